@@ -64,7 +64,6 @@ class QuickRssiConfig(RssiConfig):
     """A fit without primitives, in a class that workers of a cluster find by its name."""
 
     n_primitives: int = 0
-    steps: int = 2
 
 
 class QuickNetwork(Constant):

@@ -1,4 +1,4 @@
-"""Choices that training spectra make: the kernel, the number of components, and where to measure next.
+"""Choices that training spectra make: kernel, principal components and their number, and where to measure next.
 
 The kernel is that of the pixel Gaussian process with the smallest error at held-out training spectra: held out at random, or
 a region at a time if the model has to predict unmeasured regions. All errors follow from the inner products of the spectra,
@@ -8,14 +8,14 @@ Learning", 2006, chapters 2 and 5).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from swiftwrf.data.store import Store
-from swiftwrf.gp.kernel import Kernel, candidates
-from swiftwrf.gp.process import N_NEIGHBOURS, LeaveGroupOut, held_out, local_weights
+from swiftwrf.gp.process import N_NEIGHBOURS, Kernel, candidates, leave_folds_out, local_weights
 from swiftwrf.positions import Neighbours, distance
 from swiftwrf.runtime.threads import single_thread
 
@@ -25,6 +25,8 @@ MIN_ERROR = 1e-12  # squared error, for logarithms
 JITTER = 1e-6  # relative variance below which a position counts as measured
 MAX_ROWS = 400  # spectra that choose; a candidate costs their number cubed
 MAX_LOCAL_ROWS = 200  # spectra that are held out among more, each predicted from its neighbours
+N_OVERSAMPLING = 16  # directions of the sketch of principal components beyond their number
+MIN_VARIANCE = 1e-6  # fraction of the variance below which a principal component is left out
 
 
 @single_thread()
@@ -59,8 +61,8 @@ def _held_out_errors(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -
     gram = inner_products(spectrum[:])
 
     def evaluate(kernel: Kernel) -> Tensor:
-        groups = LeaveGroupOut.each(kernel, position, fold)
-        return torch.cat([squared_errors(gram, group.out, group.kept, group.weights) for group in groups])
+        parts = leave_folds_out(kernel, position, fold)
+        return torch.cat([squared_errors(gram, part.out, part.kept, part.weight) for part in parts])
 
     return evaluate
 
@@ -110,9 +112,11 @@ def choose_rank(position: Tensor, spectrum: Tensor | Store, fold: Tensor, kernel
     variance, vector = torch.linalg.eigh(inner_products(spectrum))
     variance = variance.flip(0).clamp_min(0)
     component = vector.flip(1) * variance.sqrt()  # (n, n), one column a component
-    predicted, _ = held_out(kernel, position, fold, component)
+    error = torch.zeros((), dtype=torch.float64)
+    for out, kept, weight, _ in leave_folds_out(kernel, position, fold):
+        error += (component[out] - weight @ component[kept]).square().sum()
     left_out = variance.flip(0).cumsum(0).flip(0)  # by 0, 1, ... components
-    enough = left_out <= MAX_RANK_ERROR * (component - predicted).square().sum()
+    enough = left_out <= MAX_RANK_ERROR * error
     return int((~enough).sum())
 
 
@@ -199,3 +203,70 @@ def squared_errors(gram: Tensor, out: Tensor, kept: Tensor, weight: Tensor) -> T
     """
     own = gram.diagonal()[out]
     return own - 2 * (weight * gram[out][:, kept]).sum(1) + ((weight @ gram[kept][:, kept]) * weight).sum(1)
+
+
+class Components(NamedTuple):
+    """Rows that are nearly mean + score @ component.
+
+    Example:
+        >>> found = principal_components(torch.outer(torch.arange(5.0), torch.ones(8)), rank=1)
+        >>> (found.mean + found.score.float() @ found.component)[:, 0].round().tolist()
+        [0.0, 1.0, 2.0, 3.0, 4.0]
+    """
+
+    mean: Tensor  # float32 (P,)
+    score: Tensor  # float64 (n, K), each column of length 1, the least component first
+    component: Tensor  # float32 (K, P)
+
+
+def principal_components(
+    rows: Tensor | Callable[[], Iterable[Tensor]], rank: int, min_variance: float = MIN_VARIANCE, seed: int = 0
+) -> Components:
+    """Return the largest principal components of rows.
+
+    The components of a tensor follow from the inner products of its rows. Those of batches follow from a random sketch of
+    the covariance after one power iteration (N. Halko, P. G. Martinsson and J. A. Tropp, "Finding structure with
+    randomness", SIAM Review 53, 2011, algorithms 4.3 and 5.1), whose time grows with the number of rows.
+
+    Args:
+        rows: Rows (n, P), float32, or a function that yields them in order by the batch, equal at each of three calls.
+        rank: Maximum number of components.
+        min_variance: Fraction of the variance below which a component is left out.
+        seed: Seed of the sketch.
+
+    Example:
+        >>> rows = torch.outer(torch.arange(5.0), torch.ones(8))
+        >>> principal_components(rows, rank=3).component.shape
+        torch.Size([1, 8])
+    """
+    if not isinstance(rows, Tensor):
+        return _sketched(rows, rank, min_variance, seed)
+    mean = rows.mean(dim=0)
+    change = rows - mean
+    value, vector = torch.linalg.eigh((change @ change.T).double())
+    kept = (value > min_variance * value.sum()).nonzero()[:, 0]
+    vector = vector[:, kept[max(len(kept) - rank, 0) :]]
+    return Components(mean, vector, vector.T.float() @ change)
+
+
+def _sketched(batches: Callable[[], Iterable[Tensor]], rank: int, min_variance: float, seed: int) -> Components:
+    total, n = torch.zeros((), dtype=torch.float64), 0
+    for batch in batches():
+        total, n = total + batch.sum(dim=0, dtype=torch.float64), n + len(batch)
+    mean = (total / n).float()
+    width = min(rank + N_OVERSAMPLING, len(mean))
+    random = torch.randn(len(mean), width, generator=torch.Generator().manual_seed(seed))
+    sketch = torch.zeros(len(mean), width, dtype=torch.float64)
+    variance = 0.0
+    for batch in batches():
+        change = batch - mean
+        sketch += (change.T @ (change @ random)).double()
+        variance += float(change.square().sum(dtype=torch.float64))
+    span = torch.linalg.qr(sketch).Q.float()
+    score = torch.cat([(batch - mean) @ span for batch in batches()]).double()
+    value, vector = torch.linalg.eigh(score.T @ score)
+    kept = (value > min_variance * variance).nonzero()[:, 0]
+    kept = kept[max(len(kept) - rank, 0) :]
+    scale = value[kept].sqrt()
+    component = (vector[:, kept] * scale).T.float() @ span.T
+    return Components(mean, score @ vector[:, kept] / scale, component)

@@ -1,24 +1,116 @@
-"""Gaussian-process regression: exact among few positions, local among many, and leave-group-out predictions."""
+"""Gaussian processes: the kernel and its candidates, regression exact or local, and predictions of held-out rows."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from copy import copy
-from dataclasses import asdict
+from dataclasses import asdict, astuple, dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from scipy.optimize import brentq
+from torch import Tensor
+from torch.nn import functional
 
 from swiftwrf.errors import InputError
-from swiftwrf.gp.kernel import Kernel
-from swiftwrf.positions import Neighbours
+from swiftwrf.positions import Neighbours, distance
 from swiftwrf.runtime.checkpoint import Header, expect
 
 MAX_EXACT = 2000  # positions up to which a process is exact; time and memory grow with their cube and square
 N_NEIGHBOURS = 64  # positions that a local prediction conditions on; farther ones hardly change the mean
 
 
+@dataclass(frozen=True)
+class Kernel:
+    """Covariance of a field at two positions by their distance r: a rough long-range and a smooth short-range part.
+
+        k(r) = w exp(-r / l) + (1 - w) (1 + sqrt(3) r / s) exp(-sqrt(3) r / s)
+
+    The Matern 1/2 part of weight w and length l models a rough field between positions that are wavelengths apart. The
+    Matern 3/2 part of length s models a path that is sampled densely.
+
+    Args:
+        matern12_length: Correlation length l of the rough part, in the unit of the positions.
+        matern32_length: Correlation length s of the smooth part.
+        matern12_weight: Variance w of the rough part, in [0, 1].
+        noise: Variance that does not depend on position, relative to k(0) = 1.
+        vertical: Factor of differences in z, e.g. between floors.
+
+    Raises:
+        InputError: A value outside its range.
+
+    Example:
+        >>> Kernel(matern12_length=1.0, matern12_weight=1.0)(torch.zeros(1, 3), torch.tensor([[1.0, 0.0, 0.0]]))
+        tensor([[0.3679]])
+    """
+
+    matern12_length: float = 0.5
+    matern32_length: float = 0.1
+    matern12_weight: float = 0.6
+    noise: float = 1e-2
+    vertical: float = 1.0
+
+    def __post_init__(self) -> None:
+        finite = all(map(math.isfinite, astuple(self)))
+        positive = min(self.matern12_length, self.matern32_length, self.vertical) > 0
+        if not (finite and positive and 0 <= self.matern12_weight <= 1 and self.noise >= 0):
+            raise InputError(
+                f"a kernel needs lengths and a vertical factor above 0, a weight in [0, 1] and a noise from 0, got {self}"
+            )
+
+    @property
+    def correlation_length(self) -> float:
+        """Distance at which the covariance has fallen to 1/e, in the unit of the positions."""
+        longest = max(self.matern12_length, self.matern32_length)
+        return float(brentq(lambda r: float(self.at(torch.tensor(r).double())) - 1 / math.e, 0.0, 2 * longest))
+
+    def scaled(self, factor: float) -> Kernel:
+        """Return the equivalent kernel for positions that are multiplied by `factor`."""
+        lengths = {name: factor * getattr(self, name) for name in ("matern12_length", "matern32_length")}
+        return replace(self, **lengths)
+
+    def __call__(self, a: Tensor, b: Tensor) -> Tensor:
+        """Return k between positions (n, 3) and (m, 3), (n, m)."""
+        if self.vertical != 1:
+            scale = a.new_tensor([1.0, 1.0, self.vertical])
+            a, b = a * scale, b * scale
+        return self.at(distance(a, b))
+
+    def at(self, r: Tensor) -> Tensor:
+        """Return k at distances of any shape."""
+        rough, weight = torch.exp(-r / self.matern12_length), self.matern12_weight
+        if weight == 1:
+            return rough
+        near = math.sqrt(3) * r / self.matern32_length
+        value: Tensor = weight * rough + (1 - weight) * (1 + near) * torch.exp(-near)
+        return value
+
+    def covariance(self, position: Tensor) -> Tensor:
+        """Return the covariance of noisy values at positions (n, 3), float64 (n, n)."""
+        position = position.double()
+        noisy: Tensor = self(position, position) + self.noise * torch.eye(len(position)).to(position)
+        return noisy
+
+
+def candidates(position: Tensor, noises: Sequence[float]) -> Iterator[Kernel]:
+    """Yield kernels with lengths from the extent of the positions (n, 3) [m] down, with and without a smooth part.
+
+    Example:
+        >>> kernels = list(candidates(torch.rand(50, 3, dtype=torch.float64), noises=[0.01]))
+        >>> {kernel.noise for kernel in kernels}
+        {0.01}
+    """
+    extent = float((position.max(0).values - position.min(0).values).max()) or 1.0
+    for noise in noises:
+        for k in range(5):
+            length = extent / 2**k
+            yield Kernel(length, extent, matern12_weight=1.0, noise=noise)
+            yield from (Kernel(length, extent / 3 / 2**j, matern12_weight=0.6, noise=noise) for j in range(1, 6))
+
+
+@dataclass(frozen=True, eq=False)
 class GaussianProcess:
     """Regression with a given kernel and prior mean 0.
 
@@ -41,17 +133,21 @@ class GaussianProcess:
         True
     """
 
-    def __init__(
-        self,
-        kernel: Kernel,
-        known: Tensor,
-        coefficient: Tensor | None = None,
-        exact: bool | None = None,
-        correlation: Tensor | None = None,
-    ) -> None:
-        self.kernel, self.known, self.coefficient = kernel, known.double(), coefficient
-        self._asked_exact, self.exact = exact, len(known) <= MAX_EXACT if exact is None else exact
-        self.correlation = self.known.new_ones(len(known)) if correlation is None else correlation.double()
+    kernel: Kernel
+    known: Tensor
+    coefficient: Tensor | None = None
+    exact: bool | None = None
+    correlation: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        known = self.known.double()
+        correlation = known.new_ones(len(known)) if self.correlation is None else self.correlation.double()
+        vars(self).update(known=known, correlation=correlation)
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether every prediction conditions on all positions."""
+        return len(self.known) <= MAX_EXACT if self.exact is None else self.exact
 
     @classmethod
     def regress(
@@ -61,22 +157,24 @@ class GaussianProcess:
         value: Tensor,
         exact: bool | None = None,
         dtype: torch.dtype = torch.float64,
-        correlation: Tensor | None = None,
     ) -> GaussianProcess:
         """Return the process of values (n, K) at known positions (n, 3), with coefficients of the given type."""
-        process = cls(kernel, known, value.to(dtype), exact, correlation)
-        if process.exact:
-            process.value = value.to(dtype)
-            process.coefficient = torch.cholesky_solve(value.double(), process._factor).to(dtype)
-        return process
+        return cls(kernel, known, value.to(dtype), exact).regressed(value)
+
+    def regressed(self, value: Tensor) -> GaussianProcess:
+        """Return the process of other values (n, K) at the same positions."""
+        kept = value.to(self._coefficient)
+        if not self.is_exact:
+            return self._with(coefficient=kept)
+        coefficient = torch.cholesky_solve(value.double(), self._factor)
+        return self._with(coefficient=coefficient.to(kept), value=kept)
 
     @cached_property
     def value(self) -> Tensor:
         """Values (n, K) that the process was regressed on, in the precision of the coefficients."""
-        assert self.coefficient is not None
-        if not self.exact:
-            return self.coefficient
-        return (self._factor @ (self._factor.T @ self.coefficient.double())).to(self.coefficient)
+        if not self.is_exact:
+            return self._coefficient
+        return (self._factor @ (self._factor.T @ self._coefficient.double())).to(self._coefficient)
 
     def updated(self, position: Tensor, value: Tensor) -> GaussianProcess:
         """Return the process with more values (k, K) at positions (k, 3), equal to `regress` on all values.
@@ -84,61 +182,55 @@ class GaussianProcess:
         The Cholesky factor grows by k rows, in a time proportional to n^2 k (G. H. Golub and C. F. Van Loan, "Matrix
         Computations", 4th ed., 2013, section 6.5.4).
         """
-        assert self.coefficient is not None
+        values = torch.cat([self.value, value.to(self._coefficient)])
         known = torch.cat([self.known, position.double()])
-        correlation = torch.cat([self.correlation, self.correlation.new_ones(len(position))])
-        options = self._asked_exact, self.coefficient.dtype, correlation
-        if not self.exact or not (self._asked_exact or len(known) <= MAX_EXACT):
-            return self.regress(self.kernel, known, torch.cat([self.value, value.to(self.coefficient)]), *options)
-        n, coefficient = len(self.known), self.coefficient.double()
-        cross = self._cross(position)
+        correlation = torch.cat([self._correlation, self._correlation.new_ones(len(position))])
+        process = replace(self, known=known, coefficient=values, correlation=correlation)
+        if not (self.is_exact and process.is_exact):
+            return process.regressed(values)
+        n, coefficient, cross = len(self.known), self._coefficient.double(), self._cross(position)
         root = torch.linalg.solve_triangular(self._factor, cross.T, upper=False)  # (n, k)
         corner = torch.linalg.cholesky(self.kernel.covariance(position) - root.T @ root)
         new = torch.cholesky_solve(value.double() - cross @ coefficient, corner)
         weight = torch.linalg.solve_triangular(self._factor.T, root, upper=True)
-        coefficient = torch.cat([coefficient - weight @ new, new]).to(self.coefficient)
-        process = GaussianProcess(self.kernel, known, coefficient, self._asked_exact, correlation)
         factor = corner.new_zeros(len(known), len(known))
         factor[:n, :n], factor[n:, :n], factor[n:, n:] = self._factor, root.T, corner
-        process._factor, process.value = factor, torch.cat([self.value, value.to(coefficient)])
-        return process
+        coefficient = torch.cat([coefficient - weight @ new, new]).to(values)
+        return process._with(coefficient=coefficient, value=values, _factor=factor)
 
     def without(self, rows: Tensor) -> GaussianProcess:
         """Return the process without the values of some rows, by regression on the remaining ones."""
-        assert self.coefficient is not None
         kept = torch.ones(len(self.known), dtype=torch.bool)
         kept[rows] = False
-        options = self._asked_exact, self.coefficient.dtype, self.correlation[kept]
-        return self.regress(self.kernel, self.known[kept], self.value[kept], *options)
+        process = replace(self, known=self.known[kept], correlation=self._correlation[kept])
+        return process.regressed(self.value[kept])
 
     def with_kernel(self, kernel: Kernel) -> GaussianProcess:
         """Return the process of the values with another kernel."""
-        assert self.coefficient is not None
-        options = self._asked_exact, self.coefficient.dtype, self.correlation
-        return self.regress(kernel, self.known, self.value, *options)
+        return replace(self, kernel=kernel).regressed(self.value)
 
     def widened(self, count: int) -> GaussianProcess:
         """Return the process with some more columns of values, all 0."""
-        process = copy(self)
-        process.coefficient, process.value = (
-            nn.functional.pad(torch.as_tensor(x), (0, count)) for x in (self.coefficient, self.value)
-        )
-        return process
+        coefficient, value = (functional.pad(x, (0, count)) for x in (self._coefficient, self.value))
+        return self._with(coefficient=coefficient, value=value)
 
     def aged(self, correlation: float) -> GaussianProcess:
         """Return the process after a change of the field, whose values before and after have the given correlation.
 
         Covariances of the values stay as they are, and the posterior mean is multiplied by the correlation.
         """
+        return self._with(correlation=correlation * self._correlation)
+
+    def _with(self, **changes: Tensor) -> GaussianProcess:
+        """Return a copy with other fields or cached properties. All other cached properties must stay valid."""
         process = copy(self)
-        process.correlation = correlation * self.correlation
+        vars(process).update(changes)
         return process
 
     def mean(self, position: Tensor) -> Tensor:
         """Return the posterior mean at positions (m, 3), (m, K), in the precision of the coefficients."""
-        assert self.coefficient is not None
-        if self.exact:
-            mean: Tensor = self._cross(position).to(self.coefficient) @ self.coefficient
+        if self.is_exact:
+            mean: Tensor = self._cross(position).to(self._coefficient) @ self._coefficient
             return mean
         return self.local(position)[0]
 
@@ -148,7 +240,7 @@ class GaussianProcess:
         Returns:
             Row numbers (r,) of the values that count, and their weights, float64 (m, r).
         """
-        if self.exact:
+        if self.is_exact:
             weight = torch.cholesky_solve(self._cross(position).T, self._factor).T
             return torch.arange(len(self.known)), weight
         number, weight, _ = self._local(position)
@@ -156,7 +248,7 @@ class GaussianProcess:
 
     def variance(self, position: Tensor) -> Tensor:
         """Return the posterior variance, without noise, at positions (m, 3), relative to k(0) = 1, float64 (m,)."""
-        if not self.exact:
+        if not self.is_exact:
             return self._local(position)[2]
         root = torch.linalg.solve_triangular(self._factor, self._cross(position).T, upper=False)
         variance: Tensor = 1 - root.square().sum(dim=0)
@@ -164,10 +256,9 @@ class GaussianProcess:
 
     def state(self, prefix: str = "") -> tuple[dict[str, Tensor], Header]:
         """Return positions and coefficients, and the kernel as plain values, with names that begin with `prefix`."""
-        assert self.coefficient is not None
-        tensors = {f"{prefix}position": self.known, f"{prefix}coefficient": self.coefficient}
-        if bool((self.correlation < 1).any()):
-            tensors[f"{prefix}correlation"] = self.correlation
+        tensors = {f"{prefix}position": self.known, f"{prefix}coefficient": self._coefficient}
+        if bool((self._correlation < 1).any()):
+            tensors[f"{prefix}correlation"] = self._correlation
         return tensors, {f"{prefix}kernel": asdict(self.kernel)}
 
     @classmethod
@@ -188,16 +279,26 @@ class GaussianProcess:
             raise InputError("correlation in time must be above 0 and at most 1")
         return cls(Kernel(**header[f"{prefix}kernel"]), known, coefficient.to(dtype), exact, correlation)
 
+    @property
+    def _coefficient(self) -> Tensor:
+        assert self.coefficient is not None
+        return self.coefficient
+
+    @property
+    def _correlation(self) -> Tensor:
+        assert self.correlation is not None
+        return self.correlation
+
     def _cross(self, position: Tensor) -> Tensor:
         """Return the covariances of the present field at positions (m, 3) with the values, float64 (m, n)."""
         cross: Tensor = self.kernel(position.double(), self.known)
-        return cross * self.correlation
+        return cross * self._correlation
 
     @cached_property
     @torch.inference_mode(False)
     def _factor(self) -> Tensor:
         """Cholesky factor of the covariance of the values, float64 (n, n)."""
-        ratio = self.correlation[:, None] / self.correlation
+        ratio = self._correlation[:, None] / self._correlation
         covariance = self.kernel.covariance(self.known) * torch.minimum(ratio, ratio.T)
         factor: Tensor = torch.linalg.cholesky(covariance)
         return factor
@@ -208,16 +309,15 @@ class GaussianProcess:
 
     def local(self, position: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean (m, K) and variance (m,) at positions from the nearest known ones, whatever their number."""
-        assert self.coefficient is not None
         number, weight, variance = self._local(position)
-        return torch.einsum("mk,mkc->mc", weight, self.coefficient[number].double()), variance
+        return torch.einsum("mk,mkc->mc", weight, self._coefficient[number].double()), variance
 
     def _local(self, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return row numbers (m, k), weights (m, k) and posterior variance (m,) from the nearest positions."""
         position = position.to(self.known)
         number = self._neighbours(position, min(N_NEIGHBOURS, len(self.known)))[1].to(self.known.device)
         near = self.known[number]
-        correlation = self.correlation[number]
+        correlation = self._correlation[number]
         ratio = correlation[:, :, None] / correlation[:, None]
         covariance = self.kernel(near, near) * torch.minimum(ratio, ratio.mT)
         cross = self.kernel(position[:, None], near)[:, 0] * correlation
@@ -248,106 +348,64 @@ def dense_weights(number: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     return rows, weight.new_zeros(len(weight), len(rows)).scatter(1, column, weight)
 
 
-def held_out_neighbours(
-    kernel: Kernel, position: Tensor, fold: Tensor, rows: Tensor
-) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """Yield how the nearest rows of other folds predict some rows, fold by fold.
+class HeldOut(NamedTuple):
+    """How rows of other folds predict the rows of one fold; see `leave_folds_out`."""
+
+    out: Tensor  # numbers of the rows that are held out, (o,)
+    kept: Tensor  # numbers of the rows that predict them, (k,)
+    weight: Tensor  # their weights, float64 (o, k)
+    variance: Tensor  # variances of the errors of noisy values, float64 (o,)
+
+
+def leave_folds_out(
+    kernel: Kernel, position: Tensor, fold: Tensor, nearest_for: Tensor | None = None
+) -> Iterator[HeldOut]:
+    """Yield how a process with mean 0 predicts the rows of each fold from all other folds, without another fit.
 
     Args:
-        kernel: Kernel of a process with mean 0.
+        kernel: Kernel with its noise.
         position: Positions (n, 3).
-        fold: Number of the group that each row is held out with, (n,).
-        rows: Row numbers (m,).
-
-    Yields:
-        Row numbers (b,) of one fold, row numbers (r,) of the values that predict them, weights float64 (b, r), and
-        variances of the noisy values, float64 (b,).
+        fold: Number of the fold of each row, (n,).
+        nearest_for: Numbers of rows that are predicted from their nearest rows only. Defaults to all rows from all others.
 
     Example:
         >>> position = torch.linspace(0, 1, 20, dtype=torch.float64)[:, None] * torch.ones(3)
-        >>> parts = held_out_neighbours(Kernel(noise=0.01), position, torch.arange(20) % 2, torch.arange(4))
-        >>> [(own.tolist(), len(others), weight.shape) for own, others, weight, _ in parts]
-        [([0, 2], 10, torch.Size([2, 10])), ([1, 3], 10, torch.Size([2, 10]))]
+        >>> kernel, fold = Kernel(noise=0.01), torch.arange(20) % 2
+        >>> [(part.out.tolist(), part.weight.shape) for part in leave_folds_out(kernel, position, fold, torch.arange(4))]
+        [([0, 2], torch.Size([2, 10])), ([1, 3], torch.Size([2, 10]))]
     """
-    for number in fold[rows].unique():
-        own, others = rows[fold[rows] == number], (fold != number).nonzero()[:, 0]
-        near, weight, variance = GaussianProcess(kernel, position[others], exact=False)._local(position[own])
-        used, dense = dense_weights(near, weight)
-        yield own, others[used], dense, variance + kernel.noise
+    if nearest_for is not None:
+        for number in fold[nearest_for].unique():
+            out, others = nearest_for[fold[nearest_for] == number], (fold != number).nonzero()[:, 0]
+            near, weight, variance = GaussianProcess(kernel, position[others], exact=False)._local(position[out])
+            used, dense = dense_weights(near, weight)
+            yield HeldOut(out, others[used], dense, variance + kernel.noise)
+        return
+    precision = torch.linalg.inv(kernel.covariance(position))
+    for number in fold.unique():
+        out, kept = ((fold == number) == held for held in (True, False))
+        covariance = torch.linalg.inv(precision[out][:, out])
+        weight = -covariance @ precision[out][:, kept]
+        yield HeldOut(out.nonzero()[:, 0], kept.nonzero()[:, 0], weight, covariance.diagonal())
 
 
-class LeaveGroupOut:
-    """Prediction of a group of rows from all other rows without another fit.
+def held_out_errors(precision: Tensor, dual: Tensor, out: Tensor) -> Tensor:
+    """Return the errors of a group of rows, predicted from all other rows without another fit.
 
-    For a Gaussian vector y with precision P, the errors at the rows g are inv(P[g, g]) @ (P @ y)[g], with covariance
-    inv(P[g, g]) (C. E. Rasmussen and C. K. I. Williams, "Gaussian Processes for Machine Learning", 2006, eq. 5.12).
+    For a Gaussian vector y with precision P, true minus predicted values of the rows g are inv(P[g, g]) @ (P @ y)[g], with
+    covariance inv(P[g, g]) (C. E. Rasmussen and C. K. I. Williams, "Gaussian Processes for Machine Learning", 2006, eq.
+    5.12).
 
     Args:
-        precision: Inverse covariance of the noisy values (n, n).
-        out: Numbers of the rows that are held out, (o,).
+        precision: Inverse covariance P of the noisy values (n, n).
+        dual: P @ y, (n, ...).
+        out: Numbers g of the rows that are held out, (o,).
 
     Example:
         >>> position = torch.linspace(0, 1, 9, dtype=torch.float64)[:, None] * torch.ones(3)
         >>> precision = torch.linalg.inv(Kernel(noise=0.01).covariance(position))
-        >>> group = LeaveGroupOut(precision, torch.tensor([3, 4]))
-        >>> group.errors(precision @ position[:, 0]).shape, group.covariance.shape
-        (torch.Size([2]), torch.Size([2, 2]))
+        >>> held_out_errors(precision, precision @ position[:, 0], torch.tensor([3, 4])).shape
+        torch.Size([2])
     """
-
-    def __init__(self, precision: Tensor, out: Tensor) -> None:
-        self.precision, self.out = precision, out
-        self._block = precision.index_select(0, out).index_select(1, out)
-
-    @classmethod
-    def each(cls, kernel: Kernel, position: Tensor, fold: Tensor) -> Iterator[LeaveGroupOut]:
-        """Yield one group for each fold of a process with mean 0 at positions (n, 3) with fold numbers (n,)."""
-        precision = torch.linalg.inv(kernel.covariance(position))
-        for number in fold.unique():
-            yield cls(precision, (fold == number).nonzero()[:, 0])
-
-    @cached_property
-    def covariance(self) -> Tensor:
-        """Covariance of the errors (o, o)."""
-        covariance: Tensor = torch.linalg.inv(self._block)
-        return covariance
-
-    @cached_property
-    def kept(self) -> Tensor:
-        """Numbers of the other rows, (k,)."""
-        held = torch.zeros(len(self.precision), dtype=torch.bool)
-        held[self.out] = True
-        return (~held).nonzero()[:, 0]
-
-    @property
-    def weights(self) -> Tensor:
-        """Weights (o, k) with which the other rows predict the group."""
-        return -self.covariance @ self.precision.index_select(0, self.out).index_select(1, self.kept)
-
-    def errors(self, dual: Tensor) -> Tensor:
-        """Return true minus predicted values (o, ...) from precision @ values (n, ...)."""
-        errors: Tensor = torch.linalg.solve(self._block, dual[self.out])
-        return errors
-
-
-def held_out(kernel: Kernel, position: Tensor, fold: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
-    """Return predictions (n, K) of values (n, K) without their folds, and variances of the noisy values, float64 (n,).
-
-    Args:
-        kernel: Kernel of a process with mean 0.
-        position: Positions (n, 3).
-        fold: Number of the group that each row is held out with, (n,).
-        value: Values (n, K).
-
-    Example:
-        >>> position = torch.linspace(0, 1, 20, dtype=torch.float64)[:, None] * torch.ones(3)
-        >>> predicted, variance = held_out(Kernel(noise=0.01), position, torch.arange(20) % 5, position[:, :1])
-        >>> predicted.shape, variance.shape
-        (torch.Size([20, 1]), torch.Size([20]))
-    """
-    predicted, variance = torch.empty_like(value, dtype=torch.float64), torch.empty(len(value), dtype=torch.float64)
-    dual: Tensor | None = None
-    for group in LeaveGroupOut.each(kernel, position, fold):
-        dual = group.precision @ value.double() if dual is None else dual
-        predicted[group.out] = value[group.out].double() - group.errors(dual)
-        variance[group.out] = group.covariance.diagonal()
-    return predicted, variance
+    errors: Tensor = torch.linalg.solve(precision.index_select(0, out).index_select(1, out), dual[out])
+    return errors

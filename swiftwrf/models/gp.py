@@ -46,7 +46,7 @@ class GPModel(ProcessModel, MemoryModel):
     def _prepare(self, process: GaussianProcess) -> None:
         """Precompute what predictions share: mean, and differences from the mean, if they are few."""
         self._mean, self.process = self.store.mean(), process
-        some = self.store[:] if process.exact else subsample(self.store)[0]
+        some = self.store[:] if process.is_exact else subsample(self.store)[0]
         self._change = (some - self._mean).flatten(1)
 
     def _values(self, new: Spectra) -> Tensor:
@@ -73,7 +73,7 @@ class GPModel(ProcessModel, MemoryModel):
     def _mean_change(self, position: Tensor) -> Tensor:
         """Return predicted differences from the mean spectrum (b, pixels)."""
         rows, weight = self.process.weights(position)
-        change = self._change if self.process.exact else (self.store[rows] - self._mean).flatten(1)
+        change = self._change if self.process.is_exact else (self.store[rows] - self._mean).flatten(1)
         return weight.float() @ change
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:

@@ -22,7 +22,7 @@ from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import folds
 from swiftwrf.data.store import Store
 from swiftwrf.errors import InputError
-from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel, held_out_neighbours, subsample
+from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel, leave_folds_out, subsample
 from swiftwrf.metrics import std_factor
 from swiftwrf.models.base import FieldModel
 from swiftwrf.runtime.checkpoint import expect
@@ -108,7 +108,7 @@ class ProcessModel(FieldModel):
         """
         (rows,) = subsample(torch.arange(len(train)), rows=MAX_HELD_OUT)
         scores = []
-        for own, others, weight, variance in held_out_neighbours(self.process.kernel, train.position, fold, rows):
+        for own, others, weight, variance in leave_folds_out(self.process.kernel, train.position, fold, rows):
             predicted = spectrum(weight.float() @ value(others).float(), own).clamp(0, 1)
             scores.append((predicted - train.store[own]).abs() / variance.sqrt().float()[:, None, None])
         score = torch.cat(scores)
@@ -166,4 +166,4 @@ class ProcessModel(FieldModel):
 def _held_out_std(kernel: Kernel, position: Tensor, fold: Tensor) -> Tensor:
     """Return the root mean square of the standard deviations of noisy values at held-out positions."""
     (rows,) = subsample(torch.arange(len(position)), rows=MAX_HELD_OUT)
-    return torch.cat([part[3] for part in held_out_neighbours(kernel, position, fold, rows)]).mean().sqrt()
+    return torch.cat([part.variance for part in leave_folds_out(kernel, position, fold, rows)]).mean().sqrt()

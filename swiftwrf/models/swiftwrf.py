@@ -20,7 +20,15 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import folds
 from swiftwrf.errors import InputError
-from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel, choose_rank, held_out, principal_components, subsample
+from swiftwrf.gp import (
+    GaussianProcess,
+    Kernel,
+    choose_kernel,
+    choose_rank,
+    leave_folds_out,
+    principal_components,
+    subsample,
+)
 from swiftwrf.metrics import spectrum_loss, std_factor
 from swiftwrf.models.base import CPU, FieldConfig, FieldModel
 from swiftwrf.models.primitives import constrained, min_width
@@ -304,9 +312,11 @@ def _held_out(spectra: Spectra, function: Tensor, kernel: Kernel, fold: Tensor) 
         fold: Number of the group that each spectrum is held out with, (n,).
     """
     weight = _weights(function, spectra.spectrum)
-    mean = weight.mean(dim=0)
-    predicted, variance = held_out(kernel, spectra.position, fold, weight - mean)
-    return _render(mean + predicted.float(), function).clamp(0, 1), variance.float()
+    mean, predicted = weight.mean(dim=0), torch.empty_like(weight)
+    change, variance = (weight - mean).double(), weight.new_empty(len(weight))
+    for out, kept, share, of_errors in leave_folds_out(kernel, spectra.position, fold):
+        predicted[out], variance[out] = (share @ change[kept]).to(weight), of_errors.to(weight)
+    return _render(mean + predicted, function).clamp(0, 1), variance
 
 
 def _shapes(target: Tensor, n: int, grid: AngularGrid, steps: int) -> tuple[Tensor, Tensor]:

@@ -266,7 +266,7 @@ def described(old: Kernel, new: Kernel) -> str:
     """Return how a kernel differs from an earlier one, in words.
 
     Example:
-        >>> described(Kernel(long=1.0, share=1.0), Kernel(long=0.5, share=1.0, noise=0.1))
+        >>> described(Kernel(1.0, matern12_weight=1.0), Kernel(0.5, matern12_weight=1.0, noise=0.1))
         'correlation length 1 -> 0.5 m, noise 0.01 -> 0.1'
     """
     lengths = f"correlation length {old.correlation_length:.2g} -> {new.correlation_length:.2g} m"

@@ -1,12 +1,12 @@
 """RSSI at fixed receivers from the position of the transmitter."""
 
-from swiftwrf.rssi.base import Map, RssiFitContext, RssiPredictor
-from swiftwrf.rssi.config import RssiConfig
-from swiftwrf.rssi.floors import FloorAttenuation, estimate_floor_attenuation
-from swiftwrf.rssi.model import LEVEL, RssiModel, fit_rssi
-from swiftwrf.rssi.offsets import estimate_offsets
+from swiftwrf.rssi.base import Map, RssiConfig, RssiFitContext, RssiPredictor
+from swiftwrf.rssi.model import RssiModel, fit_rssi
+from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation, estimate_offsets
 from swiftwrf.rssi.pairs import PairConfig, PairModel, PairPredictor
+from swiftwrf.rssi.paper import RssiPaperConfig, RssiPaperModel
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, fit_shared_path_loss, log_distance
+from swiftwrf.rssi.training import LEVEL
 
 __all__ = [
     "LEVEL",
@@ -18,6 +18,8 @@ __all__ = [
     "RssiConfig",
     "RssiFitContext",
     "RssiModel",
+    "RssiPaperConfig",
+    "RssiPaperModel",
     "RssiPredictor",
 ]
 __all__ += [

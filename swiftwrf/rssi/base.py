@@ -10,9 +10,10 @@ from collections.abc import Callable, Iterable
 from copy import copy
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import torch
+from annotated_types import Ge
 from torch import Tensor
 
 from swiftwrf.data.coordinates import GeodeticOrigin
@@ -25,12 +26,12 @@ from swiftwrf.models.base import CPU, FieldConfig, check_checkpoint
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Displayed
 from swiftwrf.positions import check_positions, to_tensor
-from swiftwrf.rssi.floors import FloorAttenuation, estimate_floor_attenuation, receiver_floors
+from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation, receiver_floors
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.options import Configured, all_or_nothing, from_plain
 from swiftwrf.runtime.session import Record
 from swiftwrf.runtime.threads import parallel_map, to_device
-from swiftwrf.runtime.validation import checked
+from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, checked, configuration
 
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 ITEMS_PER_THREAD = 4  # between two results that are kept: starting threads costs milliseconds
@@ -43,6 +44,24 @@ def map_threads(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterabl
     waiting, n_items = list(items), ITEMS_PER_THREAD * torch.get_num_threads()
     for start in range(0, len(waiting), n_items):
         yield from parallel_map(function, waiting[start : start + n_items])
+
+
+@configuration
+class RssiConfig(FieldConfig):
+    """Options of `RssiModel`. The defaults have the lowest error on held-out training rows.
+
+    Example:
+        >>> RssiConfig(validation="block").n_primitives
+        50
+    """
+
+    n_primitives: NonNegativeInt = 50
+    """primitives a receiver; a fit uses none if the path-loss model predicts held-out rows as well as a field"""
+    huber: PositiveFloat = 1.345
+    """number of standard deviations of the noise beyond which an error counts linearly (Huber's constant: 95 % efficient
+    for Gaussian noise), since packets have outliers"""
+    max_locations: Annotated[int, Ge(10)] = 1500
+    """location bins that the rows are averaged in; the time of a fit grows with the cube of their number"""
 
 
 @dataclass(frozen=True)
@@ -144,8 +163,9 @@ class RssiPredictor(Configured, Displayed, ABC):
             device: Device to compute on. The fitted predictor is on the CPU.
             parallel: Function that maps a picklable fit over receivers as `map` does, e.g. on other machines. Defaults to
                 threads of this process.
-            checkpoint: File for the state of a long fit. If it exists, the fit continues from it.
-            on_record: Called with each evaluation, e.g. stage and seconds.
+            checkpoint: File for the state of the training of a network. If it exists, the fit continues from it. Other
+                predictors write none.
+            on_record: Called with each evaluation of a network, e.g. stage and seconds.
             progress: Show a progress bar on a terminal.
 
         Raises:

@@ -3,19 +3,14 @@
     rssi_r(s) = T_r - 10 gamma_r log10 |s - receiver_r| + directivity_r(s) + w_r (m_r(c_r(s)) - m_r(0))       [dBm]
 
 m_r is the mean magnitude of receiver r's primitives (`swiftwrf.rssi.head`), c_r a Gaussian process of the position,
-directivity_r a few harmonics of the direction from the receiver, and w_r the mixing weight of the field. The paper's head is
--100 + m_r(c_r(s)).
+directivity_r a few harmonics of the direction from the receiver, and w_r the mixing weight of the field.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from statistics import NormalDist
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -24,29 +19,31 @@ from swiftwrf.data.rssi import Rssi
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, subsample
 from swiftwrf.plotting import Axes
-from swiftwrf.rssi.base import Map, RssiFitContext, SavedRssiPredictor, fingerprint, map_threads
-from swiftwrf.rssi.config import RssiConfig
+from swiftwrf.rssi.base import RssiConfig, RssiFitContext, SavedRssiPredictor, map_threads
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
 from swiftwrf.rssi.maps import RssiMap
-from swiftwrf.rssi.paper_head import HELD_OUT_FOLD, learn_receivers
 from swiftwrf.rssi.path_loss import N_HARMONICS, harmonics, log_distance
 from swiftwrf.rssi.posterior import FitState, RssiPosterior
-from swiftwrf.rssi.regression import fit_receiver
-from swiftwrf.rssi.stacking import comparable, mixing_weights
-from swiftwrf.rssi.training import RssiTraining, prepare, representative_receivers, rounding_std
+from swiftwrf.rssi.training import (
+    MAX_VARIANCE_POSITIONS,
+    RssiTraining,
+    check_comparable,
+    comparable,
+    fit_receiver,
+    interval_scale,
+    mixing_weights,
+    prepare,
+    representative_receivers,
+    rounding_std,
+)
 from swiftwrf.runtime import checkpoint as files
 from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.progress import progress_bar
-from swiftwrf.runtime.session import Record, Session
 from swiftwrf.runtime.threads import single_thread
 
-LEVEL = 0.8  # nominal coverage of the interval that the standard deviation is calibrated for
-PAPER_RECEIVERS = 4  # receivers that the paper's head is learnt for together, which saves time
 FIELD_ALONE = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)  # mixing weights
 SHRINKAGE = 0.05  # of the mixing weights towards the field, by nested cross-validation in the training rows
-MIN_SCORES = 30  # held-out rows of a receiver below which the scores of all receivers scale its standard deviation
 BINNED = 0.01  # relative difference of variances beyond which a row is the mean of several measurements
-MAX_VARIANCE_POSITIONS = 200  # measured positions that determine where the field is known
 
 
 class RssiModel(SavedRssiPredictor):
@@ -60,7 +57,6 @@ class RssiModel(SavedRssiPredictor):
 
     Args:
         config: Options as one object. Defaults to `RssiConfig()`.
-        preset: "quick" for the defaults, "paper" for `RssiConfig.paper()`.
         options: Single options, which replace those of `config`.
 
     Example:
@@ -101,42 +97,24 @@ class RssiModel(SavedRssiPredictor):
     noise_db: Tensor
     """calibrated standard deviation of a measurement about the field, (R,) [dB]"""
     _posterior: RssiPosterior | None
-    """least squares of the fit, which `update` continues; None for the paper's head"""
+    """least squares of the fit, which `update` continues; None for `RssiPaperModel`"""
 
     def _fit(self, train: Rssi, context: RssiFitContext) -> None:
-        began = time.perf_counter()
-        owner = fingerprint(self.config, train, context.pool)
-        with progress_bar(context.progress) as bar:
-            session = Session(context.checkpoint, owner, bar, context.on_record)
-            training = prepare(train, context.pool, self.config)
-            record: Record = {"stage": "search", "n_primitives": training.n_primitives}
-            if not session.records:
-                session.evaluated(record | {"seconds": time.perf_counter() - began}, {}, {})
-            found = session.saved.tensors if session.saved else {}
-            done = len(found.get("level", ()))
-            with files.refusing(f"{context.checkpoint} is no state that a fit can continue from"):
-                files.expect(found, dict.fromkeys(found and ("held_out", "coefficient"), (done, len(training.rssi))))
-            fit_some, size = (learn_receivers, PAPER_RECEIVERS) if self.config.paper_head else (fit_receiver, 1)
-            # compiled rasterizers are not safe in several threads, and only the paper's head needs them here
-            parallel: Map = context.parallel or (map if self.config.paper_head else map_threads)
-            task = partial(fit_some, data=training, config=self.config, device=context.device)
-            parts = [slice(start, start + size) for start in range(done, len(training.receiver_names), size)]
-            mask = _held_out_mask(training, self.config)
-            results = zip(parts, parallel(task, parts), strict=True)
-            for part, result in bar.track(results, total=len(parts), description="receivers"):
-                found = {name: torch.cat([found[name], new]) if found else new for name, new in result.items()}
-                error = result["held_out"].T.where(mask[:, part], torch.nan) - training.rssi[:, part]
-                record |= {"stage": "final", "receivers": list(training.receiver_names[part])}
-                record |= {"validation": float(error.abs().nanmean()), "seconds": time.perf_counter() - began}
-                session.evaluated(record, found, {})
-        weight = FIELD_ALONE
-        if not self.config.paper_head:
-            weight = self._mixing_weights(train, training, found, context)
+        training = prepare(train, context.pool, self.config)
+        found = self._receivers(training, context)
+        weight = self._mixing_weights(train, training, found["held_out"], context)
         self._assemble(train, training, found, weight[:, None].repeat(1, len(training.receiver_names)))
 
-    def _mixing_weights(
-        self, train: Rssi, training: RssiTraining, found: dict[str, Tensor], context: RssiFitContext
-    ) -> Tensor:
+    def _receivers(self, training: RssiTraining, context: RssiFitContext) -> dict[str, Tensor]:
+        """Fit each receiver, and return the tensors of `fit_receiver` for all of them."""
+        task = partial(fit_receiver, data=training, config=self.config, device=context.device)
+        parts = [slice(r, r + 1) for r in range(len(training.receiver_names))]
+        with progress_bar(context.progress) as bar:
+            fits = (context.parallel or map_threads)(task, parts)
+            results = list(bar.track(fits, total=len(parts), description="receivers"))
+        return {name: torch.cat([result[name] for result in results]) for name in results[0]}
+
+    def _mixing_weights(self, train: Rssi, training: RssiTraining, held_out: Tensor, context: RssiFitContext) -> Tensor:
         """Return the weights (4,) of the field and the simpler predictors with the lowest error on held-out rows.
 
         The weights are those of all receivers: the few folds determine no weights for each of them. They follow from the
@@ -145,31 +123,24 @@ class RssiModel(SavedRssiPredictor):
         pool = representative_receivers(context.pool)
         if set(pool.receiver_names) <= set(train.receiver_names):
             columns = [train.receiver_names.index(name) for name in pool.receiver_names]
-            predictors = _held_out_predictors(training, found["held_out"], self.config)[:, :, columns]
+            predictors = _held_out_predictors(training, held_out)[:, :, columns]
         else:
             others = prepare(pool, context.pool, self.config, training)
-            fit = partial(fit_receiver, data=others, config=self.config, device=context.device)
-            each = [slice(r, r + 1) for r in range(len(pool.receiver_names))]
-            fits = (context.parallel or map_threads)(fit, each)
-            predictors = _held_out_predictors(others, torch.cat([one["held_out"] for one in fits]), self.config)
-        held_out = predictors[:, training.bin_of_row]
-        if not comparable(held_out, pool.rssi_dbm).any():
+            quiet = replace(context, progress=False)
+            predictors = _held_out_predictors(others, self._receivers(others, quiet)["held_out"])
+        predicted = predictors[:, training.bin_of_row]
+        if not comparable(predicted, pool.rssi_dbm).any():
             return FIELD_ALONE
-        return mixing_weights(held_out, pool.rssi_dbm, SHRINKAGE)
+        return mixing_weights(predicted, pool.rssi_dbm, SHRINKAGE)
 
     @single_thread()
     def _assemble(self, train: Rssi, training: RssiTraining, found: dict[str, Tensor], weight: Tensor) -> None:
         """Mix the fits of all receivers with the simpler predictors by weights (4, R), and calibrate the deviation."""
-        predictors = _held_out_predictors(training, found["held_out"], self.config)
-        measured, row = train.rssi_dbm, training.bin_of_row
-        if not comparable(predictors[: 1 if self.config.paper_head else None, row], measured).any():
-            raise InputError(
-                "no rows can be held out to estimate the error of the model: all measurements are in one part of the "
-                'region; measure elsewhere, too, give a pool of more receivers, or take validation="random"'
-            )
+        predictors = _held_out_predictors(training, found["held_out"])
+        check_comparable(predictors[:, training.bin_of_row], train.rssi_dbm)
         predicted = (weight[:, None] * predictors).where(weight[:, None] > 0, 0.0).sum(dim=0)
-        score = ((measured - predicted[row]) / _held_out_std(training)[row]).abs()
-        scale = _receiver_quantiles(score) / NormalDist().inv_cdf((1 + LEVEL) / 2)
+        prior_db = training.field_db, training.noise_db
+        scale = interval_scale(training, training.kernel, prior_db, predicted, train)
 
         def mixed(own: Tensor, baselines: Tensor) -> Tensor:
             return (weight * torch.cat([own[None], baselines])).sum(dim=0)
@@ -181,19 +152,17 @@ class RssiModel(SavedRssiPredictor):
         self.directivity = (weight[0][:, None] * found["directivity"]).float()
         self.anchor, self.coefficient = training.position.float(), found["coefficient"].T.float().contiguous()
         self.rendered = found["rendered"]
-        self._posterior = None
-        if not self.config.paper_head:
-            state = FitState(
-                dual=found["dual"].T,
-                tangent=found["tangent"].T,
-                variance=found["variance"].T,
-                prior_level=found["prior_level"],
-                prior_slope=found["prior_slope"],
-                field_variance=training.field_db.square(),
-                noise_variance=training.noise_db.square(),
-            )
-            self._posterior = self._posterior_of(state)
-        noise_db = (scale * training.noise_db).clamp_min(rounding_std(measured))
+        state = FitState(
+            dual=found["dual"].T,
+            tangent=found["tangent"].T,
+            variance=found["variance"].T,
+            prior_level=found["prior_level"],
+            prior_slope=found["prior_slope"],
+            field_variance=training.field_db.square(),
+            noise_variance=training.noise_db.square(),
+        )
+        self._posterior = self._posterior_of(state)
+        noise_db = (scale * training.noise_db).clamp_min(rounding_std(train.rssi_dbm))
         self.field_db, self.noise_db = (scale * training.field_db).float(), noise_db.float()
         self.slope_std = weight[:2].sum(dim=0) * found["slope_std"]  # only two predictors have the receiver's slope
         self._precompute()
@@ -210,8 +179,7 @@ class RssiModel(SavedRssiPredictor):
     def _precompute(self) -> None:
         """Compute what all predictions share."""
         self._table = HeadTable(self.rendered)
-        at_zero = self._table(torch.zeros(1, len(self.level)))[0]
-        self._offset = torch.zeros_like(at_zero) if self.config.paper_head else at_zero
+        self._offset = self._table(torch.zeros(1, len(self.level)))[0]
         self._process = self._variance_process()
 
     def _variance_process(self) -> GaussianProcess:
@@ -280,7 +248,7 @@ class RssiModel(SavedRssiPredictor):
 
     def _checked_posterior(self) -> RssiPosterior:
         if self._posterior is None:
-            raise InputError(f"this {self.kind} has the paper's head; fit it again to all rows")
+            raise InputError(f"a predictor {self.name} cannot be updated; fit it again to all rows")
         return self._posterior
 
     def _take_rows(self, folded: RssiPosterior) -> None:
@@ -344,33 +312,15 @@ class RssiModel(SavedRssiPredictor):
         return model
 
 
-def fit_rssi(
-    train: Rssi,
-    config: RssiConfig | None = None,
-    *,
-    pool: Rssi | None = None,
-    device: torch.device | str = "cpu",
-    parallel: Map | None = None,
-    checkpoint: Path | None = None,
-    on_record: Callable[[Record], None] | None = None,
-    progress: bool = False,
-) -> RssiModel:
-    """Fit an `RssiModel`; arguments and errors as of `RssiModel.fit`.
+def fit_rssi(train: Rssi, config: RssiConfig | None = None, **options: Any) -> RssiModel:
+    """Fit an `RssiModel`; options and errors as of `RssiModel.fit`.
 
     Example:
         >>> import swiftwrf
         >>> fit_rssi(swiftwrf.rssi_room(n=60))
         RssiModel(fitted, 12 receivers)
     """
-    return RssiModel(config).fit(
-        train,
-        pool=pool,
-        device=device,
-        parallel=parallel,
-        checkpoint=checkpoint,
-        on_record=on_record,
-        progress=progress,
-    )
+    return RssiModel(config).fit(train, **options)
 
 
 def _shapes(n_receivers: int, n_anchors: int) -> dict[str, tuple[int, ...]]:
@@ -386,35 +336,7 @@ def _shapes(n_receivers: int, n_anchors: int) -> dict[str, tuple[int, ...]]:
     }
 
 
-def _held_out_mask(training: RssiTraining, config: RssiConfig) -> Tensor:
-    """Return which bins are predicted without their own fold by the fits of the receivers, bool (n, R)."""
-    detected = ~training.rssi.isnan()
-    return detected & (training.fold == HELD_OUT_FOLD)[:, None] if config.paper_head else detected
-
-
-def _held_out_predictors(training: RssiTraining, held_out: Tensor, config: RssiConfig) -> Tensor:
+def _held_out_predictors(training: RssiTraining, held_out: Tensor) -> Tensor:
     """Return held-out predictions of the field (R, n), and those of the simpler predictors after them, (4, n, R) [dBm]."""
-    field = held_out.T.where(_held_out_mask(training, config), torch.nan)
+    field = held_out.T.where(~training.rssi.isnan(), torch.nan)
     return torch.cat([field[None], training.baseline_held_out])
-
-
-def _receiver_quantiles(score: Tensor) -> Tensor:
-    """Return the 80 % quantile of finite scores (rows, R) at each receiver (R,); of all scores at receivers with few."""
-    finite = score.where(score.isfinite(), torch.nan)
-    quantile = finite.nanquantile(LEVEL, dim=0)
-    few = (~finite.isnan()).sum(dim=0) < MIN_SCORES
-    return quantile.where(~few, score[score.isfinite()].quantile(LEVEL)) if few.any() else quantile
-
-
-def _held_out_std(training: RssiTraining) -> Tensor:
-    """Return the uncalibrated standard deviation (n, R) [dB] of a measurement in each bin, by all other folds.
-
-    The interval is thus cross-conformal (V. Vovk, Annals of Mathematics and Artificial Intelligence 74, 2015): the error of
-    each row is divided by the standard deviation that a model without the row predicts.
-    """
-    variance = torch.empty(len(training.position), dtype=torch.float64)
-    for number in training.fold.unique():
-        out = training.fold == number
-        (known,) = subsample(training.position[~out], rows=MAX_VARIANCE_POSITIONS)
-        variance[out] = GaussianProcess(training.kernel, known).variance(training.position[out])
-    return (training.noise_db.square() + training.field_db.square() * variance[:, None]).sqrt()

@@ -26,9 +26,8 @@ from swiftwrf.models.base import FieldConfig
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import Neighbours, check_positions, distance
 from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiFitContext, RssiPredictor, SavedRssiPredictor
-from swiftwrf.rssi.model import LEVEL
 from swiftwrf.rssi.path_loss import PairPathLoss
-from swiftwrf.rssi.training import rounding_std
+from swiftwrf.rssi.training import LEVEL, rounding_std
 from swiftwrf.runtime import checkpoint as files
 from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.threads import single_thread
@@ -242,10 +241,14 @@ class PairModel(PairPredictor, SavedRssiPredictor):
             residual.append(own[out])
         r_between, r_across, values, truth = (torch.cat(parts) for parts in (between, across, value, residual))
         # rough fields only, as in the model of each receiver
-        kernels = [k for k in candidates(metric.coordinates(self.pair), RELATIVE_NOISE_VARIANCES) if k.share == 1]
+        kernels = [
+            k for k in candidates(metric.coordinates(self.pair), RELATIVE_NOISE_VARIANCES) if k.matern12_weight == 1
+        ]
         judged = []
-        for long, alike in groupby(sorted(kernels, key=lambda kernel: kernel.long), key=lambda kernel: kernel.long):
-            shape = Kernel(long=long, share=1.0)
+        for length, alike in groupby(
+            sorted(kernels, key=lambda kernel: kernel.matern12_length), key=lambda kernel: kernel.matern12_length
+        ):
+            shape = Kernel(length, matern12_weight=1.0)
             covariance, cross = shape.at(r_between), shape.at(r_across)
             for kernel in alike:
                 weight, variance = local_weights(covariance, cross, kernel.noise)

@@ -1,34 +1,63 @@
-"""The training rows of an RSSI fit by location bin, with the priors of every receiver and the kernel of all."""
+"""The fit of the RSSI model: rows by location bin, priors and kernel, the receivers by regression, and mixing weights.
+
+A receiver is a MAP estimate by iteratively reweighted least squares. The latent field c of its head is a Gaussian process;
+level, slope and directivity have Gaussian priors; the error is Gaussian in the middle and linear in the tails (P. J. Huber,
+1964). With the head replaced by its tangent this is weighted least squares, solved again until weights and tangent converge
+(Gauss-Newton). Weights of several predictors follow from their held-out predictions (stacking: L. Breiman, Machine Learning
+24, 1996).
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 
+import numpy as np
 import torch
+from scipy.optimize import nnls
 from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
-from swiftwrf.gp import Kernel, LeaveGroupOut, candidates, subsample
+from swiftwrf.errors import FitError, InputError
+from swiftwrf.gp import GaussianProcess, Kernel, candidates, held_out_errors, subsample
 from swiftwrf.positions import cells
-from swiftwrf.rssi.config import RssiConfig
-from swiftwrf.rssi.head import Head, render
-from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, fit_shared_path_loss, log_distance
+from swiftwrf.rssi.base import RssiConfig
+from swiftwrf.rssi.head import Head, HeadTable, render
+from swiftwrf.rssi.path_loss import (
+    N_HARMONICS,
+    PathLoss,
+    fit_path_loss,
+    fit_shared_path_loss,
+    harmonics,
+    log_distance,
+)
 from swiftwrf.runtime.threads import single_thread
 
 MAX_STEP_DB = 1.0  # of the values that a receiver reports: nearly all report whole decibels
-PAPER_LEVEL_DBM = -100.0  # of the paper's head where nothing is received
 # variance of a packet relative to the variance of the field: fading is as large as shadowing
 RELATIVE_NOISE_VARIANCES = (0.3, 1.0, 2.0, 3.0)
 VERTICALS = (1.0, 5.0)  # factors of the heights of floors: floors alike, or nearly independent beyond their attenuation
 MAX_KERNEL_ROWS, MAX_KERNEL_RECEIVERS = 300, 12  # more do not change the chosen kernel or weights
+PATH_LOSS_STD_DB = 30.0  # prior of level and slope about their least squares: as good as none
+MAX_SLOPE_STD_DB = 10.0  # of a slope: path-loss exponents of 2 to 6 (Rappaport 2002, table 4.2) scatter no more
+DIRECTIVITY_STD_DB = 2.0  # prior of each harmonic of a receiver's antenna and surroundings
+# prior standard deviation of each coefficient that the regressors of level, slope and directivity are scaled by
+FEATURE_SCALE_DB = torch.tensor([PATH_LOSS_STD_DB] * 2 + [DIRECTIVITY_STD_DB] * N_HARMONICS, dtype=torch.float64)
+MAX_REWEIGHTINGS, WEIGHT_TOLERANCE = 30, 3e-3  # each weight is in (0, 1]
+MIN_CONTRACTION = 0.9  # a change of the field above this share of the last one is an oscillation
+FIELD_TOLERANCE_DB = 0.1  # mean change of the latent field that counts as converged
+LEVEL = 0.8  # nominal coverage of the interval that the standard deviation is calibrated for
+MIN_SCORES = 30  # held-out rows of a receiver below which the scores of all receivers scale its standard deviation
+MAX_VARIANCE_POSITIONS = 200  # measured positions that determine where the field is known
+MAX_PAIRS = 20_000  # measurements that determine the mixing weights
+MIN_ERROR_DB = 0.5  # of mixed predictors: absolute errors below it count as squares, so that the solution is unique
 
 
 @dataclass(frozen=True)
-class RssiTraining:
-    """Training rows averaged by location bin, and everything that is known before a receiver is fitted.
+class Bins:
+    """Training rows averaged by location bin.
 
     Args:
         receiver_names: R names.
@@ -39,14 +68,6 @@ class RssiTraining:
         fold: Cross-validation fold of each bin, int64 (n,).
         rssi: Mean in each bin, float64 (n, R) [dBm], nan where not detected.
         count: Measurements in each mean, float64 (n, R).
-        kernel: Kernel of the latent field, lengths in [m].
-        rendered: Fields of each receiver's head, (R, 2, 2, directions).
-        prior_mean: Path-loss model of each receiver that its fit starts from, (R,).
-        field_db: Prior standard deviation of the latent field, (R,) [dB].
-        noise_db: Standard deviation of one measurement about it, (R,) [dB].
-        baselines: Path-loss models of the simple predictors, (3, R): that of each receiver, that of all receivers, and the
-            mean of each receiver.
-        baseline_held_out: Their predictions of held-out bins, (3, n, R) [dBm].
     """
 
     receiver_names: tuple[str, ...]
@@ -57,6 +78,24 @@ class RssiTraining:
     fold: Tensor
     rssi: Tensor
     count: Tensor
+
+
+@dataclass(frozen=True)
+class RssiTraining(Bins):
+    """Training rows by location bin, and everything that is known before a receiver is fitted.
+
+    Args:
+        kernel: Kernel of the latent field, lengths in [m].
+        n_primitives: Number of primitives a receiver.
+        rendered: Fields of each receiver's head, (R, 2, 2, directions).
+        prior_mean: Path-loss model of each receiver that its fit starts from, (R,).
+        field_db: Prior standard deviation of the latent field, (R,) [dB].
+        noise_db: Standard deviation of one measurement about it, (R,) [dB].
+        baselines: Path-loss models of the simple predictors, (3, R): that of each receiver, that of all receivers, and the
+            mean of each receiver.
+        baseline_held_out: Their predictions of held-out bins, (3, n, R) [dBm].
+    """
+
     kernel: Kernel
     n_primitives: int
     rendered: Tensor
@@ -77,13 +116,10 @@ def prepare(train: Rssi, pool: Rssi, config: RssiConfig, like: RssiTraining | No
         config: Options.
         like: Training data of the same pool whose kernel is taken. Defaults to a choice on held-out rows.
     """
-    position, rssi, count, bin_of_row = bin_locations(train, config.max_locations)
-    pool_rssi = bin_locations(pool, config.max_locations)[1]
-    fold = folds(position, config.validation, config.seed, session=_most_frequent(train.session, bin_of_row))
-    centre = position.mean(dim=0)
-    local, receiver = position - centre, train.receiver_position.double() - centre
-    distance = log_distance(local, receiver)
-    pool_distance = log_distance(local, pool.receiver_position.double() - centre)
+    bins = binned(train, config)
+    rssi, fold, pool_rssi = bins.rssi, bins.fold, bin_locations(pool, config.max_locations)[1]
+    distance = log_distance(bins.position, bins.receiver)
+    pool_distance = log_distance(bins.position, pool.receiver_position.double() - bins.centre)
 
     def fit_baselines(rows: Tensor) -> PathLoss:
         """Fit the simple predictors to some of the bins."""
@@ -100,41 +136,101 @@ def prepare(train: Rssi, pool: Rssi, config: RssiConfig, like: RssiTraining | No
     for number in fold.unique():
         out = fold == number
         held_out[:, out] = fit_baselines(~out)(distance[out])
-    own, _, mean = (PathLoss(*values) for values in zip(*baselines, strict=True))
-    if config.paper_head:
-        pool_residual = pool_rssi - pool_rssi.nanmean(dim=0)
-        prior_mean, residual = PathLoss(torch.full_like(own.level, PAPER_LEVEL_DBM), mean.slope), rssi - mean.level
-    else:
-        pool_residual = pool_rssi - fit_path_loss(pool_distance, pool_rssi)(pool_distance)
-        prior_mean, residual = own, rssi - own(distance)
+    own = PathLoss(*(values[0] for values in baselines))
+    pool_residual = pool_rssi - fit_path_loss(pool_distance, pool_rssi)(pool_distance)
     if like is None:
-        verticals = (1.0,) if train.floors is None else VERTICALS
-        kernel, helps = choose_residual_kernel(local, pool_residual, fold, verticals)
-        n_primitives = config.n_primitives if helps or config.paper_head else 0
+        kernel, helps = choose_residual_kernel(bins.position, pool_residual, fold, train.floors is not None)
+        n_primitives = config.n_primitives if helps else 0
     else:
         kernel, n_primitives = like.kernel, like.n_primitives
-    common = float(pool_residual.square().nanmean())  # of a receiver without measurements
-    variance = residual.square().nanmean(dim=0).nan_to_num(common).clamp_min(1e-6)
-    noise = kernel.noise / (1 + kernel.noise) if n_primitives else 1.0
-    names = tuple(map(str, train.receiver_names))
+    field_db, noise_db = prior_std(rssi - own(distance), pool_residual, kernel if n_primitives else None)
+    heads = [Head(name, n_primitives, config.seed).requires_grad_(False) for name in bins.receiver_names]
     return RssiTraining(
-        receiver_names=names,
-        receiver=receiver,
-        centre=centre,
-        position=local,
-        bin_of_row=bin_of_row,
-        fold=fold,
-        rssi=rssi,
-        count=count,
+        **vars(bins),
         kernel=kernel,
         n_primitives=n_primitives,
-        rendered=render([Head(name, n_primitives, config.seed).requires_grad_(False) for name in names]),
-        prior_mean=prior_mean,
-        field_db=((1 - noise) * variance).sqrt(),
-        noise_db=(noise * variance).sqrt(),
+        rendered=render(heads),
+        prior_mean=own,
+        field_db=field_db,
+        noise_db=noise_db,
         baselines=baselines,
         baseline_held_out=held_out,
     )
+
+
+def binned(train: Rssi, config: RssiConfig) -> Bins:
+    """Return the training rows by location bin, with the folds that the options state."""
+    position, rssi, count, bin_of_row = bin_locations(train, config.max_locations)
+    session = _most_frequent(train.session, bin_of_row)
+    centre = position.mean(dim=0)
+    return Bins(
+        receiver_names=tuple(map(str, train.receiver_names)),
+        receiver=train.receiver_position.double() - centre,
+        centre=centre,
+        position=position - centre,
+        bin_of_row=bin_of_row,
+        fold=folds(position, config.validation, config.seed, session=session),
+        rssi=rssi,
+        count=count,
+    )
+
+
+def prior_std(residual: Tensor, pool_residual: Tensor, kernel: Kernel | None) -> tuple[Tensor, Tensor]:
+    """Return prior standard deviations (R,) [dB] of latent field and noise, whose variances sum to that of the residuals.
+
+    Args:
+        residual: Residuals of the prior mean (n, R) [dB], nan where not detected.
+        pool_residual: Those of the pool (n, P) [dB], for a receiver without measurements.
+        kernel: Kernel, whose noise is relative to the field. None without a field.
+    """
+    common = float(pool_residual.square().nanmean())
+    variance = residual.square().nanmean(dim=0).nan_to_num(common).clamp_min(1e-6)
+    noise = 1.0 if kernel is None else kernel.noise / (1 + kernel.noise)
+    return ((1 - noise) * variance).sqrt(), (noise * variance).sqrt()
+
+
+def interval_scale(
+    bins: Bins, kernel: Kernel, prior_db: tuple[Tensor, Tensor], predicted: Tensor, train: Rssi
+) -> Tensor:
+    """Return the factors (R,) of the standard deviations with which the 80 % intervals hold 80 % of the held-out rows.
+
+    The interval is cross-conformal (V. Vovk, Annals of Mathematics and Artificial Intelligence 74, 2015): the error of each
+    row is divided by the standard deviation that a model without the row's fold predicts.
+
+    Args:
+        bins: Training rows by location bin.
+        kernel: Kernel of the latent field.
+        prior_db: Standard deviations of latent field and noise, each (R,) [dB].
+        predicted: Held-out predictions of the bins (n, R) [dBm], nan where there is none.
+        train: Training rows.
+    """
+    variance = torch.empty(len(bins.position), dtype=torch.float64)
+    for number in bins.fold.unique():
+        out = bins.fold == number
+        (known,) = subsample(bins.position[~out], rows=MAX_VARIANCE_POSITIONS)
+        variance[out] = GaussianProcess(kernel, known).variance(bins.position[out])
+    field_db, noise_db = prior_db
+    std = (noise_db.square() + field_db.square() * variance[:, None]).sqrt()
+    score = ((train.rssi_dbm - predicted[bins.bin_of_row]) / std[bins.bin_of_row]).abs()
+    finite = score.where(score.isfinite(), torch.nan)
+    quantile = finite.nanquantile(LEVEL, dim=0)
+    few = (~finite.isnan()).sum(dim=0) < MIN_SCORES
+    if few.any():
+        quantile = quantile.where(~few, score[score.isfinite()].quantile(LEVEL))
+    return quantile / NormalDist().inv_cdf((1 + LEVEL) / 2)
+
+
+def check_comparable(held_out: Tensor, measured: Tensor) -> None:
+    """Refuse held-out predictions (predictors, rows, R) that cannot be compared with any measurement (rows, R).
+
+    Raises:
+        InputError: As described.
+    """
+    if not comparable(held_out, measured).any():
+        raise InputError(
+            "no rows can be held out to estimate the error of the model: all measurements are in one part of the "
+            'region; measure elsewhere, too, give a pool of more receivers, or take validation="random"'
+        )
 
 
 def rounding_std(rssi: Tensor) -> float:
@@ -189,7 +285,7 @@ def bin_locations(rows: Rssi, max_locations: int) -> tuple[Tensor, Tensor, Tenso
 
 
 def choose_residual_kernel(
-    position: Tensor, residual: Tensor, fold: Tensor, verticals: Sequence[float] = (1.0,)
+    position: Tensor, residual: Tensor, fold: Tensor, has_floors: bool = False
 ) -> tuple[Kernel, bool]:
     """Choose the kernel with the lowest mean absolute error on held-out residuals of the path-loss model.
 
@@ -197,7 +293,7 @@ def choose_residual_kernel(
         position: Positions of the bins (n, 3) [m].
         residual: Residuals (n, R) [dB], nan where not detected.
         fold: Cross-validation fold of each bin, (n,).
-        verticals: Factors of differences in height.
+        has_floors: Whether differences in height may count more than horizontal ones.
 
     Returns:
         The kernel, and whether its error is lower than that of no field at all.
@@ -217,11 +313,181 @@ def choose_residual_kernel(
     def error(kernel: Kernel) -> float:
         precision = torch.linalg.inv(kernel.covariance(position))
         dual = precision @ residual.nan_to_num()
-        errors = [LeaveGroupOut(precision, out).errors(dual[:, r])[:n] for r, n, out in held_out]
+        errors = [held_out_errors(precision, dual[:, r], out)[:n] for r, n, out in held_out]
         return float(torch.cat(errors).abs().mean())
 
     # rough fields only: a choice among mixtures with a smooth part follows chance, and its errors are no lower
-    rough = [kernel for kernel in candidates(position, RELATIVE_NOISE_VARIANCES) if kernel.share == 1]
-    stretched = (replace(kernel, vertical=vertical) for vertical in verticals for kernel in rough)
+    rough = [kernel for kernel in candidates(position, RELATIVE_NOISE_VARIANCES) if kernel.matern12_weight == 1]
+    stretched = (replace(kernel, vertical=vertical) for vertical in VERTICALS[: 1 + has_floors] for kernel in rough)
     score, best = min(((error(kernel), kernel) for kernel in stretched), key=lambda pair: pair[0])
     return best, score < float(residual.abs().nanmean())
+
+
+@single_thread()  # several threads add up sums in another order
+def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: torch.device) -> dict[str, Tensor]:
+    """Fit one receiver.
+
+    Args:
+        some: The receiver, as a slice of length 1.
+        data: Training data.
+        config: Options.
+        device: Device to compute on.
+
+    Returns:
+        Tensors by name, with R = 1.
+
+        - level (R,) [dBm], slope (R,) [dB a decade] and directivity (R, 8) [dB].
+        - prior_level and prior_slope (R,), where the fit starts; slope 0 and no regressor of distance if RSSI rises with it.
+        - slope_std (R,), the posterior standard deviation of the slope [dB a decade].
+        - coefficient (R, n) of the kernel to the bins, whose sum is the latent field [dB].
+        - dual, tangent and variance (R, n). See `posterior.FitState`.
+        - rendered fields of the heads (R, 2, 2, directions).
+        - held_out (R, n), predictions of detected bins by all other folds [dBm].
+
+    Raises:
+        FitError: A system that cannot be solved, for positions or values beyond any measurement.
+    """
+    rssi, receiver = data.rssi[:, some][:, 0], data.receiver[some]
+    prior_mean = PathLoss(data.prior_mean.level[some], data.prior_mean.slope[some])
+    distance, bearing = log_distance(data.position, receiver), harmonics(data.position, receiver)[:, 0]
+    detected = (~rssi.isnan()).nonzero()[:, 0]
+    feature = torch.cat([torch.ones_like(distance), distance, bearing], dim=1) * FEATURE_SCALE_DB
+    error, linear, spread = torch.zeros_like(rssi), torch.zeros_like(FEATURE_SCALE_DB), distance.any().double()
+    dual, tangent, noise = (torch.zeros_like(rssi) for _ in range(3))
+    variance = float(data.field_db[some]) ** 2
+    if len(detected):
+        position = data.position[detected].to(device)
+        covariance = variance * data.kernel(position, position)
+        noise_db = (data.noise_db[some] / data.count[detected, some][:, 0].sqrt()).to(device)
+        rest = covariance, noise_db, HeadTable(data.rendered[some].to(device)), config.huber
+
+        def solved(prior: PathLoss) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+            residual = rssi - prior(distance)[:, 0]
+            return solve(residual[detected].to(device), feature[detected].to(device), *rest)
+
+        try:
+            *found, factor = solved(prior_mean)
+            along = feature[detected, 1].to(device)
+            spread *= (1 - along @ torch.cholesky_solve(along[:, None], factor)[:, 0]).clamp(0, 1).sqrt().cpu()
+            start = float(prior_mean.slope)
+            if bool(along.any()) and (start == 0 or start + PATH_LOSS_STD_DB * float(found[0] @ along) > 0):
+                prior_mean, feature[:, 1] = PathLoss(rssi.nanmean().reshape(1), torch.zeros(1).double()), 0.0
+                *found, factor = solved(prior_mean)
+            error[detected] = fold_errors(factor, found[0], data.fold[detected].to(device)).cpu()
+        except torch.linalg.LinAlgError as reason:  # type: ignore[attr-defined]
+            raise FitError(
+                f"the RSSI fit of receiver {data.receiver_names[some][0]!r} broke ({reason}); are its values sane?"
+            ) from None
+        dual[detected], tangent[detected], noise[detected] = (x.cpu() for x in found)
+        linear = FEATURE_SCALE_DB * (dual @ feature)
+    return {
+        "level": prior_mean.level + linear[0],
+        "slope": prior_mean.slope + linear[1],
+        "prior_level": prior_mean.level,
+        "prior_slope": prior_mean.slope,
+        "slope_std": (PATH_LOSS_STD_DB * spread).clamp_max(MAX_SLOPE_STD_DB)[None],
+        "directivity": linear[None, 2:],
+        "coefficient": variance * (tangent * dual)[None],
+        "dual": dual[None],
+        "tangent": tangent[None],
+        "variance": noise[None],
+        "rendered": data.rendered[some],
+        "held_out": (rssi.nan_to_num() - error)[None],
+    }
+
+
+def solve(
+    residual: Tensor, feature: Tensor, covariance: Tensor, noise_db: Tensor, table: HeadTable, huber: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Fit residual = feature b + head(c) + noise in n bins, with b standard normal and c of a given covariance.
+
+    Args:
+        residual: RSSI less the prior mean, (n,) [dB].
+        feature: Scaled regressors, (n, k).
+        covariance: Covariance of the latent field c, (n, n) [dB^2].
+        noise_db: Standard deviation of the noise, (n,) [dB].
+        table: Head of the receiver.
+        huber: See `RssiConfig`.
+
+    Returns:
+        Dual coefficients (n,), i.e. the inverse covariance of the data times the data; the slope of the tangent (n,); the
+        variance of the noise over the weights (n,) [dB^2]; the Cholesky factor of the covariance of the data (n, n).
+    """
+    zero = table(torch.zeros(1, 1, dtype=torch.float64, device=residual.device))[0][0, 0]
+    weight, latent = torch.ones_like(residual), torch.zeros_like(residual)
+    step, last = 1.0, math.inf
+    for _ in range(MAX_REWEIGHTINGS):
+        head, slope = (x[:, 0] for x in table(latent[:, None]))
+        target = residual - (head - zero) + slope * latent
+        variance = noise_db.square() / weight
+        whole = (slope[:, None] * covariance).mul_(slope).addmm_(feature, feature.T)
+        whole.diagonal().add_(variance)
+        factor = torch.linalg.cholesky(whole)
+        dual = torch.cholesky_solve(target[:, None], factor)[:, 0]
+        change = covariance @ (slope * dual) - latent
+        mean_change = float(change.abs().mean())
+        if mean_change > MIN_CONTRACTION * last:  # oscillates where the head bends
+            step /= 2
+        latent, last = latent + step * change, mean_change
+        previous, error = weight, (variance * dual).abs()  # of the data about the tangent
+        weight = (huber * noise_db / error.clamp_min(1e-12)).clamp_max(1)
+        settled = float((weight - previous).abs().max()) < WEIGHT_TOLERANCE
+        if settled and (step == 1 or mean_change < FIELD_TOLERANCE_DB):
+            break
+    return dual, slope, variance, factor
+
+
+def fold_errors(factor: Tensor, dual: Tensor, fold: Tensor) -> Tensor:
+    """Return the errors (n,) [dB] of the predictions of each bin by all other folds (n,)."""
+    precision = torch.cholesky_inverse(factor)
+    error = torch.empty_like(dual)
+    for number in fold.unique():
+        part = (fold == number).nonzero()[:, 0]
+        error[part] = held_out_errors(precision, dual, part)
+    return error
+
+
+def comparable(held_out: Tensor, measured: Tensor) -> Tensor:
+    """Return which measurements exist and are predicted by all predictors, bool (rows, R).
+
+    Args:
+        held_out: Held-out predictions (predictors, rows, R) [dBm], nan where there is none.
+        measured: Measurements (rows, R) [dBm], nan where not detected.
+    """
+    return (~held_out.isnan()).all(dim=0) & ~measured.isnan()
+
+
+def mixing_weights(held_out: Tensor, measured: Tensor, shrinkage: float = 0.0) -> Tensor:
+    """Return the weights of the weighted mean of predictors with the lowest mean absolute error on held-out rows.
+
+    Args:
+        held_out: Held-out predictions (predictors, rows, R) [dBm], nan where there is none.
+        measured: Measurements (rows, R) [dBm], nan where not detected.
+        shrinkage: Ridge penalty on the distance of the weights to those of the first predictor alone, relative to the mean
+            squared error of a predictor. It steadies weights that few folds determine.
+
+    Returns:
+        Non-negative weights of sum 1, float64 (predictors,).
+
+    Example:
+        >>> held_out = torch.tensor([[[1.0], [2.0], [3.0]], [[9.0], [9.0], [9.0]]])
+        >>> mixing_weights(held_out, held_out[0]).round(decimals=2)
+        tensor([1., 0.], dtype=torch.float64)
+    """
+    usable = comparable(held_out, measured)
+    predicted, target = subsample(held_out[:, usable].T.double(), measured[usable].double(), rows=MAX_PAIRS)
+    error = (predicted - target[:, None]).numpy()  # the error of a mean with weights of sum 1 is the mean of the errors
+    n = error.shape[1]
+    weight, importance = np.full(n, 1 / n), np.ones(len(error))
+    scale = 1e-9 * max(float((error**2).mean()), 1.0)
+    away = np.eye(n)
+    away[0] -= 1.0  # weights less (1, 0, ...), for weights of sum 1
+    for _ in range(20):  # least absolute errors by weighted least squares
+        gram = (error * importance[:, None]).T @ error / max(len(error), 1)
+        gram += shrinkage * np.trace(gram) / n * away.T @ away
+        # the weights of least squares are proportional to argmin of w' G w / 2 - sum w over w >= 0
+        factor = np.linalg.cholesky(gram + scale * np.eye(n))
+        weight = nnls(factor.T, np.linalg.solve(factor, np.ones(n)))[0]
+        weight /= weight.sum()
+        importance = 1 / np.maximum(np.abs(error @ weight), MIN_ERROR_DB)
+    return torch.from_numpy(weight)

@@ -58,7 +58,7 @@ from swiftwrf.models.geometry import GeometryModel, HybridModel
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.geometry.path_gains import fit_path_gains
 from swiftwrf.models.swiftwrf_paper import SwiftWRFPaper
-from swiftwrf.rssi import PairModel
+from swiftwrf.rssi import PairModel, RssiPaperModel
 from tasks.aoa.estimators.kernel_regression import KernelRegression
 
 N = 12
@@ -155,6 +155,10 @@ def model_nerf2_rssi(folder: Path) -> None:
 
 def model_rssi(folder: Path) -> None:
     fit_rssi(rssi_room(n=40).receivers(["1", "2"])).save(folder / "model")
+
+
+def model_rssi_paper(folder: Path) -> None:
+    RssiPaperModel(steps=2).fit(rssi_room(n=40).receivers(["1", "2"])).save(folder / "model")
 
 
 def model_pairs(folder: Path) -> None:
@@ -267,6 +271,7 @@ KINDS: dict[str, tuple[Callable[[Path], object], Reader]] = {
     "inverse-distance model": (functools.partial(model_of, "idw"), read_model),
     "nearest-spectrum model": (functools.partial(model_of, "nearest"), read_model),
     "rssi model": (model_rssi, read_model),
+    "rssi paper model": (model_rssi_paper, read_model),
     "nerf2 model": (functools.partial(model_published, "nerf2"), read_model),
     "wrf-gs model": (functools.partial(model_published, "wrfgs"), read_model),
     "nerf2 rssi model": (model_nerf2_rssi, read_model),

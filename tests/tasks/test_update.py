@@ -17,8 +17,7 @@ from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.simulated import rssi_room, simulated_room
 from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.models import FIELD_MODELS
-from swiftwrf.rssi import RssiConfig
-from swiftwrf.rssi.floors import FloorAttenuation
+from swiftwrf.rssi import FloorAttenuation, RssiPaperModel
 
 SIGNAL = 1e-5  # of the signal: magnitudes up to 1, RSSI over 60 dB
 OPTIONS = {"swiftwrf": {"n_primitives": 24}}
@@ -138,7 +137,7 @@ def test_an_update_beyond_the_exact_size_is_local(monkeypatch, generator):
     position = torch.rand(30, 3, generator=generator, dtype=torch.float64)
     value = torch.randn(30, 2, generator=generator, dtype=torch.float64)
     process = GaussianProcess.regress(Kernel(), position[:24], value[:24]).updated(position[24:], value[24:])
-    assert not process.exact
+    assert not process.is_exact
     torch.testing.assert_close(process.value, value)
 
 
@@ -205,7 +204,7 @@ def test_rssi_refuses_other_receivers_and_the_papers_head():
     with pytest.raises(InputError, match="receivers"):
         fitted_rssi().update(floor().columns([0, 1]))
     few = floor().columns([0])
-    paper = RssiModel(RssiConfig.paper(steps=2)).fit(few)
+    paper = RssiPaperModel(steps=2).fit(few)
     with pytest.raises(InputError, match="fit it again"):
         paper.update(few)
 
@@ -215,7 +214,7 @@ def test_a_chosen_kernel_is_that_of_a_fit(name):
     """From another kernel, the choice by the values of the process is that by the spectra."""
     model = fitted(name)
     other = model._copy()
-    other._set_process(model.process.with_kernel(Kernel(long=0.01, share=1.0, noise=0.1)))
+    other._set_process(model.process.with_kernel(Kernel(0.01, matern12_weight=1.0, noise=0.1)))
     found = other.with_chosen_kernel()
     assert found.kernel.correlation_length == pytest.approx(model.with_chosen_kernel().kernel.correlation_length)
     torch.testing.assert_close(found.process.value, model.process.value, rtol=1e-4, atol=1e-4)
@@ -236,7 +235,7 @@ def test_rssi_follows_from_its_residuals():
 def test_rssi_with_a_chosen_kernel_is_a_fit_to_all_rows():
     model = fitted_rssi().update(floor().subset(torch.arange(60, 90))).with_chosen_kernel()
     whole, at = RssiModel().fit(floor()), floor().transmitter_position[:20] + 0.5
-    assert model.kernel.long == pytest.approx(whole.kernel.long)
+    assert model.kernel.matern12_length == pytest.approx(whole.kernel.matern12_length)
     assert model.kernel.noise == whole.kernel.noise
     assert (model.predict(at).mean - whole.predict(at).mean).abs().mean() < 0.5
 

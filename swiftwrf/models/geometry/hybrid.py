@@ -18,7 +18,7 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import folds
 from swiftwrf.errors import InputError
-from swiftwrf.gp import GaussianProcess, Kernel, LeaveGroupOut, choose_kernel, principal_components
+from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel, leave_folds_out, principal_components
 from swiftwrf.metrics import psnr
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel
 from swiftwrf.models.geometry.fit import GeometryConfig, observe
@@ -207,10 +207,10 @@ def _mixing_weight(position: Tensor, seen: Tensor, known: Tensor, fold: Tensor, 
     Also return whether weight and process together predict better than `known` alone, by the mean log squared error.
     """
     missed, sharp = torch.empty_like(seen), torch.empty_like(known)
-    for group in LeaveGroupOut.each(kernel, position, fold):
+    for out, kept, weight, _ in leave_folds_out(kernel, position, fold):
         for x, left in ((seen, missed), (known, sharp)):
-            mean = x[group.kept].mean(0)
-            left[group.out] = x[group.out] - mean - group.weights.float() @ (x[group.kept] - mean)
+            mean = x[kept].mean(0)
+            left[out] = x[out] - mean - weight.float() @ (x[kept] - mean)
     power = float(sharp.square().sum())
     share = min(1.0, max(0.0, float((missed * sharp).sum()) / power)) if power > 0 else 0.0
     both, alone = ((x.square().mean(1) + 1e-9).log().mean() for x in (missed - share * sharp, seen - known))

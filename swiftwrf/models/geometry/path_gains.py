@@ -259,4 +259,4 @@ def _error(gains: PathGains, geometry: GeometryModel, held: PhaseObservations) -
 def kernel_of(position: Tensor) -> Kernel:
     """Return the prior kernel of path gains in the region of positions (n, 3) [m]."""
     extent = float((position.max(0).values - position.min(0).values).max())
-    return Kernel(long=extent / EXTENT_PER_LENGTH, short=extent, share=1.0, noise=NOISE_VARIANCE)
+    return Kernel(extent / EXTENT_PER_LENGTH, matern12_weight=1.0, noise=NOISE_VARIANCE)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from swiftwrf.rssi import RssiPredictor
+from swiftwrf.rssi import RssiModel, RssiPaperModel, RssiPredictor
 from swiftwrf.runtime.options import Preset
 from swiftwrf.runtime.validation import checked
 from tasks.rssi.predictors import PREDICTORS
@@ -16,15 +16,17 @@ def make_predictor(name: str, preset: Preset = "quick", **options: Any) -> RssiP
 
     Args:
         name: Name in the registry, e.g. "knn".
-        preset: "quick", or "paper" for published settings; a predictor without published settings ignores it.
+        preset: "quick", or "paper" for published settings; a predictor without published settings ignores it. With "paper"
+            the name "swiftwrf" gives `RssiPaperModel`.
         options: Options such as seed and validation. A predictor ignores options that it does not have.
 
     Raises:
         InputError: An unknown name, or a value outside its range.
 
     Example:
-        >>> make_predictor("swiftwrf", "paper", seed=3).config.paper_head
-        True
+        >>> make_predictor("swiftwrf", "paper", seed=3).name
+        'swiftwrf_paper'
     """
-    predictor_type: type[RssiPredictor] = PREDICTORS[name]
+    is_published = name == RssiModel.name and preset == "paper"
+    predictor_type: type[RssiPredictor] = RssiPaperModel if is_published else PREDICTORS[name]
     return predictor_type(**predictor_type.supported({"preset": preset} | options))

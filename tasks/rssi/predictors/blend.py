@@ -12,7 +12,7 @@ from swiftwrf import Rssi
 from swiftwrf.data.splits import folds
 from swiftwrf.models.base import FieldConfig
 from swiftwrf.rssi import RssiFitContext, RssiPredictor
-from swiftwrf.rssi.stacking import mixing_weights
+from swiftwrf.rssi.training import mixing_weights
 from swiftwrf.runtime.options import Preset
 from swiftwrf.runtime.validation import configuration
 from tasks.rssi.predictors import PREDICTORS

@@ -11,16 +11,16 @@ from sklearn.gaussian_process.kernels import Matern
 from swiftwrf.gp import (
     GaussianProcess,
     Kernel,
-    LeaveGroupOut,
     choose_kernel,
     choose_rank,
-    held_out,
+    held_out_errors,
+    leave_folds_out,
     most_informative,
     subsample,
 )
 from swiftwrf.gp.choice import MAX_LOCAL_ROWS, _held_out_errors, _local_errors
 
-KERNEL = Kernel(long=1.0, short=0.3, share=0.6, noise=1e-2)
+KERNEL = Kernel(1.0, 0.3, matern12_weight=0.6, noise=1e-2)
 
 
 def test_regression_is_that_of_scikit_learn(generator):
@@ -89,15 +89,15 @@ def test_held_out_predictions_are_those_of_a_process_without_the_fold(generator,
     position = torch.rand(40, 3, generator=generator, dtype=torch.float64)
     value = torch.randn(40, 2, generator=generator, dtype=torch.float64)
     fold = torch.arange(40) % n_folds
-    predicted, variance = held_out(KERNEL, position, fold, value)
-    for number in range(n_folds):
-        out, kept = fold == number, fold != number
+    precision = torch.linalg.inv(KERNEL.covariance(position))
+    for number, (out, kept, weight, variance) in enumerate(leave_folds_out(KERNEL, position, fold)):
+        assert torch.equal(out, (fold == number).nonzero()[:, 0])
+        assert torch.equal(kept, (fold != number).nonzero()[:, 0])
         process = GaussianProcess.regress(KERNEL, position[kept], value[kept])
-        torch.testing.assert_close(predicted[out], process.mean(position[out]))
-        torch.testing.assert_close(variance[out], process.variance(position[out]) + KERNEL.noise)
-        group = LeaveGroupOut(torch.linalg.inv(KERNEL.covariance(position)), out.nonzero()[:, 0])
-        torch.testing.assert_close(group.weights, process.weights(position[out])[1])
-        torch.testing.assert_close(group.errors(group.precision @ value), value[out] - predicted[out])
+        torch.testing.assert_close(weight, process.weights(position[out])[1])
+        torch.testing.assert_close(variance, process.variance(position[out]) + KERNEL.noise)
+        error = held_out_errors(precision, precision @ value, out)
+        torch.testing.assert_close(error, value[out] - process.mean(position[out]))
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
@@ -129,7 +129,7 @@ def test_local_predictions_condition_on_the_nearest_positions(generator):
 def test_slopes_are_those_of_finite_differences(generator, exact):
     position = 2 * torch.rand(70, 3, generator=generator, dtype=torch.float64) - 1
     value = torch.sin(position @ torch.randn(3, 2, generator=generator, dtype=torch.float64))
-    process = GaussianProcess.regress(Kernel(long=8.0, short=0.4, share=0.05, noise=1e-2), position, value, exact)
+    process = GaussianProcess.regress(Kernel(8.0, 0.4, matern12_weight=0.05, noise=1e-2), position, value, exact)
     at = (1.6 * torch.rand(3, 3, generator=generator, dtype=torch.float64) - 0.8).requires_grad_()
     for quantity in (process.mean, process.variance):
         (slope,) = torch.autograd.grad(quantity(at).sum(), at)

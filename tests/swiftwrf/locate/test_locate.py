@@ -171,7 +171,7 @@ def test_a_room_in_closed_form_is_located_to_two_millimetres(closed_form):
 
 def test_few_cells_are_enough_where_path_gains_change_with_position():
     spectra = simulated_room(n=300, seed=3, grid=AngularGrid.hemisphere(15, 60))
-    room, kernel = GeometryModel.of_planes(spectra, ROOM, order=1), Kernel(long=20.0, share=1.0, noise=1e-3)
+    room, kernel = GeometryModel.of_planes(spectra, ROOM, order=1), Kernel(20.0, matern12_weight=1.0, noise=1e-3)
     normal = torch.randn(len(spectra), 8, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     value = 2 * torch.linalg.cholesky(kernel.covariance(spectra.position)) @ normal
     gains = PathGains(GaussianProcess.regress(kernel, spectra.position, value, dtype=torch.float32), 4)

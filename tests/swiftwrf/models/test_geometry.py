@@ -489,7 +489,7 @@ def test_path_gains_follow_a_shadow():
 def test_path_gains_are_held_out_from_spectra_without_observed_phases_too():
     """Predictions of one fold depend on the observed spectra of the other folds alone."""
     data, fold = mirror_room(SIX, n=80), torch.arange(80) % 3
-    kernel = Kernel(long=0.5, short=1.0, share=1.0, noise=1e-3)
+    kernel = Kernel(0.5, matern12_weight=1.0, noise=1e-3)
     few = GeometryConfig(max_spectra=40)
     hybrid, like = HybridModel(few), HybridModel()
     hybrid._room, hybrid.grid = fit(data, max_extra_planes=0, beam_width=1, max_spectra=40), data.grid

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -10,16 +11,21 @@ from scipy.optimize import minimize
 
 from swiftwrf import InputError, Rssi, RssiModel, fit_rssi, load, rssi_room
 from swiftwrf.gp import Kernel
-from swiftwrf.rssi import RssiConfig
+from swiftwrf.rssi import RssiConfig, RssiPaperModel
 from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, harmonics, log_distance
-from swiftwrf.rssi.regression import DIRECTIVITY_STD_DB, PATH_LOSS_STD_DB, fit_receiver
-from swiftwrf.rssi.stacking import mixing_weights
-from swiftwrf.rssi.training import RssiTraining, bin_locations
+from swiftwrf.rssi.training import (
+    DIRECTIVITY_STD_DB,
+    PATH_LOSS_STD_DB,
+    RssiTraining,
+    bin_locations,
+    fit_receiver,
+    mixing_weights,
+)
 from swiftwrf.runtime import checkpoint
 from swiftwrf.runtime.threads import threads_kept
 
-KERNEL = Kernel(long=4.0, short=1.0, share=0.6, noise=1.0)
+KERNEL = Kernel(4.0, 1.0, matern12_weight=0.6, noise=1.0)
 FIELD_DB, NOISE_DB = 3.0, 2.0
 CPU, FIRST = torch.device("cpu"), slice(0, 1)
 
@@ -196,7 +202,7 @@ def test_no_primitives_without_a_field():
 
 def test_paper_head_learns_without_a_path_loss_model():
     train, test = with_field().split("random")
-    model = fit_rssi(train, RssiConfig.paper(steps=200))
+    model = RssiPaperModel(steps=200).fit(train)
     assert not model.slope.any()
     mean = (train.rssi_dbm.mean(dim=0) - test.rssi_dbm).abs().median()
     assert missed(model, test) < 0.5 * mean
@@ -284,14 +290,14 @@ def test_many_rows_are_averaged_by_location():
     assert torch.equal(bin_locations(data, 4000)[0], data.transmitter_position)
 
 
-@pytest.mark.parametrize("options", [{}, {"preset": "paper", "steps": 5}], ids=["quick", "paper"])
-def test_a_receiver_does_not_depend_on_the_others(options):
+@pytest.mark.parametrize("make", [RssiModel, partial(RssiPaperModel, steps=5)], ids=["quick", "paper"])
+def test_a_receiver_does_not_depend_on_the_others(make):
     """Neither on their number nor on its place among them, with the same pool."""
     pool = rssi_room(n=200)
     position = rssi_room(n=20, seed=1).transmitter_position
-    alone = RssiModel(**options).fit(pool.receivers(["6"]), pool=pool).predict(position)
+    alone = make().fit(pool.receivers(["6"]), pool=pool).predict(position)
     for names in (["5", "6"], ["1", "2", "3", "4", "6"]):
-        among = RssiModel(**options).fit(pool.receivers(names), pool=pool).predict(position)
+        among = make().fit(pool.receivers(names), pool=pool).predict(position)
         torch.testing.assert_close(both(among)[:, :, -1:], both(alone), atol=1e-3, rtol=0)
 
 
@@ -350,52 +356,6 @@ def test_a_file_with_unusable_positions_of_receivers_is_refused(tmp_path, positi
     checkpoint.write(tmp_path / "model", RssiModel.kind, tensors, header | {"receiver_position": position})
     with pytest.raises(InputError, match="is no rssi model that can be used"):
         load(tmp_path / "model")
-
-
-def test_an_incomplete_state_of_a_fit_is_refused(tmp_path):
-    data, state = with_field(n=30), tmp_path / "state"
-    fit_rssi(data, checkpoint=state)
-    kind, tensors, header = checkpoint.read(state, "fit state")
-    checkpoint.write(state, kind, tensors | {"held_out": tensors["held_out"][:, :3]}, header)
-    with pytest.raises(InputError, match="no state that a fit can continue from"):
-        fit_rssi(data, checkpoint=state)
-
-
-def test_interrupted_fit_continues(tmp_path):
-    """Stopped after the first of three receivers, it fits only the others, and ends with the same model."""
-    data = with_field(n=60)
-    state, fitted = tmp_path / "state", []
-
-    def interrupt(task, parts):
-        yield task(parts[0])
-        raise KeyboardInterrupt
-
-    def count(task, parts):
-        fitted.extend(parts)
-        return map(task, parts)
-
-    with pytest.raises(KeyboardInterrupt):
-        fit_rssi(data, parallel=interrupt, checkpoint=state)
-    records = []
-    resumed = fit_rssi(data, parallel=count, checkpoint=state, on_record=records.append)
-    assert fitted == [slice(1, 2), slice(2, 3)]
-    assert [r["stage"] for r in records] == ["search", "final", "final", "final"]
-    assert [r["receivers"] for r in records[1:]] == [["a"], ["b"], ["c"]]
-    whole = fit_rssi(data).predict(data.transmitter_position).mean
-    assert torch.equal(resumed.predict(data.transmitter_position).mean, whole)
-    with pytest.raises(InputError, match="another fit"):
-        fit_rssi(data, RssiConfig(huber=2.0), checkpoint=state)
-
-
-@pytest.mark.parametrize("paper", [False, True])
-def test_a_fit_with_missing_values_continues(tmp_path, paper):
-    data = with_field(n=60)
-    data.rssi_dbm[::5, 0] = torch.nan
-    config = RssiConfig.paper(steps=5) if paper else None
-    found = [
-        fit_rssi(data, config, checkpoint=tmp_path / "state").predict(data.transmitter_position).mean for _ in range(2)
-    ]
-    assert torch.equal(*found)
 
 
 @pytest.mark.parametrize("n_detected", [12, 0])
@@ -495,7 +455,6 @@ def test_a_receiver_that_is_nowhere_and_detects_nothing_has_the_mean_level():
     [
         ({"n_primitives": -1}, "n_primitives must be a whole number at least 0"),
         ({"huber": 0.0}, "huber must be a number above 0"),
-        ({"steps": -5}, "steps must be"),
         ({"validation": "blok"}, "validation must be 'random' or 'block'"),
         ({"max_locations": 3}, "max_locations must be"),
         ({"plain": True}, "RssiModel has no option 'plain'"),
@@ -515,15 +474,6 @@ def test_a_lone_receiver_detected_in_one_slab_only_is_refused():
     with pytest.raises(InputError, match="in one part of the region"):
         fit_rssi(alone, RssiConfig(validation="block"))
     assert fit_rssi(alone, RssiConfig(validation="block"), pool=pool).noise_db.isfinite()
-
-
-def test_a_fit_does_not_continue_with_another_pool(tmp_path):
-    data = with_field(n=60)
-    alone, moved = data.columns([0]), data.receiver_position.clone()
-    moved[1] += 5
-    fit_rssi(alone, pool=data, checkpoint=tmp_path / "state")
-    with pytest.raises(InputError, match="another fit"):
-        fit_rssi(alone, pool=replace(data, receiver_position=moved), checkpoint=tmp_path / "state")
 
 
 def test_path_loss_model_of_a_receiver_detected_at_one_distance():

@@ -1,0 +1,197 @@
+"""The RSSI model of the paper: primitives and latent field of each receiver, learnt together by gradient descent.
+
+    rssi_r(s) = -100 + m_r(c_r(s))       [dBm]
+
+m_r is the mean magnitude of the receiver's primitives (`swiftwrf.rssi.head`), and c_r a Gaussian process of the position.
+There is no path-loss model. The loss is that of `swiftwrf.rssi.training`.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from swiftwrf.data.rssi import Rssi
+from swiftwrf.errors import FitError
+from swiftwrf.rssi.base import RssiConfig, RssiFitContext
+from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
+from swiftwrf.rssi.model import FIELD_ALONE, RssiModel
+from swiftwrf.rssi.path_loss import N_HARMONICS
+from swiftwrf.rssi.training import (
+    Bins,
+    bin_locations,
+    binned,
+    check_comparable,
+    choose_residual_kernel,
+    interval_scale,
+    prior_std,
+    rounding_std,
+)
+from swiftwrf.runtime.progress import progress_bar
+from swiftwrf.runtime.threads import single_thread
+from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, configuration
+
+LEVEL_DBM = -100.0  # where nothing is received. The paper leaves the scale of its target open: this is that of NeRF2
+PRIOR_JITTER = 1e-3  # relative variance added to the latent field, for bins that nearly coincide
+HELD_OUT_FOLD = 0  # the only fold that is held out: a fit costs minutes
+N_TOGETHER = 4  # receivers that are learnt together, which saves time
+
+
+@configuration
+class RssiPaperConfig(RssiConfig):
+    """Options of `RssiPaperModel`.
+
+    Example:
+        >>> RssiPaperConfig(steps=100).n_primitives
+        50
+    """
+
+    steps: PositiveInt = 600
+    """gradient steps"""
+    batch: PositiveInt = 1024
+    """location bins a gradient step"""
+    rate: PositiveFloat = 5e-2
+    """learning rate of a gradient step"""
+
+
+class RssiPaperModel(RssiModel):
+    """RSSI by the paper's head: 50 learnt primitives a receiver on 16 x 16 directions, and their mean magnitude only.
+
+    It cannot be updated. One of five folds is held out to calibrate the standard deviation.
+
+    Args:
+        config: Options as one object. Defaults to `RssiPaperConfig()`.
+        options: Single options, which replace those of `config`.
+
+    Example:
+        >>> import swiftwrf
+        >>> train, test = swiftwrf.rssi_room(n=60).split()
+        >>> RssiPaperModel(steps=5).fit(train).predict(test.transmitter_position).mean.shape
+        torch.Size([12, 12])
+    """
+
+    kind = "rssi paper model"
+    name = "swiftwrf_paper"
+    config_type = RssiPaperConfig
+    slow = True
+
+    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+        config, bins = self.config, binned(train, self.config)
+        pool_rssi = bin_locations(context.pool, config.max_locations)[1]
+        pool_residual = pool_rssi - pool_rssi.nanmean(dim=0)
+        self.kernel, _ = choose_residual_kernel(bins.position, pool_residual, bins.fold, train.floors is not None)
+        prior_db = prior_std(bins.rssi - bins.rssi.nanmean(dim=0), pool_residual, self.kernel)
+        covariance = self.kernel(bins.position, bins.position)
+        covariance.diagonal().add_(PRIOR_JITTER)
+        root = torch.linalg.cholesky(covariance)  # the latent field in the bins is this times standard normal numbers
+        task = partial(learn_receivers, bins=bins, root=root, prior_db=prior_db, config=config, device=context.device)
+        n_receivers = len(bins.receiver_names)
+        parts = [slice(start, start + N_TOGETHER) for start in range(0, n_receivers, N_TOGETHER)]
+        with progress_bar(context.progress) as bar:
+            # compiled rasterizers are not safe in several threads
+            fits = (context.parallel or map)(task, parts)
+            results = list(bar.track(fits, total=len(parts), description="receivers"))
+        held_out, white, rendered = (torch.cat(values) for values in zip(*results, strict=True))
+        self._calibrate(train, bins, prior_db, held_out.T)
+        per_receiver = torch.zeros(n_receivers, dtype=torch.float64)
+        self.n_primitives, self.mixing_weight = config.n_primitives, FIELD_ALONE[:, None].repeat(1, n_receivers)
+        self.centre, self.anchor, self.rendered = bins.centre, bins.position.float(), rendered
+        self.level = LEVEL_DBM + HeadTable(rendered)(per_receiver[None])[0][0]
+        self.slope, self.slope_std = per_receiver, per_receiver.clone()
+        self.directivity = torch.zeros(n_receivers, N_HARMONICS)
+        dual = torch.linalg.solve_triangular(root.T, white.T.double() * prior_db[0], upper=True)
+        self.coefficient, self._posterior = dual.float(), None
+        self._precompute()
+
+    def _calibrate(self, train: Rssi, bins: Bins, prior_db: tuple[Tensor, Tensor], held_out: Tensor) -> None:
+        """Determine both standard deviations from predictions (n, R) of the bins, one fold of which was held out."""
+        out = ~bins.rssi.isnan() & (bins.fold == HELD_OUT_FOLD)[:, None]
+        predicted = held_out.double().where(out, torch.nan)
+        check_comparable(predicted[None, bins.bin_of_row], train.rssi_dbm)
+        scale = interval_scale(bins, self.kernel, prior_db, predicted, train)
+        field_db, noise_db = (scale * db for db in prior_db)
+        self.field_db, self.noise_db = field_db.float(), noise_db.clamp_min(rounding_std(train.rssi_dbm)).float()
+
+
+@single_thread()
+def learn_receivers(
+    some: slice,
+    bins: Bins,
+    root: Tensor,
+    prior_db: tuple[Tensor, Tensor],
+    config: RssiPaperConfig,
+    device: torch.device,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Fit some receivers twice: without one fold, and with all.
+
+    The receivers share the steps, which saves time, but no parameter, loss or moment: each is fitted as if alone.
+
+    Args:
+        some: The receivers.
+        bins: Training rows by location bin.
+        root: Cholesky factor of the covariance of the latent field in the n bins, (n, n).
+        prior_db: Standard deviations of latent field and noise, each (R,) [dB].
+        config: Options.
+        device: Device to compute on.
+
+    Returns:
+        Predictions of the fit without the fold (R, n) [dBm], the standard normal numbers behind the field (R, n), and the
+        rendered heads (R, 2, 2, directions).
+
+    Raises:
+        FitError: A loss that is not finite.
+    """
+    kept = bins.fold != HELD_OUT_FOLD
+    held_out = _descend(some, bins, root, prior_db, kept, config, device)[0]
+    _, white, rendered = _descend(some, bins, root, prior_db, torch.ones_like(kept), config, device)
+    return held_out.T, white.T, rendered
+
+
+def _descend(
+    some: slice,
+    bins: Bins,
+    root: Tensor,
+    prior_db: tuple[Tensor, Tensor],
+    kept: Tensor,
+    config: RssiPaperConfig,
+    device: torch.device,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return predictions in all bins (n, R) [dBm], the normal numbers behind the field (n, R), and the rendered heads."""
+    generator = torch.Generator().manual_seed(config.seed)
+    names = bins.receiver_names[some]
+    heads = [Head(name, config.n_primitives, config.seed).to(device) for name in names]
+    field_db, noise_db = (x[some].float().to(device) for x in prior_db)
+    measured, count = (x[:, some].float().to(device) for x in (bins.rssi, bins.count))
+    root = root.float().to(device)
+    white = nn.Parameter(torch.zeros_like(measured))
+    noise_db = noise_db / count.clamp_min(1).sqrt()
+    rows = kept.nonzero()[:, 0]
+    n_detected = (~measured[rows.to(device)].isnan()).sum(dim=0).clamp_min(1)
+    optimiser = torch.optim.Adam([*(p for head in heads for p in head.parameters()), white], lr=config.rate)
+
+    def predict(at: Tensor) -> Tensor:
+        return LEVEL_DBM + mean_magnitude(render(heads), field_db * (root[at] @ white))
+
+    for step in range(config.steps):
+        batch = rows[torch.randint(len(rows), (min(config.batch, len(rows)),), generator=generator)].to(device)
+        detected = ~measured[batch].isnan()
+        error = ((predict(batch) - measured[batch]) / noise_db[batch]).where(detected, 0.0)
+        losses = functional.huber_loss(error, torch.zeros_like(error), delta=config.huber, reduction="none").sum(dim=0)
+        losses = losses / detected.sum(dim=0).clamp_min(1) + 0.5 * white.square().sum(dim=0) / n_detected
+        loss = losses.sum()
+        if not math.isfinite(loss.item()):
+            raise FitError(
+                f"the RSSI fit of {', '.join(names)} broke at step {step}: loss {loss.item():.3g}; try a rate "
+                f"below {config.rate:g}"
+            )
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.param_groups[0]["lr"] = config.rate * 0.5 * (1 + math.cos(math.pi * step / config.steps))
+        optimiser.step()
+    with torch.no_grad():
+        parts = torch.arange(len(root), device=device).split(config.batch)
+        return torch.cat([predict(at) for at in parts]).cpu(), white.detach().cpu(), render(heads).cpu()
