@@ -315,8 +315,8 @@ class FieldModel(Configured, Saved, Displayed):
         raise InputError(f"{self.kind}: cannot weigh earlier spectra less; fit it again to the new ones")
 
     @property
-    def room(self) -> FieldModel | None:
-        """Room that the model found or uses; None for models without one."""
+    def room(self) -> Any:
+        """`GeometryModel` of the room that the model found or uses; None for models without one."""
         return None
 
     @property
