@@ -336,9 +336,3 @@ def test_tls_with_the_certificates_of_dask(tmp_path, monkeypatch):
         dask.config.set({"distributed.comm.tls.ca-file": str(tmp_path / "gone.pem")})
         with pytest.raises(InputError, match="with the certificates of Dask's configuration"):
             Cluster("tls://127.0.0.1:1", CPU)
-
-
-@pytest.mark.parametrize("more", [("--scheduler",), ("--seed", 1), ("--scheduler", "a", "b")])
-def test_resume_takes_a_scheduler_and_nothing_else(tmp_path, capsys, more):
-    assert run("rssi", "--resume", tmp_path, *more) == 2
-    assert "--resume takes one directory" in said(capsys)

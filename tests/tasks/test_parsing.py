@@ -171,6 +171,7 @@ def test_resume_is_given_anywhere_and_changes_no_result(tmp_path):
     for given in (("--resume", folder, "--json"), (f"--resume={folder}", "--json"), ("--json", f"--resume={folder}")):
         found = executed(RssiTaskConfig, *given)
         assert (plain(found), found.json) == (values | {"scheduler": None}, True)
+    assert executed(RssiTaskConfig, "--resume", folder, "--scheduler", "tcp://new:1").scheduler == "tcp://new:1"
     for given, name in ((("--seed", 7), "seed"), (("--config", "x"), "config"), (("--keep-filler",), "keep-filler")):
         with pytest.raises(InputError, match=f"--{name} cannot change the run that --resume continues"):
             executed(RssiTaskConfig, *given, "--resume", folder)
