@@ -92,6 +92,7 @@ class SwiftWRF(ProcessModel):
     name = "swiftwrf"
     kind = "swiftwrf model"
     config_type = SwiftWRFConfig
+    searches = True
     any_grid = True
 
     mean: Tensor

@@ -63,7 +63,7 @@ def training(config, data):
     """The training of a model's network, and the model."""
     (name,) = (name for name in PUBLISHED if isinstance(config, FIELD_MODELS[name].config_type))
     found = []
-    with mock.patch.object(Training, "trained", lambda self, *_: found.append(self) or self.result):
+    with mock.patch.object(Training, "trained", lambda self, *_, **__: found.append(self) or self.result):
         model = FIELD_MODELS[name](config).fit(data)
     return found[0], model
 

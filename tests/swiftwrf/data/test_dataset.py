@@ -181,9 +181,9 @@ WRONG = {
         "receiver_position must be real",
     ),
     "an infinite time": (lambda: Rssi([[-50.0]], [[0, 0, 0]], time=[math.inf]), "time must be finite, or nan"),
-    "names in one text": (lambda: Rssi([[-50.0, -60]], [[0, 0, 0]], receiver_names="ab"), "must be a list of texts"),
+    "names in one text": (lambda: Rssi([[-50.0, -60]], [[0, 0, 0]], receiver_names="ab"), "must be a list, of which each is a text"),
     "an empty name": (lambda: Rssi([[-50.0]], [[0, 0, 0]], receiver_names=[" "]), "must be a list of texts"),
-    "a number as name": (lambda: Rssi([[-50.0]], [[0, 0, 0]], receiver_names=[1]), "must be a list of texts"),
+    "a number as name": (lambda: Rssi([[-50.0]], [[0, 0, 0]], receiver_names=[1]), "must be a list, of which each is a text"),
     "two lines as name": (lambda: Rssi([[-50.0]], [[0, 0, 0]], receiver_names=["a\r\nb"]), "must be a list of texts"),
     "half a seed": (lambda: ROOM.split("block", 0.5), "seed must be a whole number at least 0, got 0.5"),
     "a seed of text": (lambda: rssi_room(n=20).split(seed="a"), "seed must be a whole number"),
@@ -198,6 +198,7 @@ WRONG = {
 }
 
 
+@pytest.mark.usefixtures("without_annotation_checks")
 @pytest.mark.parametrize("name", WRONG)
 def test_refuses_arrays(name):
     make, says = WRONG[name]
@@ -276,6 +277,7 @@ def test_tables_and_one_line_of_a_data_set():
     assert "30 rows at 12 receivers" in repr(rssi_room(n=30))
 
 
+@pytest.mark.usefixtures("without_annotation_checks")
 @pytest.mark.parametrize(
     ("call", "says"),
     [

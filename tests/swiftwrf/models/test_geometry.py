@@ -637,8 +637,6 @@ def test_a_link_that_cannot_be_used_is_refused(room, change, tmp_path):
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("residual", {"direct": "x"}),
-        ("moving", "reciever"),
         ("mixing_weight", "x"),
         ("order", 9),
         ("planes", [{"normal": [1]}]),

@@ -148,8 +148,7 @@ def test_a_checkpoint_in_no_folder_is_refused_before_the_fit(room, model, data, 
 
 @pytest.mark.parametrize("end", [RuntimeError, KeyboardInterrupt])
 def test_an_interrupted_fit_leaves_the_model_as_it_was(room, end):
-    model = make_model("swiftwrf", steps=4, model=replace(make_model("swiftwrf").config.model, n_primitives=8))
-    model.fit(room)
+    model = make_model("swiftwrf", n_primitives=8).fit(room)
     expected = model.synthesize(room.position)
 
     def stop(record):

@@ -113,7 +113,7 @@ def test_the_preset_paper_is_the_paper():
     paper = model.config
     assert (paper.n_primitives, paper.steps, paper.batch, paper.max_azimuths) == (10_000, 110_000, 1, 0)
     assert (paper.rate, paper.deformation_rate, paper.ssim_weight, paper.smoothing) == (1e-2, 8e-3, 0.3, 1.0)
-    with pytest.raises(InputError, match="SwiftWRFPaper"):
+    with pytest.raises(InputError, match="no published settings"):
         SwiftWRF(preset="paper")
 
 

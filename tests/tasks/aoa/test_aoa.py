@@ -580,12 +580,15 @@ def test_models_for_comparison_are_always_quick(small, monkeypatch):
     train, test = small.split("random", 0)
     data = context.Experiment(given, train, test, 0, torch.device("cpu"))
     made = []
-    monkeypatch.setattr(
-        context, "make_model", lambda name, **options: made.append((name, options.get("preset"))) or mock.Mock()
-    )
+
+    def model_type(name, preset):
+        made.append((name, preset))
+        return mock.MagicMock()
+
+    monkeypatch.setattr(context, "model_type", model_type)
     for synthesis in synthesizing.syntheses(data, MeasuredSubset(0.5), ["idw"], {}):
         synthesis._fitted(data, train, synthesizing._FitHistory(), Path())
-    assert made == [("idw", None), ("gp", "quick"), ("coarray", "quick")]
+    assert made == [("idw", "paper"), ("gp", "quick"), ("coarray", "quick")]
 
 
 def test_the_room_is_searched_once_for_all_models_with_one(room, glances, tmp_path, monkeypatch):
