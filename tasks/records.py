@@ -139,6 +139,8 @@ def read_table(file: Path) -> pd.DataFrame:
     from swiftwrf.runtime.checkpoint import refusing
 
     text = read_text(file)
+    if not text.strip():  # a table without rows has no columns either
+        return pd.DataFrame()
     with refusing(f"{file} is not the table that a run writes"):
         columns = list(pd.read_csv(io.StringIO(text), nrows=0))
         names = [name for name in NAMES if name in columns]

@@ -203,7 +203,7 @@ class PhaseObservations:
             ray: Vectors from the receiver to the source, float32 (3, ...) [m].
         """
         length = ray.square().sum(0).sqrt().clamp_min(MIN_LENGTH_M)  # the norm over a first dimension is slow
-        phase = (self.element @ (ray / length).flatten(1)).reshape(-1, *length.shape)
+        phase = (self.element @ (ray / length).flatten(1)).reshape(len(self.element), *length.shape)
         return phase - self.wavenumber * length, length
 
     def coherence(self, field: Tensor) -> Tensor:

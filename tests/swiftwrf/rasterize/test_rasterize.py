@@ -128,6 +128,7 @@ def test_without_numba_the_reference_renders():
 import sys
 sys.modules["numba"] = None
 import warnings, torch, swiftwrf
+from swiftwrf.models.swiftwrf_paper import SwiftWRFPaper
 from swiftwrf.runtime.threads import set_threads
 from scenes import GRID, random_scene
 
@@ -139,7 +140,7 @@ print(caught[0].message)
 assert torch.equal(rendered, swiftwrf.rasterize(*inputs, GRID, "reference"))
 for use in (
     lambda: swiftwrf.rasterize(*inputs, GRID, "cpu"),
-    lambda: swiftwrf.SwiftWRFPaper(steps=1).fit(swiftwrf.simulated_room(n=20)),
+    lambda: SwiftWRFPaper(steps=1).fit(swiftwrf.simulated_room(n=20)),
 ):
     try:
         use()
