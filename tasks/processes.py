@@ -34,7 +34,7 @@ MAX_SECONDS_TO_END = 10.0  # from the signal to the end of a process
 
 
 class Computation(Protocol):
-    """What a process needs of a step of `tasks.steps`."""
+    """A step of `tasks.steps`, as a process computes it."""
 
     def compute(self, context: Any, folder: Path) -> Any:
         """Return plain values."""

@@ -146,7 +146,7 @@ class GaussianProcess:
 
     @property
     def is_exact(self) -> bool:
-        """Whether every prediction conditions on all positions."""
+        """True if every prediction conditions on all positions."""
         return len(self.known) <= MAX_EXACT if self.exact is None else self.exact
 
     @classmethod
@@ -349,7 +349,7 @@ def dense_weights(number: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class HeldOut(NamedTuple):
-    """How rows of other folds predict the rows of one fold; see `leave_folds_out`."""
+    """Weights with which the rows of other folds predict those of one fold; see `leave_folds_out`."""
 
     out: Tensor  # numbers of the rows that are held out, (o,)
     kept: Tensor  # numbers of the rows that predict them, (k,)

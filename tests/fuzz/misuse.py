@@ -201,7 +201,7 @@ MODELS: dict[str, Call] = {
         for name in ("like", "device", "checkpoint")
     },
     **{
-        f"rssi.fit({name}=x)": lambda x, name=name: RssiModel(steps=1, n_primitives=0).fit(rssi(), **{name: x})
+        f"rssi.fit({name}=x)": lambda x, name=name: RssiModel(n_primitives=0).fit(rssi(), **{name: x})
         for name in ("pool", "device", "checkpoint")
     },
     **{

@@ -51,13 +51,13 @@ def floor():
 
 @pytest.fixture(scope="module")
 def model(floor):
-    return RssiModel(n_primitives=0, steps=2).fit(floor.columns([0, 4]))
+    return RssiModel(n_primitives=0).fit(floor.columns([0, 4]))
 
 
 @pytest.fixture(scope="module")
 def geodetic(floor, model):
     """A model of positions that were projected from degrees."""
-    return RssiModel(n_primitives=0, steps=2).fit(replace(floor.columns([0, 4]), origin=ORIGIN))
+    return RssiModel(n_primitives=0).fit(replace(floor.columns([0, 4]), origin=ORIGIN))
 
 
 @pytest.fixture(scope="module")

@@ -181,9 +181,15 @@ WRONG = {
         "receiver_position must be real",
     ),
     "an infinite time": (lambda: Rssi([[-50.0]], [[0, 0, 0]], time=[math.inf]), "time must be finite, or nan"),
-    "names in one text": (lambda: Rssi([[-50.0, -60]], [[0, 0, 0]], receiver_names="ab"), "must be a list, of which each is a text"),
+    "names in one text": (
+        lambda: Rssi([[-50.0, -60]], [[0, 0, 0]], receiver_names="ab"),
+        "must be a list, of which each is a text",
+    ),
     "an empty name": (lambda: Rssi([[-50.0]], [[0, 0, 0]], receiver_names=[" "]), "must be a list of texts"),
-    "a number as name": (lambda: Rssi([[-50.0]], [[0, 0, 0]], receiver_names=[1]), "must be a list, of which each is a text"),
+    "a number as name": (
+        lambda: Rssi([[-50.0]], [[0, 0, 0]], receiver_names=[1]),
+        "must be a list, of which each is a text",
+    ),
     "two lines as name": (lambda: Rssi([[-50.0]], [[0, 0, 0]], receiver_names=["a\r\nb"]), "must be a list of texts"),
     "half a seed": (lambda: ROOM.split("block", 0.5), "seed must be a whole number at least 0, got 0.5"),
     "a seed of text": (lambda: rssi_room(n=20).split(seed="a"), "seed must be a whole number"),

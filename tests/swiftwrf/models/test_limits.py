@@ -58,7 +58,7 @@ def test_grids_arrays_and_kernels_refuse_what_they_cannot_be():
     for frequency, spacing in ((nan, 0.1), (1e9, nan), (float("inf"), 0.1)):
         with pytest.raises(InputError):
             PlanarArray.square(4, frequency, spacing)
-    for settings in ({"long": nan}, {"short": 0.0}, {"share": 2.0}, {"noise": -1.0}):
+    for settings in ({"matern12_length": nan}, {"matern32_length": 0.0}, {"matern12_weight": 2.0}, {"noise": -1.0}):
         with pytest.raises(InputError):
             Kernel(**settings)
 
