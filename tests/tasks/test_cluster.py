@@ -20,6 +20,7 @@ import model_size
 import pytest
 import torch
 from quick import run, said
+from small import small_swiftwrf
 from test_interrupts import same_results
 from test_rssi_model import with_field
 
@@ -155,9 +156,10 @@ def test_studies_have_the_same_scores(local, tmp_path, monkeypatch):
         monkeypatch.setattr(study, "write_result", lambda name, content: written.append(content))
     monkeypatch.setattr(model_size, "SIZES", (16,))
     monkeypatch.setattr(ablation, "variants", lambda default: {"default": default})
-    for study in (ablation, model_size):
-        for address in (None, local.scheduler_address):
-            study.main(study.Config(scheduler=address))
+    with small_swiftwrf():  # as the workers, which preload `quick`
+        for study in (ablation, model_size):
+            for address in (None, local.scheduler_address):
+                study.main(study.Config(scheduler=address))
     found = [content["scenes"]["simulated-room random"] for content in written]
     varied = [scores(study["variants"].values()) for study in found[:2]]
     sized = [scores([study["auto"], *study["fixed"]]) for study in found[2:]]
