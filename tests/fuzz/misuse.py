@@ -21,7 +21,6 @@ from swiftwrf import (
     InputError,
     MatchedField,
     PairModel,
-    Posterior,
     Prediction,
     Rssi,
     RssiLocator,
@@ -35,11 +34,12 @@ from swiftwrf import (
     load_rssi,
     load_spectra,
     make_model,
-    project,
     rssi_room,
     simulated_room,
 )
 from swiftwrf.array.planar import PlanarArray
+from swiftwrf.locate import Posterior
+from swiftwrf.models.coarray import project
 from swiftwrf.models.geometry import Plane
 from swiftwrf.online import Follower, MonitorConfig
 from swiftwrf.positions import MAX_COORDINATE_M
