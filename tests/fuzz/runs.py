@@ -26,6 +26,7 @@ from fuzz.mutate import mutated
 from swiftwrf import (
     AngularGrid,
     FieldModel,
+    GeometryModel,
     InputError,
     Rssi,
     RssiLocator,
@@ -37,7 +38,6 @@ from swiftwrf import (
     simulated_room,
 )
 from swiftwrf.errors import MAX_LENGTH
-from swiftwrf.models.geometry import fit_geometry
 from swiftwrf.online import Follower
 from tasks.aoa.options import AoaConfig
 from tasks.aoa.page.room import in_plan
@@ -135,7 +135,7 @@ def _rssi_model() -> RssiModel:
 @functools.cache
 def _field_model(name: str) -> FieldModel:
     room = simulated_room(n=14, grid=AngularGrid.hemisphere(4, 8))
-    return make_model(name).fit(room) if name != "geometry" else fit_geometry(room, GLANCE, progress=False)
+    return (GeometryModel(GLANCE) if name == "geometry" else make_model(name)).fit(room)
 
 
 def json_lines(model: FieldModel | RssiModel) -> bytes:
