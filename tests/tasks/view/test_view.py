@@ -118,7 +118,7 @@ def test_predicted_spectrum_is_that_of_the_model(aoa_run):
     assert shown.peak == pytest.approx(peak)
     direction = view.data.direction_at(torch.from_numpy(at)[None])[0].rad2deg()
     assert shown.line_of_sight == pytest.approx(tuple(direction.tolist()))
-    assert view.predict(view.models[0], at).std is None  # fitted by gradient
+    assert view.predict(view.models[0], at).std is not None
 
 
 def test_nearest_measured_spectrum(aoa_run, room):
@@ -161,7 +161,7 @@ def test_a_model_by_itself(tmp_path, room, kind):
     assert np.isfinite(shown.mean).all()
     assert (view.positions.min(axis=0) <= view.start).all()
     assert (view.start <= view.positions.max(axis=0)).all()
-    assert (shown.line_of_sight is not None) == (kind in ("geometry", "hybrid", "nerf2", "wrfgs"))
+    assert shown.line_of_sight is not None  # models store the link of their training spectra
     assert bool(view.models[0].planes) == (kind in ("geometry", "hybrid"))
 
 
