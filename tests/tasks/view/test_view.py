@@ -205,7 +205,8 @@ def test_room_of_another_model_on_the_same_spectra(aoa_run, tmp_path):
     shutil.copytree(aoa_run, folder)
     plane = {"normal": [1.0, 0, 0], "offset_m": 6.0, "gain": -0.5, "std_mm": 1.0, "certain": True}
     (folder / "geometry-mix1.json").write_text(json.dumps({"planes": [plane]}))
-    assert [loaded.planes for loaded in open_source(folder).models] == [[], [plane]]
+    shown = plane | {"normal": tuple(plane["normal"])}
+    assert [loaded.planes for loaded in open_source(folder).models] == [[], [shown]]
 
 
 def test_maps_are_those_of_the_model(rssi_run):
