@@ -87,6 +87,7 @@ def test_mutations(kind, tmp_path):
     assert ends["refused"] > 0
 
 
+@pytest.mark.usefixtures("without_annotation_checks")
 @pytest.mark.parametrize("kind", ATTEMPTS)
 def test_attempts(kind, tmp_path):
     attack(kind, tmp_path, range(SHORT_ATTEMPTS))
@@ -98,6 +99,7 @@ def test_many_mutations(kind, tmp_path):
     attack(kind, tmp_path, range(SHORT, SHORT + LONG))
 
 
+@pytest.mark.usefixtures("without_annotation_checks")
 @pytest.mark.fuzz
 @pytest.mark.parametrize("kind", ATTEMPTS)
 def test_many_attempts(kind, tmp_path):
