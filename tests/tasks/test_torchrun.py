@@ -112,7 +112,7 @@ def test_a_run_of_two_processes_is_that_of_one(ended):
     assert run(*AOA, "--out", folder / "one") == 0
     one, two = folder / "one", folder / "two"
     assert {file.name for file in two.iterdir()} == {file.name for file in one.iterdir()}
-    # degrees and dB; a processor that trains in bfloat16 amplifies the rounding of gradients that two processes add
+    # degrees and dB; directions by the network differed by 0.07 degrees between one and two processes, cause not found
     for table in ("errors.csv", "synthesis.csv"):
         pd.testing.assert_frame_equal(pd.read_csv(two / table), pd.read_csv(one / table), rtol=0, atol=0.3)
     assert json.loads((two / "environment.json").read_text())["processes"] == 2
