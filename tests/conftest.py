@@ -13,7 +13,7 @@ import small
 import torch
 from PIL import Image
 
-from swiftwrf import AngularGrid, InputError, Spectra, fit, simulated_room
+from swiftwrf import AngularGrid, InputError, Spectra, make_model, simulated_room
 from swiftwrf.data.raytraced import sionna
 from swiftwrf.data.writing import write_spectra
 
@@ -106,7 +106,7 @@ def generator() -> torch.Generator:
 
 @pytest.fixture(scope="session")
 def aoa_run(tmp_path_factory: pytest.TempPathFactory, room: Spectra) -> Path:
-    """A run of angle of arrival on files, whose second model knows its deviation."""
+    """A run of angle of arrival on files, whose second model does not know its deviation."""
     import quick  # the tasks are imported by the tests that run them
 
     folder = tmp_path_factory.mktemp("aoa")
@@ -115,7 +115,7 @@ def aoa_run(tmp_path_factory: pytest.TempPathFactory, room: Spectra) -> Path:
     options = ("--synthesizer", "swiftwrf", "--extra", 0, "--data", folder / "data", "--out", folder / "run")
     with mock.patch("tasks.aoa.context.candidates", return_value=["idw"]):  # finding a room has tests of its own
         assert quick.run("aoa", "--mix", 0.5, 1, *options) == 0
-    fit(room, n_primitives=16).save(folder / "run" / "model-mix1.safetensors")
+    make_model("idw").fit(room).save(folder / "run" / "model-mix1.safetensors")
     return folder / "run"
 
 

@@ -148,11 +148,11 @@ def has_views_models_and_keys(browser, plan):
     rectangular = find(browser, "#measured img").get_attribute("src")
     press(browser, "polar")
     until(lambda: find(browser, "#measured img").get_attribute("src") != rectangular)
-    assert not find(browser, "#deviation").is_displayed()
+    assert find(browser, "#deviation").is_displayed()
     find(browser, ".q-select").click()
     until(lambda: browser.find_elements("css selector", ".q-item"))
-    browser.find_elements("css selector", ".q-item")[1].click()  # a model that knows its deviation
-    until(lambda: find(browser, "#deviation").is_displayed())
+    browser.find_elements("css selector", ".q-item")[1].click()  # a model that does not know its deviation
+    until(lambda: not find(browser, "#deviation").is_displayed())
     pointer(browser).move_to_element_with_offset(plan, 20, 10).click().perform()
     for key in (Keys.ARROW_RIGHT, Keys.ARROW_UP, Keys.PAGE_UP):
         before = said(browser, "where")
