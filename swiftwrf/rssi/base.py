@@ -36,7 +36,6 @@ from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, checked, 
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 ITEMS_PER_THREAD = 4  # between two results that are kept: starting threads costs milliseconds
 RECEIVER_POSITIONS = "positions of the receivers"
-RECEIVER_TOLERANCE_M = 0.01  # between two positions of one receiver
 
 
 def map_threads(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
@@ -228,7 +227,7 @@ class RssiPredictor(Configured, Displayed, ABC):
             )
         position = data.about(self.origin).receiver_position
         apart = (position - self.receiver_position).norm(dim=1).nan_to_num(0.0)
-        if len(moved := (apart > RECEIVER_TOLERANCE_M).nonzero()[:, 0]):
+        if len(moved := (apart > 0.01).nonzero()[:, 0]):
             name, metres = self.receiver_names[int(moved[0])], float(apart[moved[0]])
             raise InputError(
                 f"{data.name} has receiver {name} {metres:.3g} m away from its position in the rows that the predictor was "

@@ -23,9 +23,7 @@ from swiftwrf.positions import distance
 from swiftwrf.rssi.path_loss import MIN_DISTANCE_M, log_distance
 from swiftwrf.runtime.threads import single_thread
 
-MIN_FLOOR_ROWS = 3  # on a floor, for its mean to count as evidence of a receiver's floor
 MAX_ROWS = 300  # of a receiver; the cost grows with their cube
-PRIOR_PRECISION = 0.05  # of an offset relative to the field: a standard deviation of about 10 dB
 LENGTH_SHARE = 0.25  # correlation length of the field relative to the extent
 RELATIVE_NOISE = 1.0  # variance of a packet relative to that of the field
 
@@ -115,7 +113,7 @@ def receiver_floors(data: Rssi) -> Tensor:
     floor, mean = data.floors.number(data.transmitter_position), []
     for number in range(len(data.floors.names)):
         rssi = data.rssi_dbm[floor == number]
-        enough = (~rssi.isnan()).sum(dim=0) >= MIN_FLOOR_ROWS
+        enough = (~rssi.isnan()).sum(dim=0) >= 3
         mean.append(rssi.nanmean(dim=0).where(enough, -torch.inf))
     strongest = torch.stack(mean).argmax(dim=0)
     return data.floors.number(data.receiver_position.nan_to_num(0.0)).where(data.receiver_located, strongest)
@@ -174,7 +172,7 @@ def estimate_offsets(train: Rssi, reference: str | None = None) -> Offsets:
         right += member[rows].T @ weight @ rssi[rows]
         total += float(rssi[rows] @ weight @ rssi[rows])
     free = torch.tensor([name != chosen for name in groups.names])
-    precision = normal[free][:, free] + PRIOR_PRECISION * torch.eye(int(free.sum())).double()
+    precision = normal[free][:, free] + 0.05 * torch.eye(int(free.sum())).double()  # a standard deviation of 10 dB
     offset = torch.zeros(len(groups.names), dtype=torch.float64)
     offset[free] = torch.linalg.solve(precision, right[free])
     explained = float(right @ offset) / total if total > 0 else 0.0

@@ -15,7 +15,6 @@ from swiftwrf.positions import Neighbours, distance
 
 MIN_DISTANCE_M = 0.3  # shorter distances count as this one: the model does not hold in the near field
 PLACE_PENALTY = 10.0  # measurements that a place needs for half of its own path-loss model
-SAME_PLACE_M = 1e-3
 N_HARMONICS = 8  # real spherical harmonics of degree 1 and 2
 
 
@@ -184,7 +183,7 @@ class PairPathLoss:
         values = self.shared.expand(len(pair), 2)
         if len(self.place) and len(pair):
             away, nearest = (found[:, 0] for found in self._places(pair[:, 3:], 1))
-            values = values + self.correction[nearest].where(away[:, None] < SAME_PLACE_M, 0.0)
+            values = values + self.correction[nearest].where(away[:, None] < 1e-3, 0.0)
         return values[:, 0] + values[:, 1] * _pair_log_distance(pair)
 
 
