@@ -37,9 +37,8 @@ from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.path_gains import PathGains, PriorChoice, choose_prior, fit_path_gains, kernel_of
 from swiftwrf.positions import to_tensor
 from swiftwrf.runtime.checkpoint import Header, Saved, expect
-from swiftwrf.runtime.options import Configured, all_or_nothing
 from swiftwrf.runtime.threads import parallel_map
-from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, checked, configuration
+from swiftwrf.runtime.validation import Configured, NonNegativeInt, PositiveInt, all_or_nothing, checked, configuration
 
 FOLDS = 5
 MIN_SPECTRA = 15

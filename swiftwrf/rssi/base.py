@@ -26,12 +26,19 @@ from swiftwrf.models.base import CPU, FieldConfig, check_checkpoint
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Displayed
 from swiftwrf.positions import check_positions, to_tensor
-from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation, receiver_floors
+from swiftwrf.rssi.path_loss import FloorAttenuation, estimate_floor_attenuation, receiver_floors
 from swiftwrf.runtime.checkpoint import Header, Saved
-from swiftwrf.runtime.options import Configured, all_or_nothing, from_plain
 from swiftwrf.runtime.session import Record
 from swiftwrf.runtime.threads import parallel_map, to_device
-from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, checked, configuration
+from swiftwrf.runtime.validation import (
+    Configured,
+    NonNegativeInt,
+    PositiveFloat,
+    all_or_nothing,
+    checked,
+    configuration,
+    from_plain,
+)
 
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 ITEMS_PER_THREAD = 4  # between two results that are kept: starting threads costs milliseconds

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import ClassVar, Literal
 
 from swiftwrf.errors import InputError
-from swiftwrf.runtime.options import Preset
+from swiftwrf.runtime.validation import Preset
 from tasks.options import OffsetSource, Output, command_options
 from tasks.rssi.predictors import PREDICTORS
 

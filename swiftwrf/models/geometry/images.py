@@ -201,9 +201,8 @@ class PhaseObservations:
         Args:
             ray: Vectors from the receiver to the source, float32 (3, ...) [m].
         """
-        length = (
-            ray.square().sum(0).sqrt().clamp_min(1e-6)
-        )  # the norm over a first dimension is slow, and 1 / 0 infinite
+        # the norm over a first dimension is slow, and an amplitude finite also between ends at one place
+        length = ray.square().sum(0).sqrt().clamp_min(1e-6)
         phase = (self.element @ (ray / length).flatten(1)).reshape(len(self.element), *length.shape)
         return phase - self.wavenumber * length, length
 

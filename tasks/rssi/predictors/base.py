@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from swiftwrf.rssi import RssiModel, RssiPaperModel, RssiPredictor
-from swiftwrf.runtime.options import Preset
-from swiftwrf.runtime.validation import checked
+from swiftwrf.runtime.validation import Preset, checked
 from tasks.rssi.predictors import PREDICTORS
 
 

@@ -13,8 +13,7 @@ from swiftwrf.data.splits import folds
 from swiftwrf.models.base import FieldConfig
 from swiftwrf.rssi import RssiFitContext, RssiPredictor
 from swiftwrf.rssi.training import mixing_weights
-from swiftwrf.runtime.options import Preset
-from swiftwrf.runtime.validation import configuration
+from swiftwrf.runtime.validation import Preset, configuration
 from tasks.rssi.predictors import PREDICTORS
 from tasks.rssi.predictors.base import make_predictor
 
