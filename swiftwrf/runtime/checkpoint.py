@@ -24,8 +24,6 @@ from swiftwrf.runtime.durable import write_bytes
 from swiftwrf.runtime.validation import checked
 
 FORMAT = 1
-DEFINING_PACKAGES = ("swiftwrf.models", "swiftwrf.comparison", "swiftwrf.rssi", "swiftwrf.locate")  # of saved kinds
-EXTENSION_GROUPS = ("swiftwrf.models", "swiftwrf.estimators")  # entry points of packages that define saved kinds
 Header = dict[str, Any]  # values that JSON can store
 
 
@@ -91,14 +89,12 @@ class Saved(ABC):
     """Base class of fitted models that one file stores. A subclass with a `kind` is registered for `load`."""
 
     kind: ClassVar[str]
-    former_kinds: ClassVar[tuple[str, ...]] = ()
-    """kinds in files of earlier versions"""
     kinds: ClassVar[dict[str, type[Saved]]] = {}
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         if "kind" in cls.__dict__:
-            Saved.kinds |= dict.fromkeys((cls.kind, *cls.former_kinds), cls)
+            Saved.kinds[cls.kind] = cls
 
     @abstractmethod
     def state(self) -> tuple[dict[str, Tensor], Header]:
@@ -149,9 +145,9 @@ def load(path: str | Path) -> Saved:
 
 def _import_kinds() -> None:
     """Import all packages that define saved kinds; those of others that cannot be imported define none."""
-    for package in DEFINING_PACKAGES:
+    for package in ("swiftwrf.models", "swiftwrf.comparison", "swiftwrf.rssi", "swiftwrf.locate"):
         import_module(package)
-    for point in (point for group in EXTENSION_GROUPS for point in entry_points(group=group)):
+    for point in (point for group in ("swiftwrf.models", "swiftwrf.estimators") for point in entry_points(group=group)):
         with suppress(Exception):  # code of another package may raise anything
             point.load()
 
