@@ -127,8 +127,8 @@ DATA: dict[str, Call] = {
         for name in ("receiver_position", "receiver_names", "origin", "session", "time", "name", "index")
     },
     "from_frame(x)": Rssi.from_frame,
-    "from_frame, a column": lambda x: Rssi.from_frame(pd.DataFrame(FLOOR | {"hall": [-50.0, x]})),
-    "from_frame, a coordinate": lambda x: Rssi.from_frame(pd.DataFrame(FLOOR | {"x": [0.0, x]})),
+    "from_frame, a column": lambda x: Rssi.from_frame(pd.DataFrame(FLOOR | {"hall": [-50.0, x]}, dtype=object)),
+    "from_frame, a coordinate": lambda x: Rssi.from_frame(pd.DataFrame(FLOOR | {"x": [0.0, x]}, dtype=object)),
     **{
         f"from_frame({name}=x)": lambda x, name=name: Rssi.from_frame(pd.DataFrame(FLOOR), **{name: x})
         for name in (
