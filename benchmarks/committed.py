@@ -7,9 +7,10 @@ import math
 from pathlib import Path
 from typing import Any
 
+from swiftwrf.metrics import ChangeMetrics
 from tasks.aoa.condition import Condition, conditions_of, headline, reference_of
 from tasks.aoa.former import with_present_names
-from tasks.metrics import AoaMetrics, ChangeMetrics, ErrorSummary, MixMetrics
+from tasks.metrics import AoaMetrics, ErrorSummary, MixMetrics
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"

@@ -48,7 +48,7 @@ from speed_tables import (
 )
 from targets import aoa_targets, rssi_targets, synthesis_targets
 
-from tasks.aoa.condition import LOCATOR
+from augment.cross_validation import LOCATOR
 
 
 def synthesis() -> str:

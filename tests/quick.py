@@ -13,14 +13,15 @@ from unittest import mock
 
 from small import glances, small_published, small_swiftwrf
 
+from augment.estimators import ESTIMATORS
+from augment.estimators.baselines import Constant
 from swiftwrf import AngularGrid, RssiModel, rssi_room, simulated_room
+from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.errors import MAX_LENGTH
 from swiftwrf.rssi import RssiConfig
 from swiftwrf.runtime.validation import configuration
 from tasks.aoa import experiment as aoa
 from tasks.aoa.condition import NETWORKS
-from tasks.aoa.estimators import ESTIMATORS
-from tasks.aoa.estimators.baselines import Constant
 from tasks.aoa.options import AoaConfig
 from tasks.command_line import command_line
 from tasks.convert.options import ConvertConfig
@@ -35,7 +36,6 @@ from tasks.report.options import ReportConfig
 from tasks.report.run import run as report
 from tasks.rssi import experiment as rssi
 from tasks.rssi.options import RssiTaskConfig
-from tasks.rssi.predictors import PREDICTORS
 from tasks.scenes.options import ScenesConfig
 from tasks.scenes.run import run as scenes
 from tasks.update.options import UpdateConfig
@@ -92,7 +92,7 @@ def quick() -> Iterator[None]:
         mock.patch.object(RssiModel, "config_type", QuickRssiConfig),
         mock.patch("tasks.rssi.experiment.MAP_CELLS", 8),
         mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
-        mock.patch.object(PREDICTORS, "_registered", {name: PREDICTORS[name] for name in PREDICTORS_KEPT}),
+        mock.patch.object(RSSI_PREDICTORS, "_registered", {name: RSSI_PREDICTORS[name] for name in PREDICTORS_KEPT}),
     ):
         yield
 

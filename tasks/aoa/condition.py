@@ -7,18 +7,17 @@ from dataclasses import asdict, dataclass, replace
 from itertools import product
 from typing import Any, Literal, TypeVar, get_args
 
+from augment.cross_validation import LOCATOR, STAND_IN
+from augment.estimators import ESTIMATORS
 from swiftwrf.models import FIELD_MODELS
 from tasks import labels
-from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.options import AUTO, fraction_key
 from tasks.run import Preset, Row
 
 Training = Literal["measured", "turbo", "turbo_extra", "all"]
 NETWORKS: dict[Preset, str] = {"quick": "aann_kernel", "paper": "aann"}
 """network that a run of each preset trains; names of its conditions omit it"""
-STAND_IN = "kernel_regression"  # estimator in place of the network where many or quick trainings are needed
 MEASURED_STAND_IN = f"{STAND_IN}_measured_only"  # file of it without synthetic spectra
-LOCATOR = "matched_field"  # estimator that locates the moving end by the room; it needs positions, array and fixed end
 Value = TypeVar("Value")
 
 

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from augment import Mixed
+from augment.cross_validation import LOCATOR
 from swiftwrf import FitError, InputError, Spectra, load
 from swiftwrf.locate import MatchedField, Posterior
 from swiftwrf.models import FieldModel
-from tasks.aoa.condition import LOCATOR, Condition
+from tasks.aoa.condition import Condition
 from tasks.aoa.context import Experiment
 from tasks.records import write_npz
 from tasks.run import Row

@@ -9,24 +9,21 @@ from pathlib import Path
 import torch
 
 from augment import Fold, ModelChoice, choose_model
+from augment.cross_validation import (
+    STAND_IN,
+    CrossValidationMetrics,
+    cross_validate,
+    located_errors,
+    located_folds,
+    measured_errors,
+)
 from swiftwrf import GeometryModel, InputError, Spectra, load
 from swiftwrf.models import FIELD_MODELS
-from tasks.aoa.condition import (
-    EVERYTHING,
-    NETWORKS,
-    STAND_IN,
-    Condition,
-    MeasuredSubset,
-    Training,
-    estimators,
-    trainable,
-)
+from tasks.aoa.condition import EVERYTHING, NETWORKS, Condition, MeasuredSubset, Training, estimators, trainable
 from tasks.aoa.context import ROOM_MODEL, Experiment
-from tasks.aoa.cross_validation import cross_validate, located_errors, located_folds, measured_errors
 from tasks.aoa.options import AUTO
 from tasks.aoa.synthesis import Evaluation, RoomSearch, syntheses
 from tasks.claim import STEPS
-from tasks.metrics import CrossValidationMetrics
 from tasks.records import read_json
 from tasks.run import Row
 from tasks.steps import Step

@@ -12,19 +12,19 @@ import torch
 from torch import Tensor
 
 from augment import Mixed, SyntheticPositions, mix, synthetic_positions
+from augment.cross_validation import STAND_IN, CrossValidationMetrics
+from augment.estimators import SavedEstimator, make_estimator
 from swiftwrf import FitError, GeometryModel, InputError, Spectra, load
 from swiftwrf.data.store import Store
 from swiftwrf.metrics import l1, psnr, ssim
 from swiftwrf.models import FieldModel
 from swiftwrf.runtime.checkpoint import read, write
 from tasks.aoa.artifacts import save_artifacts
-from tasks.aoa.condition import MEASURED_STAND_IN, NETWORKS, STAND_IN, Condition, MeasuredSubset, Training, trainable
+from tasks.aoa.condition import MEASURED_STAND_IN, NETWORKS, Condition, MeasuredSubset, Training, trainable
 from tasks.aoa.context import ROOM_MODEL, Experiment
-from tasks.aoa.estimators import SavedEstimator, make_estimator
 from tasks.aoa.locating import Locating
 from tasks.aoa.options import AUTO
 from tasks.claim import STEPS
-from tasks.metrics import CrossValidationMetrics
 from tasks.run import Row
 from tasks.steps import Step
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import torch
 
+from augment.estimators import SavedEstimator
 from swiftwrf import InputError, load
 from swiftwrf.errors import with_article
 from swiftwrf.locate import MatchedField
 from swiftwrf.metrics import angle_errors
-from tasks.aoa.estimators import SavedEstimator
 from tasks.directory import check_new_file
 from tasks.environment import stamp
 from tasks.estimate.options import EstimateConfig

@@ -11,10 +11,9 @@ from torch import Tensor
 
 from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.data import Rssi, Spectra
+from swiftwrf.diagnostics.inspection import Findings, nearest
 from swiftwrf.rssi import fit_path_loss, log_distance
 from tasks.environment import command
-from tasks.inspect.findings.base import Findings
-from tasks.inspect.findings.positions import nearest
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table
 from tasks.summarise import fingerprinting

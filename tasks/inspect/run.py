@@ -7,10 +7,9 @@ from pathlib import Path
 
 from swiftwrf.data import Rssi, Snapshots
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
+from swiftwrf.diagnostics.inspection import inspect, propose_offsets
 from tasks.directory import new_directory
 from tasks.environment import stamp
-from tasks.inspect.findings import inspect
-from tasks.inspect.findings.rssi import propose_offsets
 from tasks.inspect.options import InspectConfig
 from tasks.inspect.page import page
 from tasks.page.page import write_page

@@ -10,8 +10,8 @@ import torch
 
 from swiftwrf import InputError, Rssi, rssi_room
 from swiftwrf.data.coordinates import degree_columns
+from swiftwrf.locate.baselines import LEVELS
 from tasks.cluster import connected
-from tasks.locate.localizers import LEVELS
 from tasks.locate.observations import write_positions
 from tasks.locate.options import LocateConfig
 from tasks.locate.page import page

@@ -18,10 +18,10 @@ from swiftwrf.data.store import Store
 from swiftwrf.data.survey import has_positions
 from swiftwrf.errors import listed, with_article
 from swiftwrf.locate import MatchedField, Posterior, RssiLocator, smoothed
+from swiftwrf.locate.baselines import BATCH_ROWS
 from swiftwrf.metrics import angle_errors
 from tasks.directory import check_new_file
 from tasks.environment import stamp
-from tasks.locate.localizers import BATCH_ROWS
 from tasks.locate.options import LocateConfig
 from tasks.options import SpectraSource, TableSource, given
 from tasks.records import Row, rounded, write_table

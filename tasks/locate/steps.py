@@ -15,9 +15,9 @@ from augment.suggest import suggest_positions
 from swiftwrf import Rssi
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.locate import Posterior, RssiLocator
+from swiftwrf.locate.baselines import LOCALIZERS, PosteriorLocalizer
 from swiftwrf.positions import nearest
 from tasks.claim import LOCATOR
-from tasks.locate.localizers import LOCALIZERS, PosteriorLocalizer
 from tasks.records import Row, write_npz, write_table
 from tasks.steps import Step
 

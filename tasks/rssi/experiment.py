@@ -14,12 +14,14 @@ import torch
 from pandas import DataFrame
 
 from swiftwrf import InputError, Rssi, rssi_room
+from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.files import sha256
 from swiftwrf.data.rssi import PLACE
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import distance
 from swiftwrf.rssi import LEVEL, PairModel, RssiModel
+from swiftwrf.rssi.baselines import make_predictor
 from tasks.claim import MODEL
 from tasks.cluster import connected
 from tasks.metrics import PredictorMetrics, PredictorSeconds, ReceiverMetrics, RssiMetrics
@@ -29,8 +31,6 @@ from tasks.page.records import Records
 from tasks.rssi.options import RssiTaskConfig
 from tasks.rssi.page import page
 from tasks.rssi.page.summary import answer
-from tasks.rssi.predictors import PREDICTORS
-from tasks.rssi.predictors.base import make_predictor
 from tasks.run import Row, Run, choose_device
 from tasks.source import asked_offsets, measured_rssi, offset_notes, split_notes
 from tasks.summarise import error_summary, grouped
@@ -69,8 +69,8 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     ):
         options = {"pool": pool, "device": device, "parallel": cluster.map if cluster else None}
         tables = _Tables(config, train, test, plan, directory, options)
-        compared = [name for name in PREDICTORS if PREDICTORS[name].compared(data) or name in config.also]
-        left_out = {name: reason for name in compared if (reason := PREDICTORS[name].lacking(data))}
+        compared = [name for name in RSSI_PREDICTORS if RSSI_PREDICTORS[name].compared(data) or name in config.also]
+        left_out = {name: reason for name in compared if (reason := RSSI_PREDICTORS[name].lacking(data))}
         for reason in left_out.values():
             console.print(f"left out: {reason}")
         with terminal.progress():

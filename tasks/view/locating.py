@@ -16,9 +16,9 @@ from torch import Tensor
 from swiftwrf import InputError, Rssi, load
 from swiftwrf.errors import with_article
 from swiftwrf.locate import MatchedField, Posterior, RssiLocator
+from swiftwrf.locate.baselines import BATCH_ROWS
 from swiftwrf.locate.rssi import UNDETECTED_BELOW_DB
 from swiftwrf.positions import nearest
-from tasks.locate.localizers import BATCH_ROWS
 from tasks.locate.steps import MAP_PIXELS, in_plan
 from tasks.page.maps import Corners, corners_of
 from tasks.records import as_table, rounded

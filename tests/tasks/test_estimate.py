@@ -9,13 +9,13 @@ import torch
 from quick import run, said
 
 from augment import Mixed
+from augment.estimators.aann import AANN
+from augment.estimators.aann_kernel import AANNKernel
+from augment.estimators.kernel_regression import KernelRegression
 from swiftwrf import AngularGrid, InputError, load, simulated_room
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
 from swiftwrf.runtime.checkpoint import read, write
-from tasks.aoa.estimators.aann import AANN
-from tasks.aoa.estimators.aann_kernel import AANNKernel
-from tasks.aoa.estimators.kernel_regression import KernelRegression
 from tasks.aoa.page.records import FractionRecords
 from tasks.aoa.page.summary import next_steps
 from tasks.page.records import Records

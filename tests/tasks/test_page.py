@@ -13,9 +13,9 @@ from matplotlib.text import Text
 from pandas import DataFrame
 
 from swiftwrf import AngularGrid, Rssi, Spectra, plotting
+from swiftwrf.diagnostics.inspection import Findings
 from tasks import labels
 from tasks.aoa.page.records import CHOSEN, LOWER_REFERENCE, UPPER_REFERENCE
-from tasks.inspect.findings.base import Findings
 from tasks.inspect.page import page as inspection
 from tasks.locate.page.drawing import posteriors
 from tasks.page import figures

@@ -20,13 +20,13 @@ import quick
 import torch
 
 from augment import Mixed
+from augment.estimators import aann
+from augment.estimators.aann import AANN, AANNConfig
 from swiftwrf import AngularGrid, InputError, simulated_room
 from swiftwrf.data.store import Store
 from swiftwrf.models.swiftwrf_paper import SwiftWRFPaperConfig
 from swiftwrf.runtime.threads import set_threads
 from tasks import torchrun
-from tasks.aoa.estimators import aann
-from tasks.aoa.estimators.aann import AANN, AANNConfig
 from tasks.cluster import connected
 
 HERE = Path(__file__).parents[1]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from swiftwrf.metrics import ChangeMetrics
 from tasks.aoa.condition import headline, reference_of
 from tasks.aoa.page.records import FractionRecords
-from tasks.metrics import ChangeMetrics
 from tasks.page.page import Table
 from tasks.page.provenance import number
 

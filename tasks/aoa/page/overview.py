@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from tasks.aoa.condition import LOCATOR
+from augment.cross_validation import LOCATOR
 from tasks.aoa.page.gains import reference, turbo_method
 from tasks.aoa.page.records import FractionRecords, palette
 from tasks.aoa.page.room import FIXED, draw_in_plan, extent

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tasks.aoa.condition import LOCATOR
+from augment.cross_validation import LOCATOR
 from tasks.aoa.page.gains import gain_table, reference, turbo_method
 from tasks.aoa.page.overview import BASELINES
 from tasks.aoa.page.records import FractionRecords

@@ -10,10 +10,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pandas import DataFrame, concat
 
+from augment.cross_validation import CrossValidationMetrics, GainMetrics
+from swiftwrf.metrics import ChangeMetrics
 from swiftwrf.models import FIELD_MODELS
 from tasks import labels
 from tasks.aoa.page.records import FractionRecords
-from tasks.metrics import ChangeMetrics, CrossValidationMetrics, GainMetrics
 from tasks.page import figures
 from tasks.page.page import Plot, Section, Table
 from tasks.page.provenance import number

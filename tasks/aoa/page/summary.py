@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from tasks.aoa.condition import LOCATOR, MEASURED_STAND_IN, STAND_IN
-from tasks.aoa.estimators import ESTIMATORS
+from augment.cross_validation import LOCATOR, STAND_IN
+from augment.estimators import ESTIMATORS
+from tasks.aoa.condition import MEASURED_STAND_IN
 from tasks.aoa.former import FORMER_NAMES
 from tasks.aoa.page.gains import change_text, changes_of, gain_sentence, judgement, learner, reference, turbo_method
 from tasks.aoa.page.overview import overview
@@ -126,7 +127,7 @@ def next_steps(fraction: FractionRecords) -> list[str]:
             f"spectra: `{command('estimate', f'{path}/{taken}-mix{key}.safetensors', 'SOURCE')}`."
         )
     elif choice:
-        steps.append(f"{choice['name']} needs no file: `tasks.aoa.estimators.make_estimator('{choice['name']}')`.")
+        steps.append(f"{choice['name']} needs no file: `augment.estimators.make_estimator('{choice['name']}')`.")
     others = sorted(estimators - {taken})
     if others:
         kept = f"`{command('estimate', f'{path}/{others[0]}-mix{key}.safetensors', 'SOURCE')}`"

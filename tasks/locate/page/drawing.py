@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from pandas import DataFrame
 from scipy.stats import binomtest
 
+from swiftwrf.locate.baselines import LOCALIZERS
 from tasks.labels import LOCALIZERS as LABELS
 from tasks.labels import labels
-from tasks.locate.localizers import LOCALIZERS
 from tasks.locate.page.summary import NEIGHBOURS, OWN
 from tasks.metrics import StudyMetrics
 from tasks.page import figures

@@ -19,7 +19,7 @@ from swiftwrf import AngularGrid, load_spectra
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data import ReadOptions, Snapshots
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
-from tasks.inspect.findings import inspect
+from swiftwrf.diagnostics.inspection import inspect
 
 GRID = AngularGrid.hemisphere(18, 72)
 SHAPES = ((2, 4), (3, 4), (2, 5), (3, 5), (4, 5))  # of arrays; not square, whose x and y may be exchanged

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from swiftwrf import AngularGrid, InputError, load_rssi, load_snapshots, load_spectra, rssi_room
 from swiftwrf.data import ReadOptions
 from swiftwrf.data.store import Store
+from swiftwrf.diagnostics.inspection import inspect
 from swiftwrf.diagnostics.path_loss import check_path_loss
-from tasks.inspect.findings import inspect
 
 GRID = AngularGrid.hemisphere(24, 96)
 HOW = ReadOptions(grid=GRID)

@@ -16,21 +16,21 @@ import torch
 from sklearn.model_selection import KFold
 from small import FIT, with_defaults
 
-from augment import Mixed, choose, sample_positions
+from augment import Mixed, choose, cross_validation, sample_positions
+from augment.estimators import ESTIMATORS, aann, make_estimator, nadaraya_watson
+from augment.estimators.aann import AANN, AANNConfig
+from augment.estimators.aann_kernel import AANNKernel, AANNKernelConfig
+from augment.estimators.baselines import Constant, NearestSpectrum, Peak
+from augment.estimators.kernel_regression import KernelRegression
 from swiftwrf import AngularGrid, InputError, load, make_model, simulated_room
 from swiftwrf.data.store import Store
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import model as geometry
-from tasks.aoa import context, cross_validation, experiment
+from tasks.aoa import context, experiment
 from tasks.aoa import synthesis as synthesizing
 from tasks.aoa.condition import Condition, MeasuredSubset, conditions_of, headline
-from tasks.aoa.estimators import ESTIMATORS, aann, make_estimator, nadaraya_watson
-from tasks.aoa.estimators.aann import AANN, AANNConfig
-from tasks.aoa.estimators.aann_kernel import AANNKernel, AANNKernelConfig
-from tasks.aoa.estimators.baselines import Constant, NearestSpectrum, Peak
-from tasks.aoa.estimators.kernel_regression import KernelRegression
 from tasks.aoa.options import AoaConfig, fraction_key
 from tasks.aoa.page.records import palette
 from tasks.aoa.synthesis import Evaluation
@@ -138,7 +138,7 @@ def test_every_spectrum_counts_alike_in_the_batch_norms():
 
 
 def test_circular_padding_makes_rolled_spectra_alike():
-    from tasks.aoa.estimators.resnet import CircularConv
+    from augment.estimators.resnet import CircularConv
 
     convolution = CircularConv(torch.nn.Conv2d(1, 3, 5, padding=2))
     x = torch.rand(1, 1, 9, 12)
@@ -232,7 +232,7 @@ def test_what_all_distances_have_in_common_does_not_move_an_estimate():
 @pytest.mark.parametrize("circular", [False, True])
 def test_pointwise_convolutions_are_matrix_products(circular):
     """Both agree in value and gradient for equal weights."""
-    from tasks.aoa.estimators.resnet import Pointwise, backbone
+    from augment.estimators.resnet import Pointwise, backbone
 
     spectrum = torch.rand(4, 1, 9, 40, dtype=torch.float64)
     found = {}
@@ -254,7 +254,7 @@ def test_pointwise_convolutions_are_matrix_products(circular):
 @pytest.mark.parametrize("size", [(1, 1), (1, 4), (2, 2), (2, 8), (3, 5), (4, 1)])
 def test_convolutions_over_few_pixels_are_matrix_products(size, stride):
     """The convolution, in value and gradient, whatever rows of the kernel meet nothing but padding."""
-    from tasks.aoa.estimators.resnet import Neighbours
+    from augment.estimators.resnet import Neighbours
 
     definition = torch.nn.Conv2d(64, 64, 3, stride, padding=1, bias=False).double()
     product = Neighbours(definition)
@@ -454,7 +454,7 @@ def registered(monkeypatch, tmp_path):
 
 NORTHERN = """
 import torch
-from tasks.aoa.estimators import Estimator
+from augment.estimators import Estimator
 
 
 class Northern(Estimator):

@@ -16,15 +16,16 @@ from quick import QuickNetwork
 from rooms import mirror_room
 from small import with_defaults
 
-from augment import Fold
+from augment import Fold, cross_validation
+from augment.cross_validation import LOCATOR
+from augment.estimators import ESTIMATORS
 from swiftwrf import MatchedField, load, make_model
 from swiftwrf.locate import MatchedFieldConfig, Posterior, matched_field
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import model as geometry
 from swiftwrf.models.geometry.planes import Plane
-from tasks.aoa import cross_validation, experiment
-from tasks.aoa.condition import LOCATOR, NETWORKS
-from tasks.aoa.estimators import ESTIMATORS
+from tasks.aoa import experiment
+from tasks.aoa.condition import NETWORKS
 from tasks.aoa.locating import Locating, containing_level
 from tasks.aoa.options import AoaConfig
 from tasks.command_line import command_line

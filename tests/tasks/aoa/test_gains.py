@@ -15,9 +15,10 @@ import targets
 import torch
 from pandas import DataFrame
 
+from augment.cross_validation import LOCATOR
 from swiftwrf import simulated_room
-from swiftwrf.metrics import median_interval
-from tasks.aoa.condition import LOCATOR, Condition
+from swiftwrf.metrics import median_interval, paired_change
+from tasks.aoa.condition import Condition
 from tasks.aoa.options import AoaConfig
 from tasks.aoa.page.gains import gain_sentence, gain_table
 from tasks.aoa.page.records import FractionRecords
@@ -26,7 +27,7 @@ from tasks.aoa.results import Results
 from tasks.aoa.synthesis import Evaluation
 from tasks.page.records import Records
 from tasks.report.run import merge
-from tasks.summarise import error_summary, paired_change, repeated_summary, summaries
+from tasks.summarise import error_summary, repeated_summary, summaries
 
 MEASURED = Condition("aann_kernel", "measured", measured_fraction=0.3)
 TURBO = replace(MEASURED, training="turbo", synthesizer="gp")

@@ -20,13 +20,13 @@ from swiftwrf import AngularGrid, InputError, RssiModel, load, make_model, rssi_
 from swiftwrf.data import ReadOptions
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.locate import MatchedField
+from swiftwrf.locate.baselines import LEVELS, LOCALIZERS, RegressedCoordinates
 from swiftwrf.runtime.registry import Registry
 from tasks.claim import LOCATOR as MODEL
 from tasks.command_line import command_line
 from tasks.labels import LOCALIZERS as LABELS
 from tasks.locate import experiment
 from tasks.locate.experiment import prepared
-from tasks.locate.localizers import LEVELS, LOCALIZERS, RegressedCoordinates
 from tasks.locate.observations import aligned, read_rssi
 from tasks.locate.options import LocateConfig
 from tasks.locate.steps import Localization, in_plan
@@ -95,7 +95,7 @@ def test_baselines_locate_better_than_the_mean_position(name, validation):
 
 def test_a_known_fingerprint_is_located_where_it_was_measured():
     train = rssi_room(n=60)
-    with mock.patch("tasks.locate.localizers.NEIGHBOUR_COUNTS", (1,)):
+    with mock.patch("swiftwrf.locate.baselines.NEIGHBOUR_COUNTS", (1,)):
         located = LOCALIZERS["knn"]().fit(train).locate(train.rssi_dbm)
     torch.testing.assert_close(located.position, train.transmitter_position)
 

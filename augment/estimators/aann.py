@@ -19,15 +19,15 @@ from torch.nn import functional
 from torch.optim.swa_utils import update_bn
 
 from augment import Mixed
+from augment.estimators.base import ESTIMATORS, EstimatorConfig, SavedEstimator
+from augment.estimators.resnet import backbone, distributed
 from swiftwrf import InputError
 from swiftwrf.array.angles import to_angles, to_direction
 from swiftwrf.data.spectra import coarsening
 from swiftwrf.runtime.checkpoint import Header, expect
+from swiftwrf.runtime.options import Preset
 from swiftwrf.runtime.progress import progress
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, PositiveInt, configuration
-from tasks.aoa.estimators.base import ESTIMATORS, EstimatorConfig, SavedEstimator
-from tasks.aoa.estimators.resnet import backbone, distributed
-from tasks.run import Preset
 from tasks.torchrun import distribute, process_count
 
 MIN_ROWS = 8  # fewest elevations after averaging; a prime number of rows could only be averaged to one

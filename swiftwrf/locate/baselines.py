@@ -16,10 +16,9 @@ from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 from sklearn.neighbors import NearestNeighbors
 from torch import Tensor
 
-from swiftwrf import Rssi
+from swiftwrf.data import Rssi
 from swiftwrf.data.splits import Validation, folds
-from swiftwrf.locate import RssiLocator
-from swiftwrf.locate.rssi import NEIGHBOUR_COUNTS, UNDETECTED_BELOW_DB
+from swiftwrf.locate.rssi import NEIGHBOUR_COUNTS, UNDETECTED_BELOW_DB, RssiLocator
 from swiftwrf.runtime.registry import Registry
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
 

@@ -1,9 +1,10 @@
-"""Predictors from the neighbourhood: one of scikit-learn's regressors on the position for each receiver."""
+"""Baselines for RSSI: the mean, path-loss models, neighbours, Gaussian processes, and a blend of several predictors."""
 
 from __future__ import annotations
 
 import warnings
 from abc import abstractmethod
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,19 +15,100 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 from sklearn.neighbors import KNeighborsRegressor, NearestNeighbors
-from torch import Tensor
+from torch import Tensor, from_numpy
 
-from swiftwrf import Rssi
+from swiftwrf.choices import RSSI_PREDICTORS
+from swiftwrf.data import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
-from swiftwrf.rssi import RssiFitContext, RssiPredictor
+from swiftwrf.models.base import FieldConfig
+from swiftwrf.rssi.base import RssiFitContext, RssiPredictor
+from swiftwrf.rssi.model import RssiModel
+from swiftwrf.rssi.pairs import PairPredictor
+from swiftwrf.rssi.paper import RssiPaperModel
+from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, fit_shared_path_loss, log_distance
+from swiftwrf.rssi.training import mixing_weights
+from swiftwrf.runtime.options import Preset
 from swiftwrf.runtime.threads import parallel_map
-from tasks.rssi.predictors.path_loss import Mean, ReceiverPathLoss
+from swiftwrf.runtime.validation import checked, configuration
 
 # scikit-learn's own choice for many neighbours computes distances from squares and a product, which cancel map coordinates
 NEIGHBOUR_SEARCH = "kd_tree"
 NEIGHBOUR_COUNTS = (1, 3, 5, 8, 12, 20, 40, 80, 120)
 FLOOR_STRETCH = 5.0  # of heights where there are floors, so that neighbours are on one floor
 MAX_TUNING_ROWS, MAX_GP_ROWS = 500, 1500  # the cost of the Gaussian process grows with their cube
+
+
+@checked
+def make_predictor(name: str, preset: Preset = "quick", **options: Any) -> RssiPredictor:
+    """Return a predictor by its name, with those of the options that it has.
+
+    Args:
+        name: Name in the registry, e.g. "knn".
+        preset: "quick", or "paper" for published settings; a predictor without published settings ignores it. With "paper"
+            the name "swiftwrf" gives `RssiPaperModel`.
+        options: Options such as seed and validation. A predictor ignores options that it does not have.
+
+    Raises:
+        InputError: An unknown name, or a value outside its range.
+
+    Example:
+        >>> make_predictor("swiftwrf", "paper", seed=3).name
+        'swiftwrf_paper'
+    """
+    is_published = name == RssiModel.name and preset == "paper"
+    predictor_type: type[RssiPredictor] = RssiPaperModel if is_published else RSSI_PREDICTORS[name]
+    return predictor_type(**predictor_type.supported({"preset": preset} | options))
+
+
+class Mean(RssiPredictor):
+    """The mean of the receiver's training values, at every position.
+
+    A receiver that no training row detected has the mean of the others.
+    """
+
+    name = "mean"
+
+    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+        self._mean = train.rssi_dbm.nanmean(dim=0).nan_to_num(float(train.rssi_dbm.nanmean()))
+
+    def _predict(self, position: Tensor) -> tuple[Tensor, None]:
+        return self._mean.expand(len(position), -1), None
+
+
+class SharedPathLoss(RssiPredictor):
+    """One log-distance path-loss model for all receivers of the pool, by least squares.
+
+    Receivers of unknown position share one level.
+
+    "MRI" is its name in the NeRF2 repository and, most likely, in the paper's table.
+    """
+
+    name = "mri_pooled"
+    requires_receiver_position = True
+
+    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+        self._receiver = train.receiver_position
+        self._path_loss = _fit_shared(context.pool, train)
+
+    def _predict(self, position: Tensor) -> tuple[Tensor, None]:
+        return self._path_loss(log_distance(position, self._receiver)), None
+
+
+class ReceiverPathLoss(SharedPathLoss):
+    """A log-distance path-loss model for each receiver; a receiver never detected has the model of all receivers."""
+
+    name = "mri_receiver"
+
+    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+        self._receiver = train.receiver_position
+        detected = (~train.rssi_dbm.isnan()).any(dim=0)
+        own = fit_path_loss(log_distance(train.transmitter_position, train.receiver_position), train.rssi_dbm)
+        self._path_loss = own.where(detected, _fit_shared(train, train))
+
+
+def _fit_shared(rows: Rssi, applied: Rssi) -> PathLoss:
+    distance = log_distance(rows.transmitter_position, rows.receiver_position)
+    return fit_shared_path_loss(distance, rows.rssi_dbm, rows.receiver_located, applied.receiver_located)
 
 
 class ReceiverRegressors(RssiPredictor):
@@ -143,3 +225,73 @@ def choose_neighbours(x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> K
             errors[k, weights] += float(np.abs(predicted - y[out]).mean()) / len(numbers)
     k, weights = min(errors, key=lambda setting: errors[setting])
     return KNeighborsRegressor(k, weights=weights, algorithm=NEIGHBOUR_SEARCH).fit(x, y)
+
+
+class PairKNN(PairPredictor):
+    """Inverse-distance mean of the k nearest measured pairs of positions; k by cross-validation in the training rows."""
+
+    name = "knn_pairs"
+
+    def _fit_pairs(self, pair: Tensor, rssi: Tensor, fold: Tensor) -> None:
+        self._regressor = choose_neighbours(pair.numpy(), rssi.numpy(), fold.numpy())
+
+    def _at_pairs(self, pair: Tensor) -> tuple[Tensor, None]:
+        if not len(pair):  # scikit-learn refuses it
+            return pair.new_zeros(0), None
+        return from_numpy(self._regressor.predict(pair.detach().numpy())), None
+
+
+@configuration
+class BlendConfig(FieldConfig):
+    """Options of `Blend`."""
+
+    members: tuple[str, ...] = ("swiftwrf", "gp", "knn", "mri_residual")
+    """names of the predictors; those whose requirements the data do not meet are left out"""
+    member_preset: Preset = "quick"
+    """preset of the members"""
+
+    @classmethod
+    def paper(cls, **changes: Any) -> BlendConfig:
+        """Return a blend of members with published settings."""
+        return replace(cls(member_preset="paper"), **changes)
+
+
+class Blend(RssiPredictor):
+    """A weighted mean of other predictors, weights by cross-validation.
+
+    The weights, the same at all receivers, have the lowest mean absolute error on held-out training rows (stacking).
+    """
+
+    name = "blend"
+    config_type = BlendConfig
+    slow = True
+
+    weights: dict[str, float]
+    """weight of each member, set by `fit`"""
+
+    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+        names = [name for name in self.config.members if not RSSI_PREDICTORS[name].lacking(train)]
+        fold = folds(train.transmitter_position, self.config.validation, self.config.seed, session=train.session)
+        held_out = torch.full((len(names), *train.rssi_dbm.shape), torch.nan, dtype=torch.float64)
+        for number in fold.unique():
+            out = fold == number
+            position = train.transmitter_position[out]
+            for i, name in enumerate(names):
+                held_out[i, out] = self._member(name, train, context, ~out).predict(position).mean.double()
+        self.weights = dict(zip(names, mixing_weights(held_out, train.rssi_dbm).tolist(), strict=True))
+        every = torch.ones_like(fold, dtype=torch.bool)
+        self._members = {name: self._member(name, train, context, every) for name in names if self.weights[name] > 0}
+
+    def _member(self, name: str, train: Rssi, context: RssiFitContext, kept: Tensor) -> RssiPredictor:
+        """Return a member, fitted to the kept rows (rows,)."""
+        rows = kept.nonzero()[:, 0]
+        member = make_predictor(
+            name, self.config.member_preset, validation=self.config.validation, seed=self.config.seed
+        )
+        return member.fit(
+            train.subset(rows), pool=context.pool.subset(rows), device=context.device, parallel=context.parallel
+        )
+
+    def _predict(self, position: Tensor) -> tuple[Tensor, None]:
+        parts = [self.weights[name] * member.predict(position).mean.double() for name, member in self._members.items()]
+        return torch.stack(parts).sum(dim=0), None
