@@ -78,6 +78,7 @@ def _of_rssi(locator: RssiLocator, config: LocateConfig, source: str) -> Columns
             console.print(f"{data.name}: rows count as those of {offsets.column} {offsets.reference}")
         data = offsets.removed(data)
     data = aligned(data.about(origin), locator.receiver_names)
+    locator.model.check_measurements(data)
     kept = data.detected.any(dim=1)
     if not bool(kept.any()):
         raise InputError(f"no receiver of {config.model} detected the transmitter in any row of {source}")
@@ -136,11 +137,12 @@ def aligned(data: Rssi, names: tuple[str, ...]) -> Rssi:
     if others:
         console.print(f"{data.name}: receivers that the model does not have are not used: {listed(others)}")
     rssi = torch.full((len(data), len(names)), torch.nan, dtype=torch.float64)
+    position = torch.full((len(names), 3), torch.nan, dtype=torch.float64)
     for column, name in enumerate(names):
         if name in place:
             rssi[:, column] = data.rssi_dbm[:, place[name]]
-    unknown = torch.full((len(names), 3), torch.nan, dtype=torch.float64)
-    return replace(data, rssi_dbm=rssi, receiver_names=names, receiver_position=unknown)
+            position[column] = data.receiver_position[place[name]]
+    return replace(data, rssi_dbm=rssi, receiver_names=names, receiver_position=position)
 
 
 def _of_spectra(locator: MatchedField, config: LocateConfig, source: str) -> Columns:

@@ -225,6 +225,8 @@ def test_receivers_of_the_model_are_found_by_name(finished, tmp_path, capsys):
     assert placed.receiver_names == locator.receiver_names
     torch.testing.assert_close(placed.rssi_dbm[:, 1], data.rssi_dbm[:, 1], equal_nan=True)
     assert placed.detected[:, 2:].sum() == 0
+    torch.testing.assert_close(placed.receiver_position[1], data.receiver_position[1])
+    assert placed.receiver_position[[0, 2]].isnan().all()
     printed = " ".join(capsys.readouterr().err.split())
     assert "count as not detecting: receiver01" in printed
     assert "are not used: kitchen" in printed
@@ -264,6 +266,14 @@ def test_no_receiver_detected(finished, tmp_path, capsys):
         assert locate(finished / MODEL, "walk", "--out", tmp_path / "out.csv") == 0
     assert "left out: 19" in capsys.readouterr().err
     assert pd.read_csv(tmp_path / "out.csv")["index"].tolist() == [3]
+
+
+def test_receivers_that_moved_are_refused(finished, tmp_path, capsys):
+    data = rssi_room(n=20)
+    moved = replace(data, receiver_position=data.receiver_position + torch.tensor([0.0, 2.0, 0.0]))
+    with mock.patch("tasks.locate.observations.read_rssi", return_value=(moved, True)):
+        assert locate(finished / MODEL, "walk", "--out", tmp_path / "out.csv") == 2
+    assert "receiver01 2 m away from its position" in said(capsys)
 
 
 def test_positions_and_directions_of_spectra(matched, tmp_path, capsys):
