@@ -27,7 +27,6 @@ from swiftwrf.runtime.threads import set_threads
 from tasks.environment import machine, packages
 from tasks.run import choose_device
 from tasks.terminal import console
-from tasks.torchrun import process_count
 
 if TYPE_CHECKING:
     from distributed import Future
@@ -45,13 +44,11 @@ def connected(address: str | None, device: torch.device) -> Iterator[Cluster | N
     """Connect to the cluster of a scheduler. Yields None if there is no address.
 
     Raises:
-        InputError: The optional extra is missing, no scheduler or no worker answers, or torchrun started this process.
+        InputError: The optional extra is missing, or no scheduler or no worker answers.
     """
     if address is None:
         yield None
         return
-    if process_count() > 1:
-        raise InputError("--scheduler and torchrun both spread the steps of a run; use one of them")
     cluster = Cluster(address, device)
     try:
         yield cluster

@@ -171,13 +171,11 @@ def test_a_resumed_run_has_the_processes_of_now_with_the_threads_of_its_beginnin
     assert (recorded["threads"], recorded["processes"], recorded["resumed"][0]["processes"]) == (2, 4, processes)
 
 
-def test_one_process_with_one_thread_on_a_gpu_and_with_torchrun():
+def test_one_process_with_one_thread_and_on_a_gpu():
     assert number_of_processes(torch.device("cpu")) == 1
     with mock.patch("torch.get_num_threads", return_value=16):
         assert number_of_processes(torch.device("cpu")) == 4
         assert number_of_processes(torch.device("cuda")) == 1
-        with mock.patch("tasks.environment.process_count", return_value=2):
-            assert number_of_processes(torch.device("cpu")) == 1
     assert number_of_processes(torch.device("cpu"), 3) == 3
     with pytest.raises(InputError, match="--processes 2 is for steps on the CPU"):
         number_of_processes(torch.device("cuda"), 2)

@@ -17,7 +17,7 @@ from sklearn.model_selection import KFold
 from small import FIT, with_defaults
 
 from augment import Mixed, choose, cross_validation, sample_positions
-from augment.estimators import ESTIMATORS, aann, make_estimator, nadaraya_watson
+from augment.estimators import ESTIMATORS, make_estimator, nadaraya_watson
 from augment.estimators.aann import AANN, AANNConfig
 from augment.estimators.aann_kernel import AANNKernel, AANNKernelConfig
 from augment.estimators.baselines import Constant, NearestSpectrum, Peak
@@ -268,7 +268,7 @@ def test_convolutions_over_few_pixels_are_matrix_products(size, stride):
 @pytest.mark.parametrize(("spectra", "batch", "sizes"), [(11, 64, [5, 5, 5]), (11, 4, [4, 4, 4]), (3, 64, [1, 1, 1])])
 def test_batches_are_at_most_half_of_what_trains(room, monkeypatch, spectra, batch, sizes):
     found = []
-    monkeypatch.setattr(aann, "_train", lambda network, config, device, batches, *_: found.extend(batches) or [])
+    monkeypatch.setattr(AANN, "_train", lambda self, batches, *_: found.extend(batches) or [])
     AANN(steps=3, batch=batch).fit(Mixed.measured(room.subset(torch.arange(spectra))))
     assert [len(rows) for rows in found] == sizes
     assert not torch.equal(found[0], found[1])
