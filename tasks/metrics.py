@@ -163,13 +163,13 @@ class RssiMetrics(RunMetrics):
     """Metrics of a run of tasks.rssi.
 
     `notes` are those of the reader. `receivers` is by receiver and method, `left_out` is the reason why a method is missing.
-    `model` is the method whose maps and intervals the run contains. Results of earlier versions lack it.
+    `model` is the method whose maps and intervals the run contains.
     """
 
     notes: list[str]
 
     preset: str
-    model: NotRequired[str]
+    model: str
     overall: dict[str, PredictorMetrics]
     left_out: dict[str, str]
     receivers: dict[str, dict[str, ReceiverMetrics]]

@@ -53,7 +53,6 @@ class AANNKernel(AANN):
     """
 
     kind = "kernel regression on the features of an angular neural network"
-    former_kinds = ("angle-of-arrival network",)
     config_type = AANNKernelConfig
 
     def _fit(self, train: Mixed, device: torch.device) -> None:

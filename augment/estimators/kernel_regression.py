@@ -30,7 +30,6 @@ class KernelRegression(SavedEstimator):
     """
 
     kind = "kernel regression"
-    former_kinds = ("kernel ridge regression",)
 
     def _fit(self, train: Mixed, device: torch.device) -> None:
         rows = torch.from_numpy(kept_rows(len(train), self.config.seed))

@@ -91,14 +91,12 @@ class Saved(ABC):
     """Base class of fitted models that one file stores. A subclass with a `kind` is registered for `load`."""
 
     kind: ClassVar[str]
-    former_kinds: ClassVar[tuple[str, ...]] = ()
-    """kinds in files of earlier versions"""
     kinds: ClassVar[dict[str, type[Saved]]] = {}
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         if "kind" in cls.__dict__:
-            Saved.kinds |= dict.fromkeys((cls.kind, *cls.former_kinds), cls)
+            Saved.kinds[cls.kind] = cls
 
     @abstractmethod
     def state(self) -> tuple[dict[str, Tensor], Header]:

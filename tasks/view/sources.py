@@ -168,7 +168,7 @@ def _located(
 def _rssi_run(folder: Path) -> RssiView:
     file = folder / MODEL
     if not file.is_file():
-        raise InputError(f"{folder} holds no model: it has no {MODEL}; the run did not end, or is of an older version")
+        raise InputError(f"{folder} holds no model: it has no {MODEL}; the run did not end")
     model = load(file)
     if not isinstance(model, RssiModel):
         raise _not_shown(file, model)

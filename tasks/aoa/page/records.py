@@ -11,7 +11,6 @@ from pandas import DataFrame
 from swiftwrf.models import FIELD_MODELS
 from tasks import labels
 from tasks.aoa.condition import Condition, conditions_of
-from tasks.aoa.former import table_with_present_names, with_present_names
 from tasks.aoa.options import AUTO, fraction_key
 from tasks.metrics import AoaMetrics, MixMetrics
 from tasks.page.palette import Palette
@@ -42,8 +41,7 @@ class FractionRecords:
     @cached_property
     def mix(self) -> MixMetrics:
         """Metrics of the measured fraction."""
-        metrics: MixMetrics = with_present_names(self.run.metrics["mixes"][self.key])
-        return metrics
+        return self.run.metrics["mixes"][self.key]
 
     @cached_property
     def conditions(self) -> dict[str, Condition]:
@@ -57,7 +55,7 @@ class FractionRecords:
 
     def table(self, name: str) -> DataFrame:
         """Return the rows of a table of the run, e.g. `errors`, with this measured fraction."""
-        return table_with_present_names(of_fraction(self.run.table(name), self.key))
+        return of_fraction(self.run.table(name), self.key)
 
     def synthesizers(self, methods: Iterable[str]) -> list[str]:
         """Return the field models behind these methods, that of the first repeat where repeats chose differently."""
@@ -92,9 +90,8 @@ class FractionRecords:
 
 
 def of_fraction(table: DataFrame, key: str) -> DataFrame:
-    """Return the rows of a measured fraction. Older runs call the column `mix`."""
-    column = table["measured_fraction" if "measured_fraction" in table else "mix"]
-    return table[[fraction_key(float(text)) == key for text in column]]
+    """Return the rows of a measured fraction."""
+    return table[[fraction_key(float(text)) == key for text in table["measured_fraction"]]]
 
 
 def palette(conditions: Iterable[Condition]) -> Palette:

@@ -77,7 +77,7 @@ def _comparison(runs: list[RssiRecords]) -> Summary:
 
 
 def _errors(run: RssiRecords) -> Section:
-    left_out = [f"Left out: {reason}." for reason in run.metrics.get("left_out", {}).values()]
+    left_out = [f"Left out: {reason}." for reason in run.metrics["left_out"].values()]
     plots = [errors.distribution(run)]
     if len(run.metrics["receivers"]) > 1:
         plots.append(errors.differences(run))
