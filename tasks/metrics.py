@@ -5,10 +5,11 @@ Units are degrees, dB and seconds. A number that does not exist is nan here and 
 
 from __future__ import annotations
 
-from typing import Literal, NotRequired, TypedDict, get_args
+from typing import TYPE_CHECKING, Literal, NotRequired, TypedDict, get_args
 
-from augment.cross_validation import CrossValidationMetrics, EstimatorChoiceMetrics
-from swiftwrf.metrics import ChangeMetrics
+if TYPE_CHECKING:
+    from augment.cross_validation import CrossValidationMetrics, EstimatorChoiceMetrics
+    from swiftwrf.metrics import ChangeMetrics
 
 Angle = Literal["azimuth_deg", "elevation_deg", "great_circle_deg"]
 Score = Literal["psnr_db", "ssim", "l1"]

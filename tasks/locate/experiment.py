@@ -12,7 +12,6 @@ from swiftwrf import InputError, Rssi, rssi_room
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.locate.baselines import LEVELS
 from tasks.cluster import connected
-from tasks.locate.observations import write_positions
 from tasks.locate.options import LocateConfig
 from tasks.locate.page import page
 from tasks.locate.page.summary import answer
@@ -28,14 +27,11 @@ from tasks.terminal import console, terminal
 
 
 def run(config: LocateConfig, resume: Path | None = None) -> None:
-    """Run the experiment and write its directory, or write the positions of new observations.
+    """Run the experiment and write its directory.
 
     Raises:
         InputError: Data or options that do not exist or do not fit together.
     """
-    if config.model is not None:
-        write_positions(config)
-        return
     device = choose_device("cpu")
     data = measurements(config)
     for note in data.notes:
