@@ -161,7 +161,7 @@ def test_figures_of_constant_empty_and_single_values(values):
         room = Spectra(torch.full((n, 9, 36), 0.5), position, grid=AngularGrid.hemisphere(9, 36))
         rssi = Rssi(torch.full((n, 1), -60.0), position, receiver_position=position[:1])
         for data in (room, rssi):
-            found = inspection(data, "toys", Findings(), "source")
+            found = inspection(Findings(data), "toys", "source")
             drawn += [panel for plot in [*found.summary.plots, *found.sections[1].plots] for panel in plot.panels]
         colour_image(values[None], "viridis", values.min(), values.max())
     assert all(figures.as_svg(figure).endswith("</svg>\n") for figure in drawn)
