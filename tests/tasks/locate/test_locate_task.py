@@ -95,7 +95,7 @@ def test_baselines_locate_better_than_the_mean_position(name, validation):
 
 def test_a_known_fingerprint_is_located_where_it_was_measured():
     train = rssi_room(n=60)
-    with mock.patch("swiftwrf.locate.baselines.NEIGHBOUR_COUNTS", (1,)):
+    with mock.patch("swiftwrf.rssi.baselines.NEIGHBOUR_COUNTS", (1,)):
         located = LOCALIZERS["knn"]().fit(train).locate(train.rssi_dbm)
     torch.testing.assert_close(located.position, train.transmitter_position)
 
@@ -188,7 +188,7 @@ def test_rows_that_no_receiver_detected_are_left_out(tmp_path, capsys):
 
 def test_an_interrupted_run_goes_on_to_the_same_numbers(finished, tmp_path):
     out = tmp_path / "run"
-    with mock.patch.object(RegressedCoordinates, "_regress", side_effect=KeyboardInterrupt):
+    with mock.patch.object(RegressedCoordinates, "_fitted", side_effect=KeyboardInterrupt):
         assert run("--cells", 300, "--out", out) == 130
     partial = tmp_path / "run.partial"
     kept = {file.stem for file in (partial / "steps").iterdir()}
