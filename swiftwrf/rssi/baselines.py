@@ -27,9 +27,8 @@ from swiftwrf.rssi.pairs import PairPredictor
 from swiftwrf.rssi.paper import RssiPaperModel
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, fit_shared_path_loss, log_distance
 from swiftwrf.rssi.training import mixing_weights
-from swiftwrf.runtime.options import Preset
 from swiftwrf.runtime.threads import parallel_map
-from swiftwrf.runtime.validation import checked, configuration
+from swiftwrf.runtime.validation import Preset, checked, configuration
 
 MAX_TREE_COLUMNS = 15  # of coordinates whose neighbours a tree finds
 NEIGHBOUR_COUNTS = (1, 3, 5, 8, 12, 20, 40, 80, 120)

@@ -36,7 +36,6 @@ from swiftwrf.runtime.validation import configuration
 RATIOS = (0.5, 1.0, 2.0)  # distance that the receiver moves, relative to an equivalent one of the transmitter
 RELATIVE_NOISE_VARIANCES = (0.03, 0.1, 0.3, 1.0, 3.0)  # variance of a measurement relative to that of the field
 MAX_HELD_OUT = 500  # pairs that choose the kernel; more do not change it
-PAIRS_AT_ONCE = 2048  # each needs a matrix of 64 x 64
 
 
 @configuration
@@ -102,7 +101,7 @@ class PairPredictor(RssiPredictor):
         return mean.reshape(n, r), None if std is None else std.reshape(n, r)
 
     def _batches(self, pair: Tensor) -> tuple[Tensor, Tensor | None]:
-        parts = [self._at_pairs(some) for some in pair.split(PAIRS_AT_ONCE)]
+        parts = [self._at_pairs(some) for some in pair.split(2048)]  # each needs a matrix of 64 x 64
         stds = [std for _, std in parts if std is not None]
         return torch.cat([mean for mean, _ in parts]), torch.cat(stds) if stds else None
 

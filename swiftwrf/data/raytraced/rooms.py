@@ -25,7 +25,6 @@ THICKNESS_M = {  # of panels, walls and sheets by material
     "plasterboard": 0.025,
     "wood": 0.02,
 }
-DEFAULT_THICKNESS_M = 0.1
 FACES = [  # of a box, corners counted as x y z bits, counter-clockwise from outside
     (0, 1, 3, 2),
     (4, 6, 7, 5),
@@ -147,7 +146,7 @@ class FurnishedRoom:
             boxes = [box(piece.low, piece.high) for piece in self.furniture if piece.material == material]
             meshes[f"furniture-{material}"] = (material, boxes)
         return [
-            Surface.joined(name, Material(material, THICKNESS_M.get(material, DEFAULT_THICKNESS_M)), parts)
+            Surface.joined(name, Material(material, THICKNESS_M.get(material, 0.1)), parts)
             for name, (material, parts) in meshes.items()
         ]
 

@@ -28,10 +28,8 @@ from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.validation import NonNegativeInt, configuration
 
 SEARCH_RAYS = 30_000  # that search for chains of surfaces
-SCATTERED_RAYS = 300  # each is a path wherever it scatters
 BATCH_POSITIONS = 32  # chains share a table, which many positions would fill
 SAME_IMAGE_M = 1e-3  # distance below which two image sources are one, found twice
-DIFFUSE = 2  # Sionna's number of a scattering
 Table = dict[str, NDArray[Any]]
 MIN_LLVM = 19  # earlier ones abort the process when they compile a trace; tried: 15 and 16
 ISOTROPIC = {"num_rows": 1, "num_cols": 1, "pattern": "iso", "polarization": "V"}
@@ -228,7 +226,7 @@ def _trace_batch(held: Any, fixed: Tensor, position: Tensor, moving: Moving, tra
     _place(held, fixed, position)
     tables = [_solve(held, tracing, SEARCH_RAYS, diffuse=False)]
     if tracing.scattering:
-        tables.append(_solve(held, tracing, SCATTERED_RAYS, diffuse=True))
+        tables.append(_solve(held, tracing, 300, diffuse=True))  # each is a path wherever it scatters
     table = {name: np.concatenate([part[name] for part in tables]) for name in tables[0]}
     table = {name: values[np.lexsort((table["length"], table["owner"]))] for name, values in table.items()}
     order = np.isfinite(table["corner"][..., 0]).sum(axis=1)
@@ -288,7 +286,7 @@ def _solve(held: Any, tracing: Tracing, rays: int, diffuse: bool) -> Table:
     if depth:
         kind[..., :depth] = np.moveaxis(paths.interactions.numpy()[:, :, 0], 0, -1)
     if diffuse:
-        kept &= (kind == DIFFUSE).any(axis=-1)
+        kept &= (kind == 2).any(axis=-1)  # scatterings
     owner, path = np.nonzero(kept)
     corner = np.full((len(owner), tracing.order, 3), np.nan)
     if depth:
