@@ -148,7 +148,7 @@ def test_figures_of_constant_empty_and_single_values(values):
         lambda axes: figures.curves(axes, Palette(), {"a": (values, values)}, "x", "y"),
         lambda axes: figures.speed(axes, Palette(), {str(i): (x, x) for i, x in enumerate(values)}, "x", "y"),
         lambda axes: plotting.plan(position, torch.tensor(values), "value", axes),
-        lambda axes: plotting.plan_map(np.array([[0, 0], [1, 1]]), values[None] if n else np.zeros((1, 1)), "v", axes),
+        lambda axes: plotting.plan_map((0, 1, 0, 1), values[None] if n else np.zeros((1, 1)), "v", axes),
     ):
         figure, axes = figures.panel(4, 3)
         draw(axes)

@@ -29,7 +29,7 @@ from tasks.locate import experiment
 from tasks.locate.experiment import prepared
 from tasks.locate.observations import aligned, read_rssi
 from tasks.locate.options import LocateConfig
-from tasks.locate.steps import Localization, in_plan
+from tasks.locate.steps import Localization
 
 GRID = AngularGrid.hemisphere(8, 32)
 
@@ -295,17 +295,6 @@ def test_positions_and_directions_of_spectra(matched, tmp_path, capsys):
     assert "--grid 8 32" in said(capsys)
     assert locate(file, tmp_path / "unknown.npy", "--every", 2, "--out", tmp_path / "out.csv") == 2
     assert "--every does not apply" in said(capsys)
-
-
-def test_a_posterior_is_summed_over_height():
-    at = torch.tensor([[[0.0, 0, 0], [0, 0, 1], [1, 0, 0], [1, 2, 0]]], dtype=torch.float64)
-    posterior = mock.Mock(position=at, weight=torch.tensor([[0.2, 0.2, 0.4, 0.2]]).double(), resolution_m=0.3)
-    posterior.__len__ = lambda self: 1
-    xs, ys, density = in_plan(posterior)
-    assert density.shape == (1, len(ys), len(xs))
-    assert density[0, 0, 0] == pytest.approx(1)
-    assert density[0, -1, -1] == pytest.approx(0.5)
-    assert density[0, len(ys) // 2].isnan().all()
 
 
 def test_the_benchmark_measures_every_localizer(monkeypatch):
