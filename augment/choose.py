@@ -28,9 +28,7 @@ from swiftwrf.metrics import psnr
 from swiftwrf.models import FIELD_MODELS, FieldModel
 from swiftwrf.models.base import model_type
 
-MAX_TEST_SPECTRA = 1000  # predicted spectra of a fold; more do not change the choice
 BLIND_FOLDS = ((0, 1), (2, 3))  # pairs of folds that one structure search leaves out
-TRIMMED_FRACTION = 0.1  # of the held-out spectra with the lowest PSNR, and of those with the highest
 
 
 @dataclass(frozen=True)
@@ -169,7 +167,7 @@ def choose_model(
         except (InputError, FitError) as error:
             left_out[name] = str(error)
             continue
-        psnr_db[name] = float(trim_mean(torch.cat(score).numpy(), TRIMMED_FRACTION))
+        psnr_db[name] = float(trim_mean(torch.cat(score).numpy(), 0.1))  # of the highest and of the lowest
         found[name], seconds[name] = scored, spent
     if not psnr_db:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
@@ -213,4 +211,5 @@ def _without(fold: Tensor, *numbers: int) -> Tensor:
 def _split(measured: Spectra, fold: Tensor, number: int) -> tuple[Spectra, Spectra]:
     """Return training and test spectra of one fold."""
     test = (fold == number).nonzero()[:, 0]
-    return measured.subset(_without(fold, number)), measured.subset(*subsample(test, rows=MAX_TEST_SPECTRA))
+    test, *_ = subsample(test, rows=1000)  # more do not change the choice
+    return measured.subset(_without(fold, number)), measured.subset(test)

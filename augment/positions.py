@@ -19,7 +19,6 @@ MIN_RELATIVE_EXTENT = (
 )
 MIN_HULL_FRACTION = 1e-3  # smallest fraction of the convex hull that the region covers
 SPACING_NEIGHBOURS = 8  # nearest neighbours that define the typical spacing; the first alone is the step along a path
-SPACING_QUANTILE = 0.95  # quantile over the positions of the distance to that neighbour
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +92,7 @@ def sample_positions(known: Tensor, n: int, seed: int) -> Tensor:
     projected = ((known - centre) @ axes.T).numpy()
     places = known.unique(dim=0)
     distance, _ = nearest(places, places, min(SPACING_NEIGHBOURS + 1, len(places)))  # each is its own nearest
-    spacing = float(distance[:, -1].quantile(SPACING_QUANTILE))
+    spacing = float(distance[:, -1].quantile(0.95))
     samples, tried = torch.empty(0, 3, dtype=torch.float64), 0
     while len(samples) < n:
         inside = torch.from_numpy(_sample_hull(projected, 2 * n, generator)) @ axes + centre

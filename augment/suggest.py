@@ -18,8 +18,6 @@ from swiftwrf.positions import nearest
 
 N_CANDIDATE_POSITIONS = 1500  # positions that are compared
 MAX_MEASURED_POSITIONS = 2000  # measured positions that the variance is conditioned on
-N_SIMULATED_ROWS = 400  # rows of RSSI whose expected position errors are computed
-N_AVERAGED_ROWS = 8  # rows nearest to a candidate, whose mean error is the candidate's
 BATCH_ROWS = 128  # rows whose posteriors are in memory together
 
 
@@ -104,9 +102,9 @@ def suggest_positions(locator: RssiLocator, train: Rssi, count: int, seed: int =
         raise InputError(
             f"{count} positions cannot be chosen among {len(candidate)} cells; fit the locator with more cells"
         )
-    at = candidate[torch.arange(min(N_SIMULATED_ROWS, len(candidate)))]
+    at = candidate[torch.arange(min(400, len(candidate)))]
     error = _expected_errors(locator, at, generator)
-    _, number = nearest(candidate, at, min(N_AVERAGED_ROWS, len(at)))
+    _, number = nearest(candidate, at, min(8, len(at)))
     weight = error[number].square().mean(dim=1).clamp_min(1e-12)
     (known,) = subsample(train.transmitter_position, rows=MAX_MEASURED_POSITIONS)
     chosen, variance = most_informative(locator.model.kernel, known, candidate, count, weight)

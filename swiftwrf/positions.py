@@ -14,7 +14,6 @@ from swiftwrf.errors import InputError
 MAX_COORDINATE_M = 1e9  # of a position: beyond, float64 does not resolve a wavelength
 MAX_COORDINATE = 1e15
 MAX_NORMALISED = 1e6  # normalised: beyond, all is equally far, and float32 must not overflow
-BISECTIONS = 20  # of the edge of cells, which find it to a millionth of the extent
 MIN_TREE_POSITIONS = 2000  # known positions from which on a tree finds the nearest ones faster than all distances do
 
 
@@ -138,7 +137,7 @@ def cells(position: Tensor, n: int) -> tuple[Tensor, float]:
         return spot, 0.0
     local = position - position.min(dim=0).values
     fine, coarse, found = 0.0, float(local.max()), torch.zeros(len(position), dtype=torch.int64)
-    for _ in range(BISECTIONS):
+    for _ in range(20):  # to a millionth of the extent
         edge = (fine + coarse) / 2
         number = torch.unique((local / edge).floor().long(), dim=0, return_inverse=True)[1]
         if int(number.max()) < n:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from swiftwrf.runtime.options import Preset
 from swiftwrf.runtime.threads import to_device
+from swiftwrf.runtime.validation import Preset
 from tasks.directory import Run
 from tasks.records import Row
 from tasks.terminal import console

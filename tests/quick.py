@@ -90,7 +90,7 @@ def quick() -> Iterator[None]:
         mock.patch.object(rssi, "rssi_room", return_value=floor),
         mock.patch.object(locate, "rssi_room", return_value=rssi_room(n=80)),
         mock.patch.object(RssiModel, "config_type", QuickRssiConfig),
-        mock.patch("tasks.rssi.experiment.MAP_CELLS", 8),
+        mock.patch("swiftwrf.rssi.maps.CELLS", 8),
         mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
         mock.patch.object(RSSI_PREDICTORS, "_registered", {name: RSSI_PREDICTORS[name] for name in PREDICTORS_KEPT}),
     ):

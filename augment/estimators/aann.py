@@ -22,9 +22,8 @@ from augment.estimators.resnet import backbone
 from swiftwrf.array.angles import to_angles, to_direction
 from swiftwrf.data.spectra import coarsening
 from swiftwrf.runtime.checkpoint import Header, expect
-from swiftwrf.runtime.options import Preset
 from swiftwrf.runtime.progress import progress
-from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, PositiveInt, configuration
+from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, PositiveInt, Preset, configuration
 
 MIN_ROWS = 8  # fewest elevations after averaging; a prime number of rows could only be averaged to one
 EVALUATIONS = 30  # of each spectrum of a scene in a quick training

@@ -12,9 +12,8 @@ from torch import Tensor
 from augment import Mixed
 from swiftwrf import AngularGrid, InputError, Spectra
 from swiftwrf.runtime.checkpoint import Header, Saved
-from swiftwrf.runtime.options import Preset
 from swiftwrf.runtime.registry import Registry
-from swiftwrf.runtime.validation import NonNegativeInt, configuration
+from swiftwrf.runtime.validation import NonNegativeInt, Preset, configuration
 
 
 @configuration

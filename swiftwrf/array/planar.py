@@ -21,9 +21,6 @@ from swiftwrf.runtime.validation import PositiveFloat, check_value, checked
 LIGHT_SPEED = 299_792_458.0  # [m / s]
 MAX_ELEMENTS = 4096  # of an array: the co-array grows with their square
 MAX_BASIS_VALUES = 2**28  # of the co-array's basis functions on a grid: 2 GiB
-LAG_TOLERANCE_WAVELENGTHS = 1e-6  # closer differences of element positions are one
-OPPOSITE_TOLERANCE_WAVELENGTHS = 1e-2  # between an element and the mirror image of another one
-LINE_TOLERANCE_WAVELENGTHS = 1e-2  # between the elements of a linear array and their line
 Side = Annotated[int, Ge(1), Le(MAX_ELEMENTS)]
 BATCH_SPECTRA, MAX_ELEMENT_PAIRS = 256, 2**24  # in double precision at a time
 
@@ -120,7 +117,7 @@ class PlanarArray:
         """
         centre = (self.element.amax(dim=0) + self.element.amin(dim=0)) / 2
         apart, number = torch.cdist(2 * centre - self.element, self.element).min(dim=1)
-        return number if bool((apart < OPPOSITE_TOLERANCE_WAVELENGTHS * self.wavelength).all()) else None
+        return number if bool((apart < 1e-2 * self.wavelength).all()) else None
 
     @cached_property
     def axis(self) -> Tensor | None:
@@ -128,7 +125,7 @@ class PlanarArray:
         offset = self.element.double() - self.element.double().mean(dim=0)
         _, size, axes = torch.linalg.svd(offset, full_matrices=True)
         beside = float((offset @ axes[1]).abs().max())
-        if float(size[0]) == 0 or beside > LINE_TOLERANCE_WAVELENGTHS * self.wavelength:
+        if float(size[0]) == 0 or beside > 1e-2 * self.wavelength:
             return None
         first = axes[0] * torch.sign(axes[0][axes[0].abs().argmax()])
         return torch.nn.functional.pad(first, (0, 1))
@@ -229,7 +226,7 @@ def _lags(array: PlanarArray) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the half co-array (P, 2) [wavelengths], and the pairs of elements a, b with their index in it."""
     element = array.element.double() / array.wavelength
     every = (element[:, None] - element).reshape(-1, 2)
-    rounded = torch.round(every / LAG_TOLERANCE_WAVELENGTHS)
+    rounded = torch.round(every / 1e-6)  # closer differences are one
     rounded, group, count = rounded.unique(dim=0, return_inverse=True, return_counts=True)
     mean = torch.zeros_like(rounded).index_add(0, group, every) / count[:, None]
     first = (rounded[:, 0] > 0) | ((rounded[:, 0] == 0) & (rounded[:, 1] > 0))

@@ -26,11 +26,7 @@ from swiftwrf.errors import InputError
 
 Method = Callable[[PlanarArray, Tensor], Tensor]  # (array, covariance (n, K, K)) to direction cosines (n, d)
 
-POINTS_PER_BEAM = 8  # of the search, along the width of a beam of the whole array
-NEWTON_STEPS = 12
-TINY_CURVATURE = 1e-12  # of the objective, below which it counts as flat
 EDGE = 1e-9  # distance of direction cosines from the unit circle within which they are on it
-MAX_ESPRIT_SHIFT = 0.51  # wavelengths, beyond which phases are ambiguous, not only near the plane or the axis
 BATCH_ROWS, BATCH_VALUES = 256, 2**24  # covariances at a time, and basis values at a time
 
 
@@ -125,7 +121,7 @@ def _shifts(array: PlanarArray) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
     lag = differences(array) @ _axes(array)
     first, second, number = pairs(array)
     n_pairs = number.bincount(minlength=len(lag))
-    usable = lag.norm(dim=1) <= MAX_ESPRIT_SHIFT
+    usable = lag.norm(dim=1) <= 0.51  # beyond, phases are ambiguous, not only near the plane or the axis
     order = sorted(usable.nonzero()[:, 0].tolist(), key=lambda n: (-int(n_pairs[n]), float(lag[n].norm())))
     chosen = order[:1]
     if lag.shape[1] == 2 and chosen:
@@ -147,7 +143,8 @@ def _maximum(array: PlanarArray, matrix: Tensor) -> Tensor:
     """
     coefficient, lag = array.coefficients(matrix), differences(array) @ _axes(array)
     element = array.element.double() @ _axes(array) / array.wavelength
-    step = 1 / (POINTS_PER_BEAM * float((element.amax(dim=0) - element.amin(dim=0)).max()))
+    # 8 points along the width of a beam of the whole array
+    step = 1 / (8 * float((element.amax(dim=0) - element.amin(dim=0)).max()))
     axis = torch.linspace(-1, 1, 2 * math.ceil(1 / step) + 1, dtype=torch.float64)
     grid = torch.cartesian_prod(*[axis] * lag.shape[1]).reshape(-1, lag.shape[1])
     grid = grid[grid.norm(dim=1) <= 1]
@@ -170,12 +167,12 @@ def _basis(lag: Tensor, cosine: Tensor) -> Tensor:
 def _ascended(coefficient: Tensor, lag: Tensor, cosine: Tensor, largest: float) -> tuple[Tensor, Tensor]:
     """Return local maxima from direction cosines (n, d), by Newton steps of at most `largest`, and their values (n,)."""
     _, even, odd = coefficient.split([1, len(lag), len(lag)], dim=-1)
-    for _ in range(NEWTON_STEPS):
+    for _ in range(12):
         phase = math.tau * cosine @ lag.T
         gradient = math.tau * (odd * phase.cos() - even * phase.sin()) @ lag
         hessian = -(math.tau**2) * torch.einsum("np,pi,pj->nij", even * phase.cos() + odd * phase.sin(), lag, lag)
         curvature, axes = torch.linalg.eigh(hessian)
-        along = (gradient[:, None] @ axes)[:, 0] / curvature.abs().clamp_min(TINY_CURVATURE)
+        along = (gradient[:, None] @ axes)[:, 0] / curvature.abs().clamp_min(1e-12)
         step = (axes @ along[..., None])[..., 0]
         cosine = cosine + step * (largest / step.norm(dim=-1, keepdim=True).clamp_min(1e-300)).clamp_max(1)
         cosine = cosine / cosine.norm(dim=-1, keepdim=True).clamp_min(1)

@@ -13,7 +13,6 @@ from swiftwrf.comparison.base import TrainedModel, Training, draw_parameters
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.errors import InputError
 
-MAX_HALVINGS = 4
 MIN_HALVED_PIXELS = 4  # rows or columns that are still halved
 
 Shape = tuple[int, int]
@@ -28,7 +27,7 @@ def stages(grid: AngularGrid) -> list[Shape]:
         InputError: The spectra are too small.
     """
     shapes = [grid.shape]
-    while len(shapes) <= MAX_HALVINGS and min(shapes[-1]) >= MIN_HALVED_PIXELS:
+    while len(shapes) <= 4 and min(shapes[-1]) >= MIN_HALVED_PIXELS:
         shapes.append((-(-shapes[-1][0] // 2), -(-shapes[-1][1] // 2)))
     if len(shapes) == 1:
         least, found = MIN_HALVED_PIXELS, " x ".join(map(str, grid.shape))

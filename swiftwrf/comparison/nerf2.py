@@ -37,7 +37,6 @@ from swiftwrf.models.base import FIXED_END
 from swiftwrf.models.mlp import SkipMLP, encode
 from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
 
-MAX_SAMPLES_AT_ONCE = 2**19  # samples of the field evaluated at a time, which bounds the memory
 MAX_SAMPLES_ON_CPU = 2**16  # the same on a CPU: layers of more samples leave its caches
 PATH_GAIN = 0.025  # [m] amplitude times distance, from the publication's code
 FIRST_PHASE = 1.0  # [rad], from the publication's code
@@ -213,7 +212,7 @@ class NeRF2(TrainedModel):
 
     def render(self, network: Field, position: Tensor, grid: AngularGrid) -> Tensor:
         ends, direction = self.ends(position, position.device), self._to_world(grid, position.device)
-        samples = MAX_SAMPLES_ON_CPU if direction.device.type == "cpu" else MAX_SAMPLES_AT_ONCE
+        samples = MAX_SAMPLES_ON_CPU if direction.device.type == "cpu" else 2**19  # bounds the memory
         parts = direction.split(max(1, samples // (len(position) * self.config.samples)))
         magnitudes = [self._magnitude(network, *ends, part[None]) for part in parts]
         return torch.cat(magnitudes, dim=1).reshape(-1, *grid.shape)

@@ -31,8 +31,7 @@ from swiftwrf.models.base import check_finite
 from swiftwrf.positions import frame, normalise
 from swiftwrf.rssi.base import RssiFitContext, RssiPredictor, fingerprint
 from swiftwrf.runtime.checkpoint import Header, Saved, expect
-from swiftwrf.runtime.options import from_plain
-from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
+from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration, from_plain
 
 
 @configuration

@@ -51,7 +51,6 @@ from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, PositiveI
 SHAPES = ("log_scale", "quaternion", "opacity")  # of the Gaussians, in the order of the optimiser's first groups
 MIN_AXIS_DISTANCE = 1e-6  # relative to the distance; limits d azimuth near the axis
 FIRST_OPACITY = 0.1
-SSIM_WEIGHT = 0.2
 CUTOFF = 1e-4
 MIN_DISTANCE_M = 1e-3  # between a Gaussian and the array
 # densification: steps at which Gaussians are doubled and removed, and opacities reset
@@ -270,7 +269,7 @@ class GaussianTraining(Training[nn.ModuleDict]):
         mean, cholesky = self.owner.project(network, position)
         self.projected = mean.requires_grad_(self.owner.config.grows)
         predicted = self.owner.rasterize(network, position, mean, cholesky, self.grid)
-        return spectrum_loss(predicted, self.spectrum[row.to(predicted.device)], SSIM_WEIGHT)
+        return spectrum_loss(predicted, self.spectrum[row.to(predicted.device)], 0.2)
 
     def advance(self) -> Tensor:
         loss = super().advance()

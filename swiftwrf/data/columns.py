@@ -47,11 +47,8 @@ MIN_RSSI_DBM, MAX_RSSI_DBM = -150.0, 30.0
 # a frequent value from -1 dBm on is a filler, unless values within 10 dB are as frequent
 STRONG_DBM, STRONG_GAP_DB = -1.0, 10.0
 N_NEIGHBOURS_DB = 5  # of the next stronger values that a filler at the lower edge is compared with
-MIN_FREQUENCY_RATIO = 3.0  # of a filler to the values beside it
 MIN_REPEATS = 5  # cells with a filler that is not known
 MIN_VALUES = 5  # different values that are left
-MIN_EDGE_SHARE = 0.2  # of the least value of a receiver that may stand for not detected
-MIN_RECEIVER_SHARE = 0.5  # of the receivers, more of which have the filler: near ones detect every row
 
 
 def column_of(table: pd.DataFrame, role: str, columns: Mapping[str, str]) -> str | None:
@@ -209,7 +206,7 @@ def has_frequent_edge(rssi: Floats) -> bool:
         True
     """
     value, count = np.unique(rssi, return_counts=True)
-    if len(value) <= MIN_VALUES or int(count[0]) < MIN_EDGE_SHARE * len(rssi):
+    if len(value) <= MIN_VALUES or int(count[0]) < 0.2 * len(rssi):
         return False
     return _is_frequent(value, count, 0, N_NEIGHBOURS_DB)
 
@@ -219,7 +216,7 @@ def _is_frequent(value: Floats, count: NDArray[np.int64], index: int, within_db:
     near = np.abs(value - value[index]) <= within_db
     near[index] = False
     bins = np.bincount((value[near] - value[index] + within_db).round().astype(int), count[near], minlength=1)
-    return bool(count[index] > MIN_FREQUENCY_RATIO * bins.max())
+    return bool(count[index] > 3.0 * bins.max())
 
 
 def _fills_the_lower_edge(rssi: Floats, value: Floats, count: NDArray[np.int64]) -> bool:
@@ -227,7 +224,7 @@ def _fills_the_lower_edge(rssi: Floats, value: Floats, count: NDArray[np.int64])
     if len(value) <= MIN_VALUES or count[0] < MIN_REPEATS or not _is_frequent(value, count, 0, N_NEIGHBOURS_DB):
         return False
     weakest = np.where((rssi >= MIN_RSSI_DBM) & (rssi <= MAX_RSSI_DBM), rssi, np.inf).min(axis=0)
-    return bool((weakest[np.isfinite(weakest)] == value[0]).mean() > MIN_RECEIVER_SHARE)
+    return bool((weakest[np.isfinite(weakest)] == value[0]).mean() > 0.5)  # near receivers detect every row
 
 
 def without_fillers(rssi: Floats, fillers: list[float]) -> tuple[Floats, list[str]]:

@@ -17,7 +17,6 @@ Floats = NDArray[np.float64]
 Coordinates = Literal["degrees", "metres"]
 FAR_RATIO = 10.0  # distance of the origin relative to the distance between positions, or to their extent
 MAX_EXTENT_DEG = 2.0  # of positions that are recognised as degrees
-MAX_FINE_EXTENT = 0.05  # extent that is a walk in degrees (5 km), and none in metres (5 cm)
 NO_FIX = (
     0.0,
     -1.0,
@@ -164,7 +163,7 @@ def degrees_in(
         return degrees
     if not named and (distance <= FAR_RATIO * extent or extent == 0 or extent > MAX_EXTENT_DEG):
         return None
-    if not named and extent <= MAX_FINE_EXTENT:
+    if not named and extent <= 0.05:  # a walk in degrees (5 km), and none in metres (5 cm)
         return degrees
     raise InputError(
         f"{columns} extend over {extent:.3g} and may be degrees or metres; choose --coordinates degrees or "

@@ -15,9 +15,6 @@ from swiftwrf.choices import Moving
 from swiftwrf.data.spectra import GRID, Spectra, array_spectra, check_pixels
 from swiftwrf.errors import InputError
 
-ARRAY_SIDE = 4  # elements, of the array that is assumed
-CARRIER_TOLERANCE = 1e-3  # relative difference between the carriers of paths and array
-
 
 @dataclass(frozen=True, eq=False)
 class PropagationPaths:
@@ -122,8 +119,8 @@ class PropagationPaths:
         """
         grid = grid or GRID
         check_pixels(name, len(self.count), grid)
-        array, wavelength = array or PlanarArray.square(ARRAY_SIDE, self.frequency_hz), LIGHT_SPEED / self.frequency_hz
-        if abs(array.wavelength - wavelength) > CARRIER_TOLERANCE * wavelength:
+        array, wavelength = array or PlanarArray.square(4, self.frequency_hz), LIGHT_SPEED / self.frequency_hz
+        if abs(array.wavelength - wavelength) > 1e-3 * wavelength:
             raise InputError(
                 f"{name} has a carrier of {self.frequency_hz:.6g} Hz, but the array was given with a wavelength of "
                 f"{array.wavelength:.4g} m, not {wavelength:.4g} m"

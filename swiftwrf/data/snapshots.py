@@ -19,7 +19,6 @@ from swiftwrf.errors import InputError, ranges
 from swiftwrf.positions import to_tensor
 from swiftwrf.runtime.validation import checked
 
-NULL_TOLERANCE = 1e-3  # relative difference between values of a null subcarrier
 SPACING_WAVELENGTHS = (0.01, 20.0)  # of neighbouring elements: beyond, positions are in another unit than metres
 
 
@@ -178,7 +177,7 @@ def without_null(channel: Tensor, drop: bool) -> tuple[Tensor, tuple[str, ...]]:
         (..., ('null subcarriers, the same at every position and element, are left out (1 of 4, counted from 0): 2',))
     """
     first = channel[:1, :, :1]
-    null = ((channel - first).abs() <= NULL_TOLERANCE * first.abs()).all(dim=2).all(dim=0)
+    null = ((channel - first).abs() <= 1e-3 * first.abs()).all(dim=2).all(dim=0)
     if not bool(null.any()) or bool(null.all()) or len(channel) < 2:
         return channel, ()
     which = f"({int(null.sum())} of {len(null)}, counted from 0): {ranges(null.nonzero()[:, 0].tolist())}"

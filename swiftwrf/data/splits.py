@@ -17,8 +17,6 @@ from swiftwrf.runtime.validation import PositiveInt, checked
 TEST_SHARE = 0.2
 MIN_TRAINING = 10  # measurements
 MAX_REPEATED = 0.1  # fraction of test rows at training positions, beyond which a split tests look-up
-REPEATED_SPACING = 0.02  # distance of positions that count as one, relative to the mean spacing
-MAX_INDEX_DIGITS = 18
 FOLDS = 5
 
 Validation = Literal["random", "block", "session"]
@@ -63,7 +61,7 @@ def _read_indices(file: Path, n: int, first: int) -> list[int]:
     rows: dict[int, None] = {}
     for line, text in enumerate(read_text(file).split(), start=1):
         digits = text.lstrip("0") or "0"
-        if not (text.isascii() and text.isdecimal() and len(digits) <= MAX_INDEX_DIGITS):
+        if not (text.isascii() and text.isdecimal() and len(digits) <= 18):
             raise InputError(f"{file} entry {line} is {text!r}; expected a whole number, {first} to {n - 1 + first}")
         row = int(digits) - first
         if not 0 <= row < n:
@@ -147,7 +145,7 @@ def repeated_fraction(train: Tensor, test: Tensor) -> float:
     sides = (train.amax(dim=0) - train.amin(dim=0)).sort(descending=True).values
     spacing = math.sqrt(float(sides[0] * sides[1]) / len(train))
     distance, _ = cKDTree(train.numpy()).query(test.numpy())
-    return float((distance <= REPEATED_SPACING * spacing).mean())
+    return float((distance <= 0.02 * spacing).mean())
 
 
 def slabs(position: Tensor, n_slabs: int) -> Tensor:

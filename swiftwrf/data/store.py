@@ -31,7 +31,6 @@ MIN_FILE_SPECTRA = 20_000  # from which on spectra are stored in a file
 MAX_MEMORY_PIXELS = 2**29  # 2 GiB of float32
 MAX_FILE_PIXELS, MAX_FINE_PIXELS = 2**34, 2**20  # of all spectra, and of each where they exceed the memory
 BATCH_PIXELS = 2**26  # converted to float32 at a time: 256 MiB
-MAX_UNUSED_DAYS = 30  # after which a file of the cache is deleted
 TYPES = {torch.uint8: np.uint8, torch.float16: np.float16, torch.float32: np.float32}
 
 
@@ -203,5 +202,5 @@ def _prune(folder: Path) -> None:
     """Remove files that were not used for a month, and unfinished files of processes that were killed."""
     for file in folder.glob("*spectra-*"):
         with suppress(OSError):  # another process may be faster
-            if time.time() - file.stat().st_mtime > MAX_UNUSED_DAYS * 86_400:
+            if time.time() - file.stat().st_mtime > 30 * 86_400:
                 file.unlink()

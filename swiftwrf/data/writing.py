@@ -27,7 +27,6 @@ from swiftwrf.errors import InputError
 from swiftwrf.runtime.durable import replacing, write_bytes, write_text
 
 DEEPMIMO_PAIR = "t000_tx000_r001"  # transmitter and receivers, as file names contain them
-DIRECT_TOLERANCE = 1e-6  # relative difference between the length of a direct path and the distance
 
 
 def write_spectra(data: Spectra, folder: Path) -> None:
@@ -141,7 +140,7 @@ def write_deepmimo(paths: PropagationPaths, folder: Path) -> None:
         )
     distance = (paths.transmitter - paths.receiver).norm(dim=1)
     away = (paths.length / distance[paths.owner] - 1).abs()
-    direct = paths.line_of_sight[paths.owner] & (away < DIRECT_TOLERANCE)
+    direct = paths.line_of_sight[paths.owner] & (away < 1e-6)  # from rounding
     azimuth, _ = to_angles(paths.direction)
     zenith = paths.direction[:, 2].clamp(-1, 1).acos()  # beyond 90 degrees for paths from below
     columns = {

@@ -24,7 +24,6 @@ from swiftwrf.errors import InputError
 from swiftwrf.runtime.durable import cache_folder, refusing_unwritable, rename, write_text
 
 FOLDER = "SWIFTWRF_DATA"  # environment variable with a folder of converted data sets
-PAGE = "README.md"
 CHECKSUMS = Path(__file__).parent / "checksums"
 
 
@@ -208,7 +207,7 @@ def _convert(name: str, data: DataSet, folder: Path) -> None:
     try:
         data.convert(raw, unfinished)
         page = f"# {name}\n\n{data.content}\n\nSource: {data.url}\nLicence: {data.licence}\nCite: {data.citation}\n"
-        write_text(unfinished / PAGE, f"{page}Converted from the raw files by swiftwrf.datasets.\n")
+        write_text(unfinished / "README.md", f"{page}Converted from the raw files by swiftwrf.datasets.\n")
         if not folder.exists():
             rename(unfinished, folder)
     finally:

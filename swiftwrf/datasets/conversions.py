@@ -35,7 +35,6 @@ PICKLED = {  # names in the pickled tables of NeWRF; others are refused
     ("pandas.core.internals.managers", "BlockManager"),
 }
 S23_TRAINING = 160  # spectra before the block of the path that tests
-EVENT_GAP_S = 0.1  # between the receptions of two advertisements
 WEAKEST_DBM = -99.9  # in place of received values that stand for not detected in the layout
 TAG_HEIGHT_M = 1.3
 KOLAK_CELL_M = 1.5
@@ -43,8 +42,6 @@ KOLAK_TEST_CELLS = ((0, 4), (2, 2), (2, 4), (3, 3), (4, 4))
 LORA_GATEWAY = (-21.7788416255599, -43.373362355391, 932.0)  # latitude, longitude [deg], altitude [m]
 METRES_PER_DEGREE = (110_574.0, 111_320.0)  # of latitude, and of longitude at the equator
 WIFI_GRID_M = 0.6
-WIFI_UNDETECTED_DBM = -200
-WIFI_MIN_PACKETS = 10
 # x and y in cells of the grid, and the columns of their RSSI: AP1 is never received in the corridor
 WIFI_ACCESS_POINTS: dict[str, tuple[list[float], list[float], list[int]]] = {
     "office": ([1, 11, 15, 20, 25], [5, -1, 6, -1, 5], [1, 2, 3, 4, 5]),
@@ -109,7 +106,7 @@ def tetam_tracks(raw: Path, out: Path) -> None:
     for file in sorted(raw.glob("trk/*_all_sensors.mbd")):
         part = pd.read_csv(file, header=None, usecols=range(7), names=columns, dtype={"receiver": str})
         part = part[part["rssi"] < 0].sort_values("time", kind="stable")
-        part["event"] = (part["time"].diff() > EVENT_GAP_S).cumsum()
+        part["event"] = (part["time"].diff() > 0.1).cumsum()  # between two advertisements
         parts.append(part.assign(track=file.name.removesuffix("_all_sensors.mbd")))
     packets = pd.concat(parts)
     events = packets.groupby(["track", "event"], sort=False)
@@ -194,8 +191,8 @@ def wifi_room(raw: Path, out: Path, room: str) -> None:
     for part in ("train", "test"):
         table = pd.read_csv(raw / f"data/database_{room.replace('-', '_')}_{part}.csv")
         rssi = table[[f"AP{number} RSS(dBm)" for number in columns]]
-        grouped = rssi.where(rssi != WIFI_UNDETECTED_DBM).groupby([table["X"], table["Y"]])
-        means.append(grouped.mean().where(grouped.count() >= WIFI_MIN_PACKETS))
+        grouped = rssi.where(rssi != -200).groupby([table["X"], table["Y"]])
+        means.append(grouped.mean().where(grouped.count() >= 10))
     values = pd.concat(means)
     place = np.array(values.index.tolist())
     position = np.column_stack([place * WIFI_GRID_M, np.zeros(len(place))]).round(3)

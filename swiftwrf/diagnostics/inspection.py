@@ -9,8 +9,9 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.beamforming import PHASE
-from swiftwrf.data import ReadOptions, Rssi, Snapshots, Spectra
+from swiftwrf.data import Rssi, Snapshots, Spectra
 from swiftwrf.data.columns import has_frequent_edge
 from swiftwrf.data.splits import MAX_REPEATED, MIN_TRAINING, repeated_fraction
 from swiftwrf.diagnostics.calibration import calibrate
@@ -20,6 +21,7 @@ from swiftwrf.diagnostics.path_loss import check_path_loss
 from swiftwrf.errors import InputError, listed, ranges
 from swiftwrf.positions import distance
 from swiftwrf.rssi import estimate_offsets
+from swiftwrf.runtime.validation import checked
 
 Level = Literal["fact", "warning"]
 MAX_POSITIONS = 3000  # whose neighbours are searched
@@ -44,10 +46,22 @@ class Finding:
 
 @dataclass
 class Findings:
-    """Sentences and numbers, in the order of the checks."""
+    """Facts and warnings about measurements, in the order of the checks. `print` shows a line each, warnings with a mark.
 
+    Args:
+        data: Measurements that were inspected, snapshots as spectra.
+        sentences: Facts and warnings.
+        numbers: Numbers behind the sentences by name, with units in the names.
+    """
+
+    data: Spectra | Rssi
     sentences: list[Finding] = field(default_factory=list)
     numbers: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def warnings(self) -> list[str]:
+        """Texts of the warnings."""
+        return [finding.text for finding in self.sentences if finding.level == "warning"]
 
     def add(self, text: str, **numbers: Any) -> None:
         """Add a fact."""
@@ -59,29 +73,47 @@ class Findings:
         self.sentences.append(Finding("warning", text))
         self.numbers |= numbers
 
+    def __str__(self) -> str:
+        return "\n".join(f"{'!' if finding.level == 'warning' else ' '} {finding.text}" for finding in self.sentences)
 
-def inspect(data: Spectra | Snapshots | Rssi, options: ReadOptions) -> tuple[Findings, Spectra | Rssi]:
-    """Return the findings, and the spectra of snapshots."""
-    findings = Findings()
+
+@checked
+def inspect(
+    data: Spectra | Snapshots | Rssi, *, grid: AngularGrid | tuple[int, int] | None = None, beamformer: str = PHASE
+) -> Findings:
+    """Return what measurements contain and what may be wrong: counts, frames, units, density, calibration.
+
+    Args:
+        data: Spectra, array snapshots or RSSI.
+        grid: Grid of the spectra of snapshots, or its numbers of elevations and azimuths.
+        beamformer: Beamformer of the spectra of snapshots.
+
+    Raises:
+        InputError: An unknown beamformer, or too few snapshots for it.
+
+    Example:
+        >>> import swiftwrf
+        >>> findings = inspect(swiftwrf.simulated_room(n=50))
+        >>> len(findings.warnings), findings.numbers["frame"]
+        (1, 'fits')
+    """
+    spectra = data.spectra(grid, beamformer) if isinstance(data, Snapshots) else data
+    findings = Findings(spectra)
     for note in data.notes:
         findings.add(f"{note[0].upper()}{note[1:]}.")
-    if isinstance(data, Rssi):
-        check_rssi(data, findings)
-        return findings, data
-    if isinstance(data, Spectra):
-        check_spectra(data, findings)
-        check_peaks(data, findings)
-        return findings, data
-    beamformer = options.beamformer or PHASE
-    spectra = data.spectra(options.grid, beamformer)
-    check_snapshots(data, findings)
-    check_spectra(spectra, findings)
-    if check_peaks(spectra, findings, data, beamformer) != "explained":
-        check_calibration(data, findings)
-    return findings, spectra
+    if isinstance(spectra, Rssi):
+        _check_rssi(spectra, findings)
+        return findings
+    snapshots = data if isinstance(data, Snapshots) else None
+    if snapshots is not None:
+        _check_snapshots(snapshots, findings)
+    _check_spectra(spectra, findings)
+    if _check_peaks(spectra, findings, snapshots, beamformer) != "explained" and snapshots is not None:
+        _check_calibration(snapshots, findings)
+    return findings
 
 
-def check_positions(position: Tensor, findings: Findings, wavelength: float | None = None) -> None:
+def _check_positions(position: Tensor, findings: Findings, wavelength: float | None = None) -> None:
     """Report extent and density of positions (n, 3) [m], in wavelengths [m] if the carrier is known."""
     low, high = position.amin(dim=0), position.amax(dim=0)
     extent = (high - low).tolist()
@@ -118,7 +150,7 @@ def check_positions(position: Tensor, findings: Findings, wavelength: float | No
         findings.warn(f"{text}: interpolators see no fringes between such positions; {geometry}.")
 
 
-def normalised(position: Tensor) -> str:
+def _normalised(position: Tensor) -> str:
     """Return the interval that every coordinate of positions (n, 3) fills exactly, as normalised ones do, or an empty text.
 
     Coordinates without extent are left out; one coordinate alone is no evidence.
@@ -140,7 +172,7 @@ def nearest(position: Tensor) -> tuple[Tensor, Tensor]:
     return some, apart.amin(dim=1)
 
 
-def add_splits(data: Spectra | Snapshots | Rssi, findings: Findings) -> None:
+def _add_splits(data: Spectra | Snapshots | Rssi, findings: Findings) -> None:
     """Report the splits that came with the measurements."""
     for name, (train, test) in data.named_splits.items():
         findings.add(f"Split {name}: {len(train)} for training, {len(test)} for testing.")
@@ -149,7 +181,7 @@ def add_splits(data: Spectra | Snapshots | Rssi, findings: Findings) -> None:
             findings.warn(f"Split {name} tests look-up: {repeated:.0%} of its test rows are at training positions.")
 
 
-def check_spectra(data: Spectra, findings: Findings) -> None:
+def _check_spectra(data: Spectra, findings: Findings) -> None:
     """Report number, grid, positions and range of spectra."""
     rows, columns = data.grid.shape
     findings.add(
@@ -158,7 +190,7 @@ def check_spectra(data: Spectra, findings: Findings) -> None:
         grid=[rows, columns],
         moving=data.moving,
     )
-    check_positions(data.position, findings, data.array.wavelength if data.array else None)
+    _check_positions(data.position, findings, data.array.wavelength if data.array else None)
     free = float(data.line_of_sight.double().mean())
     findings.add(
         f"{free:.0%} of the positions have line of sight, or are not known to lack it.", line_of_sight_share=free
@@ -172,10 +204,10 @@ def check_spectra(data: Spectra, findings: Findings) -> None:
         findings.warn(f"{int((peak < 0.05).sum())} spectra are nearly empty, below 0.05 everywhere.")
     if bool((least == peak).any()):
         findings.warn("Some spectra have one value everywhere.")
-    add_splits(data, findings)
+    _add_splits(data, findings)
 
 
-def check_snapshots(data: Snapshots, findings: Findings) -> None:
+def _check_snapshots(data: Snapshots, findings: Findings) -> None:
     """Report number, spacing and times of snapshots."""
     count, elements = data.channel.shape[1:]
     spacing = data.array.spacing_wavelengths
@@ -199,7 +231,7 @@ def check_snapshots(data: Snapshots, findings: Findings) -> None:
             findings.warn("Times are not in order; a block split by position does not mind.")
 
 
-def check_calibration(data: Snapshots, findings: Findings) -> None:
+def _check_calibration(data: Snapshots, findings: Findings) -> None:
     """Report whether the array needs a calibration."""
     try:
         found = calibrate(data)
@@ -211,14 +243,14 @@ def check_calibration(data: Snapshots, findings: Findings) -> None:
     if found.after - found.before >= MIN_GAIN:
         findings.warn(
             f"The array is not calibrated: {text} (turned by {float(found.turn.rad2deg().norm()):.1f} degrees). Use "
-            "python -m tasks.convert SOURCE OUT --calibrate.",
+            "swiftwrf.calibrate, or swiftwrf convert SOURCE OUT --calibrate.",
             calibration=found.to_json(),
         )
     else:
         findings.add(f"The array needs no calibration: {text}.", calibration=found.to_json())
 
 
-def check_peaks(
+def _check_peaks(
     data: Spectra, findings: Findings, snapshots: Snapshots | None = None, beamformer: str = PHASE
 ) -> Frame:
     """Report whether the peaks of the spectra follow the lines of sight, and return the result in a word.
@@ -257,7 +289,7 @@ def check_peaks(
 
 def _error(data: Spectra, report: FrameReport, snapshots: Snapshots | None) -> tuple[Frame, str] | None:
     """Return the error that explains the peaks, in words, or None."""
-    if not report.fits and (filled := normalised(data.position)):
+    if not report.fits and (filled := _normalised(data.position)):
         return "explained", f". All coordinates fill {filled} exactly, so positions look normalised; give metres"
     if report.explanations:
         return "explained", f". That would fit if {'; or if '.join(report.explanations)}"
@@ -316,7 +348,7 @@ def _add_behind(data: Spectra, report: FrameReport, findings: Findings) -> None:
         findings.warn(f"{text}: two places share one label.")
 
 
-def check_rssi(data: Rssi, findings: Findings) -> None:
+def _check_rssi(data: Rssi, findings: Findings) -> None:
     """Report number, range and suspicious columns of RSSI."""
     detected = data.detected
     share = float(detected.double().mean())
@@ -327,14 +359,14 @@ def check_rssi(data: Rssi, findings: Findings) -> None:
         receivers=len(data.receiver_names),
         detected_fraction=share,
     )
-    check_positions(data.transmitter_position, findings)
+    _check_positions(data.transmitter_position, findings)
     count = detected.sum(dim=0)
     few = [name for name, n in zip(data.receiver_names, count.tolist(), strict=True) if n < MIN_TRAINING]
     if few:
         findings.warn(f"Receivers that detected fewer than {MIN_TRAINING} rows, too few to fit a model: {listed(few)}.")
     _columns(data, detected, findings)
     _path_loss(data, findings)
-    add_splits(data, findings)
+    _add_splits(data, findings)
 
 
 def propose_offsets(data: Rssi, findings: Findings) -> None:

@@ -22,10 +22,8 @@ from swiftwrf.runtime.threads import single_thread
 NOISE_CANDIDATES = (1e-3, 1e-2, 1e-1)  # variance of spectra that does not depend on position
 MAX_RANK_ERROR = 5e-4  # fraction of the held-out error that omitted components may add
 MIN_ERROR = 1e-12  # squared error, for logarithms
-JITTER = 1e-6  # relative variance below which a position counts as measured
 MAX_ROWS = 400  # spectra that choose; a candidate costs their number cubed
 MAX_LOCAL_ROWS = 200  # spectra that are held out among more, each predicted from its neighbours
-N_OVERSAMPLING = 16  # directions of the sketch of principal components beyond their number
 MIN_VARIANCE = 1e-6  # fraction of the variance below which a principal component is left out
 
 
@@ -152,7 +150,7 @@ def most_informative(
     chosen: list[int] = []
     left = [(weight * covariance.diagonal()).mean()]
     for _ in range(count):
-        noisy = covariance.diagonal().clamp_min(0) + kernel.noise + JITTER
+        noisy = covariance.diagonal().clamp_min(0) + kernel.noise + 1e-6  # also at a measured position
         lowered = (weight @ covariance.square()) / noisy
         lowered[chosen] = -1
         best = int(lowered.argmax())
@@ -254,7 +252,7 @@ def _sketched(batches: Callable[[], Iterable[Tensor]], rank: int, min_variance: 
     for batch in batches():
         total, n = total + batch.sum(dim=0, dtype=torch.float64), n + len(batch)
     mean = (total / n).float()
-    width = min(rank + N_OVERSAMPLING, len(mean))
+    width = min(rank + 16, len(mean))  # more directions are more exact
     random = torch.randn(len(mean), width, generator=torch.Generator().manual_seed(seed))
     sketch = torch.zeros(len(mean), width, dtype=torch.float64)
     variance = 0.0

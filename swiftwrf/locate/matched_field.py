@@ -37,13 +37,11 @@ from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.path_gains import PathGains, PriorChoice, choose_prior, fit_path_gains, kernel_of
 from swiftwrf.positions import to_tensor
 from swiftwrf.runtime.checkpoint import Header, Saved, expect
-from swiftwrf.runtime.options import Configured, all_or_nothing
 from swiftwrf.runtime.threads import parallel_map
-from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, checked, configuration
+from swiftwrf.runtime.validation import Configured, NonNegativeInt, PositiveInt, all_or_nothing, checked, configuration
 
 FOLDS = 5
 MIN_SPECTRA = 15
-BATCH_OBSERVATIONS = 16  # searched at a time: their likelihoods at all cells are 26 MB at most
 BATCH_CANDIDATES = 2048  # whose waves are computed together: as many as a processor's cache holds
 
 
@@ -280,7 +278,7 @@ class MatchedField(Configured, Saved):
         """Yield cells (b, m) and log-likelihoods (k, b, m) of some observations at a time."""
         generator = torch.Generator().manual_seed(self.config.seed)
         config = self.config
-        for rows in torch.arange(len(observed)).split(BATCH_OBSERVATIONS):
+        for rows in torch.arange(len(observed)).split(16):  # likelihoods at all cells: 26 MB at most
             part = observed.subset(rows)
 
             def evaluate(position: Tensor, part: SpectrumFeatures = part) -> Tensor:

@@ -23,9 +23,8 @@ from swiftwrf.locate.student import Student, correlation
 from swiftwrf.positions import to_tensor
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime.checkpoint import Header, Saved, expect
-from swiftwrf.runtime.options import Configured, all_or_nothing
 from swiftwrf.runtime.progress import progress as tracked
-from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, checked, configuration
+from swiftwrf.runtime.validation import Configured, NonNegativeInt, PositiveInt, all_or_nothing, checked, configuration
 
 NEIGHBOUR_COUNTS = (1, 2, 3, 5, 8, 13, 20)
 UNDETECTED_BELOW_DB = 5.0  # below the weakest value, of what is not detected, in the space of fingerprints

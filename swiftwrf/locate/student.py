@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 DEGREES = (3.0, 5.0, 10.0, 30.0, math.inf)  # degrees of freedom that are compared
-EM_STEPS = 8
 MIN_COMMON_ROWS = 10.0  # rows that two features have in common, after which their correlation counts half
 CHUNK = 2**24  # values of observations x candidates x features at a time
 
@@ -126,7 +125,7 @@ def covariance(residual: Tensor, shrinkage: Tensor, degrees: float, floor: float
     n, f = residual.shape
     weight, identity = residual.new_ones(len(shrinkage), 1, n), torch.eye(f, dtype=residual.dtype)
     shrinkage = shrinkage[:, None, None]
-    for _ in range(1 if math.isinf(degrees) else EM_STEPS):
+    for _ in range(1 if math.isinf(degrees) else 8):  # expectation and maximisation
         scatter = (residual.T * weight) @ residual / n
         mean = scatter.diagonal(dim1=1, dim2=2).mean(dim=1)[:, None, None]
         scale: Tensor = (1 - shrinkage) * scatter + (shrinkage * mean + floor) * identity

@@ -24,10 +24,17 @@ from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Axes, Displayed, extent
 from swiftwrf.positions import check_positions, to_tensor
 from swiftwrf.runtime.checkpoint import Header, Saved
-from swiftwrf.runtime.options import Configured, Preset, all_or_nothing, from_plain
 from swiftwrf.runtime.session import Record
 from swiftwrf.runtime.threads import single_thread, to_device
-from swiftwrf.runtime.validation import NonNegativeInt, checked, configuration
+from swiftwrf.runtime.validation import (
+    Configured,
+    NonNegativeInt,
+    Preset,
+    all_or_nothing,
+    checked,
+    configuration,
+    from_plain,
+)
 
 ARRAY, FIXED_END = "array", "fixed end"  # requirements that a model can declare
 CPU = torch.device("cpu")

@@ -30,7 +30,6 @@ from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import checked
 
 MAX_COMPONENTS = 64  # principal components of the training magnitudes
-VALUE_AZIMUTHS = 90  # columns of the components that new spectra are projected on; the beams of an array are far wider
 MAX_EXACT_ROWS = 2000  # spectra whose principal components are computed in memory
 
 
@@ -183,7 +182,7 @@ class CoarrayModel(Linked, ProcessModel):
 
 def _coarse(spectra: Store) -> Tensor:
     """Return spectra averaged to few pixels, (n, h, w)."""
-    factor = coarsening(spectra.shape[1:], VALUE_AZIMUTHS)
+    factor = coarsening(spectra.shape[1:], 90)  # the beams of an array are far wider
     return spectra.coarsen(factor)[:]
 
 

@@ -20,7 +20,6 @@ from swiftwrf.models.base import FieldModel
 from swiftwrf.positions import distance, nearest
 from swiftwrf.runtime.checkpoint import Header, expect
 
-NEIGHBOUR_CANDIDATES = (1, 2, 3, 5, 8, 13, 20, 30)
 MIN_DISTANCE_M = 1e-9
 MAX_CHOICE_SPECTRA = 2000  # that choose the number of neighbours
 
@@ -91,7 +90,7 @@ class IDWModel(MemoryModel):
         super()._fit(train)
         (rows,) = subsample(torch.arange(len(train)), rows=MAX_CHOICE_SPECTRA)
         fold = folds(self.position, self.config.validation, self.config.seed)[rows]
-        candidates = [k for k in NEIGHBOUR_CANDIDATES if k <= len(rows) - int(fold.bincount().max())]
+        candidates = [k for k in (1, 2, 3, 5, 8, 13, 20, 30) if k <= len(rows) - int(fold.bincount().max())]
         position, gram = self.position[rows], inner_products(self.store[rows])
         self.k = min(candidates, key=lambda k: _held_out_loss(k, position, gram, fold))
 

@@ -29,7 +29,6 @@ from swiftwrf.runtime.checkpoint import expect
 
 MAX_HELD_OUT = 100  # training spectra that determine the spread
 SHRINKAGE_SPECTRA = 5.0  # weight of the mean over directions in the spread of each one, in spectra
-MIN_SPREAD = 1e-6  # of magnitudes, which are in [0, 1]
 
 
 class ProcessModel(FieldModel):
@@ -114,7 +113,7 @@ class ProcessModel(FieldModel):
         score = torch.cat(scores)
         square = score.square()
         total = square.sum(dim=0) + SHRINKAGE_SPECTRA * square.mean()
-        spread = (total / (len(score) + SHRINKAGE_SPECTRA)).sqrt().clamp_min(MIN_SPREAD)
+        spread = (total / (len(score) + SHRINKAGE_SPECTRA)).sqrt().clamp_min(1e-6)
         self.spread = spread * std_factor(score / spread)
 
     def _std(self, position: Tensor, grid: AngularGrid) -> Tensor:

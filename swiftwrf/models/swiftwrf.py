@@ -43,19 +43,12 @@ from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configurati
 
 SIZES = (16, 32, 64, 128, 256, 512)  # numbers of primitives that a fit compares
 MIN_GAIN = 0.004  # relative reduction of the loss that counts, 0.04 dB
-SHAPE_STEPS = 60
-TRIAL_STEPS = 8  # steps of a comparison of sizes; it ranks them as all steps do
-SHAPE_RATE = 0.02  # learning rate of means [rad] and logarithms of widths
 RIDGE = 1e-6  # regularisation relative to a kernel's mean square, against large weights of opposite sign
 MAX_ROWS = 1000  # spectra that fit the shapes and compare sizes; more do not change the choice
-SHAPE_AZIMUTHS = 90  # columns of the spectra that fit the shapes; the beams of an array are far wider
 MIN_VARIANCE = 1e-9  # fraction of the variance below which a principal component is rounding
 MARGIN = 0.5  # spacings by which the first means lie below the horizon
-FILL_EVERY = 16  # one primitive in this number starts at the largest residual
-PEAK_WIDTH = 1.5  # its initial standard deviation, in pixels
 CUTOFF = 1e-4  # kernel values below count as 0
 MAX_CACHED_VALUES = 2**26  # float32 kernel values that one grid caches: 256 MiB
-MAX_CACHED_GRIDS = 2
 MAX_BATCH_ON_GPU, MAX_PRIMITIVES_ON_GPU = 4096, 2**24  # positions at a time, and primitives of all of them
 
 
@@ -124,7 +117,7 @@ class SwiftWRF(ProcessModel):
         rank = choose_rank(work.position, work.store, fold, kernel)
         (rows,) = subsample(torch.arange(len(work)), rows=MAX_ROWS)
         some, fold = work.subset(rows).in_memory(), fold[rows]
-        small = some.at_most(SHAPE_AZIMUTHS).in_memory()
+        small = some.at_most(90).in_memory()  # the beams of an array are far wider
         n, record = config.n_primitives, on_record or (lambda record: None)
         if n == "auto" and isinstance(like, SwiftWRF):
             n = len(like.mean)
@@ -134,14 +127,14 @@ class SwiftWRF(ProcessModel):
 
             def loss(n: int) -> float:
                 bar.update(task, description=f"swiftwrf, {n} primitives")
-                function = kernels(*_shapes(target, n, small.grid, TRIAL_STEPS), small.grid, CUTOFF)
+                function = kernels(*_shapes(target, n, small.grid, 8), small.grid, CUTOFF)  # few steps rank alike
                 found = float(spectrum_loss(_held_out(small, function, kernel, fold)[0], small.spectrum))
                 record({"stage": "search", "n_primitives": n, "validation": found})
                 return found
 
             if n == "auto":
                 n = smallest(loss, SIZES)
-            self.mean, self.cholesky = _shapes(target, n, small.grid, SHAPE_STEPS)
+            self.mean, self.cholesky = _shapes(target, n, small.grid, 60)
             self._regress(work, some, kernel, rank, fold)
         record({"stage": "final", "n_primitives": n})
         self._move(device)
@@ -212,7 +205,7 @@ class SwiftWRF(ProcessModel):
         prior = component.square().sum(dim=0).sqrt().reshape(grid.shape)
         basis = Basis(kernel, self.weight[0] @ kernel, dual.float(), prior)
         if kernel.numel() <= MAX_CACHED_VALUES:
-            while len(self._bases) >= MAX_CACHED_GRIDS:
+            while len(self._bases) >= 2:
                 del self._bases[next(iter(self._bases))]
             self._bases[grid] = basis
         return basis
@@ -340,7 +333,7 @@ def _shapes(target: Tensor, n: int, grid: AngularGrid, steps: int) -> tuple[Tens
 
     _fill(mean, raw, residual().square().sum(dim=0), grid)
     with torch.enable_grad():
-        optimiser = torch.optim.Adam([mean.requires_grad_(), raw.requires_grad_()], lr=SHAPE_RATE, betas=(0.9, 0.99))
+        optimiser = torch.optim.Adam([mean.requires_grad_(), raw.requires_grad_()], lr=0.02, betas=(0.9, 0.99))
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
         for _ in range(steps):
             optimiser.zero_grad()
@@ -352,8 +345,8 @@ def _shapes(target: Tensor, n: int, grid: AngularGrid, steps: int) -> tuple[Tens
 
 def _fill(mean: Tensor, raw: Tensor, residual: Tensor, grid: AngularGrid) -> None:
     """Move some primitives, made narrow, to the peaks of the residual energy (H, W)."""
-    width = PEAK_WIDTH * torch.tensor([grid.azimuth_step, grid.elevation_step])
-    for n in range(0, len(mean), FILL_EVERY):
+    width = 1.5 * torch.tensor([grid.azimuth_step, grid.elevation_step])  # 1.5 pixels
+    for n in range(0, len(mean), 16):  # one in 16 starts at the largest residual
         row, column = divmod(int(residual.argmax()), residual.shape[1])
         mean[n] = torch.stack([grid.azimuth[column], grid.elevation[row]]).float()
         raw[n, ::2] = width.log()

@@ -40,7 +40,6 @@ from swiftwrf.runtime.validation import (
 
 MEAN_BANDS, POSITION_BANDS = 10, 6  # frequency bands of the paper's encodings
 WIDTH, DEPTH = 156, 8  # size of the paper's network
-SKIPS = range(2, DEPTH, 2)  # layers that take the input again
 OFFSETS = (2, 2, 1)  # numbers of offsets of mean, response and attenuation for each primitive
 WARM_UP_STEPS, FINAL_RATE = 50, 0.02  # steps over which the rates rise, and their final fraction
 CUTOFF = 1e-4  # kernel values below count as 0
@@ -178,7 +177,7 @@ class DeformableGaussians(nn.Module):
         self.register_buffer("centre", centre)
         self.register_buffer("scale", scale)
         self.primitives = Primitives(n, grid, bounded=True, generator=generator)
-        self.layers = SkipMLP(2 * (2 * MEAN_BANDS + 1) + 3 * (2 * POSITION_BANDS + 1), WIDTH, DEPTH, SKIPS)
+        self.layers = SkipMLP(2 * (2 * MEAN_BANDS + 1) + 3 * (2 * POSITION_BANDS + 1), WIDTH, DEPTH, range(2, DEPTH, 2))
         self.output = nn.Linear(WIDTH, sum(OFFSETS))
         for layer in self.layers:  # torch's default, sampled from the given generator
             bound = 1 / math.sqrt(cast(nn.Linear, layer).in_features)

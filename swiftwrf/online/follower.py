@@ -29,14 +29,10 @@ from swiftwrf.positions import nearest
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.runtime.validation import checked, configuration
 
-CORRELATIONS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.05)  # of the fields before and after a change, that are compared
 N_FOLDS = 5  # of the spectra after a change, and of the training spectra that give the reference
-MAX_INNOVATION = 3.0  # standard deviations; single outliers raise no alarm
 MIN_NEW, MIN_GROWTH = 30, 0.1  # measurements, and relative to those before, after which a kernel is chosen
 ROOM_NOTICE = "the room no longer explains the spectra since measurement {}; fit it again, also if an obstacle appeared"
 MIN_MISSING = 3e-3  # missing coherence that counts as none, phases of 3 degrees
-MAX_RECENT = 500  # spectra that are kept to adapt the model to a change
-MAX_WAITING = 5 * MIN_TRAINING  # spectra that wait for an update of a geometry
 
 
 def adapted(before: ProcessModel, after: Spectra) -> tuple[ProcessModel, float]:
@@ -68,7 +64,7 @@ def adapted(before: ProcessModel, after: Spectra) -> tuple[ProcessModel, float]:
             scores.append(psnr(predicted.cpu(), out.spectrum))
         return float(torch.cat(scores).mean()) if scores else 0.0
 
-    best = max(CORRELATIONS, key=lambda correlation: held_out(before.aged(correlation)))
+    best = max((1.0, 0.8, 0.6, 0.4, 0.2, 0.05), key=lambda correlation: held_out(before.aged(correlation)))
     return before.aged(best).update(after), best
 
 
@@ -148,7 +144,7 @@ class Monitor:
         """Add the innovations of one measurement at a position (3,) [m], (1,) or (R,); return the alarms."""
         value = innovation.double()
         if self.receiver_names:
-            standard = value.clamp(-MAX_INNOVATION, MAX_INNOVATION)
+            standard = value.clamp(-3.0, 3.0)  # single outliers raise no alarm
             standard = torch.cat([standard, -standard])
         elif self.cusum.count == 0 and len(self.reference) < self.config.n_reference:
             self.reference = torch.cat([self.reference, value])
@@ -357,7 +353,7 @@ class Follower:
         notices += self._learn(new)
         self.count += 1
         if isinstance(new, Spectra) and isinstance(self.model, ProcessModel):
-            self._recent = [*self._recent, new][-MAX_RECENT:]
+            self._recent = [*self._recent, new][-500:]
             if alarms:
                 correlation = self._adapt(self.model, alarms[0])
         if correlation is None and isinstance(self.model, ProcessModel | RssiModel):
@@ -374,7 +370,7 @@ class Follower:
         try:
             self.model = learnt(self.model, waiting)
         except InputError as error:  # fewer than 10 positions, or spectra that do not fit the array
-            if len(waiting) < MAX_WAITING:
+            if len(waiting) < 5 * MIN_TRAINING:
                 return []
             notices = [f"{len(waiting)} spectra were not learnt: {error}"]
         self.waiting = None

@@ -22,7 +22,6 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.runtime.threads import threads_kept
 
-MAX_SQUARED_DISTANCE = 210.0  # exp(-x / 2) is 0 in float32 beyond it
 BASE2 = np.float32(-0.5 / math.log(2))  # exp(-x / 2) = 2^(BASE2 x)
 
 _FAST = {"contract", "nsz", "arcp", "reassoc"}  # Without nnan and ninf, so that values that are not finite propagate.
@@ -255,7 +254,7 @@ def _threads() -> int:
 def _inputs(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None) -> tuple[Any, ...]:
     """Return the first arguments of both kernels."""
     tensors = mean, cholesky if cholesky.dim() == 3 else cholesky[None], weight
-    squared = MAX_SQUARED_DISTANCE if cutoff is None else -2 * math.log(cutoff)
+    squared = 210.0 if cutoff is None else -2 * math.log(cutoff)  # beyond, exp(-x / 2) is 0 in float32
     origin, step = (grid.elevation_start, grid.azimuth_start), (grid.elevation_step, grid.azimuth_step)
     return *(tensor.detach().contiguous().numpy() for tensor in tensors), origin, step, grid.shape, np.float32(squared)
 

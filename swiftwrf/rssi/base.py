@@ -26,17 +26,23 @@ from swiftwrf.models.base import CPU, FieldConfig, check_checkpoint
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Displayed
 from swiftwrf.positions import check_positions, to_tensor
-from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation, receiver_floors
+from swiftwrf.rssi.path_loss import FloorAttenuation, estimate_floor_attenuation, receiver_floors
 from swiftwrf.runtime.checkpoint import Header, Saved
-from swiftwrf.runtime.options import Configured, all_or_nothing, from_plain
 from swiftwrf.runtime.session import Record
 from swiftwrf.runtime.threads import parallel_map, to_device
-from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, checked, configuration
+from swiftwrf.runtime.validation import (
+    Configured,
+    NonNegativeInt,
+    PositiveFloat,
+    all_or_nothing,
+    checked,
+    configuration,
+    from_plain,
+)
 
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 ITEMS_PER_THREAD = 4  # between two results that are kept: starting threads costs milliseconds
 RECEIVER_POSITIONS = "positions of the receivers"
-RECEIVER_TOLERANCE_M = 0.01  # between two positions of one receiver
 
 
 def map_threads(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
@@ -114,6 +120,8 @@ class RssiPredictor(Configured, Displayed, ABC):
     """whether the positions of the receivers must be known"""
     slow: ClassVar[bool] = False
     """whether a fit takes minutes, so that it is compared only on request"""
+    max_map_predictions: ClassVar[int] = 2**22
+    """predictions of a map at all receivers if its cells are not given"""
     batch_size: ClassVar[int] = 512
     """positions evaluated at a time, few enough to stay in the processor's cache"""
 
@@ -228,7 +236,7 @@ class RssiPredictor(Configured, Displayed, ABC):
             )
         position = data.about(self.origin).receiver_position
         apart = (position - self.receiver_position).norm(dim=1).nan_to_num(0.0)
-        if len(moved := (apart > RECEIVER_TOLERANCE_M).nonzero()[:, 0]):
+        if len(moved := (apart > 0.01).nonzero()[:, 0]):
             name, metres = self.receiver_names[int(moved[0])], float(apart[moved[0]])
             raise InputError(
                 f"{data.name} has receiver {name} {metres:.3g} m away from its position in the rows that the predictor was "

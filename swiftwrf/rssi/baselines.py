@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sklearn.dummy import DummyRegressor
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
+from sklearn.gaussian_process.kernels import ConstantKernel, Kernel, Matern, WhiteKernel
 from sklearn.neighbors import KNeighborsRegressor, NearestNeighbors
 from torch import Tensor, from_numpy
 
@@ -27,12 +27,10 @@ from swiftwrf.rssi.pairs import PairPredictor
 from swiftwrf.rssi.paper import RssiPaperModel
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, fit_shared_path_loss, log_distance
 from swiftwrf.rssi.training import mixing_weights
-from swiftwrf.runtime.options import Preset
 from swiftwrf.runtime.threads import parallel_map
-from swiftwrf.runtime.validation import checked, configuration
+from swiftwrf.runtime.validation import Preset, checked, configuration
 
-# scikit-learn's own choice for many neighbours computes distances from squares and a product, which cancel map coordinates
-NEIGHBOUR_SEARCH = "kd_tree"
+MAX_TREE_COLUMNS = 15  # of coordinates whose neighbours a tree finds
 NEIGHBOUR_COUNTS = (1, 3, 5, 8, 12, 20, 40, 80, 120)
 FLOOR_STRETCH = 5.0  # of heights where there are floors, so that neighbours are on one floor
 MAX_TUNING_ROWS, MAX_GP_ROWS = 500, 1500  # the cost of the Gaussian process grows with their cube
@@ -200,31 +198,50 @@ class GPPredictor(ReceiverRegressors):
         length = Matern(extent / 10, (extent / 200, 2.5 * extent), nu=1.5)
         kernel = ConstantKernel(scale / 3, (scale * 1e-3, scale * 10)) * length
         kernel = kernel + WhiteKernel(scale / 2, (scale * 1e-3, scale * 10))
-        order = np.random.default_rng(self.config.seed).permutation(len(y))
-        tuned, kept = order[:MAX_TUNING_ROWS], order[:MAX_GP_ROWS]
-        fitted = GaussianProcessRegressor(kernel, random_state=self.config.seed).fit(x[tuned], y[tuned])
-        return GaussianProcessRegressor(fitted.kernel_, optimizer=None).fit(x[kept], y[kept])
+        return fit_process(kernel, x, y, self.config.seed)
+
+
+def fit_process(
+    kernel: Kernel, x: NDArray[Any], y: NDArray[Any], seed: int, *, normalize: bool = False
+) -> GaussianProcessRegressor:
+    """Return a Gaussian process fitted to coordinates (n, d) and values (n,) or (n, c).
+
+    The parameters of the kernel maximise the marginal likelihood of 500 rows. The process is conditioned on 1500 rows.
+
+    Args:
+        kernel: Kernel with start values and bounds.
+        x: Coordinates.
+        y: Values.
+        seed: Seed of the rows.
+        normalize: Scale values to mean 0 and variance 1.
+    """
+    order = np.random.default_rng(seed).permutation(len(y))
+    tuned, kept = order[:MAX_TUNING_ROWS], order[:MAX_GP_ROWS]
+    tuning = GaussianProcessRegressor(kernel, normalize_y=normalize, random_state=seed).fit(x[tuned], y[tuned])
+    return GaussianProcessRegressor(tuning.kernel_, optimizer=None, normalize_y=normalize).fit(x[kept], y[kept])
 
 
 def choose_neighbours(x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> KNeighborsRegressor:
-    """Return a regressor fitted to coordinates (n, d) and values (n,) whose settings predict held-out folds (n,) best."""
-    numbers = np.unique(fold)
+    """Return a regressor fitted to coordinates (n, d) and values (n, ...), settings by held-out folds (n,)."""
+    # scikit-learn's choice for many neighbours computes distances from squares and a product, which cancel map coordinates
+    algorithm = "kd_tree" if x.shape[1] <= MAX_TREE_COLUMNS else "auto"
+    numbers, values = np.unique(fold), y.reshape(len(y), -1)
     fewest = len(y) - int(np.bincount(fold).max())
     errors = {(k, weights): 0.0 for k in NEIGHBOUR_COUNTS if k <= fewest for weights in ("uniform", "distance")}
     for number in numbers:  # one search for neighbours serves all settings; GridSearchCV repeats it
         out, kept = fold == number, fold != number
-        search = NearestNeighbors(n_neighbors=max(errors)[0], algorithm=NEIGHBOUR_SEARCH)
+        search = NearestNeighbors(n_neighbors=max(errors)[0], algorithm=algorithm)
         distance, row = search.fit(x[kept]).kneighbors(x[out])
-        near = y[kept][row]
+        near, truth = values[kept][row], values[out]
         with np.errstate(divide="ignore"):
             inverse = 1 / distance
         inverse = np.where(np.isinf(inverse).any(axis=1, keepdims=True), np.isinf(inverse), inverse)
         for k, weights in errors:
-            weight = inverse[:, :k] if weights == "distance" else np.ones_like(inverse[:, :k])
+            weight = inverse[:, :k, None] if weights == "distance" else np.ones_like(inverse[:, :k, None])
             predicted = (weight * near[:, :k]).sum(axis=1) / weight.sum(axis=1)
-            errors[k, weights] += float(np.abs(predicted - y[out]).mean()) / len(numbers)
+            errors[k, weights] += float(np.linalg.norm(predicted - truth, axis=1).mean()) / len(numbers)
     k, weights = min(errors, key=lambda setting: errors[setting])
-    return KNeighborsRegressor(k, weights=weights, algorithm=NEIGHBOUR_SEARCH).fit(x, y)
+    return KNeighborsRegressor(k, weights=weights, algorithm=algorithm).fit(x, y)
 
 
 class PairKNN(PairPredictor):

@@ -24,7 +24,6 @@ HEAD_GRID = AngularGrid.hemisphere(16, 16)
 N_DIRECTIONS = HEAD_GRID.shape[0] * HEAD_GRID.shape[1]
 DB_PER_UNIT = 100.0  # of magnitude
 TABLE_RANGE_DB, TABLE_STEP_DB = 64.0, 0.125  # 64 dB are 10 standard deviations of any measured field
-RESPONSE_SPREAD = 0.3  # responses of B relative to A: independent ones overfit, since only their sum is measured
 
 
 class Head(nn.Module):
@@ -41,7 +40,8 @@ class Head(nn.Module):
         digest = hashlib.sha256(f"{seed} {receiver_name}".encode()).digest()
         generator = torch.Generator().manual_seed(int.from_bytes(digest[:7], "big"))
         self.primitives = Primitives(n_primitives, HEAD_GRID, generator=generator)
-        self.basis = nn.Parameter(1 + RESPONSE_SPREAD * torch.randn(n_primitives, generator=generator))
+        # independent responses overfit, since only their sum is measured
+        self.basis = nn.Parameter(1 + 0.3 * torch.randn(n_primitives, generator=generator))
 
 
 def render(heads: Iterable[Head]) -> Tensor:

@@ -42,7 +42,6 @@ from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import single_thread
 
 FIELD_ALONE = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)  # mixing weights
-SHRINKAGE = 0.05  # of the mixing weights towards the field, by nested cross-validation in the training rows
 BINNED = 0.01  # relative difference of variances beyond which a row is the mean of several measurements
 
 
@@ -131,7 +130,7 @@ class RssiModel(SavedRssiPredictor):
         predicted = predictors[:, training.bin_of_row]
         if not comparable(predicted, pool.rssi_dbm).any():
             return FIELD_ALONE
-        return mixing_weights(predicted, pool.rssi_dbm, SHRINKAGE)
+        return mixing_weights(predicted, pool.rssi_dbm, 0.05)  # by nested cross-validation
 
     @single_thread()
     def _assemble(self, train: Rssi, training: RssiTraining, found: dict[str, Tensor], weight: Tensor) -> None:

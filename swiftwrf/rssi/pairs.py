@@ -36,7 +36,6 @@ from swiftwrf.runtime.validation import configuration
 RATIOS = (0.5, 1.0, 2.0)  # distance that the receiver moves, relative to an equivalent one of the transmitter
 RELATIVE_NOISE_VARIANCES = (0.03, 0.1, 0.3, 1.0, 3.0)  # variance of a measurement relative to that of the field
 MAX_HELD_OUT = 500  # pairs that choose the kernel; more do not change it
-PAIRS_AT_ONCE = 2048  # each needs a matrix of 64 x 64
 
 
 @configuration
@@ -102,7 +101,7 @@ class PairPredictor(RssiPredictor):
         return mean.reshape(n, r), None if std is None else std.reshape(n, r)
 
     def _batches(self, pair: Tensor) -> tuple[Tensor, Tensor | None]:
-        parts = [self._at_pairs(some) for some in pair.split(PAIRS_AT_ONCE)]
+        parts = [self._at_pairs(some) for some in pair.split(2048)]  # each needs a matrix of 64 x 64
         stds = [std for _, std in parts if std is not None]
         return torch.cat([mean for mean, _ in parts]), torch.cat(stds) if stds else None
 
@@ -189,6 +188,7 @@ class PairModel(PairPredictor, SavedRssiPredictor):
 
     kind: ClassVar[str] = "rssi pair model"
     name = "pairs"
+    max_map_predictions = 60_000  # each needs a system of 64 equations
 
     metric: Metric
     """how distances of both ends count"""
@@ -256,6 +256,10 @@ class PairModel(PairPredictor, SavedRssiPredictor):
                 score = error / (variance + kernel.noise).sqrt()
                 judged.append((float(error.mean()), metric, kernel, score))
         return judged
+
+    def region(self) -> Tensor:
+        """Return the training positions (n, 3) [m], one for each pair."""
+        return self.pair[:, :3]
 
     def _precompute(self) -> None:
         known, value = self.metric.known(self.pair), self.metric.values(self.residual)

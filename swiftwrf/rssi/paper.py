@@ -36,9 +36,7 @@ from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, configuration
 
 LEVEL_DBM = -100.0  # where nothing is received. The paper leaves the scale of its target open: this is that of NeRF2
-PRIOR_JITTER = 1e-3  # relative variance added to the latent field, for bins that nearly coincide
 HELD_OUT_FOLD = 0  # the only fold that is held out: a fit costs minutes
-N_TOGETHER = 4  # receivers that are learnt together, which saves time
 
 
 @configuration
@@ -86,11 +84,11 @@ class RssiPaperModel(RssiModel):
         self.kernel, _ = choose_residual_kernel(bins.position, pool_residual, bins.fold, train.floors is not None)
         prior_db = prior_std(bins.rssi - bins.rssi.nanmean(dim=0), pool_residual, self.kernel)
         covariance = self.kernel(bins.position, bins.position)
-        covariance.diagonal().add_(PRIOR_JITTER)
+        covariance.diagonal().add_(1e-3)  # bins may nearly coincide
         root = torch.linalg.cholesky(covariance)  # the latent field in the bins is this times standard normal numbers
         task = partial(learn_receivers, bins=bins, root=root, prior_db=prior_db, config=config, device=context.device)
         n_receivers = len(bins.receiver_names)
-        parts = [slice(start, start + N_TOGETHER) for start in range(0, n_receivers, N_TOGETHER)]
+        parts = [slice(start, start + 4) for start in range(0, n_receivers, 4)]
         with progress_bar(context.progress) as bar:
             # compiled rasterizers are not safe in several threads
             fits = (context.parallel or map)(task, parts)

@@ -35,7 +35,6 @@ from swiftwrf.rssi.path_loss import (
 )
 from swiftwrf.runtime.threads import single_thread
 
-MAX_STEP_DB = 1.0  # of the values that a receiver reports: nearly all report whole decibels
 # variance of a packet relative to the variance of the field: fading is as large as shadowing
 RELATIVE_NOISE_VARIANCES = (0.3, 1.0, 2.0, 3.0)
 VERTICALS = (1.0, 5.0)  # factors of the heights of floors: floors alike, or nearly independent beyond their attenuation
@@ -45,9 +44,7 @@ MAX_SLOPE_STD_DB = 10.0  # of a slope: path-loss exponents of 2 to 6 (Rappaport 
 DIRECTIVITY_STD_DB = 2.0  # prior of each harmonic of a receiver's antenna and surroundings
 # prior standard deviation of each coefficient that the regressors of level, slope and directivity are scaled by
 FEATURE_SCALE_DB = torch.tensor([PATH_LOSS_STD_DB] * 2 + [DIRECTIVITY_STD_DB] * N_HARMONICS, dtype=torch.float64)
-MAX_REWEIGHTINGS, WEIGHT_TOLERANCE = 30, 3e-3  # each weight is in (0, 1]
-MIN_CONTRACTION = 0.9  # a change of the field above this share of the last one is an oscillation
-FIELD_TOLERANCE_DB = 0.1  # mean change of the latent field that counts as converged
+WEIGHT_TOLERANCE = 3e-3  # each weight is in (0, 1]
 LEVEL = 0.8  # nominal coverage of the interval that the standard deviation is calibrated for
 MIN_SCORES = 30  # held-out rows of a receiver below which the scores of all receivers scale its standard deviation
 MAX_VARIANCE_POSITIONS = 200  # measured positions that determine where the field is known
@@ -238,7 +235,7 @@ def rounding_std(rssi: Tensor) -> float:
 
     The step of the values is their least difference, at most 1 dB, which is also that of constant values.
     """
-    step: float = min([MAX_STEP_DB, *rssi[~rssi.isnan()].unique().diff().tolist()])
+    step: float = min([1.0, *rssi[~rssi.isnan()].unique().diff().tolist()])
     return step / math.sqrt(12)
 
 
@@ -416,7 +413,7 @@ def solve(
     zero = table(torch.zeros(1, 1, dtype=torch.float64, device=residual.device))[0][0, 0]
     weight, latent = torch.ones_like(residual), torch.zeros_like(residual)
     step, last = 1.0, math.inf
-    for _ in range(MAX_REWEIGHTINGS):
+    for _ in range(30):
         head, slope = (x[:, 0] for x in table(latent[:, None]))
         target = residual - (head - zero) + slope * latent
         variance = noise_db.square() / weight
@@ -426,13 +423,13 @@ def solve(
         dual = torch.cholesky_solve(target[:, None], factor)[:, 0]
         change = covariance @ (slope * dual) - latent
         mean_change = float(change.abs().mean())
-        if mean_change > MIN_CONTRACTION * last:  # oscillates where the head bends
+        if mean_change > 0.9 * last:  # oscillates where the head bends
             step /= 2
         latent, last = latent + step * change, mean_change
         previous, error = weight, (variance * dual).abs()  # of the data about the tangent
         weight = (huber * noise_db / error.clamp_min(1e-12)).clamp_max(1)
         settled = float((weight - previous).abs().max()) < WEIGHT_TOLERANCE
-        if settled and (step == 1 or mean_change < FIELD_TOLERANCE_DB):
+        if settled and (step == 1 or mean_change < 0.1):
             break
     return dual, slope, variance, factor
 

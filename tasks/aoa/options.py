@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from swiftwrf.choices import FIELD_MODELS, MAX_SUGGESTIONS, Moving, check_scene
 from swiftwrf.errors import InputError
-from swiftwrf.runtime.options import Preset
+from swiftwrf.runtime.validation import Preset
 from tasks import labels
 from tasks.options import SEEDS, Output, SpectraSource, choice, command_options, given
 

@@ -33,10 +33,10 @@ DIRECTIONS = (
 )
 
 
-def page(data: Spectra | Rssi, kind: str, findings: Findings, source: str) -> Page:
+def page(findings: Findings, kind: str, source: str) -> Page:
     """Return the page: findings and figures of what was read from a source."""
+    data, warnings = findings.data, findings.warnings
     rows = [[finding.level, finding.text] for finding in findings.sentences]
-    warnings = [finding.text for finding in findings.sentences if finding.level == "warning"]
     table = Table(["level", "finding"], rows, strong=frozenset(["warning"]), long=True)
     plan, *plots = _rssi(data) if isinstance(data, Rssi) else _spectra(data)
     position = data.transmitter_position if isinstance(data, Rssi) else data.position

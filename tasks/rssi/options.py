@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.errors import InputError
-from swiftwrf.runtime.options import Preset
+from swiftwrf.runtime.validation import Preset
 from tasks.options import OffsetSource, Output, command_options
 
 

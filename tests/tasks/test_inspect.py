@@ -36,6 +36,7 @@ def test_snapshots(tmp_path, capsys):
     assert numbers["spacing_wavelengths"] == pytest.approx(0.5)
     assert numbers["peak_to_line_of_sight_deg"] < 3
     assert numbers["nearest_wavelengths"] == pytest.approx(numbers["nearest_m"] / WAVELENGTH)
+    assert "! The nearest other position" in text
     assert "interpolators see no fringes" in text
     assert "needs no calibration" in text
     html = (tmp_path / "page" / "report.html").read_text()

@@ -109,7 +109,7 @@ def _antennas(**changes):
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        (_antennas() | {"frequency": None}, "lacks frequency"),
+        (_antennas() | {"frequency": None}, "frequency must be a number"),
         (_antennas() | {"frequency": 2.4}, "carrier in Hz"),
         (_antennas(location=[0, 0]), "location"),
         (_antennas(spacingX=60, spacingY=60), "is the spacing in metres"),

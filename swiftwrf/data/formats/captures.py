@@ -34,7 +34,6 @@ ESP32_MARK, MARK_BYTES = b"CSI_DATA", 4096  # in the first bytes of its tables
 Channel = NDArray[np.complex128]
 ONE_ANTENNA = "which has one antenna and receives no direction"
 
-BFEE = 0xBB  # code of the frames with CSI; others are skipped
 BFEE_HEADER_BYTES = 21  # code included
 BFEE_SUBCARRIERS, BFEE_ANTENNAS = 30, 3
 
@@ -43,9 +42,7 @@ PCAP_ORDERS |= dict.fromkeys((b"\xa1\xb2\xc3\xd4", b"\xa1\xb2\x3c\x4d"), "big")
 PCAP_HEADER_BYTES, RECORD_HEADER_BYTES, UDP_HEADER_BYTES = 24, 16, 42  # the last with those of Ethernet and IP
 NEXMON_MARK, NEXMON_HEADER_BYTES = b"\x11\x11", 18
 NEXMON_CHIPS = {3: "4358", 0xDEAD: "4358", 106: "4366c0"}  # 0xDEAD in captures of earlier versions
-NEXMON_ONE_ANTENNA = 101  # 43455c0, of the Raspberry Pi
 NEXMON_USED = {64: (1, 28), 128: (2, 58), 256: (2, 122)}  # size of the FFT: first and last subcarrier beside DC
-MAX_SUBCARRIERS = 64  # used of each packet, about
 
 
 class Tool(NamedTuple):
@@ -67,7 +64,7 @@ def _split_csitool(content: bytes, elements: int) -> tuple[list[bytes], int]:
         frame = content[start + 2 : start + 2 + size]
         if not 0 < size == len(frame):
             raise ValueError(f"the frame at byte {start} is cut off")
-        if frame[0] == BFEE:
+        if frame[0] == 0xBB:  # CSI; other frames are skipped
             n_receive, n_transmit = frame[9:11] if size > BFEE_HEADER_BYTES else (0, 0)
             expected = (BFEE_SUBCARRIERS * (16 * n_receive * n_transmit + 3) + 7) // 8
             if not (
@@ -109,7 +106,7 @@ def _split_nexmon(content: bytes, elements: int) -> tuple[list[bytes], int]:
         if payload[:2] == NEXMON_MARK:
             if (len(payload) - NEXMON_HEADER_BYTES) / 4 not in NEXMON_USED:
                 raise ValueError(f"the record at byte {start} does not have 64, 128 or 256 subcarriers")
-            if int.from_bytes(payload[16:18], "little") == NEXMON_ONE_ANTENNA:
+            if int.from_bytes(payload[16:18], "little") == 101:
                 raise InputError(f"it is of a 43455c0 (Raspberry Pi), {ONE_ANTENNA}")
             core, stream = payload[12] & 7, payload[12] >> 3 & 7
             frame = payload[4:12], payload[16:18], len(payload)  # address and number, chip, bandwidth
@@ -140,7 +137,7 @@ def _decode_nexmon(packet: bytes, elements: int) -> Channel:
         channel[:, core] = capture.csi[0]
     first, last = NEXMON_USED[tones]
     used = np.r_[first : last + 1, -last : 1 - first]  # in the order of the FFT
-    used = used[:: max(1, len(used) // MAX_SUBCARRIERS)]
+    used = used[:: max(1, len(used) // 64)]  # about 64 of each packet
     return channel[used]
 
 

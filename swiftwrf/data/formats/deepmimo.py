@@ -39,10 +39,8 @@ Floats = NDArray[np.float64]
 KEYS = ("power", "phase", "delay", "aoa_az", "aoa_el")
 INTERACTIONS, LINE_OF_SIGHT = "inter", 0
 FILE = re.compile(r"power_(t\d+_tx\d+_r\d+)\.npz")
-SIONNA = "sionna"  # in the name of the ray tracer
 MIN_DETOUR, MAX_DETOUR = 0.9, 100.0  # median length of the shortest paths, in distances: beyond, units are wrong
 DIRECT_DETOUR = 0.01  # relative: without interactions, a path that is at most this much longer counts as direct
-STEADY_RESULTANT = 0.5  # mean resultant length above which phases count as constant
 MAX_ANGLE_OFFSET_DEG = 15.0  # median angle between direct paths and the line of sight
 MIN_DIRECT_PATHS = 10  # that show the conventions
 NO_INTERACTIONS = (
@@ -250,6 +248,6 @@ def _convention(phase: Floats, lag: Floats, tracer: str) -> str:
         residual = {"whole": phase + lag, "passband": phase, "reversed": phase - lag}
         resultant = {name: abs(np.exp(1j * left).mean()) for name, left in residual.items()}
         best = max(resultant, key=lambda name: resultant[name])
-        if resultant[best] > STEADY_RESULTANT:
+        if resultant[best] > 0.5:  # mean resultant length of phases that count as constant
             return best
-    return "passband" if SIONNA in tracer.lower() else "whole"
+    return "passband" if "sionna" in tracer.lower() else "whole"

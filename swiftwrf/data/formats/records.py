@@ -23,11 +23,12 @@ import struct
 from abc import abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import google_crc32c
 import numpy as np
 import torch
+from annotated_types import Ge, Lt
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -37,23 +38,19 @@ from swiftwrf.data.files import check_carrier, digests, read_text
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
 from swiftwrf.data.snapshots import Snapshots, check_spacing, round_trip_array, without_null
 from swiftwrf.errors import InputError
-from swiftwrf.positions import MAX_COORDINATE_M
+from swiftwrf.positions import MAX_COORDINATE_M, check_positions
+from swiftwrf.runtime.validation import PositiveFloat, check_value
 
 SUFFIX = ".tfrecords"
-SUBCARRIERS = 64  # kept of each measurement, evenly spaced: more do not improve directions
-MAX_COSINE = 0.1  # between right and up: beyond, they are no axes of a plane
-MAX_ANTENNAS = 4096
 ROWS, COLUMNS = 2, 4  # of an array of ESPARGOS
 MAX_RECORD_BYTES = 2**28
 DTYPES: dict[Any, np.dtype[Any]] = {
     number: np.dtype(name) for number, name in ((1, "<f4"), (2, "<f8"), (3, "<i4"), (8, "<c8"), (9, "<i8"))
 }
 DTYPES[18] = np.dtype("<c16")
-VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5  # wire types
-NO_OFFSETS = (
-    "no reftx-offsets-NAME.json lies beside the records, so the elements' phases are as measured: calibrate them"
-)
-Assignments = list[list[int | None]]  # antenna of each row and column of an array, None for a missing one
+Assignments = list[
+    list[Annotated[int, Ge(0), Lt(4096)] | None]
+]  # antenna of each row and column, None where it is missing
 
 
 class RecordFormat(Format[Snapshots]):
@@ -62,19 +59,23 @@ class RecordFormat(Format[Snapshots]):
     takes = frozenset({"beamformer", "grid", "every", "station", "drop_null", "round_trip"})
     assigned: ClassVar[bool]
     """whether the description assigns antennas to rows and columns"""
+    position: ClassVar[str]
+    """name of the position (3,) [m] in a record"""
 
     @abstractmethod
-    def parse(self, features: dict[str, bytes], file: Path) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return channel (antennas, subcarriers) and position (3,) [m] of a record; refuse others by ValueError."""
+    def channel(self, csi: NDArray[Any], file: Path) -> NDArray[Any]:
+        """Return the channel (antennas, subcarriers) of a record; refuse others by ValueError."""
 
     def prepare(self, files: list[Path]) -> tuple[list[Path], tuple[str, ...]]:
         """Read what lies beside the records; return its files and notes."""
         return [], ()
 
     def recognises(self, path: Path) -> bool:
-        described = _description(path) if _record_files(path) else None
-        assigns = described is not None and any("assignments" in antenna for antenna in _antennas(described))
-        return bool(_record_files(path)) and self.assigned == assigns
+        if not _record_files(path):
+            return False
+        described = _description(path)
+        assigns = described is not None and any("assignments" in antenna for antenna in described[1]["antennas"])
+        return self.assigned == assigns
 
     def read(self, path: Path, options: ReadOptions) -> Snapshots:
         files, described = _record_files(path), _description(path)
@@ -82,19 +83,23 @@ class RecordFormat(Format[Snapshots]):
             raise InputError(
                 f"{path} holds records, but no JSON with antennas, which describes their arrays, lies beside them"
             )
-        station, link, antennas = _read_station(described, options.station, self.assigned)
-        check_spacing(described, link["array"])
+        station, link, antennas = _read_station(*described, options.station, self.assigned)
+        check_spacing(described[0], link["array"])
         beside, notes = self.prepare(files)
         channels, positions, index, without, stride = [], [], [], 0, options.every or 1
         for number, (file, features) in enumerate((source, f) for source in files for f in records(source)):
             if number % stride:
                 continue
             try:
-                csi, position = self.parse(features, file)
-                channel = csi[antennas]
+                channel, position = (
+                    self.channel(tensor(features["csi"]), file)[antennas],
+                    tensor(features[self.position]),
+                )
+                if position.shape != (3,):
+                    raise ValueError(f"{self.position} of shape {position.shape}")
             except (KeyError, IndexError, ValueError) as error:
                 raise InputError(f"{file}: record {number + 1} of all is not what the data set has ({error})") from None
-            channel = channel[:, :: max(1, channel.shape[1] // SUBCARRIERS)].T
+            channel = channel[:, :: max(1, channel.shape[1] // 64)].T  # more subcarriers do not improve directions
             power = float(np.abs(channel).astype(np.float64).max())
             if not (0 < power < math.inf and (np.abs(position) <= MAX_COORDINATE_M).all()):
                 without += 1
@@ -121,7 +126,7 @@ class RecordFormat(Format[Snapshots]):
             **link,
             name=f"{name}-{station}" if station else name,
             index=index,
-            source=digests([*files, described, *beside]),
+            source=digests([*files, described[0], *beside]),
             notes=(*notes, *null, *turned),
         )
 
@@ -131,13 +136,12 @@ class Espargos(RecordFormat):
     """Data sets of https://espargos.net/datasets: `csi` complex (arrays, 2, 4, subcarriers), `pos` (3,) [m]."""
 
     assigned = False
+    position = "pos"
 
-    def parse(self, features: dict[str, bytes], file: Path) -> tuple[NDArray[Any], NDArray[Any]]:
-        csi, position = tensor(features["csi"]), tensor(features["pos"])
-        fits = csi.ndim == 4 and csi.shape[1:3] == (ROWS, COLUMNS) and csi.dtype.kind == "c" and 0 not in csi.shape
-        if not fits or position.shape != (3,):
-            raise ValueError(f"csi of shape {csi.shape} and pos of shape {position.shape}")
-        return csi.reshape(-1, csi.shape[3]), position
+    def channel(self, csi: NDArray[Any], file: Path) -> NDArray[Any]:
+        if csi.ndim != 4 or csi.shape[1:3] != (ROWS, COLUMNS) or csi.dtype.kind != "c" or 0 in csi.shape:
+            raise ValueError(f"csi of shape {csi.shape}")
+        return csi.reshape(-1, csi.shape[3])
 
 
 @SNAPSHOT_FORMATS.register("dichasus")
@@ -149,26 +153,26 @@ class Dichasus(RecordFormat):
     """
 
     assigned = True
+    position = "pos-tachy"
 
     def prepare(self, files: list[Path]) -> tuple[list[Path], tuple[str, ...]]:
         found = {file: file.with_name(f"reftx-offsets-{file.stem}.json") for file in files}
         self._offsets = {file: _read_offsets(source) for file, source in found.items() if source.is_file()}
-        return [found[file] for file in self._offsets], () if len(self._offsets) == len(files) else (NO_OFFSETS,)
+        note = "no reftx-offsets-NAME.json lies beside the records, so the elements' phases are as measured: calibrate them"
+        return [found[file] for file in self._offsets], () if len(self._offsets) == len(files) else (note,)
 
-    def parse(self, features: dict[str, bytes], file: Path) -> tuple[NDArray[Any], NDArray[Any]]:
-        parts, position = tensor(features["csi"]), tensor(features["pos-tachy"])
-        fits = parts.ndim == 3 and parts.shape[2] == 2 and parts.dtype.kind == "f" and 0 not in parts.shape
-        if not fits or position.shape != (3,):
-            raise ValueError(f"csi of shape {parts.shape} and pos-tachy of shape {position.shape}")
-        joined = parts.view(np.result_type(parts.dtype, np.complex64))[..., 0]
-        csi = np.fft.fftshift(joined, axes=1)  # from the order of the FFT to that of frequency
+    def channel(self, csi: NDArray[Any], file: Path) -> NDArray[Any]:
+        if csi.ndim != 3 or csi.shape[2] != 2 or csi.dtype.kind != "f" or 0 in csi.shape:
+            raise ValueError(f"csi of shape {csi.shape}")
+        joined = csi.view(np.result_type(csi.dtype, np.complex64))[..., 0]
+        channel = np.fft.fftshift(joined, axes=1)  # from the order of the FFT to that of frequency
         if (offsets := self._offsets.get(file)) is not None:
-            if len(offsets) != len(csi):
-                raise ValueError(f"{len(csi)} antennas, but offsets of {len(offsets)}")
-            cycles = np.arange(csi.shape[1]) / csi.shape[1]
+            if len(offsets) != len(channel):
+                raise ValueError(f"{len(channel)} antennas, but offsets of {len(offsets)}")
+            cycles = np.arange(channel.shape[1]) / channel.shape[1]
             with np.errstate(invalid="ignore", over="ignore"):  # `read` omits channels that are not finite
-                csi = csi * np.exp(1j * (offsets[:, :1] + offsets[:, 1:] * 2 * np.pi * cycles))
-        return csi, position
+                channel = channel * np.exp(1j * (offsets[:, :1] + offsets[:, 1:] * 2 * np.pi * cycles))
+        return channel
 
 
 def _read_offsets(file: Path) -> NDArray[Any]:
@@ -189,80 +193,71 @@ def _record_files(path: Path) -> list[Path]:
     return [path] if path.suffix == SUFFIX else []
 
 
-def _description(path: Path) -> Path | None:
-    """Return the JSON file beside the records that describes their arrays."""
+def _description(path: Path) -> tuple[Path, dict[str, Any]] | None:
+    """Return the JSON file beside the records that describes their arrays, and its content."""
     folder = path if path.is_dir() else path.parent
-    return next((file for file in sorted(folder.glob("*.json")) if _antennas(file)), None)
+    for file in sorted(folder.glob("*.json")):
+        try:
+            content = json.loads(read_text(file))
+        except (ValueError, RecursionError):  # InputError is such
+            continue
+        antennas = content.get("antennas") if isinstance(content, dict) else None
+        if isinstance(antennas, list) and antennas and all(isinstance(antenna, dict) for antenna in antennas):
+            return file, content
+    return None
 
 
-def _antennas(file: Path) -> list[dict[str, Any]]:
-    try:
-        content = json.loads(read_text(file))
-    except (ValueError, RecursionError):  # InputError is such
-        return []
-    found = content.get("antennas") if isinstance(content, dict) else None
-    return found if isinstance(found, list) and found and all(isinstance(a, dict) for a in found) else []
-
-
-def _read_station(file: Path, number: int | None, assigned: bool) -> tuple[str, dict[str, Any], list[int]]:
+def _read_station(
+    file: Path, content: dict[str, Any], number: int | None, assigned: bool
+) -> tuple[str, dict[str, Any], list[int]]:
     """Return name, array with position and rotation, and antennas of its elements, of the array with that number from 1.
 
     Raises:
         InputError: Several arrays and no number, a number that is too large, or an incomplete description.
     """
-    antennas = _antennas(file)
+    antennas = content["antennas"]
     names = [str(antenna.get("name", "")) for antenna in antennas]
     if (number is None and len(antennas) > 1) or not 1 <= (number or 1) <= len(antennas):
         listed = ", ".join(f"{i} {name}" for i, name in enumerate(names, start=1))
         raise InputError(f"{file} describes {len(antennas)} arrays; choose one by its number: station ({listed})")
     index = (number or 1) - 1
     antenna = antennas[index]
-    location = _vector(file, antenna, "location")
-    spacing = _numbers(antenna.get("spacingX")), _numbers(antenna.get("spacingY"))
-    if any(len(s) != 1 or s[0] <= 0 for s in spacing):
-        raise InputError(f"{file}: array {index + 1} needs spacingX and spacingY in metres")
-    frequency = _numbers(json.loads(read_text(file)).get("frequency"))
-    if len(frequency) != 1:
-        raise InputError(f"{file} lacks frequency, the carrier in Hz; add it")
-    check_carrier(file, frequency[0])
-    rotation = _rotation(file, antenna)
+    right, up, frequency = antenna.get("spacingX"), antenna.get("spacingY"), content.get("frequency")
+    for name, value in (
+        ("spacingX [m] of an array", right),
+        ("spacingY [m] of an array", up),
+        ("frequency", frequency),
+    ):
+        check_value(f"{file}: {name}", value, PositiveFloat)
+    check_carrier(file, frequency)
     rows: Assignments = [[row * COLUMNS + column for column in range(COLUMNS)] for row in range(ROWS)]
     first = index * ROWS * COLUMNS  # of the antennas of ESPARGOS, whose arrays follow each other
     if assigned:
-        rows, first = _assignments(file, antenna.get("assignments"), names[index]), 0
-    middle, ((right,), (up,)) = ((len(rows) - 1) / 2, (len(rows[0]) - 1) / 2), spacing
+        rows, first = _assignments(file, antenna.get("assignments")), 0
+    middle = (len(rows) - 1) / 2, (len(rows[0]) - 1) / 2
     cells = [(r, c, antenna) for r, row in enumerate(rows) for c, antenna in enumerate(row) if antenna is not None]
     element = [(right * (column - middle[1]), up * (middle[0] - row)) for row, column, _ in cells]
-    array = PlanarArray(torch.tensor(element, dtype=torch.float64), LIGHT_SPEED / frequency[0])
-    link = {"array": array, "fixed_position": location, "rotation": rotation}
+    array = PlanarArray(torch.tensor(element, dtype=torch.float64), LIGHT_SPEED / frequency)
+    location = check_positions(antenna.get("location"), f"{file}: location", (3,))
+    link = {"array": array, "fixed_position": location, "rotation": _rotation(file, antenna)}
     return names[index], link, [first + antenna for _, _, antenna in cells]
-
-
-def _numbers(value: Any) -> tuple[float, ...]:
-    """Return the finite numbers of a JSON number or list, none if it is something else."""
-    values = value if isinstance(value, list) else [value]
-    if all(isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= MAX_COORDINATE_M * 1e4 for v in values):
-        return tuple(map(float, values))
-    return ()
-
-
-def _vector(file: Path, antenna: dict[str, Any], name: str) -> tuple[float, ...]:
-    vector = _numbers(antenna.get(name))
-    if len(vector) != 3 or max(map(abs, vector)) > MAX_COORDINATE_M:
-        raise InputError(f"{file}: each array needs {name}, 3 finite numbers, got {antenna.get(name)}")
-    return vector
 
 
 def _rotation(file: Path, antenna: dict[str, Any]) -> Tensor:
     """Return the matrix of the axes to the right, up and to the front, seen from the front."""
+
+    def vector(name: str) -> NDArray[np.float64]:
+        found: NDArray[np.float64] = check_positions(antenna.get(name), f"{file}: {name}", (3,)).numpy()
+        return found
+
     if "rightvector" in antenna:
-        right, up = (np.array(_vector(file, antenna, name)) for name in ("rightvector", "upvector"))
+        right, up = vector("rightvector"), vector("upvector")
     else:
-        front = np.array(_vector(file, antenna, "direction"))
+        front = vector("direction")
         right = np.cross([0.0, 0.0, 1.0], front)
         up = np.cross(front, right)
     size = np.linalg.norm(right) * np.linalg.norm(up)
-    if not size > 1e-12 or abs(right @ up) > MAX_COSINE * size:
+    if not size > 1e-12 or abs(right @ up) > 0.1 * size:
         raise InputError(
             f"{file}: rightvector and upvector of an array must be at right angles, or its direction not vertical"
         )
@@ -270,19 +265,15 @@ def _rotation(file: Path, antenna: dict[str, Any]) -> Tensor:
     return torch.from_numpy(np.stack([right, np.cross(front, right), front], axis=1))
 
 
-def _assignments(file: Path, assignments: Any, name: str) -> Assignments:
-    if assignments is None:
-        raise InputError(f"{file}: array {name} lacks assignments, the antenna of each row and column")
-    rows: Assignments = assignments if isinstance(assignments, list) else []
-    if not rows or not all(isinstance(row, list) and len(row) == len(rows[0]) for row in rows):
+def _assignments(file: Path, rows: Any) -> Assignments:
+    check_value(f"{file}: assignments, the antenna of each row and column,", rows, Assignments)
+    if len({len(row) for row in rows}) != 1:
         raise InputError(f"{file}: assignments must be rows of equal length, with null where an antenna is missing")
-    cells = [cell for row in rows for cell in row]
-    used = [cell for cell in cells if isinstance(cell, int) and not isinstance(cell, bool) and 0 <= cell < MAX_ANTENNAS]
-    if len(used) + cells.count(None) != len(cells) or len(set(used)) != len(used) or len(used) < 2:
-        raise InputError(
-            f"{file}: assignments must name at least 2 antennas by their numbers, each once, got {assignments}"
-        )
-    return rows
+    used = [cell for row in rows for cell in row if cell is not None]
+    if len(set(used)) != len(used) or len(used) < 2:
+        raise InputError(f"{file}: assignments must name at least 2 antennas by their numbers, each once, got {rows}")
+    found: Assignments = rows
+    return found
 
 
 def records(file: Path) -> Iterator[dict[str, bytes]]:
@@ -360,16 +351,13 @@ def _fields(message: bytes) -> Iterator[tuple[int, int | bytes]]:
     while at < len(message):
         key, at = _varint(message, at)
         field, wire = key >> 3, key & 7
-        if wire == VARINT:
+        if wire == 0:
             value, at = _varint(message, at)
             yield field, value
             continue
-        if wire == BYTES:
-            length, at = _varint(message, at)
-        elif wire in (FIXED64, FIXED32):
-            length = 8 if wire == FIXED64 else 4
-        else:
+        if wire not in (1, 2, 5):
             raise ValueError(f"wire type {wire}")
+        length, at = _varint(message, at) if wire == 2 else (8 if wire == 1 else 4, at)
         if at + length > len(message):
             raise ValueError("a field that is longer than its message")
         yield field, message[at : at + length]

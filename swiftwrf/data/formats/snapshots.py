@@ -23,7 +23,6 @@ REQUIRED_ARRAYS = ("csi", "position", "frequency_hz", "array_position", "array_o
 OPTIONAL = ("element_position", "rows", "columns", "spacing_m", "line_of_sight", "time")
 SCALARS = ("frequency_hz", "rows", "columns", "spacing_m")
 VECTORS = ("array_position", "array_orientation", "line_of_sight", "time")
-MAX_HEIGHT_WAVELENGTHS = 1e-3  # of elements over their plane
 
 
 @SNAPSHOT_FORMATS.register("snapshots")
@@ -183,7 +182,7 @@ def _plane(file: Path, arrays: Arrays, wavelength: float) -> Tensor:
     """Return the positions of the elements in their plane, (K, 2) [m]."""
     columns = 2 if arrays["element_position"].shape[1:] == (2,) else 3
     element = check_positions(arrays["element_position"], f"{file}: element_position", (None, columns))
-    if columns == 3 and float((height := element[:, 2]).max() - height.min()) > MAX_HEIGHT_WAVELENGTHS * wavelength:
+    if columns == 3 and float((height := element[:, 2]).max() - height.min()) > 1e-3 * wavelength:
         raise InputError(
             f"{file}: element_position spreads {float(height.max() - height.min()):.3g} m along z; give the elements in "
             "array coordinates, x and y in the array's plane, and let array_orientation turn them into the world"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,6 @@ THICKNESS_M = {  # of panels, walls and sheets by material
     "plasterboard": 0.025,
     "wood": 0.02,
 }
-DEFAULT_THICKNESS_M = 0.1
 FACES = [  # of a box, corners counted as x y z bits, counter-clockwise from outside
     (0, 1, 3, 2),
     (4, 6, 7, 5),
@@ -131,10 +130,6 @@ class FurnishedRoom:
     fixed: Point
     region: tuple[Point, Point]
 
-    def of_materials(self, walls: str | None, floor: str | None, ceiling: str | None) -> FurnishedRoom:
-        """Return the room with the given materials in place of its own."""
-        return replace(self, walls=walls or self.walls, floor=floor or self.floor, ceiling=ceiling or self.ceiling)
-
     def surfaces(self) -> list[Surface]:
         """Return floor, ceiling and walls, then the furniture, one surface a material."""
         x, y, z = self.size
@@ -147,7 +142,7 @@ class FurnishedRoom:
             boxes = [box(piece.low, piece.high) for piece in self.furniture if piece.material == material]
             meshes[f"furniture-{material}"] = (material, boxes)
         return [
-            Surface.joined(name, Material(material, THICKNESS_M.get(material, DEFAULT_THICKNESS_M)), parts)
+            Surface.joined(name, Material(material, THICKNESS_M.get(material, 0.1)), parts)
             for name, (material, parts) in meshes.items()
         ]
 

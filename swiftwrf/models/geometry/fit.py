@@ -45,11 +45,7 @@ from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, configuration
 
-MAX_PHASE_ERROR = 0.1  # relative error of a spectrum's autocorrelation up to which its phases are used
-MAX_ALIAS_STEPS = 3  # times that planes move to other phase aliases
 FURTHER_SIGNIFICANCE = 4.0  # standard errors for a plane of any orientation, of which far more are tried
-PROMISING_SIGNIFICANCE = 1.0  # standard errors by which one must be better after a few steps to be refined further
-MAX_FURTHER_TRIED = 8  # candidates of any orientation that are refined
 MIN_SEARCHED = 50  # spectra of a search whose room is extended; searches in fewer end at phase aliases more often
 MAX_MISSING_RATIO = 1.4  # of the missing coherence of new spectra and of those of a search, geometric means
 N_FINAL = 400  # positions of the last moves of a search; fewer do not separate planes from aliases in furnished rooms
@@ -273,7 +269,7 @@ def observe(train: Spectra, config: GeometryConfig | None = None) -> tuple[Phase
     if len(train.position.unique(dim=0)) < MIN_TRAINING:
         raise InputError(f"the positions of {train.name} are fewer than {MIN_TRAINING} different ones")
     channel, error = retrieve_phases(correlations(train), train.array, config.seed)
-    solved = (error < MAX_PHASE_ERROR).nonzero()[:, 0]
+    solved = (error < 0.1).nonzero()[:, 0]  # relative error of the autocorrelation
     if len(solved) < max(MIN_TRAINING, len(train) / 2):
         raise InputError(
             f"only {len(solved)} of {len(train)} spectra of {train.name} fit its array; check its geometry and carrier"
@@ -310,7 +306,7 @@ def _without_aliases(room: PlaneSet, scene: PhaseObservations, config: GeometryC
     The search moves few planes at once, and takes one sign for all walls and one for floor and ceiling. Half a period away
     the wrong sign explains planes that are often hidden nearly as well, so a lower score alone does not count.
     """
-    for _ in range(MAX_ALIAS_STEPS):
+    for _ in range(3):  # moves to other phase aliases
         here = room.coherence(scene)
         others = phase_alternatives(scene, room)
         other = next((r for r in others if robust_advantage(r.coherence(scene), here) > config.significance), None)
@@ -349,11 +345,11 @@ def _with_further_planes(
     for _ in range(config.max_extra_planes):
         if room.score_at(some) < PERFECT_SCORE:
             break
-        further = oblique_planes(scene, room.field(scene), config.search_distance_m, MAX_FURTHER_TRIED)
+        further = oblique_planes(scene, room.field(scene), config.search_distance_m, 8)
         wider = refine_all(some, [room.joined(plane) for plane in further], 8, tilt=True)
         wider.sort(key=lambda r: r.score_at(some))
         now = room.coherence(some)
-        if not wider or advantage(wider[0].coherence(some), now) < PROMISING_SIGNIFICANCE:
+        if not wider or advantage(wider[0].coherence(some), now) < 1.0:  # standard errors
             break
         wider = [r for other in wider[:2] for r in (other, *sign_alternatives(scene, other))]
         best = min(refine_all(some, wider, 20, tilt=True), key=lambda r: r.score_at(some))

@@ -31,10 +31,8 @@ from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import Fraction, check_value
 
 MAX_COMPONENTS = 64  # principal components of the residual spectra
-MIN_RESIDUAL = 1e-3  # relative norm below which an update adds no component
 MAX_PIXELS = 4000  # of a spectrum, to choose kernel and mixing weight
 MAX_SPECTRA = 10_000  # the fit computes all their inner products
-CONSTANT_GAINS_MARGIN = 1.0  # standard errors by which constant path gains must be ahead to be taken
 FIRST_WEIGHT = 0.7  # mixing weight with which the kernel is chosen
 
 
@@ -131,7 +129,7 @@ class HybridModel(ProcessModel):
                 known[part] = self._paths(train.position[part])
         if not like:
             constant, seen = found.synthesize(train.position), train.spectrum
-            if advantage(psnr(constant, seen), psnr(known, seen)) > CONSTANT_GAINS_MARGIN:
+            if advantage(psnr(constant, seen), psnr(known, seen)) > 1.0:  # standard errors
                 self._room, self.path_gains = found, None
                 return constant
         self.path_gains = fit_path_gains(self.room, scene, kernel, prior)
@@ -160,7 +158,7 @@ class HybridModel(ProcessModel):
         rest = residual - (residual @ unit.T) @ unit
         n = min(MAX_COMPONENTS - len(unit), len(rest))
         _, size, direction = torch.linalg.svd(rest, full_matrices=False)
-        added = direction[:n][size[:n] > MIN_RESIDUAL * residual.norm()]
+        added = direction[:n][size[:n] > 1e-3 * residual.norm()]  # smaller ones are noise
         self.process, self.component = self.process.widened(len(added)), torch.cat([self.component, added])
 
     def _paths(self, position: Tensor) -> Tensor:

@@ -25,7 +25,6 @@ MAX_COSINE = 0.02  # of two planes that count as perpendicular; above 1 - MAX_CO
 ROUNDING_RAD = 1e-3  # of phase, to which positions are rounded in a search
 N_POSITIONS = 36  # that many rooms are scored at
 MAX_DISTANCE_M = 1e7  # from the fixed end; beyond, only the direction counts, because rounding destroys the phases
-MIN_LENGTH_M = 1e-6  # of a path, whose amplitude is finite also between ends at one place
 BATCH_WAVES = 2**15  # waves that are summed at a time
 SIDES = torch.tensor(
     [[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], dtype=torch.float64
@@ -202,7 +201,8 @@ class PhaseObservations:
         Args:
             ray: Vectors from the receiver to the source, float32 (3, ...) [m].
         """
-        length = ray.square().sum(0).sqrt().clamp_min(MIN_LENGTH_M)  # the norm over a first dimension is slow
+        # the norm over a first dimension is slow, and an amplitude finite also between ends at one place
+        length = ray.square().sum(0).sqrt().clamp_min(1e-6)
         phase = (self.element @ (ray / length).flatten(1)).reshape(len(self.element), *length.shape)
         return phase - self.wavenumber * length, length
 

@@ -31,14 +31,9 @@ from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.threads import parallel_map, single_thread
 from swiftwrf.runtime.validation import check_value
 
-EXTENT_PER_LENGTH = 4  # extent of the region over the correlation length of gains
-NOISE_VARIANCE = 1e-3  # of a gain, relative to its prior variance
 N_FIELDS = 8  # whose spectra are averaged
-LEARNING_RATE = 0.2  # of Adam, on standard normal variables
 MAX_CHOICE = 200  # spectra that choose the prior
-MAX_ADVANTAGE = 3.0  # standard errors by which a choice must be behind to be given up before all folds are seen
 MIN_ERROR = 1e-6  # of squared co-array numbers, by rounding
-MIN_MODULUS = 1e-30  # of a field whose phase is taken
 HIGHEST_ORDER, MAX_PATHS = 3, 100  # of the image sources that may be added to those of the room
 
 PREFIX = "path_gains."  # of the names in a file
@@ -141,7 +136,7 @@ def fit_path_gains(
     shape = len(scene), N_FIELDS, len(gain), 2
     sample = prior.sample_std * torch.randn(shape, generator=torch.Generator().manual_seed(0))
     gradient, normal = posterior_gradient(scene, wave, gain, root, sample, prior), sample.clone()
-    optimiser = torch.optim.Adam([normal], lr=LEARNING_RATE, fused=True)
+    optimiser = torch.optim.Adam([normal], lr=0.2, fused=True)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, prior.steps)
     for _ in range(prior.steps):
         normal.grad = gradient(normal)
@@ -187,7 +182,7 @@ def posterior_gradient(
         better = match.abs().argmax(-1, keepdim=True)
         nearer = conjugate.gather(1, better.expand(-1, -1, field.shape[-1]))
         across = (match.gather(2, better).conj() * nearer * unit).imag
-        slope = scale * across / field.abs().clamp_min_(MIN_MODULUS)
+        slope = scale * across / field.abs().clamp_min_(1e-30)  # a phase needs no modulus
         by_gain = torch.complex(-slope * unit.imag, slope * unit.real) @ wave.mH
         return times_root(std * torch.view_as_real(by_gain), transposed=True) + (normal - sample)
 
@@ -241,8 +236,8 @@ def choose_prior(geometry: GeometryModel, scene: PhaseObservations, fold: Tensor
             error[row].append(_error(gains, candidates[row][0], held))
         so_far = {row: torch.cat(error[row]) for row in left}
         best = min(left, key=lambda row: float(so_far[row].mean()))
-        # one held-out position has no standard error, and gives nothing up
-        left = [row for row in left if row == best or not advantage(so_far[row], so_far[best]) >= MAX_ADVANTAGE]
+        # three standard errors behind is given up; one held-out position has no standard error, and gives nothing up
+        left = [row for row in left if row == best or not advantage(so_far[row], so_far[best]) >= 3.0]
         if len(left) == 1:
             break
     return PriorChoice(*candidates[best], fits[best] if complete else {})
@@ -259,4 +254,4 @@ def _error(gains: PathGains, geometry: GeometryModel, held: PhaseObservations) -
 def kernel_of(position: Tensor) -> Kernel:
     """Return the prior kernel of path gains in the region of positions (n, 3) [m]."""
     extent = float((position.max(0).values - position.min(0).values).max())
-    return Kernel(extent / EXTENT_PER_LENGTH, matern12_weight=1.0, noise=NOISE_VARIANCE)
+    return Kernel(extent / 4, matern12_weight=1.0, noise=1e-3)

@@ -19,8 +19,6 @@ from swiftwrf.array.planar import PlanarArray, basis, pairs
 from swiftwrf.data.spectra import Spectra
 
 MAX_PIXELS = 6000  # of a spectrum, for its few dozen coefficients
-N_STEPS, MAX_STARTS = 40, 20
-MAX_ERROR = 5e-3  # relative error of the autocorrelation of a solution
 
 
 def autocorrelation(channel: Tensor, array: PlanarArray) -> Tensor:
@@ -76,8 +74,8 @@ def retrieve_phases(observed: Tensor, array: PlanarArray, seed: int = 0) -> tupl
     toeplitz[:, b, a] = toeplitz[:, a, b].conj()
     phase = torch.linalg.eigh(toeplitz).eigenvectors[..., -1].angle()  # close to the solution if one path dominates
     best, error = phase.clone(), torch.full((n,), math.inf, dtype=torch.float64)
-    for start in range(MAX_STARTS):
-        rows = (error > MAX_ERROR).nonzero()[:, 0]
+    for start in range(20):
+        rows = (error > 5e-3).nonzero()[:, 0]
         if not len(rows):
             break
         x = phase[rows] + min(0.7 * start, 2.1) * torch.randn(len(rows), k, dtype=torch.float64, generator=generator)
@@ -101,7 +99,7 @@ def _descend(phase: Tensor, observed: Tensor, a: Tensor, b: Tensor, lag: Tensor)
 
     damping = torch.full((n,), 1e-2, dtype=torch.float64)
     product, missed = residual(phase)
-    for _ in range(N_STEPS):
+    for _ in range(40):
         jacobian = torch.einsum("lp,np,pk->nlk", gather.to(product.dtype), 1j * product, difference.to(product.dtype))
         jacobian = torch.view_as_real(jacobian).permute(0, 1, 3, 2).flatten(1, 2)
         normal = jacobian.mT @ jacobian

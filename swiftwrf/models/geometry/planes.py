@@ -27,7 +27,6 @@ from swiftwrf.models.geometry.phase_retrieval import autocorrelation
 from swiftwrf.runtime.validation import NonNegativeFloat, check_value, configuration
 
 MAX_PLANES, MAX_ORDER = 64, 4  # of a room, whose image sources number MAX_PLANES^MAX_ORDER at most
-NORMAL_TOLERANCE = 1e-6  # of the length of a normal, from rounding
 MIN_MISSING = 1e-5  # missing coherence by rounding of spectra and phases
 MIN_FIELD, MIN_GAIN = 1e-9, 1e-6  # moduli by which derivatives are divided
 
@@ -56,7 +55,7 @@ class Plane:
     def check(self) -> None:
         """Refuse a normal of another length and infinite numbers."""
         length = math.hypot(*self.normal)
-        if abs(length - 1) > NORMAL_TOLERANCE:
+        if abs(length - 1) > 1e-6:  # from rounding
             raise InputError(
                 f"the normal of a plane must be a unit vector, got {self.normal} of length {length:.6g}; divide normal and "
                 "offset_m by it"

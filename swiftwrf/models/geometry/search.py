@@ -34,18 +34,13 @@ MAX_START_RATIO = 1.4  # of a start's score and the best one, beyond which the s
 Alternatives = list[list[tuple[float, float]]]  # offset [m] and gain, for each side
 MAX_ALTERNATIVES = {2: 99, 3: 7, 4: 4}  # of each side, by the number of sides that move at once
 SEARCH_ORDER = 2  # reflections of an image while planes move together
-N_MINIMA = 8  # of a scan, for each side
 N_REFINED = 8  # combinations of each kind of move
 N_SCANNED = 64  # positions that scans score planes at
 N_SCREENED = 24  # positions at which all combinations of a kind of move are scored
 N_RESCORED = 8  # times as many combinations as are wanted are scored at all positions
 MAX_MOVES = 20
-BEAM_STEPS = 3  # Levenberg-Marquardt steps after each plane of a beam; moves refine its rooms further
-MAX_COMBINATIONS = 1000  # that are scored at a time
 N_HORIZONTAL_NORMALS = 90  # of upright walls
 N_SPHERE_NORMALS = 1200  # in all directions
-N_NEAR = 24  # positions close together, whose waves stay in phase over a few degrees of tilt
-BATCH_NORMALS = 4  # that are scanned at a time
 FURTHER_GAIN = 0.7  # modulus of the gain that planes of any orientation are tried with
 MIN_DISTANCE_RAD, DISTANCE_STEP_RAD = 0.5, 0.6  # of the scanned offsets beyond both ends, in phase
 
@@ -136,7 +131,7 @@ class SteeringResponses:
         crossed = [j for j, some in pairs.items() if some]
         chosen = [functional.one_hot(right[j - half], size[j]).T for j in crossed]
         found = []
-        for rows in torch.arange(left.shape[1]).split(max(1, MAX_COMBINATIONS // right.shape[1])):
+        for rows in torch.arange(left.shape[1]).split(max(1, 1000 // right.shape[1])):
             total = stay.expand(-1, -1, left.shape[1])[:, :, rows, None] + move[:, :, None]
             between = [
                 sum((self.double[i, j].index_select(2, left[i, rows]) for i in pairs[j]), start=torch.zeros(()))
@@ -239,7 +234,7 @@ class Search:
                 break
             best = sorted(pool.values(), key=lambda room: float(room.score))[: 3 * width]
             distinct: dict[tuple[tuple[int, int], ...], PlaneSet] = {}
-            for room in self.refined(best, BEAM_STEPS):
+            for room in self.refined(best, 3):  # moves refine these rooms further
                 distinct.setdefault(self.key(room), room)
             rooms = list(distinct.values())[:width]
         return rooms[0]
@@ -323,7 +318,7 @@ class Search:
         """Yield the best room of each kind of move, cheap kinds first."""
         if float(room.score) < PERFECT_SCORE:
             return
-        alternatives = self.alternatives(room, N_MINIMA)
+        alternatives = self.alternatives(room, 8)  # for each side
         responses = self.responses(alternatives)
         for k in MAX_ALTERNATIVES:
             yield self.refined(self.moves(alternatives, responses, k, N_REFINED))[0]
@@ -388,7 +383,8 @@ def oblique_planes(scene: PhaseObservations, base: Tensor, reach: float, top: in
         top: Number of planes.
     """
     both = torch.cat([scene.transmitter, scene.receiver])
-    rows = (scene.moving - scene.moving.mean(0)).norm(dim=1).argsort()[:N_NEAR]
+    # positions close together, whose waves stay in phase over a few degrees of tilt
+    rows = (scene.moving - scene.moving.mean(0)).norm(dim=1).argsort()[:24]
     near, base = scene.subset(rows), base[rows]
     farthest = max(reach * scene.wavenumber, MIN_DISTANCE_RAD)
     distance = torch.arange(MIN_DISTANCE_RAD, farthest, DISTANCE_STEP_RAD, dtype=torch.float64) / scene.wavenumber
@@ -409,5 +405,5 @@ def oblique_planes(scene: PhaseObservations, base: Tensor, reach: float, top: in
             ]
         return found
 
-    found = itertools.chain.from_iterable(parallel_map(of_normals, directions().split(BATCH_NORMALS)))
+    found = itertools.chain.from_iterable(parallel_map(of_normals, directions().split(4)))
     return sorted(found, key=lambda plane: float(plane.score))[:top]

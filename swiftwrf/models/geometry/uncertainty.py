@@ -36,10 +36,8 @@ MAX_STD_RAD = 0.5  # of phase, beyond which a plane is not certain
 MIN_SPREAD_RAD = 0.8  # of phase: positions with less spread in any direction count as flat
 CARRIER_SCALES = (0.95, 0.97, 0.98, 0.99, 1.01, 1.02, 1.03, 1.05)  # of alternative carriers
 SYSTEMATIC_STD_WAVELENGTHS = 0.02  # of planes that explain nothing, because unmodelled paths are no random noise
-MAX_MOVING = 6  # planes, one for each side of a room
 MAX_PERIODS = 4  # to either side
 N_POSITIONS = 18  # that the best combinations are scored at
-N_FIRST_POSITIONS = 6  # that all combinations are scored at
 N_RESCORED = 8  # times as many combinations as are wanted are scored at more than the first positions
 OFFSET_STEP_WAVELENGTHS = 0.125  # of the grid from which aliases are interpolated
 N_WHOLE = 32  # combinations of whole periods around which half periods are tried
@@ -168,7 +166,7 @@ def phase_alternatives(scene: PhaseObservations, room: PlaneSet) -> list[PlaneSe
 def _alias_offsets(scene: PhaseObservations, room: PlaneSet, plane: int) -> dict[int, float]:
     """Return the offsets [m] at which the mean phase of a plane's wave differs by half periods, by their number."""
     here = float(room.offset[0, plane])
-    if plane >= MAX_MOVING:
+    if plane >= 6:  # a plane for each side of a room
         return {0: here}
     normal = room.normal[0, plane]
     nearest = float((torch.cat([scene.transmitter, scene.receiver]) @ normal).max())
@@ -201,7 +199,7 @@ class _AlternativeTable:
         self.offsets = [_alias_offsets(scene, room, plane) for plane in range(room.normal.shape[1])]
         offset = [torch.tensor(list(p.values()), dtype=torch.float64) for p in self.offsets]
         gain = [g * (-1.0) ** torch.tensor(list(p)) for g, p in zip(room.gain[0], self.offsets, strict=True)]
-        self.scenes = [scene.few(N_FIRST_POSITIONS), scene]
+        self.scenes = [scene.few(6), scene]  # all combinations are scored at the first
         self.waves = [SteeringResponses.of(some, room.normal[0], offset, gain, room.order) for some in self.scenes]
 
     def room(self, choice: HalfPeriods) -> PlaneSet:

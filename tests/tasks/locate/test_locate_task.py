@@ -26,7 +26,7 @@ from tasks.claim import LOCATOR as MODEL
 from tasks.command_line import command_line
 from tasks.labels import LOCALIZERS as LABELS
 from tasks.locate.experiment import prepared
-from tasks.locate.steps import Localization, in_plan
+from tasks.locate.steps import Localization
 from tasks.predict.observations import read_rssi
 from tasks.predict.options import PredictConfig
 from tasks.predict.run import run as predict
@@ -96,7 +96,7 @@ def test_baselines_locate_better_than_the_mean_position(name, validation):
 
 def test_a_known_fingerprint_is_located_where_it_was_measured():
     train = rssi_room(n=60)
-    with mock.patch("swiftwrf.locate.baselines.NEIGHBOUR_COUNTS", (1,)):
+    with mock.patch("swiftwrf.rssi.baselines.NEIGHBOUR_COUNTS", (1,)):
         located = LOCALIZERS["knn"]().fit(train).locate(train.rssi_dbm)
     torch.testing.assert_close(located.position, train.transmitter_position)
 
@@ -189,7 +189,7 @@ def test_rows_that_no_receiver_detected_are_left_out(tmp_path, capsys):
 
 def test_an_interrupted_run_goes_on_to_the_same_numbers(finished, tmp_path):
     out = tmp_path / "run"
-    with mock.patch.object(RegressedCoordinates, "_regress", side_effect=KeyboardInterrupt):
+    with mock.patch.object(RegressedCoordinates, "_fitted", side_effect=KeyboardInterrupt):
         assert run("--cells", 300, "--out", out) == 130
     partial = tmp_path / "run.partial"
     kept = {file.stem for file in (partial / "steps").iterdir()}
@@ -296,17 +296,6 @@ def test_positions_and_directions_of_spectra(matched, tmp_path, capsys):
     assert "--grid 8 32" in said(capsys)
     assert locate(file, tmp_path / "unknown.npy", "--every", 2, "--out", tmp_path / "out.csv") == 2
     assert "--every does not apply" in said(capsys)
-
-
-def test_a_posterior_is_summed_over_height():
-    at = torch.tensor([[[0.0, 0, 0], [0, 0, 1], [1, 0, 0], [1, 2, 0]]], dtype=torch.float64)
-    posterior = mock.Mock(position=at, weight=torch.tensor([[0.2, 0.2, 0.4, 0.2]]).double(), resolution_m=0.3)
-    posterior.__len__ = lambda self: 1
-    xs, ys, density = in_plan(posterior)
-    assert density.shape == (1, len(ys), len(xs))
-    assert density[0, 0, 0] == pytest.approx(1)
-    assert density[0, -1, -1] == pytest.approx(0.5)
-    assert density[0, len(ys) // 2].isnan().all()
 
 
 def test_the_benchmark_measures_every_localizer(monkeypatch):
