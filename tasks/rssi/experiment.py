@@ -21,7 +21,6 @@ from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import distance
 from swiftwrf.rssi import LEVEL, PairModel, RssiModel
 from tasks.claim import MODEL
-from tasks.cluster import connected
 from tasks.metrics import PredictorMetrics, PredictorSeconds, ReceiverMetrics, RssiMetrics
 from tasks.page.floor_plan import read_pixels
 from tasks.page.page import reporting
@@ -35,6 +34,7 @@ from tasks.run import Row, Run, choose_device
 from tasks.source import asked_offsets, measured_rssi, offset_notes, split_notes
 from tasks.summarise import error_summary, grouped
 from tasks.terminal import console, terminal
+from tasks.workers import connected
 
 MAP_CELLS = 80  # along the longer side of the floor
 MAX_PAIR_CELLS = 60_000  # of all maps together: each needs a system of 64 equations
