@@ -23,7 +23,6 @@ from swiftwrf.rssi import LEVEL, PairModel, RssiModel
 from swiftwrf.rssi.baselines import make_predictor
 from swiftwrf.rssi.maps import RssiMap
 from tasks.claim import MODEL
-from tasks.cluster import connected
 from tasks.metrics import PredictorMetrics, PredictorSeconds, ReceiverMetrics, RssiMetrics
 from tasks.page.floor_plan import read_pixels
 from tasks.page.page import reporting
@@ -35,6 +34,7 @@ from tasks.run import Row, Run, choose_device
 from tasks.source import asked_offsets, measured_rssi, offset_notes, split_notes
 from tasks.summarise import error_summary, grouped
 from tasks.terminal import console, terminal
+from tasks.workers import connected
 
 
 def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
