@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 from typing import Any
 
-from tasks.aoa.condition import Condition, conditions_of, headline, reference_of
-from tasks.aoa.former import with_present_names
-from tasks.metrics import AoaMetrics, ChangeMetrics, ErrorSummary, MixMetrics
+from swiftwrf.metrics import ChangeMetrics
+from tasks.aoa.condition import Condition, conditions_of, headline
+from tasks.metrics import AoaMetrics, ErrorSummary, MixMetrics
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
@@ -17,7 +16,7 @@ RESULTS = ROOT / "benchmarks" / "results"
 
 def load(name: str) -> dict[str, Any]:
     """Return one result."""
-    content: dict[str, Any] = with_present_names(json.loads((RESULTS / f"{name}.json").read_text()))
+    content: dict[str, Any] = json.loads((RESULTS / f"{name}.json").read_text())
     return content
 
 
@@ -45,25 +44,9 @@ def turbo_condition(mix: MixMetrics) -> Condition:
     return headline(conditions_of(mix["methods"]).values())
 
 
-def reference(mix: MixMetrics) -> str:
-    """Return the best method on measured spectra alone. Results of earlier versions do not name it."""
-    conditions = conditions_of(mix["methods"])
-    error = {name: method["great_circle_deg"]["median"] for name, method in mix["methods"].items()}
-    return mix.get("reference") or reference_of(conditions, error)
-
-
-def change(mix: MixMetrics, method: str, other: str) -> ChangeMetrics:
-    """Return the change of the angular error against another method. Its interval is nan in results of earlier versions."""
-    if found := mix["methods"][method].get("changes", {}).get(other):
-        return found
-    own, before = (mix["methods"][name]["great_circle_deg"]["median"] for name in (method, other))
-    return {"median_deg": own, "change": own / before - 1, "low": math.nan, "high": math.nan}
-
-
 def change_text(found: ChangeMetrics) -> str:
-    """Return a change with its interval if there is one."""
-    interval = f" [{found['low']:+.0%}, {found['high']:+.0%}]" if math.isfinite(found["low"]) else ""
-    return f"{found['change']:+.0%}{interval}"
+    """Return a change with its interval."""
+    return f"{found['change']:+.0%} [{found['low']:+.0%}, {found['high']:+.0%}]"
 
 
 def markdown(columns: list[str], rows: list[list[str]]) -> str:

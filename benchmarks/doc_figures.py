@@ -25,7 +25,7 @@ import swiftwrf
 from swiftwrf.plotting import mark_direction, polar_spectrum
 from swiftwrf.rssi.maps import RssiMap
 from tasks.page.figures import as_svg
-from tasks.page.maps import corners_of, hatch
+from tasks.page.maps import hatch
 
 FOLDER = Path(__file__).parent.parent / "docs" / "figures"
 INK, TRAIN, TEST, SYNTHETIC = (
@@ -200,7 +200,7 @@ def _image(
     axes: Axes, chart: RssiMap, values: np.ndarray, known: np.ndarray, style: dict[str, Any], label: str
 ) -> AxesImage:
     """Draw a map, hatched outside of the measured positions."""
-    image = axes.imshow(values, origin="lower", extent=corners_of(chart.x, chart.y), **style)
+    image = axes.imshow(values, origin="lower", extent=chart.corners, **style)
     hatch(axes, chart.x, chart.y, known)
     axes.figure.colorbar(image, ax=axes, label=label)
     axes.set(xlabel="x [m]", ylabel="y [m]")

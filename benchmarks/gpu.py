@@ -35,6 +35,7 @@ from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
 from augment import Mixed
+from augment.estimators.aann import AANN, AANNConfig
 from swiftwrf import (
     AngularGrid,
     CoarrayModel,
@@ -50,7 +51,6 @@ from swiftwrf.models.geometry.planes import Plane
 from swiftwrf.models.swiftwrf_paper import SwiftWRFPaper
 from swiftwrf.online import prequential
 from swiftwrf.rasterize import rasterize_magnitude
-from tasks.aoa.estimators.aann import AANN, AANNConfig
 from tasks.run import choose_device
 
 FORWARD = {10_000: (600e3, 1e6), 1000: (1.8e6, 1.8e6)}  # by N: spectra a second that drawing should reach, and the goal

@@ -16,8 +16,8 @@ from committed import RESULTS, load
 from record import write_result
 
 from swiftwrf import Rssi, load_rssi, rssi_room
+from swiftwrf.locate.baselines import LOCALIZERS
 from tasks.locate.experiment import Results, prepared
-from tasks.locate.localizers import LOCALIZERS
 from tasks.locate.steps import Localization
 from tasks.records import strict
 

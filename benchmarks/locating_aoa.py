@@ -20,10 +20,10 @@ import tyro
 from record import RESULTS, write_result
 
 from augment import Mixed, withhold
+from augment.estimators import make_estimator
 from swiftwrf import FitError, InputError, MatchedField, Spectra, load_spectra, make_model, simulated_room
 from swiftwrf.metrics import angle_errors, summary
 from tasks.aoa.context import ROOM_MODEL
-from tasks.aoa.estimators import make_estimator
 from tasks.aoa.locating import LEVEL, NO_PLANE, located
 from tasks.aoa.options import fraction_key
 

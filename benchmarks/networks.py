@@ -23,16 +23,16 @@ from record import RESULTS, write_result
 from torch import Tensor
 
 from augment import Mixed, SyntheticPositions, mix, synthetic_positions, withhold
+from augment.cross_validation import LOCATOR
+from augment.estimators import make_estimator
+from augment.estimators.aann import AANN
+from augment.estimators.aann_kernel import AANNKernel, AANNKernelConfig
 from swiftwrf import MatchedField, Spectra, load_spectra, make_model, simulated_room
-from swiftwrf.metrics import angle_errors
+from swiftwrf.metrics import angle_errors, paired_change
 from swiftwrf.models import FIELD_MODELS
-from tasks.aoa.condition import LOCATOR
 from tasks.aoa.context import ROOM_MODEL
-from tasks.aoa.estimators import make_estimator
-from tasks.aoa.estimators.aann import AANN
-from tasks.aoa.estimators.aann_kernel import AANNKernel, AANNKernelConfig
 from tasks.run import Preset
-from tasks.summarise import error_summary, paired_change
+from tasks.summarise import error_summary
 
 REFERENCE = "kernel_regression"  # estimator to which others are compared
 N_EXTRA = 3000  # extra synthetic positions in rooms

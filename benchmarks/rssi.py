@@ -28,11 +28,11 @@ from record import write_result
 from torch import Tensor
 
 from swiftwrf import Rssi, load_rssi
+from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.data.rssi import PLACE
 from swiftwrf.rssi import LEVEL, PairModel, RssiModel
+from swiftwrf.rssi.baselines import make_predictor
 from swiftwrf.rssi.head import DB_PER_UNIT, Head, render
-from tasks.rssi.predictors import PREDICTORS
-from tasks.rssi.predictors.base import make_predictor
 from tasks.summarise import error_summary, paired_difference
 
 RESULT = "rssi"
@@ -90,8 +90,8 @@ def measure(data: Rssi, split: str, also: tuple[str, ...] = ()) -> Row:
     """Return errors, differences to the best baseline, coverage of intervals and seconds of every predictor on a split."""
     data = data.receivers(["all"])
     train, test = data.split(split)
-    compared = [name for name in PREDICTORS if PREDICTORS[name].compared(data) or name in also]
-    names = [name for name in compared if not PREDICTORS[name].lacking(data)]
+    compared = [name for name in RSSI_PREDICTORS if RSSI_PREDICTORS[name].compared(data) or name in also]
+    names = [name for name in compared if not RSSI_PREDICTORS[name].lacking(data)]
     methods, errors = {}, {}
     for name in (*names, IDENTITY):
         methods[name], errors[name] = _measured(name, train, test, split)

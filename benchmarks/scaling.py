@@ -28,12 +28,12 @@ from committed import RESULTS, ROOT
 from record import write_result
 
 from augment import Mixed
+from augment.estimators.aann import AANN
 from swiftwrf import AngularGrid, Spectra, load_spectra, make_model, simulated_room
 from swiftwrf.data.simulated import REGION
 from swiftwrf.data.store import stored
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import psnr
-from tasks.aoa.estimators.aann import AANN
 from tasks.page import figures
 
 GRID = AngularGrid.hemisphere(90, 360)

@@ -9,12 +9,10 @@ from typing import Any
 from committed import (
     ROOT,
     aoa_shares,
-    change,
     change_text,
     interval,
     load,
     markdown,
-    reference,
     turbo_condition,
 )
 from comparison_tables import comparison, comparison_cost, comparison_counts, comparison_turbo
@@ -48,7 +46,7 @@ from speed_tables import (
 )
 from targets import aoa_targets, rssi_targets, synthesis_targets
 
-from tasks.aoa.condition import LOCATOR
+from augment.cross_validation import LOCATOR
 
 
 def synthesis() -> str:
@@ -67,7 +65,7 @@ def aoa() -> str:
     rows = []
     for share, mix, result in aoa_shares():
         metrics, methods = result["metrics"], mix["methods"]
-        turbo, best = turbo_condition(mix), reference(mix)
+        turbo, best = turbo_condition(mix), mix["reference"]
         median = {name: f"{method['great_circle_deg']['median']:.2f}" for name, method in methods.items()}
         rows.append(
             [
@@ -78,7 +76,7 @@ def aoa() -> str:
                 f"{median[best]} `{best}`",
                 median["measured_only"],
                 median[turbo.method],
-                *(change_text(change(mix, turbo.method, other)) for other in ("measured_only", best)),
+                *(change_text(methods[turbo.method]["changes"][other]) for other in ("measured_only", best)),
                 median.get(LOCATOR, ""),
                 median["measured_all"],
             ]

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from swiftwrf.data import Rssi, Snapshots, Spectra, load_rssi, load_snapshots, load_spectra
     from swiftwrf.data.simulated import rssi_room, simulated_room
     from swiftwrf.diagnostics.calibration import calibrate
+    from swiftwrf.diagnostics.inspection import inspect
     from swiftwrf.errors import FitError, InputError
     from swiftwrf.locate import MatchedField, RssiLocator
     from swiftwrf.models.base import FieldModel, make_model
@@ -39,6 +40,7 @@ import_lazily(
         "swiftwrf.data": ("Rssi", "Snapshots", "Spectra", "load_rssi", "load_snapshots", "load_spectra"),
         "swiftwrf.data.simulated": ("rssi_room", "simulated_room"),
         "swiftwrf.diagnostics.calibration": ("calibrate",),
+        "swiftwrf.diagnostics.inspection": ("inspect",),
         "swiftwrf.errors": ("FitError", "InputError"),
         "swiftwrf.locate": ("MatchedField", "RssiLocator"),
         "swiftwrf.models.base": ("FieldModel", "make_model"),
@@ -73,6 +75,7 @@ __all__ = [
     "calibrate",
     "fit",
     "fit_rssi",
+    "inspect",
     "load",
     "load_rssi",
     "load_snapshots",

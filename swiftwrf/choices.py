@@ -35,6 +35,23 @@ FIELD_MODELS: Registry[Any] = Registry(
         "wrfgs": "swiftwrf.comparison:WrfGs",
     },
 )
+RSSI_PREDICTORS: Registry[Any] = Registry(
+    "predictor",
+    "swiftwrf.rssi_predictors",
+    {
+        "swiftwrf": "swiftwrf.rssi:RssiModel",
+        "mean": "swiftwrf.rssi.baselines:Mean",
+        "mri_pooled": "swiftwrf.rssi.baselines:SharedPathLoss",
+        "mri_receiver": "swiftwrf.rssi.baselines:ReceiverPathLoss",
+        "knn": "swiftwrf.rssi.baselines:KNNPredictor",
+        "mri_residual": "swiftwrf.rssi.baselines:ResidualKNNPredictor",
+        "gp": "swiftwrf.rssi.baselines:GPPredictor",
+        "pairs": "swiftwrf.rssi:PairModel",
+        "knn_pairs": "swiftwrf.rssi.baselines:PairKNN",
+        "blend": "swiftwrf.rssi.baselines:Blend",
+        "nerf2": "swiftwrf.comparison:NeRF2Rssi",
+    },
+)
 PUBLISHED = {"swiftwrf": "swiftwrf_paper"}  # field models whose published settings are those of another one
 ROOMS = {  # what stands in the rooms of data/raytraced/rooms.yml
     "conference": "conference room, 8 x 5 x 2.8 m: a table with ten chairs, screen, whiteboard, sideboard",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
@@ -52,13 +52,23 @@ def extent(position: Tensor) -> str:
     return f"{' x '.join(f'{side:.2f}' for side in sides)} m"
 
 
-def polar_spectrum(spectrum: Tensor, grid: AngularGrid, ax: Axes | None = None) -> Axes:
+def polar_spectrum(
+    spectrum: Tensor,
+    grid: AngularGrid,
+    ax: Axes | None = None,
+    colours: str = "viridis",
+    limits: tuple[float, float] = (0.0, 1.0),
+    label: str | None = "magnitude",
+) -> Axes:
     """Draw a spectrum as seen along the normal of the array, which is the centre, and return the axes.
 
     Args:
-        spectrum: Magnitudes in [0, 1], (n_elevation, n_azimuth).
+        spectrum: Values, e.g. magnitudes in [0, 1], (n_elevation, n_azimuth).
         grid: Directions of the pixels.
         ax: Polar axes to draw into. Defaults to those of a new figure.
+        colours: Name of a matplotlib colour map.
+        limits: Values of the first and the last colour.
+        label: Label of the colour bar. None for no colour bar.
 
     Example:
         >>> import torch
@@ -72,10 +82,12 @@ def polar_spectrum(spectrum: Tensor, grid: AngularGrid, ax: Axes | None = None) 
     azimuth = np.degrees(grid.azimuth_start + grid.azimuth_step * (np.arange(grid.n_azimuth + 1) - 0.5))
     elevation = np.degrees(grid.elevation_start + grid.elevation_step * (np.arange(grid.n_elevation + 1) - 0.5))
     zenith = (90 - elevation).clip(0, 90)
-    mesh = ax.pcolormesh(np.radians(azimuth), zenith, _array(spectrum), vmin=0, vmax=1, rasterized=True)
+    style = {"cmap": colours, "vmin": limits[0], "vmax": limits[1]}
+    mesh = ax.pcolormesh(np.radians(azimuth), zenith, _array(spectrum), rasterized=True, **style)
     ax.set(ylim=(0, 90), yticks=(30, 60, 90), yticklabels=("60°", "30°", "0°"))  # elevations
     ax.grid(alpha=0.4)
-    ax.figure.colorbar(mesh, ax=ax, label="magnitude", pad=0.1)
+    if label is not None:
+        ax.figure.colorbar(mesh, ax=ax, label=label, pad=0.1)
     return ax
 
 
@@ -100,33 +112,51 @@ def plan(position: Tensor, value: Tensor, label: str, ax: Axes | None = None, **
         >>> plan(torch.rand(5, 3), torch.rand(5), "RSSI [dBm]").get_xlabel()
         'x [m]'
     """
-    ax = _plan_axes(ax)
+    ax = plan_axes(ax)
     x, y, _ = _array(position).T
     points = ax.scatter(x, y, c=_array(value), **({"s": 14} | style))
     ax.figure.colorbar(points, ax=ax, label=label)
     return ax
 
 
-def plan_map(corners: NDArray[Any], value: NDArray[Any], label: str, ax: Axes | None = None) -> Axes:
+def corners_of(x: NDArray[Any], y: NDArray[Any], cell: float | None = None) -> tuple[float, float, float, float]:
+    """Return the edges x0, x1, y0, y1 of a map from the centres of its columns and rows.
+
+    Args:
+        x: Centres of the columns, ascending.
+        y: Centres of the rows, ascending.
+        cell: Edge of a cell. Defaults to the distance of the centres. Then a single row is as high as a column is wide.
+
+    Example:
+        >>> corners_of(np.array([0.0, 2.0]), np.array([5.0]))
+        (-1.0, 3.0, 4.0, 6.0)
+    """
+    steps = [float(line[1] - line[0]) for line in (x, y) if len(line) > 1] if cell is None else [cell]
+    dx, dy = (steps[end] / 2 if steps else 0.5 for end in (0, -1))
+    return float(x[0]) - dx, float(x[-1]) + dx, float(y[0]) - dy, float(y[-1]) + dy
+
+
+def plan_map(corners: Sequence[float], value: NDArray[Any], label: str, ax: Axes | None = None) -> Axes:
     """Draw a map seen from above and to scale, and return the axes.
 
     Args:
-        corners: Lower left and upper right corner, (2, 2) [m].
+        corners: Edges x0, x1, y0, y1 [m].
         value: Values of the cells, (rows along y, columns along x).
         label: Quantity and unit of the values.
         ax: Axes to draw into. Defaults to those of a new figure.
 
     Example:
-        >>> plan_map(np.array([[0, 0], [4, 2]]), np.zeros((2, 4)), "RSSI [dBm]").get_ylabel()
+        >>> plan_map((0, 4, 0, 2), np.zeros((2, 4)), "RSSI [dBm]").get_ylabel()
         'y [m]'
     """
-    ax = _plan_axes(ax)
-    image = ax.imshow(value, origin="lower", extent=tuple(corners.T.ravel().tolist()))
+    ax = plan_axes(ax)
+    image = ax.imshow(value, origin="lower", extent=tuple(corners))
     ax.figure.colorbar(image, ax=ax, label=label)
     return ax
 
 
-def _plan_axes(ax: Axes | None) -> Axes:
+def plan_axes(ax: Axes | None = None) -> Axes:
+    """Return axes for positions seen from above, those of a new figure for None."""
     if ax is None:
         from matplotlib import pyplot
 

@@ -36,20 +36,12 @@ def command_line(
 
 
 def exit_code(action: Callable[[], None]) -> int:
-    """Return the exit code of an action and print its error as one sentence. Under torchrun the first process acts.
+    """Return the exit code of an action and print its error as one sentence.
 
     Returns:
         0: done. 1: a fit failed. 2: wrong input, or a file that cannot be written. 130: interrupted. 141: the reader of the
         output, e.g. `head`, is gone.
     """
-    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
-        return _exit_code(action)
-    from tasks.torchrun import together  # imports torch
-
-    return together(partial(_exit_code, action))
-
-
-def _exit_code(action: Callable[[], None]) -> int:
     try:
         action()
         sys.stdout.flush()

@@ -18,7 +18,6 @@ import torch
 
 from swiftwrf import InputError
 from tasks.preload import MAX_PROCESSES
-from tasks.torchrun import process_count
 
 CODE = ("swiftwrf", "augment", "tasks")  # packages whose files decide the results of a run
 
@@ -55,20 +54,20 @@ def number_of_processes(device: torch.device, asked: int | None = None, threads:
     """Return the number of processes for the steps of a run: `asked`, or up to 4 that share the threads of this process.
 
     Raises:
-        InputError: Several on a GPU or with torchrun, where the number is 1.
+        InputError: Several on a GPU, where the number is 1.
     """
-    if device.type == "cpu" and process_count() == 1:
+    if device.type == "cpu":
         return asked or min(max(1, torch.get_num_threads() // threads), MAX_PROCESSES)
     if (asked or 1) > 1:
-        raise InputError(f"--processes {asked} is for steps on the CPU without torchrun; leave it out")
+        raise InputError(f"--processes {asked} is for steps on the CPU; leave it out")
     return 1
 
 
 def environment(device: torch.device, source: dict[str, str], processes: int = 1) -> dict[str, Any]:
     """Return code, versions, machine and input of a run that computes its steps in this number of processes.
 
-    The number of threads of a process belongs to the seed, and so does the number of processes of torchrun: they decide the
-    order in which sums are added, and a training turns the last bit of a sum into degrees.
+    The number of threads of a process belongs to the seed: it decides the order in which sums are added, and a training
+    turns the last bit of a sum into degrees.
     """
     return {
         "commit": _commit(),
@@ -77,7 +76,7 @@ def environment(device: torch.device, source: dict[str, str], processes: int = 1
         "packages": packages(),
         "device": machine(device),
         "threads": torch.get_num_threads(),
-        "processes": max(processes, process_count()),
+        "processes": processes,
         "input_sha256": source,
         "start": now(),
     }

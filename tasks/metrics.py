@@ -5,7 +5,11 @@ Units are degrees, dB and seconds. A number that does not exist is nan here and 
 
 from __future__ import annotations
 
-from typing import Literal, NotRequired, TypedDict, get_args
+from typing import TYPE_CHECKING, Literal, NotRequired, TypedDict, get_args
+
+if TYPE_CHECKING:
+    from augment.cross_validation import CrossValidationMetrics, EstimatorChoiceMetrics
+    from swiftwrf.metrics import ChangeMetrics
 
 Angle = Literal["azimuth_deg", "elevation_deg", "great_circle_deg"]
 Score = Literal["psnr_db", "ssim", "l1"]
@@ -44,15 +48,6 @@ class SynthesisMetrics(TypedDict):
     seconds: dict[str, float]
 
 
-class ChangeMetrics(TypedDict):
-    """Median error with synthetic spectra, its relative change (-0.3 is 30 % lower), and the change's 95 % interval."""
-
-    median_deg: float
-    change: float
-    low: float
-    high: float
-
-
 class MethodMetrics(TypedDict):
     """Errors of one condition; seconds to `train` and to `estimate`, means of the repeats.
 
@@ -78,40 +73,6 @@ class ChoiceMetrics(TypedDict):
     psnr_db: dict[str, float]
     seconds: dict[str, float]
     left_out: dict[str, str]
-
-
-class GainMetrics(ChangeMetrics):
-    """Change by a number of synthetic spectra at synthetic positions."""
-
-    n_synthetic: int
-
-
-class CrossValidationMetrics(TypedDict):
-    """Cross-validation of one field model: change of the error on held-out measured spectra by extra synthetic spectra.
-
-    `gains` has every number that was compared, `rule` the number chosen on the other folds. Further positions
-    are recommended if every number reduces the error; `helps` requires that the interval of `rule` excludes zero, too.
-    """
-
-    stand_in: str
-    n_held_out: int
-    measured_only_deg: float
-    gains: list[GainMetrics]
-    rule: ChangeMetrics | None
-    recommended_n_synthetic: int
-    helps: bool
-
-
-class EstimatorChoiceMetrics(TypedDict):
-    """Method with the smallest median angular error on held-out measured spectra; that error of each candidate.
-
-    `better` has the methods with a significantly smaller error on the test spectra, best first, and why they are not chosen.
-    """
-
-    name: str
-    held_out_deg: dict[str, float]
-    n_held_out: int
-    better: dict[str, str]
 
 
 class LocatingMetrics(TypedDict):
@@ -203,13 +164,13 @@ class RssiMetrics(RunMetrics):
     """Metrics of a run of tasks.rssi.
 
     `notes` are those of the reader. `receivers` is by receiver and method, `left_out` is the reason why a method is missing.
-    `model` is the method whose maps and intervals the run contains. Results of earlier versions lack it.
+    `model` is the method whose maps and intervals the run contains.
     """
 
     notes: list[str]
 
     preset: str
-    model: NotRequired[str]
+    model: str
     overall: dict[str, PredictorMetrics]
     left_out: dict[str, str]
     receivers: dict[str, dict[str, ReceiverMetrics]]

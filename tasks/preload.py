@@ -41,8 +41,8 @@ def without_main() -> Iterator[None]:
 
 
 def preload(modules: Sequence[str]) -> None:
-    """Begin to load modules for the processes to come, where there will be some: with several threads, without torchrun."""
-    several = (os.cpu_count() or 1) > 1 and os.environ.get("OMP_NUM_THREADS") != "1" and "WORLD_SIZE" not in os.environ
+    """Begin to load modules for the processes to come, where there will be some: with several threads."""
+    several = (os.cpu_count() or 1) > 1 and os.environ.get("OMP_NUM_THREADS") != "1"
     global _is_served
     if SERVED and modules and several:
         from multiprocessing import forkserver

@@ -11,14 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from pandas import DataFrame, Series
 
 from swiftwrf.metrics import summary
-from tasks.metrics import ChangeMetrics, ErrorSummary
+from tasks.metrics import ErrorSummary
 
 MIN_ROWS = 10  # of a test, for an interval of differences
-N_BOOTSTRAP = 2000
 MAX_COVERAGE_ERROR = 0.05  # difference from the nominal coverage below which intervals count as calibrated
 MIN_RELEVANT = 0.02  # difference of mean errors, relative to them, below which methods are equal in practice
 MAX_SPREAD = 0.5  # of labels about their mean direction, relative to the error of the peaks, for a warning
-SMALLEST_ERROR = 1e-9  # degrees: a change is relative to at least this median
 SHORTEST = 1e-5  # seconds: what took less is drawn here, for logarithmic axes have no zero
 
 
@@ -173,31 +171,6 @@ def fingerprinting(constant_deg: float, peak_deg: float) -> str:
         f"This is fingerprinting along a path rather than estimation of angles: directions lie within {constant_deg:.1f} "
         f"degrees of their mean (median), and peaks are {peak_deg:.0f} degrees off."
     )
-
-
-def paired_change(before: ArrayLike, after: ArrayLike) -> ChangeMetrics:
-    """Return the median of `after`, its change relative to the median of `before`, and the change's 95 % interval.
-
-    The interval is a bootstrap over test rows. All errors of a row are resampled together, so that differences between rows
-    do not widen it, and repeats do not narrow it.
-
-    Args:
-        before: Errors (n,) of test rows, or (n, repeats).
-        after: Errors of the same rows and repeats.
-
-    Example:
-        >>> change = paired_change([1.0, 2.0, 3.0], [0.5, 1.0, 1.5])
-        >>> change["change"], change["low"], change["high"]
-        (-0.5, -0.5, -0.5)
-    """
-    first, second = np.asarray(before, dtype=float), np.asarray(after, dtype=float)
-    rows = np.random.default_rng(0).integers(len(first), size=(N_BOOTSTRAP, len(first)))
-    reference, changed = (np.median(x[rows].reshape(N_BOOTSTRAP, -1), axis=1) for x in (first, second))
-    ratio = changed / np.maximum(reference, SMALLEST_ERROR)
-    low, high = np.percentile(ratio - 1, (2.5, 97.5))
-    median = float(np.median(second))
-    change = median / max(float(np.median(first)), SMALLEST_ERROR) - 1
-    return {"median_deg": median, "change": change, "low": float(low), "high": float(high)}
 
 
 def running_median(values: Series) -> Series:

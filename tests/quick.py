@@ -13,29 +13,29 @@ from unittest import mock
 
 from small import glances, small_published, small_swiftwrf
 
+from augment.estimators import ESTIMATORS
+from augment.estimators.baselines import Constant
 from swiftwrf import AngularGrid, RssiModel, rssi_room, simulated_room
+from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.errors import MAX_LENGTH
 from swiftwrf.rssi import RssiConfig
 from swiftwrf.runtime.validation import configuration
 from tasks.aoa import experiment as aoa
 from tasks.aoa.condition import NETWORKS
-from tasks.aoa.estimators import ESTIMATORS
-from tasks.aoa.estimators.baselines import Constant
 from tasks.aoa.options import AoaConfig
 from tasks.command_line import command_line
 from tasks.convert.options import ConvertConfig
 from tasks.convert.run import run as convert
-from tasks.estimate.options import EstimateConfig
-from tasks.estimate.run import run as estimate
 from tasks.inspect.options import InspectConfig
 from tasks.inspect.run import run as inspect
 from tasks.locate import experiment as locate
 from tasks.locate.options import LocateConfig
+from tasks.predict.options import PredictConfig
+from tasks.predict.run import run as predict
 from tasks.report.options import ReportConfig
 from tasks.report.run import run as report
 from tasks.rssi import experiment as rssi
 from tasks.rssi.options import RssiTaskConfig
-from tasks.rssi.predictors import PREDICTORS
 from tasks.scenes.options import ScenesConfig
 from tasks.scenes.run import run as scenes
 from tasks.update.options import UpdateConfig
@@ -49,7 +49,7 @@ TASKS = {
     "locate": (LocateConfig, locate.run),
     "report": (ReportConfig, report),
     "convert": (ConvertConfig, convert),
-    "estimate": (EstimateConfig, estimate),
+    "predict": (PredictConfig, predict),
     "inspect": (InspectConfig, inspect),
     "view": (ViewConfig, view),
     "scenes": (ScenesConfig, scenes),
@@ -90,9 +90,9 @@ def quick() -> Iterator[None]:
         mock.patch.object(rssi, "rssi_room", return_value=floor),
         mock.patch.object(locate, "rssi_room", return_value=rssi_room(n=80)),
         mock.patch.object(RssiModel, "config_type", QuickRssiConfig),
-        mock.patch("tasks.rssi.experiment.MAP_CELLS", 8),
+        mock.patch("swiftwrf.rssi.maps.CELLS", 8),
         mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
-        mock.patch.object(PREDICTORS, "_registered", {name: PREDICTORS[name] for name in PREDICTORS_KEPT}),
+        mock.patch.object(RSSI_PREDICTORS, "_registered", {name: RSSI_PREDICTORS[name] for name in PREDICTORS_KEPT}),
     ):
         yield
 

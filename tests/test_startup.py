@@ -10,11 +10,10 @@ import pytest
 import augment
 import swiftwrf
 from swiftwrf.array.beamforming import BEAMFORMERS
-from swiftwrf.choices import FIELD_MODELS, ROOMS
+from swiftwrf.choices import FIELD_MODELS, ROOMS, RSSI_PREDICTORS
 from swiftwrf.data.raytraced import ROOMS as BUILT_IN_ROOMS
 from tasks import labels
 from tasks.command import COMMANDS
-from tasks.rssi.predictors import PREDICTORS
 
 HEAVY = ("torch", "torchvision", "numba", "sklearn", "matplotlib", "scipy", "pandas")
 RUN = """
@@ -54,7 +53,7 @@ def test_help_imports_nothing_heavy(name):
         ("locate", "--cells", "1"),
         ("inspect", "x", "--grid", "1", "1"),
         ("convert", "x", "y", "--split", "block"),
-        ("estimate", "x", "y", "--array", "4", "0", "1e9"),
+        ("predict", "x", "y", "--array", "4", "0", "1e9"),
         ("view", "x", "--port", "-1"),
         ("scenes", "--room", "none", "--moving", "receiver", "--positions", "9", "--out", "x"),
         ("resume", "x"),
@@ -64,7 +63,7 @@ def test_wrong_options_import_nothing_heavy(arguments):
     assert imported(RUN, *arguments) == (2, [])
 
 
-@pytest.mark.parametrize("package", ["swiftwrf", "augment", "tasks.rssi.predictors"])
+@pytest.mark.parametrize("package", ["swiftwrf", "augment", "swiftwrf.choices"])
 def test_packages_import_their_members_at_first_use(package):
     assert imported(f"import {package}, sys; print(0, *sys.modules, file=sys.stderr)") == (0, [])
 
@@ -100,7 +99,7 @@ print(int(not all(unchanged)), file=sys.stderr)
 
 @pytest.mark.parametrize(
     ("registry", "known"),
-    [(FIELD_MODELS, labels.FIELD_MODELS), (BEAMFORMERS, labels.BEAMFORMERS), (PREDICTORS, labels.PREDICTORS)],
+    [(FIELD_MODELS, labels.FIELD_MODELS), (BEAMFORMERS, labels.BEAMFORMERS), (RSSI_PREDICTORS, labels.PREDICTORS)],
     ids=["field models", "beamformers", "predictors"],
 )
 def test_what_is_declared_has_a_label_and_can_be_imported(registry, known):

@@ -11,12 +11,12 @@ import pytest
 from quick import PREDICTORS_KEPT, TASKS, QuickNetwork, QuickRssiConfig
 from small import glances
 
+from augment.estimators import ESTIMATORS
 from swiftwrf import RssiModel
+from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.rssi import RssiConfig
 from tasks.aoa.condition import NETWORKS
-from tasks.aoa.estimators import ESTIMATORS
 from tasks.command_line import command_line
-from tasks.rssi.predictors import PREDICTORS
 
 TEXT = (Path(__file__).parent.parent / "docs" / "tutorial.md").read_text()
 PARTS = re.split(r"^## ", TEXT, flags=re.MULTILINE)[1:]
@@ -41,7 +41,9 @@ def test_every_block_runs(part, tmp_path, monkeypatch):
             glances(),
             mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
             mock.patch.object(RssiModel, "config_type", rssi_config),
-            mock.patch.object(PREDICTORS, "_registered", {name: PREDICTORS[name] for name in PREDICTORS_KEPT}),
+            mock.patch.object(
+                RSSI_PREDICTORS, "_registered", {name: RSSI_PREDICTORS[name] for name in PREDICTORS_KEPT}
+            ),
         ):
             assert command_line(module, config, function, arguments) == 0, block
         out = Path(arguments[arguments.index("--out") + 1] if "--out" in arguments else arguments[-1])

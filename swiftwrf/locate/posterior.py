@@ -15,11 +15,44 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from swiftwrf.errors import InputError
-from swiftwrf.plotting import MARK, Axes, Displayed, plan
+from swiftwrf.plotting import MARK, Axes, Displayed, corners_of, plan
+from swiftwrf.positions import nearest
 from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.validation import checked
 
+PLAN_PIXELS = 80  # of a posterior in plan, along its longer side
 RIDGE = 1e-3  # of the weights: keeps those that the data do not determine near their start
+
+
+@dataclass(frozen=True, eq=False)
+class PlanMap:
+    """Values on a grid in plan.
+
+    Args:
+        x: Centres of the columns, ascending, (W,) [m].
+        y: Centres of the rows, ascending, (H,) [m].
+        values: Values (H, W), nan where there are none.
+
+    Example:
+        >>> PlanMap(np.array([0.0, 1.0]), np.array([0.0]), np.array([[3.0, 4.0]])).at(0.8, 0.1)
+        4.0
+    """
+
+    x: NDArray[np.floating]
+    y: NDArray[np.floating]
+    values: NDArray[np.floating]
+
+    @property
+    def corners(self) -> tuple[float, float, float, float]:
+        """Edges x0, x1, y0, y1 of all cells [m]. A single row is as high as a column is wide."""
+        return corners_of(self.x, self.y)
+
+    def at(self, x: float, y: float) -> float:
+        """Return the value of the cell at a position [m], nan outside of the grid."""
+        x0, x1, y0, y1 = self.corners
+        if not (x0 <= x <= x1 and y0 <= y <= y1):
+            return math.nan
+        return float(self.values[np.abs(self.y - y).argmin(), np.abs(self.x - x).argmin()])
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +93,36 @@ class Posterior(Displayed):
     @property
     def _median_radius(self) -> str:
         return f"{float(self.credible_radius().median()):.2f} m"
+
+    def in_plan(self, row: int = 0) -> PlanMap:
+        """Return the mass of an observation summed over height and square pixels, relative to the largest sum.
+
+        A pixel without a candidate has the value of the nearest pixel with one, and nan if that is farther away than the
+        resolution of the candidates.
+
+        Args:
+            row: Number of the observation.
+
+        Example:
+            >>> at = torch.tensor([[[0.0, 0, 0], [0.0, 0, 1], [1.0, 0, 0]]], dtype=torch.float64)
+            >>> weight = torch.tensor([[0.25, 0.25, 0.5]], dtype=torch.float64)
+            >>> Posterior(at, weight.log(), 0.1).in_plan().values[0, [0, -1]].tolist()
+            [1.0, 1.0]
+        """
+        at = self.position[row if len(self.position) > 1 else 0, :, :2]
+        low, extent = at.amin(dim=0), at.amax(dim=0) - at.amin(dim=0)
+        pixel = float(extent.max()) / PLAN_PIXELS or 1.0
+        width, height = (round(side / pixel) + 1 for side in extent.tolist())
+        column, line = ((at - low) / pixel).round().long().unbind(dim=1)
+        filled, owner = (line * width + column).unique(return_inverse=True)
+        mass = torch.zeros(len(filled), dtype=torch.float64).index_add_(0, owner, self.weight[row])
+        every = torch.arange(height * width)
+        pixels = torch.stack([every % width, every // width, torch.zeros(len(every))], dim=1).double()
+        away, number = nearest(pixels, pixels[filled], 1)
+        values = (mass / mass.max())[number[:, 0]]
+        values[away[:, 0] * pixel > max(self.resolution_m, pixel)] = torch.nan
+        x, y = (float(start) + pixel * np.arange(size) for start, size in zip(low, (width, height), strict=True))
+        return PlanMap(x, y, values.reshape(height, width).numpy())
 
     def plot(self, row: int = 0, ax: Axes | None = None) -> Axes:
         """Draw the mass of the candidates, the median and the 80 % credible circle of an observation, seen from above.

@@ -119,6 +119,8 @@ class RssiPredictor(Configured, Displayed, ABC):
     """whether the positions of the receivers must be known"""
     slow: ClassVar[bool] = False
     """whether a fit takes minutes, so that it is compared only on request"""
+    max_map_predictions: ClassVar[int] = 2**22
+    """predictions of a map at all receivers if its cells are not given"""
     batch_size: ClassVar[int] = 512
     """positions evaluated at a time, few enough to stay in the processor's cache"""
 

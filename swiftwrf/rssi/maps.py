@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -11,10 +12,11 @@ import torch
 from numpy.typing import NDArray
 
 from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
-from swiftwrf.data.dataset import DEGREE_UNITS, Arrays, Labelled
+from swiftwrf.data.dataset import DEGREE_UNITS, Arrays, Labelled, Numbers
 from swiftwrf.data.rssi import receiver_row
 from swiftwrf.errors import InputError, listed
-from swiftwrf.plotting import Axes, Displayed, plan_map
+from swiftwrf.models.prediction import Prediction
+from swiftwrf.plotting import Axes, Displayed, corners_of, plan_map
 from swiftwrf.rssi.base import RssiPredictor
 
 CELLS = 120  # of a map, along its longer side
@@ -47,13 +49,20 @@ class RssiMap(Labelled, Displayed):
     origin: GeodeticOrigin | None = None
 
     @classmethod
-    def predict(cls, model: RssiPredictor, cell: float | None = None, height: float | None = None) -> RssiMap:
-        """Return the map of a fitted model over the box of its training positions.
+    def predict(
+        cls,
+        model: RssiPredictor,
+        cell: float | None = None,
+        height: float | None = None,
+        region: Numbers | None = None,
+    ) -> RssiMap:
+        """Return the map of a fitted model over the box of a region.
 
         Args:
             model: Fitted model.
-            cell: Edge of a cell [m]. Defaults to 1/120 of the longer side.
+            cell: Edge of a cell [m]. Defaults to 1/120 of the longer side, larger if predictions of the model are slow.
             height: Height of the transmitter [m]. Defaults to the median of the training positions.
+            region: Positions (n, 2 or 3) [m]. Defaults to the training positions and the known positions of receivers.
 
         Raises:
             InputError: A cell that is not positive, or a map of more than 2^22 cells.
@@ -64,9 +73,14 @@ class RssiMap(Labelled, Displayed):
             >>> RssiMap.predict(model, cell=1.0).mean.shape
             (12, 15, 19)
         """
-        position = model.region()
-        low, high = (end[:2].numpy() for end in (position.amin(dim=0), position.amax(dim=0)))
-        cell = float((high - low).max()) / CELLS or 1.0 if cell is None else cell
+        known, receiver = model.region(), model.receiver_position
+        if region is None:
+            region = torch.cat([known, receiver[receiver.isfinite().all(dim=1)]])
+        corner = np.asarray(region, dtype=np.float64)[:, :2]
+        low, high = corner.min(axis=0), corner.max(axis=0)
+        if cell is None:
+            n_cells = min(CELLS, math.isqrt(model.max_map_predictions // len(model.receiver_names)))
+            cell = float((high - low).max()) / n_cells or 1.0
         if not cell > 0:
             raise InputError(f"a cell needs an edge above 0 m, got {cell:g}")
         sizes = np.maximum(np.ceil((high - low) / cell), 1)
@@ -74,7 +88,7 @@ class RssiMap(Labelled, Displayed):
             raise InputError(f"a map of cells of {cell:g} m would have {sizes.prod():.3g} of them; take larger cells")
         first = (low + high - sizes * cell) / 2 + cell / 2
         x, y = (start + cell * np.arange(int(size)) for start, size in zip(first, sizes, strict=True))
-        z = float(position[:, 2].median()) if height is None else height
+        z = float(known[:, 2].median()) if height is None else height
         grid = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), z)], axis=-1).reshape(-1, 3)
         with torch.no_grad():
             found = model.predict(grid)
@@ -95,6 +109,16 @@ class RssiMap(Labelled, Displayed):
         names = tuple(self.receiver_names[row] for row in rows)
         return replace(self, mean=self.mean[rows], std=self.std[rows], receiver_names=names)
 
+    @property
+    def prediction(self) -> Prediction:
+        """Prediction of all cells, mean and standard deviation (R, rows, columns)."""
+        return Prediction(torch.from_numpy(self.mean), torch.from_numpy(self.std))
+
+    @property
+    def corners(self) -> tuple[float, float, float, float]:
+        """Edges x0, x1, y0, y1 of all cells [m]."""
+        return corners_of(self.x, self.y, self.cell)
+
     def plot(self, receiver: str | None = None, ax: Axes | None = None) -> Axes:
         """Draw the map of the predictive mean, seen from above.
 
@@ -106,8 +130,7 @@ class RssiMap(Labelled, Displayed):
             InputError: An unknown receiver.
         """
         shown = self if receiver is None else self.receivers([receiver])
-        corners = np.array([[self.x[0], self.y[0]], [self.x[-1], self.y[-1]]]) + self.cell / 2 * np.array([[-1], [1]])
-        ax = plan_map(corners, shown.mean.max(axis=0), "predicted RSSI [dBm]", ax)
+        ax = plan_map(self.corners, shown.mean.max(axis=0), "predicted RSSI [dBm]", ax)
         ax.set_title(f"predicted RSSI of {'the strongest receiver' if receiver is None else shown.receiver_names[0]}")
         return ax
 

@@ -188,6 +188,7 @@ class PairModel(PairPredictor, SavedRssiPredictor):
 
     kind: ClassVar[str] = "rssi pair model"
     name = "pairs"
+    max_map_predictions = 60_000  # each needs a system of 64 equations
 
     metric: Metric
     """how distances of both ends count"""
@@ -255,6 +256,10 @@ class PairModel(PairPredictor, SavedRssiPredictor):
                 score = error / (variance + kernel.noise).sqrt()
                 judged.append((float(error.mean()), metric, kernel, score))
         return judged
+
+    def region(self) -> Tensor:
+        """Return the training positions (n, 3) [m], one for each pair."""
+        return self.pair[:, :3]
 
     def _precompute(self) -> None:
         known, value = self.metric.known(self.pair), self.metric.values(self.residual)

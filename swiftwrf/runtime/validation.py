@@ -215,7 +215,10 @@ class Configured:
             raise InputError(f"{type(self).__name__} has no option {unknown[0]!r}; it has {', '.join(known)}")
         if config is None:
             if not self.supported({"preset": preset}):
-                raise InputError(f"{type(self).__name__} has no published settings; leave preset='paper' out")
+                raise InputError(
+                    f"{type(self).__name__} has no published settings; leave preset='paper' out, or let "
+                    "make_model(name, preset='paper') return the published model"
+                )
             self.config = (self.config_type.paper if preset == "paper" else self.config_type)(**options)
         elif isinstance(config, self.config_type):
             self.config = replace(config, **options)

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
-from itertools import product
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, Literal, TypeVar
 
-from swiftwrf.models import FIELD_MODELS
+from augment.cross_validation import LOCATOR, STAND_IN
+from augment.estimators import ESTIMATORS
 from tasks import labels
-from tasks.aoa.estimators import ESTIMATORS
 from tasks.aoa.options import AUTO, fraction_key
 from tasks.run import Preset, Row
 
 Training = Literal["measured", "turbo", "turbo_extra", "all"]
 NETWORKS: dict[Preset, str] = {"quick": "aann_kernel", "paper": "aann"}
 """network that a run of each preset trains; names of its conditions omit it"""
-STAND_IN = "kernel_regression"  # estimator in place of the network where many or quick trainings are needed
 MEASURED_STAND_IN = f"{STAND_IN}_measured_only"  # file of it without synthetic spectra
-LOCATOR = "matched_field"  # estimator that locates the moving end by the room; it needs positions, array and fixed end
 Value = TypeVar("Value")
 
 
@@ -160,24 +157,8 @@ def trainable(preset: Preset) -> list[str]:
 
 
 def conditions_of(methods: Mapping[str, Mapping[str, Any]]) -> dict[str, Condition]:
-    """Return the condition of each method of metrics.json.
-
-    Older runs do not store the condition. There a method is found by its name among those of all registered estimators and
-    field models; other methods are left out.
-    """
-    known: dict[str, Condition] = {}
-    if any("estimator" not in entry for entry in methods.values()):
-        for estimator, training in product(estimators("quick"), get_args(Training)):
-            for synthesizer in ("",) if training in ("measured", "all") else (*FIELD_MODELS, AUTO):
-                condition = Condition(estimator, training, synthesizer)
-                known[condition.method] = condition
-    found = {}
-    for method, entry in methods.items():
-        if "estimator" in entry:
-            found[method] = Condition(**{name: entry[name] for name in DESCRIPTION})
-        elif method in known:
-            found[method] = known[method]
-    return found
+    """Return the condition of each method of metrics.json."""
+    return {method: Condition(**{name: entry[name] for name in DESCRIPTION}) for method, entry in methods.items()}
 
 
 def headline(conditions: Iterable[Condition]) -> Condition:

@@ -9,13 +9,13 @@ import torch
 
 from augment import SyntheticPositions, withhold
 from augment.choose import candidates
+from augment.cross_validation import LOCATOR, CrossValidationMetrics
+from augment.estimators import ESTIMATORS
 from swiftwrf import Spectra
 from swiftwrf.models import FIELD_MODELS, FieldModel
 from swiftwrf.models.base import model_type
-from tasks.aoa.condition import EVERYTHING, LOCATOR, Condition, MeasuredSubset, estimators
-from tasks.aoa.estimators import ESTIMATORS
+from tasks.aoa.condition import EVERYTHING, Condition, MeasuredSubset, estimators
 from tasks.aoa.options import RAYTRACE, AoaConfig
-from tasks.metrics import CrossValidationMetrics
 from tasks.run import Preset
 
 ROOM_MODEL = "geometry"  # field model that finds the room for all models with one

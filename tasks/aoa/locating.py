@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from augment import Mixed
+from augment.cross_validation import LOCATOR
 from swiftwrf import FitError, InputError, Spectra, load
 from swiftwrf.locate import MatchedField, Posterior
 from swiftwrf.models import FieldModel
-from tasks.aoa.condition import LOCATOR, Condition
+from tasks.aoa.condition import Condition
 from tasks.aoa.context import Experiment
 from tasks.records import write_npz
 from tasks.run import Row
@@ -49,10 +50,6 @@ class Locating(Step[Experiment]):
     @property
     def title(self) -> str:
         return f"locating by the room, {self.condition.meaning}"
-
-    @property
-    def reads(self) -> tuple[str, ...]:
-        return (self.room_file,)
 
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         condition, test = self.condition, experiment.test

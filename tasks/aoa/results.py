@@ -9,29 +9,20 @@ import torch
 from pandas import DataFrame
 from torch import Tensor
 
-from swiftwrf.metrics import angle_errors, covered
+from augment.cross_validation import LOCATOR, STAND_IN, EstimatorChoiceMetrics, choose_estimator
+from swiftwrf.metrics import ChangeMetrics, angle_errors, covered, paired_change
 from swiftwrf.models import FIELD_MODELS
-from tasks.aoa.condition import EVERYTHING, LOCATOR, STAND_IN, Condition, MeasuredSubset, pooled, reference_of
+from tasks.aoa.condition import EVERYTHING, Condition, MeasuredSubset, pooled, reference_of
 from tasks.aoa.context import ROOM_MODEL, Experiment
-from tasks.aoa.cross_validation import choose_estimator
 from tasks.aoa.locating import LEVEL, NO_PLANE, Locating
 from tasks.aoa.options import AUTO, fraction_key
 from tasks.aoa.steps import CrossValidation, FoldLocating
 from tasks.aoa.suggestion import Suggestion
 from tasks.aoa.synthesis import Evaluation, RoomSearch, Synthesis, as_bytes
-from tasks.metrics import (
-    ANGLES,
-    SCORES,
-    ChangeMetrics,
-    EstimatorChoiceMetrics,
-    LocatingMetrics,
-    MethodMetrics,
-    MixMetrics,
-    SynthesisMetrics,
-)
+from tasks.metrics import ANGLES, SCORES, LocatingMetrics, MethodMetrics, MixMetrics, SynthesisMetrics
 from tasks.run import Row, Run
 from tasks.steps import Step
-from tasks.summarise import averaged, by_repeat, paired_change, summaries
+from tasks.summarise import averaged, by_repeat, summaries
 from tasks.terminal import console, terminal
 
 EXAMPLE_QUANTILES = (
@@ -88,7 +79,7 @@ class Results:
                 self._add_synthesis(step, value)
             case RoomSearch() if not value.get("planes"):
                 self._leave_out(step.located, value.get("refused", NO_PLANE))
-            case Evaluation() | Locating() if "refused" in value:
+            case Locating() if "refused" in value:
                 self._leave_out((step.condition,), value["refused"])
             case Evaluation() | Locating():
                 self.evaluated.append((step.condition, value))

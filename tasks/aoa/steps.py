@@ -9,24 +9,21 @@ from pathlib import Path
 import torch
 
 from augment import Fold, ModelChoice, choose_model
+from augment.cross_validation import (
+    STAND_IN,
+    CrossValidationMetrics,
+    cross_validate,
+    located_errors,
+    located_folds,
+    measured_errors,
+)
 from swiftwrf import GeometryModel, InputError, Spectra, load
 from swiftwrf.models import FIELD_MODELS
-from tasks.aoa.condition import (
-    EVERYTHING,
-    NETWORKS,
-    STAND_IN,
-    Condition,
-    MeasuredSubset,
-    Training,
-    estimators,
-    trainable,
-)
+from tasks.aoa.condition import EVERYTHING, NETWORKS, Condition, MeasuredSubset, Training, estimators, trainable
 from tasks.aoa.context import ROOM_MODEL, Experiment
-from tasks.aoa.cross_validation import cross_validate, located_errors, located_folds, measured_errors
 from tasks.aoa.options import AUTO
 from tasks.aoa.synthesis import Evaluation, RoomSearch, syntheses
 from tasks.claim import STEPS
-from tasks.metrics import CrossValidationMetrics
 from tasks.records import read_json
 from tasks.run import Row
 from tasks.steps import Step
@@ -165,18 +162,9 @@ class FoldLocating(Step[Experiment]):
     def title(self) -> str:
         return "comparing estimators"
 
-    @property
-    def result(self) -> str:
-        """File of the kept comparison."""
-        return f"{STEPS}/{self.compared.name}.json"
-
-    @property
-    def reads(self) -> tuple[str, ...]:
-        return (self.result, self.room_file)
-
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         measured, _ = experiment.withhold(self.compared.subset)
-        entry = read_json(folder / self.result)["value"]["folds"][str(self.number)]
+        entry = read_json(folder / STEPS / f"{self.compared.name}.json")["value"]["folds"][str(self.number)]
         room = load(folder / self.room_file)
         assert isinstance(room, GeometryModel)
         train, test = (

@@ -12,19 +12,19 @@ import torch
 from torch import Tensor
 
 from augment import Mixed, SyntheticPositions, mix, synthetic_positions
+from augment.cross_validation import STAND_IN, CrossValidationMetrics
+from augment.estimators import SavedEstimator, make_estimator
 from swiftwrf import FitError, GeometryModel, InputError, Spectra, load
 from swiftwrf.data.store import Store
 from swiftwrf.metrics import l1, psnr, ssim
 from swiftwrf.models import FieldModel
 from swiftwrf.runtime.checkpoint import read, write
 from tasks.aoa.artifacts import save_artifacts
-from tasks.aoa.condition import MEASURED_STAND_IN, NETWORKS, STAND_IN, Condition, MeasuredSubset, Training, trainable
+from tasks.aoa.condition import MEASURED_STAND_IN, NETWORKS, Condition, MeasuredSubset, Training, trainable
 from tasks.aoa.context import ROOM_MODEL, Experiment
-from tasks.aoa.estimators import SavedEstimator, make_estimator
 from tasks.aoa.locating import Locating
 from tasks.aoa.options import AUTO
 from tasks.claim import STEPS
-from tasks.metrics import CrossValidationMetrics
 from tasks.run import Row
 from tasks.steps import Step
 
@@ -82,10 +82,6 @@ class RoomSearch(Step[Experiment]):
     def file(self) -> str:
         """File of the fitted model in the run's directory."""
         return f"{STEPS}/{self.name}.safetensors"
-
-    @property
-    def reads(self) -> tuple[str, ...]:
-        return (self.start.file,) if self.start else ()
 
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         measured, _ = experiment.withhold(self.subset)
@@ -149,10 +145,6 @@ class Synthesis(Step[Experiment]):
     def file(self) -> str:
         """File of the spectra in the run's directory."""
         return f"{STEPS}/{self.name}.safetensors"
-
-    @property
-    def reads(self) -> tuple[str, ...]:
-        return (self.room.file,) if self.room else ()
 
     def test_spectra(self, folder: Path) -> dict[str, Store]:
         """Return the spectra at the test positions: `test`, and `test_std` if the model has it."""
@@ -259,16 +251,8 @@ class Evaluation(Step[Experiment]):
         return f"training {self.condition.estimator}, {self.condition.meaning}"
 
     @property
-    def reads(self) -> tuple[str, ...]:
-        return (self.synthesis.file,) if self.synthesis else ()
-
-    @property
     def priority(self) -> int:
         return int(self.condition.is_network)
-
-    @property
-    def is_optional(self) -> bool:
-        return self.condition.is_network
 
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         train = self._training_set(experiment, folder)

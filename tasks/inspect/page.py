@@ -11,10 +11,9 @@ from torch import Tensor
 
 from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.data import Rssi, Spectra
+from swiftwrf.diagnostics.inspection import Findings, nearest
 from swiftwrf.rssi import fit_path_loss, log_distance
 from tasks.environment import command
-from tasks.inspect.findings.base import Findings
-from tasks.inspect.findings.positions import nearest
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table
 from tasks.summarise import fingerprinting
@@ -34,10 +33,10 @@ DIRECTIONS = (
 )
 
 
-def page(data: Spectra | Rssi, kind: str, findings: Findings, source: str) -> Page:
+def page(findings: Findings, kind: str, source: str) -> Page:
     """Return the page: findings and figures of what was read from a source."""
+    data, warnings = findings.data, findings.warnings
     rows = [[finding.level, finding.text] for finding in findings.sentences]
-    warnings = [finding.text for finding in findings.sentences if finding.level == "warning"]
     table = Table(["level", "finding"], rows, strong=frozenset(["warning"]), long=True)
     plan, *plots = _rssi(data) if isinstance(data, Rssi) else _spectra(data)
     position = data.transmitter_position if isinstance(data, Rssi) else data.position

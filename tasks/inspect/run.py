@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from swiftwrf.array.beamforming import PHASE
 from swiftwrf.data import Rssi, Snapshots
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
+from swiftwrf.diagnostics.inspection import inspect, propose_offsets
 from tasks.directory import new_directory
 from tasks.environment import stamp
-from tasks.inspect.findings import inspect
-from tasks.inspect.findings.rssi import propose_offsets
 from tasks.inspect.options import InspectConfig
 from tasks.inspect.page import page
 from tasks.page.page import write_page
@@ -30,7 +30,7 @@ def run(config: InspectConfig) -> None:
     with new_directory(out, "an inspection") as folder:
         data = read(source, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS)
         kind = "RSSI" if isinstance(data, Rssi) else "array snapshots" if isinstance(data, Snapshots) else "spectra"
-        findings, shown = inspect(data, options)
+        findings = inspect(data, grid=options.grid, beamformer=options.beamformer or PHASE)
         for column in data.labels if isinstance(data, Rssi) else ():
             propose_offsets(read(source, replace(options, offset_by=column), RSSI_FORMATS), findings)
         content = {
@@ -40,6 +40,5 @@ def run(config: InspectConfig) -> None:
             "numbers": findings.numbers,
         }
         write_json(folder / "inspect.json", content)
-        write_page(folder, page(shown, kind, findings, str(config.source)))
-    marked = (f"{'! ' if finding.level == 'warning' else '  '}{finding.text}" for finding in findings.sentences)
-    terminal.page(content, "\n".join([f"{config.source}: {kind}", *marked]), out / "report.html")
+        write_page(folder, page(findings, kind, str(config.source)))
+    terminal.page(content, f"{config.source}: {kind}\n{findings}", out / "report.html")

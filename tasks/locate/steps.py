@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from augment.suggest import suggest_positions
 from swiftwrf import Rssi
 from swiftwrf.data.coordinates import degree_columns
-from swiftwrf.locate import Posterior, RssiLocator
-from swiftwrf.positions import nearest
+from swiftwrf.locate import RssiLocator
+from swiftwrf.locate.baselines import LOCALIZERS, PosteriorLocalizer
 from tasks.claim import LOCATOR
-from tasks.locate.localizers import LOCALIZERS, PosteriorLocalizer
 from tasks.records import Row, write_npz, write_table
 from tasks.steps import Step
 
@@ -26,7 +26,6 @@ SUGGESTED = "suggested"
 MIN_ROWS = 20  # training rows that a receiver detected: five folds, of which four hold at least 10 rows
 ROW_FRACTIONS, RECEIVER_FRACTIONS = (0.1, 0.3), (0.25, 0.5)  # that are compared with everything
 STUDIED = ("posterior", "knn")
-MAP_PIXELS = 80  # along the longer side of a posterior map
 N_MAPS = 6  # test rows with a posterior map
 
 
@@ -159,34 +158,14 @@ def posterior_maps(locator: RssiLocator, train: Rssi, test: Rssi, error: Tensor)
     """Return the posteriors in plan of six test rows, from the smallest error (n,) [m] to the largest."""
     shown = error.argsort()[torch.linspace(0, len(error) - 1, min(N_MAPS, len(error))).round().long()]
     posterior = locator.locate(test.rssi_dbm[shown])
-    xs, ys, density = in_plan(posterior)
+    plans = [posterior.in_plan(row) for row in range(len(posterior))]
     return {
-        "x": xs.numpy(),
-        "y": ys.numpy(),
-        "density": density.float().numpy(),
+        "x": plans[0].x,
+        "y": plans[0].y,
+        "density": np.stack([plan.values for plan in plans]).astype(np.float32),
         "index": test.index[shown].numpy(),
         "truth": test.transmitter_position[shown].numpy(),
         "estimate": posterior.median.numpy(),
         "radius_80_m": posterior.credible_radius(0.8).numpy(),
         "training_position": train.transmitter_position.numpy(),
     }
-
-
-def in_plan(posterior: Posterior) -> tuple[Tensor, Tensor, Tensor]:
-    """Sum a posterior on shared candidates over height.
-
-    Returns:
-        Coordinates x (W,) and y (H,) [m], and masses relative to the largest (n, H, W), nan away from all candidates.
-    """
-    column, owner = posterior.position[0, :, :2].unique(dim=0, return_inverse=True)
-    mass = torch.zeros(len(posterior), len(column), dtype=torch.float64).index_add_(1, owner, posterior.weight)
-    low, high = column.amin(dim=0), column.amax(dim=0)
-    pixel = float((high - low).max()) / MAP_PIXELS or 1.0
-    xs, ys = (
-        torch.arange(float(a), float(b) + pixel, pixel, dtype=torch.float64) for a, b in zip(low, high, strict=True)
-    )
-    grid = torch.stack([*torch.meshgrid(xs, ys, indexing="xy"), torch.zeros(len(ys), len(xs))], dim=-1).reshape(-1, 3)
-    away, number = nearest(grid, torch.nn.functional.pad(column, (0, 1)), 1)
-    density = (mass / mass.amax(dim=1, keepdim=True))[:, number[:, 0]]
-    density[:, away[:, 0] > max(posterior.resolution_m, pixel)] = torch.nan
-    return xs, ys, density.reshape(len(posterior), len(ys), len(xs))

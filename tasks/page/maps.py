@@ -9,23 +9,11 @@ from matplotlib.axes import Axes
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
+from swiftwrf.plotting import corners_of
+
 MIN_REACH = 1.5  # of the largest distance between neighbours, for positions on a line
 HATCH = "#555b66"
 Corners = tuple[float, float, float, float]  # x0, x1, y0, y1 [m]
-
-
-def corners_of(x: NDArray[Any], y: NDArray[Any]) -> Corners:
-    """Return the corners x0, x1, y0, y1 of a picture from the centres of its columns and rows.
-
-    A single row is as high as a column is wide.
-
-    Example:
-        >>> corners_of(np.array([0.0, 2.0]), np.array([5.0]))
-        (-1.0, 3.0, 4.0, 6.0)
-    """
-    steps = [float(line[1] - line[0]) for line in (x, y) if len(line) > 1] or [1.0]
-    dx, dy = steps[0] / 2, steps[-1] / 2
-    return float(x[0]) - dx, float(x[-1]) + dx, float(y[0]) - dy, float(y[-1]) + dy
 
 
 def inside(position: ArrayLike, known: ArrayLike) -> NDArray[np.bool_]:

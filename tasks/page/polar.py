@@ -6,9 +6,12 @@ from typing import Any
 
 import matplotlib.style
 import numpy as np
+import torch
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from swiftwrf import AngularGrid
+from swiftwrf.plotting import polar_spectrum
 from tasks.page.figures import LABEL, STYLE, colour_bar, plain
 
 MAX_DIFFERENCE = 0.5  # of a magnitude in [0, 1]: end of the scale of differences and standard deviations
@@ -38,25 +41,21 @@ def spectra(images: dict[str, NDArray[Any]], title: str, truth: Direction | None
         axes = list(figure.subplots(n_rows, 2, squeeze=False, subplot_kw={"projection": "polar"}).flat)
     for ax, (kind, image) in zip(axes, images.items(), strict=False):
         colours, low, high = SCALES[kind]
-        n_elevation, n_azimuth = image.shape
-        step = 2 * np.pi / n_azimuth
-        azimuth = (np.arange(n_azimuth + 1) - 0.5) * step  # edges of the pixels
-        radius = np.maximum(90 - 90 * (np.arange(n_elevation + 1) + 0.5) / n_elevation, 0)  # from the zenith [deg]
-        drawn = ax.pcolormesh(azimuth, radius, image, cmap=colours, vmin=low, vmax=high, rasterized=True)
-        ax.set(yticks=(), ylim=(0, 90), xticks=np.deg2rad((0, 90, 180, 270)))
+        grid, values = AngularGrid.hemisphere(*image.shape), torch.from_numpy(image)
+        polar_spectrum(values, grid, ax, colours, (low, high), label=None)
+        ax.set(yticks=(), xticks=np.deg2rad((0, 90, 180, 270)))
         ax.tick_params(labelsize=LABEL, pad=-2)
         ax.grid(visible=False)
         ax.set_title(kind, fontsize=9)
         if kind in ("measured", "predicted"):
-            row, column = np.unravel_index(np.argmax(image), image.shape)
-            at = (column * step, 90 - 90 * (row + 1) / n_elevation)
-            _mark(ax, at, "o", PEAK)
+            azimuth, elevation = grid.peak_direction(values[None])[0].tolist()
+            _mark(ax, (azimuth, 90 - np.rad2deg(elevation)), "o", PEAK)
             if truth is not None:
                 _mark(ax, (np.deg2rad(truth[0]), 90 - truth[1]), "x", TRUTH)
         if kind == "measured":  # in the colours of the prediction beside it
             continue
         extend = {"difference": "both", "standard deviation": "max"}.get(kind, "neither")
-        colour_bar(ax, drawn, extend=extend, pad=0.12)
+        colour_bar(ax, ax.collections[0], extend=extend, pad=0.12)
     for ax in axes[len(images) :]:
         ax.set_visible(False)
     figure.suptitle(plain(title), fontsize=9)

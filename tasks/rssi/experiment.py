@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,14 +13,16 @@ import torch
 from pandas import DataFrame
 
 from swiftwrf import InputError, Rssi, rssi_room
+from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.files import sha256
 from swiftwrf.data.rssi import PLACE
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import distance
 from swiftwrf.rssi import LEVEL, PairModel, RssiModel
+from swiftwrf.rssi.baselines import make_predictor
+from swiftwrf.rssi.maps import RssiMap
 from tasks.claim import MODEL
-from tasks.cluster import connected
 from tasks.metrics import PredictorMetrics, PredictorSeconds, ReceiverMetrics, RssiMetrics
 from tasks.page.floor_plan import read_pixels
 from tasks.page.page import reporting
@@ -29,15 +30,11 @@ from tasks.page.records import Records
 from tasks.rssi.options import RssiTaskConfig
 from tasks.rssi.page import page
 from tasks.rssi.page.summary import answer
-from tasks.rssi.predictors import PREDICTORS
-from tasks.rssi.predictors.base import make_predictor
 from tasks.run import Row, Run, choose_device
 from tasks.source import asked_offsets, measured_rssi, offset_notes, split_notes
 from tasks.summarise import error_summary, grouped
 from tasks.terminal import console, terminal
-
-MAP_CELLS = 80  # along the longer side of the floor
-MAX_PAIR_CELLS = 60_000  # of all maps together: each needs a system of 64 equations
+from tasks.workers import connected
 
 
 def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
@@ -69,8 +66,8 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     ):
         options = {"pool": pool, "device": device, "parallel": cluster.map if cluster else None}
         tables = _Tables(config, train, test, plan, directory, options)
-        compared = [name for name in PREDICTORS if PREDICTORS[name].compared(data) or name in config.also]
-        left_out = {name: reason for name in compared if (reason := PREDICTORS[name].lacking(data))}
+        compared = [name for name in RSSI_PREDICTORS if RSSI_PREDICTORS[name].compared(data) or name in config.also]
+        left_out = {name: reason for name in compared if (reason := RSSI_PREDICTORS[name].lacking(data))}
         for reason in left_out.values():
             console.print(f"left out: {reason}")
         with terminal.progress():
@@ -226,31 +223,17 @@ class _Tables:
 
     def _write_maps(self, model: RssiModel | PairModel) -> None:
         """Write the prediction and the width of its interval over the floor, at the median height of the measurements."""
-        position = self.train.transmitter_position
-        shown = torch.cat([position, self.test.transmitter_position])
-        shown = torch.cat([shown, self.train.receiver_position[self.train.receiver_located]])
-        low, high = shown.min(dim=0).values, shown.max(dim=0).values
-        n_cells = MAP_CELLS
-        if isinstance(model, PairModel):
-            n_cells = min(n_cells, math.isqrt(MAX_PAIR_CELLS // len(self.train.receiver_names)))
-        cell = float((high - low)[:2].max()) / n_cells or 1.0
-        xs, ys = (
-            torch.arange(float(a), float(b) + cell, cell, dtype=torch.float64)
-            for a, b in zip(low[:2], high[:2], strict=True)
-        )
-        grid = torch.stack([*torch.meshgrid(xs, ys, indexing="xy")], dim=-1).reshape(-1, 2)
-        height = position[:, 2].median()
-        if self.train.floors is not None:  # the floor with most measurements, since the median may be between two
-            height = torch.tensor(self.train.floors.height_m)[self.train.floors.number(position).mode().values]
-        prediction = model.predict(torch.cat([grid, height.double().expand(len(grid), 1)], dim=1))
-        lower, upper = prediction.interval(LEVEL)
-        predicted, width = (x.T.reshape(-1, len(ys), len(xs)).numpy() for x in (prediction.mean, upper - lower))
+        height, floors = None, self.train.floors
+        if floors is not None:  # the floor with most measurements, since the median may be between two
+            height = floors.height_m[int(floors.number(self.train.transmitter_position).mode().values)]
+        chart = RssiMap.predict(model, height=height)
+        lower, upper = chart.prediction.interval(LEVEL)
         maps = {
-            "x": xs.numpy(),
-            "y": ys.numpy(),
-            "predicted": predicted,
-            "width": width,
-            "measured_position": position.numpy(),
+            "x": chart.x,
+            "y": chart.y,
+            "predicted": chart.mean,
+            "width": (upper - lower).numpy(),
+            "measured_position": self.train.transmitter_position.numpy(),
             "measured": self.train.rssi_dbm.numpy(),
             "receiver": self.train.receiver_position.numpy(),
             "receiver_names": np.array(self.train.receiver_names),

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import ClassVar, Literal
 
+from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.validation import Preset
 from tasks.options import OffsetSource, Output, command_options
-from tasks.rssi.predictors import PREDICTORS
 
 
 @command_options
@@ -50,7 +50,7 @@ class RssiTaskConfig(OffsetSource, Output):
     def check(self) -> None:
         super().check()
         for name in self.also:
-            PREDICTORS.check(name)
+            RSSI_PREDICTORS.check(name)
         self.check_used(self.data)
         if (self.floor_plan is None) != (self.floor_extent is None):
             raise InputError("--floor-plan needs --floor-extent x0 x1 y0 y1 [m], and the other way round")

@@ -20,8 +20,7 @@ ROOM_HELP = "a Mitsuba scene with radio materials (FILE.xml), or a built-in room
 class ScenesConfig(Output):
     """Ray paths in a room with furniture or in a scene file of Mitsuba, traced by Sionna RT (extra: raytrace).
 
-    The directory holds paths.npz, which --data of the tasks reads, and a page with the room in plan, in space, and with the
-    paths of one position.
+    The directory holds paths.npz, which --data of the tasks reads, and scene.svg, a plan of the room and the positions.
 
     Example: python -m tasks.scenes --room office --moving receiver --positions 1000 --out office
     """
@@ -35,13 +34,6 @@ class ScenesConfig(Output):
     """directory to write; must not exist"""
     frequency: float = 2.4e9
     """carrier [Hz]; ITU-R P.2040 knows most materials from 1 GHz on"""
-    walls: str | None = None
-    """material of the room's walls, of ITU-R P.2040: concrete, brick, plasterboard, wood, glass, metal, ... (default: that
-    of the room)"""
-    floor: str | None = None
-    """material of its floor"""
-    ceiling: str | None = None
-    """material of its ceiling"""
     order: int = 3
     """largest number of reflections (and other interactions) of a path"""
     scattering: float = 0.0
@@ -68,9 +60,6 @@ class ScenesConfig(Output):
         check_scene(self.room)
         if not self.room.endswith(SCENE_FILE):
             return
-        for name in ("walls", "floor", "ceiling"):
-            if getattr(self, name) is not None:
-                raise InputError(f"--{name} is for the rooms ({', '.join(ROOMS)}); {self.room} names its own materials")
         if self.fixed is None or self.region is None:
             raise InputError(
                 f"{self.room} does not contain the positions of the ends; give --fixed X Y Z and --region X Y Z X Y Z"

@@ -16,17 +16,17 @@ from swiftwrf.data.writing import write_paths
 from tasks.directory import new_directory
 from tasks.environment import invocation
 from tasks.options import plain
-from tasks.page.page import write_page
+from tasks.page import figures
 from tasks.records import write_json
 from tasks.scenes.options import ScenesConfig
-from tasks.scenes.page import page
 from tasks.terminal import console, terminal
 
+PLAN = "scene.svg"  # the room and the positions, seen from above
 MAX_ATTEMPTS = 100  # draws of all positions before the region counts as full
 
 
 def run(config: ScenesConfig) -> None:
-    """Draw positions, trace the paths to them, and write paths, record and page.
+    """Draw positions, trace the paths to them, and write paths, record and plan.
 
     Raises:
         InputError: An option that makes no sense, no such room or scene, positions outside of it, a material that has no
@@ -67,9 +67,13 @@ def run(config: ScenesConfig) -> None:
             "sionna_rt": version("sionna-rt"),
         }
         write_json(folder / "scene.json", record)
-        write_page(folder, page(Path(config.room).stem, scene.surfaces, config.moving, paths))
+        figure, axes = figures.panel(8, 5)
+        ends = (paths.transmitter, paths.receiver)
+        moving, still = ends if config.moving == "transmitter" else ends[::-1]
+        scene.plot(still[0], moving, axes)
+        (folder / PLAN).write_text(figures.as_svg(figure, f"Plan of {Path(config.room).stem}"), encoding="utf-8")
     text = f"{len(paths.count)} positions with {each:.0f} paths each, traced in {seconds:.0f} s: {config.out}"
-    terminal.page(record, text, Path(config.out) / "report.html")
+    terminal.page(record, text, Path(config.out) / PLAN)
 
 
 def where(config: ScenesConfig) -> tuple[FurnishedRoom | None, Tensor, Tensor]:
@@ -84,7 +88,6 @@ def where(config: ScenesConfig) -> tuple[FurnishedRoom | None, Tensor, Tensor]:
     fixed = torch.tensor(config.fixed or (room.fixed if room else ()), dtype=torch.float64)
     if room is None:
         return None, fixed, region
-    room = room.of_materials(config.walls, config.floor, config.ceiling)
     size = " x ".join(f"{side:g}" for side in room.size)
     if not bool(room.free(fixed[None])):
         raise InputError(f"--fixed {_listed(fixed)} is outside the room of {size} m, at a wall, or in furniture")

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -16,50 +14,14 @@ from torch import Tensor
 from swiftwrf import InputError, Rssi, load
 from swiftwrf.errors import with_article
 from swiftwrf.locate import MatchedField, Posterior, RssiLocator
+from swiftwrf.locate.baselines import BATCH_ROWS
+from swiftwrf.locate.posterior import PlanMap
 from swiftwrf.locate.rssi import UNDETECTED_BELOW_DB
 from swiftwrf.positions import nearest
-from tasks.locate.localizers import BATCH_ROWS
-from tasks.locate.steps import MAP_PIXELS, in_plan
-from tasks.page.maps import Corners, corners_of
-from tasks.records import as_table, rounded
 
 LEVELS = (0.5, 0.8)  # probabilities of the credible regions that are shown
 N_POSITIONS = 300  # of the map of expected errors
-MIN_MASS = 1e-3  # of a pixel, relative to the largest; less is transparent
 N_DRAWS = 16  # simulated rows at each of them
-
-
-@dataclass(frozen=True, eq=False)
-class PlanMap:
-    """Values on a grid in plan.
-
-    Args:
-        x: Centres of the columns [m], (W,).
-        y: Centres of the rows [m], (H,).
-        values: Values (H, W), nan away from the known positions.
-    """
-
-    x: NDArray[np.floating]
-    y: NDArray[np.floating]
-    values: NDArray[np.floating]
-
-    @property
-    def corners(self) -> Corners:
-        """Corners of the picture of all cells. A single row is as high as a column is wide."""
-        return corners_of(self.x, self.y)
-
-    def at(self, x: float, y: float) -> float:
-        """Return the value of the cell at a position [m], nan outside of the grid."""
-        x0, x1, y0, y1 = self.corners
-        if not (x0 <= x <= x1 and y0 <= y <= y1):
-            return math.nan
-        return float(self.values[np.abs(self.y - y).argmin(), np.abs(self.x - x).argmin()])
-
-    def table(self, name: str) -> str:
-        """Return the cells with values as comma-separated values, under this name."""
-        x, y = np.meshgrid(self.x, self.y)
-        table = pd.DataFrame({"x_m": x.ravel(), "y_m": y.ravel(), name: self.values.ravel().round(4)})
-        return as_table(rounded(table.dropna().to_dict("records")))
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,10 +43,10 @@ class Located:
     ambiguous: bool
 
     @classmethod
-    def of(cls, posterior: Posterior, density: PlanMap, truth: Tensor) -> Located:
+    def of(cls, posterior: Posterior, truth: Tensor) -> Located:
         """Return what the page shows of the posterior of one observation, measured at `truth` (3,) [m]."""
         radius = tuple(float(posterior.credible_radius(level)) for level in LEVELS)
-        return cls(density, posterior.median[0].numpy(), radius, truth.numpy(), bool(posterior.ambiguous))
+        return cls(posterior.in_plan(), posterior.median[0].numpy(), radius, truth.numpy(), bool(posterior.ambiguous))
 
     def describe(self) -> str:
         """Describe the posterior in a few sentences."""
@@ -154,9 +116,7 @@ class RssiLocating:
 
     def _located(self, row: int) -> Located:
         posterior = self.locator.locate(self.rows.rssi_dbm[row : row + 1])
-        x, y, density = in_plan(posterior)
-        in_plan_of_row = PlanMap(x.numpy(), y.numpy(), density[0].numpy())
-        return Located.of(posterior, in_plan_of_row, self.rows.transmitter_position[row])
+        return Located.of(posterior, self.rows.transmitter_position[row])
 
     def describe(self, row: int) -> str:
         """Describe the posterior of a row in a few sentences."""
@@ -218,21 +178,8 @@ class SpectrumLocating:
         return locator
 
     def located(self, spectrum: Tensor, truth: Tensor) -> Located:
-        """Return the posterior of a spectrum (n_elevation, n_azimuth) that was measured at `truth`, (3,) [m].
-
-        Its masses are summed over square pixels of the locator's region.
-        """
-        posterior = self.locator.locate(spectrum[None])
-        cells = self.locator.cells.position[:, :2]
-        low, extent = cells.amin(dim=0), cells.amax(dim=0) - cells.amin(dim=0)
-        pixel_m = float(extent.max()) / MAP_PIXELS or 1.0
-        width, height = (int(number) + 1 for number in (extent / pixel_m).ceil())
-        column, row = ((posterior.position[0, :, :2] - low) / pixel_m).round().long().unbind(-1)
-        mass = torch.zeros(height * width, dtype=torch.float64)
-        mass.index_add_(0, row.clamp(0, height - 1) * width + column.clamp(0, width - 1), posterior.weight[0])
-        density = (mass / mass.max()).masked_fill(mass < MIN_MASS * mass.max(), torch.nan).reshape(height, width)
-        x, y = (float(start) + pixel_m * np.arange(number) for start, number in zip(low, (width, height), strict=True))
-        return Located.of(posterior, PlanMap(x, y, density.numpy()), truth)
+        """Return the posterior of a spectrum (n_elevation, n_azimuth) that was measured at `truth`, (3,) [m]."""
+        return Located.of(self.locator.locate(spectrum[None]), truth)
 
 
 def _coarse_grid(locator: RssiLocator) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from swiftwrf import InputError, Prediction, Rssi, RssiModel
-from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.positions import MAX_COORDINATE_M
 from swiftwrf.rssi import LEVEL
+from swiftwrf.rssi.maps import RssiMap
 from tasks.page import figures, maps
 from tasks.page.floor_plan import FloorPlan
 from tasks.page.maps import Corners
@@ -27,7 +27,6 @@ from tasks.rssi.page.maps import MAX_WIDTH_DB
 from tasks.view.drawing import PlanProjection
 from tasks.view.locating import RssiLocating
 
-CELLS = 120  # of a map, along its longer side
 RECEIVER_COLOURS, N_RECEIVER_COLOURS = "tab20", 20
 RECEIVER_MARK = "#cf4a4a"
 MIN_STD_DB = 1e-6
@@ -148,7 +147,7 @@ class RssiView:
     locating: RssiLocating | None = None
     notes: list[str] = field(default_factory=list)
     folder: Path | None = None
-    _last: tuple[float, Prediction] | None = field(default=None, init=False, repr=False)
+    _last: RssiMap | None = field(default=None, init=False, repr=False)
 
     @property
     def receivers(self) -> tuple[str, ...]:
@@ -179,65 +178,49 @@ class RssiView:
         if self.folder is not None:
             plan.save(self.folder)
         self.floor, self._last = replace(self.floor, plan=plan), None
-        for name in ("cells", "inside"):  # they cover the plan, too
-            self.__dict__.pop(name, None)
+        self.__dict__.pop("inside", None)  # the map covers the plan, too
 
-    def plan(self, max_px: tuple[int, int] = (CELLS, CELLS)) -> PlanProjection:
+    def plan(self, max_px: tuple[int, int]) -> PlanProjection:
         """Return the plan that contains measurements, receivers and floor plan, at most of this size in pixels."""
-        corners = np.array(self.floor.plan.corners).reshape(2, 2).T if self.floor.plan else self.floor.position
-        return PlanProjection.around(self.floor.position, self.floor.receiver, corners, max_px=max_px)
-
-    @cached_property
-    def cells(self) -> tuple[Values, Values]:
-        """Centres of the columns and of the rows of a map [m]."""
-        plan = self.plan()
-        x, y = (
-            low + (np.arange(number) + 0.5) / number * (high - low)
-            for low, high, number in zip(plan.low, plan.high, plan.size, strict=True)
-        )
-        return x, y
+        return PlanProjection.around(self._region, max_px=max_px)
 
     @property
-    def corners(self) -> Corners:
-        """Corners of the picture of all cells."""
-        (x0, y0), (x1, y1) = self.plan().low.tolist(), self.plan().high.tolist()
-        return x0, x1, y0, y1
+    def _region(self) -> Values:
+        """Positions (n, 2) [m] whose box the page covers: measurements, known receivers and the floor plan."""
+        receiver = self.floor.receiver[np.isfinite(self.floor.receiver).all(axis=1)]
+        corners = np.array(self.floor.plan.corners).reshape(2, 2).T if self.floor.plan else np.empty((0, 2))
+        return np.concatenate([self.model.region().numpy()[:, :2], receiver[:, :2], corners])
 
-    def map(self, height: float) -> Prediction:
-        """Return predicted RSSI [dBm] (R, rows, columns) at a height of the transmitter [m]; the last one is cached."""
-        if self._last is None or self._last[0] != height:
-            x, y = self.cells
-            position = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), height)], axis=-1).reshape(-1, 3)
-            found = self._predict(position)
-            mean, std = (values.T.reshape(-1, len(y), len(x)) for values in found)
-            self._last = height, Prediction(mean, std)
-        return self._last[1]
+    @property
+    def chart(self) -> RssiMap:
+        """Last map, or that of the median height."""
+        return self._last or self.map(self.heights[1])
 
-    def _predict(self, position: Values) -> tuple[Tensor, Tensor]:
-        with torch.no_grad():
-            found = self.model.predict(torch.from_numpy(position))
-        assert found.std is not None
-        return found.mean, found.std
-
-    def _width(self, height: float) -> Values:
-        """Return the width of the intervals [dB], (R, rows, columns)."""
-        low, high = self.map(height).interval(LEVEL)
-        return (high - low).numpy()
+    def map(self, height: float) -> RssiMap:
+        """Return the map at a height of the transmitter [m]; the last one is cached."""
+        if self._last is None or self._last.height != height:
+            self._last = RssiMap.predict(self.model, height=height, region=self._region)
+        return self._last
 
     def coloured(self, selection: MapSelection) -> ColouredMap:
         """Return values and colours of the selected map."""
         if selection.kind in LOCATING:
             return self._located(selection)
-        mean, receiver = self.map(selection.height).mean.numpy(), selection.receiver
+        chart, receiver = self.map(selection.height), selection.receiver
+        mean = chart.mean
         match selection.kind:
             case "RSSI":
                 measured = self.floor.rssi_dbm[np.isfinite(self.floor.rssi_dbm)]
                 low, high = np.percentile(measured if len(measured) else mean, (1, 99)).tolist()
                 return ColouredMap(mean[receiver], "viridis", low, high, "predicted RSSI [dBm]")
             case "interval":
-                width = self._width(selection.height)
+                low, high = chart.prediction.interval(LEVEL)
                 return ColouredMap(
-                    width[receiver], "magma", 0.0, MAX_WIDTH_DB, f"width of the {LEVEL:.0%} interval [dB]"
+                    (high - low)[receiver].numpy(),
+                    "magma",
+                    0.0,
+                    MAX_WIDTH_DB,
+                    f"width of the {LEVEL:.0%} interval [dB]",
                 )
             case "coverage":
                 return ColouredMap(np.where(self._covered(selection), 0.7, np.nan), "GnBu", 0.0, 1.0, "")
@@ -255,7 +238,7 @@ class RssiView:
         return ColouredMap(found.values, "viridis", 0.0, high, "expected position error [m]", found.corners)
 
     def _covered(self, selection: MapSelection) -> NDArray[np.bool_]:
-        probability = probability_above(self.map(selection.height), selection)
+        probability = probability_above(self.map(selection.height).prediction, selection)
         if selection.at_least == 0:
             return (probability[selection.receiver] >= selection.certainty).numpy()
         return (at_least(probability, selection.at_least) >= selection.certainty).numpy()
@@ -263,7 +246,7 @@ class RssiView:
     @cached_property
     def inside(self) -> NDArray[np.bool_]:
         """True for each cell inside the measured positions, in plan (rows, columns)."""
-        return maps.inside(np.stack(np.meshgrid(*self.cells), axis=-1), self.floor.position)
+        return maps.inside(np.stack(np.meshgrid(self.chart.x, self.chart.y), axis=-1), self.floor.position)
 
     def sentence(self, selection: MapSelection) -> str:
         """Describe the selected map in a few sentences."""
@@ -286,7 +269,7 @@ class RssiView:
                     f"{selection.threshold:g} dBm with {selection.certainty:.0%} certainty, if it is detected at all."
                 )
             case "best receiver":
-                best = self.map(selection.height).mean.argmax(dim=0)
+                best = torch.from_numpy(self.map(selection.height).mean).argmax(dim=0)
                 counts = best.flatten().bincount()
                 first = int(counts.argmax())
                 fraction = counts[first] / best.numel()
@@ -295,8 +278,10 @@ class RssiView:
 
     def at(self, selection: MapSelection, x: float, y: float) -> Prediction:
         """Return the predictions of all receivers (R,) at a position [m], at the height of the selected map."""
-        mean, std = self._predict(np.array([[x, y, selection.height]]))
-        return Prediction(mean[0], std[0])
+        with torch.no_grad():
+            found = self.model.predict(np.array([[x, y, selection.height]]))
+        assert found.std is not None
+        return Prediction(found.mean[0], found.std[0])
 
     def describe(self, selection: MapSelection, x: float, y: float) -> str:
         """Describe the predictions at a position [m] in lines of text."""
@@ -327,31 +312,24 @@ class RssiView:
         if self.locating is not None and selection.kind in LOCATING:
             is_error = selection.kind == "expected error"
             name = "expected_error_m" if is_error else f"posterior_of_row_{self.locating.rows.index[selection.row]}"
-            return self.locating.map(None if is_error else selection.row).table(name)
-        rssi, r = self.map(selection.height), selection.receiver
-        low, high = rssi.interval(LEVEL)
-        x, y = np.meshgrid(*self.cells)
-        columns = {"predicted_dbm": rssi.mean[r], "low_dbm": low[r], "high_dbm": high[r]}
-        table = pd.DataFrame(
-            {
-                "x_m": x.ravel(),
-                "y_m": y.ravel(),
-                "z_m": selection.height,
-                **degree_columns(self.model.origin, np.stack([x.ravel(), y.ravel()], axis=1)),
-                "receiver": self.receivers[r],
-                **{name: values.double().numpy().ravel() for name, values in columns.items()},
-                f"above_{selection.threshold:g}_dbm_with_{selection.certainty:.0%}": self._covered(selection)
-                .ravel()
-                .astype(int),
-                "best_receiver": np.array(self.receivers)[rssi.mean.argmax(dim=0).flatten()],
-            }
+            found = self.locating.map(None if is_error else selection.row)
+            x, y = np.meshgrid(found.x, found.y)
+            table = pd.DataFrame({"x_m": x.ravel(), "y_m": y.ravel(), name: found.values.ravel().round(4)}).dropna()
+            return as_table(rounded(table.to_dict("records")))
+        chart, r = self.map(selection.height), selection.receiver
+        low, high = (end[r].double().numpy().ravel() for end in chart.prediction.interval(LEVEL))
+        table = chart.receivers([self.receivers[r]]).to_frame().drop(columns="std_db")
+        table = table.assign(low_dbm=low, high_dbm=high)
+        table[f"above_{selection.threshold:g}_dbm_with_{selection.certainty:.0%}"] = (
+            self._covered(selection).ravel() * 1
         )
+        table["best_receiver"] = np.array(self.receivers)[chart.mean.argmax(axis=0).ravel()]
         return as_table(rounded(table.to_dict("records")))
 
     def picture(self, selection: MapSelection) -> bytes:
         """Return the selected map as PNG with axes and legend."""
-        coloured, corners = self.coloured(selection), self.corners
-        width, height = self.plan().size
+        coloured, corners = self.coloured(selection), self.chart.corners
+        height, width = self.chart.mean.shape[1:]
         figure, (ax,) = figures.new_figure(1, 1, 8, 1 + 7 * height / width)
         if self.floor.plan:
             ax.imshow(self.floor.plan.pixels, extent=self.floor.plan.corners, zorder=0)

@@ -136,9 +136,9 @@ class RssiPage:
         plan, floor = self._plan, self._view.floor
         parts = [plan.picture(Image.fromarray(floor.plan.pixels), floor.plan.corners)] if floor.plan else []
         image = colour_image(coloured.values[::-1], coloured.colours, coloured.low, coloured.high)
-        parts.append(plan.picture(image, coloured.corners or self._view.corners, 0.7 if floor.plan else 1.0))
+        parts.append(plan.picture(image, coloured.corners or self._view.chart.corners, 0.7 if floor.plan else 1.0))
         if selection.kind not in LOCATING:
-            parts.append(plan.picture(colour_image(self._outside, "gray"), self._view.corners, 0.55))
+            parts.append(plan.picture(colour_image(self._outside, "gray"), self._view.chart.corners, 0.55))
         if selection.kind == "RSSI":
             parts.append(self._measured_svg(selection.receiver, coloured))
         if selection.kind == "posterior":

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from augment import withhold
+from augment.cross_validation import LOCATOR as MATCHED_FIELD
 from swiftwrf import FieldModel, InputError, RssiModel, Spectra, load
 from swiftwrf.errors import with_article
 from swiftwrf.locate import RssiLocator
@@ -18,7 +19,6 @@ from swiftwrf.models.geometry import Plane
 from swiftwrf.rssi.base import RssiPredictor
 from swiftwrf.runtime.checkpoint import Saved, refusing
 from tasks.aoa.artifacts import model_file
-from tasks.aoa.condition import LOCATOR as MATCHED_FIELD
 from tasks.aoa.experiment import measurements as spectra_of
 from tasks.aoa.options import AoaConfig, fraction_key
 from tasks.claim import CONFIG, ENVIRONMENT, LOCATOR, MODEL
@@ -168,7 +168,7 @@ def _located(
 def _rssi_run(folder: Path) -> RssiView:
     file = folder / MODEL
     if not file.is_file():
-        raise InputError(f"{folder} holds no model: it has no {MODEL}; the run did not end, or is of an older version")
+        raise InputError(f"{folder} holds no model: it has no {MODEL}; the run did not end")
     model = load(file)
     if not isinstance(model, RssiModel):
         raise _not_shown(file, model)

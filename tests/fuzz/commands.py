@@ -14,6 +14,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import get_type_hints
 
+import numpy as np
 import yaml
 from quick import TASKS, run
 
@@ -174,4 +175,4 @@ def updates_and_conversions(draw: random.Random, folder: Path) -> None:
         assert all(len(error) <= MAX_LENGTH for error in errors), arguments
         raise InputError(errors[0] if errors else "the parser refuses the options")
     if task == "convert" and out == "new" and len(arguments) == 2:
-        assert load_rssi(folder / out).rssi_dbm.equal(rssi().rssi_dbm)
+        np.testing.assert_array_equal(load_rssi(folder / out).rssi_dbm, rssi().rssi_dbm)

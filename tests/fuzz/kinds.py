@@ -31,6 +31,7 @@ from samples import (
 from small import GLANCE, PUBLISHED, PUBLISHED_RSSI
 
 from augment import Mixed
+from augment.estimators.kernel_regression import KernelRegression
 from fuzz import runs
 from fuzz.commands import config_file, updates_and_conversions
 from fuzz.misuse import CALLS, misuse
@@ -59,7 +60,6 @@ from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.geometry.path_gains import fit_path_gains
 from swiftwrf.models.swiftwrf_paper import SwiftWRFPaper
 from swiftwrf.rssi import PairModel, RssiPaperModel
-from tasks.aoa.estimators.kernel_regression import KernelRegression
 
 N = 12
 GRID = AngularGrid.hemisphere(8, 32)

@@ -45,7 +45,9 @@ from swiftwrf.online import Follower, MonitorConfig
 from swiftwrf.positions import MAX_COORDINATE_M
 from swiftwrf.rssi.base import RssiPredictor
 
-MAX_RSSI_DB = 200.0  # of any plausible prediction or measurement, and of its standard deviation
+MAX_RSSI_DB = (
+    300.0  # of any plausible prediction, and of its standard deviation: path loss of 50 dB a decade, 100 km away
+)
 FLOOR = {"x": [0.0, 1.0], "y": [0.0, 1.0], "z": [1.0, 1.0], "hall": [-50.0, -60.0]}
 SPECTRA_OPTIONS = (
     "array", "pose", "moving", "grid", "label", "line_of_sight", "name", "fixed_position", "rotation", "index", "notes",
@@ -127,8 +129,8 @@ DATA: dict[str, Call] = {
         for name in ("receiver_position", "receiver_names", "origin", "session", "time", "name", "index")
     },
     "from_frame(x)": Rssi.from_frame,
-    "from_frame, a column": lambda x: Rssi.from_frame(pd.DataFrame(FLOOR | {"hall": [-50.0, x]})),
-    "from_frame, a coordinate": lambda x: Rssi.from_frame(pd.DataFrame(FLOOR | {"x": [0.0, x]})),
+    "from_frame, a column": lambda x: Rssi.from_frame(pd.DataFrame(FLOOR | {"hall": [-50.0, x]}, dtype=object)),
+    "from_frame, a coordinate": lambda x: Rssi.from_frame(pd.DataFrame(FLOOR | {"x": [0.0, x]}, dtype=object)),
     **{
         f"from_frame({name}=x)": lambda x, name=name: Rssi.from_frame(pd.DataFrame(FLOOR), **{name: x})
         for name in (

@@ -92,7 +92,7 @@ def followed_run(folder: Path) -> None:
 
 def show(folder: Path) -> None:
     """Open a run and compute what its page shows, with small maps and without files of the figures."""
-    with mock.patch("tasks.view.rssi.CELLS", 9), mock.patch("tasks.view.followed.as_svg", return_value="<svg"):
+    with mock.patch("swiftwrf.rssi.maps.CELLS", 9), mock.patch("tasks.view.followed.as_svg", return_value="<svg"):
         view = open_source(folder)
         if isinstance(view, FollowedView):
             view.snapshot()
@@ -106,14 +106,14 @@ def show(folder: Path) -> None:
 
 
 def _show_rssi(view: RssiView) -> None:
-    x, y = (float(line.mean()) for line in view.cells)
-    assert view.map(view.heights[1]).mean.isfinite().all()
+    x, y = (float(line.mean()) for line in (view.chart.x, view.chart.y))
+    assert np.isfinite(view.chart.mean).all()
     for kind in set(view.kinds) - {"expected error"}:
         selection = MapSelection(kind, 0, view.heights[1])
         view.coloured(selection)
         view.sentence(selection)
         view.describe(selection, x, y)
-    plan = view.plan()
+    plan = view.plan((120, 120))
     if view.floor.plan is not None:
         plan.picture(Image.fromarray(view.floor.plan.pixels), view.floor.plan.corners)
     plan.dots(view.floor.position, "red", 1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import matplotlib
 import pytest
 import torch
@@ -109,6 +111,21 @@ def test_a_posterior_draws_its_mass_and_credible_circle():
     assert (median.get_label(), circle.get_label()) == ("median", "80 % circle")
     radius = (max(circle.get_xdata()) - min(circle.get_xdata())) / 2
     assert radius == pytest.approx(float(posterior.credible_radius()), rel=1e-2)
+
+
+@pytest.mark.parametrize("is_shared", [True, False])
+def test_a_posterior_is_summed_over_height(is_shared):
+    at = torch.tensor([[[0.0, 0, 0], [0, 0, 1], [1, 0, 0], [1, 2, 0]]], dtype=torch.float64)
+    weight = torch.tensor([[1.0, 0, 0, 0], [0.2, 0.2, 0.4, 0.2]], dtype=torch.float64)
+    if not is_shared:
+        at = torch.cat([at + 5, at])
+    found = Posterior(at, weight.log(), resolution_m=0.3).in_plan(1)
+    assert found.at(0, 0) == found.at(1, 0) == pytest.approx(1)
+    assert found.at(1, 2) == pytest.approx(0.5)
+    assert math.isnan(found.at(0.5, 1))  # far from all candidates
+    assert found.at(0, 0.27) == pytest.approx(1)
+    assert math.isnan(found.at(0, 9))
+    assert (found.corners[0], found.corners[3]) == pytest.approx((-0.0125, 2.0125))
 
 
 def test_texts_are_short_and_tables_escape_names():

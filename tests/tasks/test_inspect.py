@@ -12,7 +12,7 @@ from samples import WAVELENGTH, snapshots, write_snapshots, write_survey
 
 from swiftwrf import AngularGrid, simulated_room
 from swiftwrf.data.writing import write_spectra
-from tasks.inspect.findings.positions import nearest
+from swiftwrf.diagnostics.inspection import nearest
 
 
 def run(*arguments):
@@ -36,6 +36,7 @@ def test_snapshots(tmp_path, capsys):
     assert numbers["spacing_wavelengths"] == pytest.approx(0.5)
     assert numbers["peak_to_line_of_sight_deg"] < 3
     assert numbers["nearest_wavelengths"] == pytest.approx(numbers["nearest_m"] / WAVELENGTH)
+    assert "! The nearest other position" in text
     assert "interpolators see no fringes" in text
     assert "needs no calibration" in text
     html = (tmp_path / "page" / "report.html").read_text()
@@ -67,7 +68,7 @@ def test_the_nearest_other_position():
 
 
 def test_more_positions_than_are_looked_at(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("tasks.inspect.findings.positions.MAX_POSITIONS", 20)
+    monkeypatch.setattr("swiftwrf.diagnostics.inspection.MAX_POSITIONS", 20)
     room = simulated_room(n=15, grid=AngularGrid.hemisphere(8, 32))
     (tmp_path / "source").mkdir()
     write_spectra(room.subset(torch.arange(15).repeat(2)), tmp_path / "source")

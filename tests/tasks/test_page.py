@@ -13,9 +13,9 @@ from matplotlib.text import Text
 from pandas import DataFrame
 
 from swiftwrf import AngularGrid, Rssi, Spectra, plotting
+from swiftwrf.diagnostics.inspection import Findings
 from tasks import labels
 from tasks.aoa.page.records import CHOSEN, LOWER_REFERENCE, UPPER_REFERENCE
-from tasks.inspect.findings.base import Findings
 from tasks.inspect.page import page as inspection
 from tasks.locate.page.drawing import posteriors
 from tasks.page import figures
@@ -148,7 +148,7 @@ def test_figures_of_constant_empty_and_single_values(values):
         lambda axes: figures.curves(axes, Palette(), {"a": (values, values)}, "x", "y"),
         lambda axes: figures.speed(axes, Palette(), {str(i): (x, x) for i, x in enumerate(values)}, "x", "y"),
         lambda axes: plotting.plan(position, torch.tensor(values), "value", axes),
-        lambda axes: plotting.plan_map(np.array([[0, 0], [1, 1]]), values[None] if n else np.zeros((1, 1)), "v", axes),
+        lambda axes: plotting.plan_map((0, 1, 0, 1), values[None] if n else np.zeros((1, 1)), "v", axes),
     ):
         figure, axes = figures.panel(4, 3)
         draw(axes)
@@ -161,7 +161,7 @@ def test_figures_of_constant_empty_and_single_values(values):
         room = Spectra(torch.full((n, 9, 36), 0.5), position, grid=AngularGrid.hemisphere(9, 36))
         rssi = Rssi(torch.full((n, 1), -60.0), position, receiver_position=position[:1])
         for data in (room, rssi):
-            found = inspection(data, "toys", Findings(), "source")
+            found = inspection(Findings(data), "toys", "source")
             drawn += [panel for plot in [*found.summary.plots, *found.sections[1].plots] for panel in plot.panels]
         colour_image(values[None], "viridis", values.min(), values.max())
     assert all(figures.as_svg(figure).endswith("</svg>\n") for figure in drawn)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -129,10 +129,6 @@ class FurnishedRoom:
     furniture: tuple[Box, ...]
     fixed: Point
     region: tuple[Point, Point]
-
-    def of_materials(self, walls: str | None, floor: str | None, ceiling: str | None) -> FurnishedRoom:
-        """Return the room with the given materials in place of its own."""
-        return replace(self, walls=walls or self.walls, floor=floor or self.floor, ceiling=ceiling or self.ceiling)
 
     def surfaces(self) -> list[Surface]:
         """Return floor, ceiling and walls, then the furniture, one surface a material."""

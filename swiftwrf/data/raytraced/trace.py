@@ -24,12 +24,16 @@ from swiftwrf.choices import SCENE_FILE, Moving, check_scene
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.raytraced.rooms import ROOMS, Material, Surface
 from swiftwrf.errors import InputError
+from swiftwrf.plotting import MARK, Axes, plan_axes
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.validation import NonNegativeInt, configuration
 
 BATCH_POSITIONS = 32  # chains share a table, which many positions would fill
 Table = dict[str, NDArray[Any]]
 MIN_LLVM = 19  # earlier ones abort the process when they compile a trace; tried: 15 and 16
+LEVEL_COSINE = 0.5  # of a normal to the vertical; faces above are level
+SHELL_EXTENT = 0.95  # of the scene; floors, ceilings and walls of that size are not filled in a plan
+MOVING = "#444444"
 
 
 def sionna() -> Any:
@@ -101,6 +105,38 @@ class Scene:
         scene._scatter(scattering)
         scene.surfaces = [_surface(name, thing) for name, thing in held.objects.items()]
         return scene
+
+    def plot(self, fixed: Tensor | None = None, position: Tensor | None = None, ax: Axes | None = None) -> Axes:
+        """Draw the surfaces seen from above, coloured by material, and return the axes.
+
+        Args:
+            fixed: Position of the fixed end, (3,) [m].
+            position: Positions of the moving end, (n, 3) [m].
+            ax: Axes to draw into. Defaults to those of a new figure.
+        """
+        ax = plan_axes(ax)
+        every = np.concatenate([surface.vertex[:, :2] for surface in self.surfaces])
+        materials = list(dict.fromkeys(surface.material.name for surface in self.surfaces))
+        for surface in self.surfaces:
+            name, face = surface.material.name, surface.vertex[surface.triangle]
+            normal = np.cross(face[:, 1] - face[:, 0], face[:, 2] - face[:, 0])
+            is_level = np.abs(normal[:, 2]) > LEVEL_COSINE * np.linalg.norm(normal, axis=1)
+            is_shell = bool((np.ptp(surface.vertex[:, :2], axis=0) > SHELL_EXTENT * np.ptp(every, axis=0)).all())
+            colour = f"C{materials.index(name) % 10}"
+            outline, filled = face[~is_level, :, :2], face[is_level & (not is_shell), :, :2]
+            width = 2.0 if is_shell else 0.8
+            ax.plot(*outline[:, [0, 1, 2, 0]].T, color=colour, linewidth=width)
+            for triangle in filled:
+                ax.fill(*triangle.T, color=colour, alpha=0.2, linewidth=0)
+            if len(outline) or len(filled):
+                shown = ax.get_legend_handles_labels()[1]
+                ax.plot([], [], color=colour, label=None if name in shown else name)
+        if position is not None:
+            ax.plot(*position[:, :2].T.numpy(), ".", color=MOVING, markersize=2.5, label="moving end")
+        if fixed is not None:
+            ax.plot(*fixed[:2].numpy(), "*", color=MARK, markersize=12, label="fixed end", linestyle="")
+        ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1))
+        return ax
 
     def _scatter(self, coefficient: float) -> None:
         for material in self.held.radio_materials.values():

@@ -10,9 +10,9 @@ from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 from pandas import DataFrame
 
+from swiftwrf.plotting import corners_of
 from tasks.aoa.page.records import FractionRecords
 from tasks.page import figures
-from tasks.page.maps import corners_of
 from tasks.page.page import Plot, Section
 
 MIN_SHIFT_RAD = np.deg2rad(0.1)  # smallest visible shift of a primitive's mean along the walk

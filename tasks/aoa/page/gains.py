@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from tasks.aoa.condition import headline, reference_of
+from swiftwrf.metrics import ChangeMetrics
+from tasks.aoa.condition import headline
 from tasks.aoa.page.records import FractionRecords
-from tasks.metrics import ChangeMetrics
 from tasks.page.page import Table
 from tasks.page.provenance import number
 
@@ -18,11 +18,6 @@ def learner(fraction: FractionRecords) -> str:
     """Return the estimator of `turbo_method` in words."""
     condition = headline(fraction.conditions.values())
     return "the network" if condition.is_network else condition.estimator
-
-
-def reference(fraction: FractionRecords) -> str:
-    """Return the best method that is trained on measured spectra alone."""
-    return fraction.mix.get("reference") or reference_of(fraction.conditions, fraction.medians)
 
 
 def change_text(change: ChangeMetrics) -> str:
@@ -47,22 +42,15 @@ def judgement(change: ChangeMetrics) -> str:
     return "a loss" if change["low"] > 0 else "not significant"
 
 
-def changes_of(fraction: FractionRecords, method: str) -> dict[str, ChangeMetrics]:
-    """Return the changes of a method, by the method that it is compared to. Runs of earlier versions have none."""
-    return fraction.mix["methods"][method].get("changes") or {}
-
-
 def gain_sentence(fraction: FractionRecords) -> str:
-    """Return the change of the network's error by synthetic spectra, and whether it is significant; empty if unknown."""
+    """Return the change of the network's error by synthetic spectra, and whether it is significant."""
     method = turbo_method(fraction)
-    best = reference(fraction)
+    best = fraction.mix["reference"]
     parts = [
         f"{change_text(change)} against {other}"
         f"{', the best one without synthetic spectra' if other == best else ''} ({judgement(change)})"
-        for other, change in changes_of(fraction, method).items()
+        for other, change in fraction.mix["methods"][method]["changes"].items()
     ]
-    if not parts:
-        return ""
     return (
         f"Synthetic spectra change the median angular error of {learner(fraction)} ({method}) by {' and '.join(parts)}. "
         "Intervals are paired over the test positions."
@@ -71,10 +59,10 @@ def gain_sentence(fraction: FractionRecords) -> str:
 
 def gain_table(fraction: FractionRecords) -> list[Table]:
     """Return the changes of all methods with synthetic spectra."""
-    best = reference(fraction)
+    best = fraction.mix["reference"]
     rows = []
     for method in fraction.mix["methods"]:
-        for other, change in changes_of(fraction, method).items():
+        for other, change in fraction.mix["methods"][method]["changes"].items():
             name = f"{other} (best)" if other == best else other
             rows.append([method, name, number(change["median_deg"]), change_text(change), judgement(change)])
     caption = (

@@ -18,7 +18,7 @@ MAX_MARK = 120  # area [pt^2] of the candidate with the largest mass
 
 def locating_section(fraction: FractionRecords) -> Section | None:
     """Return the errors of located test positions; None if nothing was located and nothing was left out."""
-    located, left_out = fraction.mix.get("locating") or {}, fraction.mix.get("left_out") or {}
+    located, left_out = fraction.mix["locating"], fraction.mix["left_out"]
     title = "Where was it?"
     notes = [f"{method} is left out: {reason}." for method, reason in left_out.items() if method not in located]
     if not located:

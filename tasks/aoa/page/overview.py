@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from tasks.aoa.condition import LOCATOR
-from tasks.aoa.page.gains import reference, turbo_method
+from augment.cross_validation import LOCATOR
+from tasks.aoa.page.gains import turbo_method
 from tasks.aoa.page.records import FractionRecords, palette
 from tasks.aoa.page.room import FIXED, draw_in_plan, extent
 from tasks.aoa.page.synthesis import examples
@@ -23,8 +23,8 @@ SHOWN_SPECTRUM = 3  # of the examples, quantile 0.4 of the quality
 
 def essential(fraction: FractionRecords) -> list[str]:
     """Return the methods of overviews, in their order: baselines, without synthetic spectra, with them, references."""
-    choice = fraction.mix.get("estimator_choice")
-    names = [*BASELINES, reference(fraction), "measured_only", turbo_method(fraction), LOCATOR]
+    choice = fraction.mix["estimator_choice"]
+    names = [*BASELINES, fraction.mix["reference"], "measured_only", turbo_method(fraction), LOCATOR]
     names += [*([choice["name"]] if choice else []), "measured_all"]
     return [name for name in dict.fromkeys(names) if name in fraction.mix["methods"]]
 
@@ -88,7 +88,13 @@ def compared(fractions: list[FractionRecords]) -> tuple[Table, Plot]:
     for fraction in fractions:
         methods = {name: fraction.mix["methods"][name]["great_circle_deg"] for name in essential(fraction)}
         every.append(Compared(fraction.scene, methods, {}))
-    shown = [*BASELINES, *map(reference, fractions), *map(turbo_method, fractions), LOCATOR, "measured_all"]
+    shown = [
+        *BASELINES,
+        *(fraction.mix["reference"] for fraction in fractions),
+        *map(turbo_method, fractions),
+        LOCATOR,
+        "measured_all",
+    ]
     conditions = [condition for fraction in fractions for condition in fraction.conditions.values()]
     names = [name for name in dict.fromkeys(shown) if any(name in one.errors for one in every)]
     return comparison(every, palette(conditions), names, "deg", "angular error")

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 from pandas import DataFrame
 
+from augment.cross_validation import STAND_IN
 from swiftwrf.models import FIELD_MODELS
 from tasks import labels
-from tasks.aoa.condition import Condition, conditions_of
-from tasks.aoa.former import table_with_present_names, with_present_names
+from tasks.aoa.condition import MEASURED_STAND_IN, Condition, conditions_of
 from tasks.aoa.options import AUTO, fraction_key
 from tasks.metrics import AoaMetrics, MixMetrics
 from tasks.page.palette import Palette
@@ -42,8 +43,7 @@ class FractionRecords:
     @cached_property
     def mix(self) -> MixMetrics:
         """Metrics of the measured fraction."""
-        metrics: MixMetrics = with_present_names(self.run.metrics["mixes"][self.key])
-        return metrics
+        return self.run.metrics["mixes"][self.key]
 
     @cached_property
     def conditions(self) -> dict[str, Condition]:
@@ -57,13 +57,24 @@ class FractionRecords:
 
     def table(self, name: str) -> DataFrame:
         """Return the rows of a table of the run, e.g. `errors`, with this measured fraction."""
-        return table_with_present_names(of_fraction(self.run.table(name), self.key))
+        return of_fraction(self.run.table(name), self.key)
 
     def synthesizers(self, methods: Iterable[str]) -> list[str]:
         """Return the field models behind these methods, that of the first repeat where repeats chose differently."""
         found = dict.fromkeys(self.conditions[name].synthesizer for name in methods if name in self.conditions)
         choice = self.mix["choice"]
         return [name for name in found if name not in ("", AUTO)] or ([choice["name"]] if choice else [])
+
+    @property
+    def chosen_file(self) -> Path | None:
+        """File of the estimator that cross-validation chose. None if nothing was chosen, or what needs no file."""
+        choice = self.mix["estimator_choice"]
+        condition = self.conditions.get(choice["name"]) if choice else None
+        if condition is None:
+            return None
+        name = MEASURED_STAND_IN if condition.method == STAND_IN else condition.estimator
+        file = self.run.folder / f"{name}-mix{self.key}.safetensors"
+        return file if file.is_file() else None
 
     @property
     def percent(self) -> str:
@@ -92,9 +103,8 @@ class FractionRecords:
 
 
 def of_fraction(table: DataFrame, key: str) -> DataFrame:
-    """Return the rows of a measured fraction. Older runs call the column `mix`."""
-    column = table["measured_fraction" if "measured_fraction" in table else "mix"]
-    return table[[fraction_key(float(text)) == key for text in column]]
+    """Return the rows of a measured fraction."""
+    return table[[fraction_key(float(text)) == key for text in table["measured_fraction"]]]
 
 
 def palette(conditions: Iterable[Condition]) -> Palette:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from tasks.aoa.condition import LOCATOR
-from tasks.aoa.page.gains import gain_table, reference, turbo_method
+from augment.cross_validation import LOCATOR
+from tasks.aoa.page.gains import gain_table, turbo_method
 from tasks.aoa.page.overview import BASELINES
 from tasks.aoa.page.records import FractionRecords
 from tasks.metrics import Angle
@@ -60,7 +60,7 @@ def results_section(fraction: FractionRecords) -> Section:
 
 def estimator_section(fraction: FractionRecords) -> Section | None:
     """Return the comparison of the estimators on held-out measured spectra; None if the run has none."""
-    choice = fraction.mix.get("estimator_choice")
+    choice = fraction.mix["estimator_choice"]
     if choice is None:
         return None
     held_out = sorted(choice["held_out_deg"].items(), key=lambda item: item[1])
@@ -77,7 +77,7 @@ def estimator_section(fraction: FractionRecords) -> Section | None:
 
 def choice_sentence(fraction: FractionRecords) -> str:
     """Return which estimator cross-validation chose, and by which errors; empty if the run has no choice."""
-    choice = fraction.mix.get("estimator_choice")
+    choice = fraction.mix["estimator_choice"]
     if choice is None:
         return ""
     errors = ", ".join(f"{name} {error:.2f}" for name, error in choice["held_out_deg"].items())
@@ -93,7 +93,7 @@ def choice_sentence(fraction: FractionRecords) -> str:
 def _cdf(fraction: FractionRecords) -> Plot:
     """Return the distributions of the errors of the baseline, the best one on measured spectra, and the networks."""
     table = fraction.table("errors")
-    wanted = ("peak", reference(fraction), turbo_method(fraction), LOCATOR, "measured_all")
+    wanted = ("peak", fraction.mix["reference"], turbo_method(fraction), LOCATOR, "measured_all")
     names = [name for name in dict.fromkeys(wanted) if name in fraction.mix["methods"]][:MAX_CURVES]
     panels = []
     for column, name in ERRORS.items():

@@ -10,10 +10,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pandas import DataFrame, concat
 
+from augment.cross_validation import CrossValidationMetrics, GainMetrics
+from swiftwrf.metrics import ChangeMetrics
 from swiftwrf.models import FIELD_MODELS
 from tasks import labels
 from tasks.aoa.page.records import FractionRecords
-from tasks.metrics import ChangeMetrics, CrossValidationMetrics, GainMetrics
 from tasks.page import figures
 from tasks.page.page import Plot, Section, Table
 from tasks.page.provenance import number
@@ -24,12 +25,8 @@ FIXED, MEASURED, IMAGE = "#cf4a4a", "#3a7fd5", "#d1620f"
 
 
 def _cross_validations(fraction: FractionRecords) -> dict[str, CrossValidationMetrics]:
-    """Return the cross-validation of each field model, if it has extra positions. Older runs have the chosen one alone."""
-    validation: dict[str, Any] = dict(fraction.mix["cross_validation"] or {})
-    choice = fraction.mix["choice"]
-    if "stand_in" in validation and choice is not None:
-        validation = {choice["name"]: validation}
-    return {name: entry for name, entry in validation.items() if entry["gains"]}
+    """Return the cross-validation of each field model, if it has extra positions."""
+    return {name: entry for name, entry in (fraction.mix["cross_validation"] or {}).items() if entry["gains"]}
 
 
 def cross_validation_sentences(fraction: FractionRecords) -> list[str]:
@@ -37,13 +34,12 @@ def cross_validation_sentences(fraction: FractionRecords) -> list[str]:
     texts = []
     for name, validation in _cross_validations(fraction).items():
         best, rule = _best_and_rule(validation)
-        how = "chosen on other held-out spectra" if validation.get("rule") else "chosen on the same spectra"
         found = (
             f"Cross-validation inside the measured fraction ({validation['n_held_out']} spectra held out, "
-            f"{validation['stand_in']} in place of the network): spectra "
-            f"predicted by {name} at synthetic positions change the "
-            f"median error by {rule['change']:+.0%} [{rule['low']:+.0%}, {rule['high']:+.0%}], from "
-            f"{validation['measured_only_deg']:.2f} to {rule['median_deg']:.2f} degrees, with their number {how}. "
+            f"{validation['stand_in']} in place of the network): spectra predicted by {name} at synthetic positions change "
+            f"the median error by {rule['change']:+.0%} [{rule['low']:+.0%}, {rule['high']:+.0%}], from "
+            f"{validation['measured_only_deg']:.2f} to {rule['median_deg']:.2f} degrees, with their number chosen on other "
+            "held-out spectra. "
             f"The best number is {best['n_synthetic']}."
         )
         texts.append(f"{found} {_advice(validation)}")
@@ -62,7 +58,7 @@ def _advice(validation: CrossValidationMetrics) -> str:
 def _best_and_rule(validation: CrossValidationMetrics) -> tuple[GainMetrics, ChangeMetrics]:
     """Return the number with the lowest error, and the number chosen on other folds."""
     best = min(validation["gains"], key=lambda gain: gain["median_deg"])
-    return best, validation.get("rule") or best  # older runs have the best number alone
+    return best, validation["rule"] or best
 
 
 def choice_section(fraction: FractionRecords) -> Section | None:
@@ -84,7 +80,7 @@ def choice_section(fraction: FractionRecords) -> Section | None:
     name = choice["name"]
     meaning = labels.labels(FIELD_MODELS, labels.FIELD_MODELS, [name])
     text = f"{name} predicts held-out measured spectra best" + (f": {meaning[name].meaning}." if meaning else ".")
-    reasons = [f"{name} could not be fitted: {reason}." for name, reason in choice.get("left_out", {}).items()]
+    reasons = [f"{name} could not be fitted: {reason}." for name, reason in choice["left_out"].items()]
     plots = [_gain(fraction, *item) for item in _cross_validations(fraction).items()]
     return Section(
         "Which field model, and does it help?", [text, *reasons, *cross_validation_sentences(fraction)], [table], plots

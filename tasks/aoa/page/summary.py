@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from tasks.aoa.condition import LOCATOR, MEASURED_STAND_IN, STAND_IN
-from tasks.aoa.estimators import ESTIMATORS
-from tasks.aoa.former import FORMER_NAMES
-from tasks.aoa.page.gains import change_text, changes_of, gain_sentence, judgement, learner, reference, turbo_method
+from augment.cross_validation import LOCATOR
+from augment.estimators import ESTIMATORS
+from tasks.aoa.condition import MEASURED_STAND_IN
+from tasks.aoa.page.gains import change_text, gain_sentence, judgement, learner, turbo_method
 from tasks.aoa.page.overview import overview
 from tasks.aoa.page.records import AoaRecords, FractionRecords
 from tasks.aoa.page.results import choice_sentence
@@ -33,7 +33,7 @@ def summary(fraction: FractionRecords) -> Summary:
 def _numbers(fraction: FractionRecords) -> list[Number]:
     """Return errors of the chosen estimator, the network and the strongest peak, and the quality of the spectra."""
     turbo = turbo_method(fraction)
-    choice = fraction.mix.get("estimator_choice")
+    choice = fraction.mix["estimator_choice"]
     first = choice["name"] if choice else turbo
     synthesizer = fraction.synthesizers([turbo])[0]
     quality = fraction.mix["synthesis"][synthesizer]["psnr_db"]
@@ -62,23 +62,17 @@ def answer(run: AoaRecords) -> Answer:
 def conclusion(fraction: FractionRecords) -> str:
     """Return which estimator to take and what synthetic spectra change, in short sentences."""
     sentences, medians = [], fraction.medians
-    if choice := fraction.mix.get("estimator_choice"):
+    if choice := fraction.mix["estimator_choice"]:
         sentences.append(f"Take {choice['name']}: median error {medians[choice['name']]:.2f} degrees.")
-        for name, reason in list(choice.get("better", {}).items())[:1]:  # runs of earlier versions do not have it
+        for name, reason in list(choice["better"].items())[:1]:
             sentences.append(f"{name} has {medians[name]:.2f} degrees, but is not recommended: {reason}.")
-    turbo = turbo_method(fraction)
-    best = reference(fraction)
-    if change := changes_of(fraction, turbo).get(best):
-        without = "that uses neither them nor the room" if LOCATOR in medians else "without them"
-        sentences.append(
-            f"With synthetic spectra {learner(fraction)} changes the median error by {change_text(change)} against {best}, "
-            f"the best estimator {without}: {judgement(change)}."
-        )
-    else:
-        sentences.append(
-            f"{best}, the best estimator without synthetic spectra, has a median error of {medians[best]:.2f} degrees, "
-            f"{learner(fraction)} with them {medians[turbo]:.2f}."
-        )
+    best = fraction.mix["reference"]
+    change = fraction.mix["methods"][turbo_method(fraction)]["changes"][best]
+    without = "that uses neither them nor the room" if LOCATOR in medians else "without them"
+    sentences.append(
+        f"With synthetic spectra {learner(fraction)} changes the median error by {change_text(change)} against {best}, "
+        f"the best estimator {without}: {judgement(change)}."
+    )
     if "peak" in medians and "constant" in medians:
         sentences.append(fingerprinting(medians["constant"], medians["peak"]))
     return " ".join(sentence for sentence in sentences if sentence)
@@ -87,12 +81,12 @@ def conclusion(fraction: FractionRecords) -> str:
 def _error(fraction: FractionRecords, method: str) -> Number:
     """Return the error of a method, with its position error if it locates."""
     error = fraction.mix["methods"][method]["great_circle_deg"]
-    choice = fraction.mix.get("estimator_choice")
+    choice = fraction.mix["estimator_choice"]
     chosen = choice is not None and choice["name"] == method
     who = "network with synthetic spectra" if fraction.conditions[method].is_network else "estimator"
     text = f"median angular error of {method}, {'the chosen ' if chosen else 'the '}{who}, 95 % interval "
     text += f"[{error['low']:.2f}, {error['high']:.2f}]"
-    if located := (fraction.mix.get("locating") or {}).get(method):
+    if located := fraction.mix["locating"].get(method):
         text += f"; median position error {100 * located['position_error_m']['median']:.1f} cm"
     return Number(f"{error['median']:.2f}\N{DEGREE SIGN}", text)
 
@@ -114,22 +108,24 @@ def next_steps(fraction: FractionRecords) -> list[str]:
     files = {
         file.name.removesuffix(f"-mix{key}.safetensors") for file in fraction.run.folder.glob(f"*-mix{key}.safetensors")
     }
-    estimators = files & {*ESTIMATORS, *FORMER_NAMES, LOCATOR, MEASURED_STAND_IN}
+    estimators = files & {*ESTIMATORS, LOCATOR, MEASURED_STAND_IN}
     steps = []
     if files - estimators:
         steps.append(f"Explore the spectra: `{command('view', path)}`.")
-    choice = fraction.mix.get("estimator_choice")
-    taken = _file_of(fraction, choice["name"], estimators) if choice else ""
-    if taken:
+    choice = fraction.mix["estimator_choice"]
+    file = fraction.chosen_file
+    taken = file.name.removesuffix(f"-mix{key}.safetensors") if file else ""
+    if file:
+        model = path if len(metrics["mixes"]) == 1 else f"{path}/{file.name}"
         steps.append(
             f"Take {taken} on this data: cross-validation chose it, without the test spectra. Estimate directions of new "
-            f"spectra: `{command('estimate', f'{path}/{taken}-mix{key}.safetensors', 'SOURCE')}`."
+            f"spectra: `{command('predict', model, 'SOURCE')}`."
         )
     elif choice:
-        steps.append(f"{choice['name']} needs no file: `tasks.aoa.estimators.make_estimator('{choice['name']}')`.")
+        steps.append(f"{choice['name']} needs no file: `augment.estimators.make_estimator('{choice['name']}')`.")
     others = sorted(estimators - {taken})
     if others:
-        kept = f"`{command('estimate', f'{path}/{others[0]}-mix{key}.safetensors', 'SOURCE')}`"
+        kept = f"`{command('predict', f'{path}/{others[0]}-mix{key}.safetensors', 'SOURCE')}`"
         more = f" Also kept: {', '.join(others[1:])}." if len(others) > 1 else ""
         steps.append(f"{'Or by' if taken else 'Estimate directions by'} {others[0]}: {kept}.{more}")
     steps += [
@@ -146,14 +142,3 @@ def next_steps(fraction: FractionRecords) -> list[str]:
     if metrics["split"] == "random" and metrics["data"] != "simulated-room":
         steps.append("Run `--split block`: it shows the error in a region where nothing was measured.")
     return steps
-
-
-def _file_of(fraction: FractionRecords, method: str, kept: set[str]) -> str:
-    """Return the kept estimator of a method, empty if no file is of it."""
-    condition = fraction.conditions.get(method)
-    if condition is None:
-        return ""
-    if method == STAND_IN:
-        return MEASURED_STAND_IN if MEASURED_STAND_IN in kept else ""
-    names = [condition.estimator, *(old for old, new in FORMER_NAMES.items() if new == condition.estimator)]
-    return next((name for name in names if name in kept), "")

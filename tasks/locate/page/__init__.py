@@ -6,10 +6,10 @@ import math
 
 from pandas import concat
 
+from swiftwrf.locate.baselines import LOCALIZERS
 from tasks.environment import command
 from tasks.labels import LOCALIZERS as LABELS
 from tasks.labels import labels
-from tasks.locate.localizers import LOCALIZERS
 from tasks.locate.page import drawing
 from tasks.locate.page.summary import LEVEL, NEIGHBOURS, OWN, LocateRecords, by_method, conclusion, summary
 from tasks.locate.steps import SUGGESTED

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from pandas import DataFrame
 from scipy.stats import binomtest
 
+from swiftwrf.locate.baselines import LOCALIZERS
+from swiftwrf.plotting import corners_of
 from tasks.labels import LOCALIZERS as LABELS
 from tasks.labels import labels
-from tasks.locate.localizers import LOCALIZERS
 from tasks.locate.page.summary import NEIGHBOURS, OWN
 from tasks.metrics import StudyMetrics
 from tasks.page import figures
-from tasks.page.maps import corners_of
 from tasks.page.palette import DASHES, MAX_CURVES, Palette
 
 MAX_VECTOR_LINES = 300  # more lines become an image, so that the page stays small

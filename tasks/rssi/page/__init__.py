@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from swiftwrf.choices import RSSI_PREDICTORS
 from tasks.environment import command
 from tasks.labels import PREDICTORS as LABELS
 from tasks.labels import labels
@@ -12,12 +13,11 @@ from tasks.page.records import notes
 from tasks.rssi.page import errors
 from tasks.rssi.page.maps import CERTAINTY, COVERED_DBM, Maps
 from tasks.rssi.page.summary import RssiRecords, best_baseline, conclusion, model_of, next_steps, title
-from tasks.rssi.predictors import PREDICTORS
 
 
 def page(runs: list[RssiRecords]) -> Page:
     """Return the page of these runs."""
-    terms = {name: label.meaning for name, label in labels(PREDICTORS, LABELS).items()}
+    terms = {name: label.meaning for name, label in labels(RSSI_PREDICTORS, LABELS).items()}
     sections = [
         sections_of("Errors", runs, _errors, terms),
         sections_of("Where the errors are", runs, lambda run: Section("", plots=[errors.where(run)])),
@@ -77,7 +77,7 @@ def _comparison(runs: list[RssiRecords]) -> Summary:
 
 
 def _errors(run: RssiRecords) -> Section:
-    left_out = [f"Left out: {reason}." for reason in run.metrics.get("left_out", {}).values()]
+    left_out = [f"Left out: {reason}." for reason in run.metrics["left_out"].values()]
     plots = [errors.distribution(run)]
     if len(run.metrics["receivers"]) > 1:
         plots.append(errors.differences(run))

@@ -7,6 +7,7 @@ from typing import Any
 
 from pandas import DataFrame
 
+from swiftwrf.choices import RSSI_PREDICTORS
 from tasks.labels import PREDICTORS as LABELS
 from tasks.labels import labels
 from tasks.page import figures
@@ -16,7 +17,6 @@ from tasks.page.palette import Palette
 from tasks.page.provenance import number
 from tasks.rssi.page.maps import MAX_VECTOR_DOTS
 from tasks.rssi.page.summary import RssiRecords, best_baseline, by_method, model_of, title
-from tasks.rssi.predictors import PREDICTORS
 from tasks.summarise import SHORTEST, paired_difference, running_median
 
 MAX_RECEIVERS = 40  # of the figure of differences; all are in its table
@@ -24,7 +24,7 @@ MAX_RECEIVERS = 40  # of the figure of differences; all are in its table
 
 def palette() -> Palette:
     """Return the colours of the predictors."""
-    return Palette.of(labels(PREDICTORS, LABELS))
+    return Palette.of(labels(RSSI_PREDICTORS, LABELS))
 
 
 def table(run: RssiRecords) -> Table:

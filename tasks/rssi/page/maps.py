@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pandas import DataFrame
 
 from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
+from swiftwrf.plotting import corners_of
 from swiftwrf.rssi import LEVEL
 from tasks.page import figures, maps
 from tasks.page.page import Plot
@@ -109,7 +110,7 @@ class Maps:
     def _panel(self, values: NDArray[Any], kind: str, title: str, receiver: int | None, width: float = 4.6) -> Figure:
         """Draw one map, with the measurements of a receiver, or with all receivers for None."""
         a = self.arrays
-        x0, x1, y0, y1 = maps.corners_of(a["x"], a["y"])
+        x0, x1, y0, y1 = corners_of(a["x"], a["y"])
         shape = (y1 - y0) / (x1 - x0)
         figure, ax = figures.panel(width, 0.8 + (width - 1.2) * float(np.clip(shape, 0.4, 1.6)))
         limits, colours = ((0.0, MAX_WIDTH_DB), "magma") if kind == "width" else (self._limits, "viridis")

@@ -25,7 +25,7 @@ def answer(run: RssiRecords) -> Answer:
 
 def model_of(run: RssiRecords) -> str:
     """Return the predictor that all others are compared with, whose maps and intervals the run contains."""
-    return run.metrics.get("model", "swiftwrf")
+    return run.metrics["model"]
 
 
 def title(run: RssiRecords) -> str:

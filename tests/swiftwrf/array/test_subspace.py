@@ -11,6 +11,7 @@ import torch
 from samples import snapshots, write_snapshots
 
 from augment import Mixed
+from augment.estimators import make_estimator
 from swiftwrf import InputError, load_spectra
 from swiftwrf.array.angles import angular_distance
 from swiftwrf.array.planar import PlanarArray
@@ -18,7 +19,6 @@ from swiftwrf.array.subspace import esprit, maximum_likelihood, music
 from swiftwrf.metrics import angle_errors
 from tasks.aoa.condition import MeasuredSubset
 from tasks.aoa.context import Experiment
-from tasks.aoa.estimators import make_estimator
 from tasks.aoa.options import AoaConfig
 from tasks.aoa.steps import first_steps
 

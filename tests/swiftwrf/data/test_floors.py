@@ -11,8 +11,8 @@ import torch
 
 import swiftwrf
 from swiftwrf import PairModel, Rssi, RssiModel
+from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.rssi import estimate_floor_attenuation
-from tasks.rssi.predictors import PREDICTORS
 
 FLOOR_DB, STOREY_M, SIDE_M = 15.0, 3.5, 30.0
 RECEIVERS = {
@@ -72,7 +72,7 @@ def test_predictors_take_the_floor_into_account(name):
     train, test = rssi(building()).split()
     error = []
     for floors in (train.floors, None):
-        predictor = PREDICTORS[name]().fit(replace(train, floors=floors))
+        predictor = RSSI_PREDICTORS[name]().fit(replace(train, floors=floors))
         error.append(float((predictor.predict(test.transmitter_position).mean - test.rssi_dbm).abs().mean()))
     assert error[0] < error[1]
     assert name in ("mean", "knn") or error[0] < 3.0

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from swiftwrf import InputError, Rssi, load_rssi
-from tasks.rssi.predictors import PREDICTORS
+from swiftwrf.choices import RSSI_PREDICTORS
 
 N = 200
 
@@ -40,7 +40,7 @@ def test_pooling_reduces_the_error():
     for by in (None, "mac"):
         data = Rssi.from_frame(table, pool_by=by)
         train = torch.arange(0, N, 2)
-        predicted = PREDICTORS["knn"]().fit(data.subset(train)).predict(data.transmitter_position[1::2]).mean
+        predicted = RSSI_PREDICTORS["knn"]().fit(data.subset(train)).predict(data.transmitter_position[1::2]).mean
         ap = [int(name[13]) for name in data.receiver_names]
         wrong = predicted.numpy() - truth[1::2][:, ap]
         error.append(float(np.abs(wrong - wrong.mean(axis=0)).mean()))  # a mean of powers is above the mean of decibels

@@ -19,6 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from swiftwrf import InputError, Rssi, RssiModel, load, load_rssi
+from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.rssi import Offsets
 from swiftwrf.data.splits import folds, random_split, repeated_fraction
@@ -27,7 +28,6 @@ from swiftwrf.locate import RssiLocator
 from swiftwrf.rssi import estimate_offsets
 from tasks.locate.experiment import run as locate
 from tasks.locate.options import LocateConfig
-from tasks.rssi.predictors import PREDICTORS
 
 FEW_CELLS = ("--cells", "200")
 NAMES = ["ap-a", "ap-b", "ap-c", "ap-d"]
@@ -355,7 +355,7 @@ def test_the_lengths_of_a_gaussian_process_follow_the_extent(floor, scale):
     data = Rssi(floor.rssi, scale * floor.position, receiver_position=scale * floor.receiver, receiver_names=NAMES)
     train, test = data.split("random")
     errors = [
-        float((PREDICTORS[name]().fit(train).predict(test.transmitter_position).mean - test.rssi_dbm).abs().mean())
+        float((RSSI_PREDICTORS[name]().fit(train).predict(test.transmitter_position).mean - test.rssi_dbm).abs().mean())
         for name in ("gp", "mean")
     ]
     assert errors[0] < 0.6 * errors[1]

@@ -12,12 +12,12 @@ import torch
 from samples import FREQUENCY, WAVELENGTH, snapshot_arrays, snapshots, write_snapshots
 
 from augment import Mixed
+from augment.estimators import make_estimator
 from swiftwrf import AngularGrid, InputError, load_snapshots, load_spectra
 from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.archives import read_arrays
 from swiftwrf.metrics import angle_errors
-from tasks.aoa.estimators import make_estimator
 
 GRID = AngularGrid.hemisphere(24, 96)
 

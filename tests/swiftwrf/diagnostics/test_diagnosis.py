@@ -19,7 +19,7 @@ from swiftwrf import AngularGrid, load_spectra
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data import ReadOptions, Snapshots
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
-from tasks.inspect.findings import inspect
+from swiftwrf.diagnostics.inspection import inspect
 
 GRID = AngularGrid.hemisphere(18, 72)
 SHAPES = ((2, 4), (3, 4), (2, 5), (3, 5), (4, 5))  # of arrays; not square, whose x and y may be exchanged
@@ -167,7 +167,7 @@ ALSO = {"tilted": "The array is not calibrated"}  # its calibration includes the
 
 def check(name: str, seed: int) -> None:
     make, expected = CAUSES[name]
-    findings, _ = inspect(make(seed), ReadOptions(grid=GRID))
+    findings = inspect(make(seed), grid=GRID)
     text = " ".join(finding.text for finding in findings.sentences)
     assert expected in text
     assert not [says for says in ERRORS if says in text and says not in (expected, ALSO.get(name))]
@@ -238,7 +238,7 @@ UNKNOWN = {  # errors that no statement names
 
 
 def check_unknown(name: str, seed: int) -> None:
-    findings, _ = inspect(UNKNOWN[name](seed), ReadOptions(grid=GRID))
+    findings = inspect(UNKNOWN[name](seed), grid=GRID)
     text = " ".join(finding.text for finding in findings.sentences)
     harmless = ("nearly one direction", ALSO["tilted"])  # constant phases mend an exchange in part
     assert not [says for says in ERRORS if says in text and says not in harmless]
@@ -283,7 +283,7 @@ CASES = os.environ.get("SWIFTWRF_CASES")
 def test_inputs_that_went_wrong(case, expected):
     options = ReadOptions(beamformer="bartlett" if case.startswith("16") else None)
     data = read(Path(CASES) / case / "input", options, SNAPSHOT_FORMATS, SPECTRA_FORMATS, RSSI_FORMATS)
-    findings, _ = inspect(data, replace(options, grid=GRID))
+    findings = inspect(data, grid=GRID, beamformer=options.beamformer or "phase")
     text = " ".join(finding.text for finding in findings.sentences)
     assert expected in text
     assert "--calibrate" not in text

@@ -12,13 +12,11 @@ from samples import FACING_X, snapshots, survey_rows, write_deepmimo, write_snap
 from scipy.spatial.transform import Rotation
 
 from swiftwrf import AngularGrid, InputError, load_rssi, load_snapshots, load_spectra, rssi_room
-from swiftwrf.data import ReadOptions
 from swiftwrf.data.store import Store
+from swiftwrf.diagnostics.inspection import inspect
 from swiftwrf.diagnostics.path_loss import check_path_loss
-from tasks.inspect.findings import inspect
 
 GRID = AngularGrid.hemisphere(24, 96)
-HOW = ReadOptions(grid=GRID)
 DATA = snapshots(n=150)
 SPECTRA = DATA.spectra(GRID)
 ROOM = rssi_room(n=300)
@@ -26,7 +24,7 @@ QUATERNION = FACING_X.as_quat()
 
 
 def warnings(data):
-    return " ".join(f.text for f in inspect(data, HOW)[0].sentences if f.level == "warning")
+    return " ".join(inspect(data, grid=GRID).warnings)
 
 
 def oriented(rotation):
@@ -168,7 +166,7 @@ def test_reader_refuses_it(name, tmp_path):
 
 def test_a_rotation_is_told_from_the_axes_of_the_array():
     turned = oriented(FACING_X * Rotation.from_rotvec([0, 0, math.radians(-20)]))
-    findings, _ = inspect(turned, HOW)
+    findings = inspect(turned, grid=GRID)
     assert findings.numbers["turn_deg"] == pytest.approx([0, 0, 20], abs=1.5)
     assert findings.numbers["frame"] == "turned"
 

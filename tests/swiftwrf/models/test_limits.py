@@ -12,10 +12,10 @@ import torch
 
 from swiftwrf import AngularGrid, InputError, rssi_room
 from swiftwrf.array.planar import PlanarArray
+from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.data.spectra import coarsening
 from swiftwrf.gp import Kernel
 from swiftwrf.models import FIELD_MODELS
-from tasks.rssi.predictors import PREDICTORS
 
 
 def moved(spectra, shift):
@@ -36,7 +36,7 @@ def test_field_models_do_not_depend_on_the_origin(room, small_published, glances
     torch.testing.assert_close(*predicted, atol=2e-2 if name in ("dcgan", "hybrid") else 2e-3, rtol=0)
 
 
-@pytest.mark.parametrize("name", [name for name in PREDICTORS if name != "swiftwrf"])
+@pytest.mark.parametrize("name", [name for name in RSSI_PREDICTORS if name != "swiftwrf"])
 def test_predictors_do_not_depend_on_the_origin(small_published, name):
     data, predicted = rssi_room(n=40).receivers(["1", "2"]), []
     for shift in (0.0, 1e7):
@@ -45,7 +45,7 @@ def test_predictors_do_not_depend_on_the_origin(small_published, name):
             transmitter_position=data.transmitter_position + shift,
             receiver_position=data.receiver_position + shift,
         )
-        predicted.append(PREDICTORS[name]().fit(moved).predict(moved.transmitter_position[:10]).mean)
+        predicted.append(RSSI_PREDICTORS[name]().fit(moved).predict(moved.transmitter_position[:10]).mean)
     torch.testing.assert_close(*predicted, atol=0.05, rtol=0)  # dB
 
 
@@ -64,7 +64,7 @@ def test_grids_arrays_and_kernels_refuse_what_they_cannot_be():
 
 
 def test_prime_numbers_of_rows_leave_the_network_something():
-    from tasks.aoa.estimators.aann import MIN_ROWS
+    from augment.estimators.aann import MIN_ROWS
 
     assert coarsening((89, 356), 120, MIN_ROWS) == 1
     assert coarsening((90, 360), 120, MIN_ROWS) == 3

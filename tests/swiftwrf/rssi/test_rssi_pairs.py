@@ -11,10 +11,10 @@ import torch
 
 import swiftwrf
 from swiftwrf import InputError, PairModel, Rssi, load_rssi
+from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.positions import cells
 from tasks.command_line import command_line
 from tasks.rssi import experiment
-from tasks.rssi.predictors import PREDICTORS
 
 WALL_DB, WALL_X, ROOM_M = 14.0, 4.0, 8.0
 
@@ -165,7 +165,8 @@ def test_all_places_are_kept_though_few_rows_detect_them():
 def test_pairs_predict_new_places_better_than_models_that_ignore_the_second_end():
     train, test = Rssi.from_frame(links()).split("place")
     error = {
-        name: error_db(PREDICTORS[name](), train, test) for name in ("pairs", "knn_pairs", "mri_pooled", "mean", "knn")
+        name: error_db(RSSI_PREDICTORS[name](), train, test)
+        for name in ("pairs", "knn_pairs", "mri_pooled", "mean", "knn")
     }
     assert error["pairs"] < 0.7 * min(error[name] for name in ("mri_pooled", "mean", "knn"))
     assert error["pairs"] < error["knn_pairs"] < error["mean"]
@@ -222,7 +223,7 @@ def run(*arguments):
 
 def test_whole_run_at_new_places(tmp_path, monkeypatch):
     kept = ("swiftwrf", "mri_pooled", "pairs", "knn_pairs")
-    monkeypatch.setattr(PREDICTORS, "_registered", {name: PREDICTORS[name] for name in kept})
+    monkeypatch.setattr(RSSI_PREDICTORS, "_registered", {name: RSSI_PREDICTORS[name] for name in kept})
     links(n_places=10, rows=15).to_csv(tmp_path / "links.csv", index=False)
     where = ("--data", tmp_path / "links.csv", "--rx", "all", "--split", "place", "--out", tmp_path / "run")
     assert run(*where) == 0
@@ -240,5 +241,5 @@ def test_whole_run_at_new_places(tmp_path, monkeypatch):
 def test_new_places_of_a_measured_router(measured_data):
     data = load_rssi(measured_data / "dcm-rssi", transmitter=["receiver"])
     train, test = data.subset(torch.arange(0, len(data), 6)).split("place")
-    error = {name: error_db(PREDICTORS[name](), train, test) for name in ("pairs", "mri_pooled", "mean")}
+    error = {name: error_db(RSSI_PREDICTORS[name](), train, test) for name in ("pairs", "mri_pooled", "mean")}
     assert error["pairs"] < 0.9 * error["mri_pooled"] < error["mean"]

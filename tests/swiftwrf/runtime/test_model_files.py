@@ -199,7 +199,7 @@ def test_estimators_are_opened_with_swiftwrf_alone(tmp_path):
     (installed / "entry_points.txt").write_text("\n".join(["[swiftwrf.estimators]", *lines]))
     from tasks.aoa import estimators  # noqa: F401 (defines the kinds)
 
-    kinds = {kind for kind, made in Saved.kinds.items() if made.__module__.startswith("tasks.aoa.estimators")}
+    kinds = {kind for kind, made in Saved.kinds.items() if made.__module__.startswith("augment.estimators")}
     assert kinds
     script = "import swiftwrf; from swiftwrf.runtime import checkpoint; checkpoint._import_kinds()"
     script += "; print(*checkpoint.Saved.kinds, sep='|')"

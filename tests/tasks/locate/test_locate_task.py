@@ -16,20 +16,21 @@ import torch
 from quick import said
 from small import glances
 
-from swiftwrf import AngularGrid, InputError, RssiModel, load, make_model, rssi_room, simulated_room
+from swiftwrf import AngularGrid, InputError, RssiModel, load, rssi_room, simulated_room
 from swiftwrf.data import ReadOptions
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.locate import MatchedField
+from swiftwrf.locate.baselines import LEVELS, LOCALIZERS, RegressedCoordinates
 from swiftwrf.runtime.registry import Registry
 from tasks.claim import LOCATOR as MODEL
 from tasks.command_line import command_line
 from tasks.labels import LOCALIZERS as LABELS
-from tasks.locate import experiment
 from tasks.locate.experiment import prepared
-from tasks.locate.localizers import LEVELS, LOCALIZERS, RegressedCoordinates
-from tasks.locate.observations import aligned, read_rssi
-from tasks.locate.options import LocateConfig
-from tasks.locate.steps import Localization, in_plan
+from tasks.locate.steps import Localization
+from tasks.predict.observations import read_rssi
+from tasks.predict.options import PredictConfig
+from tasks.predict.run import run as predict
+from tasks.source import aligned
 
 GRID = AngularGrid.hemisphere(8, 32)
 
@@ -41,7 +42,7 @@ def run(*arguments):
 
 def locate(*arguments):
     """The positions of new observations; the exit code."""
-    return command_line("tasks.locate", LocateConfig, experiment.run, [str(a) for a in arguments])
+    return command_line("tasks.predict", PredictConfig, predict, [str(a) for a in arguments])
 
 
 def strict_json(file):
@@ -95,7 +96,7 @@ def test_baselines_locate_better_than_the_mean_position(name, validation):
 
 def test_a_known_fingerprint_is_located_where_it_was_measured():
     train = rssi_room(n=60)
-    with mock.patch("tasks.locate.localizers.NEIGHBOUR_COUNTS", (1,)):
+    with mock.patch("swiftwrf.rssi.baselines.NEIGHBOUR_COUNTS", (1,)):
         located = LOCALIZERS["knn"]().fit(train).locate(train.rssi_dbm)
     torch.testing.assert_close(located.position, train.transmitter_position)
 
@@ -148,7 +149,7 @@ def test_the_report_shows_errors_calibration_and_posteriors(finished):
     page = (finished / "report.html").read_text()
     assert "the best nearest-neighbour fingerprinting" in page
     assert "What this does not show" in page
-    assert f"tasks.locate {finished}/{MODEL} SOURCE" in re.sub("</?span>", "", page)
+    assert f"tasks.predict {finished} SOURCE" in re.sub("</?span>", "", page)
     drawn = {file.stem.partition("-")[0] for file in (finished / "figures").glob("*.svg")}
     assert drawn == {"summary", "calibration", "studies", "posteriors"}
     with np.load(finished / "maps.npz") as maps:
@@ -188,7 +189,7 @@ def test_rows_that_no_receiver_detected_are_left_out(tmp_path, capsys):
 
 def test_an_interrupted_run_goes_on_to_the_same_numbers(finished, tmp_path):
     out = tmp_path / "run"
-    with mock.patch.object(RegressedCoordinates, "_regress", side_effect=KeyboardInterrupt):
+    with mock.patch.object(RegressedCoordinates, "_fitted", side_effect=KeyboardInterrupt):
         assert run("--cells", 300, "--out", out) == 130
     partial = tmp_path / "run.partial"
     kept = {file.stem for file in (partial / "steps").iterdir()}
@@ -225,6 +226,8 @@ def test_receivers_of_the_model_are_found_by_name(finished, tmp_path, capsys):
     assert placed.receiver_names == locator.receiver_names
     torch.testing.assert_close(placed.rssi_dbm[:, 1], data.rssi_dbm[:, 1], equal_nan=True)
     assert placed.detected[:, 2:].sum() == 0
+    torch.testing.assert_close(placed.receiver_position[1], data.receiver_position[1])
+    assert placed.receiver_position[[0, 2]].isnan().all()
     printed = " ".join(capsys.readouterr().err.split())
     assert "count as not detecting: receiver01" in printed
     assert "are not used: kitchen" in printed
@@ -246,24 +249,29 @@ def test_other_rows_are_refused(finished, matched, tmp_path, capsys):
     assert locate(finished / MODEL, others, "--out", out) == 2
     assert "has other receivers (a, b" in said(capsys)
     assert locate(finished / MODEL, others, "--every", 2, "--out", out) == 2
-    assert "--every is for spectra" in said(capsys)
-    make_model("nearest").fit(simulated_room(n=20, grid=GRID)).save(tmp_path / "nearest")
-    assert locate(tmp_path / "nearest", others, "--out", out) == 2
-    assert "locates nothing" in said(capsys)
+    assert "--every is for reading spectra" in said(capsys)
     assert not out.exists()
 
 
 def test_no_receiver_detected(finished, tmp_path, capsys):
     data = rssi_room(n=20)
     data.rssi_dbm[:] = torch.nan
-    with mock.patch("tasks.locate.observations.read_rssi", return_value=(data, True)):
+    with mock.patch("tasks.predict.observations.read_rssi", return_value=(data, True)):
         assert locate(finished / MODEL, "walk", "--out", tmp_path / "out.csv") == 2
     assert "no receiver of" in said(capsys)
     data.rssi_dbm[3] = -70.0
-    with mock.patch("tasks.locate.observations.read_rssi", return_value=(data, True)):
+    with mock.patch("tasks.predict.observations.read_rssi", return_value=(data, True)):
         assert locate(finished / MODEL, "walk", "--out", tmp_path / "out.csv") == 0
     assert "left out: 19" in capsys.readouterr().err
     assert pd.read_csv(tmp_path / "out.csv")["index"].tolist() == [3]
+
+
+def test_receivers_that_moved_are_refused(finished, tmp_path, capsys):
+    data = rssi_room(n=20)
+    moved = replace(data, receiver_position=data.receiver_position + torch.tensor([0.0, 2.0, 0.0]))
+    with mock.patch("tasks.predict.observations.read_rssi", return_value=(moved, True)):
+        assert locate(finished / MODEL, "walk", "--out", tmp_path / "out.csv") == 2
+    assert "receiver01 2 m away from its position" in said(capsys)
 
 
 def test_positions_and_directions_of_spectra(matched, tmp_path, capsys):
@@ -285,17 +293,6 @@ def test_positions_and_directions_of_spectra(matched, tmp_path, capsys):
     assert "--grid 8 32" in said(capsys)
     assert locate(file, tmp_path / "unknown.npy", "--every", 2, "--out", tmp_path / "out.csv") == 2
     assert "--every does not apply" in said(capsys)
-
-
-def test_a_posterior_is_summed_over_height():
-    at = torch.tensor([[[0.0, 0, 0], [0, 0, 1], [1, 0, 0], [1, 2, 0]]], dtype=torch.float64)
-    posterior = mock.Mock(position=at, weight=torch.tensor([[0.2, 0.2, 0.4, 0.2]]).double(), resolution_m=0.3)
-    posterior.__len__ = lambda self: 1
-    xs, ys, density = in_plan(posterior)
-    assert density.shape == (1, len(ys), len(xs))
-    assert density[0, 0, 0] == pytest.approx(1)
-    assert density[0, -1, -1] == pytest.approx(0.5)
-    assert density[0, len(ys) // 2].isnan().all()
 
 
 def test_the_benchmark_measures_every_localizer(monkeypatch):

@@ -21,9 +21,11 @@ from sklearn.neighbors import KNeighborsRegressor
 from small import with_defaults
 
 from swiftwrf import InputError, Rssi, fit_rssi, load, rssi_room
+from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.comparison import NeRF2Rssi, NeRF2RssiConfig
 from swiftwrf.data.splits import folds
 from swiftwrf.rssi import RssiPredictor
+from swiftwrf.rssi.baselines import NEIGHBOUR_COUNTS, Blend, BlendConfig, make_predictor
 from swiftwrf.runtime import registry
 from tasks.command_line import command_line
 from tasks.labels import PREDICTORS as LABELS
@@ -31,10 +33,6 @@ from tasks.report.run import merge
 from tasks.rssi import experiment
 from tasks.rssi.options import RssiTaskConfig
 from tasks.rssi.page.summary import where_next
-from tasks.rssi.predictors import PREDICTORS
-from tasks.rssi.predictors.base import make_predictor
-from tasks.rssi.predictors.blend import Blend, BlendConfig
-from tasks.rssi.predictors.regressors import NEIGHBOUR_COUNTS
 from tasks.summarise import paired_difference
 
 
@@ -48,7 +46,7 @@ def path_loss_only(n=60, noise=0.0, level=-50.0, exponent=2.0, seed=0):
     return Rssi(rssi, position, receiver_position=receiver, receiver_names=list("abc"), name="path loss")
 
 
-@pytest.mark.parametrize("name", [n for n in PREDICTORS if n.startswith(("mri", "gp"))])
+@pytest.mark.parametrize("name", [n for n in RSSI_PREDICTORS if n.startswith(("mri", "gp"))])
 def test_predictors_with_a_path_loss_model_recover_it(name):
     position = torch.tensor([[3.0, 4.0, 2.0]], dtype=torch.float64)
     predictor = make_predictor(name).fit(path_loss_only())
@@ -78,7 +76,7 @@ def short_nerf2(monkeypatch):
     monkeypatch.setattr(NeRF2Rssi, "config_type", with_defaults(config))
 
 
-@pytest.mark.parametrize("name", list(PREDICTORS))
+@pytest.mark.parametrize("name", list(RSSI_PREDICTORS))
 def test_predictors_ignore_missing_values(name):
     train, test = rssi_room(n=60).receivers(["1", "2"]).split("random")
     predictor = make_predictor(name, validation="block")
@@ -94,7 +92,7 @@ def test_predictors_ignore_missing_values(name):
     assert predictor.predict(test.transmitter_position[:0]).mean.shape == (0, 2)
 
 
-@pytest.mark.parametrize("name", list(PREDICTORS))
+@pytest.mark.parametrize("name", list(RSSI_PREDICTORS))
 @pytest.mark.parametrize("validation", ["random", "block"])
 def test_predictors_fall_back_at_a_rarely_detected_receiver(name, validation):
     """Never, once, in one slab only: the others are fitted, and all predictions are finite."""
@@ -107,13 +105,13 @@ def test_predictors_fall_back_at_a_rarely_detected_receiver(name, validation):
 
 
 def test_predictors_describe_themselves():
-    for name, predictor in PREDICTORS.items():
+    for name, predictor in RSSI_PREDICTORS.items():
         assert issubclass(predictor, RssiPredictor)
         assert predictor.name == name
-        assert PREDICTORS.summary(name)
+        assert RSSI_PREDICTORS.summary(name)
         assert LABELS[name].colour
     baselines = ["mean", "mri_pooled", "mri_receiver", "knn", "mri_residual", "gp"]
-    assert list(PREDICTORS) == ["swiftwrf", *baselines, "pairs", "knn_pairs", "blend", "nerf2"]
+    assert list(RSSI_PREDICTORS) == ["swiftwrf", *baselines, "pairs", "knn_pairs", "blend", "nerf2"]
 
 
 def test_unknown_predictor():
@@ -122,14 +120,14 @@ def test_unknown_predictor():
     with pytest.raises(InputError, match="validation must be 'random' or 'block'"):
         make_predictor("knn", validation="blok")
     with pytest.raises(InputError, match="KNNPredictor has no option 'k'"):
-        PREDICTORS["knn"](k=3)
+        RSSI_PREDICTORS["knn"](k=3)
 
 
 def test_a_predictor_of_another_package(monkeypatch, small, tmp_path):
     """Registered by an entry point, it takes part in a run."""
     point = EntryPoint("outside", "test_rssi:Outside", "swiftwrf.rssi_predictors")
     monkeypatch.setattr(registry, "_entry_points", lambda group, path: (point,) if group == point.group else ())
-    monkeypatch.setattr(PREDICTORS, "_registered", {name: PREDICTORS[name] for name in ("swiftwrf", "mean")})
+    monkeypatch.setattr(RSSI_PREDICTORS, "_registered", {name: RSSI_PREDICTORS[name] for name in ("swiftwrf", "mean")})
     assert run("--rx", "1", "--out", tmp_path / "run") == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert list(metrics["overall"]) == ["swiftwrf", "mean", "outside"]
@@ -167,7 +165,7 @@ def test_whole_run(small, tmp_path, monkeypatch):
     out = tmp_path / "run"
     metrics = json.loads((out / "metrics.json").read_text(), parse_constant=lambda name: pytest.fail(name))
     assert (metrics["task"], metrics["data"], metrics["split"]) == ("rssi", "simulated-floor", "random")
-    assert set(metrics["overall"]) == set(PREDICTORS) - {"pairs", "knn_pairs"}  # which are for two moving ends
+    assert set(metrics["overall"]) == set(RSSI_PREDICTORS) - {"pairs", "knn_pairs"}  # which are for two moving ends
     assert set(metrics["receivers"]) == {"receiver01", "receiver06"}
     assert set(metrics["seconds"]) == {"fit", "predict"}
     errors = pd.read_csv(out / "errors.csv")
@@ -218,7 +216,7 @@ def unlocated(n=60):
     return replace(data, receiver_position=torch.full_like(data.receiver_position, torch.nan))
 
 
-@pytest.mark.parametrize("name", list(PREDICTORS))
+@pytest.mark.parametrize("name", list(RSSI_PREDICTORS))
 def test_predictors_without_positions_of_the_receivers(name):
     data, predictor = unlocated(), make_predictor(name)
     if predictor.requires_receiver_position:

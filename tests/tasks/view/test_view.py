@@ -214,7 +214,7 @@ def test_maps_are_those_of_the_model(rssi_run):
     assert view.receivers == ("receiver01", "receiver06", "receiver12")
     assert view.floor.plan.corners == (0, 20, 0, 15)
     i, j = 5, 17
-    place = view.cells[0][j], view.cells[1][i]
+    place = view.chart.x[j], view.chart.y[i]
     at = torch.tensor([[*place, 1.2]], dtype=torch.float64)
     predicted = load(rssi_run / "model.safetensors").predict(at)
     np.testing.assert_allclose(view.map(1.2).mean[:, i, j], predicted.mean[0], atol=1e-3)
@@ -228,7 +228,7 @@ def test_maps_are_those_of_the_model(rssi_run):
 
 def test_certainty_is_that_of_the_interval(rssi_run):
     """90 % of a normal variable lie above the lower end of its 80 % interval, half above its mean."""
-    rssi = open_source(rssi_run).map(1.2)
+    rssi = open_source(rssi_run).map(1.2).prediction
     for threshold, certainty in ((rssi.interval(0.8)[0], 0.9), (rssi.mean, 0.5)):
         selection = MapSelection("coverage", 0, 1.2, threshold)
         np.testing.assert_allclose(probability_above(rssi, selection), certainty, atol=1e-4)
@@ -236,14 +236,14 @@ def test_certainty_is_that_of_the_interval(rssi_run):
 
 def test_coverage_is_where_the_probability_is_high_enough(rssi_run):
     view = open_source(rssi_run)
-    threshold = float(view.map(1.2).interval(0.8)[0][2].median())
+    threshold = float(view.map(1.2).prediction.interval(0.8)[0][2].median())
     selection = MapSelection("coverage", 2, 1.2, threshold, 0.9)
     covered = np.isfinite(view.coloured(selection).values)
     assert covered.mean() == pytest.approx(0.5, abs=0.01)
     assert view.sentence(selection).startswith("50% of the map")
     for cells, sign in ((covered, 1), (~covered, -1)):
         i, j = np.argwhere(cells)[0]
-        above = float(probability_above(view.at(selection, view.cells[0][j], view.cells[1][i]), selection)[2])
+        above = float(probability_above(view.at(selection, view.chart.x[j], view.chart.y[i]), selection)[2])
         assert sign * above >= sign * 0.9 - 1e-3
 
 
@@ -252,7 +252,7 @@ def test_exports(rssi_run):
     for kind in view.kinds:
         assert Image.open(io.BytesIO(view.picture(MapSelection(kind, 1, 1.2)))).format == "PNG"
     table = pd.read_csv(io.StringIO(view.table(MapSelection("coverage", 1, 1.2, -70.0, 0.9))))
-    rssi = view.map(1.2)
+    rssi = view.map(1.2).prediction
     assert len(table) == rssi.mean[0].numel()
     np.testing.assert_allclose(table["predicted_dbm"], rssi.mean[1].flatten(), atol=0.006)
     np.testing.assert_array_equal(table["above_-70_dbm_with_90%"], rssi.interval(0.8)[0][1].flatten() >= -70)
@@ -448,12 +448,12 @@ def test_a_dropped_floor_plan_lies_at_its_scale_and_origin_and_stays(rssi_run, t
     folder = tmp_path / "run"
     shutil.copytree(rssi_run, folder)
     view = open_source(folder)
-    before = len(view.cells[0]), view.inside.shape
+    before = view.inside.shape
     pixels = np.full((30, 80, 3), 9, dtype=np.uint8)
     view.place(FloorPlan.scaled(pixels, 0.5, (4, 26)))  # y counts down from the upper edge
     assert view.floor.plan.corners == (-2, 38, -2, 13)
-    assert view.corners[1] >= 38
-    assert (len(view.cells[0]), view.inside.shape) != before
+    assert view.chart.corners[1] == pytest.approx(38)
+    assert view.inside.shape == view.map(1.0).mean.shape[1:] != before
     again = open_source(folder).floor.plan
     assert again.corners == (-2, 38, -2, 13)
     np.testing.assert_array_equal(again.pixels, pixels)

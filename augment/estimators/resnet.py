@@ -1,15 +1,12 @@
-"""ResNet-50 for spectra: one input channel, a small head, fast convolutions for CPUs, and training in several processes."""
+"""ResNet-50 for spectra: one input channel, a small head, and fast convolutions for CPUs."""
 
 from __future__ import annotations
 
-import copy
-from typing import Any, cast
+from typing import cast
 
 import torch
 from torch import Tensor, nn
-from torch import distributed as dist
 from torch.nn import functional
-from torch.nn.parallel import DistributedDataParallel
 
 FEATURES = 2048  # of a spectrum, behind the last convolution
 
@@ -70,44 +67,6 @@ class Neighbours(nn.Module):
         ]
         weight = self.weight.permute(0, 2, 3, 1)[:, first:end].flatten(1)
         return functional.linear(torch.cat(neighbours, dim=-1), weight).permute(0, 3, 1, 2)
-
-
-class _Total(torch.autograd.Function):
-    """Differentiable sum over the processes."""
-
-    @staticmethod
-    def forward(ctx: Any, tensor: Tensor) -> Tensor:
-        total = tensor.clone()
-        dist.all_reduce(total)
-        return total
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Any:
-        return _Total.apply(gradient)
-
-
-class CpuSyncBatchNorm(nn.BatchNorm2d):
-    """Synchronised batch norm for the CPU, where `nn.SyncBatchNorm` has no implementation."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        wide, pixels = x.to(torch.promote_types(x.dtype, torch.float32)), (0, 2, 3)
-        count = _Total.apply(wide.new_tensor(len(x) * x.shape[2] * x.shape[3]))
-        mean = _Total.apply(wide.sum(pixels)) / count
-        centred = wide - mean[:, None, None]
-        variance = _Total.apply(centred.square().sum(pixels)) / count
-        scale = self.weight * (variance + self.eps).rsqrt()
-        return cast(Tensor, centred * scale[:, None, None] + self.bias[:, None, None]).to(x.dtype)
-
-
-def distributed(network: nn.Module) -> DistributedDataParallel:
-    """Return a copy of a network whose gradients and batch norms are those of the batches of all processes."""
-    copied = copy.deepcopy(network)
-    if next(copied.parameters()).is_cuda:
-        return DistributedDataParallel(nn.SyncBatchNorm.convert_sync_batchnorm(copied))
-    for module in copied.modules():
-        if isinstance(module, nn.BatchNorm2d):
-            module.__class__ = CpuSyncBatchNorm
-    return DistributedDataParallel(copied)
 
 
 def backbone(circular: bool, products: bool) -> nn.Module:

@@ -1,6 +1,6 @@
 """Estimators of the direction of the transmitter from a spectrum."""
 
-from tasks.aoa.estimators.base import ESTIMATORS, Estimator, EstimatorConfig, SavedEstimator, make_estimator
+from augment.estimators.base import ESTIMATORS, Estimator, EstimatorConfig, SavedEstimator, make_estimator
 
 ESTIMATORS.discover(__name__, __path__)
 

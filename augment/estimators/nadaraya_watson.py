@@ -88,7 +88,7 @@ class NadarayaWatson:
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         """Return tensors in single precision, and plain values."""
-        arrays = {"known": self.known, "says": self.dual}
+        arrays = {"known": self.known, "dual": self.dual}
         return {name: torch.from_numpy(array.astype(np.float32)) for name, array in arrays.items()}, {
             "gamma": self.gamma
         }
@@ -106,11 +106,11 @@ class NadarayaWatson:
         Raises:
             InputError: Shapes or values that do not fit together.
         """
-        expect(tensors, {"known": (n := len(tensors["known"]), features), "says": (n, values)})
+        expect(tensors, {"known": (n := len(tensors["known"]), features), "dual": (n, values)})
         gamma = float(header["gamma"])
         if not (gamma > 0 and math.isfinite(gamma)):
             raise InputError(f"gamma must be positive and finite, got {gamma}")
-        return cls(tensors["known"].double().numpy(), tensors["says"].double().numpy(), gamma)
+        return cls(tensors["known"].double().numpy(), tensors["dual"].double().numpy(), gamma)
 
 
 def choose(distance: NDArray[Any], target: NDArray[Any], seed: int) -> tuple[float, float]:

@@ -11,7 +11,7 @@ import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import cast
+from typing import TypedDict, cast
 
 import numpy as np
 import torch
@@ -20,21 +20,54 @@ from torch import Tensor
 
 from augment import Fold, Mixed, synthetic_positions
 from augment.choose import BLIND_FOLDS
+from augment.estimators import make_estimator
 from swiftwrf import FitError, InputError, Spectra
 from swiftwrf.gp import subsample
 from swiftwrf.locate import MatchedField, MatchedFieldConfig
-from swiftwrf.metrics import angle_errors
+from swiftwrf.metrics import ChangeMetrics, angle_errors, paired_change
 from swiftwrf.runtime.threads import parallel_map
-from tasks.aoa.condition import LOCATOR, STAND_IN
-from tasks.aoa.estimators import make_estimator
-from tasks.metrics import CrossValidationMetrics, EstimatorChoiceMetrics
-from tasks.summarise import paired_change
 
+STAND_IN = "kernel_regression"  # estimator in place of the network where many or quick trainings are needed
+LOCATOR = "matched_field"  # estimator that locates the moving end by the room; it needs positions, array and fixed end
 N_SYNTHETIC_CANDIDATES = (300, 1000, 3000)
 MAX_LOCATED = 60  # held-out spectra of a fold that are located
 FOLD_LOCATOR = MatchedFieldConfig(n_calibration=40, max_cells=100_000, spacing=0.2)  # half the time of the defaults
 Errors = NDArray[np.float64]
 _PREDICTING = threading.Lock()  # folds are computed side by side, but parallel loops of numba take one caller at a time
+
+
+class GainMetrics(ChangeMetrics):
+    """Change by a number of synthetic spectra at synthetic positions."""
+
+    n_synthetic: int
+
+
+class CrossValidationMetrics(TypedDict):
+    """Cross-validation of one field model: change of the error on held-out measured spectra by extra synthetic spectra.
+
+    `gains` has every number that was compared, `rule` the number chosen on the other folds. Further positions
+    are recommended if every number reduces the error; `helps` requires that the interval of `rule` excludes zero, too.
+    """
+
+    stand_in: str
+    n_held_out: int
+    measured_only_deg: float
+    gains: list[GainMetrics]
+    rule: ChangeMetrics | None
+    recommended_n_synthetic: int
+    helps: bool
+
+
+class EstimatorChoiceMetrics(TypedDict):
+    """Method with the smallest median angular error on held-out measured spectra; that error of each candidate.
+
+    `better` has the methods with a significantly smaller error on the test spectra, best first, and why they are not chosen.
+    """
+
+    name: str
+    held_out_deg: dict[str, float]
+    n_held_out: int
+    better: dict[str, str]
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from augment import Mixed
+from augment.estimators.base import ESTIMATORS, Estimator
 from swiftwrf import InputError, Spectra
 from swiftwrf.array.angles import to_angles
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.array.subspace import esprit, maximum_likelihood, music
-from tasks.aoa.estimators.base import ESTIMATORS, Estimator
 
 MIN_SNAPSHOTS = 2  # of one position: with one snapshot all methods are the peak of its spectrum
 

@@ -7,28 +7,23 @@ training direction in units of the labels' spread, so that training starts from 
 
 from __future__ import annotations
 
-import copy
 import math
 import time
 from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
-from torch import distributed as dist
 from torch.nn import functional
 from torch.optim.swa_utils import update_bn
 
 from augment import Mixed
-from swiftwrf import InputError
+from augment.estimators.base import ESTIMATORS, EstimatorConfig, SavedEstimator
+from augment.estimators.resnet import backbone
 from swiftwrf.array.angles import to_angles, to_direction
 from swiftwrf.data.spectra import coarsening
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.progress import progress
-from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, PositiveInt, configuration
-from tasks.aoa.estimators.base import ESTIMATORS, EstimatorConfig, SavedEstimator
-from tasks.aoa.estimators.resnet import backbone, distributed
-from tasks.run import Preset
-from tasks.torchrun import distribute, process_count
+from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, PositiveInt, Preset, configuration
 
 MIN_ROWS = 8  # fewest elevations after averaging; a prime number of rows could only be averaged to one
 EVALUATIONS = 30  # of each spectrum of a scene in a quick training
@@ -74,9 +69,6 @@ class AANNConfig(EstimatorConfig):
 class AANN(SavedEstimator):
     """ResNet-50 and a multilayer perceptron, the network of the paper, from a seeded start without downloads.
 
-    The processes of torchrun share each batch and its statistics in the batch norms. They train the network of one process,
-    up to the rounding of sums.
-
     Example:
         >>> import swiftwrf
         >>> room = swiftwrf.simulated_room(n=20, grid=swiftwrf.AngularGrid.hemisphere(10, 40))
@@ -115,21 +107,13 @@ class AANN(SavedEstimator):
         config, network = self.config, self._network
         generator = torch.Generator().manual_seed(config.seed)
         size = min(config.batch, max(len(train) // 2, 1))
-        if size < process_count():
-            raise InputError(
-                f"{process_count()} processes cannot share batches of {size} spectra; start at most {size}"
-            )
         prepared = torch.cat([self._prepare(part) for part in train.batches()])
         direction = to_direction(*train.label.unbind(-1)).float().to(device)
         mean = functional.normalize(direction.mean(dim=0), dim=0)
         spread = (direction - mean).square().sum(dim=1).mean().sqrt().clamp_min(1e-4)
         batches = _batches(len(train), size, config.steps, generator)
         self._offset = torch.cat([mean, spread[None]]).cpu()
-        given = prepared, direction, mean, spread
-        if process_count() > 1:
-            away = copy.deepcopy(network).cpu()
-            distribute(_train, away, config, device.type, batches, *(tensor.cpu() for tensor in given))
-        self.history = _train(network, config, device.type, batches, *given)
+        self.history = self._train(batches, prepared, direction, mean, spread)
 
         network.train()
         # a short training leaves the batch norms' running statistics behind the weights, so they are computed again
@@ -143,6 +127,31 @@ class AANN(SavedEstimator):
             for value in network.state_dict().values():
                 value.copy_(halved(value))
         return prepared, direction
+
+    def _train(
+        self, batches: Tensor, spectrum: Tensor, direction: Tensor, mean: Tensor, spread: Tensor
+    ) -> list[dict[str, Any]]:
+        """Train the network and return its history: step, loss and seconds."""
+        config, network = self.config, self._network
+        optimiser = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=1e-2, fused=True)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(
+            optimiser, config.rate, total_steps=config.steps, pct_start=WARM_UP_FRACTION
+        )
+        network.train()
+        began, history = time.perf_counter(), []
+        for step, rows in enumerate(progress(list(batches), "AANN"), start=1):
+            with _autocast(self._device):
+                offset = network(spectrum[rows])
+            miss = (functional.normalize(mean + spread * offset.float(), dim=1) - direction[rows]) / spread
+            loss = functional.smooth_l1_loss(miss, torch.zeros_like(miss))
+            optimiser.zero_grad()
+            loss.backward()
+            nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+            optimiser.step()
+            schedule.step()
+            if step % 10 == 0 or step == config.steps:
+                history.append({"step": step, "loss": loss.item(), "seconds": time.perf_counter() - began})
+        return history
 
     @torch.no_grad()
     def predict(self, spectra: Tensor) -> Tensor:
@@ -189,53 +198,6 @@ def _batches(rows: int, size: int, steps: int, generator: torch.Generator) -> Te
         batches.append(order[:size])
         order = order[size:]
     return torch.stack(batches)
-
-
-def _train(
-    network: nn.Module,
-    config: AANNConfig,
-    device: str,
-    batches: Tensor,
-    spectrum: Tensor,
-    direction: Tensor,
-    mean: Tensor,
-    spread: Tensor,
-) -> list[dict[str, Any]]:
-    """Train a network in place and return its history: step, loss and seconds.
-
-    Every process of torchrun makes this call, with its part of each batch.
-    """
-    number, rank = process_count(), dist.get_rank() if process_count() > 1 else 0
-    network = network.to(device)
-    spectrum, direction, mean, spread = (tensor.to(device) for tensor in (spectrum, direction, mean, spread))
-    shared = distributed(network) if number > 1 else None
-    trained = shared or network
-    optimiser = torch.optim.AdamW(trained.parameters(), lr=config.rate, weight_decay=1e-2, fused=True)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimiser, config.rate, total_steps=config.steps, pct_start=WARM_UP_FRACTION
-    )
-    trained.train()
-    began, history = time.perf_counter(), []
-    for step, batch in enumerate(progress(list(batches), "AANN", shown=rank == 0), start=1):
-        rows = batch[rank::number]
-        with _autocast(torch.device(device)):
-            offset = trained(spectrum[rows])
-        miss = (functional.normalize(mean + spread * offset.float(), dim=1) - direction[rows]) / spread
-        # the mean over the processes, which DistributedDataParallel takes, becomes the mean over the batch
-        loss = functional.smooth_l1_loss(miss, torch.zeros_like(miss)) * (number * len(rows) / len(batch))
-        optimiser.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(trained.parameters(), 1.0)
-        optimiser.step()
-        schedule.step()
-        if step % 10 == 0 or step == config.steps:
-            shown = loss.detach()
-            if number > 1:
-                dist.all_reduce(shown)
-            history.append({"step": step, "loss": shown.item() / number, "seconds": time.perf_counter() - began})
-    if shared:
-        network.load_state_dict(shared.module.state_dict())
-    return history
 
 
 def _autocast(device: torch.device) -> torch.autocast:

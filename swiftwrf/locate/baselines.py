@@ -11,22 +11,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
-from sklearn.neighbors import NearestNeighbors
 from torch import Tensor
 
-from swiftwrf import Rssi
+from swiftwrf.data import Rssi
 from swiftwrf.data.splits import Validation, folds
-from swiftwrf.locate import RssiLocator
-from swiftwrf.locate.rssi import NEIGHBOUR_COUNTS, UNDETECTED_BELOW_DB
+from swiftwrf.locate.rssi import UNDETECTED_BELOW_DB, RssiLocator
+from swiftwrf.rssi.baselines import choose_neighbours, fit_process
 from swiftwrf.runtime.registry import Registry
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
 
 LEVELS = (0.5, 0.8, 0.95)  # probabilities of the credible regions
 BATCH_ROWS = 128  # rows of RSSI whose posteriors are in memory together
-MIN_DISTANCE_DB = 0.1  # between fingerprints, so that weights stay finite
-MAX_TUNING_ROWS, MAX_REGRESSION_ROWS = 500, 1500  # the cost of Gaussian-process regression grows with their cube
 
 
 @configuration
@@ -125,11 +121,12 @@ class FingerprintLocalizer(Localizer):
         relative = self._relative(train.rssi_dbm)
         self._undetected = float(relative[~relative.isnan()].min()) - UNDETECTED_BELOW_DB
         fold = folds(train.transmitter_position, self.config.validation, self.config.seed, session=train.session)
-        self._regress(self._fingerprint(train.rssi_dbm), train.transmitter_position.numpy(), fold.numpy())
+        fingerprint = self._fingerprint(train.rssi_dbm)
+        self._regressor = self._fitted(fingerprint, train.transmitter_position.numpy(), fold.numpy())
         return self
 
     def locate(self, rssi: Tensor) -> Located:
-        return Located(torch.from_numpy(self._estimate(self._fingerprint(rssi))))
+        return Located(torch.from_numpy(self._regressor.predict(self._fingerprint(rssi))))
 
     def _relative(self, rssi: Tensor) -> Tensor:
         return rssi
@@ -139,12 +136,8 @@ class FingerprintLocalizer(Localizer):
         return found
 
     @abstractmethod
-    def _regress(self, x: NDArray[np.float64], position: NDArray[np.float64], fold: NDArray[np.int64]) -> None:
-        """Fit to fingerprints (n, R), positions (n, 3) [m] and folds (n,)."""
-
-    @abstractmethod
-    def _estimate(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return positions (n, 3) [m] of fingerprints (n, R)."""
+    def _fitted(self, x: NDArray[np.float64], position: NDArray[np.float64], fold: NDArray[np.int64]) -> Any:
+        """Return a regressor of scikit-learn, fitted to fingerprints (n, R), positions (n, 3) [m] and folds (n,)."""
 
 
 @LOCALIZERS.register("knn")
@@ -153,32 +146,8 @@ class NearestFingerprints(FingerprintLocalizer):
 
     name = "knn"
 
-    k: int
-    """number of neighbours, set by `fit`"""
-
-    def _regress(self, x: NDArray[np.float64], position: NDArray[np.float64], fold: NDArray[np.int64]) -> None:
-        counts = [k for k in NEIGHBOUR_COUNTS if k <= len(x) - int(np.bincount(fold).max())]
-        errors: dict[int, list[NDArray[np.float64]]] = {k: [] for k in counts}
-        for number in np.unique(fold):
-            out, kept = fold == number, fold != number
-            search = NearestNeighbors(n_neighbors=counts[-1]).fit(x[kept])
-            distance, row = search.kneighbors(x[out])  # one search serves all k
-            for k in counts:
-                estimate = _weighted(distance[:, :k], position[kept][row[:, :k]])
-                errors[k].append(np.linalg.norm(estimate - position[out], axis=1))
-        self.k = min(counts, key=lambda k: float(np.concatenate(errors[k]).mean()))
-        self._search, self._position = NearestNeighbors(n_neighbors=self.k).fit(x), position
-
-    def _estimate(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        distance, row = self._search.kneighbors(x)
-        return _weighted(distance, self._position[row])
-
-
-def _weighted(distance: NDArray[np.float64], position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the inverse-distance mean (n, 3) of positions (n, k, 3) at distances (n, k)."""
-    weight = 1 / np.maximum(distance, MIN_DISTANCE_DB)
-    mean: NDArray[np.float64] = np.einsum("nk,nkc->nc", weight, position) / weight.sum(axis=1, keepdims=True)
-    return mean
+    def _fitted(self, x: NDArray[np.float64], position: NDArray[np.float64], fold: NDArray[np.int64]) -> Any:
+        return choose_neighbours(x, position, fold)
 
 
 @LOCALIZERS.register("knn_difference")
@@ -201,23 +170,13 @@ class RegressedCoordinates(FingerprintLocalizer):
 
     name = "gp"
 
-    def _regress(self, x: NDArray[np.float64], position: NDArray[np.float64], fold: NDArray[np.int64]) -> None:
-        self._scale = max(float(x.std()), 1e-6)
-        x = x / self._scale
-        kernel = ConstantKernel(1.0, (0.01, 100.0)) * Matern(2.0, (0.1, 100.0), nu=1.5) + WhiteKernel(0.1, (1e-4, 10.0))
-        order = np.random.default_rng(self.config.seed).permutation(len(x))
-        tuned, kept = order[:MAX_TUNING_ROWS], order[:MAX_REGRESSION_ROWS]
+    def _fitted(self, x: NDArray[np.float64], position: NDArray[np.float64], fold: NDArray[np.int64]) -> Any:
+        scale = max(float(x.std()), 1e-6)
+        length = Matern(2.0 * scale, (0.1 * scale, 100.0 * scale), nu=1.5)
+        kernel = ConstantKernel(1.0, (0.01, 100.0)) * length + WhiteKernel(0.1, (1e-4, 10.0))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)  # a bound that is reached is the answer
-            tuning = GaussianProcessRegressor(kernel, normalize_y=True, random_state=self.config.seed)
-            kernel = tuning.fit(x[tuned], position[tuned]).kernel_
-        self._regressor = GaussianProcessRegressor(kernel, optimizer=None, normalize_y=True).fit(
-            x[kept], position[kept]
-        )
-
-    def _estimate(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        estimate: NDArray[np.float64] = self._regressor.predict(x / self._scale)
-        return estimate
+            return fit_process(kernel, x, position, self.config.seed, normalize=True)
 
 
 @LOCALIZERS.register("mean")

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from augment import Mixed
+from augment.estimators.base import ESTIMATORS, Estimator
 from swiftwrf.array.angles import to_angles, to_direction
 from swiftwrf.array.planar import folded_angles
-from tasks.aoa.estimators.base import ESTIMATORS, Estimator
 
 SHORTLIST = 8  # candidates found by inner products, whose differences are then computed
 

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from augment import Mixed
+from augment.estimators.aann import AANN, AANNConfig, halved
+from augment.estimators.base import ESTIMATORS
+from augment.estimators.nadaraya_watson import NadarayaWatson, coarse_pixels, kept_rows
+from augment.estimators.resnet import FEATURES
 from swiftwrf import InputError
 from swiftwrf.array.angles import to_angles
 from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.validation import PositiveInt, configuration
-from tasks.aoa.estimators.aann import AANN, AANNConfig, halved
-from tasks.aoa.estimators.base import ESTIMATORS
-from tasks.aoa.estimators.nadaraya_watson import NadarayaWatson, coarse_pixels, kept_rows
-from tasks.aoa.estimators.resnet import FEATURES
 
 MAX_FEATURE = 1e4  # larger features are clipped; typical ones are a thousandth of that
 HALF_TRUST_SPECTRA = 1000  # training spectra after which squared distances of features count half

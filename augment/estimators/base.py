@@ -13,8 +13,7 @@ from augment import Mixed
 from swiftwrf import AngularGrid, InputError, Spectra
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.registry import Registry
-from swiftwrf.runtime.validation import NonNegativeInt, configuration
-from tasks.run import Preset
+from swiftwrf.runtime.validation import NonNegativeInt, Preset, configuration
 
 
 @configuration

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from augment import Mixed
+from augment.estimators.base import ESTIMATORS, SavedEstimator
+from augment.estimators.nadaraya_watson import NadarayaWatson, coarse_pixels, kept_rows
 from swiftwrf.array.angles import to_angles, to_direction
 from swiftwrf.runtime.checkpoint import Header
-from tasks.aoa.estimators.base import ESTIMATORS, SavedEstimator
-from tasks.aoa.estimators.nadaraya_watson import NadarayaWatson, coarse_pixels, kept_rows
 
 BATCH_SPECTRA = 512  # spectra that are loaded at a time
 

@@ -1,0 +1,314 @@
+"""Baselines for RSSI: the mean, path-loss models, neighbours, Gaussian processes, and a blend of several predictors."""
+
+from __future__ import annotations
+
+import warnings
+from abc import abstractmethod
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sklearn.dummy import DummyRegressor
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import ConstantKernel, Kernel, Matern, WhiteKernel
+from sklearn.neighbors import KNeighborsRegressor, NearestNeighbors
+from torch import Tensor, from_numpy
+
+from swiftwrf.choices import RSSI_PREDICTORS
+from swiftwrf.data import Rssi
+from swiftwrf.data.splits import MIN_TRAINING, folds
+from swiftwrf.models.base import FieldConfig
+from swiftwrf.rssi.base import RssiFitContext, RssiPredictor
+from swiftwrf.rssi.model import RssiModel
+from swiftwrf.rssi.pairs import PairPredictor
+from swiftwrf.rssi.paper import RssiPaperModel
+from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, fit_shared_path_loss, log_distance
+from swiftwrf.rssi.training import mixing_weights
+from swiftwrf.runtime.threads import parallel_map
+from swiftwrf.runtime.validation import Preset, checked, configuration
+
+MAX_TREE_COLUMNS = 15  # of coordinates whose neighbours a tree finds
+NEIGHBOUR_COUNTS = (1, 3, 5, 8, 12, 20, 40, 80, 120)
+FLOOR_STRETCH = 5.0  # of heights where there are floors, so that neighbours are on one floor
+MAX_TUNING_ROWS, MAX_GP_ROWS = 500, 1500  # the cost of the Gaussian process grows with their cube
+
+
+@checked
+def make_predictor(name: str, preset: Preset = "quick", **options: Any) -> RssiPredictor:
+    """Return a predictor by its name, with those of the options that it has.
+
+    Args:
+        name: Name in the registry, e.g. "knn".
+        preset: "quick", or "paper" for published settings; a predictor without published settings ignores it. With "paper"
+            the name "swiftwrf" gives `RssiPaperModel`.
+        options: Options such as seed and validation. A predictor ignores options that it does not have.
+
+    Raises:
+        InputError: An unknown name, or a value outside its range.
+
+    Example:
+        >>> make_predictor("swiftwrf", "paper", seed=3).name
+        'swiftwrf_paper'
+    """
+    is_published = name == RssiModel.name and preset == "paper"
+    predictor_type: type[RssiPredictor] = RssiPaperModel if is_published else RSSI_PREDICTORS[name]
+    return predictor_type(**predictor_type.supported({"preset": preset} | options))
+
+
+class Mean(RssiPredictor):
+    """The mean of the receiver's training values, at every position.
+
+    A receiver that no training row detected has the mean of the others.
+    """
+
+    name = "mean"
+
+    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+        self._mean = train.rssi_dbm.nanmean(dim=0).nan_to_num(float(train.rssi_dbm.nanmean()))
+
+    def _predict(self, position: Tensor) -> tuple[Tensor, None]:
+        return self._mean.expand(len(position), -1), None
+
+
+class SharedPathLoss(RssiPredictor):
+    """One log-distance path-loss model for all receivers of the pool, by least squares.
+
+    Receivers of unknown position share one level.
+
+    "MRI" is its name in the NeRF2 repository and, most likely, in the paper's table.
+    """
+
+    name = "mri_pooled"
+    requires_receiver_position = True
+
+    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+        self._receiver = train.receiver_position
+        self._path_loss = _fit_shared(context.pool, train)
+
+    def _predict(self, position: Tensor) -> tuple[Tensor, None]:
+        return self._path_loss(log_distance(position, self._receiver)), None
+
+
+class ReceiverPathLoss(SharedPathLoss):
+    """A log-distance path-loss model for each receiver; a receiver never detected has the model of all receivers."""
+
+    name = "mri_receiver"
+
+    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+        self._receiver = train.receiver_position
+        detected = (~train.rssi_dbm.isnan()).any(dim=0)
+        own = fit_path_loss(log_distance(train.transmitter_position, train.receiver_position), train.rssi_dbm)
+        self._path_loss = own.where(detected, _fit_shared(train, train))
+
+
+def _fit_shared(rows: Rssi, applied: Rssi) -> PathLoss:
+    distance = log_distance(rows.transmitter_position, rows.receiver_position)
+    return fit_shared_path_loss(distance, rows.rssi_dbm, rows.receiver_located, applied.receiver_located)
+
+
+class ReceiverRegressors(RssiPredictor):
+    """Base class: one scikit-learn regressor on the position for each receiver.
+
+    The regressors are fitted to the residual of a simpler predictor, if `_base` returns one, else to the RSSI itself.
+    """
+
+    batch_size = 2**20  # scikit-learn bounds its memory itself
+
+    def _base(self, train: Rssi) -> RssiPredictor | None:
+        """Return the predictor whose residual is learnt."""
+        return None
+
+    @abstractmethod
+    def _regressor(self, x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> Any:
+        """Return a regressor fitted to positions (n, 3) and values (n,) of one receiver."""
+
+    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+        residual, base = train.rssi_dbm, self._base(train)
+        self._simpler = base and base.fit(train)
+        if self._simpler is not None:
+            residual = residual - self._simpler.predict(train.transmitter_position).mean
+        at, config = train.transmitter_position, self.config
+        fold = folds(at, config.validation, config.seed, session=train.session).numpy()
+        self._scale = torch.tensor([1.0, 1.0, FLOOR_STRETCH if train.floors else 1.0], dtype=torch.float64)
+        position = (train.transmitter_position * self._scale).numpy()
+        mean = float(residual.nanmean())
+
+        def fit(values: NDArray[Any]) -> Any:
+            detected = ~np.isnan(values)
+            if detected.sum() < MIN_TRAINING:  # too few to choose settings: their mean, or that of all receivers
+                level = float(values[detected].mean()) if detected.any() else mean
+                return DummyRegressor(strategy="constant", constant=level).fit(position, 0 * position[:, 0])
+            own = fold[detected]
+            if np.bincount(own).max() == len(own):  # detected in one region only: no other region is left to learn from
+                own = np.arange(len(own)) % (fold.max() + 1)
+            return self._regressor(position[detected], values[detected], own)
+
+        with warnings.catch_warnings():  # around all: threads share the filters
+            warnings.simplefilter("ignore", ConvergenceWarning)  # a bound that is reached is the answer
+            self._regressors = parallel_map(fit, residual.numpy().T)
+
+    def _predict(self, position: Tensor) -> tuple[Tensor, None]:
+        if not len(position):  # scikit-learn refuses it
+            return torch.zeros(0, len(self._regressors), dtype=torch.float64), None
+        x = (position.detach() * self._scale).numpy()
+        predicted = torch.from_numpy(np.stack([regressor.predict(x) for regressor in self._regressors], axis=1))
+        return predicted if self._simpler is None else predicted + self._simpler.predict(position.detach()).mean, None
+
+
+class KNNPredictor(ReceiverRegressors):
+    """Inverse-distance mean of the k nearest measurements of RSSI; k by cross-validation in the training rows."""
+
+    name = "knn"
+
+    def _regressor(self, x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> Any:
+        return choose_neighbours(x, y, fold)
+
+
+class ResidualKNNPredictor(KNNPredictor):
+    """The receiver's path-loss model, and the mean of its nearest residuals.
+
+    It is close to the published MRI (Shin et al., IEEE Transactions on Mobile Computing 14(6), 2015).
+    """
+
+    name = "mri_residual"
+    requires_receiver_position = True
+
+    def _base(self, train: Rssi) -> RssiPredictor:
+        return ReceiverPathLoss()
+
+
+class GPPredictor(ReceiverRegressors):
+    """A Gaussian process on the residual of the receiver's path-loss model.
+
+    Without positions of the receivers it is on the residual of the mean. The kernel is Matern 3/2 and white noise, its
+    parameters by marginal likelihood in the training rows (C. E. Rasmussen and C. K. I. Williams, 2006).
+    """
+
+    name = "gp"
+
+    def _base(self, train: Rssi) -> RssiPredictor:
+        return ReceiverPathLoss() if train.located else Mean()
+
+    def _regressor(self, x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> Any:
+        scale = max(float(np.var(y)), 1e-6)
+        extent = float(np.ptp(x, axis=0).max()) or 1.0
+        length = Matern(extent / 10, (extent / 200, 2.5 * extent), nu=1.5)
+        kernel = ConstantKernel(scale / 3, (scale * 1e-3, scale * 10)) * length
+        kernel = kernel + WhiteKernel(scale / 2, (scale * 1e-3, scale * 10))
+        return fit_process(kernel, x, y, self.config.seed)
+
+
+def fit_process(
+    kernel: Kernel, x: NDArray[Any], y: NDArray[Any], seed: int, *, normalize: bool = False
+) -> GaussianProcessRegressor:
+    """Return a Gaussian process fitted to coordinates (n, d) and values (n,) or (n, c).
+
+    The parameters of the kernel maximise the marginal likelihood of 500 rows. The process is conditioned on 1500 rows.
+
+    Args:
+        kernel: Kernel with start values and bounds.
+        x: Coordinates.
+        y: Values.
+        seed: Seed of the rows.
+        normalize: Scale values to mean 0 and variance 1.
+    """
+    order = np.random.default_rng(seed).permutation(len(y))
+    tuned, kept = order[:MAX_TUNING_ROWS], order[:MAX_GP_ROWS]
+    tuning = GaussianProcessRegressor(kernel, normalize_y=normalize, random_state=seed).fit(x[tuned], y[tuned])
+    return GaussianProcessRegressor(tuning.kernel_, optimizer=None, normalize_y=normalize).fit(x[kept], y[kept])
+
+
+def choose_neighbours(x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> KNeighborsRegressor:
+    """Return a regressor fitted to coordinates (n, d) and values (n, ...), settings by held-out folds (n,)."""
+    # scikit-learn's choice for many neighbours computes distances from squares and a product, which cancel map coordinates
+    algorithm = "kd_tree" if x.shape[1] <= MAX_TREE_COLUMNS else "auto"
+    numbers, values = np.unique(fold), y.reshape(len(y), -1)
+    fewest = len(y) - int(np.bincount(fold).max())
+    errors = {(k, weights): 0.0 for k in NEIGHBOUR_COUNTS if k <= fewest for weights in ("uniform", "distance")}
+    for number in numbers:  # one search for neighbours serves all settings; GridSearchCV repeats it
+        out, kept = fold == number, fold != number
+        search = NearestNeighbors(n_neighbors=max(errors)[0], algorithm=algorithm)
+        distance, row = search.fit(x[kept]).kneighbors(x[out])
+        near, truth = values[kept][row], values[out]
+        with np.errstate(divide="ignore"):
+            inverse = 1 / distance
+        inverse = np.where(np.isinf(inverse).any(axis=1, keepdims=True), np.isinf(inverse), inverse)
+        for k, weights in errors:
+            weight = inverse[:, :k, None] if weights == "distance" else np.ones_like(inverse[:, :k, None])
+            predicted = (weight * near[:, :k]).sum(axis=1) / weight.sum(axis=1)
+            errors[k, weights] += float(np.linalg.norm(predicted - truth, axis=1).mean()) / len(numbers)
+    k, weights = min(errors, key=lambda setting: errors[setting])
+    return KNeighborsRegressor(k, weights=weights, algorithm=algorithm).fit(x, y)
+
+
+class PairKNN(PairPredictor):
+    """Inverse-distance mean of the k nearest measured pairs of positions; k by cross-validation in the training rows."""
+
+    name = "knn_pairs"
+
+    def _fit_pairs(self, pair: Tensor, rssi: Tensor, fold: Tensor) -> None:
+        self._regressor = choose_neighbours(pair.numpy(), rssi.numpy(), fold.numpy())
+
+    def _at_pairs(self, pair: Tensor) -> tuple[Tensor, None]:
+        if not len(pair):  # scikit-learn refuses it
+            return pair.new_zeros(0), None
+        return from_numpy(self._regressor.predict(pair.detach().numpy())), None
+
+
+@configuration
+class BlendConfig(FieldConfig):
+    """Options of `Blend`."""
+
+    members: tuple[str, ...] = ("swiftwrf", "gp", "knn", "mri_residual")
+    """names of the predictors; those whose requirements the data do not meet are left out"""
+    member_preset: Preset = "quick"
+    """preset of the members"""
+
+    @classmethod
+    def paper(cls, **changes: Any) -> BlendConfig:
+        """Return a blend of members with published settings."""
+        return replace(cls(member_preset="paper"), **changes)
+
+
+class Blend(RssiPredictor):
+    """A weighted mean of other predictors, weights by cross-validation.
+
+    The weights, the same at all receivers, have the lowest mean absolute error on held-out training rows (stacking).
+    """
+
+    name = "blend"
+    config_type = BlendConfig
+    slow = True
+
+    weights: dict[str, float]
+    """weight of each member, set by `fit`"""
+
+    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+        names = [name for name in self.config.members if not RSSI_PREDICTORS[name].lacking(train)]
+        fold = folds(train.transmitter_position, self.config.validation, self.config.seed, session=train.session)
+        held_out = torch.full((len(names), *train.rssi_dbm.shape), torch.nan, dtype=torch.float64)
+        for number in fold.unique():
+            out = fold == number
+            position = train.transmitter_position[out]
+            for i, name in enumerate(names):
+                held_out[i, out] = self._member(name, train, context, ~out).predict(position).mean.double()
+        self.weights = dict(zip(names, mixing_weights(held_out, train.rssi_dbm).tolist(), strict=True))
+        every = torch.ones_like(fold, dtype=torch.bool)
+        self._members = {name: self._member(name, train, context, every) for name in names if self.weights[name] > 0}
+
+    def _member(self, name: str, train: Rssi, context: RssiFitContext, kept: Tensor) -> RssiPredictor:
+        """Return a member, fitted to the kept rows (rows,)."""
+        rows = kept.nonzero()[:, 0]
+        member = make_predictor(
+            name, self.config.member_preset, validation=self.config.validation, seed=self.config.seed
+        )
+        return member.fit(
+            train.subset(rows), pool=context.pool.subset(rows), device=context.device, parallel=context.parallel
+        )
+
+    def _predict(self, position: Tensor) -> tuple[Tensor, None]:
+        parts = [self.weights[name] * member.predict(position).mean.double() for name, member in self._members.items()]
+        return torch.stack(parts).sum(dim=0), None
