@@ -1,6 +1,6 @@
 """RSSI at fixed receivers from the position of the transmitter."""
 
-from swiftwrf.rssi.base import Map, RssiConfig, RssiFitContext, RssiPredictor
+from swiftwrf.rssi.base import Map, RssiConfig, RssiPredictor
 from swiftwrf.rssi.model import RssiModel, fit_rssi
 from swiftwrf.rssi.pairs import PairConfig, PairModel, PairPredictor
 from swiftwrf.rssi.paper import RssiPaperConfig, RssiPaperModel
@@ -23,7 +23,6 @@ __all__ = [
     "PairPredictor",
     "PathLoss",
     "RssiConfig",
-    "RssiFitContext",
     "RssiModel",
     "RssiPaperConfig",
     "RssiPaperModel",
