@@ -5,26 +5,16 @@ Units are degrees, dB and seconds. A number that does not exist is nan here and 
 
 from __future__ import annotations
 
-from typing import Literal, NotRequired, TypedDict, get_args
+from typing import TYPE_CHECKING, Literal, NotRequired, TypedDict, get_args
 
-from augment.cross_validation import CrossValidationMetrics, EstimatorChoiceMetrics
-from swiftwrf.metrics import ChangeMetrics
+if TYPE_CHECKING:  # which import torch
+    from augment.cross_validation import CrossValidationMetrics, EstimatorChoiceMetrics
+    from swiftwrf.metrics import ChangeMetrics, ErrorSummary
 
 Angle = Literal["azimuth_deg", "elevation_deg", "great_circle_deg"]
 Score = Literal["psnr_db", "ssim", "l1"]
 ANGLES: tuple[Angle, ...] = get_args(Angle)
 SCORES: tuple[Score, ...] = get_args(Score)
-
-
-class ErrorSummary(TypedDict):
-    """Summary of `n` errors or scores; `low` and `high` are the 95 % interval of the median."""
-
-    median: float
-    p90: float
-    mean: float
-    low: float
-    high: float
-    n: int
 
 
 class RunMetrics(TypedDict):
