@@ -19,7 +19,7 @@ from swiftwrf import AngularGrid, FitError, InputError, Spectra, fit, load_spect
 from swiftwrf.data.splits import validation_for
 from swiftwrf.metrics import l1, psnr, ssim, summary
 from swiftwrf.rssi import Map
-from tasks.cluster import connected
+from tasks.workers import connected
 
 SCENES = (("s23-200", "block"), ("newrf-bedroom", "random"), ("newrf-office", "random"))
 SIZES = (16, 64, 256)

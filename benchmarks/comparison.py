@@ -10,7 +10,9 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
@@ -33,10 +35,10 @@ from tasks import labels
 from tasks.aoa.condition import conditions_of
 from tasks.aoa.experiment import run
 from tasks.aoa.options import AoaConfig
-from tasks.cluster import Cluster, connected
 from tasks.environment import machine
 from tasks.page import figures
 from tasks.page.palette import Palette
+from tasks.workers import Workers, connected
 
 MEASURED = (("s23-200", "random"), ("s23-200", "block"), ("newrf-bedroom", "random"), ("newrf-office", "random"))
 MEAN = "mean"  # the mean training spectrum
@@ -154,25 +156,25 @@ def jobs(config: Config, rows: Path) -> Iterator[tuple[Spectra, Spectra, list[Jo
         yield train, test, [job for job in wanted if not Path(f"{job.file}.json").exists()]
 
 
-def measured(jobs: Iterable[tuple[Spectra, Spectra, list[Job]]], cluster: Cluster | None) -> Iterator[tuple[Job, Row]]:
+def measured(jobs: Iterable[tuple[Spectra, Spectra, list[Job]]], cluster: Workers | None) -> Iterator[tuple[Job, Row]]:
     """Yield each row when it is measured, here or on a cluster, where an interrupted fit starts from the beginning."""
     if cluster is None:
         for train, test, some in jobs:
             yield from ((job, job.measure(train, test, job.state)) for job in some)
         return
-    function, pending = cluster.hold(measure_away), {}
+    pending: dict[Future[Any], Job] = {}
     for train, test, some in jobs:
-        scene = cluster.hold((train, test))
-        pending |= {cluster.submit(job.file.name, function, job, scene): job for job in some}
+        function = cluster.hold(partial(measure_away, train, test))
+        pending |= {cluster.submit(function, job): job for job in some}
     while pending:
         future, found = cluster.next(pending)
         yield pending.pop(future), found
 
 
-def measure_away(job: Job, scene: tuple[Spectra, Spectra]) -> Row:
+def measure_away(train: Spectra, test: Spectra, job: Job) -> Row:
     """Measure a row on a worker."""
     with TemporaryDirectory(prefix="swiftwrf-") as folder:
-        return job.measure(*scene, Path(folder) / "fit.state")
+        return job.measure(train, test, Path(folder) / "fit.state")
 
 
 def gathered(rows: Path) -> Table:

@@ -18,7 +18,7 @@ from swiftwrf.data.splits import Validation, validation_for
 from swiftwrf.metrics import psnr, ssim, summary
 from swiftwrf.rasterize import prepare
 from swiftwrf.rssi import Map
-from tasks.cluster import connected
+from tasks.workers import connected
 
 SIZES = (16, 32, 64, 128, 256, 512, 1024)
 

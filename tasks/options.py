@@ -68,17 +68,25 @@ class Options:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Output(Options):
-    """Options of what a command shows. They are no part of a run's configuration."""
+class Answered(Options):
+    """Options of a command with an answer. They are no part of a run's configuration."""
+
+    group: ClassVar[str] = "output"
+
+    quiet: bool = False
+    """print the answer only, no progress and no notes"""
+    json: bool = False
+    """print the answer as one JSON object, and nothing else"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Output(Answered):
+    """Options of a command with an answer and a report."""
 
     group: ClassVar[str] = "output"
 
     open: bool = False
     """open the report in the browser at the end"""
-    quiet: bool = False
-    """print the answer only, no progress and no notes"""
-    json: bool = False
-    """print the answer as one JSON object, and nothing else"""
 
 
 OUTPUT = tuple(option.name for option in fields(Output))

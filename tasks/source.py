@@ -152,6 +152,33 @@ def observed_spectra(source: str, options: ReadOptions, grid: AngularGrid, model
     return store, known
 
 
+def aligned(data: Rssi, names: tuple[str, ...]) -> Rssi:
+    """Return the data at the receivers of a locator, in its order; those that the data lack count as not detecting.
+
+    Raises:
+        InputError: The data have none of the receivers.
+    """
+    place = {name: column for column, name in enumerate(data.receiver_names)}
+    if not place.keys() & set(names):
+        raise InputError(
+            f"{data.name} has other receivers ({listed(data.receiver_names)}) than the model ({listed(names)}); their names "
+            "must be the same"
+        )
+    missing = [name for name in names if name not in place]
+    if missing:
+        console.print(f"{data.name}: receivers of the model that are missing count as not detecting: {listed(missing)}")
+    others = [name for name in data.receiver_names if name not in names]
+    if others:
+        console.print(f"{data.name}: receivers that the model does not have are not used: {listed(others)}")
+    rssi = torch.full((len(data), len(names)), torch.nan, dtype=torch.float64)
+    position = torch.full((len(names), 3), torch.nan, dtype=torch.float64)
+    for column, name in enumerate(names):
+        if name in place:
+            rssi[:, column] = data.rssi_dbm[:, place[name]]
+            position[column] = data.receiver_position[place[name]]
+    return replace(data, rssi_dbm=rssi, receiver_names=names, receiver_position=position)
+
+
 def _read_array(file: Path) -> Tensor:
     """Return the spectra of unknown positions in a .npy file."""
     shape, dtype = array_header(file, "array")

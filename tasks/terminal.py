@@ -19,7 +19,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.table import Table
 
 from swiftwrf.runtime.progress import forwarding
-from tasks.options import Output
+from tasks.options import Answered, Output
 from tasks.records import strict
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ class Terminal:
 
     def __init__(self) -> None:
         self.console = Console(stderr=True, highlight=False)
-        self._output = Output()
+        self._output = Answered()
         self._progress: Progress | None = None
         self._done = self._expected = 0
         self._began = 0.0  # of the current step [s]
@@ -92,7 +92,7 @@ class Terminal:
     @contextmanager
     def of(self, config: object, verbose: bool = False) -> Iterator[None]:
         """Show what a configuration asks for, during the context; with `verbose` also the messages of `logging`."""
-        self._output = config if isinstance(config, Output) else Output()
+        self._output = config if isinstance(config, Answered) else Answered()
         self.console.quiet = self._output.quiet or self._output.json
         handler, loggers = RichHandler(console=self.console, show_path=False), [logging.getLogger(n) for n in LOGGERS]
         for logger in loggers if verbose else ():
@@ -101,7 +101,7 @@ class Terminal:
         try:
             yield
         finally:
-            self._output, self.console.quiet = Output(), False
+            self._output, self.console.quiet = Answered(), False
             for logger in loggers if verbose else ():
                 logger.removeHandler(handler)
                 logger.setLevel(logging.NOTSET)
@@ -173,7 +173,7 @@ class Terminal:
                 out.print(part, markup=False)
             if page is not None:
                 out.print(f"report: {page}", markup=False)
-        if self._output.open and page is not None:
+        if page is not None and isinstance(self._output, Output) and self._output.open:
             webbrowser.open(page.resolve().as_uri())
 
 

@@ -32,14 +32,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.skip(reason="needs the measured data: set SWIFTWRF_DATA to their folder"))
 
 
-@pytest.fixture(autouse=True)
-def _full_precision() -> None:
-    """Starts each test with float32 products in full precision; four tests failed after an unknown one that lowered it."""
-    torch.set_float32_matmul_precision("highest")
-    torch.set_autocast_enabled("cpu", False)
-    torch.clear_autocast_cache()
-
-
 @pytest.fixture
 def without_annotation_checks() -> Iterator[None]:
     """Leaves wrong arguments to the checks of the product, which users meet."""

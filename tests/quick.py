@@ -26,12 +26,12 @@ from tasks.aoa.options import AoaConfig
 from tasks.command_line import command_line
 from tasks.convert.options import ConvertConfig
 from tasks.convert.run import run as convert
-from tasks.estimate.options import EstimateConfig
-from tasks.estimate.run import run as estimate
 from tasks.inspect.options import InspectConfig
 from tasks.inspect.run import run as inspect
 from tasks.locate import experiment as locate
 from tasks.locate.options import LocateConfig
+from tasks.predict.options import PredictConfig
+from tasks.predict.run import run as predict
 from tasks.report.options import ReportConfig
 from tasks.report.run import run as report
 from tasks.rssi import experiment as rssi
@@ -49,7 +49,7 @@ TASKS = {
     "locate": (LocateConfig, locate.run),
     "report": (ReportConfig, report),
     "convert": (ConvertConfig, convert),
-    "estimate": (EstimateConfig, estimate),
+    "predict": (PredictConfig, predict),
     "inspect": (InspectConfig, inspect),
     "view": (ViewConfig, view),
     "scenes": (ScenesConfig, scenes),

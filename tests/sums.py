@@ -9,7 +9,9 @@ from dataclasses import dataclass
 import torch
 
 from swiftwrf import InputError
-from tasks.steps import Step
+from tasks.aoa.options import AoaConfig
+from tasks.directory import Run
+from tasks.steps import Step, run_steps
 
 
 @dataclass(frozen=True)
@@ -41,12 +43,34 @@ class Kill(Sum):
         os.kill(os.getpid(), signal.SIGKILL)
 
 
+class KillOnce(Sum):
+    """A step that ends the first process that computes it."""
+
+    def compute(self, context, folder):
+        if not (folder / "killed").exists():
+            (folder / "killed").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().compute(context, folder)
+
+
 class Exit(Sum):
     def compute(self, context, folder):
         os._exit(3)
 
 
-class Optional(Sum):
-    """A step that a budget may leave out."""
+STEPS = [Sum(1, (3, 4)), Sum(2), Sum(1, (5,))]  # the third is the first one, and has another follower
 
-    is_optional = True
+
+def results(folder, steps, processes=1, cluster=None, resume=None, act=lambda: None):
+    """Run steps. Return them with their results, and the names in the order of arrival; `act` is called at each arrival."""
+    arrived = []
+
+    def show(step, value):
+        arrived.append(step.name)
+        act()
+
+    config = AoaConfig(mix=(0.5,))
+    with Run("aoa", str(folder), "", config, torch.device("cpu"), {}, resume, processes) as run:
+        found = list(run_steps(run, steps, 10, cluster, show))
+        run.finish({}, lambda folder, metrics: None)
+    return found, arrived

@@ -53,7 +53,7 @@ def test_help_imports_nothing_heavy(name):
         ("locate", "--cells", "1"),
         ("inspect", "x", "--grid", "1", "1"),
         ("convert", "x", "y", "--split", "block"),
-        ("estimate", "x", "y", "--array", "4", "0", "1e9"),
+        ("predict", "x", "y", "--array", "4", "0", "1e9"),
         ("view", "x", "--port", "-1"),
         ("scenes", "--room", "none", "--moving", "receiver", "--positions", "9", "--out", "x"),
         ("resume", "x"),

@@ -17,14 +17,14 @@ from tasks.aoa.page.summary import answer
 from tasks.aoa.results import Results
 from tasks.aoa.steps import first_steps
 from tasks.aoa.suggestion import Suggestion
-from tasks.cluster import connected
 from tasks.metrics import AoaMetrics
 from tasks.page.page import reporting
 from tasks.page.records import Records
 from tasks.run import Run, choose_device
 from tasks.source import located, reading
-from tasks.steps import Budget, Step, computed
+from tasks.steps import Step, run_steps
 from tasks.terminal import console, terminal
+from tasks.workers import connected
 
 
 def run(config: AoaConfig, resume: Path | None = None) -> None:
@@ -61,8 +61,7 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
     ):
         results = Results(experiment, directory)
         with terminal.progress():
-            budget = Budget(config.budget)
-            for step, value in computed(directory, steps, experiment, cluster, results.show, budget):
+            for step, value in run_steps(directory, steps, experiment, cluster, results.show):
                 results.add(step, value)
         results.write()
         metrics: AoaMetrics = {

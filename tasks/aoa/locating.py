@@ -51,10 +51,6 @@ class Locating(Step[Experiment]):
     def title(self) -> str:
         return f"locating by the room, {self.condition.meaning}"
 
-    @property
-    def reads(self) -> tuple[str, ...]:
-        return (self.room_file,)
-
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         condition, test = self.condition, experiment.test
         of_all = condition.training == "all"

@@ -61,9 +61,6 @@ class AoaConfig(SpectraSource, Output):
     """quick: sized for a CPU; paper: the paper's model, network and measured fractions, and a long training, for a GPU"""
     repeats: int = 1
     """runs with different measured spectra and networks, pooled"""
-    budget: float | None = None
-    """time of the run [s]: cheap estimators and the room come first, and networks whose training would not end in time are
-    left out"""
     scheduler: str | None = None
     """address of a Dask scheduler whose workers compute the steps of the run (extra: cluster)"""
     processes: int | None = None
@@ -107,8 +104,6 @@ class AoaConfig(SpectraSource, Output):
             raise InputError(f"--{names[0]} is an option of the reader; give it with --data")
         if self.processes is not None and (self.processes < 1 or self.scheduler is not None):
             raise InputError(f"--processes takes a number from 1, without --scheduler, got {self.processes}")
-        if self.budget is not None and not self.budget > 0:
-            raise InputError(f"--budget takes a time in seconds above 0, got {self.budget:g}")
         if self.repeats < 1:
             raise InputError(f"--repeats must be at least 1, got {self.repeats}")
         if self.seed + self.repeats > SEEDS:

@@ -79,7 +79,7 @@ class Results:
                 self._add_synthesis(step, value)
             case RoomSearch() if not value.get("planes"):
                 self._leave_out(step.located, value.get("refused", NO_PLANE))
-            case Evaluation() | Locating() if "refused" in value:
+            case Locating() if "refused" in value:
                 self._leave_out((step.condition,), value["refused"])
             case Evaluation() | Locating():
                 self.evaluated.append((step.condition, value))

@@ -162,18 +162,9 @@ class FoldLocating(Step[Experiment]):
     def title(self) -> str:
         return "comparing estimators"
 
-    @property
-    def result(self) -> str:
-        """File of the kept comparison."""
-        return f"{STEPS}/{self.compared.name}.json"
-
-    @property
-    def reads(self) -> tuple[str, ...]:
-        return (self.result, self.room_file)
-
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         measured, _ = experiment.withhold(self.compared.subset)
-        entry = read_json(folder / self.result)["value"]["folds"][str(self.number)]
+        entry = read_json(folder / STEPS / f"{self.compared.name}.json")["value"]["folds"][str(self.number)]
         room = load(folder / self.room_file)
         assert isinstance(room, GeometryModel)
         train, test = (

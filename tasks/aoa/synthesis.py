@@ -83,10 +83,6 @@ class RoomSearch(Step[Experiment]):
         """File of the fitted model in the run's directory."""
         return f"{STEPS}/{self.name}.safetensors"
 
-    @property
-    def reads(self) -> tuple[str, ...]:
-        return (self.start.file,) if self.start else ()
-
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         measured, _ = experiment.withhold(self.subset)
         began = time.perf_counter()
@@ -149,10 +145,6 @@ class Synthesis(Step[Experiment]):
     def file(self) -> str:
         """File of the spectra in the run's directory."""
         return f"{STEPS}/{self.name}.safetensors"
-
-    @property
-    def reads(self) -> tuple[str, ...]:
-        return (self.room.file,) if self.room else ()
 
     def test_spectra(self, folder: Path) -> dict[str, Store]:
         """Return the spectra at the test positions: `test`, and `test_std` if the model has it."""
@@ -259,16 +251,8 @@ class Evaluation(Step[Experiment]):
         return f"training {self.condition.estimator}, {self.condition.meaning}"
 
     @property
-    def reads(self) -> tuple[str, ...]:
-        return (self.synthesis.file,) if self.synthesis else ()
-
-    @property
     def priority(self) -> int:
         return int(self.condition.is_network)
-
-    @property
-    def is_optional(self) -> bool:
-        return self.condition.is_network
 
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         train = self._training_set(experiment, folder)

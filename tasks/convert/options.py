@@ -16,10 +16,10 @@ MAPS = (".tif", ".geojson", ".png")  # suffixes of files that hold a map only
 
 @command_options
 class ConvertConfig(SpectraSource, TableSource):
-    """Convert measurements, predictions and RSSI maps: OUT is a directory in the toolkit's own layout, or a file.
+    """Convert measurements and RSSI maps: OUT is a directory in the toolkit's own layout, or a file.
 
     SOURCE is measurements of any known format (see docs/formats.md), the directory of a run of tasks.rssi or tasks.locate,
-    or a saved model.
+    or a saved RSSI model.
 
     Example: python -m tasks.convert DIR converted --calibrate
 
@@ -27,7 +27,8 @@ class ConvertConfig(SpectraSource, TableSource):
     """
 
     source: Annotated[str, tyro.conf.Positional]
-    """folder or file of measurements, name of a public data set, directory of a run, or saved model"""
+    """folder or file of measurements, name of a public data set, directory of a run, or saved RSSI
+    model"""
     out: Annotated[str, tyro.conf.Positional]
     """directory to write, or file: .csv, .mat, and of RSSI maps .tif (GeoTIFF), .geojson, .png (with a world file); must
     not exist"""
@@ -40,8 +41,6 @@ class ConvertConfig(SpectraSource, TableSource):
     """seed of that split"""
     deepmimo: bool = False
     """write ray paths (paths.npz) as a folder of DeepMIMO v4"""
-    at: str | None = None
-    """table of positions (x, y, z) at which a model predicts, for .csv and .mat (default: the map of an RSSI model)"""
     rx: tuple[str, ...] = ()
     """receivers of the map, names or numbers counted from 1 (default: all); a .png shows the strongest of them"""
     cell: float | None = None
@@ -63,9 +62,5 @@ class ConvertConfig(SpectraSource, TableSource):
             raise InputError(f"--deepmimo writes a folder; give a directory instead of {self.out}")
         if self.calibrate and (self.suffix or self.deepmimo):
             raise InputError("--calibrate writes a directory in the toolkit's own layout; give another OUT")
-        if self.at is not None and self.suffix not in (".csv", ".mat"):
-            raise InputError("--at gives predictions at single positions; write them to a .csv or .mat file")
-        if self.at is not None and (self.rx or self.cell is not None or self.height is not None):
-            raise InputError("--rx, --cell and --height are for maps; leave them or --at out")
         if self.cell is not None and self.cell <= 0:
             raise InputError(f"--cell must be above 0 m, got {self.cell:g}")

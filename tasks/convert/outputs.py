@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from swiftwrf import FieldModel, InputError, Prediction, RssiModel, load
+from swiftwrf import FieldModel, InputError, RssiModel, load
 from swiftwrf.data.dataset import Labelled
 from swiftwrf.data.rasters import Cells, write_geojson, write_geotiff, write_world_file
-from swiftwrf.data.survey import read_places
 from swiftwrf.data.writing import write_mat
 from swiftwrf.errors import with_article
 from swiftwrf.locate import RssiLocator
@@ -20,17 +19,18 @@ from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.durable import replacing
 from tasks.claim import CONFIG, LOCATOR, MODEL
 from tasks.convert.options import MAPS, ConvertConfig
+from tasks.environment import command
 from tasks.page.raster import colour_image
 from tasks.records import rounded, write_table
 
 WORLD_FILE = ".pgw"  # suffix beside a .png
 
 
-def saved_model(source: Path) -> FieldModel | RssiModel | None:
-    """Return the model in a file or in the directory of a run; None if the source is no model.
+def saved_model(source: Path) -> RssiModel | None:
+    """Return the RSSI model in a file or in the directory of a run; None if the source is no model.
 
     Raises:
-        InputError: A run without an RSSI model, or a model that predicts neither spectra nor RSSI.
+        InputError: A run without an RSSI model, or a model of which no map is written.
     """
     file = next((file for name in (MODEL, LOCATOR) if isfile(file := source / name)), source)
     if file == source and isfile(source / CONFIG):
@@ -44,22 +44,21 @@ def saved_model(source: Path) -> FieldModel | RssiModel | None:
             f"{file} holds {with_article(model.kind)}, of which no file is written; the report of its run shows its maps, "
             "and in Python its method predict gives RSSI at any position"
         )
-    if not isinstance(model, FieldModel | RssiModel):
+    if isinstance(model, FieldModel):
+        raise InputError(
+            f"{file} predicts spectra at positions, not a map; use {command('predict', str(file), 'POSITIONS')}"
+        )
+    if not isinstance(model, RssiModel):
         raise InputError(f"{file} holds {with_article(model.kind)}, which predicts neither spectra nor RSSI")
     return model
 
 
-def predicted(model: FieldModel | RssiModel, config: ConvertConfig) -> Prediction | RssiMap:
-    """Return the map of an RSSI model, or what a model predicts at given positions.
+def map_of(model: RssiModel, config: ConvertConfig) -> RssiMap:
+    """Return the map of an RSSI model.
 
     Raises:
-        InputError: Positions that cannot be read, a field model without positions, or an unknown receiver.
+        InputError: An unknown receiver.
     """
-    if config.at is not None:
-        origin = model.origin if isinstance(model, RssiModel) else None
-        return model.predict(read_places(Path(config.at), origin))
-    if isinstance(model, FieldModel):
-        raise InputError("a model of spectra predicts at positions; give a table of them (x, y, z) with --at")
     found = RssiMap.predict(model, config.cell, config.height)
     return found.receivers(config.rx) if config.rx else found
 

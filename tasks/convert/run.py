@@ -1,4 +1,4 @@
-"""Convert measurements to the toolkit's own layout or to files, and models to maps and predictions."""
+"""Convert measurements to the toolkit's own layout or to files, and RSSI models to maps."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from swiftwrf import FieldModel, InputError, RssiModel
+from swiftwrf import InputError, RssiModel
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.data import ReadOptions, Rssi, Snapshots, Spectra
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
@@ -15,7 +15,7 @@ from swiftwrf.data.formats.paths import read_paths
 from swiftwrf.data.writing import write_deepmimo, write_rssi, write_spectra
 from swiftwrf.diagnostics.calibration import Calibration, calibrate
 from tasks.convert.options import FILES, ConvertConfig
-from tasks.convert.outputs import predicted, saved_model, write_file
+from tasks.convert.outputs import map_of, saved_model, write_file
 from tasks.directory import check_new_file, new_directory
 from tasks.environment import invocation
 from tasks.records import write_json
@@ -41,18 +41,20 @@ def run(config: ConvertConfig) -> None:
         _write_directory(config)
 
 
-def _write_new_file(config: ConvertConfig, model: FieldModel | RssiModel | None) -> None:
+def _write_new_file(config: ConvertConfig, model: RssiModel | None) -> None:
     out = Path(config.out)
     if not config.suffix:
         raise InputError(
             f"{config.source} is a model, of which files are written: {', '.join(FILES)}; got {config.out}"
         )
-    if model is None and (config.at is not None or config.rx or config.cell is not None or config.height is not None):
-        raise InputError(f"--at, --rx, --cell and --height are for models, but {config.source} holds measurements")
+    if model is None and (config.rx or config.cell is not None or config.height is not None):
+        raise InputError(
+            f"--rx, --cell and --height are for maps of RSSI models, but {config.source} holds measurements"
+        )
     if model is not None and (options := reading(config).given):
         raise InputError(f"{config.source} is a model; --{next(iter(options)).replace('_', '-')} is for measurements")
     check_new_file(out)
-    data = _spectra_or_rssi(_read(config), reading(config)) if model is None else predicted(model, config)
+    data = _spectra_or_rssi(_read(config), reading(config)) if model is None else map_of(model, config)
     print(f"{write_file(data, out)}: {out}")
 
 

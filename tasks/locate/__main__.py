@@ -1,4 +1,4 @@
-"""Run `python -m tasks.locate --rx all` or `python -m tasks.locate MODEL SOURCE`."""
+"""Run `python -m tasks.locate --rx all`."""
 
 import sys
 

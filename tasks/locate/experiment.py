@@ -12,8 +12,6 @@ from swiftwrf import InputError, Rssi, rssi_room
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.locate.baselines import LEVELS
 from swiftwrf.metrics import summary
-from tasks.cluster import connected
-from tasks.locate.observations import write_positions
 from tasks.locate.options import LocateConfig
 from tasks.locate.page import page
 from tasks.locate.page.summary import answer
@@ -23,19 +21,17 @@ from tasks.page.page import reporting
 from tasks.page.records import Records
 from tasks.run import Row, Run, choose_device
 from tasks.source import asked_offsets, measured_rssi, split_notes
-from tasks.steps import computed
+from tasks.steps import run_steps
 from tasks.terminal import console, terminal
+from tasks.workers import connected
 
 
 def run(config: LocateConfig, resume: Path | None = None) -> None:
-    """Run the experiment and write its directory, or write the positions of new observations.
+    """Run the experiment and write its directory.
 
     Raises:
         InputError: Data or options that do not exist or do not fit together.
     """
-    if config.model is not None:
-        write_positions(config)
-        return
     device = choose_device("cpu")
     data = measurements(config)
     for note in data.notes:
@@ -54,7 +50,7 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
     ):
         results = Results(experiment)
         with terminal.progress():
-            for step, value in computed(directory, experiment.steps(), experiment, cluster):
+            for step, value in run_steps(directory, experiment.steps(), experiment, cluster):
                 assert isinstance(step, Localization)
                 results.add(step, value)
                 terminal.result(step.title, f"{results.median_m(step):.2f} m")

@@ -15,7 +15,6 @@ from swiftwrf.rssi import LEVEL, PairModel, RssiComparison, RssiModel, RssiPredi
 from swiftwrf.rssi.comparison import compared, model_of
 from swiftwrf.rssi.maps import RssiMap
 from tasks.claim import MODEL
-from tasks.cluster import connected
 from tasks.metrics import PredictorSeconds, RssiMetrics
 from tasks.page.floor_plan import read_pixels
 from tasks.page.page import reporting
@@ -26,6 +25,7 @@ from tasks.rssi.page.summary import answer
 from tasks.run import Row, Run, choose_device
 from tasks.source import measured_rssi, offset_notes, split_notes
 from tasks.terminal import console, terminal
+from tasks.workers import connected
 
 
 def run(config: RssiTaskConfig, resume: Path | None = None) -> None:

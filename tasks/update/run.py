@@ -21,11 +21,10 @@ from swiftwrf.runtime import checkpoint
 from tasks.claim import CONFIG, ENVIRONMENT, MODEL, Claim, begun
 from tasks.directory import new_directory, unchanged_environment
 from tasks.environment import environment, invocation
-from tasks.locate.observations import aligned
 from tasks.options import plain
 from tasks.page.page import write_page
 from tasks.records import write_json
-from tasks.source import located, reading
+from tasks.source import aligned, located, reading
 from tasks.terminal import console, terminal
 from tasks.update.lines import answer, check_source, lines, measurement
 from tasks.update.options import UpdateConfig

@@ -139,20 +139,6 @@ def test_matlab_files_hold_spectra_and_predictions(field, room, tmp_path):
     np.testing.assert_array_equal(loadmat(tmp_path / "prediction.mat")["spectrum"], prediction.mean.numpy())
 
 
-def test_a_model_predicts_at_the_positions_of_a_table(field, model, room, tmp_path):
-    pd.DataFrame(room.position[:5].numpy(), columns=["x", "y", "z"]).to_csv(tmp_path / "at.csv", index=False)
-    field.save(tmp_path / "field.safetensors")
-    assert run(tmp_path / "field.safetensors", tmp_path / "a.mat", "--at", tmp_path / "at.csv") == 0
-    stored = loadmat(tmp_path / "a.mat")["spectrum"]
-    np.testing.assert_allclose(stored, field.predict(room.position[:5]).mean.numpy(), atol=1e-6)
-    model.save(tmp_path / "model.safetensors")
-    assert run(tmp_path / "model.safetensors", tmp_path / "a.csv", "--at", tmp_path / "at.csv") == 0
-    table = pd.read_csv(tmp_path / "a.csv")
-    mean = model.predict(room.position[:5]).mean.numpy().ravel()
-    np.testing.assert_allclose(table["predicted_dbm"], mean, atol=0.00501)
-    assert all(len(text.rpartition(".")[2]) <= 2 for text in table["predicted_dbm"].astype(str))
-
-
 def test_measurements_become_tables(room, floor, tmp_path):
     for data, write in ((room, write_spectra), (floor, write_rssi)):
         (tmp_path / data.name).mkdir()
@@ -317,7 +303,6 @@ def test_deepmimo_folders_are_made_of_ray_paths(paths, tmp_path, capsys):
     [
         (("out.tif",), "holds a map of RSSI"),
         (("out.csv", "--cell", "1"), "are for models"),
-        (("out", "--at", "x.csv"), "to a .csv or .mat file"),
         (("out.mat", "--deepmimo"), "give a directory"),
         (("out.mat", "--calibrate"), "writes a directory"),
         (("out.png", "--cell", "0"), "above 0 m"),
@@ -332,19 +317,10 @@ def test_what_does_not_go_together_is_refused(room, arguments, reason, tmp_path,
     assert reason in said(capsys)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "reason"),
-    [
-        (("out",), "is a model"),
-        (("out.csv",), "with --at"),
-        (("out.mat", "--at", "at.csv", "--grid", "4", "8"), "is for measurements"),
-    ],
-)
-def test_models_of_spectra_need_positions(field, arguments, reason, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    field.save(tmp_path / "field.safetensors")
-    (tmp_path / "at.csv").write_text("x,y,z\n1,2,1\n")
-    assert run("field.safetensors", *arguments) == 2
+@pytest.mark.parametrize(("out", "reason"), [("out", "is a model"), ("out.csv", "use python -m tasks.predict")])
+def test_a_file_of_a_model_is_a_map_of_rssi(field, model, out, reason, tmp_path, capsys):
+    (model if out == "out" else field).save(tmp_path / "model.safetensors")
+    assert run(tmp_path / "model.safetensors", tmp_path / out) == 2
     assert reason in said(capsys)
 
 

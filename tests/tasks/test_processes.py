@@ -11,12 +11,13 @@ import time
 from functools import partial
 from importlib import import_module
 from multiprocessing import active_children
+from multiprocessing.forkserver import set_forkserver_preload
 from pathlib import Path
 from unittest import mock
 
 import pytest
 import torch
-from sums import Exit, Kill, Optional, Refusal, Sum
+from sums import STEPS, Exit, Kill, KillOnce, Refusal, Sum, results
 
 from swiftwrf import AngularGrid, FitError, InputError, simulated_room
 from swiftwrf.data.writing import write_spectra
@@ -26,23 +27,15 @@ from tasks.command import COMMANDS
 from tasks.directory import Run
 from tasks.environment import number_of_processes
 from tasks.preload import SERVED
-from tasks.steps import Budget, computed
 
 HERE = Path(__file__).parents[1]
-STEPS = [Sum(1, (3, 4)), Sum(2), Sum(1, (5,))]  # the third is the first one, and has another follower
-
-
-def results(folder, steps, processes, budget=None):
-    arrived = []
-    with Run("aoa", str(folder), "", AoaConfig(mix=(0.5,)), torch.device("cpu"), {}, None, processes) as run:
-        found = list(computed(run, steps, 10, None, lambda step, value: arrived.append(step.name), budget))
-        run.finish({}, lambda folder, metrics: None)
-    return found, arrived
+if SERVED:
+    set_forkserver_preload(["tasks.steps"])  # a process starts in a tenth of the time
 
 
 def test_processes_give_the_results_of_one_process_in_the_same_order(tmp_path):
     (here, _), (there, arrived) = (results(tmp_path / str(n), STEPS, n) for n in (1, 2))
-    assert [step.name for step, _ in there] == [step.name for step, _ in here]
+    assert [(step.name, value["sum"]) for step, value in there] == [(step.name, value["sum"]) for step, value in here]
     assert [value["sum"] for _, value in there] == [11, 13, 14, 12, 11, 15]
     assert sorted(arrived) == [f"sum-{number}" for number in range(1, 6)]
     assert all(value["process"] != os.getpid() and value["threads"] == 1 for _, value in there)
@@ -78,32 +71,6 @@ def test_a_map_is_computed_in_forks_of_the_server_if_there_is_one(modules):
     assert (done.stdout, done.stderr) == (f"[8, 9] {not modules}\n", "")
 
 
-@pytest.mark.parametrize("processes", [1, 2])
-def test_a_budget_leaves_out_optional_steps_and_no_others(tmp_path, processes):
-    steps = [Optional(1), Sum(2), Sum(3, (4,))]
-    found, arrived = results(tmp_path / "none", steps, processes, Budget(1e-9))
-    assert {step.name: "refused" in value for step, value in found} == {
-        "sum-1": True,
-        "sum-2": False,
-        "sum-3": False,
-        "sum-4": False,
-    }
-    assert "sum-1" not in arrived
-    assert not (tmp_path / "none" / "sum-1.txt").exists()
-    found, _ = results(tmp_path / "all", steps, processes, Budget(600))
-    assert not any("refused" in value for _, value in found)
-
-
-def test_an_optional_step_is_expected_to_take_as_long_as_the_longest():
-    budget = Budget(100)
-    assert budget.refusal(Optional(1)) is None
-    budget.spent(Optional(1), 100)
-    assert budget.refusal(Optional(2))["refused"] == "its training does not fit into the budget of 100 s"
-    assert budget.refusal(Sum(2)) is None
-    assert budget.priority(Optional(2)) < budget.priority(Sum(2))
-    assert Budget().priority(Optional(2)) == Budget().priority(Sum(2))
-
-
 KILLED = "was killed, probably because memory was short; continue with one process: .* --processes 1"
 
 
@@ -118,11 +85,18 @@ KILLED = "was killed, probably because memory was short; continue with one proce
 def test_a_step_that_fails_ends_the_run_and_its_processes(tmp_path, step, error):
     with pytest.raises(type(error), match=str(error)):
         results(tmp_path / "run", [Sum(2), step], 2)
-    assert not (tmp_path / "run.partial" / "steps" / ".context").exists()
-    deadline = time.monotonic() + 10
-    while active_children() and time.monotonic() < deadline:
-        time.sleep(0.05)
+    assert not list((tmp_path / "run.partial" / "steps").glob(".*"))
     assert not active_children()
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_a_run_that_lost_a_process_continues_with_the_results_that_it_kept(tmp_path, processes):
+    steps = [Sum(1, (3, 4)), KillOnce(2, (5,))]
+    with pytest.raises(FitError, match=KILLED):
+        results(tmp_path / "run", steps, 2)
+    found, arrived = results(tmp_path / "run", steps, processes, resume=tmp_path / "run.partial")
+    assert [value["sum"] for _, value in found] == [11, 13, 14, 12, 15]
+    assert {"sum-2", "sum-5"} <= set(arrived)
 
 
 SCRIPT = """
@@ -130,13 +104,13 @@ import sys, torch
 from sums import Sum
 from tasks.aoa.options import AoaConfig
 from tasks.directory import Run
-from tasks.steps import computed
+from tasks.steps import run_steps
 
 class Own(int): pass
 
 print("once")
 with Run("aoa", sys.argv[1], "", AoaConfig(mix=(0.5,)), torch.device("cpu"), {}, None, 2) as run:
-    print([value["sum"] for _, value in computed(run, [Sum(1), Sum(2)], eval(sys.argv[2]), None)])
+    print([value["sum"] for _, value in run_steps(run, [Sum(1), Sum(2)], eval(sys.argv[2]))])
 """
 
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 from pandas import DataFrame
 
+from augment.cross_validation import STAND_IN
 from swiftwrf.models import FIELD_MODELS
 from tasks import labels
-from tasks.aoa.condition import Condition, conditions_of
+from tasks.aoa.condition import MEASURED_STAND_IN, Condition, conditions_of
 from tasks.aoa.options import AUTO, fraction_key
 from tasks.metrics import AoaMetrics, MixMetrics
 from tasks.page.palette import Palette
@@ -62,6 +64,17 @@ class FractionRecords:
         found = dict.fromkeys(self.conditions[name].synthesizer for name in methods if name in self.conditions)
         choice = self.mix["choice"]
         return [name for name in found if name not in ("", AUTO)] or ([choice["name"]] if choice else [])
+
+    @property
+    def chosen_file(self) -> Path | None:
+        """File of the estimator that cross-validation chose. None if nothing was chosen, or what needs no file."""
+        choice = self.mix["estimator_choice"]
+        condition = self.conditions.get(choice["name"]) if choice else None
+        if condition is None:
+            return None
+        name = MEASURED_STAND_IN if condition.method == STAND_IN else condition.estimator
+        file = self.run.folder / f"{name}-mix{self.key}.safetensors"
+        return file if file.is_file() else None
 
     @property
     def percent(self) -> str:

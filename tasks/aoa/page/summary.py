@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from augment.cross_validation import LOCATOR, STAND_IN
+from augment.cross_validation import LOCATOR
 from augment.estimators import ESTIMATORS
 from tasks.aoa.condition import MEASURED_STAND_IN
 from tasks.aoa.page.gains import change_text, gain_sentence, judgement, learner, turbo_method
@@ -113,17 +113,19 @@ def next_steps(fraction: FractionRecords) -> list[str]:
     if files - estimators:
         steps.append(f"Explore the spectra: `{command('view', path)}`.")
     choice = fraction.mix["estimator_choice"]
-    taken = _file_of(fraction, choice["name"], estimators) if choice else ""
-    if taken:
+    file = fraction.chosen_file
+    taken = file.name.removesuffix(f"-mix{key}.safetensors") if file else ""
+    if file:
+        model = path if len(metrics["mixes"]) == 1 else f"{path}/{file.name}"
         steps.append(
             f"Take {taken} on this data: cross-validation chose it, without the test spectra. Estimate directions of new "
-            f"spectra: `{command('estimate', f'{path}/{taken}-mix{key}.safetensors', 'SOURCE')}`."
+            f"spectra: `{command('predict', model, 'SOURCE')}`."
         )
     elif choice:
         steps.append(f"{choice['name']} needs no file: `augment.estimators.make_estimator('{choice['name']}')`.")
     others = sorted(estimators - {taken})
     if others:
-        kept = f"`{command('estimate', f'{path}/{others[0]}-mix{key}.safetensors', 'SOURCE')}`"
+        kept = f"`{command('predict', f'{path}/{others[0]}-mix{key}.safetensors', 'SOURCE')}`"
         more = f" Also kept: {', '.join(others[1:])}." if len(others) > 1 else ""
         steps.append(f"{'Or by' if taken else 'Estimate directions by'} {others[0]}: {kept}.{more}")
     steps += [
@@ -140,13 +142,3 @@ def next_steps(fraction: FractionRecords) -> list[str]:
     if metrics["split"] == "random" and metrics["data"] != "simulated-room":
         steps.append("Run `--split block`: it shows the error in a region where nothing was measured.")
     return steps
-
-
-def _file_of(fraction: FractionRecords, method: str, kept: set[str]) -> str:
-    """Return the kept estimator of a method, empty if no file is of it."""
-    condition = fraction.conditions.get(method)
-    if condition is None:
-        return ""
-    if method == STAND_IN:
-        return MEASURED_STAND_IN if MEASURED_STAND_IN in kept else ""
-    return condition.estimator if condition.estimator in kept else ""

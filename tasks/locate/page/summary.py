@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pandas import DataFrame
 
-from tasks.claim import LOCATOR
 from tasks.environment import command
 from tasks.metrics import LocateMetrics
 from tasks.page.page import Number, Plot, Summary
@@ -65,7 +64,7 @@ def conclusion(run: LocateRecords) -> str:
 def _next_steps(run: LocateRecords) -> list[str]:
     steps = [
         f"Explore posteriors and maps: `{command('view', run.path)}`.",
-        f"Locate new observations: `{command('locate', f'{run.path}/{LOCATOR}', 'SOURCE')}`.",
+        f"Locate new observations: `{command('predict', run.path, 'SOURCE')}`.",
     ]
     coverage = run.metrics["calibration"][str(LEVEL)]
     if warning := coverage_warning("credible regions", coverage, LEVEL, run.metrics["n_test"]):

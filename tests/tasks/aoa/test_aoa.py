@@ -364,18 +364,6 @@ def test_a_training_is_as_long_as_the_scene_needs():
     assert make_estimator("aann", 780, "paper").config.steps == AANNConfig.paper().steps
 
 
-def test_a_budget_without_time_for_networks(small, tmp_path):
-    out = tmp_path / "run"
-    assert run("--mix", 0.5, "--extra", 10, "--budget", 1e-3, "--out", out) == 0
-    part = json.loads((out / "metrics.json").read_text())["mixes"]["0.5"]
-    assert {entry["estimator"] for entry in part["methods"].values()} >= {"peak", "kernel_regression"}
-    assert not any(entry["estimator"] == "aann_kernel" for entry in part["methods"].values())
-    assert "budget of 0.001 s" in part["left_out"]["measured_only"]
-    text = (out / "report.html").read_text()
-    assert "With synthetic spectra kernel_regression changes" in text
-    assert "its training does not fit" in text
-
-
 def test_whole_run(small, tmp_path):
     out = tmp_path / "run"
     more = ("--repeats", 2, "--extra", 20, "--suggest", 4)

@@ -29,8 +29,8 @@ from tasks.aoa.condition import NETWORKS
 from tasks.aoa.locating import Locating, containing_level
 from tasks.aoa.options import AoaConfig
 from tasks.command_line import command_line
-from tasks.estimate.options import EstimateConfig
-from tasks.estimate.run import run as estimate
+from tasks.predict.options import PredictConfig
+from tasks.predict.run import run as predict
 
 PLANES = {(0.0, 0.0, -1.0): 0.0, (1.0, 0.0, 0.0): 5.0, (0.0, 1.0, 0.0): 4.0}  # outward normal to offset [m]
 FEW_CELLS = MatchedFieldConfig(max_cells=3000, n_best=60, n_background=20, n_rounds=2, n_calibration=40)
@@ -166,13 +166,13 @@ def test_the_trained_locator_is_kept_and_estimates_directions(closed_form, finis
     np.save(tmp_path / "new.npy", test.spectrum.numpy())
     out = tmp_path / "directions.csv"
     arguments = [str(file), str(tmp_path / "new.npy"), "--out", str(out)]
-    assert command_line("tasks.estimate", EstimateConfig, estimate, arguments) == 0
+    assert command_line("tasks.predict", PredictConfig, predict, arguments) == 0
     errors = pd.read_csv(finished / "errors.csv")
     own = errors[errors.method == LOCATOR]
     found = pd.read_csv(out)
     np.testing.assert_allclose(found["elevation_deg"], own["estimate_elevation_deg"], atol=1e-3)
     np.save(tmp_path / "other.npy", np.zeros((1, 5, 5), dtype=np.float32))
-    assert command_line("tasks.estimate", EstimateConfig, estimate, [str(file), str(tmp_path / "other.npy")]) == 2
+    assert command_line("tasks.predict", PredictConfig, predict, [str(file), str(tmp_path / "other.npy")]) == 2
     assert "trained on others" in capsys.readouterr().err
 
 

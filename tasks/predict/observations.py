@@ -1,4 +1,4 @@
-"""Positions of new observations, by a locator that a run keeps."""
+"""Directions and positions of new measurements, by an estimator or a locator that a run keeps: columns of a table."""
 
 from __future__ import annotations
 
@@ -9,63 +9,32 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from swiftwrf import InputError, Rssi, Spectra, load
+from augment.estimators import SavedEstimator
+from swiftwrf import InputError, Rssi, Spectra
 from swiftwrf.data import ReadOptions
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.files import SUFFIXES, read_table
 from swiftwrf.data.formats import RSSI_FORMATS, read
 from swiftwrf.data.store import Store
 from swiftwrf.data.survey import has_positions
-from swiftwrf.errors import listed, with_article
 from swiftwrf.locate import MatchedField, Posterior, RssiLocator, smoothed
 from swiftwrf.locate.baselines import BATCH_ROWS
 from swiftwrf.metrics import angle_errors
-from tasks.directory import check_new_file
-from tasks.environment import stamp
-from tasks.locate.options import LocateConfig
-from tasks.options import SpectraSource, TableSource, given
-from tasks.records import Row, rounded, write_table
-from tasks.source import located, observed_spectra, reading
-from tasks.terminal import console, terminal
+from tasks.predict.options import PredictConfig
+from tasks.source import aligned, located, observed_spectra, reading
+from tasks.terminal import console
 
 Columns = dict[str, Tensor]
 MAX_TRACKED = 20_000_000  # candidate positions of a walk that are in memory together
 
 
-def write_positions(config: LocateConfig) -> None:
-    """Write one row for each observation: position, its uncertainty and, where positions are known, the truth and the error.
+def positions_of_rssi(locator: RssiLocator, config: PredictConfig) -> Columns:
+    """Return positions with their uncertainty, and truth and error where rows have positions.
 
     Raises:
-        InputError: No locator, observations that cannot be read or are not like those it was fitted to, or `out` exists.
+        InputError: RSSI that cannot be read, receivers that moved or that the locator does not have, or nothing detected.
     """
-    assert config.model is not None
-    assert config.source is not None
-    out = Path(config.out or f"positions-{stamp()}.csv")
-    check_new_file(out, "--out ")
-    model = load(config.model)
-    if isinstance(model, RssiLocator):
-        columns = _of_rssi(model, config, config.source)
-    elif isinstance(model, MatchedField):
-        columns = _of_spectra(model, config, config.source)
-    else:
-        raise InputError(
-            f"{config.model} holds {with_article(model.kind)}, which locates nothing; give {RssiLocator.kind!r} or "
-            f"{MatchedField.kind!r}"
-        )
-    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-    write_table(out, rounded(dict(zip(columns, row, strict=True)) for row in rows))
-    values: Row = {"n_positions": len(columns["index"]), "table": str(out)}
-    error = ""
-    if "position_error_m" in columns:
-        values["median_error_m"] = float(columns["position_error_m"].median())
-        error = f", median error {values['median_error_m']:.2f} m, too low if these rows trained the locator"
-    terminal.page(values, f"{values['n_positions']} positions{error}: {out}")
-
-
-def _of_rssi(locator: RssiLocator, config: LocateConfig, source: str) -> Columns:
-    if unused := given(config, SpectraSource):
-        raise InputError(f"--{unused[0]} is for spectra, and {config.model} locates by RSSI")
-    options = reading(config)
+    source, options = config.source, reading(config)
     offsets = locator.model.offsets
     if offsets is not None and has_column(source, offsets.column):
         options = replace(options, offset_by=offsets.column)
@@ -118,65 +87,51 @@ def has_column(source: str, name: str) -> bool:
     return file.is_file() and file.suffix.lower() in SUFFIXES and name in read_table(file).columns
 
 
-def aligned(data: Rssi, names: tuple[str, ...]) -> Rssi:
-    """Return the data at the receivers of a locator, in its order; those that the data lack count as not detecting.
+def directions(estimator: SavedEstimator, config: PredictConfig) -> Columns:
+    """Return azimuth and elevation [deg], and truth and error where spectra have positions.
 
     Raises:
-        InputError: The data have none of the receivers.
+        InputError: Spectra that cannot be read, or on another grid.
     """
-    place = {name: column for column, name in enumerate(data.receiver_names)}
-    if not place.keys() & set(names):
-        raise InputError(
-            f"{data.name} has other receivers ({listed(data.receiver_names)}) than the model ({listed(names)}); their names "
-            "must be the same"
-        )
-    missing = [name for name in names if name not in place]
-    if missing:
-        console.print(f"{data.name}: receivers of the model that are missing count as not detecting: {listed(missing)}")
-    others = [name for name in data.receiver_names if name not in names]
-    if others:
-        console.print(f"{data.name}: receivers that the model does not have are not used: {listed(others)}")
-    rssi = torch.full((len(data), len(names)), torch.nan, dtype=torch.float64)
-    position = torch.full((len(names), 3), torch.nan, dtype=torch.float64)
-    for column, name in enumerate(names):
-        if name in place:
-            rssi[:, column] = data.rssi_dbm[:, place[name]]
-            position[column] = data.receiver_position[place[name]]
-    return replace(data, rssi_dbm=rssi, receiver_names=names, receiver_position=position)
+    store, known = observed_spectra(config.source, reading(config), estimator.grid, "estimator")
+    estimate = torch.cat([estimator.predict(part) for part in store.batches()])
+    return {"index": torch.arange(len(store)) if known is None else known.index} | _directions(estimate, known)
 
 
-def _of_spectra(locator: MatchedField, config: LocateConfig, source: str) -> Columns:
-    if unused := given(config, TableSource):
-        raise InputError(f"--{unused[0]} is for RSSI, and {config.model} locates by spectra")
-    store, known = observed_spectra(source, reading(config), locator.grid, "locator")
+def positions_of_spectra(locator: MatchedField, config: PredictConfig) -> Columns:
+    """Return positions with their uncertainty and directions, and truth and errors where spectra have positions.
+
+    Raises:
+        InputError: Spectra that cannot be read, on another grid or of another array.
+    """
+    store, known = observed_spectra(config.source, reading(config), locator.grid, "locator")
     if known is not None and known.array is not None and known.array != locator.room.array:
-        raise InputError(f"{source} has spectra of another array than those that {config.model} was fitted to")
-    directions: list[Tensor] = []
+        raise InputError(f"{config.source} has spectra of another array than those that {config.model} was fitted to")
+    found: list[Tensor] = []
     index = torch.arange(len(store)) if known is None else known.index
     posteriors: Iterable[Posterior] = map(locator.locate, _batches(store))
     if config.track is not None:
         posteriors = _tracked(posteriors, index.double(), config.track)
 
     def with_direction(posterior: Posterior) -> Posterior:
-        directions.append(locator.direction(posterior))
+        found.append(locator.direction(posterior))
         return posterior
 
     columns = _located(map(with_direction, posteriors), index, None if known is None else known.position)
-    direction = torch.cat(directions)
-    columns |= {"azimuth_deg": direction[:, 0].rad2deg(), "elevation_deg": direction[:, 1].rad2deg()}
-    return columns | _direction_errors(direction, known)
+    return columns | _directions(torch.cat(found), known)
 
 
 def _batches(store: Store) -> Iterable[Tensor]:
     return (part for batch in store.batches() for part in batch.split(BATCH_ROWS))
 
 
-def _direction_errors(direction: Tensor, known: Spectra | None) -> Columns:
+def _directions(estimate: Tensor, known: Spectra | None) -> Columns:
+    columns = {"azimuth_deg": estimate[:, 0].rad2deg(), "elevation_deg": estimate[:, 1].rad2deg()}
     if known is None:
-        return {}
+        return columns
     truth = known.label.rad2deg()
-    error = angle_errors(direction, known.label)["great_circle"].rad2deg()
-    return {"truth_azimuth_deg": truth[:, 0], "truth_elevation_deg": truth[:, 1], "great_circle_deg": error}
+    columns |= {"truth_azimuth_deg": truth[:, 0], "truth_elevation_deg": truth[:, 1]}
+    return columns | {"great_circle_deg": angle_errors(estimate, known.label)["great_circle"].rad2deg()}
 
 
 def _times(source: str, data: Rssi) -> Tensor:

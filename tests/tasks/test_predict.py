@@ -1,18 +1,21 @@
-"""Trained estimators are kept, come back as they were, and take new spectra to directions."""
+"""Models are kept, come back as they were, and are applied to new spectra, rows and positions."""
 
 from __future__ import annotations
+
+import json
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
 from quick import run, said
+from scipy.io import loadmat
 
 from augment import Mixed
 from augment.estimators.aann import AANN
 from augment.estimators.aann_kernel import AANNKernel
 from augment.estimators.kernel_regression import KernelRegression
-from swiftwrf import AngularGrid, InputError, load, simulated_room
+from swiftwrf import AngularGrid, InputError, RssiModel, load, make_model, rssi_room, simulated_room
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
 from swiftwrf.runtime.checkpoint import read, write
@@ -108,7 +111,8 @@ def test_the_estimator_that_a_run_recommends_is_the_one_that_cross_validation_ch
     for name in ("kernel_regression", "kernel_regression_turbo_nearest_extra"):
         fraction.mix["estimator_choice"] = {"name": name, "held_out_deg": {name: 1.0}, "n_held_out": 9, "better": {}}
         (step,) = (text for text in next_steps(fraction) if text.startswith("Take"))
-        recommended[name] = load(step.split("tasks.estimate ")[1].split(" SOURCE")[0])
+        assert f"`python -m tasks.predict {finished} SOURCE`" in step
+        recommended[name] = load(fraction.chosen_file)
     alone, turbo = recommended.values()
     assert len(alone.state()[0]["known"]) < len(turbo.state()[0]["known"])
 
@@ -117,22 +121,22 @@ def test_directions_of_measured_and_unknown_positions(finished, small, tmp_path,
     estimator = finished / "kernel_regression-mix0.5.safetensors"
     (tmp_path / "data").mkdir()
     write_spectra(small, tmp_path / "data")
-    assert run("estimate", estimator, tmp_path / "data", "--out", tmp_path / "known.csv") == 0
+    assert run("predict", estimator, tmp_path / "data", "--out", tmp_path / "known.csv") == 0
     assert "60 directions, median error" in capsys.readouterr().out
     known = pd.read_csv(tmp_path / "known.csv")
     assert known["index"].tolist() == list(range(60))
     assert known["great_circle_deg"].between(0, 180).all()
 
     np.save(tmp_path / "unknown.npy", small.spectrum.numpy())
-    assert run("estimate", estimator, tmp_path / "unknown.npy", "--out", tmp_path / "unknown.csv") == 0
+    assert run("predict", estimator, tmp_path / "unknown.npy", "--out", tmp_path / "unknown.csv") == 0
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "directions.csv").write_text("of another run")
-    assert run("estimate", estimator, tmp_path / "unknown.npy") == 0
-    (default,) = tmp_path.glob("directions-*.csv")
+    (tmp_path / "predicted.csv").write_text("of another run")
+    assert run("predict", estimator, tmp_path / "unknown.npy") == 0
+    (default,) = tmp_path.glob("predicted-*.csv")
     unknown = pd.read_csv(tmp_path / "unknown.csv")
     assert default.read_bytes() == (tmp_path / "unknown.csv").read_bytes()
     assert unknown.columns.tolist() == ["index", "azimuth_deg", "elevation_deg"]
-    assert run("estimate", estimator, tmp_path / "unknown.npy", "--every", 7, "--out", tmp_path / "some.csv") == 2
+    assert run("predict", estimator, tmp_path / "unknown.npy", "--every", 7, "--out", tmp_path / "some.csv") == 2
     assert "--every does not apply" in said(capsys)
     np.testing.assert_allclose(unknown["elevation_deg"], known["elevation_deg"], atol=0.05)  # 8 or 16 bits on disk
 
@@ -151,7 +155,7 @@ def test_directions_of_measured_and_unknown_positions(finished, small, tmp_path,
 def test_other_spectra_are_refused(finished, tmp_path, capsys, content, sentence):
     np.save(tmp_path / "spectra.npy", content)
     file = finished / "kernel_regression-mix0.5.safetensors"
-    assert run("estimate", file, tmp_path / "spectra.npy", "--out", tmp_path / "out.csv") == 2
+    assert run("predict", file, tmp_path / "spectra.npy", "--out", tmp_path / "out.csv") == 2
     assert sentence in said(capsys)
     assert not (tmp_path / "out.csv").exists()
 
@@ -160,11 +164,41 @@ def test_other_files_are_refused(finished, small, tmp_path, capsys):
     estimator, spectra = finished / "kernel_regression-mix0.5.safetensors", tmp_path / "spectra.npy"
     np.save(spectra, small.spectrum.numpy())
     spectra.with_suffix(".txt").write_text("")
-    assert run("estimate", tmp_path / "none", spectra, "--out", tmp_path / "out.csv") == 2
+    assert run("predict", tmp_path / "none", spectra, "--out", tmp_path / "out.csv") == 2
     assert "not a readable" in said(capsys)
-    assert run("estimate", estimator, tmp_path / "none.npy", "--out", tmp_path / "out.csv") == 2
+    assert run("predict", estimator, tmp_path / "none.npy", "--out", tmp_path / "out.csv") == 2
     assert "is missing" in said(capsys)
-    assert run("estimate", estimator, spectra, "--out", spectra) == 2
+    assert run("predict", estimator, spectra, "--out", spectra) == 2
     assert "exists already" in said(capsys)
-    assert run("estimate", estimator, spectra, "--out", tmp_path / "no" / "out.csv") == 2
+    assert run("predict", estimator, spectra, "--out", tmp_path / "no" / "out.csv") == 2
     assert "no directory" in said(capsys)
+
+
+def test_spectra_and_rssi_at_the_positions_of_a_table(small, tmp_path, capsys):
+    field, rssi = make_model("idw").fit(small), RssiModel(n_primitives=0).fit(rssi_room(n=60).columns([0, 4]))
+    field.save(tmp_path / "field.safetensors")
+    rssi.save(tmp_path / "rssi.safetensors")
+    at, position = tmp_path / "at.csv", small.position[:5]
+    pd.DataFrame(position.numpy(), columns=["x", "y", "z"]).to_csv(at, index=False)
+    assert run("predict", tmp_path / "field.safetensors", at, "--out", tmp_path / "a.mat") == 0
+    np.testing.assert_allclose(loadmat(tmp_path / "a.mat")["spectrum"], field.predict(position).mean.numpy(), atol=1e-6)
+    assert run("predict", tmp_path / "rssi.safetensors", at, "--out", tmp_path / "a.csv") == 0
+    table = pd.read_csv(tmp_path / "a.csv")
+    np.testing.assert_allclose(table["predicted_dbm"], rssi.predict(position).mean.numpy().ravel(), atol=0.00501)
+    assert all(len(text.rpartition(".")[2]) <= 2 for text in table["predicted_dbm"].astype(str))
+    for options, reason in (
+        (("--grid", "4", "8"), "--grid is for reading spectra"),
+        (("--track", "1"), "locates nothing"),
+    ):
+        assert run("predict", tmp_path / "field.safetensors", at, *options, "--out", tmp_path / "b.csv") == 2
+        assert reason in said(capsys)
+
+
+def test_the_directory_of_a_run_is_enough(finished, small, tmp_path, capsys):
+    np.save(tmp_path / "new.npy", small.spectrum.numpy()[:7])
+    file = FractionRecords.of(Records(finished))[0].chosen_file
+    assert run("predict", file, tmp_path / "new.npy", "--out", tmp_path / "one.csv", "--json") == 0
+    assert json.loads(capsys.readouterr().out) == {"n": 7, "table": str(tmp_path / "one.csv")}
+    assert run("predict", finished, tmp_path / "new.npy", "--out", tmp_path / "other.csv") == 0
+    assert f"applied: {file}" in capsys.readouterr().err.replace("\n", "")
+    assert (tmp_path / "one.csv").read_bytes() == (tmp_path / "other.csv").read_bytes()

@@ -1,1 +1,0 @@
-"""Directions from spectra, by an estimator that a run of tasks.aoa trained."""

@@ -1,0 +1,1 @@
+"""What a saved model says of new measurements or positions: directions, positions, spectra or RSSI."""
