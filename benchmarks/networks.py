@@ -28,11 +28,10 @@ from augment.estimators import make_estimator
 from augment.estimators.aann import AANN
 from augment.estimators.aann_kernel import AANNKernel, AANNKernelConfig
 from swiftwrf import MatchedField, Spectra, load_spectra, make_model, simulated_room
-from swiftwrf.metrics import angle_errors, paired_change
+from swiftwrf.metrics import angle_errors, paired_change, summary
 from swiftwrf.models import FIELD_MODELS
 from tasks.aoa.context import ROOM_MODEL
 from tasks.run import Preset
-from tasks.summarise import error_summary
 
 REFERENCE = "kernel_regression"  # estimator to which others are compared
 N_EXTRA = 3000  # extra synthetic positions in rooms
@@ -94,7 +93,7 @@ def main(config: Config) -> None:
             methods = entry.setdefault("methods", {})
             for name, row, estimate in estimates(mixed, known, training, held_out, config):
                 error = angle_errors(estimate, held_out.label)["great_circle"].rad2deg().double().numpy()
-                row |= {"great_circle_deg": error_summary(error), "errors_deg": error.round(4).tolist()}
+                row |= {"great_circle_deg": summary(error), "errors_deg": error.round(4).tolist()}
                 row["change"] = paired_change(methods.get(REFERENCE, row)["errors_deg"], row["errors_deg"])
                 methods[name] = row
                 print(scene, training, name, f"{row['change']['median_deg']:.2f} deg", row["seconds"], flush=True)

@@ -30,10 +30,10 @@ from torch import Tensor
 from swiftwrf import Rssi, load_rssi
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.data.rssi import PLACE
+from swiftwrf.metrics import paired_difference, summary
 from swiftwrf.rssi import LEVEL, PairModel, RssiModel
-from swiftwrf.rssi.baselines import make_predictor
+from swiftwrf.rssi.comparison import make_predictor
 from swiftwrf.rssi.head import DB_PER_UNIT, Head, render
-from tasks.summarise import error_summary, paired_difference
 
 RESULT = "rssi"
 SPLITS = {
@@ -126,7 +126,7 @@ def _measured(name: str, train: Rssi, test: Rssi, split: str) -> tuple[Row, NDAr
     prediction = predictor.predict_detected(test)
     seconds = {"fit": fitted - began, "predict": time.process_time() - fitted}
     error = (prediction.mean - test.rssi_dbm)[test.detected].abs().numpy()
-    entry: Row = {"abs_error_db": error_summary(error), "seconds": seconds}
+    entry: Row = {"abs_error_db": summary(error), "seconds": seconds}
     if prediction.std is not None:
         low, high = (end[test.detected] for end in prediction.interval(LEVEL))
         measured = test.rssi_dbm[test.detected]

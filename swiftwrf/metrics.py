@@ -6,12 +6,14 @@ SSIM is scikit-image's default (7 x 7 uniform window, sample covariance, borders
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import TypedDict
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
+from pandas import DataFrame
 from scipy import stats
 from torch import Tensor
 
@@ -19,6 +21,7 @@ from swiftwrf.array.angles import angular_distance, to_direction, wrap
 from swiftwrf.errors import InputError
 
 WINDOW = 7
+MIN_ROWS = 10  # of a test, for an interval of differences
 N_BOOTSTRAP = 2000  # resamplings for the interval of a change
 SMALLEST_ERROR_DEG = 1e-9  # a change is relative to at least this median
 NORMAL_80 = 1.2816  # standard deviations about the mean that hold 80 % of a normal variable
@@ -165,7 +168,18 @@ def median_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float,
     return float(ordered[low]), float(ordered[n - 1 - low])
 
 
-def summary(errors: ArrayLike) -> dict[str, float | int]:
+class ErrorSummary(TypedDict):
+    """Summary of `n` errors or scores; `low` and `high` are the 95 % interval of the median."""
+
+    median: float
+    p90: float
+    mean: float
+    low: float
+    high: float
+    n: int
+
+
+def summary(errors: ArrayLike) -> ErrorSummary:
     """Return `median`, `p90`, `mean`, `n` and the 95 % interval of the median (`low`, `high`) of finite errors (n,).
 
     Example:
@@ -227,3 +241,47 @@ def paired_change(before: ArrayLike, after: ArrayLike) -> ChangeMetrics:
     median = float(np.median(second))
     change = median / max(float(np.median(first)), SMALLEST_ERROR_DEG) - 1
     return {"median_deg": median, "change": change, "low": float(low), "high": float(high)}
+
+
+def paired_difference(errors: DataFrame, method: str, other: str) -> tuple[float, float, float]:
+    """Return the mean of one method's errors minus another's on equal pairs, and its 95 % interval.
+
+    The interval is a bootstrap over test rows, because the receivers of one row are not independent. It is nan for fewer
+    than 10 rows, with which a bootstrap finds false differences.
+
+    Args:
+        errors: Errors with a column for each method and a row for each pair, indexed by `index` (the test row) and
+            `receiver`.
+        method: Column of the method.
+        other: Column of the method that it is compared to.
+    """
+    difference = (errors[method] - errors[other]).groupby(level="index").agg(["sum", "count"]).to_numpy()
+    mean = float(difference[:, 0].sum() / difference[:, 1].sum())
+    if len(difference) < MIN_ROWS:
+        return mean, math.nan, math.nan
+    draws = np.random.default_rng(0).integers(len(difference), size=(1000, len(difference)))
+    sums = difference[draws].sum(axis=1)
+    low, high = np.percentile(sums[:, 0] / sums[:, 1], (2.5, 97.5))
+    return mean, float(low), float(high)
+
+
+def method_summary(errors: DataFrame, column: str, reference: str) -> DataFrame:
+    """Return a summary of the errors of each method, and their mean difference to those of a reference.
+
+    Args:
+        errors: A row for each `method` and test row `index`, and `receiver` where a row has several errors.
+        column: Column of errors.
+        reference: Method of the differences, which are paired over test rows.
+
+    Returns:
+        A row for each method: the keys of `ErrorSummary`, `difference` and its 95 % interval `difference_low`,
+        `difference_high`.
+    """
+    pairs = errors.pivot_table(
+        index=[name for name in ("index", "receiver") if name in errors], columns="method", values=column
+    )
+    rows = {}
+    for name, own in errors.groupby("method", sort=False)[column]:
+        mean, low, high = paired_difference(pairs, name, reference)
+        rows[name] = {**summary(own), "difference": mean, "difference_low": low, "difference_high": high}
+    return DataFrame.from_dict(rows, orient="index").rename_axis("method")

@@ -7,25 +7,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal, NotRequired, TypedDict, get_args
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # which import torch
     from augment.cross_validation import CrossValidationMetrics, EstimatorChoiceMetrics
-    from swiftwrf.metrics import ChangeMetrics
+    from swiftwrf.metrics import ChangeMetrics, ErrorSummary
 
 Angle = Literal["azimuth_deg", "elevation_deg", "great_circle_deg"]
 Score = Literal["psnr_db", "ssim", "l1"]
 ANGLES: tuple[Angle, ...] = get_args(Angle)
 SCORES: tuple[Score, ...] = get_args(Score)
-
-
-class ErrorSummary(TypedDict):
-    """Summary of `n` errors or scores; `low` and `high` are the 95 % interval of the median."""
-
-    median: float
-    p90: float
-    mean: float
-    low: float
-    high: float
-    n: int
 
 
 class RunMetrics(TypedDict):

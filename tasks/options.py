@@ -214,6 +214,11 @@ class OffsetSource(TableSource):
     """column of a survey table with groups of rows, e.g. devices, whose constant offsets are estimated; COLUMN=VALUE makes
     that group the reference of maps (default: the most frequent one)"""
 
+    @property
+    def reference(self) -> str | None:
+        """Group whose offset is 0, None for the most frequent one."""
+        return None if self.offset_by is None else self.offset_by.partition("=")[2] or None
+
     def check_used(self, data: str | None) -> None:
         """Refuse options of reading RSSI without measured data.
 

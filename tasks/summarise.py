@@ -4,25 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pandas import DataFrame, Series
 
-from swiftwrf.metrics import summary
-from tasks.metrics import ErrorSummary
+from swiftwrf.metrics import ErrorSummary, paired_difference, summary
 
-MIN_ROWS = 10  # of a test, for an interval of differences
 MAX_COVERAGE_ERROR = 0.05  # difference from the nominal coverage below which intervals count as calibrated
 MIN_RELEVANT = 0.02  # difference of mean errors, relative to them, below which methods are equal in practice
 MAX_SPREAD = 0.5  # of labels about their mean direction, relative to the error of the peaks, for a warning
 SHORTEST = 1e-5  # seconds: what took less is drawn here, for logarithmic axes have no zero
-
-
-def error_summary(values: ArrayLike) -> ErrorSummary:
-    """Return median, 90th percentile, mean, interval of the median and number of the finite values."""
-    return cast(ErrorSummary, summary(values))
 
 
 def summaries(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dict[str, ErrorSummary]]:
@@ -57,7 +49,7 @@ def repeated_summary(values: NDArray[np.float64]) -> ErrorSummary:
         >>> found["median"], found["n"], (found["low"], found["high"])
         (49.5, 100, (40.0, 59.0))
     """
-    found = error_summary(values.ravel())
+    found = summary(values.ravel())
     rows = values[np.isfinite(values).any(axis=1)]
     if values.shape[1] > 1 and len(rows):
         below = np.nanmean(np.where(np.isnan(rows), np.nan, rows <= found["median"]), axis=1)
@@ -67,37 +59,10 @@ def repeated_summary(values: NDArray[np.float64]) -> ErrorSummary:
     return {**found, "n": len(rows)}
 
 
-def grouped(table: DataFrame, by: Sequence[str], column: str) -> dict[tuple[str, ...], ErrorSummary]:
-    """Return a summary of a column for each combination of values of `by` that occurs."""
-    return {key: error_summary(part) for key, part in table.groupby(list(by), sort=False)[column]}
-
-
 def averaged(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dict[str, float]]:
     """Return the mean of each column for each value of `by`."""
     means: dict[str, dict[str, float]] = table.groupby(by, sort=False)[list(columns)].mean().to_dict("index")
     return means
-
-
-def paired_difference(errors: DataFrame, method: str, other: str) -> tuple[float, float, float]:
-    """Return the mean of one method's errors minus another's on equal pairs, and its 95 % interval.
-
-    The interval is a bootstrap over test rows, because the receivers of one row are not independent. It is nan for fewer
-    than 10 rows, with which a bootstrap finds false differences.
-
-    Args:
-        errors: Errors with a column for each method and a row for each pair, indexed by `index` (the test row) and
-            `receiver`.
-        method: Column of the method.
-        other: Column of the method that it is compared to.
-    """
-    difference = (errors[method] - errors[other]).groupby(level="index").agg(["sum", "count"]).to_numpy()
-    mean = float(difference[:, 0].sum() / difference[:, 1].sum())
-    if len(difference) < MIN_ROWS:
-        return mean, math.nan, math.nan
-    draws = np.random.default_rng(0).integers(len(difference), size=(1000, len(difference)))
-    sums = difference[draws].sum(axis=1)
-    low, high = np.percentile(sums[:, 0] / sums[:, 1], (2.5, 97.5))
-    return mean, float(low), float(high)
 
 
 def comparison_sentence(

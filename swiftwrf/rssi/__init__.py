@@ -1,6 +1,7 @@
 """RSSI at fixed receivers from the position of the transmitter."""
 
 from swiftwrf.rssi.base import Map, RssiConfig, RssiPredictor
+from swiftwrf.rssi.comparison import RssiComparison, compare
 from swiftwrf.rssi.model import RssiModel, fit_rssi
 from swiftwrf.rssi.pairs import PairConfig, PairModel, PairPredictor
 from swiftwrf.rssi.paper import RssiPaperConfig, RssiPaperModel
@@ -22,6 +23,7 @@ __all__ = [
     "PairModel",
     "PairPredictor",
     "PathLoss",
+    "RssiComparison",
     "RssiConfig",
     "RssiModel",
     "RssiPaperConfig",
@@ -30,6 +32,7 @@ __all__ = [
 ]
 __all__ += [
     "FloorAttenuation",
+    "compare",
     "estimate_floor_attenuation",
     "estimate_offsets",
     "fit_path_loss",

@@ -22,40 +22,17 @@ from swiftwrf.data import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
 from swiftwrf.models.base import CPU, FieldConfig
 from swiftwrf.rssi.base import Map, RssiPredictor
-from swiftwrf.rssi.model import RssiModel
+from swiftwrf.rssi.comparison import make_predictor
 from swiftwrf.rssi.pairs import PairPredictor
-from swiftwrf.rssi.paper import RssiPaperModel
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, fit_shared_path_loss, log_distance
 from swiftwrf.rssi.training import mixing_weights
 from swiftwrf.runtime.threads import parallel_map
-from swiftwrf.runtime.validation import Preset, checked, configuration
+from swiftwrf.runtime.validation import Preset, configuration
 
 MAX_TREE_COLUMNS = 15  # of coordinates whose neighbours a tree finds
 NEIGHBOUR_COUNTS = (1, 3, 5, 8, 12, 20, 40, 80, 120)
 FLOOR_STRETCH = 5.0  # of heights where there are floors, so that neighbours are on one floor
 MAX_TUNING_ROWS, MAX_GP_ROWS = 500, 1500  # the cost of the Gaussian process grows with their cube
-
-
-@checked
-def make_predictor(name: str, preset: Preset = "quick", **options: Any) -> RssiPredictor:
-    """Return a predictor by its name, with those of the options that it has.
-
-    Args:
-        name: Name in the registry, e.g. "knn".
-        preset: "quick", or "paper" for published settings; a predictor without published settings ignores it. With "paper"
-            the name "swiftwrf" gives `RssiPaperModel`.
-        options: Options such as seed and validation. A predictor ignores options that it does not have.
-
-    Raises:
-        InputError: An unknown name, or a value outside its range.
-
-    Example:
-        >>> make_predictor("swiftwrf", "paper", seed=3).name
-        'swiftwrf_paper'
-    """
-    is_published = name == RssiModel.name and preset == "paper"
-    predictor_type: type[RssiPredictor] = RssiPaperModel if is_published else RSSI_PREDICTORS[name]
-    return predictor_type(**predictor_type.supported({"preset": preset} | options))
 
 
 class Mean(RssiPredictor):

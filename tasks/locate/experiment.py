@@ -11,6 +11,7 @@ import torch
 from swiftwrf import InputError, Rssi, rssi_room
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.locate.baselines import LEVELS
+from swiftwrf.metrics import summary
 from tasks.locate.options import LocateConfig
 from tasks.locate.page import page
 from tasks.locate.page.summary import answer
@@ -21,7 +22,6 @@ from tasks.page.records import Records
 from tasks.run import Row, Run, choose_device
 from tasks.source import asked_offsets, measured_rssi, split_notes
 from tasks.steps import run_steps
-from tasks.summarise import error_summary
 from tasks.terminal import console, terminal
 from tasks.workers import connected
 
@@ -116,7 +116,7 @@ class Results:
             "localizer": step.localizer,
             "n_train": value["n_train"],
             "n_receivers": value["n_receivers"],
-            "position_error_m": error_summary(error),
+            "position_error_m": summary(error),
         }
         self._studies.append((step, study))
         if not step.is_whole:
@@ -137,8 +137,8 @@ class Results:
         cells = zip(value["index"], *(column.tolist() for column in columns.values()), strict=True)
         self.errors += [{"method": step.localizer} | dict(zip(("index", *columns), row, strict=True)) for row in cells]
         self._overall[step.localizer] = {
-            "position_error_m": error_summary(error),
-            "horizontal_error_m": error_summary(horizontal),
+            "position_error_m": summary(error),
+            "horizontal_error_m": summary(horizontal),
             "seconds": value["seconds"],
         }
 

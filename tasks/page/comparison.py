@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tasks.metrics import ErrorSummary
+from swiftwrf.metrics import ErrorSummary
 from tasks.page import figures
 from tasks.page.page import Plot, Table
 from tasks.page.palette import MAX_CURVES, Palette

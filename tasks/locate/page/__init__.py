@@ -7,6 +7,7 @@ import math
 from pandas import concat
 
 from swiftwrf.locate.baselines import LOCALIZERS
+from swiftwrf.metrics import paired_difference
 from tasks.environment import command
 from tasks.labels import LOCALIZERS as LABELS
 from tasks.labels import labels
@@ -17,7 +18,6 @@ from tasks.page.comparison import Compared, comparison, with_interval
 from tasks.page.page import Page, Plot, Section, Summary, Table, sections_of
 from tasks.page.provenance import number, provenance
 from tasks.page.suggestion import suggestion_plot, worth
-from tasks.summarise import paired_difference
 
 
 def page(runs: list[LocateRecords]) -> Page:

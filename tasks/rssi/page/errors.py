@@ -8,6 +8,7 @@ from typing import Any
 from pandas import DataFrame
 
 from swiftwrf.choices import RSSI_PREDICTORS
+from swiftwrf.metrics import paired_difference
 from tasks.labels import PREDICTORS as LABELS
 from tasks.labels import labels
 from tasks.page import figures
@@ -17,7 +18,7 @@ from tasks.page.palette import Palette
 from tasks.page.provenance import number
 from tasks.rssi.page.maps import MAX_VECTOR_DOTS
 from tasks.rssi.page.summary import RssiRecords, best_baseline, by_method, model_of, title
-from tasks.summarise import SHORTEST, paired_difference, running_median
+from tasks.summarise import SHORTEST, running_median
 
 MAX_RECEIVERS = 40  # of the figure of differences; all are in its table
 

@@ -14,6 +14,7 @@ from pandas import DataFrame
 from augment.cross_validation import LOCATOR
 from swiftwrf import simulated_room
 from swiftwrf.metrics import median_interval, paired_change
+from swiftwrf.metrics import summary as error_summary
 from tasks.aoa.condition import Condition
 from tasks.aoa.options import AoaConfig
 from tasks.aoa.page.gains import gain_sentence, gain_table
@@ -22,7 +23,7 @@ from tasks.aoa.page.summary import summary
 from tasks.aoa.results import Results
 from tasks.aoa.synthesis import Evaluation
 from tasks.page.records import Records
-from tasks.summarise import error_summary, repeated_summary, summaries
+from tasks.summarise import repeated_summary, summaries
 
 MEASURED = Condition("aann_kernel", "measured", measured_fraction=0.3)
 TURBO = replace(MEASURED, training="turbo", synthesizer="gp")

@@ -24,16 +24,16 @@ from swiftwrf import InputError, Rssi, fit_rssi, load, rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.comparison import NeRF2Rssi, NeRF2RssiConfig
 from swiftwrf.data.splits import folds
-from swiftwrf.rssi import RssiPredictor
-from swiftwrf.rssi.baselines import NEIGHBOUR_COUNTS, Blend, BlendConfig, make_predictor
+from swiftwrf.metrics import paired_difference
+from swiftwrf.rssi import RssiPredictor, compare
+from swiftwrf.rssi.baselines import NEIGHBOUR_COUNTS, Blend, BlendConfig
+from swiftwrf.rssi.comparison import make_predictor, pool_of
 from swiftwrf.runtime import registry
 from tasks.command_line import command_line
 from tasks.labels import PREDICTORS as LABELS
 from tasks.report.run import merge
 from tasks.rssi import experiment
-from tasks.rssi.options import RssiTaskConfig
 from tasks.rssi.page.summary import where_next
-from tasks.summarise import paired_difference
 
 
 def path_loss_only(n=60, noise=0.0, level=-50.0, exponent=2.0, seed=0):
@@ -179,6 +179,20 @@ def test_whole_run(small, tmp_path, monkeypatch):
     assert list((out / "figures").glob("map-*.svg"))
 
 
+def test_a_comparison_without_a_folder_has_the_errors_of_the_command(small, tmp_path):
+    assert run("--rx", "1", "--out", tmp_path / "run") == 0
+    result = compare(rssi_room(n=60), receivers=["1"])
+    pd.testing.assert_frame_equal(result.errors, pd.read_csv(tmp_path / "run" / "errors.csv"), check_dtype=False)
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    medians = {name: entry["abs_error_db"]["median"] for name, entry in metrics["overall"].items()}
+    assert result.summary()["median"].to_dict() == pytest.approx(medians)
+    assert result.coverage == pytest.approx(metrics["interval"]["coverage"])
+    assert set(result.predictors) == set(medians)
+    again = compare(rssi_room(n=60), receivers=["1"], keep=lambda name, compute: result.values[name])
+    pd.testing.assert_frame_equal(again.errors, result.errors)
+    assert not again.predictors
+
+
 def test_a_lone_receiver_has_one_map_and_no_average(tmp_path, capsys):
     out = tmp_path / "her 'own' run"
     assert run("--rx", "1", "--out", out) == 0
@@ -311,7 +325,7 @@ def test_receivers_that_a_split_by_place_holds_out_are_not_in_the_pool(seed):
     whole = rssi_room(n=120)
     data = whole.receivers([str(number) for number in range(7, 13)])
     train, test = data.split("place", seed)
-    pool = experiment.pool_of(whole, train, test, RssiTaskConfig(rx=("all",), split="place", seed=seed))
+    pool = pool_of(whole, train, test, "place", seed)
     held_out = [name for name, out in zip(test.receiver_names, test.detected.any(dim=0), strict=True) if out]
     assert held_out
     assert not pool.detected[:, [pool.receiver_names.index(name) for name in held_out]].any()

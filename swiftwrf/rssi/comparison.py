@@ -1,0 +1,257 @@
+"""Comparison of RSSI predictors: each is fitted to the training rows of a split and predicts the test rows."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from typing import Any
+
+import torch
+from pandas import DataFrame, concat
+from torch import Tensor
+
+from swiftwrf.choices import RSSI_PREDICTORS
+from swiftwrf.data import Rssi
+from swiftwrf.data.coordinates import degree_columns
+from swiftwrf.data.rssi import PLACE
+from swiftwrf.errors import InputError
+from swiftwrf.metrics import method_summary
+from swiftwrf.models.prediction import Prediction
+from swiftwrf.positions import distance
+from swiftwrf.rssi.base import Map, RssiPredictor
+from swiftwrf.rssi.model import RssiModel
+from swiftwrf.rssi.pairs import PairModel
+from swiftwrf.rssi.paper import RssiPaperModel
+from swiftwrf.rssi.path_loss import estimate_offsets
+from swiftwrf.rssi.training import LEVEL
+from swiftwrf.runtime.validation import Preset, checked
+
+Values = dict[str, Any]
+Keep = Callable[[str, Callable[[], tuple[RssiPredictor, Values]]], Values]
+
+
+@checked
+def make_predictor(name: str, preset: Preset = "quick", **options: Any) -> RssiPredictor:
+    """Return a predictor by its name, with those of the options that it has.
+
+    Args:
+        name: Name in the registry, e.g. "knn".
+        preset: "quick", or "paper" for published settings; a predictor without published settings ignores it. With "paper"
+            the name "swiftwrf" gives `RssiPaperModel`.
+        options: Options such as seed and validation. A predictor ignores options that it does not have.
+
+    Raises:
+        InputError: An unknown name, or a value outside its range.
+
+    Example:
+        >>> make_predictor("swiftwrf", "paper", seed=3).name
+        'swiftwrf_paper'
+    """
+    is_published = name == RssiModel.name and preset == "paper"
+    predictor_type: type[RssiPredictor] = RssiPaperModel if is_published else RSSI_PREDICTORS[name]
+    return predictor_type(**predictor_type.supported({"preset": preset} | options))
+
+
+def compared(data: Rssi, also: Sequence[str] = ()) -> tuple[list[str], dict[str, str]]:
+    """Return the names of the predictors that are compared on these data, and the reason for each one that is left out.
+
+    Args:
+        data: RSSI.
+        also: Names of predictors that are compared only when named.
+
+    Example:
+        >>> import swiftwrf
+        >>> compared(swiftwrf.rssi_room(n=20))[0]
+        ['swiftwrf', 'mean', 'mri_pooled', 'mri_receiver', 'knn', 'mri_residual', 'gp']
+    """
+    asked = [name for name in RSSI_PREDICTORS if RSSI_PREDICTORS[name].compared(data) or name in also]
+    left_out = {name: reason for name in asked if (reason := RSSI_PREDICTORS[name].lacking(data))}
+    return [name for name in asked if name not in left_out], left_out
+
+
+@dataclass(frozen=True, eq=False)
+class RssiComparison:
+    """Result of `compare`.
+
+    Args:
+        train: Training rows, without offsets between groups.
+        test: Test rows.
+        values: What each predictor gave, by name: `predicted` at the detected test pairs (n,) [dBm], their standard
+            deviations `std` (n,) [dB] or None, median absolute error `median_db` [dB], seconds to `fit` and to `predict`.
+        left_out: Reason for each predictor that the data do not suffice for.
+        predictors: Fitted predictors by name, without those whose values `keep` had.
+    """
+
+    train: Rssi
+    test: Rssi
+    values: Mapping[str, Values]
+    left_out: dict[str, str]
+    predictors: dict[str, RssiPredictor] = field(default_factory=dict)
+
+    @property
+    def model(self) -> str:
+        """Name of the model of this package that all others are compared with."""
+        return model_of(self.train)
+
+    @cached_property
+    def errors(self) -> DataFrame:
+        """Errors, a row for each method and detected pair of test row and receiver."""
+        test, (row, column) = self.test, self._pairs
+        measured = test.rssi_dbm[row, column]
+        from_training = distance(test.transmitter_position, self.train.transmitter_position).amin(dim=1)[row]
+        from_receiver = distance(test.transmitter_position, test.receiver_position)[row, column]
+        rows = []
+        for name in self.values:
+            predicted = self._prediction(name).mean
+            columns = {
+                "index": test.index[row],
+                "measured_dbm": measured,
+                "predicted_dbm": predicted,
+                "abs_error_db": (predicted - measured).abs(),
+                "from_receiver_m": from_receiver,
+                "from_training_m": from_training,
+            }
+            found = DataFrame({name: values.numpy() for name, values in columns.items()})
+            found.insert(0, "receiver", self._receiver)
+            found.insert(0, "method", name)
+            rows.append(found)
+        return concat(rows, ignore_index=True)
+
+    @cached_property
+    def predictions(self) -> DataFrame:
+        """Measured values, predictions and 80 % intervals of the model, a row for each detected test pair."""
+        test, (row, column) = self.test, self._pairs
+        prediction = self._prediction(self.model)
+        low, high = prediction.interval(LEVEL)
+        values = {"measured": test.rssi_dbm[row, column], "predicted": prediction.mean, "low": low, "high": high}
+        found = DataFrame(test.transmitter_position[row].numpy().round(3), columns=["x", "y", "z"])
+        group = {"group": test.groups.subset(row).labels()} if test.groups else {}
+        found = found.assign(receiver=self._receiver, **group)
+        found = found.assign(**{name: value.numpy().round(2) for name, value in values.items()})
+        return found.assign(**degree_columns(test.origin, test.transmitter_position[row].numpy()))
+
+    @property
+    def coverage(self) -> float:
+        """Fraction of the detected test values inside the model's 80 % intervals."""
+        measured, (low, high) = self.test.rssi_dbm[self._pairs], self._prediction(self.model).interval(LEVEL)
+        return float(((measured >= low) & (measured <= high)).double().mean())
+
+    def summary(self) -> DataFrame:
+        """Return a row for each method: errors [dB], and their mean difference to those of `model`; see `method_summary`."""
+        return method_summary(self.errors, "abs_error_db", self.model)
+
+    @property
+    def _pairs(self) -> tuple[Tensor, Tensor]:
+        """Rows and receivers of the detected test pairs."""
+        row, column = self.test.detected.nonzero(as_tuple=True)
+        return row, column
+
+    @property
+    def _receiver(self) -> list[str]:
+        return [self.test.receiver_names[number] for number in self._pairs[1].tolist()]
+
+    def _prediction(self, name: str) -> Prediction:
+        """Return the prediction of the detected test pairs (n,), with the offsets of their groups."""
+        values, offsets = self.values[name], self.train.offsets
+        mean = torch.as_tensor(values["predicted"], dtype=torch.float64)
+        if offsets is not None:
+            mean = mean + offsets.of(self.test)[self._pairs[0]]
+        std = None if values["std"] is None else torch.as_tensor(values["std"], dtype=torch.float64)
+        return Prediction(mean, std)
+
+
+def model_of(data: Rssi) -> str:
+    """Return the name of the model of this package for these data."""
+    return PairModel.name if data.receiver_moves else RssiModel.name
+
+
+@checked
+def compare(
+    data: Rssi,
+    *,
+    receivers: Sequence[str] = ("all",),
+    split: str = "random",
+    seed: int = 0,
+    also: Sequence[str] = (),
+    preset: Preset = "quick",
+    reference: str | None = None,
+    device: torch.device | str = "cpu",
+    parallel: Map | None = None,
+    keep: Keep | None = None,
+    progress: bool = False,
+) -> RssiComparison:
+    """Fit every predictor to the training rows of a split, and predict the test rows.
+
+    Args:
+        data: RSSI. Offsets between its groups, if it has any, are estimated from training rows and removed from them.
+        receivers: Names of receivers, numbers counted from 1, or "all".
+        split: Split that comes with the data, or a seeded one: random, block, or place.
+        seed: Seed of everything random.
+        also: Predictors that are compared only when named, e.g. "blend".
+        preset: "quick", or "paper" for published settings.
+        reference: Group whose offset is 0. Defaults to the most frequent one.
+        device: Device to compute on.
+        parallel: Function that maps a picklable fit over receivers as `map` does.
+        keep: Memo `keep(name, compute)`, which returns the values that it has under a name, or the second item of
+            `compute()`. The first item is the fitted predictor. Defaults to no memo.
+        progress: Show a progress bar on a terminal.
+
+    Raises:
+        InputError: Unknown receivers or split, no test row that a receiver detects, or too few rows.
+
+    Example:
+        >>> import swiftwrf
+        >>> result = compare(swiftwrf.rssi_room(n=60), receivers=["6"], seed=1)
+        >>> bool(result.summary().loc["swiftwrf", "median"] < result.summary().loc["mean", "median"])
+        True
+    """
+    chosen = data.receivers(receivers)
+    train, test = chosen.split(split, seed)
+    if not bool(test.detected.any()):
+        raise InputError(f"split {split!r} of {data.name} has no test rows that detect these receivers")
+    pool = pool_of(data, train, test, split, seed)
+    if pool.groups is not None:
+        offsets = estimate_offsets(pool, reference)
+        train, pool = offsets.removed(train), offsets.removed(pool)
+    offset = 0.0 if train.offsets is None else train.offsets.of(test)[:, None]
+    options = {"validation": train.validation_for(split, test), "seed": seed, "new_places": split == PLACE}
+    names, left_out = compared(chosen, also)
+    predictors: dict[str, RssiPredictor] = {}
+
+    def compute(name: str) -> tuple[RssiPredictor, Values]:
+        predictor = make_predictor(name, preset, **options)
+        began = time.perf_counter()
+        predictor.fit(train, pool=pool, device=device, parallel=parallel, progress=progress)
+        fitted = time.perf_counter()
+        prediction = predictor.predict_detected(test)
+        seconds = {"fit": fitted - began, "predict": time.perf_counter() - fitted}
+        predictors[name] = predictor
+        std = None if prediction.std is None else prediction.std[test.detected]
+        error = (prediction.mean + offset - test.rssi_dbm)[test.detected].abs()
+        values = {"predicted": prediction.mean[test.detected], "std": std, "median_db": float(error.quantile(0.5))}
+        return predictor, seconds | values
+
+    keep = keep or (lambda name, compute: compute()[1])
+    values = {name: keep(name, partial(compute, name)) for name in names}
+    return RssiComparison(train, test, values, left_out, predictors)
+
+
+def pool_of(whole: Rssi, train: Rssi, test: Rssi, split: str, seed: int) -> Rssi:
+    """Return the training rows at every receiver, without those that a split by place holds out.
+
+    Args:
+        whole: RSSI at all receivers.
+        train: Training rows at the compared receivers.
+        test: Test rows at the compared receivers.
+        split: Name of the split.
+        seed: Seed of the split.
+    """
+    if split != PLACE or PLACE in whole.named_splits:
+        return whole.split(split, seed)[0]
+    is_held_out = test.detected.any(dim=0)
+    held_out = {name for name, out in zip(test.receiver_names, is_held_out.tolist(), strict=True) if out}
+    kept = torch.tensor([name not in held_out for name in whole.receiver_names])
+    rows = torch.isin(whole.index, train.index)
+    return replace(whole, rssi_dbm=whole.rssi_dbm.where(kept, torch.nan)).subset(rows)
