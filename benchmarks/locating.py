@@ -17,9 +17,9 @@ from record import write_result
 
 from swiftwrf import Rssi, load_rssi, rssi_room
 from swiftwrf.locate.baselines import LOCALIZERS
+from swiftwrf.runtime.durable import strict
 from tasks.locate.experiment import Results, prepared
 from tasks.locate.steps import Localization
-from tasks.records import strict
 
 RESULT = "locating_rssi"
 BUILT_IN = "floor"

@@ -11,16 +11,17 @@ import torch
 
 from augment import withhold
 from augment.cross_validation import LOCATOR as MATCHED_FIELD
+from augment.turbo.artifacts import model_file
 from swiftwrf import FieldModel, InputError, RssiModel, Spectra, load
+from swiftwrf.choices import fraction_key
 from swiftwrf.errors import with_article
 from swiftwrf.locate import RssiLocator
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import Plane
 from swiftwrf.rssi.base import RssiPredictor
 from swiftwrf.runtime.checkpoint import Saved, refusing
-from tasks.aoa.artifacts import model_file
 from tasks.aoa.experiment import measurements as spectra_of
-from tasks.aoa.options import AoaConfig, fraction_key
+from tasks.aoa.options import AoaConfig
 from tasks.claim import CONFIG, ENVIRONMENT, LOCATOR, MODEL
 from tasks.locate.experiment import measurements as rssi_of
 from tasks.locate.options import LocateConfig
