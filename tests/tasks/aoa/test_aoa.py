@@ -328,6 +328,7 @@ def pretended(monkeypatch, room, errors):
     return cross_validation.cross_validate(folds, n_synthetic=3000, seed=0).metrics
 
 
+@pytest.mark.usefixtures("without_annotation_checks")
 @pytest.mark.parametrize(
     ("factors", "recommended"),
     [((0.9, 0.8, 0.5), 3000), ((0.9, 1.1, 0.5), 0), ((0.9, 0.5, 0.8), 1000), ((1.2, 1.1, 1.3), 0)],
@@ -340,6 +341,7 @@ def test_further_positions_are_recommended_if_each_number_of_them_gains(monkeypa
     assert given["helps"] == (recommended > 0)
 
 
+@pytest.mark.usefixtures("without_annotation_checks")
 def test_the_interval_of_cross_validation_is_that_of_the_rule(monkeypatch, room):
     """Errors without any gain on average: the best number of each fold is chance, and other folds do not confirm it."""
     generator = np.random.default_rng(1)

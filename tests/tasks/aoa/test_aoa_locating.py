@@ -154,7 +154,7 @@ def test_the_report_shows_where_it_was(finished):
     html = (finished / "report.html").read_text()
     assert "Where was it?" in html
     assert f"Take {LOCATOR} on this data" in html
-    assert f"{LOCATOR}-mix0.6.safetensors" in html
+    assert f"tasks.predict {finished} SOURCE" in html.replace("<span>", "").replace("</span>", "")
     for kind in ("located", "posteriors"):
         assert list((finished / "figures").glob(f"{kind}-mix0.6-*.csv"))
 
