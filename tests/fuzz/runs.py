@@ -114,9 +114,9 @@ def _show_rssi(view: RssiView) -> None:
         view.coloured(selection)
         view.sentence(selection)
         view.describe(selection, x, y)
-    json.dumps([around(view.region), points(view.floor.position)], allow_nan=False)
-    if view.floor.plan is not None:
-        picture(Image.fromarray(view.floor.plan.pixels), view.floor.plan.corners)
+    json.dumps([around(view.region), points(view.position)], allow_nan=False)
+    if view.plan is not None:
+        picture(Image.fromarray(view.plan.pixels), view.plan.corners)
 
 
 # followed sources
