@@ -69,13 +69,11 @@ class CrossValidation(Step[Experiment]):
     subset: MeasuredSubset
     compared: tuple[str, ...]
 
+    title = "comparing field models"
+
     @property
     def name(self) -> str:
         return f"choice-{self.subset}"
-
-    @property
-    def title(self) -> str:
-        return "comparing field models"
 
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         measured, _ = experiment.withhold(self.subset)
@@ -157,13 +155,11 @@ class FoldLocating(Step[Experiment]):
     number: int
     room_file: str
 
+    title = "comparing estimators"
+
     @property
     def name(self) -> str:
         return f"located-fold{self.number}-{self.compared.subset}"
-
-    @property
-    def title(self) -> str:
-        return "comparing estimators"
 
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         measured, _ = experiment.withhold(self.compared.subset)

@@ -22,13 +22,11 @@ class Suggestion(Step[Experiment]):
 
     subset: MeasuredSubset
 
+    title = "choosing positions to measure next"
+
     @property
     def name(self) -> str:
         return f"suggestion-mix{self.subset.key}"
-
-    @property
-    def title(self) -> str:
-        return "choosing positions to measure next"
 
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         measured, _ = experiment.withhold(self.subset)
