@@ -52,11 +52,7 @@ class Workers:
     """
 
     def __init__(
-        self,
-        executor: Executor,
-        hold: Callable[[object], Any],
-        slots: Callable[[], int],
-        device: torch.device,
+        self, executor: Executor, hold: Callable[[object], Any], slots: Callable[[], int], device: torch.device
     ) -> None:
         self.hold, self.slots = hold, slots
         self.machines: set[str] = set()  # that have returned a result
@@ -189,6 +185,7 @@ def connected(address: str | None, device: torch.device) -> Iterator[Workers | N
         raise InputError("--scheduler needs the optional extra: pip install 'swiftwrf-tasks[cluster]'") from None
     for name in ("distributed", "distributed.client"):  # failures are reported here, in one sentence
         logging.getLogger(name).setLevel(logging.CRITICAL)
+    warnings.filterwarnings("ignore", message="Sending large graph")  # once an object, not once a call
 
     async def answered() -> None:  # a client of a server that never answers would wait without end
         security = Security().get_connection_args("client")
@@ -214,9 +211,7 @@ def connected(address: str | None, device: torch.device) -> Iterator[Workers | N
         raise error
 
     def hold(thing: object) -> Any:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Sending large graph")
-            return client.submit(bytes, cloudpickle.dumps(thing), pure=False)
+        return client.submit(bytes, cloudpickle.dumps(thing), pure=False)
 
     try:
         slots(InputError(f"the Dask scheduler at {address} has no workers; start some: `dask worker {address}`"))

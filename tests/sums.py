@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from dataclasses import dataclass
 
 import torch
@@ -52,6 +53,11 @@ class KillOnce(Sum):
             (folder / "killed").touch()
             os.kill(os.getpid(), signal.SIGKILL)
         return super().compute(context, folder)
+
+
+class Sleep(Sum):
+    def compute(self, context, folder):
+        time.sleep(60)
 
 
 class Exit(Sum):

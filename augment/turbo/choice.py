@@ -66,13 +66,11 @@ class CrossValidation(Step[Experiment]):
     subset: MeasuredSubset
     compared: tuple[str, ...]
 
+    title = "comparing field models"
+
     @property
     def name(self) -> str:
         return f"choice-{self.subset}"
-
-    @property
-    def title(self) -> str:
-        return "comparing field models"
 
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         measured, _ = experiment.withhold(self.subset)
@@ -163,13 +161,11 @@ class FoldLocating(Step[Experiment]):
     train: tuple[int, ...]
     test: tuple[int, ...]
 
+    title = "comparing estimators"
+
     @property
     def name(self) -> str:
         return f"located-fold{self.number}-{self.compared.subset}"
-
-    @property
-    def title(self) -> str:
-        return "comparing estimators"
 
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         measured, _ = experiment.withhold(self.compared.subset)

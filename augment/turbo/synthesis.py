@@ -69,13 +69,11 @@ class RoomSearch(Step[Experiment]):
     larger: MeasuredSubset | None = None
     start: RoomSearch | None = None
 
+    title = "finding the room"
+
     @property
     def name(self) -> str:
         return f"room-{self.subset}"
-
-    @property
-    def title(self) -> str:
-        return "finding the room"
 
     @property
     def file(self) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import subprocess
@@ -29,6 +28,7 @@ from tasks.environment import number_of_processes
 from tasks.preload import SERVED
 
 HERE = Path(__file__).parents[1]
+ENVIRONMENT = os.environ | {"PYTHONPATH": f"{HERE}{os.pathsep}{HERE.parent}"}
 if SERVED:
     set_forkserver_preload(["tasks.steps"])  # a process starts in a tenth of the time
 
@@ -119,9 +119,8 @@ with Run("aoa", sys.argv[1], "", AoaConfig(mix=(0.5,)), torch.device("cpu"), {},
 )
 def test_a_script_without_main_guard_runs_once_and_its_errors_are_those_that_happened(tmp_path, context, says):
     (tmp_path / "script.py").write_text(SCRIPT)
-    environment = os.environ | {"PYTHONPATH": f"{HERE}{os.pathsep}{HERE.parent}"}
     command = [sys.executable, str(tmp_path / "script.py"), str(tmp_path / "run"), context]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=False)
     assert done.stdout.count("once") == 1
     assert says in (done.stdout + done.stderr)
     assert "memory" not in done.stderr
@@ -155,60 +154,33 @@ def test_one_process_with_one_thread_and_on_a_gpu():
         number_of_processes(torch.device("cuda"), 2)
 
 
-def prepare(folder):
-    (folder / "data").mkdir()
-    write_spectra(simulated_room(n=26, grid=AngularGrid.hemisphere(8, 32)), folder / "data")
-
-
 def is_running(process):
     stat = Path(f"/proc/{process}/stat")
     return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
-def command(folder, threads, *more):
-    environment = os.environ | {"PYTHONPATH": str(HERE.parent), "OMP_NUM_THREADS": str(threads)}
-    arguments = [
-        "--mix",
-        "0.5",
-        "--synthesizer",
-        "gp",
-        "--data",
-        "data",
-        "--extra",
-        "0",
-        "--out",
-        f"run-{threads}",
-        *more,
-    ]
-    return subprocess.Popen([sys.executable, "-m", "tasks.aoa", *arguments], cwd=folder, env=environment)
+@pytest.mark.skipif(not Path("/proc").exists(), reason="reads the states of processes")
+def test_processes_end_with_a_run_that_is_killed(tmp_path):
+    code = "import sys; from sums import *; results(sys.argv[1], [Sum(1), Sleep(2)], 2)"
+    run = subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "run")], env=ENVIRONMENT)
+    file = tmp_path / "run.partial" / "steps" / "sum-1.json"
+    while not file.exists():
+        assert run.poll() is None
+        time.sleep(0.1)
+    run.kill()
+    run.wait()
+    process, deadline = json.loads(file.read_text())["value"]["process"], time.monotonic() + 30
+    while is_running(process) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not is_running(process)
 
 
 @pytest.mark.fuzz
 def test_the_command_gives_the_same_numbers_with_one_thread_and_with_two_processes(tmp_path):
-    prepare(tmp_path)
-    for threads in (1, 2):
-        assert command(tmp_path, threads).wait(timeout=600) == 0
-    one, two = (list(csv.DictReader((tmp_path / f"run-{threads}" / "errors.csv").open())) for threads in (1, 2))
+    write_spectra(simulated_room(n=26, grid=AngularGrid.hemisphere(8, 32)), tmp_path)
+    options = ["--mix", "0.5", "--synthesizer", "gp", "--extra", "0", "--data", "."]
+    command = [sys.executable, "-m", "tasks.aoa", *options, "--out"]
+    for threads in ("1", "2"):
+        subprocess.run([*command, threads], cwd=tmp_path, env=ENVIRONMENT | {"OMP_NUM_THREADS": threads}, check=True)
+    one, two = ((tmp_path / threads / "errors.csv").read_text() for threads in ("1", "2"))
     assert one == two
-    chosen = [
-        json.loads((tmp_path / f"run-{n}" / "metrics.json").read_text())["mixes"]["0.5"]["choice"] for n in (1, 2)
-    ]
-    assert chosen[0]["psnr_db"] == chosen[1]["psnr_db"]
-
-
-@pytest.mark.long
-def test_processes_end_with_a_run_that_is_killed(tmp_path):
-    prepare(tmp_path)
-    run = command(tmp_path, 2)
-    children: list[int] = []
-    while run.poll() is None and len(children) < 2:
-        time.sleep(0.1)
-        listed = subprocess.run(["pgrep", "-P", str(run.pid)], capture_output=True, text=True, check=False).stdout
-        children = [int(number) for number in listed.split()]
-    run.kill()
-    run.wait()
-    deadline = time.monotonic() + 30
-    while any(map(is_running, children)) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert children
-    assert not any(map(is_running, children))
