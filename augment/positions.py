@@ -18,7 +18,6 @@ MIN_RELATIVE_EXTENT = (
     1e-3  # extent of the region along an axis, relative to the largest, below which the axis is dropped
 )
 MIN_HULL_FRACTION = 1e-3  # smallest fraction of the convex hull that the region covers
-SPACING_NEIGHBOURS = 8  # nearest neighbours that define the typical spacing; the first alone is the step along a path
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +90,8 @@ def sample_positions(known: Tensor, n: int, seed: int) -> Tensor:
     axes = axes[extent > MIN_RELATIVE_EXTENT * extent[0].clamp_min(1e-12)]
     projected = ((known - centre) @ axes.T).numpy()
     places = known.unique(dim=0)
-    distance, _ = nearest(places, places, min(SPACING_NEIGHBOURS + 1, len(places)))  # each is its own nearest
+    # each is its own nearest, and the next may be the step along a path
+    distance, _ = nearest(places, places, min(9, len(places)))
     spacing = float(distance[:, -1].quantile(0.95))
     samples, tried = torch.empty(0, 3, dtype=torch.float64), 0
     while len(samples) < n:

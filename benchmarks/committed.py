@@ -6,9 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from swiftwrf.metrics import ChangeMetrics
+from swiftwrf.metrics import ChangeMetrics, ErrorSummary
 from tasks.aoa.condition import Condition, conditions_of, headline
-from tasks.metrics import AoaMetrics, ErrorSummary, MixMetrics
+from tasks.metrics import AoaMetrics, MixMetrics
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from importlib import import_module
+from typing import Any
 
 MAX_LENGTH = 300  # characters of a message: what came may be a megabyte long
 MAX_NAMES = 12  # names in a message
@@ -70,6 +72,23 @@ class FitError(RuntimeError):
 
     def __init__(self, message: object) -> None:
         super().__init__(one_line(str(message)))
+
+
+def optional_module(name: str, purpose: str, extra: str) -> Any:
+    """Return a module that an extra of this package installs.
+
+    Raises:
+        InputError: It is not installed; the message begins with the purpose.
+
+    Example:
+        >>> optional_module("nowhere", "maps of nowhere need nowhere", "maps")
+        Traceback (most recent call last):
+        swiftwrf.errors.InputError: maps of nowhere need nowhere; install it with pip install 'swiftwrf-tasks[maps]'
+    """
+    try:
+        return import_module(name)
+    except ImportError:
+        raise InputError(f"{purpose}; install it with pip install 'swiftwrf-tasks[{extra}]'") from None
 
 
 def with_article(noun: str) -> str:

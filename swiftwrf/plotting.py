@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from html import escape
 from typing import TYPE_CHECKING, Any
 
@@ -82,8 +82,10 @@ def polar_spectrum(
     azimuth = np.degrees(grid.azimuth_start + grid.azimuth_step * (np.arange(grid.n_azimuth + 1) - 0.5))
     elevation = np.degrees(grid.elevation_start + grid.elevation_step * (np.arange(grid.n_elevation + 1) - 0.5))
     zenith = (90 - elevation).clip(0, 90)
-    style = {"cmap": colours, "vmin": limits[0], "vmax": limits[1]}
-    mesh = ax.pcolormesh(np.radians(azimuth), zenith, _array(spectrum), rasterized=True, **style)
+    low, high = limits
+    mesh = ax.pcolormesh(
+        np.radians(azimuth), zenith, _array(spectrum), rasterized=True, cmap=colours, vmin=low, vmax=high
+    )
     ax.set(ylim=(0, 90), yticks=(30, 60, 90), yticklabels=("60°", "30°", "0°"))  # elevations
     ax.grid(alpha=0.4)
     if label is not None:
@@ -136,7 +138,9 @@ def corners_of(x: NDArray[Any], y: NDArray[Any], cell: float | None = None) -> t
     return float(x[0]) - dx, float(x[-1]) + dx, float(y[0]) - dy, float(y[-1]) + dy
 
 
-def plan_map(corners: Sequence[float], value: NDArray[Any], label: str, ax: Axes | None = None) -> Axes:
+def plan_map(
+    corners: tuple[float, float, float, float], value: NDArray[Any], label: str, ax: Axes | None = None
+) -> Axes:
     """Draw a map seen from above and to scale, and return the axes.
 
     Args:
@@ -150,7 +154,7 @@ def plan_map(corners: Sequence[float], value: NDArray[Any], label: str, ax: Axes
         'y [m]'
     """
     ax = plan_axes(ax)
-    image = ax.imshow(value, origin="lower", extent=tuple(corners))
+    image = ax.imshow(value, origin="lower", extent=corners)
     ax.figure.colorbar(image, ax=ax, label=label)
     return ax
 

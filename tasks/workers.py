@@ -184,7 +184,7 @@ def connected(address: str | None, device: torch.device) -> Iterator[Workers | N
     try:
         import cloudpickle
         from distributed import Client, KilledWorker, Security
-        from distributed.comm import connect
+        from distributed.comm.core import connect
     except ImportError:
         raise InputError("--scheduler needs the optional extra: pip install 'swiftwrf-tasks[cluster]'") from None
     for name in ("distributed", "distributed.client"):  # failures are reported here, in one sentence

@@ -22,7 +22,6 @@ LIGHT_SPEED = 299_792_458.0  # [m / s]
 MAX_ELEMENTS = 4096  # of an array: the co-array grows with their square
 MAX_BASIS_VALUES = 2**28  # of the co-array's basis functions on a grid: 2 GiB
 Side = Annotated[int, Ge(1), Le(MAX_ELEMENTS)]
-BATCH_SPECTRA, MAX_ELEMENT_PAIRS = 256, 2**24  # in double precision at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,9 +171,7 @@ class PlanarArray:
         snapshots = channel[:, None] if channel.dim() == 2 else channel
         make, functions = BEAMFORMERS[beamformer], basis(self, grid)
         spectrum = torch.empty(len(channel), *grid.shape)
-        for rows in torch.arange(len(channel)).split(
-            max(1, min(BATCH_SPECTRA, MAX_ELEMENT_PAIRS // len(self.element) ** 2))
-        ):
+        for rows in torch.arange(len(channel)).split(max(1, min(256, 2**24 // len(self.element) ** 2))):
             squared = make(
                 snapshots[rows], lambda matrix: (self.coefficients(matrix) @ functions).reshape(-1, *grid.shape)
             )

@@ -27,7 +27,7 @@ from swiftwrf.errors import InputError
 Method = Callable[[PlanarArray, Tensor], Tensor]  # (array, covariance (n, K, K)) to direction cosines (n, d)
 
 EDGE = 1e-9  # distance of direction cosines from the unit circle within which they are on it
-BATCH_ROWS, BATCH_VALUES = 256, 2**24  # covariances at a time, and basis values at a time
+BATCH_ROWS = 256  # covariances at a time
 
 
 def music(array: PlanarArray, channel: Tensor) -> Tensor:
@@ -148,7 +148,7 @@ def _maximum(array: PlanarArray, matrix: Tensor) -> Tensor:
     axis = torch.linspace(-1, 1, 2 * math.ceil(1 / step) + 1, dtype=torch.float64)
     grid = torch.cartesian_prod(*[axis] * lag.shape[1]).reshape(-1, lag.shape[1])
     grid = grid[grid.norm(dim=1) <= 1]
-    parts = grid.split(max(1, BATCH_VALUES // coefficient.shape[1]))
+    parts = grid.split(max(1, 2**24 // coefficient.shape[1]))
     start = grid[torch.cat([coefficient @ _basis(lag, part).T for part in parts], dim=1).argmax(dim=1)]
     found, value = _ascended(coefficient, lag, start, step)
     is_edge = found.norm(dim=-1) > 1 - EDGE

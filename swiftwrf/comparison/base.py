@@ -22,13 +22,7 @@ from swiftwrf.positions import frame, normalise
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.session import Descent, Model, Record, Schedule, Session, warm_cosine
-from swiftwrf.runtime.validation import (
-    Fraction,
-    NonNegativeInt,
-    PositiveFloat,
-    PositiveInt,
-    configuration,
-)
+from swiftwrf.runtime.validation import Fraction, NonNegativeInt, PositiveFloat, PositiveInt, configuration
 
 # sizes of networks, limited because a damaged file may claim any
 Count = Annotated[int, Ge(1), Le(2**24)]

@@ -49,7 +49,6 @@ from swiftwrf.runtime.session import State
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, PositiveInt, configuration
 
 SHAPES = ("log_scale", "quaternion", "opacity")  # of the Gaussians, in the order of the optimiser's first groups
-MIN_AXIS_DISTANCE = 1e-6  # relative to the distance; limits d azimuth near the axis
 FIRST_OPACITY = 0.1
 CUTOFF = 1e-4
 MIN_DISTANCE_M = 1e-3  # between a Gaussian and the array
@@ -199,7 +198,7 @@ def on_sphere(mean: Tensor, factor: Tensor, blur: Tensor) -> tuple[Tensor, Tenso
     """
     x, y, z = mean.unbind(-1)
     r, flat = mean.norm(dim=-1), torch.hypot(x, y)
-    rho = torch.maximum(flat, MIN_AXIS_DISTANCE * r)
+    rho = torch.maximum(flat, 1e-6 * r)  # limits d azimuth near the axis
     cosine = torch.where(flat > 0, x / rho, torch.ones_like(x))  # at the pole the azimuth is arbitrary
     sine, up = y / rho, torch.where(z < 0, -1.0, 1.0)
     turn = torch.stack([-sine, cosine, torch.zeros_like(z)], dim=-1) / rho[..., None]

@@ -15,20 +15,14 @@ from numpy.lib.format import read_array_header_1_0, read_array_header_2_0, read_
 from numpy.typing import NDArray
 from scipy.io import loadmat, whosmat
 
-from swiftwrf.errors import InputError
+from swiftwrf.errors import InputError, optional_module
 
 MAX_UNPACKED_BYTES, MAX_STORED_BYTES = 2**30, 2**33  # of arrays that are compressed, and not
 MAX_ROWS_BYTES = 2**36  # of an array that is read some rows at a time
 NUMPY, HDF5, MATLAB = (".npz",), (".h5", ".hdf5"), (".mat",)
 ARCHIVES = (*NUMPY, *HDF5, *MATLAB)  # suffixes of files that hold arrays by name
 MATLAB_HDF5 = (b"MATLAB 7.3", b"\x89HDF")  # first bytes of .mat files that are HDF5, of MATLAB and of Octave
-MATLAB_NUMBERS = {
-    "double",
-    "single",
-    "logical",
-    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
-}
-COMPLEX_FIELDS = (("real", "imag"), ("r", "i"))  # of the compounds that stand for complex numbers in HDF5
+MATLAB_NUMBERS = {"double", "single", "logical", *(f"{sign}int{8 * n}" for sign in ("", "u") for n in (1, 2, 4, 8))}
 NUMBERS = "biufc"  # kinds of NumPy types
 Arrays = dict[str, NDArray[Any]]
 Stored = tuple[int, Callable[[], NDArray[Any]]]  # bytes of an array in memory, and what reads it
@@ -71,11 +65,18 @@ def read_arrays(file: Path, needed: Sequence[str], optional: Sequence[str] = (),
 def _opened(file: Path, kinds: str = NUMBERS) -> Iterator[tuple[set[str], Callable[[str], Stored]]]:
     """Open an archive; yield the names of its arrays, and a function that finds an array by name."""
     if _is_hdf5(file):
-        with _hdf5(file) as content:
+        with optional_module("h5py", f"{file} is HDF5, which h5py reads", "formats").File(file, "r") as content:
             yield set(content), partial(_in_hdf5, content)
     elif file.suffix in MATLAB:
         variables = {name: (math.prod(shape) * 16, kind) for name, shape, kind in whosmat(file)}  # bytes if complex
-        yield set(variables), lambda name: _in_matlab(file, name, *variables[name])
+
+        def find(name: str) -> Stored:
+            size, kind = variables[name]
+            if kind not in MATLAB_NUMBERS:
+                raise ValueError(f"{name} holds {kind}, expected numbers")
+            return size, lambda: np.ascontiguousarray(loadmat(file, variable_names=[name])[name])
+
+        yield set(variables), find
     else:
         with zipfile.ZipFile(file) as archive:
             yield _stored(archive), partial(_in_npz, archive, kinds)
@@ -187,22 +188,6 @@ def _is_hdf5(file: Path) -> bool:
         return stream.read(len(MATLAB_HDF5[0])).startswith(MATLAB_HDF5)
 
 
-def _in_matlab(file: Path, name: str, size: int, kind: str) -> Stored:
-    if kind not in MATLAB_NUMBERS:
-        raise ValueError(f"{name} holds {kind}, expected numbers")
-    return size, lambda: np.ascontiguousarray(loadmat(file, variable_names=[name])[name])
-
-
-def _hdf5(file: Path) -> Any:
-    try:
-        import h5py
-    except ImportError:
-        raise InputError(
-            f"{file} is HDF5, which h5py reads; install it with pip install 'swiftwrf-tasks[formats]'"
-        ) from None
-    return h5py.File(file, "r")
-
-
 def _in_hdf5(content: Any, name: str) -> Stored:
     """Find a dataset of an HDF5 file. Links to other files are refused, because HDF5 follows them silently."""
     import h5py
@@ -224,7 +209,7 @@ def _number_type(dtype: np.dtype[Any]) -> np.dtype[Any] | None:
     """Return the type of numbers in HDF5: complex for compounds of real and imaginary parts, None for anything else."""
     if dtype.kind in NUMBERS:
         return dtype
-    if dtype.names not in COMPLEX_FIELDS or dtype.itemsize not in (8, 16):
+    if dtype.names not in (("real", "imag"), ("r", "i")) or dtype.itemsize not in (8, 16):
         return None
     part = dtype[0]
     is_complex = part == dtype[1] and part.kind == "f" and 2 * part.itemsize == dtype.itemsize

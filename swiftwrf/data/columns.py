@@ -20,7 +20,6 @@ from torch import Tensor
 from swiftwrf.errors import InputError, listed
 
 Floats = NDArray[np.float64]
-EMPTY_CELLS = {"", "nan", "na", "n/a", "null", "none", "-"}
 END = "pos|position|coord|tx|rx|transmitter|receiver"
 AXIS = f"(?:(?:{END})_)?{{0}}(?:_(?:{END}))?(?:_m)?"
 ROLES = {  # names of columns, in lower case with underscores
@@ -45,7 +44,6 @@ NOT_DETECTED_DBM = -100.0  # the usual filler
 KNOWN_FILLERS = (NOT_DETECTED_DBM, -200.0, 0.0, 100.0, 127.0)
 MIN_RSSI_DBM, MAX_RSSI_DBM = -150.0, 30.0
 # a frequent value from -1 dBm on is a filler, unless values within 10 dB are as frequent
-STRONG_DBM, STRONG_GAP_DB = -1.0, 10.0
 N_NEIGHBOURS_DB = 5  # of the next stronger values that a filler at the lower edge is compared with
 MIN_REPEATS = 5  # cells with a filler that is not known
 MIN_VALUES = 5  # different values that are left
@@ -126,7 +124,7 @@ def parsed(column: pd.Series) -> tuple[Floats, NDArray[np.bool_]]:
         return column.to_numpy(np.float64), np.zeros(len(column), dtype=bool)
     cells = column.astype(str).str.strip()
     values = pd.to_numeric(cells, errors="coerce").to_numpy(np.float64)
-    empty = column.isna().to_numpy() | cells.str.lower().isin(EMPTY_CELLS).to_numpy()
+    empty = column.isna().to_numpy() | cells.str.lower().isin({"", "nan", "na", "n/a", "null", "none", "-"}).to_numpy()
     return np.where(empty, np.nan, values), np.isnan(values) & ~empty
 
 
@@ -187,7 +185,7 @@ def find_fillers(rssi: Floats) -> list[float]:
         is_filler |= others & (count >= MIN_REPEATS)
     found: list[float] = value[is_filler].tolist()
     value, count = value[~impossible], count[~impossible]
-    while len(value) and value[-1] >= STRONG_DBM and _is_frequent(value, count, len(value) - 1, STRONG_GAP_DB):
+    while len(value) and value[-1] >= -1.0 and _is_frequent(value, count, len(value) - 1, 10.0):
         found.append(float(value[-1]))
         value, count = value[:-1], count[:-1]
     usual = np.flatnonzero(value == NOT_DETECTED_DBM)

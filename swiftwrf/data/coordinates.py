@@ -17,14 +17,8 @@ Floats = NDArray[np.float64]
 Coordinates = Literal["degrees", "metres"]
 FAR_RATIO = 10.0  # distance of the origin relative to the distance between positions, or to their extent
 MAX_EXTENT_DEG = 2.0  # of positions that are recognised as degrees
-NO_FIX = (
-    0.0,
-    -1.0,
-    999.0,
-    -999.0,
-    9999.0,
-    -9999.0,
-)  # of x and y, that receivers of satellites write without a position
+# x and y that receivers of satellites write without a position
+NO_FIX = (0.0, -1.0, 999.0, -999.0, 9999.0, -9999.0)
 STOREY_M = 4.0  # height of a floor where heights are missing or count from the floor
 MIN_STOREY_M = 1.5  # difference of the heights of two floors
 

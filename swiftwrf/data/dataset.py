@@ -15,7 +15,7 @@ from torch import Tensor
 
 from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
 from swiftwrf.data.splits import choose_split
-from swiftwrf.errors import CONTENT_ERRORS, InputError
+from swiftwrf.errors import CONTENT_ERRORS, InputError, optional_module
 from swiftwrf.plotting import Displayed, extent
 from swiftwrf.positions import check_positions, to_tensor
 from swiftwrf.runtime.validation import NonNegativeInt, checked
@@ -52,11 +52,10 @@ class Labelled(ABC):
         Raises:
             InputError: xarray is not installed.
         """
-        try:
-            import xarray
-        except ModuleNotFoundError:
-            raise InputError("to_xarray needs xarray; install it with pip install 'swiftwrf-tasks[xarray]'") from None
-        return xarray.Dataset(self.variables(), self.coordinates())
+        found: xarray.Dataset = optional_module("xarray", "to_xarray needs xarray", "xarray").Dataset(
+            self.variables(), self.coordinates()
+        )
+        return found
 
 
 def position_coordinates(position: NDArray[np.float64], origin: GeodeticOrigin | None = None) -> Arrays:

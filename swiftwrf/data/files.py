@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from swiftwrf.choices import CARRIERS_HZ
 from swiftwrf.data.archives import MAX_UNPACKED_BYTES, refusing_broken
 from swiftwrf.data.columns import column_of_numbers
-from swiftwrf.errors import InputError
+from swiftwrf.errors import InputError, optional_module
 
 SUFFIXES = (".csv", ".parquet")  # of tables
 SEPARATORS = ",;\t"
@@ -176,18 +176,14 @@ def read_table(file: Path) -> pd.DataFrame:
     """
     if file.suffix.lower() != ".parquet":
         return table_of(file, read_text(file).split("\n", lines_before_header(file))[-1])
-    try:
-        from pyarrow import parquet
-    except ImportError:
-        raise InputError(
-            f"{file} is Parquet, which pyarrow reads; install it with pip install 'swiftwrf-tasks[formats]'"
-        ) from None
+    parquet = optional_module("pyarrow.parquet", f"{file} is Parquet, which pyarrow reads", "formats")
     with refusing_broken(file, "a Parquet file"):
         content = parquet.ParquetFile(file)
         groups = range(content.metadata.num_row_groups)
         if (total := sum(content.metadata.row_group(i).total_byte_size for i in groups)) > MAX_UNPACKED_BYTES:
             raise InputError(f"it unpacks to {total} bytes; at most {MAX_UNPACKED_BYTES} are read, so split the data")
-        return content.read().to_pandas()
+        table: pd.DataFrame = content.read().to_pandas()
+        return table
 
 
 def table_of(label: object, text: str) -> pd.DataFrame:

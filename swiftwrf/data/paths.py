@@ -100,11 +100,7 @@ class PropagationPaths:
         return array.channel(direction, self.gain, self.owner, len(self.count))
 
     def spectra(
-        self,
-        name: str,
-        array: PlanarArray | None = None,
-        grid: AngularGrid | None = None,
-        **details: Any,
+        self, name: str, array: PlanarArray | None = None, grid: AngularGrid | None = None, **details: Any
     ) -> Spectra:
         """Return the spectra of a level array at each receiver, which folds paths from below to the upper half space.
 

@@ -99,7 +99,8 @@ class Rssi(PositionedData):
         count = rssi.shape[1]
         default = (f"receiver{number}" for number in range(1, count + 1))
         names = tuple(default if receiver_names is None else receiver_names)
-        if isinstance(receiver_names, str) or not all(map(_is_name, names)):
+        usable = (isinstance(label, str) and label.strip() and not NO_NAME.search(label) for label in names)
+        if isinstance(receiver_names, str) or not all(usable):
             raise InputError(
                 f"{name}: receiver_names must be a list of texts, none empty or with line breaks, got {receiver_names!r}"
             )
@@ -145,13 +146,11 @@ class Rssi(PositionedData):
 
         Args:
             frame: Columns of positions [m] and RSSI [dBm], recognised by their names as in docs/formats.md.
-            columns: Names of columns that are not recognised, by role: x, y, z, longitude, latitude, floor,
-                time, session, receiver, rssi.
+            columns: Names of columns that are not recognised, by role, as in `load_rssi`.
             filler: Values that stand for not detected, [] for none. Defaults to those that are recognised.
             coordinates: "degrees" or "metres". Defaults to the unit that is recognised.
             offset_by: Column with the groups of rows between which RSSI has constant offsets.
-            transmitter: Columns with the position of the second end of the link where both ends move: x, y and optionally z,
-                or the one column with names of its positions. Defaults to those recognised.
+            transmitter: Columns with the position of the second end of the link where both ends move, as in `load_rssi`.
             pool_by: Radios of one access point to pool, as in `load_rssi`.
             receiver_position: Positions [m] by name of the receiver; those of others are unknown.
             name: Name of the data set.
@@ -273,7 +272,13 @@ class Rssi(PositionedData):
         if list(asked) == ["all"] and self.receiver_moves:
             return self
         if list(asked) == ["all"]:
-            return self._detected_enough()
+            enough = self.detected.sum(dim=0) >= MIN_TRAINING
+            if not bool(enough.any()):
+                raise InputError(f"no receiver of {self.name} detected the transmitter in {MIN_TRAINING} rows")
+            found = self.columns(enough.nonzero()[:, 0].tolist())
+            rare = [name for name in self.receiver_names if name not in found.receiver_names]
+            note = f"receivers that detected fewer than {MIN_TRAINING} rows are left out: {listed(rare)}"
+            return replace(found, notes=(*found.notes, note)) if rare else found
         columns = [receiver_row(self.receiver_names, name, self.name) for name in asked]
         if not columns:
             raise InputError("no receiver is asked for; give names, numbers from 1, or all")
@@ -287,17 +292,6 @@ class Rssi(PositionedData):
                     f"at least {MIN_TRAINING} are needed"
                 )
         return self.columns(columns)
-
-    def _detected_enough(self) -> Rssi:
-        enough = self.detected.sum(dim=0) >= MIN_TRAINING
-        if not bool(enough.any()):
-            raise InputError(f"no receiver of {self.name} detected the transmitter in {MIN_TRAINING} rows")
-        found = self.columns(enough.nonzero()[:, 0].tolist())
-        rare = [name for name, is_enough in zip(self.receiver_names, enough.tolist(), strict=True) if not is_enough]
-        if not rare:
-            return found
-        note = f"receivers that detected fewer than {MIN_TRAINING} rows are left out: {listed(rare)}"
-        return replace(found, notes=(*found.notes, note))
 
     def columns(self, columns: list[int]) -> Rssi:
         """Return the data of the receivers of these columns, in this order."""
@@ -406,7 +400,3 @@ def receiver_row(names: Sequence[str], asked: str, owner: str) -> int:
         return int(asked) - 1
     known = ", ".join(f"{number} {name}" for number, name in enumerate(names, start=1))
     raise InputError(f"{owner} has no receiver {asked!r}; there are {known}")
-
-
-def _is_name(name: object) -> bool:
-    return isinstance(name, str) and bool(name.strip()) and not NO_NAME.search(name)

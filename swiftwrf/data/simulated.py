@@ -44,7 +44,6 @@ CHANNELS_HZ = (2.402e9, 2.426e9, 2.480e9)  # of BLE advertisements; a receiver d
 TRANSMIT_DBM = -8.0
 PACKET_NOISE_DB = 2.0
 SENSITIVITY_DBM = -97.0
-MISSED_SHARE = 0.1  # of packets, lost to scanning gaps and collisions
 
 
 class Rays(NamedTuple):
@@ -128,7 +127,11 @@ class ShoeboxRoom:
         for name, position in (("transmitter", transmitter), ("receiver", receiver)):
             if not bool(((position > 0) & (position < size)).all()):
                 raise InputError(f"a {name} stands outside the room of {self.size} m")
-        rooms = torch.tensor(_mirrored_rooms(), dtype=torch.float64)  # (25, 3)
+        # mirrored rooms (25, 3) that at most two reflections reach, the room itself first
+        steps = torch.arange(-MAX_ORDER, MAX_ORDER + 1, dtype=torch.float64)
+        rooms = torch.cartesian_prod(steps, steps, steps)
+        rooms = rooms[rooms.abs().sum(dim=1) <= MAX_ORDER]
+        rooms = rooms[rooms.abs().sum(dim=1).argsort(stable=True)]
         inside = torch.where(rooms % 2 == 0, transmitter[:, None], size - transmitter[:, None])
         ray = rooms * size + inside - receiver[:, None]  # (n, 25, 3)
         length = ray.norm(dim=-1)
@@ -147,7 +150,8 @@ class ShoeboxRoom:
             at = (wall - receiver[:, None, axis]) / ray[..., axis]
             crossing.append(torch.where(count.abs() > k, at, torch.ones_like(at)))
         parameter = torch.stack(crossing, dim=-1).sort(dim=-1).values  # corners along the line, 0 to 1
-        corner = _fold(receiver[:, None, None] + parameter[..., None] * ray[:, :, None], size)
+        unfolded = torch.remainder(receiver[:, None, None] + parameter[..., None] * ray[:, :, None], 2 * size)
+        corner = torch.minimum(unfolded, 2 * size - unfolded)  # folded back into the room
         start, step = corner[:, :, :-1], corner.diff(dim=2)
         step = torch.where(step == 0, torch.full_like(step, 1e-300), step)
         segments = [(s.contiguous(), d.contiguous()) for s, d in zip(start.unbind(-1), step.unbind(-1), strict=True)]
@@ -155,20 +159,6 @@ class ShoeboxRoom:
         for low, high in self.boxes:
             blocked |= _hits(segments, low, high).any(dim=-1)
         return blocked
-
-
-def _mirrored_rooms() -> list[tuple[int, ...]]:
-    """Return the mirrored rooms that at most two reflections reach, the room itself first."""
-    steps = range(-MAX_ORDER, MAX_ORDER + 1)
-    return sorted(
-        (r for r in itertools.product(steps, repeat=3) if sum(map(abs, r)) <= MAX_ORDER), key=lambda r: sum(map(abs, r))
-    )
-
-
-def _fold(point: Tensor, size: Tensor) -> Tensor:
-    """Return points of the unfolded rooms, folded back into the room."""
-    within = torch.remainder(point, 2 * size)
-    return torch.minimum(within, 2 * size - within)
 
 
 def _hits(segments: Sequence[tuple[Tensor, Tensor]], low: Point, high: Point) -> Tensor:
@@ -285,7 +275,7 @@ def rssi_room(n: PositiveInt = 600, seed: NonNegativeInt = 0) -> Rssi:
     channel = torch.randint(len(CHANNELS_HZ), (n, 12, 1), generator=generator)
     noise = PACKET_NOISE_DB * torch.randn(n, 12, dtype=torch.float64, generator=generator)
     rssi = (TRANSMIT_DBM + gain_db + power.gather(2, channel)[..., 0] + noise).round()
-    missed = (torch.rand(n, 12, generator=generator) < MISSED_SHARE) | (rssi < SENSITIVITY_DBM)
+    missed = (torch.rand(n, 12, generator=generator) < 0.1) | (rssi < SENSITIVITY_DBM)
     return Rssi(
         torch.where(missed, torch.nan, rssi),
         position,

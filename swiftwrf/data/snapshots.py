@@ -19,8 +19,6 @@ from swiftwrf.errors import InputError, ranges
 from swiftwrf.positions import to_tensor
 from swiftwrf.runtime.validation import checked
 
-SPACING_WAVELENGTHS = (0.01, 20.0)  # of neighbouring elements: beyond, positions are in another unit than metres
-
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
 class Snapshots(PositionedData):
@@ -157,7 +155,7 @@ def check_spacing(file: Path, array: PlanarArray) -> None:
         raise InputError(
             f"{file} describes an array of one element, which resolves no directions; at least 2 are needed"
         )
-    apart, (low, high) = array.spacing_wavelengths, SPACING_WAVELENGTHS
+    apart, (low, high) = array.spacing_wavelengths, (0.01, 20.0)  # beyond, the unit is another one
     if not low <= apart <= high:
         raise InputError(
             f"{file}: neighbouring elements are {apart * array.wavelength:.4g} m, {apart:.3g} wavelengths "

@@ -28,10 +28,7 @@ from swiftwrf.runtime.validation import checked
 
 GRID = AngularGrid.hemisphere(90, 360)  # of spectra that are computed
 DIRECTION = ("elevation", "azimuth")  # names of the dimensions of a spectrum
-MAGNITUDE_TOLERANCE = 1e-6  # beyond [0, 1], from rounding
-MAX_LABEL = (
-    torch.tensor([math.tau, math.pi / 2], dtype=torch.float64) + 1e-6
-)  # azimuth and elevation [rad], with rounding
+MAX_LABEL = torch.tensor([math.tau, math.pi / 2], dtype=torch.float64) + 1e-6  # azimuth and elevation [rad], rounded
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -260,7 +257,7 @@ def _checked_store(spectra: Numbers) -> Store:
     is_bytes = getattr(spectra, "dtype", None) in (torch.uint8, "uint8")
     values = to_tensor("spectra", spectra, torch.uint8 if is_bytes else torch.float32, (None, None, None))
     low, high = (0.0, 1.0) if is_bytes or not values.numel() else (float(end) for end in values.aminmax())
-    if low < -MAGNITUDE_TOLERANCE or high > 1 + MAGNITUDE_TOLERANCE:
+    if low < -1e-6 or high > 1 + 1e-6:  # from rounding
         raise InputError(f"spectra are magnitudes in [0, 1], got {low:.4g} to {high:.4g}; divide them by the largest")
     return Store(values if is_bytes else values.clamp(0, 1))
 

@@ -174,11 +174,7 @@ def block_split(position: Tensor, seed: int) -> tuple[Tensor, Tensor]:
 
 @checked
 def folds(
-    position: Tensor,
-    validation: Validation,
-    seed: int,
-    number: PositiveInt = FOLDS,
-    session: Tensor | None = None,
+    position: Tensor, validation: Validation, seed: int, number: PositiveInt = FOLDS, session: Tensor | None = None
 ) -> Tensor:
     """Return the fold of each training position, counted from 0. Rows at one position, or of one session, share a fold.
 

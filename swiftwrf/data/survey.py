@@ -50,8 +50,6 @@ from swiftwrf.positions import cells, check_positions
 
 Floats = NDArray[np.float64]
 MAX_VALUES = 2**27  # rows x receivers
-MAX_GROUPS, MIN_GROUP_ROWS = 30, 10  # of a column that may distinguish devices or channels
-MAX_PLACES = 500  # positions of the second end that stay apart: each has a column of RSSI
 MARKS = {"tx": "transmitter", "transmitter": "transmitter", "rx": "receiver", "receiver": "receiver"}  # words in names
 MAC = "mac"  # pools radios by the first five bytes of their addresses
 ADDRESS = re.compile(r"((?:[0-9a-f]{2}[:-]?){4}[0-9a-f]{2})[:-]?[0-9a-f]{2}", re.IGNORECASE)
@@ -92,7 +90,11 @@ def read_survey(
     table = table.set_axis([str(name).strip() for name in table.columns], axis=1).reset_index(drop=True)
     if not len(table) or not table.columns.is_unique:
         raise InputError(f"{label} must have rows, and a name of its own for each column")
-    asked, end = _second_end(label, table, columns or {}, transmitter)
+    asked, end = dict(columns or {}), dict[str, str]()
+    if len(transmitter) == 1:
+        asked["receiver"] = transmitter[0]
+    elif transmitter or not {"x", "y"} & asked.keys():
+        end = transmitter_columns(label, table, transmitter)
     roles = find_roles(label, table, asked, end.values())
     coordinate, notes = _coordinates(label, table, roles)
     if end:
@@ -127,14 +129,19 @@ def read_survey(
         raise InputError(f"{label} has no row with a position; {missing[0]}")
     row = np.flatnonzero(~omitted)
     check_positions(coordinate[row].reshape(-1, 3), f"positions of {label}")
-    position, origin = _in_metres(label, roles, coordinate[row].reshape(-1, 3), coordinates)
+    position, origin = coordinate[row].reshape(-1, 3), None
+    both = roles.get("x") or roles["longitude"], roles.get("y") or roles["latitude"]
+    named = "longitude" in roles and "latitude" in roles
+    if (degrees := degrees_in(label, both, position[:, :2], named, coordinates)) is not None:
+        origin = GeodeticOrigin.amid(degrees)
+        position = np.column_stack([origin.to_metres(degrees), position[:, 2]])
     position = position.reshape(len(row), -1)
     floors = None
     if "floor" in roles:
         name = text_of(table[roles["floor"]]).to_numpy()[source.max(axis=1)[row]]
         floors = floors_of(name.tolist(), position[:, 2])
     if origin is not None:
-        x, y = (roles.get(role) or roles[GEODETIC[role]] for role in "xy")
+        x, y = both
         if np.abs(coordinate[row, 1]).max() > 90:  # only a longitude does
             x, y = y, x
         notes.append(f"longitude {x} and latitude {y} are projected to local metres about {origin}")
@@ -152,7 +159,9 @@ def read_survey(
     sessions = None if session is None else session.to_numpy()[origins].tolist()
     time, found = seconds(table[roles["time"]].iloc[origins]) if "time" in roles else (None, [])
     notes += found
-    labels = tuple(name for name in (*unused, roles.get("session")) if name and _distinguishes(table[name]))
+    # columns with few different values, each of them in several rows
+    times = {name: text_of(table[name]).value_counts() for name in (*unused, roles.get("session")) if name}
+    labels = tuple(name for name, count in times.items() if 2 <= len(count) <= 30 and int(count.min()) >= 10)
     if labels and not offset_by:
         notes.append(f"rows differ in {listed(labels)}; tasks.inspect tests whether its values have constant offsets")
     moves = bool(end or transmitter)
@@ -190,17 +199,6 @@ def _pools(label: object, table: pd.DataFrame, roles: dict[str, str], names: lis
     return [pool[name] or name for name in names]
 
 
-def _second_end(
-    label: object, table: pd.DataFrame, asked: Mapping[str, str], transmitter: Sequence[str]
-) -> tuple[Mapping[str, str], dict[str, str]]:
-    """Return the columns that the user names, by role, and those of the second end by x, y and z, if both ends move."""
-    if len(transmitter) == 1:
-        return {**asked, "receiver": transmitter[0]}, {}
-    if not transmitter and {"x", "y"} & asked.keys():
-        return asked, {}
-    return asked, transmitter_columns(label, table, transmitter)
-
-
 def _coordinates(label: object, table: pd.DataFrame, roles: dict[str, str]) -> tuple[Floats, list[str]]:
     """Return the coordinates of the rows (n, 3) as they are, nan where empty, and notes on heights that are missing."""
     x, y = (column_of_numbers(label, table, roles.get(role) or roles[GEODETIC[role]]) for role in "xy")
@@ -220,18 +218,6 @@ def _coordinates(label: object, table: pd.DataFrame, roles: dict[str, str]) -> t
         z = np.zeros(len(table))
         notes.append("there is no height, so z is 0 m everywhere")
     return np.stack([x, y, z], axis=1), notes
-
-
-def _in_metres(
-    label: object, roles: dict[str, str], coordinate: Floats, asked: Coordinates | None
-) -> tuple[Floats, GeodeticOrigin | None]:
-    """Return positions (n, 3) [m], and their origin if they were in degrees."""
-    names = roles.get("x") or roles["longitude"], roles.get("y") or roles["latitude"]
-    degrees = degrees_in(label, names, coordinate[:, :2], "longitude" in roles and "latitude" in roles, asked)
-    if degrees is None:
-        return coordinate, None
-    origin = GeodeticOrigin.amid(degrees)
-    return np.column_stack([origin.to_metres(degrees), coordinate[:, 2]]), origin
 
 
 def _long(
@@ -282,12 +268,6 @@ def _wide(
         )
     _check_size(label, len(table), len(names))
     return names, np.stack([column_of_numbers(label, table, name) for name in names], axis=1)
-
-
-def _distinguishes(column: pd.Series) -> bool:
-    """Return True if a column has few different values, each of them in several rows."""
-    times = text_of(column).value_counts()
-    return 2 <= len(times) <= MAX_GROUPS and int(times.min()) >= MIN_GROUP_ROWS
 
 
 def _check_size(label: object, rows: int, receivers: int) -> None:
@@ -354,7 +334,7 @@ def as_receivers(label: object, rssi: Floats, ends: Floats) -> tuple[list[str], 
     own, other = ends[:, :3], ends[:, 3:]
     if len(np.unique(own, axis=0)) < len(np.unique(other, axis=0)):
         own, other = other, own
-    place, edge = cells(torch.from_numpy(other), MAX_PLACES)
+    place, edge = cells(torch.from_numpy(other), 500)  # each has a column of RSSI
     n = int(place.max()) + 1
     count = np.bincount(place.numpy(), minlength=n)
     position = np.stack([np.bincount(place.numpy(), axis, minlength=n) / count for axis in other.T], axis=1)

@@ -26,8 +26,6 @@ from swiftwrf.data.store import write_npy
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.durable import replacing, write_bytes, write_text
 
-DEEPMIMO_PAIR = "t000_tx000_r001"  # transmitter and receivers, as file names contain them
-
 
 def write_spectra(data: Spectra, folder: Path) -> None:
     """Write gateway_info.yml, tx_pos.csv or rx_pos.csv, spectrum.npz and the splits.
@@ -156,7 +154,7 @@ def write_deepmimo(paths: PropagationPaths, folder: Path) -> None:
     empty = torch.full((len(paths.count), int(paths.count.max())), torch.nan, dtype=torch.float64)
     arrays = {name: empty.index_put(place, values.double()) for name, values in columns.items()}
     for name, values in (arrays | {"rx_pos": paths.receiver, "tx_pos": transmitter}).items():
-        with replacing(folder / f"{name}_{DEEPMIMO_PAIR}.npz") as temporary, temporary.open("wb") as stream:
+        with replacing(folder / f"{name}_{'t000_tx000_r001'}.npz") as temporary, temporary.open("wb") as stream:
             np.savez_compressed(stream, **{name: values.numpy()})
     params = {"rt_params": {"frequency": paths.frequency_hz, "raytracer_name": "SwiftWRF"}}
     write_text(folder / "params.json", json.dumps(params, indent=1) + "\n")

@@ -20,7 +20,7 @@ import pandas as pd
 
 from swiftwrf.data import Rssi, Spectra, load_rssi, load_spectra
 from swiftwrf.datasets import conversions
-from swiftwrf.errors import InputError
+from swiftwrf.errors import InputError, optional_module
 from swiftwrf.runtime.durable import cache_folder, refusing_unwritable, rename, write_text
 
 FOLDER = "SWIFTWRF_DATA"  # environment variable with a folder of converted data sets
@@ -217,12 +217,7 @@ def _convert(name: str, data: DataSet, folder: Path) -> None:
 def _download(name: str, data: DataSet) -> Path:
     """Return the folder of the raw files."""
     folder = cache_folder() / "datasets" / "raw" / name
-    try:
-        import pooch
-    except ModuleNotFoundError:
-        raise InputError(
-            f"data set {name} is downloaded by pooch; install it with pip install 'swiftwrf-tasks[data]'"
-        ) from None
+    pooch = optional_module("pooch", f"data set {name} is downloaded by pooch", "data")
     pooch.get_logger().setLevel("WARNING")
     source = pooch.create(folder, data.url)
     source.load_registry(data.checksums)

@@ -35,12 +35,7 @@ PICKLED = {  # names in the pickled tables of NeWRF; others are refused
     ("pandas.core.internals.managers", "BlockManager"),
 }
 S23_TRAINING = 160  # spectra before the block of the path that tests
-WEAKEST_DBM = -99.9  # in place of received values that stand for not detected in the layout
-TAG_HEIGHT_M = 1.3
-KOLAK_CELL_M = 1.5
-KOLAK_TEST_CELLS = ((0, 4), (2, 2), (2, 4), (3, 3), (4, 4))
 LORA_GATEWAY = (-21.7788416255599, -43.373362355391, 932.0)  # latitude, longitude [deg], altitude [m]
-METRES_PER_DEGREE = (110_574.0, 111_320.0)  # of latitude, and of longitude at the equator
 WIFI_GRID_M = 0.6
 # x and y in cells of the grid, and the columns of their RSSI: AP1 is never received in the corridor
 WIFI_ACCESS_POINTS: dict[str, tuple[list[float], list[float], list[int]]] = {
@@ -113,7 +108,7 @@ def tetam_tracks(raw: Path, out: Path) -> None:
     position = events[["x", "y", "z"]].mean()
     rssi = packets.groupby(["track", "event", "receiver"])["rssi"].median().unstack()
     rssi = rssi.reindex(index=position.index, columns=list(receivers))
-    rssi = rssi.mask(rssi <= NOT_DETECTED_DBM, WEAKEST_DBM)
+    rssi = rssi.mask(rssi <= NOT_DETECTED_DBM, -99.9)  # was received
     track = position.index.get_level_values("track")
     x = position["x"].to_numpy()
     splits = {
@@ -132,15 +127,15 @@ def kolak(raw: Path, out: Path) -> None:
     runs = [pd.read_csv(raw / file) for file in files]
     table = pd.concat(runs)
     position = table[["x", "y"]].to_numpy().round(4)
-    cell = [tuple(row) for row in np.floor(position / KOLAK_CELL_M).astype(int).tolist()]
+    cell = [tuple(row) for row in np.floor(position / 1.5).astype(int).tolist()]
     splits = {
         "random": _random(len(table), round(0.2 * len(table))),
         "spatial": _parts(np.arange(len(table)) >= len(runs[0])),
-        "block": _parts(np.array([place in KOLAK_TEST_CELLS for place in cell])),
+        "block": _parts(np.array([place in ((0, 4), (2, 2), (2, 4), (3, 3), (4, 4)) for place in cell])),
     }
     rssi = table[[f"rssi_{number}" for number in anchors["id"]]].to_numpy().round(3)
     names = [f"anchor{number}" for number in anchors["id"]]
-    position = np.column_stack([position, np.full(len(table), TAG_HEIGHT_M)])
+    position = np.column_stack([position, np.full(len(table), 1.3)])  # height of the tag
     _write_rssi(rssi, position, names, anchors[["x", "y", "z"]].to_numpy(), splits, out)
 
 
@@ -167,7 +162,7 @@ def lora(raw: Path, out: Path) -> None:
     walks = ("campus_walking_by_foot", "campus_by_car")
     parts = [pd.read_csv(next(raw.glob(f"{walk}/*_Full-Collected-data.csv"))) for walk in walks]
     table = pd.concat(parts)
-    north, east = METRES_PER_DEGREE
+    north, east = 110_574.0, 111_320.0  # of latitude, and of longitude at the equator
     survey = pd.DataFrame(
         {
             "x": ((table["Longitude"] - longitude) * east * np.cos(np.deg2rad(latitude))).round(2),

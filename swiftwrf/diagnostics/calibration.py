@@ -72,9 +72,7 @@ class Calibration:
         """Return the snapshots with corrected phases of the elements and orientation of the array."""
         correction = unit_phasor(-self.phase).to(torch.complex64)
         return replace(
-            snapshots,
-            channel=snapshots.channel * correction,
-            rotation=snapshots.rotation @ _matrix(self.turn),
+            snapshots, channel=snapshots.channel * correction, rotation=snapshots.rotation @ _matrix(self.turn)
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -199,15 +197,15 @@ class _Problem:
         line = torch.arange(-MAX_TURN, MAX_TURN + step / 2, step, dtype=torch.float64)
         turns = torch.cartesian_prod(line, line, line)
         turns = turns[turns.norm(dim=1) <= MAX_TURN + 1e-9]
-        _, phase, turn = max(((*few._phases(turn), turn) for turn in turns), key=lambda found: found[0])
-        return _Found(phase, turn)
-
-    def _phases(self, turn: Tensor) -> tuple[float, Tensor]:
-        """Return the power along the line of sight at this rotation, and the phases (K,) that maximise it."""
-        steering = self._steering(turn)
-        total = torch.einsum("nab,na,nb->ab", self.covariance, steering.conj(), steering)
-        value, vector = torch.linalg.eigh(total)
-        return float(value[-1]), vector[:, -1].angle()
+        best, found = -math.inf, None
+        for turn in turns:
+            steering = few._steering(turn)
+            total = torch.einsum("nab,na,nb->ab", few.covariance, steering.conj(), steering)
+            power, vector = torch.linalg.eigh(total)  # the phases that maximise the power along the line of sight
+            if float(power[-1]) > best:
+                best, found = float(power[-1]), _Found(vector[:, -1].angle(), turn)
+        assert found is not None
+        return found
 
     def descend(self, found: _Found) -> _Found:
         """Minimise the residual phases by Gauss-Newton steps, reweighted in each."""

@@ -155,7 +155,13 @@ class _Frame:
 
     def peaks(self, spectra: Tensor, grid: AngularGrid) -> Tensor:
         """Return the directions of the largest magnitude and of others of nearly equal height, (n, P, 3)."""
-        return self.folded(_peaks(spectra, grid))
+        padded = functional.pad(functional.pad(spectra, (1, 1), mode="circular"), (0, 0, 1, 1), value=-math.inf)
+        highest = spectra.amax(dim=(1, 2), keepdim=True)
+        is_peak = (spectra == functional.max_pool2d(padded, 3, stride=1)) & (spectra >= 0.97 * highest)
+        height, pixel = (spectra * is_peak).flatten(1).topk(min(8, spectra[0].numel()))
+        used = height >= 0.97 * height[:, :1]
+        pixel = pixel.where(used, pixel[:, :1])[:, : int(used.sum(dim=1).max())]
+        return self.folded(grid.direction.flatten(0, 1)[pixel])
 
     def mapped(self, matrix: Tensor, both: bool = False) -> _Frame:
         """Return the frame with a matrix (3, 3) applied to the positions, and to the fixed one if `both`."""
@@ -253,17 +259,6 @@ def best_offset(coordinate: Tensor, score: Callable[[float], Any]) -> tuple[floa
     return max(offsets, key=score), (high - low) / 39
 
 
-def _peaks(spectra: Tensor, grid: AngularGrid) -> Tensor:
-    """Return the directions of the largest magnitude of each spectrum and of other peaks of nearly its height, (n, P, 3)."""
-    padded = functional.pad(functional.pad(spectra, (1, 1), mode="circular"), (0, 0, 1, 1), value=-math.inf)
-    highest = spectra.amax(dim=(1, 2), keepdim=True)
-    is_peak = (spectra == functional.max_pool2d(padded, 3, stride=1)) & (spectra >= 0.97 * highest)
-    height, pixel = (spectra * is_peak).flatten(1).topk(min(8, spectra[0].numel()))
-    used = height >= 0.97 * height[:, :1]
-    pixel = pixel.where(used, pixel[:, :1])[:, : int(used.sum(dim=1).max())]
-    return grid.direction.flatten(0, 1)[pixel]
-
-
 def _nearest(direction: Tensor, peak: Tensor) -> Tensor:
     """Return the angle [rad] between directions (..., n, 3) and the nearest of the peaks (n, P, 3) of each."""
     return (direction[..., None, :] * peak).sum(dim=-1).amax(dim=-1).clamp(-1, 1).arccos()
@@ -306,10 +301,7 @@ def _frames(frame: _Frame) -> Iterator[tuple[str, _Frame]]:
     """Yield the frame of positions and array under each error."""
     quaternion = Rotation.from_matrix(frame.rotation.numpy()).as_quat()
     reordered = torch.from_numpy(Rotation.from_quat(np.roll(quaternion, -1)).as_matrix())
-    yield (
-        "the quaternion is in the order w, x, y, z; it must be x, y, z, w",
-        replace(frame, rotation=reordered),
-    )
+    yield ("the quaternion is in the order w, x, y, z; it must be x, y, z, w", replace(frame, rotation=reordered))
     yield (
         "the quaternion turns world into array coordinates; it must turn array into world",
         replace(frame, rotation=frame.rotation.T),

@@ -19,8 +19,6 @@ from swiftwrf.gp.process import N_NEIGHBOURS, Kernel, candidates, leave_folds_ou
 from swiftwrf.positions import Neighbours, distance
 from swiftwrf.runtime.threads import single_thread
 
-NOISE_CANDIDATES = (1e-3, 1e-2, 1e-1)  # variance of spectra that does not depend on position
-MAX_RANK_ERROR = 5e-4  # fraction of the held-out error that omitted components may add
 MIN_ERROR = 1e-12  # squared error, for logarithms
 MAX_ROWS = 400  # spectra that choose; a candidate costs their number cubed
 MAX_LOCAL_ROWS = 200  # spectra that are held out among more, each predicted from its neighbours
@@ -51,7 +49,7 @@ def choose_kernel(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> K
     def score(kernel: Kernel) -> float:
         return -float(evaluate(kernel).clamp_min(MIN_ERROR).log().sum())
 
-    return max(candidates(position, NOISE_CANDIDATES), key=score)
+    return max(candidates(position, (1e-3, 1e-2, 1e-1)), key=score)
 
 
 def _held_out_errors(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> Callable[[Kernel], Tensor]:
@@ -114,7 +112,7 @@ def choose_rank(position: Tensor, spectrum: Tensor | Store, fold: Tensor, kernel
     for out, kept, weight, _ in leave_folds_out(kernel, position, fold):
         error += (component[out] - weight @ component[kept]).square().sum()
     left_out = variance.flip(0).cumsum(0).flip(0)  # by 0, 1, ... components
-    enough = left_out <= MAX_RANK_ERROR * error
+    enough = left_out <= 5e-4 * error  # negligible beside it
     return int((~enough).sum())
 
 

@@ -120,8 +120,8 @@ class GaussianProcess:
     Args:
         kernel: Kernel with its noise.
         known: Positions of the values (n, 3).
-        coefficient: Dual coefficients of an exact process, values of a local one, (n, K); needed by `mean` only. See
-            `regress`.
+        coefficient: Dual coefficients of an exact process, values of a local one, (n, K); see `regress`. Defaults to none,
+            for weights and variances alone.
         exact: Whether every prediction conditions on all positions. Defaults to n <= 2000.
         correlation: Correlation of the field at the time of each value with the present field, (n,), from above 0 to 1,
             ascending. Defaults to 1. Between two values of correlations a <= b it is a / b (autoregressive in time).
@@ -135,14 +135,15 @@ class GaussianProcess:
 
     kernel: Kernel
     known: Tensor
-    coefficient: Tensor | None = None
+    coefficient: Tensor = None  # type: ignore[assignment]
     exact: bool | None = None
-    correlation: Tensor | None = None
+    correlation: Tensor = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         known = self.known.double()
         correlation = known.new_ones(len(known)) if self.correlation is None else self.correlation.double()
-        vars(self).update(known=known, correlation=correlation)
+        coefficient = known.new_zeros(len(known), 0) if self.coefficient is None else self.coefficient
+        vars(self).update(known=known, coefficient=coefficient, correlation=correlation)
 
     @property
     def is_exact(self) -> bool:
@@ -151,19 +152,14 @@ class GaussianProcess:
 
     @classmethod
     def regress(
-        cls,
-        kernel: Kernel,
-        known: Tensor,
-        value: Tensor,
-        exact: bool | None = None,
-        dtype: torch.dtype = torch.float64,
+        cls, kernel: Kernel, known: Tensor, value: Tensor, exact: bool | None = None, dtype: torch.dtype = torch.float64
     ) -> GaussianProcess:
         """Return the process of values (n, K) at known positions (n, 3), with coefficients of the given type."""
         return cls(kernel, known, value.to(dtype), exact).regressed(value)
 
     def regressed(self, value: Tensor) -> GaussianProcess:
         """Return the process of other values (n, K) at the same positions."""
-        kept = value.to(self._coefficient)
+        kept = value.to(self.coefficient)
         if not self.is_exact:
             return self._with(coefficient=kept)
         coefficient = torch.cholesky_solve(value.double(), self._factor)
@@ -173,8 +169,8 @@ class GaussianProcess:
     def value(self) -> Tensor:
         """Values (n, K) that the process was regressed on, in the precision of the coefficients."""
         if not self.is_exact:
-            return self._coefficient
-        return (self._factor @ (self._factor.T @ self._coefficient.double())).to(self._coefficient)
+            return self.coefficient
+        return (self._factor @ (self._factor.T @ self.coefficient.double())).to(self.coefficient)
 
     def updated(self, position: Tensor, value: Tensor) -> GaussianProcess:
         """Return the process with more values (k, K) at positions (k, 3), equal to `regress` on all values.
@@ -182,13 +178,13 @@ class GaussianProcess:
         The Cholesky factor grows by k rows, in a time proportional to n^2 k (G. H. Golub and C. F. Van Loan, "Matrix
         Computations", 4th ed., 2013, section 6.5.4).
         """
-        values = torch.cat([self.value, value.to(self._coefficient)])
+        values = torch.cat([self.value, value.to(self.coefficient)])
         known = torch.cat([self.known, position.double()])
-        correlation = torch.cat([self._correlation, self._correlation.new_ones(len(position))])
+        correlation = torch.cat([self.correlation, self.correlation.new_ones(len(position))])
         process = replace(self, known=known, coefficient=values, correlation=correlation)
         if not (self.is_exact and process.is_exact):
             return process.regressed(values)
-        n, coefficient, cross = len(self.known), self._coefficient.double(), self._cross(position)
+        n, coefficient, cross = len(self.known), self.coefficient.double(), self._cross(position)
         root = torch.linalg.solve_triangular(self._factor, cross.T, upper=False)  # (n, k)
         corner = torch.linalg.cholesky(self.kernel.covariance(position) - root.T @ root)
         new = torch.cholesky_solve(value.double() - cross @ coefficient, corner)
@@ -202,7 +198,7 @@ class GaussianProcess:
         """Return the process without the values of some rows, by regression on the remaining ones."""
         kept = torch.ones(len(self.known), dtype=torch.bool)
         kept[rows] = False
-        process = replace(self, known=self.known[kept], correlation=self._correlation[kept])
+        process = replace(self, known=self.known[kept], correlation=self.correlation[kept])
         return process.regressed(self.value[kept])
 
     def with_kernel(self, kernel: Kernel) -> GaussianProcess:
@@ -211,7 +207,7 @@ class GaussianProcess:
 
     def widened(self, count: int) -> GaussianProcess:
         """Return the process with some more columns of values, all 0."""
-        coefficient, value = (functional.pad(x, (0, count)) for x in (self._coefficient, self.value))
+        coefficient, value = (functional.pad(x, (0, count)) for x in (self.coefficient, self.value))
         return self._with(coefficient=coefficient, value=value)
 
     def aged(self, correlation: float) -> GaussianProcess:
@@ -219,7 +215,7 @@ class GaussianProcess:
 
         Covariances of the values stay as they are, and the posterior mean is multiplied by the correlation.
         """
-        return self._with(correlation=correlation * self._correlation)
+        return self._with(correlation=correlation * self.correlation)
 
     def _with(self, **changes: Tensor) -> GaussianProcess:
         """Return a copy with other fields or cached properties. All other cached properties must stay valid."""
@@ -230,7 +226,7 @@ class GaussianProcess:
     def mean(self, position: Tensor) -> Tensor:
         """Return the posterior mean at positions (m, 3), (m, K), in the precision of the coefficients."""
         if self.is_exact:
-            mean: Tensor = self._cross(position).to(self._coefficient) @ self._coefficient
+            mean: Tensor = self._cross(position).to(self.coefficient) @ self.coefficient
             return mean
         return self.local(position)[0]
 
@@ -256,9 +252,9 @@ class GaussianProcess:
 
     def state(self, prefix: str = "") -> tuple[dict[str, Tensor], Header]:
         """Return positions and coefficients, and the kernel as plain values, with names that begin with `prefix`."""
-        tensors = {f"{prefix}position": self.known, f"{prefix}coefficient": self._coefficient}
-        if bool((self._correlation < 1).any()):
-            tensors[f"{prefix}correlation"] = self._correlation
+        tensors = {f"{prefix}position": self.known, f"{prefix}coefficient": self.coefficient}
+        if bool((self.correlation < 1).any()):
+            tensors[f"{prefix}correlation"] = self.correlation
         return tensors, {f"{prefix}kernel": asdict(self.kernel)}
 
     @classmethod
@@ -279,26 +275,16 @@ class GaussianProcess:
             raise InputError("correlation in time must be above 0 and at most 1")
         return cls(Kernel(**header[f"{prefix}kernel"]), known, coefficient.to(dtype), exact, correlation)
 
-    @property
-    def _coefficient(self) -> Tensor:
-        assert self.coefficient is not None
-        return self.coefficient
-
-    @property
-    def _correlation(self) -> Tensor:
-        assert self.correlation is not None
-        return self.correlation
-
     def _cross(self, position: Tensor) -> Tensor:
         """Return the covariances of the present field at positions (m, 3) with the values, float64 (m, n)."""
         cross: Tensor = self.kernel(position.double(), self.known)
-        return cross * self._correlation
+        return cross * self.correlation
 
     @cached_property
     @torch.inference_mode(False)
     def _factor(self) -> Tensor:
         """Cholesky factor of the covariance of the values, float64 (n, n)."""
-        ratio = self._correlation[:, None] / self._correlation
+        ratio = self.correlation[:, None] / self.correlation
         covariance = self.kernel.covariance(self.known) * torch.minimum(ratio, ratio.T)
         factor: Tensor = torch.linalg.cholesky(covariance)
         return factor
@@ -310,14 +296,14 @@ class GaussianProcess:
     def local(self, position: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean (m, K) and variance (m,) at positions from the nearest known ones, whatever their number."""
         number, weight, variance = self._local(position)
-        return torch.einsum("mk,mkc->mc", weight, self._coefficient[number].double()), variance
+        return torch.einsum("mk,mkc->mc", weight, self.coefficient[number].double()), variance
 
     def _local(self, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return row numbers (m, k), weights (m, k) and posterior variance (m,) from the nearest positions."""
         position = position.to(self.known)
         number = self._neighbours(position, min(N_NEIGHBOURS, len(self.known)))[1].to(self.known.device)
         near = self.known[number]
-        correlation = self._correlation[number]
+        correlation = self.correlation[number]
         ratio = correlation[:, :, None] / correlation[:, None]
         covariance = self.kernel(near, near) * torch.minimum(ratio, ratio.mT)
         cross = self.kernel(position[:, None], near)[:, 0] * correlation

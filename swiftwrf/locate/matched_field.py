@@ -34,7 +34,7 @@ from swiftwrf.locate.student import Student
 from swiftwrf.models.base import FieldModel
 from swiftwrf.models.geometry import GeometryModel
 from swiftwrf.models.geometry.fit import GeometryConfig, observe
-from swiftwrf.models.geometry.path_gains import PathGains, PriorChoice, choose_prior, fit_path_gains, kernel_of
+from swiftwrf.models.geometry.path_gains import PRIORS, PathGains, choose_prior, fit_path_gains, kernel_of
 from swiftwrf.positions import to_tensor
 from swiftwrf.runtime.checkpoint import Header, Saved, expect
 from swiftwrf.runtime.threads import parallel_map
@@ -167,12 +167,7 @@ class MatchedField(Configured, Saved):
     @all_or_nothing
     @checked
     def fit(
-        self,
-        train: Spectra,
-        *,
-        room: FieldModel | None = None,
-        region: Region | None = None,
-        progress: bool = False,
+        self, train: Spectra, *, room: FieldModel | None = None, region: Region | None = None, progress: bool = False
     ) -> Self:
         """Fit the likelihoods to measured spectra and return the locator.
 
@@ -197,19 +192,27 @@ class MatchedField(Configured, Saved):
         features = SpectrumFeatures.of(train.store.batches(), own.array, train.grid, self.config.seed)
         scene, rows = observe(train, GeometryConfig(seed=self.config.seed))
         fold = places(train.position, FOLDS) % FOLDS
-        choice = choose_prior(own, scene, fold[rows]) if own.planes else PriorChoice(own, "loose", {})
+        chosen, prior = own, next(iter(PRIORS))
+        if own.planes:
+            chosen, prior, _ = choose_prior(own, scene, fold[rows])
         kernel = kernel_of(scene.moving)
         self.grid = train.grid
 
         def fitted(kept: Tensor) -> _Fit:
             phases = scene.subset(kept[rows].nonzero()[:, 0])
-            part = choice.room.refined_on(phases)
+            part = chosen.refined_on(phases)
             likelihood = PhaseLikelihood.fit(part, train.position[kept], features.subset(kept))
-            return _Fit(part, fit_path_gains(part, phases, kernel, choice.prior), likelihood)
+            return _Fit(part, fit_path_gains(part, phases, kernel, prior), likelihood)
 
         everything = torch.ones_like(fold, dtype=torch.bool)
         *parts, self._fit = parallel_map(fitted, [*(fold != number for number in range(FOLDS)), everything])
-        self._set_residuals(train.position, features, fold, parts)
+        # of every spectrum, by the fit without its fold
+        self.residual = torch.empty(2, *features.coarray.shape)
+        for number, part in enumerate(parts):
+            waves = PathWaves.at(part.room, train.position[fold == number])
+            for kind, predict in enumerate(part.features):
+                self.residual[kind, fold == number] = predict(waves) - features.coarray[fold == number]
+        self.observed_power = float(features.coarray.square().mean())
         held_out = [train.position[fold == number] for number in range(FOLDS)]
         others = [Region(train.position[fold != number]) for number in range(FOLDS)]
         self.region = region or Region(train.position, outside=outside_mass(others, held_out))
@@ -218,16 +221,6 @@ class MatchedField(Configured, Saved):
         self.weight, self.inflation = torch.tensor([0.05, 0.05, 0.3], dtype=torch.float64), 1.0
         self._calibrate(train.position, features, fold, parts)
         return self
-
-    def _set_residuals(self, position: Tensor, features: SpectrumFeatures, fold: Tensor, parts: list[_Fit]) -> None:
-        """Predict the co-array numbers of every spectrum by the fit without its fold."""
-        self.residual = torch.empty(2, *features.coarray.shape)
-        for number, part in enumerate(parts):
-            out = fold == number
-            waves = PathWaves.at(part.room, position[out])
-            for kind, predict in enumerate(part.features):
-                self.residual[kind, out] = predict(waves) - features.coarray[out]
-        self.observed_power = float(features.coarray.square().mean())
 
     def _prepare(self) -> None:
         """Compute what all spectra share: cells of the region and their predicted co-array numbers."""
@@ -339,17 +332,9 @@ class MatchedField(Configured, Saved):
         """Return the fitted tensors by name, and plain values."""
         tensors, header = self.room.state()
         gains, values = self._fit.gains.state()
-        own = {
-            "statistics": self._fit.phases.log_variance,
-            "residual": self.residual,
-            "weight": self.weight,
-        }
+        own = {"statistics": self._fit.phases.log_variance, "residual": self.residual, "weight": self.weight}
         at, prior_values = self.region.state()
-        plain = {
-            "locator": asdict(self.config),
-            "observed_power": self.observed_power,
-            "inflation": self.inflation,
-        }
+        plain = {"locator": asdict(self.config), "observed_power": self.observed_power, "inflation": self.inflation}
         return tensors | gains | own | at, header | values | plain | prior_values
 
     @classmethod

@@ -89,12 +89,7 @@ class RssiLocator(Configured, Saved):
     @all_or_nothing
     @checked
     def fit(
-        self,
-        train: Rssi,
-        *,
-        model: RssiModel | None = None,
-        region: Region | None = None,
-        progress: bool = False,
+        self, train: Rssi, *, model: RssiModel | None = None, region: Region | None = None, progress: bool = False
     ) -> Self:
         """Fit the likelihoods to measured rows and return the locator.
 
@@ -266,8 +261,7 @@ class RssiLocator(Configured, Saved):
         locator.receiver_names = locator.model.receiver_names
         n, r = len(tensors["known"]), len(locator.receiver_names)
         expect(
-            tensors,
-            {"known": (n, 3), "fingerprint": (n, r), "scale_m": (3,), "correlation": (r, r), "weight": (3,)},
+            tensors, {"known": (n, 3), "fingerprint": (n, r), "scale_m": (3,), "correlation": (r, r), "weight": (3,)}
         )
         degrees, k = header["degrees"], int(header["k"])
         if not 1 <= k <= n:

@@ -44,7 +44,8 @@ class DetectionLikelihood:
         m, d = mean.double().flatten(), detected.flatten()
 
         def loss(raw: NDArray[np.float64]) -> float:
-            return -float(cls._of(raw)._log_probability(m, d).mean())
+            chance = cls._of(raw).probability(m).clamp(1e-4, 1 - 1e-4)
+            return -float(torch.where(d, chance.log(), (-chance).log1p()).mean())
 
         start = np.array([float(m.quantile(0.1)), 1.5, -2.0])
         return cls._of(minimize(loss, start, method="Nelder-Mead", options={"maxiter": 300}).x)
@@ -56,10 +57,6 @@ class DetectionLikelihood:
     def probability(self, mean: Tensor) -> Tensor:
         """Return the probability of a detection for each predicted RSSI [dBm], of the same shape."""
         return (1 - self.loss) * torch.sigmoid((mean - self.threshold) / self.width)
-
-    def _log_probability(self, mean: Tensor, detected: Tensor) -> Tensor:
-        chance = self.probability(mean).clamp(1e-4, 1 - 1e-4)
-        return torch.where(detected, chance.log(), (-chance).log1p())
 
     def log_likelihood(self, mean: Tensor, rssi: Tensor) -> Tensor:
         """Return log-likelihoods (n, m) of the detections in RSSI (n, R) at candidates of predicted RSSI (m, R)."""

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 DEGREES = (3.0, 5.0, 10.0, 30.0, math.inf)  # degrees of freedom that are compared
-MIN_COMMON_ROWS = 10.0  # rows that two features have in common, after which their correlation counts half
 CHUNK = 2**24  # values of observations x candidates x features at a time
 
 Estimator = Callable[[Tensor, Tensor, float], Tensor]  # residuals (n, F), shrinkages (S,), degrees to scales (S, F, F)
@@ -143,7 +142,7 @@ def correlation(residual: Tensor, shrinkage: Tensor, degrees: float) -> Tensor:
     filled = residual.nan_to_num()
     count = known.T @ known
     product = (filled.T @ filled) / count.clamp_min(1)
-    product = product * count / (count + MIN_COMMON_ROWS)
+    product = product * count / (count + 10.0)  # half of it with 10 common rows
     scale = product.diagonal().clamp_min(0.25).sqrt()
     shape = (1 - shrinkage)[:, None, None] * (product / scale / scale[:, None]).clamp(-0.99, 0.99)
     shape.diagonal(dim1=1, dim2=2).fill_(1)

@@ -38,7 +38,6 @@ from swiftwrf.runtime.validation import (
 
 ARRAY, FIXED_END = "array", "fixed end"  # requirements that a model can declare
 CPU = torch.device("cpu")
-MIN_STD = 1 / 255  # of a measured magnitude: a quantisation step of the 8-bit images that spectra are stored in
 
 
 @configuration
@@ -217,7 +216,8 @@ class FieldModel(Configured, Saved, Displayed):
 
         def evaluate(some: Tensor) -> tuple[Tensor, Tensor | None]:
             mean, std = self._predict(some, grid, with_std)
-            return mean.float().clamp(0, 1), None if std is None else std.float().clamp_min(MIN_STD)
+            # images of 8 bits, in which spectra are stored, have steps of 1 / 255
+            return mean.float().clamp(0, 1), None if std is None else std.float().clamp_min(1 / 255)
 
         differentiable = position.requires_grad or any(tensor.requires_grad for tensor in self.parameters())
         with torch.set_grad_enabled(torch.is_grad_enabled() and differentiable):

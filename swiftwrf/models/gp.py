@@ -11,7 +11,7 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import folds
 from swiftwrf.data.store import Store
-from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel, subsample
+from swiftwrf.gp import GaussianProcess, choose_kernel, subsample
 from swiftwrf.models.neighbours import MemoryModel
 from swiftwrf.models.process import ProcessModel
 from swiftwrf.runtime.checkpoint import Header
@@ -35,7 +35,8 @@ class GPModel(ProcessModel, MemoryModel):
     def _fit(self, train: Spectra, **_: Any) -> None:
         self.position, self.store = train.position, train.store
         fold = folds(train.position, self.config.validation, self.config.seed)
-        self._prepare(_without_values(choose_kernel(train.position, train.store, fold), train.position))
+        # without values, for weights and variances alone
+        self._prepare(GaussianProcess(choose_kernel(train.position, train.store, fold), train.position))
         self._set_spread(
             train,
             fold,
@@ -70,14 +71,10 @@ class GPModel(ProcessModel, MemoryModel):
         self.position, self.store = self.process.known, self.store.subset(kept)
         self._prepare(self.process)
 
-    def _mean_change(self, position: Tensor) -> Tensor:
-        """Return predicted differences from the mean spectrum (b, pixels)."""
+    def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         rows, weight = self.process.weights(position)
         change = self._change if self.process.is_exact else (self.store[rows] - self._mean).flatten(1)
-        return weight.float() @ change
-
-    def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
-        mean = self._mean + self._mean_change(position).reshape(-1, *grid.shape)
+        mean = self._mean + (weight.float() @ change).reshape(-1, *grid.shape)
         return mean, self._std(position, grid) if with_std else None
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
@@ -90,8 +87,3 @@ class GPModel(ProcessModel, MemoryModel):
         none = {"coefficient": torch.zeros(len(self.position), 0)}
         self._prepare(GaussianProcess.from_state(tensors | none, header, torch.float64))
         self._restore_spread(tensors)
-
-
-def _without_values(kernel: Kernel, position: Tensor) -> GaussianProcess:
-    """Return a process for weights and variances alone."""
-    return GaussianProcess(kernel, position, torch.zeros(len(position), 0, dtype=torch.float64))

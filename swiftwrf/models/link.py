@@ -14,8 +14,6 @@ from swiftwrf.errors import InputError
 from swiftwrf.positions import to_tensor
 from swiftwrf.runtime.validation import check_value
 
-LENGTH_TOLERANCE_WAVELENGTHS = 1e-3  # between fixed ends, elements and wavelengths of one link
-LENGTH_TOLERANCE_M = 1e-3  # between fixed ends where the wavelength is unknown
 ROTATION_TOLERANCE = 1e-4  # between the matrices of one orientation
 
 
@@ -79,7 +77,7 @@ class Link:
         """
         own, other = self.array, data.array
         array = own or other
-        length = LENGTH_TOLERANCE_WAVELENGTHS * array.wavelength if array else LENGTH_TOLERANCE_M
+        length = 1e-3 * array.wavelength if array else 1e-3
         compared = {
             f"moving end ({data.moving}, not {self.moving})": data.moving != self.moving,
             "position of the fixed end": _differ(self.fixed_position, data.fixed_position, length),

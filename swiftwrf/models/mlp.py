@@ -8,8 +8,6 @@ from collections.abc import Collection
 import torch
 from torch import Tensor, nn
 
-NERF_SKIPS = (5,)  # the layer that takes the input again in NeRF2's code
-
 
 def encode(x: Tensor, bands: int, lowest: float = math.pi) -> Tensor:
     """Return [x, sin(2^k lowest x), cos(2^k lowest x)] for k = 0 .. bands - 1.
@@ -38,7 +36,7 @@ class SkipMLP(nn.ModuleList):
         [3, 8, 11]
     """
 
-    def __init__(self, inputs: int, width: int, depth: int, skips: Collection[int] = NERF_SKIPS) -> None:
+    def __init__(self, inputs: int, width: int, depth: int, skips: Collection[int] = (5,)) -> None:
         sizes = [inputs] + [width + inputs * (i in skips) for i in range(1, depth)]
         super().__init__(nn.Linear(size, width) for size in sizes)
         self.skips = skips

@@ -81,8 +81,12 @@ class ProcessModel(FieldModel):
         position, before = model.process.known.cpu(), model.process.kernel
         fold = folds(position, self.config.validation, self.config.seed)
         model._set_process(model.process.with_kernel(choose_kernel(position, model._weighted_values(), fold)))
-        errors = [_held_out_std(kernel, position, fold) for kernel in (before, model.process.kernel)]
-        model._scale_std(float(errors[0] / errors[1]))
+        (rows,) = subsample(torch.arange(len(position)), rows=MAX_HELD_OUT)
+        old, new = (
+            torch.cat([part.variance for part in leave_folds_out(kernel, position, fold, rows)]).mean().sqrt()
+            for kernel in (before, model.process.kernel)
+        )
+        model._scale_std(float(old / new))  # of noisy values at held-out positions
         return model
 
     def _scale_std(self, factor: float) -> None:
@@ -160,9 +164,3 @@ class ProcessModel(FieldModel):
 
     def _age(self, correlation: float) -> None:
         self.process = self.process.aged(correlation)
-
-
-def _held_out_std(kernel: Kernel, position: Tensor, fold: Tensor) -> Tensor:
-    """Return the root mean square of the standard deviations of noisy values at held-out positions."""
-    (rows,) = subsample(torch.arange(len(position)), rows=MAX_HELD_OUT)
-    return torch.cat([part.variance for part in leave_folds_out(kernel, position, fold, rows)]).mean().sqrt()

@@ -18,10 +18,8 @@ from swiftwrf.models.link import Linked
 from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.validation import configuration
 
-EXTENT = 10.0  # half the side of an unbounded wall, in distances of the farthest known point from the fixed end
 MAX_DISTANCE_M = 1e4  # from the fixed end; beyond, single precision loses the phase
 MAX_GAIN = 0.95  # of a plane that a material can have
-THICKNESS_M, CONDUCTIVITY_S_PER_M = 100.0, 1e-3  # of a slab without a second reflection
 
 
 @configuration
@@ -114,8 +112,10 @@ def surfaces(room: GeometryModel) -> list[Surface]:
     made = []
     for number, normal in enumerate(found.normal[0]):
         gain = min(float(found.gain[0, number].abs()), MAX_GAIN)
-        material = Material(f"plane-{number}", THICKNESS_M, ((1 + gain) / (1 - gain)) ** 2, CONDUCTIVITY_S_PER_M)
-        side = 2 * EXTENT * farthest * torch.linalg.svd(normal[None]).Vh[1:]  # (2, 3), across the normal
+        # a slab without a second reflection
+        material = Material(f"plane-{number}", 100.0, ((1 + gain) / (1 - gain)) ** 2, 1e-3)
+        # an unbounded wall ends at ten times the distance of the farthest known point from the fixed end
+        side = 20 * farthest * torch.linalg.svd(normal[None]).Vh[1:]  # (2, 3), across the normal
         corner = float(away[number]) * normal - side.sum(dim=0) / 2
         made.append(Surface.joined(material.name, material, [rectangle(corner.tolist(), *side.tolist())]))
     return made

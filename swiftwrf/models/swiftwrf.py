@@ -49,7 +49,6 @@ MIN_VARIANCE = 1e-9  # fraction of the variance below which a principal componen
 MARGIN = 0.5  # spacings by which the first means lie below the horizon
 CUTOFF = 1e-4  # kernel values below count as 0
 MAX_CACHED_VALUES = 2**26  # float32 kernel values that one grid caches: 256 MiB
-MAX_BATCH_ON_GPU, MAX_PRIMITIVES_ON_GPU = 4096, 2**24  # positions at a time, and primitives of all of them
 
 
 @configuration
@@ -175,7 +174,7 @@ class SwiftWRF(ProcessModel):
         """Return more positions on a GPU, which takes as long to start the kernels of 64 as to compute them."""
         if device.type == "cpu":
             return self.batch
-        return max(self.batch, min(MAX_BATCH_ON_GPU, MAX_PRIMITIVES_ON_GPU // len(self.mean)))
+        return max(self.batch, min(4096, 2**24 // len(self.mean)))
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         mean, cholesky, weight = self.primitives(position)

@@ -41,7 +41,6 @@ from swiftwrf.runtime.validation import (
 MEAN_BANDS, POSITION_BANDS = 10, 6  # frequency bands of the paper's encodings
 WIDTH, DEPTH = 156, 8  # size of the paper's network
 OFFSETS = (2, 2, 1)  # numbers of offsets of mean, response and attenuation for each primitive
-WARM_UP_STEPS, FINAL_RATE = 50, 0.02  # steps over which the rates rise, and their final fraction
 CUTOFF = 1e-4  # kernel values below count as 0
 
 
@@ -246,7 +245,7 @@ class Optimisation(Descent[DeformableGaussians]):
         self.noise = torch.randn(steps, batch, 3, generator=generator).to(device)
 
     def rate(self, step: int) -> float:
-        return warm_cosine(step, self.schedule.steps, WARM_UP_STEPS, FINAL_RATE)
+        return warm_cosine(step, self.schedule.steps, warm_up=50, final=0.02)
 
     def loss(self, rendered: Tensor, measured: Tensor) -> Tensor:
         """Return the loss of spectra; see `spectrum_loss`."""

@@ -30,8 +30,6 @@ from swiftwrf.rssi.model import RssiModel
 from swiftwrf.runtime.validation import checked, configuration
 
 N_FOLDS = 5  # of the spectra after a change, and of the training spectra that give the reference
-MIN_NEW, MIN_GROWTH = 30, 0.1  # measurements, and relative to those before, after which a kernel is chosen
-ROOM_NOTICE = "the room no longer explains the spectra since measurement {}; fit it again, also if an obstacle appeared"
 MIN_MISSING = 3e-3  # missing coherence that counts as none, phases of 3 degrees
 
 
@@ -242,7 +240,7 @@ class KernelMonitor:
         self._scores.append(scores)
         count = len(self._new)
         n = len(model.process.known if isinstance(model, ProcessModel) else model.anchor)
-        if count < max(MIN_NEW, MIN_GROWTH * (n - count)) or n - count < MIN_TRAINING:
+        if count < max(30, 0.1 * (n - count)) or n - count < MIN_TRAINING:
             return None
         last, error = self._new, Scores.joined(self._scores).error
         self.restart()
@@ -384,7 +382,8 @@ class Follower:
         if not alarms:
             return []
         self.room = None
-        return [ROOM_NOTICE.format(alarms[0].since)]
+        since = f"the room no longer explains the spectra since measurement {alarms[0].since}"
+        return [f"{since}; fit it again, also if an obstacle appeared"]
 
     def _choose_kernel(self, model: ProcessModel | RssiModel, new: Spectra | Rssi, scores: Scores) -> list[str]:
         """Choose the kernel again; return a notice if another one predicts better."""

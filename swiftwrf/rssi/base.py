@@ -41,13 +41,12 @@ from swiftwrf.runtime.validation import (
 )
 
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
-ITEMS_PER_THREAD = 4  # between two results that are kept: starting threads costs milliseconds
 RECEIVER_POSITIONS = "positions of the receivers"
 
 
 def map_threads(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
     """Apply a function to items as `map` does, in as many threads as torch has."""
-    waiting, n_items = list(items), ITEMS_PER_THREAD * torch.get_num_threads()
+    waiting, n_items = list(items), 4 * torch.get_num_threads()  # starting threads costs milliseconds
     for start in range(0, len(waiting), n_items):
         yield from parallel_map(function, waiting[start : start + n_items])
 

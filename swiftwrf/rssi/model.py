@@ -42,7 +42,6 @@ from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import single_thread
 
 FIELD_ALONE = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)  # mixing weights
-BINNED = 0.01  # relative difference of variances beyond which a row is the mean of several measurements
 
 
 class RssiModel(SavedRssiPredictor):
@@ -151,16 +150,10 @@ class RssiModel(SavedRssiPredictor):
         self.directivity = (weight[0][:, None] * found["directivity"]).float()
         self.anchor, self.coefficient = training.position.float(), found["coefficient"].T.float().contiguous()
         self.rendered = found["rendered"]
-        state = FitState(
-            dual=found["dual"].T,
-            tangent=found["tangent"].T,
-            variance=found["variance"].T,
-            prior_level=found["prior_level"],
-            prior_slope=found["prior_slope"],
-            field_variance=training.field_db.square(),
-            noise_variance=training.noise_db.square(),
-        )
-        self._posterior = self._posterior_of(state)
+        rows = {name: found[name].T for name in ("dual", "tangent", "variance")}
+        prior = {name: found[name] for name in ("prior_level", "prior_slope")}
+        variance = {"field_variance": training.field_db.square(), "noise_variance": training.noise_db.square()}
+        self._posterior = self._posterior_of(FitState(**rows, **prior, **variance))
         noise_db = (scale * training.noise_db).clamp_min(rounding_std(train.rssi_dbm))
         self.field_db, self.noise_db = (scale * training.field_db).float(), noise_db.float()
         self.slope_std = weight[:2].sum(dim=0) * found["slope_std"]  # only two predictors have the receiver's slope
@@ -202,7 +195,9 @@ class RssiModel(SavedRssiPredictor):
         change = self.mixing_weight[0] * (self._posterior.linear - before).T  # (10, R)
         self.level, self.slope = self.level + change[0], self.slope + change[1]
         self.directivity = self.directivity + change[2:].T.float()
-        self._take_rows(self._posterior.folded())
+        folded = self._posterior.folded()
+        self.anchor, self.coefficient = folded.anchor.float(), folded.coefficient.float()
+        self._process = self._variance_process()
 
     def with_chosen_kernel(self, without: Tensor | None = None) -> Self:
         """Return the model fitted again to all rows that it has learnt, with kernel, noise and mixing weights chosen again.
@@ -241,7 +236,7 @@ class RssiModel(SavedRssiPredictor):
         model.attenuation, model.offsets = self.attenuation, self.offsets
         state = posterior.state
         # a mean of several measurements has a smaller variance than one measurement
-        if bool(((state.variance > 0) & (state.variance < (1 - BINNED) * state.noise_variance)).any()):
+        if bool(((state.variance > 0) & (state.variance < 0.99 * state.noise_variance)).any()):
             model.field_db, model.noise_db = self.field_db, self.noise_db
         return model
 
@@ -249,10 +244,6 @@ class RssiModel(SavedRssiPredictor):
         if self._posterior is None:
             raise InputError(f"a predictor {self.name} cannot be updated; fit it again to all rows")
         return self._posterior
-
-    def _take_rows(self, folded: RssiPosterior) -> None:
-        self.anchor, self.coefficient = folded.anchor.float(), folded.coefficient.float()
-        self._process = self._variance_process()
 
     @single_thread()
     def _predict(self, position: Tensor) -> tuple[Tensor, Tensor]:

@@ -33,7 +33,6 @@ from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import configuration
 
-RATIOS = (0.5, 1.0, 2.0)  # distance that the receiver moves, relative to an equivalent one of the transmitter
 RELATIVE_NOISE_VARIANCES = (0.03, 0.1, 0.3, 1.0, 3.0)  # variance of a measurement relative to that of the field
 MAX_HELD_OUT = 500  # pairs that choose the kernel; more do not change it
 
@@ -170,7 +169,8 @@ class Metric(NamedTuple):
         return value.repeat(1 + self.reciprocal)
 
 
-METRICS = (*(Metric(ratio) for ratio in RATIOS), Metric(reciprocal=True))
+# distances that the receiver moves, relative to an equivalent one of the transmitter, and both ends alike
+METRICS = (Metric(0.5), Metric(1.0), Metric(2.0), Metric(reciprocal=True))
 
 
 class PairModel(PairPredictor, SavedRssiPredictor):

@@ -26,11 +26,8 @@ from swiftwrf.positions import Neighbours, distance
 from swiftwrf.runtime.threads import single_thread
 
 MIN_DISTANCE_M = 0.3  # shorter distances count as this one: the model does not hold in the near field
-PLACE_PENALTY = 10.0  # measurements that a place needs for half of its own path-loss model
 N_HARMONICS = 8  # real spherical harmonics of degree 1 and 2
 MAX_ROWS = 300  # of a receiver, from which offsets are estimated; the cost grows with their cube
-LENGTH_SHARE = 0.25  # correlation length of the field relative to the extent
-RELATIVE_NOISE = 1.0  # variance of a packet relative to that of the field
 
 
 def log_distance(position: Tensor, receiver: Tensor) -> Tensor:
@@ -181,7 +178,7 @@ class PairPathLoss:
             return cls(shared, place.reshape(0, 3), torch.zeros(0, 2, dtype=torch.float64))
         centre = apart.mean()
         own = torch.stack([torch.ones_like(apart), apart - centre], dim=1)
-        normal = PLACE_PENALTY * torch.eye(2).double().repeat(len(place), 1, 1)
+        normal = 10.0 * torch.eye(2).double().repeat(len(place), 1, 1)  # half after 10 measurements
         normal = normal.index_add(0, row, own[:, :, None] * own[:, None])
         residual = rssi - shared[0] - shared[1] * apart
         right = torch.zeros(len(place), 2, dtype=torch.float64).index_add(0, row, own * residual[:, None])
@@ -336,7 +333,7 @@ def estimate_offsets(train: Rssi, reference: str | None = None) -> Offsets:
         raise InputError(f"column {groups.column} has no value {chosen!r}; there are {listed(groups.names)}")
     position = train.transmitter_position
     extent = float((position.amax(dim=0) - position.amin(dim=0)).max()) or 1.0
-    kernel = Kernel(LENGTH_SHARE * extent, matern12_weight=1.0, noise=RELATIVE_NOISE)
+    kernel = Kernel(0.25 * extent, matern12_weight=1.0, noise=1.0)  # fading is as large as shadowing
     apart = log_distance(position, train.receiver_position)
     member = torch.nn.functional.one_hot(groups.code, len(groups.names)).double()
     normal = torch.zeros(len(groups.names), len(groups.names), dtype=torch.float64)

@@ -28,7 +28,6 @@ from swiftwrf.rssi.path_loss import harmonics, log_distance
 from swiftwrf.rssi.training import FEATURE_SCALE_DB, WEIGHT_TOLERANCE
 
 MAX_NEW_ROWS = 256  # beyond, the weights of new rows are fixed and the inverses are computed again
-MAX_ITERATIONS = 100  # of the weights of new rows
 TOLERANCE = WEIGHT_TOLERANCE / 100  # of these weights, so that the order of the rows does not matter
 
 
@@ -108,7 +107,7 @@ class NewRows:
     def solved(self, huber: float) -> NewRows:
         """Return the rows with weights and dual coefficients by iteratively reweighted least squares."""
         weight, noise = self.weight, self.variance.where(self.variance > 0, 1.0)
-        for _ in range(MAX_ITERATIONS):
+        for _ in range(100):
             dual = torch.linalg.solve(self.covariance + torch.diag_embed(noise / weight), self.error)
             used, missed = weight, (noise / weight * dual).abs()
             weight = (huber * noise.sqrt() / missed.clamp_min(1e-12)).clamp_max(1)

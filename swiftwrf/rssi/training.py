@@ -25,20 +25,12 @@ from swiftwrf.gp import GaussianProcess, Kernel, candidates, held_out_errors, su
 from swiftwrf.positions import cells
 from swiftwrf.rssi.base import RssiConfig
 from swiftwrf.rssi.head import Head, HeadTable, render
-from swiftwrf.rssi.path_loss import (
-    N_HARMONICS,
-    PathLoss,
-    fit_path_loss,
-    fit_shared_path_loss,
-    harmonics,
-    log_distance,
-)
+from swiftwrf.rssi.path_loss import N_HARMONICS, PathLoss, fit_path_loss, fit_shared_path_loss, harmonics, log_distance
 from swiftwrf.runtime.threads import single_thread
 
 # variance of a packet relative to the variance of the field: fading is as large as shadowing
 RELATIVE_NOISE_VARIANCES = (0.3, 1.0, 2.0, 3.0)
-VERTICALS = (1.0, 5.0)  # factors of the heights of floors: floors alike, or nearly independent beyond their attenuation
-MAX_KERNEL_ROWS, MAX_KERNEL_RECEIVERS = 300, 12  # more do not change the chosen kernel or weights
+MAX_KERNEL_RECEIVERS = 12  # more do not change the chosen kernel or weights
 PATH_LOSS_STD_DB = 30.0  # prior of level and slope about their least squares: as good as none
 MAX_SLOPE_STD_DB = 10.0  # of a slope: path-loss exponents of 2 to 6 (Rappaport 2002, table 4.2) scatter no more
 DIRECTIVITY_STD_DB = 2.0  # prior of each harmonic of a receiver's antenna and surroundings
@@ -46,10 +38,8 @@ DIRECTIVITY_STD_DB = 2.0  # prior of each harmonic of a receiver's antenna and s
 FEATURE_SCALE_DB = torch.tensor([PATH_LOSS_STD_DB] * 2 + [DIRECTIVITY_STD_DB] * N_HARMONICS, dtype=torch.float64)
 WEIGHT_TOLERANCE = 3e-3  # each weight is in (0, 1]
 LEVEL = 0.8  # nominal coverage of the interval that the standard deviation is calibrated for
-MIN_SCORES = 30  # held-out rows of a receiver below which the scores of all receivers scale its standard deviation
 MAX_VARIANCE_POSITIONS = 200  # measured positions that determine where the field is known
 MAX_PAIRS = 20_000  # measurements that determine the mixing weights
-MIN_ERROR_DB = 0.5  # of mixed predictors: absolute errors below it count as squares, so that the solution is unique
 
 
 @dataclass(frozen=True)
@@ -211,7 +201,7 @@ def interval_scale(
     score = ((train.rssi_dbm - predicted[bins.bin_of_row]) / std[bins.bin_of_row]).abs()
     finite = score.where(score.isfinite(), torch.nan)
     quantile = finite.nanquantile(LEVEL, dim=0)
-    few = (~finite.isnan()).sum(dim=0) < MIN_SCORES
+    few = (~finite.isnan()).sum(dim=0) < 30  # scores of all receivers count
     if few.any():
         quantile = quantile.where(~few, score[score.isfinite()].quantile(LEVEL))
     return quantile / NormalDist().inv_cdf((1 + LEVEL) / 2)
@@ -296,7 +286,7 @@ def choose_residual_kernel(
         The kernel, and whether its error is lower than that of no field at all.
     """
     some = (~residual.isnan()).any(dim=1)
-    position, residual, fold = subsample(position[some], residual[some], fold[some], rows=MAX_KERNEL_ROWS)
+    position, residual, fold = subsample(position[some], residual[some], fold[some], rows=300)
     residual = residual[:, (~residual.isnan()).any(dim=0)]
     (columns,) = subsample(torch.arange(residual.shape[1]), rows=MAX_KERNEL_RECEIVERS)
     residual = residual[:, columns]
@@ -315,7 +305,8 @@ def choose_residual_kernel(
 
     # rough fields only: a choice among mixtures with a smooth part follows chance, and its errors are no lower
     rough = [kernel for kernel in candidates(position, RELATIVE_NOISE_VARIANCES) if kernel.matern12_weight == 1]
-    stretched = (replace(kernel, vertical=vertical) for vertical in VERTICALS[: 1 + has_floors] for kernel in rough)
+    # floors alike, or nearly independent beyond their attenuation
+    stretched = (replace(kernel, vertical=vertical) for vertical in (1.0, 5.0)[: 1 + has_floors] for kernel in rough)
     score, best = min(((error(kernel), kernel) for kernel in stretched), key=lambda pair: pair[0])
     return best, score < float(residual.abs().nanmean())
 
@@ -486,5 +477,6 @@ def mixing_weights(held_out: Tensor, measured: Tensor, shrinkage: float = 0.0) -
         factor = np.linalg.cholesky(gram + scale * np.eye(n))
         weight = nnls(factor.T, np.linalg.solve(factor, np.ones(n)))[0]
         weight /= weight.sum()
-        importance = 1 / np.maximum(np.abs(error @ weight), MIN_ERROR_DB)
+        # absolute errors below 0.5 dB count as squares, so that the solution is unique
+        importance = 1 / np.maximum(np.abs(error @ weight), 0.5)
     return torch.from_numpy(weight)

@@ -24,8 +24,6 @@ from swiftwrf.runtime.durable import write_bytes
 from swiftwrf.runtime.validation import checked
 
 FORMAT = 1
-DEFINING_PACKAGES = ("swiftwrf.models", "swiftwrf.comparison", "swiftwrf.rssi", "swiftwrf.locate")  # of saved kinds
-EXTENSION_GROUPS = ("swiftwrf.models", "swiftwrf.estimators")  # entry points of packages that define saved kinds
 Header = dict[str, Any]  # values that JSON can store
 
 
@@ -147,9 +145,9 @@ def load(path: str | Path) -> Saved:
 
 def _import_kinds() -> None:
     """Import all packages that define saved kinds; those of others that cannot be imported define none."""
-    for package in DEFINING_PACKAGES:
+    for package in ("swiftwrf.models", "swiftwrf.comparison", "swiftwrf.rssi", "swiftwrf.locate"):
         import_module(package)
-    for point in (point for group in EXTENSION_GROUPS for point in entry_points(group=group)):
+    for point in (point for group in ("swiftwrf.models", "swiftwrf.estimators") for point in entry_points(group=group)):
         with suppress(Exception):  # code of another package may raise anything
             point.load()
 

@@ -53,11 +53,7 @@ def forwarding(listener: Callable[[float], None]) -> Iterator[None]:
 def silent() -> None:
     """Show no progress bar in this process from now on."""
     global _listener
-    _listener = _ignored
-
-
-def _ignored(fraction: float) -> None:
-    """Receive a fraction that nobody wants."""
+    _listener = lambda fraction: None  # noqa: E731
 
 
 def progress_bar(shown: bool = True) -> Progress:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import inspect
 import math
+import operator
 import sys
 import types
 from collections.abc import Callable, Mapping, Sequence
@@ -42,7 +43,12 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 Class = TypeVar("Class")
 NUMBERS: dict[type, tuple[type, ...]] = {int: (int,), float: (int, float)}
 LARGEST = {int: 2**63 - 1, float: sys.float_info.max}  # whole number that is accepted
-RANGES = {Ge: ("at least", "ge"), Gt: ("above", "gt"), Le: ("at most", "le"), Lt: ("below", "lt")}
+RANGES: dict[type, tuple[str, str, Callable[[Any, Any], bool]]] = {  # in words, attribute of the bound, comparison
+    Ge: ("at least", "ge", operator.ge),
+    Gt: ("above", "gt", operator.gt),
+    Le: ("at most", "le", operator.le),
+    Lt: ("below", "lt", operator.lt),
+}
 
 
 def check_value(name: str, value: object, annotation: Any) -> None:
@@ -68,7 +74,8 @@ def check_value(name: str, value: object, annotation: Any) -> None:
 def _allowed(value: object, annotation: Any) -> bool:
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
-        return _allowed(value, arguments[0]) and all(_in_range(value, bound) for bound in arguments[1:])
+        bounds = [(*RANGES[type(bound)][1:], bound) for bound in arguments[1:] if type(bound) in RANGES]
+        return _allowed(value, arguments[0]) and all(holds(value, getattr(b, name)) for name, holds, b in bounds)
     if origin is Literal:
         return any(type(value) is type(item) and value == item for item in arguments)
     if origin in (Union, types.UnionType):
@@ -98,19 +105,6 @@ def _allowed(value: object, annotation: Any) -> bool:
     if annotation in (None, type(None)):
         return value is None
     return annotation is Any or not isinstance(annotation, type) or isinstance(value, annotation)
-
-
-def _in_range(value: Any, bound: object) -> bool:
-    match bound:
-        case Ge(ge):
-            return bool(value >= ge)
-        case Gt(gt):
-            return bool(value > gt)
-        case Le(le):
-            return bool(value <= le)
-        case Lt(lt):
-            return bool(value < lt)
-    return True
 
 
 def _described(annotation: Any) -> str:

@@ -4,36 +4,60 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import json
 import socket
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
 from contextlib import suppress
 from ipaddress import ip_address
 from typing import Any
 
-from matplotlib import colormaps
-from matplotlib.colors import to_hex
-from nicegui import app, background_tasks, ui
+from markupsafe import escape
+from nicegui import app, background_tasks, events, ui
 from starlette.exceptions import HTTPException
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from swiftwrf import InputError
-from tasks.view.drawing import PlanProjection, ring, text
+from tasks.page.maps import Corners
+from tasks.view.charts import (
+    PLAN_LEFT,
+    PLAN_RIGHT,
+    PLAN_TOP,
+    Data,
+    Option,
+    circle,
+    crosses,
+    data_of,
+    lines,
+    paths,
+    plan,
+    points,
+)
 from tasks.view.locating import Located
 
 MAX_UPLOAD_BYTES, MAX_FRAME_BYTES = 2**25, 2**12  # of an image, and of the form around it
 MEDIAN, TRUTH = "#ffffff", "#66ccee"
+SET_OPTION = """(function set(left) {
+    const chart = getElement(%(id)d)?.chart;  // not there until the page is built
+    if (chart) chart.setOption(%(option)s); else if (left) setTimeout(set, 20, left - 1);
+})(1500)"""
+POINTER = """(event) => {
+    const box = event.currentTarget.getBoundingClientRect();
+    const at = [event.clientX - box.left, event.clientY - box.top];
+    const found = getElement(%d).chart?.convertFromPixel({gridIndex: 0}, at);
+    if (found) emit(event.type, event.buttons, ...found);
+}"""
 STYLE = """
 .nicegui-content { padding: 12px 20px; }
-.outside svg { overflow: visible; }
 .drag { touch-action: none; cursor: crosshair; user-select: none; }
-.pixels img { image-rendering: pixelated; }
+.chart image { image-rendering: pixelated; }
 .numbers { font-variant-numeric: tabular-nums; }
 .quiet { opacity: 0.8; font-size: 0.85rem; overflow-wrap: anywhere; }
-.extrapolated img { filter: grayscale(0.9); opacity: 0.6; }
+.extrapolated image { filter: grayscale(0.9); opacity: 0.6; }
 .nicegui-content, .nicegui-content > * { min-width: 0; max-width: 100%; }
 :root { --lines: #e4e8ef; --paper: #ffffff; }
 .body--dark { --lines: #2b3340; --paper: #121212; }
+.q-btn-group { flex-wrap: wrap; max-width: 100%; }
 .figure svg { width: 100%; height: auto; }
 @media (max-width: 700px) { .nicegui-content { padding: 8px 10px; } }
 """
@@ -81,19 +105,81 @@ def header(title: str, notes: list[str]) -> ui.row:
     return row
 
 
-def plan_picture(plan: PlanProjection, name: str) -> ui.interactive_image:
-    """Build a picture of the size of a plan that reports the position of the pointer."""
-    events = ["pointerdown", "pointermove", "pointerup", "pointerleave"]
-    picture = ui.interactive_image(size=plan.size, events=events, sanitize=False)
-    picture.style(f"width: {plan.size[0]}px; max-width: calc(100% - 58px); margin: 24px 10px 34px 48px")
-    return picture.classes("outside drag").props(f'id="{name}"')
+class Chart:
+    """A chart whose layers change one by one.
+
+    Args:
+        name: Identifier of the element on the page.
+        options: Options of ECharts.
+        style: Size of the element, as CSS.
+    """
+
+    def __init__(self, name: str, options: Option, style: str) -> None:
+        # SVG follows the colours of the page and keeps pixels sharp
+        self.element = ui.echart(options, renderer="svg").props(f'id="{name}"').classes("chart").style(style)
+
+    def show(self, layers: dict[str, Data], bar: Option | None = None) -> None:
+        """Replace the data of layers by their names, and the colour bar."""
+        option = json.dumps(data_of(layers, bar), allow_nan=False)
+        self.element.client.run_javascript(SET_OPTION % {"id": self.element.id, "option": option})
 
 
-def located_marks(plan: PlanProjection, found: Located) -> str:
-    """Return median, credible radii and measured position of a located observation."""
-    x, y = plan.pixel(found.median)
-    rings = [ring(x, y, radius * plan.scale, MEDIAN, 6) for radius in found.radius]
-    return "".join([*rings, plan.cross(found.median, MEDIAN), plan.cross(found.truth, TRUTH)])
+class PlanChart(Chart):
+    """A chart of positions, to scale, that reports the position of the pointer.
+
+    Args:
+        name: Identifier of the element on the page.
+        corners: Edges x0, x1, y0, y1 [m].
+        layers: Layers from the lowest to the highest.
+        max_px: Maximum width and height.
+        pointed: Called with kind of the event, pressed buttons, x and y [m].
+        has_bar: Whether there is a colour bar below.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        corners: Corners,
+        layers: list[Option],
+        max_px: tuple[int, int],
+        pointed: Callable[[str, int, float, float], None],
+        has_bar: bool = False,
+    ) -> None:
+        self.corners, (x0, x1, y0, y1) = corners, corners
+        bottom, ratio = 80 if has_bar else 40, (y1 - y0) / (x1 - x0)
+        width = min(max_px[0], max_px[1] / ratio)
+        style = (
+            f"width: 100%; height: calc((100cqw - {PLAN_LEFT + PLAN_RIGHT}px) * {ratio:.5f} + {PLAN_TOP + bottom}px)"
+        )
+        with ui.element().style(f"width: {width:.0f}px; max-width: 100%; container-type: inline-size"):
+            super().__init__(name, plan(corners, layers, bottom), style)
+        self.element.classes("drag")
+
+        def inside(event: events.GenericEventArguments) -> None:
+            kind, buttons, x, y = event.args
+            pointed(kind, buttons, min(max(x, x0), x1), min(max(y, y0), y1))
+
+        for kind in ("pointerdown", "pointermove", "pointerup", "pointerleave"):
+            self.element.on(kind, inside, js_handler=POINTER % self.element.id)
+
+
+def legend(entries: Iterable[tuple[str, str, str]]) -> str:
+    """Return a legend of entries: colour, symbol and text."""
+    parts = [f'<span style="color: {colour}">{symbol}</span> {escape(text)}' for colour, symbol, text in entries]
+    return "".join(f'<div style="display: inline-block; margin-right: 1em">{part}</div>' for part in parts)
+
+
+def located_layers() -> list[Option]:
+    """Return the layers of a located observation."""
+    return [lines("regions", MEDIAN, 2), crosses("median", MEDIAN), crosses("truth", TRUTH)]
+
+
+def located_data(found: Located | None) -> dict[str, Data]:
+    """Return credible regions, median and measured position of a located observation, nothing for None."""
+    if found is None:
+        return {"regions": [], "median": [], "truth": []}
+    regions = paths(circle(found.median, radius) for radius in found.radius)
+    return {"regions": regions, "median": points(found.median[None]), "truth": points(found.truth[None])}
 
 
 def slider(
@@ -107,18 +193,6 @@ def slider(
         shown = ui.label().classes("numbers").style("min-width: 5rem")
         shown.bind_text_from(made, "value", lambda value: f"{value or 0:.{digits}f} {unit}")
     return made
-
-
-def colour_bar(colours: str, low: float, high: float, label: str) -> str:
-    """Return a legend of a colour map as SVG."""
-    stops = "".join(f'<stop offset="{i / 8:g}" stop-color="{to_hex(colormaps[colours](i / 8))}"/>' for i in range(9))
-    ends = ((0, "start", low), (130, "middle", (low + high) / 2), (260, "end", high))
-    numbers = "".join(text(x, 30, f"{value:.3g}", anchor) for x, anchor, value in ends)
-    return (
-        '<svg viewBox="0 0 520 34" style="width: 520px; max-width: 100%">'
-        f'<defs><linearGradient id="bar-{colours}">{stops}</linearGradient></defs>'
-        f'<rect width="260" height="14" fill="url(#bar-{colours})"/>{numbers}{text(272, 12, label, size=13)}</svg>'
-    )
 
 
 def limited(app: ASGIApp) -> ASGIApp:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import textwrap
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,16 +17,14 @@ from swiftwrf import InputError, Prediction, Rssi, RssiModel
 from swiftwrf.positions import MAX_COORDINATE_M
 from swiftwrf.rssi import LEVEL
 from swiftwrf.rssi.maps import RssiMap
-from tasks.page import figures, maps
+from tasks.page import maps
 from tasks.page.floor_plan import FloorPlan
 from tasks.page.maps import Corners
 from tasks.records import as_table, read_npz, rounded
 from tasks.rssi.page.maps import MAX_WIDTH_DB
-from tasks.view.drawing import PlanProjection
 from tasks.view.locating import RssiLocating
 
 RECEIVER_COLOURS, N_RECEIVER_COLOURS = "tab20", 20
-RECEIVER_MARK = "#cf4a4a"
 MIN_STD_DB = 1e-6
 MapKind = Literal["RSSI", "interval", "coverage", "best receiver", "posterior", "expected error"]
 LOCATING: tuple[MapKind, ...] = ("posterior", "expected error")
@@ -116,8 +112,9 @@ class ColouredMap:
         colours: Name of a matplotlib colour map.
         low: Value of its first colour.
         high: Value of its last colour.
-        label: Quantity with its unit. Empty if the colours stand for names.
-        corners: Corners of the picture. Defaults to those of the view.
+        label: Unit. Empty if the colours stand for names.
+        extend: Ends of the scale that stand for all values beyond, "neither", "max" or "both".
+        corners: Edges x0, x1, y0, y1 [m] of the picture. Defaults to those of the map.
     """
 
     values: Values
@@ -125,6 +122,7 @@ class ColouredMap:
     low: float
     high: float
     label: str
+    extend: str = "neither"
     corners: Corners | None = None
 
 
@@ -180,12 +178,8 @@ class RssiView:
         self.floor, self._last = replace(self.floor, plan=plan), None
         self.__dict__.pop("inside", None)  # the map covers the plan, too
 
-    def plan(self, max_px: tuple[int, int]) -> PlanProjection:
-        """Return the plan that contains measurements, receivers and floor plan, at most of this size in pixels."""
-        return PlanProjection.around(self._region, max_px=max_px)
-
     @property
-    def _region(self) -> Values:
+    def region(self) -> Values:
         """Positions (n, 2) [m] whose box the page covers: measurements, known receivers and the floor plan."""
         receiver = self.floor.receiver[np.isfinite(self.floor.receiver).all(axis=1)]
         corners = np.array(self.floor.plan.corners).reshape(2, 2).T if self.floor.plan else np.empty((0, 2))
@@ -199,7 +193,7 @@ class RssiView:
     def map(self, height: float) -> RssiMap:
         """Return the map at a height of the transmitter [m]; the last one is cached."""
         if self._last is None or self._last.height != height:
-            self._last = RssiMap.predict(self.model, height=height, region=self._region)
+            self._last = RssiMap.predict(self.model, height=height, region=self.region)
         return self._last
 
     def coloured(self, selection: MapSelection) -> ColouredMap:
@@ -212,16 +206,10 @@ class RssiView:
             case "RSSI":
                 measured = self.floor.rssi_dbm[np.isfinite(self.floor.rssi_dbm)]
                 low, high = np.percentile(measured if len(measured) else mean, (1, 99)).tolist()
-                return ColouredMap(mean[receiver], "viridis", low, high, "predicted RSSI [dBm]")
+                return ColouredMap(mean[receiver], "viridis", low, high, "dBm", "both")
             case "interval":
                 low, high = chart.prediction.interval(LEVEL)
-                return ColouredMap(
-                    (high - low)[receiver].numpy(),
-                    "magma",
-                    0.0,
-                    MAX_WIDTH_DB,
-                    f"width of the {LEVEL:.0%} interval [dB]",
-                )
+                return ColouredMap((high - low)[receiver].numpy(), "magma", 0.0, MAX_WIDTH_DB, "dB", "max")
             case "coverage":
                 return ColouredMap(np.where(self._covered(selection), 0.7, np.nan), "GnBu", 0.0, 1.0, "")
             case "best receiver":
@@ -233,15 +221,21 @@ class RssiView:
         assert self.locating is not None
         found = self.locating.map(None if selection.kind == "expected error" else selection.row)
         if selection.kind == "posterior":
-            return ColouredMap(found.values, "magma", 0.0, 1.0, "posterior relative to its maximum", found.corners)
+            return ColouredMap(found.values, "magma", 0.0, 1.0, "of the maximum", corners=found.corners)
         high = float(np.nanpercentile(found.values, 98))
-        return ColouredMap(found.values, "viridis", 0.0, high, "expected position error [m]", found.corners)
+        return ColouredMap(found.values, "viridis", 0.0, high, "m", "max", found.corners)
 
     def _covered(self, selection: MapSelection) -> NDArray[np.bool_]:
         probability = probability_above(self.map(selection.height).prediction, selection)
         if selection.at_least == 0:
             return (probability[selection.receiver] >= selection.certainty).numpy()
         return (at_least(probability, selection.at_least) >= selection.certainty).numpy()
+
+    def best(self, height: float) -> dict[int, float]:
+        """Return the fraction of cells where each receiver has the highest prediction, the largest first."""
+        counts = np.bincount(self.map(height).mean.argmax(axis=0).ravel())
+        order = [int(number) for number in np.argsort(-counts, kind="stable") if counts[number]]
+        return {number: float(counts[number] / counts.sum()) for number in order}
 
     @cached_property
     def inside(self) -> NDArray[np.bool_]:
@@ -269,10 +263,7 @@ class RssiView:
                     f"{selection.threshold:g} dBm with {selection.certainty:.0%} certainty, if it is detected at all."
                 )
             case "best receiver":
-                best = torch.from_numpy(self.map(selection.height).mean).argmax(dim=0)
-                counts = best.flatten().bincount()
-                first = int(counts.argmax())
-                fraction = counts[first] / best.numel()
+                first, fraction = next(iter(self.best(selection.height).items()))
                 return f"Receiver with the highest prediction: {self.receivers[first]} on {fraction:.0%} of the map."
         raise AssertionError(selection.kind)
 
@@ -325,38 +316,6 @@ class RssiView:
         )
         table["best_receiver"] = np.array(self.receivers)[chart.mean.argmax(axis=0).ravel()]
         return as_table(rounded(table.to_dict("records")))
-
-    def picture(self, selection: MapSelection) -> bytes:
-        """Return the selected map as PNG with axes and legend."""
-        coloured, corners = self.coloured(selection), self.chart.corners
-        height, width = self.chart.mean.shape[1:]
-        figure, (ax,) = figures.new_figure(1, 1, 8, 1 + 7 * height / width)
-        if self.floor.plan:
-            ax.imshow(self.floor.plan.pixels, extent=self.floor.plan.corners, zorder=0)
-        drawn = ax.imshow(
-            coloured.values,
-            origin="lower",
-            extent=coloured.corners or corners,
-            cmap=coloured.colours,
-            vmin=coloured.low,
-            vmax=coloured.high,
-            alpha=0.75 if self.floor.plan else 1.0,
-            zorder=1,
-        )
-        for number, (x, y) in enumerate(self.floor.receiver[:, :2]):
-            if number == selection.receiver or selection.kind == "best receiver":
-                ax.plot(x, y, "x", color=RECEIVER_MARK, markersize=9, markeredgewidth=2)
-                ax.annotate(figures.short(self.receivers[number]), (x, y), (6, 6), textcoords="offset points")
-        ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", xlim=corners[:2], ylim=corners[2:])
-        ax.grid(visible=False)
-        height_m = "" if selection.kind in LOCATING else f" Height {selection.height:.2f} m."
-        title = textwrap.fill(f"{self.sentence(selection)}{height_m}", figures.MAX_LINE_LENGTH)
-        ax.set_title(figures.plain(title), fontsize=8)
-        if coloured.label:
-            figure.colorbar(drawn, ax=ax, label=coloured.label, fraction=0.04, pad=0.02)
-        stream = io.BytesIO()
-        figure.savefig(stream, format="png", dpi=150)
-        return stream.getvalue()
 
 
 def probability_above(rssi: Prediction, selection: MapSelection) -> Tensor:

@@ -3,33 +3,34 @@
 from __future__ import annotations
 
 import io
+from urllib.parse import unquote
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 from nicegui import events, run, ui
-from numpy.typing import NDArray
 from PIL import Image
 
 from swiftwrf import InputError
 from tasks.page.floor_plan import FloorPlan, read_pixels
 from tasks.page.raster import colour_image
-from tasks.view.drawing import text
-from tasks.view.page import MAX_UPLOAD_BYTES, NewestOnly, colour_bar, header, located_marks, plan_picture, slider
-from tasks.view.rssi import (
-    LOCATING,
-    N_RECEIVER_COLOURS,
-    RECEIVER_COLOURS,
-    RECEIVER_MARK,
-    ColouredMap,
-    MapSelection,
-    RssiView,
+from tasks.view.charts import BAR, Data, around, colour_bar, crosses, dots, named, picture, pictures, points
+from tasks.view.page import (
+    MAX_UPLOAD_BYTES,
+    NewestOnly,
+    PlanChart,
+    header,
+    legend,
+    located_data,
+    located_layers,
+    slider,
 )
+from tasks.view.rssi import LOCATING, N_RECEIVER_COLOURS, RECEIVER_COLOURS, ColouredMap, MapSelection, RssiView
 
-N_DOT_COLOURS = 33
 MAX_MAP_PX = (880, 700)
 KIND_LABELS = {"interval": "uncertainty"}  # of the kinds that the page calls by another word
 HINT = "Hover over the map."
+RECEIVER_MARK = "#cf4a4a"
 ROW = "#999999"  # of the measured rows under a posterior
 
 
@@ -37,20 +38,20 @@ class RssiPage:
     """The page for one visitor."""
 
     def __init__(self, view: RssiView) -> None:
-        self._view, self._plan = view, view.plan(MAX_MAP_PX)
+        self._view = view
         self._placing: dict[str, ui.number] = {}
         self._maps, self._points = NewestOnly(self._show_map), NewestOnly(self._show_point)
         with header(view.title, view.notes):
             kinds = {kind: KIND_LABELS.get(kind, kind) for kind in view.kinds}
             self._kind = ui.toggle(kinds, value="RSSI", on_change=self._update).props("no-caps padding='2px 12px'")
+        layers = [pictures("floor"), pictures("map"), pictures("outside"), dots("rows", ROW, 3)]
+        layers += [dots("measured", ROW, 8, borderColor="white", borderWidth=0.7), *located_layers()]
+        layers += [crosses("receivers", RECEIVER_MARK)]
         with ui.row().classes("w-full items-start gap-8 lg:flex-nowrap"):
-            with ui.column().classes("gap-1").style("flex: none; max-width: 100%"):
-                self._picture = plan_picture(self._plan, "map")
-                self._picture.on_mouse(self._on_pointer)
-                self._bar = ui.html("", sanitize=False).style(
-                    "min-height: 34px; margin-left: 48px; max-width: calc(100% - 48px)"
-                )
-            with ui.column().classes("gap-3 grow").style("max-width: 420px; min-width: min(100%, 18rem)"):
+            with ui.column().classes("gap-1").style("flex: 0 1 880px; max-width: 100%; min-width: 0"):
+                self._plan = PlanChart("map", around(view.region), layers, MAX_MAP_PX, self._on_pointer, has_bar=True)
+                self._best = ui.html("", sanitize=False).props('id="best"').classes("quiet")
+            with ui.column().classes("gap-3").style("flex: 1 1 300px; max-width: 420px"):
                 self._build_controls()
         self._update()
 
@@ -79,7 +80,7 @@ class RssiPage:
         self._point = ui.label(HINT).classes("numbers").props('id="here"').style("white-space: pre-line")
         ui.separator()
         with ui.row():
-            ui.button("PNG", icon="download", on_click=self._save_picture).props("outline no-caps")
+            ui.button("SVG", icon="download", on_click=self._save_picture).props("outline no-caps")
             ui.button("CSV", icon="download", on_click=self._save_table).props("outline no-caps")
         self._build_floor_plan()
 
@@ -128,64 +129,44 @@ class RssiPage:
         self._height.set_enabled(selection.kind not in LOCATING)
         self._choice.set_visibility(selection.kind == "posterior")
         self._sentence.set_text(self._view.sentence(selection))
-        bar = colour_bar(coloured.colours, coloured.low, coloured.high, coloured.label) if coloured.label else ""
-        self._bar.set_content(bar)
-        self._picture.set_content(self._map_svg(selection, coloured))
+        best = self._view.best(selection.height) if selection.kind == "best receiver" else {}
+        entries = [(_colour(r), "■", f"{self._view.receivers[r]} {part:.0%}") for r, part in best.items()]
+        self._best.set_content(legend(entries[:N_RECEIVER_COLOURS]))
+        limits = coloured.low, coloured.high
+        bar = colour_bar(coloured.colours, limits, coloured.label, "measured", coloured.extend)
+        self._plan.show(self._data(selection, coloured), bar if coloured.label else {"id": BAR, "show": False})
 
-    def _map_svg(self, selection: MapSelection, coloured: ColouredMap) -> str:
-        plan, floor = self._plan, self._view.floor
-        parts = [plan.picture(Image.fromarray(floor.plan.pixels), floor.plan.corners)] if floor.plan else []
+    def _data(self, selection: MapSelection, coloured: ColouredMap) -> dict[str, Data]:
+        """Return the data of all layers of the plan."""
+        view, floor, corners = self._view, self._view.floor, self._view.chart.corners
         image = colour_image(coloured.values[::-1], coloured.colours, coloured.low, coloured.high)
-        parts.append(plan.picture(image, coloured.corners or self._view.chart.corners, 0.7 if floor.plan else 1.0))
-        if selection.kind not in LOCATING:
-            parts.append(plan.picture(colour_image(self._outside, "gray"), self._view.chart.corners, 0.55))
+        data: dict[str, Data] = {"floor": [], "outside": [], "rows": [], "measured": [], "receivers": []}
+        data["map"] = picture(image, coloured.corners or corners, 0.7 if floor.plan else 1.0)
+        if floor.plan:
+            data["floor"] = picture(Image.fromarray(floor.plan.pixels), floor.plan.corners)
+        if selection.kind not in LOCATING:  # grey where the map is extrapolated
+            data["outside"] = picture(colour_image(np.where(view.inside, np.nan, 0.5)[::-1], "gray"), corners, 0.55)
         if selection.kind == "RSSI":
-            parts.append(self._measured_svg(selection.receiver, coloured))
-        if selection.kind == "posterior":
-            parts.append(self._located_svg(selection.row))
+            values = floor.rssi_dbm[:, selection.receiver]
+            detected = np.isfinite(values)
+            data["measured"] = points(floor.position[detected], values[detected])
+        found = None
+        if selection.kind == "posterior" and view.locating is not None:
+            data["rows"], found = points(floor.position), view.locating.located(selection.row)
         every = selection.kind in ("best receiver", *LOCATING)
         for number, position in enumerate(floor.receiver):
             if np.isfinite(position).all() and (every or number == selection.receiver):
-                x, y = plan.pixel(position)
-                if selection.kind == "best receiver":
-                    colour = to_hex(colormaps[RECEIVER_COLOURS](number % N_RECEIVER_COLOURS))
-                    parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="7" fill="{colour}" stroke="black"/>')
-                else:
-                    parts.append(plan.cross(position, RECEIVER_MARK))
-                parts.append(text(x + 11, y + 5, self._view.receivers[number], haloed=True))
-        return "".join([*parts, plan.axes()])
+                colour = _colour(number) if selection.kind == "best receiver" else RECEIVER_MARK
+                data["receivers"].append(named(position, view.receivers[number], color=colour))
+        return data | located_data(found)
 
-    @property
-    def _outside(self) -> NDArray[np.floating]:
-        """Grey where the map is extrapolated, transparent elsewhere, the first row on top."""
-        return np.where(self._view.inside, np.nan, 0.5)[::-1]
-
-    def _measured_svg(self, receiver: int, coloured: ColouredMap) -> str:
-        """Return the measurements as dots in the colours of the map, with a white rim."""
-        values = self._view.floor.rssi_dbm[:, receiver]
-        detected = np.isfinite(values)
-        position = self._view.floor.position[detected]
-        scaled = np.clip((values[detected] - coloured.low) / (coloured.high - coloured.low), 0, 1)
-        step = np.rint(scaled * (N_DOT_COLOURS - 1)).astype(int)
-        # one path for each colour: one for each dot would be too many for a browser
-        colour = colormaps[coloured.colours].resampled(N_DOT_COLOURS)
-        dots = [self._plan.dots(position[step == number], to_hex(colour(int(number))), 4) for number in np.unique(step)]
-        return "".join([self._plan.dots(position, "white", 4.7), *dots])
-
-    def _located_svg(self, row: int) -> str:
-        """Return the measured rows, and the median, credible regions and measured position of one of them."""
-        assert self._view.locating is not None
-        dots = self._plan.dots(self._view.floor.position, ROW, 1.5)
-        return dots + located_marks(self._plan, self._view.locating.located(row))
-
-    def _on_pointer(self, event: events.MouseEventArguments) -> None:
-        if event.type == "pointerdown" and self._view.locating is not None and self._kind.value == "posterior":
-            row = self._view.locating.nearest(*self._plan.position(event.image_x, event.image_y))
-            self._row.value = int(self._view.locating.rows.index[row])
-        if event.type == "pointerleave":
+    def _on_pointer(self, kind: str, buttons: int, x: float, y: float) -> None:
+        if kind == "pointerdown" and self._view.locating is not None and self._kind.value == "posterior":
+            self._row.value = int(self._view.locating.rows.index[self._view.locating.nearest(x, y)])
+        if kind == "pointerleave":
             self._point.set_text(HINT)
         else:
-            self._points.submit(*self._plan.position(event.image_x, event.image_y))
+            self._points.submit(x, y)
 
     async def _show_point(self, x: float, y: float) -> None:
         described = await run.io_bound(self._view.describe, self._selection, x, y)
@@ -193,14 +174,17 @@ class RssiPage:
             self._point.set_text(described)
 
     async def _save_picture(self) -> None:
-        selection = self._selection
-        content = await run.io_bound(self._view.picture, selection)
-        if content is not None:
-            ui.download.content(content, f"{_file_name(selection)}.png", "image/png")
+        name = f"{_file_name(self._selection)}.svg"
+        address = await self._plan.element.run_chart_method("getDataURL", timeout=10)
+        ui.download.content(unquote(address.partition(",")[2]), name, "image/svg+xml")
 
     def _save_table(self) -> None:
         selection = self._selection
         ui.download.content(self._view.table(selection), f"{_file_name(selection)}.csv", "text/csv")
+
+
+def _colour(receiver: int) -> str:
+    return to_hex(colormaps[RECEIVER_COLOURS](receiver % N_RECEIVER_COLOURS))
 
 
 def _file_name(selection: MapSelection) -> str:

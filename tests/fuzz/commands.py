@@ -44,7 +44,7 @@ REQUIRED_OPTIONS = {
     "inspect": ["data"],
     "view": ["data"],
     "scenes": ["--room", "office", "--moving", "receiver", "--positions", "5"],
-    "estimate": ["data", "data"],
+    "predict": ["data", "data"],
     "locate": ["--cells", "100"],
     "update": ["model", "data"],
 }

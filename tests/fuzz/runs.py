@@ -48,6 +48,7 @@ from tasks.page.floor_plan import FloorPlan
 from tasks.records import write_json
 from tasks.update import lines
 from tasks.update.record import TABLE, Record
+from tasks.view.charts import around, picture, points
 from tasks.view.followed import FollowedView
 from tasks.view.rssi import MapSelection, RssiView
 from tasks.view.sources import open_source
@@ -113,10 +114,9 @@ def _show_rssi(view: RssiView) -> None:
         view.coloured(selection)
         view.sentence(selection)
         view.describe(selection, x, y)
-    plan = view.plan((120, 120))
+    json.dumps([around(view.region), points(view.floor.position)], allow_nan=False)
     if view.floor.plan is not None:
-        plan.picture(Image.fromarray(view.floor.plan.pixels), view.floor.plan.corners)
-    plan.dots(view.floor.position, "red", 1)
+        picture(Image.fromarray(view.floor.plan.pixels), view.floor.plan.corners)
 
 
 # followed sources

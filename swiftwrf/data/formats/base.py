@@ -113,30 +113,23 @@ def read(path: str | Path, options: ReadOptions, *registries: Registry[Format[An
     if not os.path.isdir(source) and not os.path.isfile(source):  # Path.is_dir raises for a name that is too long
         raise InputError(f"{source} is not a folder or file; expected measurements (formats: {known})")
     try:
-        name, reader = _find(source, known, registries)
+        readers = [(name, registry[name]()) for registry in registries for name in registry]
+        found = [(name, reader) for name, reader in readers if reader.recognises(source)]
+        if not found:
+            raise InputError(f"{source} is in none of the known formats ({known}); docs/formats.md describes them")
+        if len(found) > 1:
+            names = " and ".join(name for name, _ in found)
+            raise InputError(
+                f"{source} holds several formats ({names}); keep one in the folder, or name the file itself"
+            )
+        ((name, reader),) = found
         logger.info("%s is read as %s", source, name)
         for option in options.given:
             if option not in reader.takes:
                 raise InputError(f"{source} is read as {name}, which takes no {option}; leave it out")
-        return _with_limits(reader.read(source, options))
+        data = reader.read(source, options)
     except OSError as error:
         reason = "no permission to read it" if isinstance(error, PermissionError) else error.strerror
         raise InputError(f"{error.filename or source} cannot be read ({reason})") from None
-
-
-def _with_limits(data: Any) -> Any:
-    """Return the measurements with a note on directions that their array does not distinguish."""
     array = getattr(data, "array", None)
     return data if array is None or array.axis is None else replace(data, notes=(*data.notes, LINEAR_ARRAY))
-
-
-def _find(source: Path, known: str, registries: tuple[Registry[Any], ...]) -> tuple[str, Format[Any]]:
-    """Return the only format that recognises the source; with two, either would be a guess."""
-    readers = [(name, registry[name]()) for registry in registries for name in registry]
-    found = [(name, reader) for name, reader in readers if reader.recognises(source)]
-    if not found:
-        raise InputError(f"{source} is in none of the known formats ({known}); docs/formats.md describes them")
-    if len(found) > 1:
-        names = " and ".join(name for name, _ in found)
-        raise InputError(f"{source} holds several formats ({names}); keep one in the folder, or name the file itself")
-    return found[0]

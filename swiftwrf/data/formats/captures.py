@@ -19,7 +19,7 @@ from swiftwrf.data.files import read_bytes, read_table, read_yaml
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
 from swiftwrf.data.formats.snapshots import array_of, snapshots_of
 from swiftwrf.data.snapshots import Snapshots
-from swiftwrf.errors import InputError, listed, ranges
+from swiftwrf.errors import InputError, listed, optional_module, ranges
 
 POSITIONS, DESCRIPTION = "positions.csv", "array.yml"
 NEEDED = (
@@ -27,15 +27,13 @@ NEEDED = (
     "array_orientation, frequency_hz, and rows, columns and spacing_m or element_position)"
 )
 GIVEN = ("frequency_hz", "array_position", "array_orientation")
-ELEMENTS = ("rows", "columns", "spacing_m", "element_position")
 OFFSETS = "phases of the receiver's chains are as measured; they contain constant offsets unless these were corrected"
 MAX_PACKETS = 32  # used of each capture, evenly spaced
-ESP32_MARK, MARK_BYTES = b"CSI_DATA", 4096  # in the first bytes of its tables
 Channel = NDArray[np.complex128]
 ONE_ANTENNA = "which has one antenna and receives no direction"
 
 BFEE_HEADER_BYTES = 21  # code included
-BFEE_SUBCARRIERS, BFEE_ANTENNAS = 30, 3
+BFEE_ANTENNAS = 3
 
 PCAP_ORDERS: dict[bytes, Literal["little", "big"]] = dict.fromkeys((b"\xd4\xc3\xb2\xa1", b"\x4d\x3c\xb2\xa1"), "little")
 PCAP_ORDERS |= dict.fromkeys((b"\xa1\xb2\xc3\xd4", b"\xa1\xb2\x3c\x4d"), "big")
@@ -66,7 +64,7 @@ def _split_csitool(content: bytes, elements: int) -> tuple[list[bytes], int]:
             raise ValueError(f"the frame at byte {start} is cut off")
         if frame[0] == 0xBB:  # CSI; other frames are skipped
             n_receive, n_transmit = frame[9:11] if size > BFEE_HEADER_BYTES else (0, 0)
-            expected = (BFEE_SUBCARRIERS * (16 * n_receive * n_transmit + 3) + 7) // 8
+            expected = (30 * (16 * n_receive * n_transmit + 3) + 7) // 8
             if not (
                 1 <= n_receive <= BFEE_ANTENNAS
                 and 1 <= n_transmit <= BFEE_ANTENNAS
@@ -142,11 +140,7 @@ def _decode_nexmon(packet: bytes, elements: int) -> Channel:
 
 
 def _csiread() -> Any:
-    try:
-        import csiread
-    except ImportError:
-        raise InputError("captures are decoded by csiread; install it with pip install 'swiftwrf-tasks[csi]'") from None
-    return csiread
+    return optional_module("csiread", "captures are decoded by csiread", "csi")
 
 
 TOOLS = {
@@ -212,8 +206,8 @@ def _is_capture(file: Path) -> bool:
     if file.suffix not in (*TOOLS, ".csv") or not file.is_file():
         return False
     with file.open("rb") as stream:
-        start = stream.read(MARK_BYTES)
-    return TOOLS[file.suffix].recognises(start) if file.suffix in TOOLS else ESP32_MARK in start
+        start = stream.read(4096)
+    return TOOLS[file.suffix].recognises(start) if file.suffix in TOOLS else b"CSI_DATA" in start
 
 
 def _read_description(file: Path) -> Arrays:
@@ -223,7 +217,7 @@ def _read_description(file: Path) -> Arrays:
     if missing:
         raise InputError(f"{file} lacks {', '.join(missing)}: {NEEDED}")
     arrays = {}
-    for name in (*GIVEN, *ELEMENTS):
+    for name in (*GIVEN, "rows", "columns", "spacing_m", "element_position"):
         if name in content:
             try:
                 arrays[name] = np.array(content[name], dtype=np.float64)

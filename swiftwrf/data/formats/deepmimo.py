@@ -37,9 +37,8 @@ from swiftwrf.positions import check_positions
 
 Floats = NDArray[np.float64]
 KEYS = ("power", "phase", "delay", "aoa_az", "aoa_el")
-INTERACTIONS, LINE_OF_SIGHT = "inter", 0
+INTERACTIONS = "inter"
 FILE = re.compile(r"power_(t\d+_tx\d+_r\d+)\.npz")
-MIN_DETOUR, MAX_DETOUR = 0.9, 100.0  # median length of the shortest paths, in distances: beyond, units are wrong
 DIRECT_DETOUR = 0.01  # relative: without interactions, a path that is at most this much longer counts as direct
 MAX_ANGLE_OFFSET_DEG = 15.0  # median angle between direct paths and the line of sight
 MIN_DIRECT_PATHS = 10  # that show the conventions
@@ -145,7 +144,7 @@ def _paths(
         raise InputError(f"{folder}: a receiver at {receiver[distance.argmin()].tolist()} m is at the transmitter")
     detour = np.where(known, table["delay"] * LIGHT_SPEED / distance[:, None], math.inf)
     shortest = float(np.median(detour.min(axis=1)))
-    if not MIN_DETOUR <= shortest <= MAX_DETOUR:
+    if not 0.9 <= shortest <= 100.0:  # times the distance
         raise InputError(
             f"{folder}: shortest paths are {shortest:.3g} times as long as the distance (median), so positions are not in "
             "metres or delays not in seconds"
@@ -154,7 +153,7 @@ def _paths(
     if max(np.abs(azimuth[known]).max(), np.abs(zenith[known]).max()) <= 2 * math.pi:
         raise InputError(f"{folder}: no angle is beyond 2 pi, so they look like radians; aoa_az and aoa_el are degrees")
     if INTERACTIONS in table:
-        direct, notes = known & (table[INTERACTIONS] == LINE_OF_SIGHT), []
+        direct, notes = known & (table[INTERACTIONS] == 0), []
     else:
         direct, notes = np.abs(detour - 1) < DIRECT_DETOUR, [NO_INTERACTIONS]
     if _from_horizon(folder, azimuth, zenith, direct, away, known):
@@ -188,12 +187,7 @@ def _direction(azimuth: Floats, zenith: Floats) -> Floats:
 
 
 def _from_horizon(
-    folder: Path,
-    azimuth: Floats,
-    zenith: Floats,
-    direct: NDArray[np.bool_],
-    away: Floats,
-    known: NDArray[np.bool_],
+    folder: Path, azimuth: Floats, zenith: Floats, direct: NDArray[np.bool_], away: Floats, known: NDArray[np.bool_]
 ) -> bool:
     """Return True if elevations count from the horizon, and refuse other conventions than those of docs/formats.md.
 

@@ -36,7 +36,6 @@ TABLES = ("gateway_rssi.csv", "rssi.csv")
 POSITIONS = ("tx_pos.csv", "rx_pos.csv", "beacon_pos.csv")
 RECEIVERS = ("gateway_position.yml", "gateway_pos.csv")
 FILES = ("gateway_rssi.csv", *POSITIONS, *RECEIVERS)  # any of which marks the layout
-EMPTY_VALUES = ("", "~", "null", "none")  # of a receiver whose position is unknown
 
 
 @RSSI_FORMATS.register("nerf2")
@@ -46,7 +45,8 @@ class Nerf2Rssi(Format[Rssi]):
     takes = frozenset({"filler"})
 
     def recognises(self, path: Path) -> bool:
-        return any((path / name).is_file() for name in (*TABLES[:1], *RECEIVERS[:1])) or _is_raw(path)
+        raw = (path / TABLES[1]).is_file() and any((path / name).is_file() for name in POSITIONS)
+        return raw or any((path / name).is_file() for name in (*TABLES[:1], *RECEIVERS[:1]))
 
     def read(self, path: Path, options: ReadOptions) -> Rssi:
         table, positions = _one_of(path, TABLES), _one_of(path, POSITIONS)
@@ -129,10 +129,6 @@ def _properties(file: Path) -> dict[str, Any]:
     return found
 
 
-def _is_raw(path: Path) -> bool:
-    return (path / TABLES[1]).is_file() and any((path / name).is_file() for name in POSITIONS)
-
-
 def _one_of(path: Path, names: tuple[str, ...]) -> Path:
     """Return the only file with one of these names.
 
@@ -153,7 +149,7 @@ def _receiver_positions(file: Path | None, names: list[str]) -> tuple[Tensor | N
         return None, []
     if file.suffix == ".csv":
         return read_receivers(file, names)
-    content = {name: value for name, value in read_yaml(file).items() if value not in EMPTY_VALUES}
+    content = {name: value for name, value in read_yaml(file).items() if value not in ("", "~", "null", "none")}
     unknown = [name for name in names if name not in content]
     if len(unknown) == len(names):
         raise InputError(f"{file} has no position of the receivers that the table names: {listed(names)}")

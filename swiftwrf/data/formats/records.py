@@ -222,7 +222,8 @@ def _read_station(
         raise InputError(f"{file} describes {len(antennas)} arrays; choose one by its number: station ({listed})")
     index = (number or 1) - 1
     antenna = antennas[index]
-    right, up, frequency = antenna.get("spacingX"), antenna.get("spacingY"), content.get("frequency")
+    right, up = antenna.get("spacingX"), antenna.get("spacingY")
+    frequency: Any = content.get("frequency")
     for name, value in (
         ("spacingX [m] of an array", right),
         ("spacingY [m] of an array", up),
@@ -233,7 +234,15 @@ def _read_station(
     rows: Assignments = [[row * COLUMNS + column for column in range(COLUMNS)] for row in range(ROWS)]
     first = index * ROWS * COLUMNS  # of the antennas of ESPARGOS, whose arrays follow each other
     if assigned:
-        rows, first = _assignments(file, antenna.get("assignments")), 0
+        rows, first = antenna.get("assignments"), 0
+        check_value(f"{file}: assignments, the antenna of each row and column,", rows, Assignments)
+        if len({len(row) for row in rows}) != 1:
+            raise InputError(f"{file}: assignments must be rows of equal length, with null where an antenna is missing")
+        used = [cell for row in rows for cell in row if cell is not None]
+        if len(set(used)) != len(used) or len(used) < 2:
+            raise InputError(
+                f"{file}: assignments must name 2 or more antennas by their numbers, each once, got {rows}"
+            )
     middle = (len(rows) - 1) / 2, (len(rows[0]) - 1) / 2
     cells = [(r, c, antenna) for r, row in enumerate(rows) for c, antenna in enumerate(row) if antenna is not None]
     element = [(right * (column - middle[1]), up * (middle[0] - row)) for row, column, _ in cells]
@@ -263,17 +272,6 @@ def _rotation(file: Path, antenna: dict[str, Any]) -> Tensor:
         )
     right, front = (vector / np.linalg.norm(vector) for vector in (right, np.cross(right, up)))
     return torch.from_numpy(np.stack([right, np.cross(front, right), front], axis=1))
-
-
-def _assignments(file: Path, rows: Any) -> Assignments:
-    check_value(f"{file}: assignments, the antenna of each row and column,", rows, Assignments)
-    if len({len(row) for row in rows}) != 1:
-        raise InputError(f"{file}: assignments must be rows of equal length, with null where an antenna is missing")
-    used = [cell for row in rows for cell in row if cell is not None]
-    if len(set(used)) != len(used) or len(used) < 2:
-        raise InputError(f"{file}: assignments must name at least 2 antennas by their numbers, each once, got {rows}")
-    found: Assignments = rows
-    return found
 
 
 def records(file: Path) -> Iterator[dict[str, bytes]]:

@@ -57,7 +57,11 @@ def snapshots_of(
     Raises:
         InputError: An array that is invalid, or arrays that do not match.
     """
-    arrays, reversed_axes = _turned_round(_without_unit_axes(arrays))
+    # scalars and vectors as such, which MATLAB stores as matrices
+    vectors = {name: arrays[name] for name in VECTORS if name in arrays and arrays[name].ndim == 2}
+    arrays = arrays | {name: values.reshape(-1) for name, values in vectors.items() if 1 in values.shape}
+    arrays |= {name: arrays[name].reshape(()) for name in SCALARS if name in arrays and arrays[name].size == 1}
+    arrays, reversed_axes = _turned_round(arrays)
     position, array = check_positions(arrays["position"], f"{source}: position"), array_of(source, arrays)
     n, folder, pose = len(position), files[0].parent, _pose(source, arrays)
     raw = _channel(source, arrays["csi"], n, len(array.element))
@@ -87,17 +91,6 @@ def _file(path: Path) -> Path | None:
             (path / f"snapshots{suffix}" for suffix in ARCHIVES if (path / f"snapshots{suffix}").is_file()), None
         )
     return path if path.suffix in ARCHIVES and "csi" in array_names(path) else None
-
-
-def _without_unit_axes(arrays: Arrays) -> Arrays:
-    """Return the arrays with scalars and vectors as such, which MATLAB stores as matrices."""
-    vectors = {name: arrays[name].reshape(-1) for name in VECTORS if name in arrays and _is_row(arrays[name])}
-    scalars = {name: arrays[name].reshape(()) for name in SCALARS if name in arrays and arrays[name].size == 1}
-    return arrays | vectors | scalars
-
-
-def _is_row(values: NDArray[np.generic]) -> bool:
-    return values.ndim == 2 and 1 in values.shape
 
 
 def _turned_round(arrays: Arrays) -> tuple[Arrays, tuple[str, ...]]:

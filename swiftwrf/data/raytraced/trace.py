@@ -28,15 +28,12 @@ from swiftwrf.plotting import MARK, Axes, plan_axes
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.validation import NonNegativeInt, configuration
 
-SEARCH_RAYS = 30_000  # that search for chains of surfaces
 BATCH_POSITIONS = 32  # chains share a table, which many positions would fill
-SAME_IMAGE_M = 1e-3  # distance below which two image sources are one, found twice
 Table = dict[str, NDArray[Any]]
 MIN_LLVM = 19  # earlier ones abort the process when they compile a trace; tried: 15 and 16
 LEVEL_COSINE = 0.5  # of a normal to the vertical; faces above are level
 SHELL_EXTENT = 0.95  # of the scene; floors, ceilings and walls of that size are not filled in a plan
 MOVING = "#444444"
-ISOTROPIC = {"num_rows": 1, "num_cols": 1, "pattern": "iso", "polarization": "V"}
 
 
 def sionna() -> Any:
@@ -162,7 +159,7 @@ def open_scene(name: str, frequency_hz: float) -> Scene:
 
 def _at(held: Any, frequency_hz: float) -> Any:
     held.frequency = frequency_hz
-    held.tx_array = held.rx_array = sionna().PlanarArray(**ISOTROPIC)
+    held.tx_array = held.rx_array = sionna().PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
     return held
 
 
@@ -260,7 +257,7 @@ def trace(
 
 def _trace_batch(held: Any, fixed: Tensor, position: Tensor, moving: Moving, tracing: Tracing) -> PropagationPaths:
     _place(held, fixed, position)
-    tables = [_solve(held, tracing, SEARCH_RAYS, diffuse=False)]
+    tables = [_solve(held, tracing, 30_000, diffuse=False)]  # search for chains
     if tracing.scattering:
         tables.append(_solve(held, tracing, 300, diffuse=True))  # each is a path wherever it scatters
     table = {name: np.concatenate([part[name] for part in tables]) for name in tables[0]}
@@ -352,7 +349,7 @@ def _first(table: Table) -> NDArray[np.int64]:
     """Return the rows that do not repeat an earlier path of their position; adjacent triangles may find one twice."""
     image = table["length"][:, None] * table["arrival"]
     rows = [
-        mine[~np.tril(np.linalg.norm(image[mine][:, None] - image[mine], axis=-1) < SAME_IMAGE_M, -1).any(axis=1)]
+        mine[~np.tril(np.linalg.norm(image[mine][:, None] - image[mine], axis=-1) < 1e-3, -1).any(axis=1)]
         for mine in (np.flatnonzero(table["owner"] == number) for number in np.unique(table["owner"]))
     ]
     return np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)

@@ -46,7 +46,6 @@ from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, configuration
 
 FURTHER_SIGNIFICANCE = 4.0  # standard errors for a plane of any orientation, of which far more are tried
-MIN_SEARCHED = 50  # spectra of a search whose room is extended; searches in fewer end at phase aliases more often
 MAX_MISSING_RATIO = 1.4  # of the missing coherence of new spectra and of those of a search, geometric means
 N_FINAL = 400  # positions of the last moves of a search; fewer do not separate planes from aliases in furnished rooms
 
@@ -128,7 +127,7 @@ def extend_room(room: PlaneSet, train: Spectra, is_new: Tensor, config: Geometry
     new = is_new[evidence.rows]
     explained = log_explained(room.coherence(scene))
     excess = explained[~new].mean() - explained[new].mean()
-    if int((~new).sum()) < MIN_SEARCHED or not room.normal.shape[1] or not float(excess) < math.log(MAX_MISSING_RATIO):
+    if int((~new).sum()) < 50 or not room.normal.shape[1] or not float(excess) < math.log(MAX_MISSING_RATIO):
         return None
     planes = room.by_side()
     signs = max(SIGNS, key=lambda row: sum(float(row[side]) * gain > 0 for side, (_, gain) in planes.items()))

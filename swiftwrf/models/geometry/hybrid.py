@@ -23,7 +23,7 @@ from swiftwrf.metrics import psnr
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel
 from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.model import GeometryModel
-from swiftwrf.models.geometry.path_gains import PathGains, PriorChoice, choose_prior, fit_path_gains, kernel_of
+from swiftwrf.models.geometry.path_gains import PathGains, choose_prior, fit_path_gains, kernel_of
 from swiftwrf.models.geometry.planes import advantage
 from swiftwrf.models.process import ProcessModel
 from swiftwrf.runtime.checkpoint import Header, expect
@@ -33,7 +33,6 @@ from swiftwrf.runtime.validation import Fraction, check_value
 MAX_COMPONENTS = 64  # principal components of the residual spectra
 MAX_PIXELS = 4000  # of a spectrum, to choose kernel and mixing weight
 MAX_SPECTRA = 10_000  # the fit computes all their inner products
-FIRST_WEIGHT = 0.7  # mixing weight with which the kernel is chosen
 
 
 class HybridModel(ProcessModel):
@@ -90,7 +89,7 @@ class HybridModel(ProcessModel):
         seen = train.spectrum.flatten(1)
         stride = max(1, seen.shape[1] // MAX_PIXELS) | 1
         some, some_known = seen[:, ::stride], known[:, ::stride]
-        kernel = choose_kernel(train.position, (some - FIRST_WEIGHT * some_known)[:, None], fold)
+        kernel = choose_kernel(train.position, (some - 0.7 * some_known)[:, None], fold)  # a usual mixing weight
         self.mixing_weight, gains = _mixing_weight(train.position, some, some_known, fold, kernel)
         score = torch.zeros(len(train), 0)
         self.component = torch.zeros(1, seen.shape[1])
@@ -115,16 +114,16 @@ class HybridModel(ProcessModel):
         scene, rows = observe(train, self.config)
         found = self.room
         if like and like.path_gains:
-            kernel = like.path_gains.process.kernel
-            choice = PriorChoice(found.with_order(like.room.order), like.path_gains.prior, {})
+            kernel, prior, fits = like.path_gains.process.kernel, like.path_gains.prior, dict[int, PathGains]()
+            self._room = found.with_order(like.room.order)
         else:
-            kernel, choice = kernel_of(scene.moving), choose_prior(found, scene, fold[rows])
-        self._room, prior = choice.room, choice.prior
+            kernel = kernel_of(scene.moving)
+            self._room, prior, fits = choose_prior(found, scene, fold[rows])
         known = torch.empty(len(train), *train.grid.shape)
         for number in fold.unique().tolist():
             out = (fold == number).nonzero()[:, 0]  # including spectra without observed phases
             kept = scene.subset((fold[rows] != number).nonzero()[:, 0])
-            self.path_gains = choice.fits.get(number) or fit_path_gains(self.room, kept, kernel, prior)
+            self.path_gains = fits.get(number) or fit_path_gains(self.room, kept, kernel, prior)
             for part in out.split(self.batch):
                 known[part] = self._paths(train.position[part])
         if not like:

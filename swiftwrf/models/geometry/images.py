@@ -22,13 +22,10 @@ from swiftwrf.array.planar import PlanarArray
 from swiftwrf.choices import Moving
 
 MAX_COSINE = 0.02  # of two planes that count as perpendicular; above 1 - MAX_COSINE**2 they count as parallel
-ROUNDING_RAD = 1e-3  # of phase, to which positions are rounded in a search
 N_POSITIONS = 36  # that many rooms are scored at
 MAX_DISTANCE_M = 1e7  # from the fixed end; beyond, only the direction counts, because rounding destroys the phases
-BATCH_WAVES = 2**15  # waves that are summed at a time
-SIDES = torch.tensor(
-    [[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], dtype=torch.float64
-)  # outward normals
+# outward normals
+SIDES = torch.tensor([[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], dtype=torch.float64)
 UNKNOWN = torch.tensor([math.nan])  # score of a room that was not refined
 
 Sequence = tuple[int, ...]
@@ -180,7 +177,7 @@ class PhaseObservations:
 
         Without rounding, near ties of a search would depend on the origin of the world coordinates.
         """
-        step = ROUNDING_RAD / self.wavenumber
+        step = 1e-3 / self.wavenumber
         transmitter, receiver = (((end - origin) / step).round() * step for end in (self.transmitter, self.receiver))
         return replace(self, transmitter=transmitter, receiver=receiver)
 
@@ -304,7 +301,7 @@ def field(scene: PhaseObservations, planes: PlaneSet) -> Tensor:
         return torch.zeros(len(scene), 2 * len(scene.element), len(planes.offset))
     ray = (images(scene, planes) - scene.receiver).permute(3, 1, 2, 0).float().contiguous()
     strength = (planes.image_gain[..., None] * visibility(scene, planes)).permute(1, 2, 0)
-    size = max(1, BATCH_WAVES // max(1, ray[0, 0].numel()))  # there may be no rooms
+    size = max(1, 2**15 // max(1, ray[0, 0].numel()))  # there may be no rooms
     total = torch.zeros(())
     for some, part in zip(ray.split(size, dim=1), strength.split(size), strict=True):
         phase, length = scene.phases(some)

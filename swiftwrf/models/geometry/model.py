@@ -12,13 +12,7 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra, check_training, fingerprint
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, bounding_box
-from swiftwrf.models.geometry.fit import (
-    GeometryConfig,
-    extend_room,
-    observe,
-    search_room,
-    update_room,
-)
+from swiftwrf.models.geometry.fit import GeometryConfig, extend_room, observe, search_room, update_room
 from swiftwrf.models.geometry.images import PhaseObservations, PlaneSet, images
 from swiftwrf.models.geometry.planes import Plane, RoomEstimate, refine
 from swiftwrf.models.link import Link, Linked
@@ -212,10 +206,7 @@ class GeometryModel(Linked, FieldModel):
         return torch.stack([(low + high) / 2, low, high])
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
-        header = self.to_json() | {
-            "conclusion": self.conclusion,
-            "fingerprint": self.fingerprint,
-        }
+        header = self.to_json() | {"conclusion": self.conclusion, "fingerprint": self.fingerprint}
         return {"covariance": self.estimate.covariance}, header
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:

@@ -31,7 +31,6 @@ from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.threads import parallel_map, single_thread
 from swiftwrf.runtime.validation import check_value
 
-N_FIELDS = 8  # whose spectra are averaged
 MAX_CHOICE = 200  # spectra that choose the prior
 MIN_ERROR = 1e-6  # of squared co-array numbers, by rounding
 HIGHEST_ORDER, MAX_PATHS = 3, 100  # of the image sources that may be added to those of the room
@@ -80,7 +79,6 @@ class PathGains:
     """
 
     def __init__(self, process: GaussianProcess, n_paths: int, prior: PriorName = "loose") -> None:
-        assert process.coefficient is not None
         self.process, self.n_paths, self.prior = process, n_paths, prior
         if (size := process.coefficient.shape[1]) == 0 or size % (2 * n_paths):
             raise InputError(f"path gains of {n_paths} paths need multiples of {2 * n_paths} coefficients, got {size}")
@@ -100,7 +98,6 @@ class PathGains:
 
     def averaged(self) -> PathGains:
         """Return the mean of the fields, as one field."""
-        assert self.process.coefficient is not None
         coefficient = self.process.coefficient.unflatten(1, (-1, 2 * self.n_paths)).mean(dim=1)
         process = GaussianProcess(self.process.kernel, self.process.known, coefficient, exact=True)
         return PathGains(process, self.n_paths, self.prior)
@@ -133,7 +130,7 @@ def fit_path_gains(
     """Fit path gains around several samples of their prior to the observed phases."""
     prior, (wave, gain) = PRIORS[name], paths(geometry, scene)
     root = torch.linalg.cholesky(kernel.covariance(scene.moving.double())).float()
-    shape = len(scene), N_FIELDS, len(gain), 2
+    shape = len(scene), 8, len(gain), 2  # eight fields, whose spectra are averaged
     sample = prior.sample_std * torch.randn(shape, generator=torch.Generator().manual_seed(0))
     gradient, normal = posterior_gradient(scene, wave, gain, root, sample, prior), sample.clone()
     optimiser = torch.optim.Adam([normal], lr=0.2, fused=True)
@@ -189,29 +186,20 @@ def posterior_gradient(
     return gradient
 
 
-@dataclass(frozen=True)
-class PriorChoice:
-    """Result of `choose_prior`.
-
-    Args:
-        room: Room, perhaps with image sources of a higher order.
-        prior: Name of the prior.
-        fits: Path gains fitted without each fold, by its number. Empty if not all positions were used.
-    """
-
-    room: GeometryModel
-    prior: PriorName
-    fits: dict[int, PathGains]
-
-
 @single_thread()
-def choose_prior(geometry: GeometryModel, scene: PhaseObservations, fold: Tensor) -> PriorChoice:
-    """Return the order of the image sources and the prior that predict held-out spectra best.
+def choose_prior(
+    geometry: GeometryModel, scene: PhaseObservations, fold: Tensor
+) -> tuple[GeometryModel, PriorName, dict[int, PathGains]]:
+    """Choose the order of the image sources and the prior that predict held-out spectra best.
 
     Args:
         geometry: Room with planes.
         scene: Observed phases at n positions, of which at most 200 are used.
         fold: Fold of each position, (n,).
+
+    Returns:
+        Room, perhaps with image sources of a higher order; the name of the prior; and the path gains fitted without each
+        fold, by its number, none if not all positions were used.
     """
     complete = len(scene) <= MAX_CHOICE
     some = torch.linspace(0, len(scene) - 1, min(MAX_CHOICE, len(scene))).long()
@@ -240,7 +228,7 @@ def choose_prior(geometry: GeometryModel, scene: PhaseObservations, fold: Tensor
         left = [row for row in left if row == best or not advantage(so_far[row], so_far[best]) >= 3.0]
         if len(left) == 1:
             break
-    return PriorChoice(*candidates[best], fits[best] if complete else {})
+    return *candidates[best], fits[best] if complete else {}
 
 
 def _error(gains: PathGains, geometry: GeometryModel, held: PhaseObservations) -> Tensor:

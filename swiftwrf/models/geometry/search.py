@@ -35,8 +35,6 @@ Alternatives = list[list[tuple[float, float]]]  # offset [m] and gain, for each 
 MAX_ALTERNATIVES = {2: 99, 3: 7, 4: 4}  # of each side, by the number of sides that move at once
 SEARCH_ORDER = 2  # reflections of an image while planes move together
 N_REFINED = 8  # combinations of each kind of move
-N_SCANNED = 64  # positions that scans score planes at
-N_SCREENED = 24  # positions at which all combinations of a kind of move are scored
 N_RESCORED = 8  # times as many combinations as are wanted are scored at all positions
 MAX_MOVES = 20
 N_HORIZONTAL_NORMALS = 90  # of upright walls
@@ -179,7 +177,8 @@ class Search:
         self.offsets = [
             n + torch.arange(self.step, max(reach, self.step), self.step, dtype=torch.float64) for n in self.near
         ]
-        self._scanned, self._screened = scene.few(N_SCANNED), scene.few_rows(N_SCREENED)
+        # scans score planes at the former, combinations of moves at the latter
+        self._scanned, self._screened = scene.few(64), scene.few_rows(24)
 
     @cached_property
     def single(self) -> list[Tensor]:

@@ -32,14 +32,11 @@ from swiftwrf.models.geometry.planes import (
 from swiftwrf.models.geometry.search import SteeringResponses
 from swiftwrf.runtime.threads import parallel_map
 
-MAX_STD_RAD = 0.5  # of phase, beyond which a plane is not certain
 MIN_SPREAD_RAD = 0.8  # of phase: positions with less spread in any direction count as flat
 CARRIER_SCALES = (0.95, 0.97, 0.98, 0.99, 1.01, 1.02, 1.03, 1.05)  # of alternative carriers
-SYSTEMATIC_STD_WAVELENGTHS = 0.02  # of planes that explain nothing, because unmodelled paths are no random noise
 MAX_PERIODS = 4  # to either side
 N_POSITIONS = 18  # that the best combinations are scored at
 N_RESCORED = 8  # times as many combinations as are wanted are scored at more than the first positions
-OFFSET_STEP_WAVELENGTHS = 0.125  # of the grid from which aliases are interpolated
 N_WHOLE = 32  # combinations of whole periods around which half periods are tried
 N_COARSE, N_FINE = 24, 8  # rooms that are refined with some positions, and with all
 HalfPeriods = tuple[int, ...]  # by which each plane is moved
@@ -64,13 +61,14 @@ def assess(
         nothing = torch.zeros(0, 0, dtype=torch.float64)
         return RoomEstimate([], room.order, score, unexplained, "no plane explains the spectra", nothing)
     covariance = offset_covariance(scene, room)
-    systematic = SYSTEMATIC_STD_WAVELENGTHS * train.array.wavelength * math.sqrt(max(unexplained, 0))
+    systematic = 0.02 * train.array.wavelength * math.sqrt(max(unexplained, 0))  # unmodelled paths are no noise
     covariance = covariance + systematic**2 * torch.eye(len(covariance), dtype=torch.float64)
     reason = _flat(scene) or _other_carrier(scene, room, certainty)
     std = covariance.diagonal().clamp_min(0).sqrt().tolist()
     alternatives = [(other, log_explained(other.coherence(scene))) for other in phase_alternatives(scene, room)]
     nearest = parallel_map(lambda plane: _nearest_alternative(scene, room, plane, alternatives), range(len(std)))
-    lost = [lead <= certainty or s * scene.wavenumber > MAX_STD_RAD for s, (lead, _) in zip(std, nearest, strict=True)]
+    # beyond half a radian of phase, too, a plane is not certain
+    lost = [lead <= certainty or s * scene.wavenumber > 0.5 for s, (lead, _) in zip(std, nearest, strict=True)]
     # a room most of whose planes have alternatives may be wrong as a whole, because each plane holds the others
     all_lost = bool(reason) or sum(lost) > len(lost) / 2
     planes = []
@@ -174,9 +172,7 @@ def _alias_offsets(scene: PhaseObservations, room: PlaneSet, plane: int) -> dict
     farthest = MAX_PERIODS * wavelength  # twice as far as at normal incidence
     if nearest >= here + farthest:  # it lies among the positions, where no alias is outside of the region
         return {0: here}
-    grid = torch.arange(
-        max(nearest, here - farthest), here + farthest, OFFSET_STEP_WAVELENGTHS * wavelength, dtype=torch.float64
-    )
+    grid = torch.arange(max(nearest, here - farthest), here + farthest, 0.125 * wavelength, dtype=torch.float64)
     scanned = PlaneSet(normal.expand(len(grid), 1, 3), grid[:, None], torch.ones(len(grid), 1), only=((0,),))
     source = images(scene, scanned)[:, 0]
     now = images(scene, replace(room, only=((plane,),)))[0, 0]

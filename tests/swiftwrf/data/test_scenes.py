@@ -286,7 +286,8 @@ def test_materials_that_cannot_be_traced(ray_tracer, material, says):
 def test_a_plan_of_a_room_has_its_walls_furniture_and_ends():
     scene, room = Scene.__new__(Scene), ROOMS["bedroom"]
     scene.surfaces = room.surfaces()
-    ax = scene.plot(torch.tensor(room.fixed), places(9))
+    region = torch.tensor(room.region, dtype=torch.float64)
+    ax = scene.plot(torch.tensor(room.fixed), draw_positions(room, region, 9, 0))
     assert {"brick", "wood", "fixed end", "moving end"} <= set(ax.get_legend_handles_labels()[1])
     walls = np.concatenate([line.get_xydata() for line in ax.lines])
     np.testing.assert_allclose([np.nanmin(walls, axis=0), np.nanmax(walls, axis=0)], [(0, 0), room.size[:2]], atol=1e-9)

@@ -33,8 +33,7 @@ from tasks.locate.options import LocateConfig
 from tasks.page.floor_plan import FloorPlan
 from tasks.page.raster import colour_image
 from tasks.update.record import Record
-from tasks.view import spectra
-from tasks.view.drawing import HemisphereProjection, PlanProjection, data_url, text
+from tasks.view import charts, spectra
 from tasks.view.locating import N_POSITIONS, RssiLocating
 from tasks.view.options import ViewConfig
 from tasks.view.rssi import MapSelection, at_least, probability_above
@@ -46,54 +45,59 @@ GRID = AngularGrid.hemisphere(15, 60)
 needs_the_extra = pytest.mark.skipif(find_spec("nicegui") is None, reason="needs the extra view")
 
 
-@pytest.mark.parametrize(
-    "projection", [HemisphereProjection.rectangular(GRID), HemisphereProjection.disc()], ids=["rectangular", "polar"]
-)
 @pytest.mark.parametrize("pixel", [(0, 0), (3, 10), (7, 59), (13, 31)])
-def test_a_direction_is_drawn_where_it_is_marked(projection, pixel):
+def test_a_direction_is_drawn_where_it_is_marked(pixel):
+    """The picture lies on axes of azimuth and elevation, or seen along the normal in a square around the disc."""
     spectrum = np.zeros(GRID.shape)
     spectrum[pixel] = 1
-    azimuth, elevation = GRID.azimuth[pixel[1]].rad2deg(), GRID.elevation[pixel[0]].rad2deg()
-    row, column = (projection.project(spectrum, GRID) == 1).nonzero()
-    if not projection.polar and pixel[1] == 0:  # half of it lies beyond the seam
-        row, column = row[column < projection.width / 2], column[column < projection.width / 2]
-    x, y = projection.pixel(float(azimuth), float(elevation))
-    assert np.hypot(column + 0.5 - x, row + 0.5 - y).min() <= 1
-    assert abs(row.mean() + 0.5 - y) <= 0.6 * projection.height / GRID.n_elevation
+    azimuth, elevation = float(GRID.azimuth[pixel[1]].rad2deg()), float(GRID.elevation[pixel[0]].rad2deg())
+    values, (x0, x1, y0, y1) = charts.rectangle(spectrum, GRID)
+    row, column = (values == 1).nonzero()
+    x = x0 + (column + 0.5) / values.shape[1] * (x1 - x0)
+    y = y1 - (row + 0.5) / values.shape[0] * (y1 - y0)
+    assert np.hypot(x - azimuth, y - elevation).min() < 1e-6
+    assert (x0 <= 0, x1 >= 360, y0 <= 0, y1 >= 90) == (True,) * 4
+    row, column = (charts.disc(spectrum, GRID) == 1).nonzero()
+    right, up = (column + 0.5) / charts.DISC_PX * 2 - 1, 1 - (row + 0.5) / charts.DISC_PX * 2
+    radius, angle = 1 - elevation / 90, np.deg2rad(azimuth)
+    assert np.hypot(right - radius * np.cos(angle), up - radius * np.sin(angle)).min() < 3 / charts.DISC_PX
 
 
 def test_polar_view_is_clear_outside_the_hemisphere():
-    laid = HemisphereProjection.disc().project(np.ones(GRID.shape), GRID)
-    assert np.isnan(laid[0, 0])
-    assert np.isfinite(laid).mean() == pytest.approx(np.pi / 4, abs=0.01)
+    shown = charts.disc(np.ones(GRID.shape), GRID)
+    assert np.isnan(shown[0, 0])
+    assert np.isfinite(shown).mean() == pytest.approx(np.pi / 4, abs=0.01)
 
 
 def test_pictures_have_the_ends_of_the_colours_and_clear_pixels():
-    content = data_url(colour_image(np.array([[0.0, 1.0, np.nan, 7.0]]), "viridis")).removeprefix(
-        "data:image/png;base64,"
-    )
-    pixels = np.asarray(Image.open(io.BytesIO(base64.b64decode(content))).convert("RGBA"))[0]
+    image = colour_image(np.array([[0.0, 1.0, np.nan, 7.0]]), "viridis")
+    ((*place, width, height, opacity, address),) = charts.picture(image, (0, 4, 0, 1), 0.5)
+    assert (place, width, height, opacity) == ([0, 4, 0, 1], 4, 1, 0.5)
+    content = base64.b64decode(address.removeprefix("data:image/png;base64,"))
+    pixels = np.asarray(Image.open(io.BytesIO(content)).convert("RGBA"))[0]
     np.testing.assert_allclose(pixels[:, 3], [255, 255, 0, 255])
     np.testing.assert_allclose(pixels[[0, 1], :3], [[68, 1, 84], [253, 231, 37]], atol=2)
     assert (pixels[3] == pixels[1]).all()
 
 
-def test_plan_goes_there_and_back_and_keeps_inside():
-    plan = PlanProjection.around(np.array([[0.0, 0, 1], [4, 2, 1]]), [np.nan, np.nan, 0], max_px=(400, 300))
-    assert plan.position(*plan.pixel([1.5, 0.5])) == pytest.approx((1.5, 0.5))
-    assert plan.contains([[0, 0], [4, 2]])
-    assert not plan.contains([[0, 0], [4, 9]])
-    assert plan.position(-1e6, 1e6) == pytest.approx((plan.low[0], plan.low[1]))
-    assert max(plan.size[0] / 400, plan.size[1] / 300) == pytest.approx(1, abs=0.01)
-
-
 def test_a_path_along_an_axis_leaves_room_to_drag():
-    width, height = PlanProjection.around([[0.0, 3], [10, 3]], max_px=(500, 500)).size
-    assert height > 0.3 * width
+    x0, x1, y0, y1 = charts.around([[0.0, 3], [10, 3]], [[np.nan, np.nan]])
+    assert (y1 - y0) > 0.3 * (x1 - x0)
+    assert x0 < 0 < 10 < x1
 
 
+@needs_the_extra
 def test_texts_are_texts():
-    assert "<script>" not in text(0, 0, "<script>")
+    from tasks.view.page import legend
+
+    assert "<script>" not in legend([("red", "●", "<script>")])
+
+
+@pytest.mark.parametrize(
+    ("extend", "ends"), [("neither", ["3  dB", "1"]), ("max", ["≥ 3  dB", "1"]), ("both", ["≥ 3  dB", "≤ 1"])]
+)
+def test_open_scales_are_written_as_such(extend, ends):
+    assert charts.colour_bar("viridis", (1, 3), "dB", "map", extend)["text"] == ends
 
 
 def test_view_of_a_run(aoa_run, room):
@@ -249,14 +253,22 @@ def test_coverage_is_where_the_probability_is_high_enough(rssi_run):
 
 def test_exports(rssi_run):
     view = open_source(rssi_run)
-    for kind in view.kinds:
-        assert Image.open(io.BytesIO(view.picture(MapSelection(kind, 1, 1.2)))).format == "PNG"
     table = pd.read_csv(io.StringIO(view.table(MapSelection("coverage", 1, 1.2, -70.0, 0.9))))
     rssi = view.map(1.2).prediction
     assert len(table) == rssi.mean[0].numel()
     np.testing.assert_allclose(table["predicted_dbm"], rssi.mean[1].flatten(), atol=0.006)
     np.testing.assert_array_equal(table["above_-70_dbm_with_90%"], rssi.interval(0.8)[0][1].flatten() >= -70)
     assert list(table["best_receiver"]) == [view.receivers[best] for best in rssi.mean.argmax(dim=0).flatten()]
+
+
+def test_fractions_of_the_best_receivers(rssi_run):
+    view = open_source(rssi_run)
+    mean, fraction = view.map(1.2).mean, view.best(1.2)
+    assert list(fraction.values()) == sorted(fraction.values(), reverse=True)
+    assert sum(fraction.values()) == pytest.approx(1)
+    first, part = next(iter(fraction.items()))
+    assert part == pytest.approx((mean.argmax(axis=0) == first).mean())
+    assert f"{view.receivers[first]} on {part:.0%}" in view.sentence(MapSelection("best receiver", 0, 1.2))
 
 
 def test_one_receiver_has_no_best(rssi_run):
@@ -346,7 +358,6 @@ def test_view_of_a_locator_by_itself(located_floor, tmp_path):
     coloured = view.coloured(selection)
     assert coloured.values.shape == view.locating.located(3).density.values.shape
     assert coloured.corners == view.locating.located(3).density.corners
-    assert Image.open(io.BytesIO(view.picture(selection))).format == "PNG"
     assert list(pd.read_csv(io.StringIO(view.table(selection)))) == ["x_m", "y_m", "posterior_of_row_3"]
     assert "of its maximum" in view.describe(selection, *train.transmitter_position[3, :2].tolist())
     assert "outside the region" in view.describe(selection, 1e3, 1e3)
@@ -388,7 +399,7 @@ def test_posterior_of_a_spectrum_is_that_of_the_locator(aoa_run, room, tmp_path)
     np.testing.assert_allclose(found.median, posterior.median[0], atol=1e-3)
     np.testing.assert_allclose(found.truth, room.position[3], atol=1e-6)
     x0, x1, y0, y1 = found.density.corners
-    low, high = locator.cells.position.amin(dim=0), locator.cells.position.amax(dim=0)
+    low, high = posterior.position[0].amin(dim=0), posterior.position[0].amax(dim=0)
     assert x0 <= low[0] <= high[0] <= x1
     assert y0 <= low[1] <= high[1] <= y1
     assert np.nanmax(found.density.values) == 1

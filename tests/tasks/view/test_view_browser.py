@@ -38,9 +38,10 @@ ROOT = Path(__file__).parents[3]
 PATIENCE = 60  # [s], for machines that are busy
 MOVES = 60  # of a drag, one in 16 ms as a pointer's are
 COUNT = """
-const image = document.querySelector('#synthesized img');
 window.frames_seen = [];
-image.addEventListener('load', () => window.frames_seen.push(performance.now()));
+const seen = () => window.frames_seen.push(performance.now());
+const options = {subtree: true, childList: true, attributes: true, attributeFilter: ['href', 'xlink:href']};
+new MutationObserver(seen).observe(document.querySelector('#synthesized'), options);
 """
 
 
@@ -109,8 +110,22 @@ def said(browser, name):
     return find(browser, f"#{name}").text
 
 
+def shown(browser, name):
+    """Return the picture of a chart, None if it has none yet."""
+    drawn = browser.find_elements("css selector", f"#{name} image")
+    return drawn[0].get_attribute("href") or drawn[0].get_attribute("xlink:href") if drawn else None
+
+
 def press(browser, label):
     browser.find_element("xpath", f"//button[.//*[text()='{label}']]").click()
+
+
+def assert_fits(browser, name):
+    """Nothing is wider than the window, and this element is to be seen, on a telephone, a tablet and a screen."""
+    for width in (360, 700, 1400):
+        browser.set_window_size(width, 900)
+        assert browser.execute_script("return document.querySelector('.q-layout').scrollWidth <= window.innerWidth")
+        assert find(browser, f"#{name} svg").rect["width"] > 0.7 * min(width, 620)
 
 
 def pointer(browser):
@@ -128,7 +143,7 @@ def opened(browser, address, name, label):
 
 def follows_the_pointer(browser, plan):
     """Frames a second while the moving end is dragged."""
-    before = said(browser, "where"), find(browser, "#synthesized img").get_attribute("src")
+    before = said(browser, "where"), shown(browser, "synthesized")
     browser.execute_script(COUNT)
     chain = pointer(browser).move_to_element_with_offset(plan, -100, 0).click_and_hold()
     for move in range(MOVES):
@@ -136,7 +151,7 @@ def follows_the_pointer(browser, plan):
     chain.release().perform()
     until(lambda: said(browser, "where") != before[0])
     frames = browser.execute_script("return window.frames_seen")
-    assert find(browser, "#synthesized img").get_attribute("src") != before[1]
+    assert shown(browser, "synthesized") != before[1]
     assert len(frames) >= 10  # it follows on the way, not only at the end
     assert "ms" in said(browser, "frame")
     return 1e3 * (len(frames) - 1) / (frames[-1] - frames[0])
@@ -145,9 +160,9 @@ def follows_the_pointer(browser, plan):
 def has_views_models_and_keys(browser, plan):
     from selenium.webdriver.common.keys import Keys
 
-    rectangular = find(browser, "#measured img").get_attribute("src")
+    rectangular = until(lambda: shown(browser, "measured"))
     press(browser, "polar")
-    until(lambda: find(browser, "#measured img").get_attribute("src") != rectangular)
+    until(lambda: shown(browser, "measured") not in (None, rectangular))
     assert find(browser, "#deviation").is_displayed()
     find(browser, ".q-select").click()
     until(lambda: browser.find_elements("css selector", ".q-item"))
@@ -178,6 +193,7 @@ def test_page_of_spectra(browser, serve, aoa_run, record_property):
     record_property("frames_per_second", rate)
     print(f"{rate:.1f} frames a second while dragging")
     has_views_models_and_keys(browser, plan)
+    assert_fits(browser, "plan")
 
 
 def test_page_of_rssi(browser, serve, rssi_run, tmp_path):
@@ -193,11 +209,13 @@ def test_page_of_rssi(browser, serve, rssi_run, tmp_path):
     ):
         press(browser, kind)
         until(lambda sentence=sentence: sentence in said(browser, "sentence"))
-    press(browser, "PNG")
+        assert ("receiver01" in said(browser, "best")) == (kind == "best receiver")  # its legend
+    press(browser, "SVG")
     press(browser, "CSV")
     file = until(lambda: next(tmp_path.glob("*.csv"), None))
-    until(lambda: next(tmp_path.glob("*.png"), None))
+    until(lambda: next(tmp_path.glob("*.svg"), None))
     assert set(pd.read_csv(file)["receiver"]) == {"receiver01"}
+    assert_fits(browser, "map")
 
 
 def test_page_of_a_followed_run_grows_without_reloading(browser, serve, tmp_path):
@@ -225,9 +243,7 @@ def test_page_of_a_followed_run_grows_without_reloading(browser, serve, tmp_path
     assert find(browser, "#changes").get_attribute("innerHTML") != before
     assert find(browser, "#error svg").is_displayed()
     assert browser.execute_script("return window.not_reloaded")
-    for width in (360, 700, 1400):
-        browser.set_window_size(width, 900)
-        assert browser.execute_script("return document.querySelector('.q-layout').scrollWidth <= window.innerWidth")
+    assert_fits(browser, "changes")
     browser.save_screenshot(str(tmp_path / "followed.png"))
 
 
