@@ -73,7 +73,7 @@ def measure(data: Rssi, split: str, cells: int, seed: int) -> dict[str, Any]:
         "weights": values[Trial("posterior")]["weights"],
         "cells": cells,
         "localizers": result.overall,
-        "coverage": result.coverage,
+        "coverage": {str(level): fraction for level, fraction in result.coverage.items()},
     }
 
 
