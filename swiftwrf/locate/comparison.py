@@ -168,6 +168,12 @@ class LocateComparison:
     Args:
         split: Training and test rows.
         values: What `LocateSplit.fit` gave, by trial.
+
+    Example:
+        >>> import swiftwrf
+        >>> split, trial = LocateSplit.of(swiftwrf.rssi_room(n=60), "random", 100, 0), Trial("mean")
+        >>> len(LocateComparison(split, {trial: split.fit(trial)[1]}).errors)
+        12
     """
 
     split: LocateSplit
