@@ -5,7 +5,6 @@ python benchmarks/locating.py tetam-tracks:spatial tetam-tracks:block floor --fo
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,9 +16,7 @@ from record import write_result
 
 from swiftwrf import Rssi, load_rssi, rssi_room
 from swiftwrf.locate.baselines import LOCALIZERS
-from swiftwrf.runtime.durable import strict
-from tasks.locate.experiment import Results, prepared
-from tasks.locate.steps import Localization
+from swiftwrf.locate.comparison import LocateComparison, LocateSplit, Trial
 
 RESULT = "locating_rssi"
 BUILT_IN = "floor"
@@ -64,16 +61,20 @@ def read(source: Path | None) -> Rssi:
 
 def measure(data: Rssi, split: str, cells: int, seed: int) -> dict[str, Any]:
     """Return errors and seconds of every localizer on a split, and the coverage of the posterior's credible regions."""
-    experiment, n_undetected = prepared(data, split, cells, seed)
-    results = Results(experiment)
-    with tempfile.TemporaryDirectory() as folder:
-        for name in LOCALIZERS:
-            step = Localization(name)
-            results.add(step, strict(step.compute(experiment, Path(folder))))
-    metrics = results.metrics(data, n_undetected)
-    kept = ("n_train", "n_test", "n_receivers", "n_undetected", "seed", "weights")
-    content = {name: value for name, value in metrics.items() if name in kept}
-    return content | {"cells": cells, "localizers": metrics["overall"], "coverage": metrics["calibration"]}
+    measured = LocateSplit.of(data, split, cells, seed)
+    values = {trial: measured.fit(trial)[1] for trial in map(Trial, LOCALIZERS)}
+    result = LocateComparison(measured, values)
+    return {
+        "n_train": len(measured.train),
+        "n_test": len(measured.test),
+        "n_receivers": len(measured.train.receiver_names),
+        "n_undetected": measured.n_undetected,
+        "seed": seed,
+        "weights": values[Trial("posterior")]["weights"],
+        "cells": cells,
+        "localizers": result.overall,
+        "coverage": {str(level): fraction for level, fraction in result.coverage.items()},
+    }
 
 
 if __name__ == "__main__":

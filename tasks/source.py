@@ -15,12 +15,10 @@ from swiftwrf import AngularGrid, InputError, Rssi, Spectra
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data import ReadOptions, load_rssi, load_spectra
 from swiftwrf.data.archives import array_header, read_rows
-from swiftwrf.data.rssi import Offsets
 from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
 from swiftwrf.data.store import Store
 from swiftwrf.datasets import DATA_SETS, fetch
 from swiftwrf.errors import listed
-from swiftwrf.rssi import estimate_offsets
 from tasks.options import OffsetSource, SpectraSource, TableSource
 from tasks.terminal import console
 
@@ -85,15 +83,6 @@ def measured_rssi(data: str | None, config: TableSource) -> Rssi | None:
         InputError: RSSI that cannot be read.
     """
     return None if data is None else load_rssi(located(data), **reading(config).given)
-
-
-def asked_offsets(train: Rssi, config: OffsetSource) -> Offsets | None:
-    """Return the offsets of the groups that a user asks for, estimated from training rows.
-
-    Raises:
-        InputError: One group only, or an unknown reference.
-    """
-    return None if config.offset_by is None else estimate_offsets(train, config.offset_by.partition("=")[2] or None)
 
 
 def offset_notes(data: Rssi, config: OffsetSource) -> list[str]:

@@ -18,7 +18,12 @@ from swiftwrf.runtime.validation import NonNegativeInt, Preset, configuration
 
 @configuration
 class EstimatorConfig:
-    """Options of every estimator."""
+    """Options of every estimator.
+
+    Example:
+        >>> EstimatorConfig(seed=3).seed
+        3
+    """
 
     seed: NonNegativeInt = 0
     """seed of everything random"""
@@ -42,6 +47,10 @@ class Estimator(ABC):
 
     Raises:
         InputError: An unknown option, or a value outside its range.
+
+    Example:
+        >>> make_estimator("peak").trainable
+        False
     """
 
     config_type: ClassVar[type[Any]] = EstimatorConfig
@@ -93,6 +102,10 @@ class SavedEstimator(Estimator, Saved):
     """Base class of estimators that `save` writes to a file and `swiftwrf.load` reads, on the CPU.
 
     A subclass sets `kind`, and implements `_state` and `_restore`.
+
+    Example:
+        >>> isinstance(make_estimator("kernel_regression"), SavedEstimator)
+        True
     """
 
     def state(self) -> tuple[dict[str, Tensor], Header]:

@@ -1,9 +1,27 @@
 """Posterior over the position of the mobile terminal, from a fitted field and an observation."""
 
+from typing import TYPE_CHECKING
+
 from swiftwrf.locate.matched_field import MatchedField, MatchedFieldConfig
 from swiftwrf.locate.posterior import Posterior
 from swiftwrf.locate.region import Region
 from swiftwrf.locate.rssi import RssiLocator, RssiLocatorConfig
 from swiftwrf.locate.track import smoothed
+from swiftwrf.runtime.lazy import import_lazily
 
-__all__ = ["MatchedField", "MatchedFieldConfig", "Posterior", "Region", "RssiLocator", "RssiLocatorConfig", "smoothed"]
+if TYPE_CHECKING:
+    from swiftwrf.locate.comparison import LocateComparison, compare
+
+import_lazily(__name__, {"swiftwrf.locate.comparison": ("LocateComparison", "compare")})  # imports scikit-learn
+
+__all__ = [
+    "LocateComparison",
+    "MatchedField",
+    "MatchedFieldConfig",
+    "Posterior",
+    "Region",
+    "RssiLocator",
+    "RssiLocatorConfig",
+    "compare",
+    "smoothed",
+]

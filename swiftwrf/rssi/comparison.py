@@ -82,6 +82,12 @@ class RssiComparison:
             deviations `std` (n,) [dB] or None, median absolute error `median_db` [dB], seconds to `fit` and to `predict`.
         left_out: Reason for each predictor that the data do not suffice for.
         predictors: Fitted predictors by name, without those whose values `keep` had.
+
+    Example:
+        >>> import swiftwrf
+        >>> train, test = swiftwrf.rssi_room(n=60).split()
+        >>> RssiComparison(train, test, {}, {}).model
+        'swiftwrf'
     """
 
     train: Rssi

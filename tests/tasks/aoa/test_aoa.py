@@ -23,6 +23,7 @@ from augment.estimators.aann_kernel import AANNKernel, AANNKernelConfig
 from augment.estimators.baselines import Constant, NearestSpectrum, Peak
 from augment.estimators.kernel_regression import KernelRegression
 from augment.turbo import experiment as context
+from augment.turbo import synthesis as synthesizing
 from augment.turbo.condition import Condition, MeasuredSubset, conditions_of, headline
 from augment.turbo.experiment import Experiment
 from augment.turbo.synthesis import Evaluation
@@ -34,7 +35,6 @@ from swiftwrf.metrics import angle_errors
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import model as geometry
 from tasks.aoa import experiment
-from tasks.aoa import synthesis as synthesizing
 from tasks.aoa.options import AoaConfig
 from tasks.aoa.page.records import palette
 from tasks.command_line import command_line

@@ -21,12 +21,11 @@ from swiftwrf.data import ReadOptions
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.locate import MatchedField
 from swiftwrf.locate.baselines import LEVELS, LOCALIZERS, RegressedCoordinates
+from swiftwrf.locate.comparison import LocateSplit, Trial, compare
 from swiftwrf.runtime.registry import Registry
 from tasks.claim import LOCATOR as MODEL
 from tasks.command_line import command_line
 from tasks.labels import LOCALIZERS as LABELS
-from tasks.locate.experiment import prepared
-from tasks.locate.steps import Localization
 from tasks.predict.observations import read_rssi
 from tasks.predict.options import PredictConfig
 from tasks.predict.run import run as predict
@@ -75,6 +74,18 @@ def matched(tmp_path_factory):
     return data, file
 
 
+def test_a_comparison_without_a_folder_has_the_errors_of_the_command(finished):
+    with quick.quick():
+        result = compare(rssi_room(n=80), n_cells=300)
+    pd.testing.assert_frame_equal(result.errors, pd.read_csv(finished / "errors.csv"), check_dtype=False)
+    metrics = strict_json(finished / "metrics.json")
+    medians = {name: entry["position_error_m"]["median"] for name, entry in metrics["overall"].items()}
+    assert result.summary()["median"].to_dict() == pytest.approx(medians)
+    assert {str(level): fraction for level, fraction in result.coverage.items()} == pytest.approx(
+        metrics["calibration"]
+    )
+
+
 def test_localizers_describe_themselves():
     assert list(LOCALIZERS) == ["posterior", "knn", "knn_difference", "gp", "mean"]
     for name, localizer in LOCALIZERS.items():
@@ -110,10 +121,10 @@ def test_differences_are_robust_to_the_offset_of_a_device():
 
 
 def test_test_rows_reach_no_fit():
-    given, _ = prepared(rssi_room(n=60), "random", 50, 0)
+    given = LocateSplit.of(rssi_room(n=60), "random", 50, 0)
     moved = replace(given, test=replace(given.test, transmitter_position=given.test.transmitter_position + 5))
     for name in ("knn", "knn_difference", "gp"):
-        values = [Localization(name).compute(one, None) for one in (given, moved)]
+        values = [one.fit(Trial(name))[1] for one in (given, moved)]
         torch.testing.assert_close(values[0]["estimate"], values[1]["estimate"])
 
 
@@ -163,11 +174,11 @@ def test_runs_are_merged(finished, tmp_path):
 
 
 def test_a_part_of_the_training_rows():
-    given, _ = prepared(rssi_room(n=100), "block", 100, 3)
+    given = LocateSplit.of(rssi_room(n=100), "block", 100, 3)
     train, test = given.part(0.3, 1)
     assert (len(train), len(test)) == (24, 20)
     assert set(train.index.tolist()) < set(given.train.index.tolist())
-    assert [step.name for step in given.steps()][5:] == [
+    assert [trial.name for trial in given.trials()][5:] == [
         f"{name}-{part}" for part in ("rows0.3", "receivers0.25", "receivers0.5") for name in ("posterior", "knn")
     ]
 
@@ -184,7 +195,7 @@ def test_rows_that_no_receiver_detected_are_left_out(tmp_path, capsys):
     assert f"test rows that no receiver detected are left out: {metrics['n_undetected']}" in capsys.readouterr().err
     data.rssi_dbm[:70] = torch.nan
     with pytest.raises(InputError, match="at least 20 are needed"):
-        prepared(data, "random", 100, 0)
+        LocateSplit.of(data, "random", 100, 0)
 
 
 def test_an_interrupted_run_goes_on_to_the_same_numbers(finished, tmp_path):
