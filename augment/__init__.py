@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from augment.mix import Mixed, mix, withhold
     from augment.positions import SyntheticPositions, sample_positions, synthetic_positions
     from augment.suggest import Suggestion, suggest
+    from augment.turbo import TurboResult, turbo_learning
 
 import_lazily(
     __name__,
@@ -17,6 +18,7 @@ import_lazily(
         "augment.mix": ("Mixed", "mix", "withhold"),
         "augment.positions": ("SyntheticPositions", "sample_positions", "synthetic_positions"),
         "augment.suggest": ("Suggestion", "suggest"),
+        "augment.turbo": ("TurboResult", "turbo_learning"),
     },
 )
 
@@ -26,10 +28,12 @@ __all__ = [
     "ModelChoice",
     "Suggestion",
     "SyntheticPositions",
+    "TurboResult",
     "choose_model",
     "mix",
     "sample_positions",
     "suggest",
     "synthetic_positions",
+    "turbo_learning",
     "withhold",
 ]

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from augment import Fold, Mixed, synthetic_positions
 from augment.choose import BLIND_FOLDS
-from augment.estimators import make_estimator
+from augment.estimators import Estimator, make_estimator
 from swiftwrf import FitError, InputError, Spectra
 from swiftwrf.gp import subsample
 from swiftwrf.locate import MatchedField, MatchedFieldConfig
@@ -129,16 +129,15 @@ def cross_validate(folds: Sequence[Fold], n_synthetic: int, seed: int) -> CrossV
     return CrossValidation(validation, alone, by_rule)
 
 
-def measured_errors(fold: Fold, estimator: str, test: Spectra, seed: int) -> Errors:
+def measured_errors(fold: Fold, estimator: Estimator, test: Spectra) -> Errors:
     """Return the angular errors [deg] of an estimator, trained on the measured spectra of a fold, on its test spectra.
 
     Args:
         fold: Training spectra.
-        estimator: Name of the estimator.
+        estimator: Estimator, which is trained here.
         test: Held-out spectra of the fold, with their snapshots if they have any.
-        seed: Seed of the estimator.
     """
-    return _degrees(make_estimator(estimator, seed=seed).fit(Mixed.measured(fold.train)).estimate(test), test.label)
+    return _degrees(estimator.fit(Mixed.measured(fold.train)).estimate(test), test.label)
 
 
 def located_folds(folds: Sequence[Fold]) -> dict[int, Fold]:

@@ -6,9 +6,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+from augment.turbo.condition import Condition, conditions_of, headline
+from augment.turbo.results import MixMetrics
 from swiftwrf.metrics import ChangeMetrics, ErrorSummary
-from tasks.aoa.condition import Condition, conditions_of, headline
-from tasks.metrics import AoaMetrics, MixMetrics
+from tasks.metrics import AoaMetrics
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"

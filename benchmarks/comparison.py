@@ -24,6 +24,7 @@ from record import write_result
 from synthesis import load
 from torch import Tensor
 
+from augment.turbo.condition import conditions_of
 from swiftwrf import FieldModel, Spectra, make_model, simulated_room
 from swiftwrf.data.splits import validation_for
 from swiftwrf.gp import subsample
@@ -32,7 +33,6 @@ from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.neighbours import MemoryModel
 from swiftwrf.runtime.durable import write_text
 from tasks import labels
-from tasks.aoa.condition import conditions_of
 from tasks.aoa.experiment import run
 from tasks.aoa.options import AoaConfig
 from tasks.environment import machine

@@ -21,11 +21,11 @@ from record import RESULTS, write_result
 
 from augment import Mixed, withhold
 from augment.estimators import make_estimator
+from augment.turbo.experiment import ROOM_MODEL
+from augment.turbo.locating import LEVEL, NO_PLANE, located
 from swiftwrf import FitError, InputError, MatchedField, Spectra, load_spectra, make_model, simulated_room
+from swiftwrf.choices import fraction_key
 from swiftwrf.metrics import angle_errors, summary
-from tasks.aoa.context import ROOM_MODEL
-from tasks.aoa.locating import LEVEL, NO_PLANE, located
-from tasks.aoa.options import fraction_key
 
 N_LOCATED = 200  # spectra whose time is measured
 KERNEL = "kernel_regression"

@@ -25,11 +25,11 @@ from torch import Tensor
 
 from augment import Mixed
 from augment.estimators import make_estimator
+from augment.turbo.condition import NETWORKS
 from swiftwrf import Spectra, make_model
 from swiftwrf.data.splits import validation_for
 from swiftwrf.metrics import angle_errors, covered, psnr, ssim, summary
 from swiftwrf.models import FIELD_MODELS
-from tasks.aoa.condition import NETWORKS
 
 MODELS = ("nearest", "idw", "gp", "coarray", "swiftwrf")
 ESTIMATORS = ("peak", "constant", "nearest_spectrum", "kernel_regression", NETWORKS["quick"])

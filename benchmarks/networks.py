@@ -27,10 +27,10 @@ from augment.cross_validation import LOCATOR
 from augment.estimators import make_estimator
 from augment.estimators.aann import AANN
 from augment.estimators.aann_kernel import AANNKernel, AANNKernelConfig
+from augment.turbo.experiment import ROOM_MODEL
 from swiftwrf import MatchedField, Spectra, load_spectra, make_model, simulated_room
 from swiftwrf.metrics import angle_errors, paired_change, summary
 from swiftwrf.models import FIELD_MODELS
-from tasks.aoa.context import ROOM_MODEL
 from tasks.run import Preset
 
 REFERENCE = "kernel_regression"  # estimator to which others are compared

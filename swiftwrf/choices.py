@@ -14,6 +14,8 @@ from swiftwrf.runtime.registry import Registry
 Moving = Literal["transmitter", "receiver"]
 CARRIERS_HZ = (1e6, 1e13)
 MAX_SUGGESTIONS = 500  # positions to measure next
+AUTO = "auto"  # the field model that cross-validation chooses
+RAYTRACE = "raytrace"  # the field model that takes a scene
 SCENE_FILE = ".xml"  # suffix of scene files; other names are those of rooms
 
 FIELD_MODELS: Registry[Any] = Registry(
@@ -77,3 +79,14 @@ def check_scene(name: str, prefix: str = "") -> None:
         raise InputError(f"unknown room {name!r}; choose from {', '.join(ROOMS)}")
     if name.endswith(SCENE_FILE) and not Path(name).is_file():
         raise InputError(f"{prefix}{name} does not exist; expected a Mitsuba scene, or one of {', '.join(ROOMS)}")
+
+
+def fraction_key(fraction: float) -> str:
+    """Return the shortest text that reads back as the same number, for keys and file names.
+
+    Example:
+        >>> fraction_key(0.3), fraction_key(1.0), fraction_key(0.6666667)
+        ('0.3', '1', '0.6666667')
+    """
+    short = f"{fraction:g}"
+    return short if float(short) == fraction else repr(fraction)

@@ -9,9 +9,10 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from swiftwrf import InputError
+from swiftwrf.runtime.steps import STEPS
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # errors of file systems without locks
-LOCK, STEPS, CONFIG, ENVIRONMENT = "lock", "steps", "config.json", "environment.json"
+LOCK, CONFIG, ENVIRONMENT = "lock", "config.json", "environment.json"
 MODEL, LOCATOR = "model.safetensors", "locator.safetensors"  # fitted RSSI models of runs
 
 

@@ -36,7 +36,7 @@ COMMANDS = {
         "estimate angles of arrival with few measured spectra, and report the errors",
         "AoaConfig",
         "experiment",
-        ("tasks.aoa.steps", "torchvision", "torch._dynamo"),
+        ("augment.turbo.choice", "torchvision", "torch._dynamo"),
     ),
     "rssi": Command("predict RSSI maps of receivers, and report the errors", "RssiTaskConfig", "experiment"),
     "locate": Command("locate transmitters from RSSI, and report the errors", "LocateConfig", "experiment"),

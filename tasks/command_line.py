@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TypeVar
 
 from swiftwrf.errors import FitError, InputError, one_line
+from swiftwrf.runtime.durable import strict
 from tasks.options import OUTPUT, Options
 from tasks.parsing import file_options, general_options, parse
-from tasks.records import strict
 from tasks.resume import saved_config
 from tasks.terminal import terminal
 

@@ -17,12 +17,13 @@ from typing import Any
 import torch
 
 from swiftwrf import InputError
-from swiftwrf.runtime.durable import rename
+from swiftwrf.runtime.durable import rename, strict, write_json, write_npz
+from swiftwrf.runtime.steps import STEPS
 from swiftwrf.runtime.threads import set_threads
-from tasks.claim import CONFIG, ENVIRONMENT, LOCK, STEPS, Claim
+from tasks.claim import CONFIG, ENVIRONMENT, LOCK, Claim
 from tasks.environment import environment, invocation, now, number_of_processes, stamp
 from tasks.options import plain
-from tasks.records import Row, read_json, strict, write_json, write_npz, write_table
+from tasks.records import Row, read_json, write_table
 from tasks.resume import PARTIAL, digest
 from tasks.terminal import terminal
 

@@ -5,16 +5,11 @@ Units are degrees, dB and seconds. A number that does not exist is nan here and 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, NotRequired, TypedDict, get_args
+from typing import TYPE_CHECKING, NotRequired, TypedDict
 
 if TYPE_CHECKING:  # which import torch
-    from augment.cross_validation import CrossValidationMetrics, EstimatorChoiceMetrics
-    from swiftwrf.metrics import ChangeMetrics, ErrorSummary
-
-Angle = Literal["azimuth_deg", "elevation_deg", "great_circle_deg"]
-Score = Literal["psnr_db", "ssim", "l1"]
-ANGLES: tuple[Angle, ...] = get_args(Angle)
-SCORES: tuple[Score, ...] = get_args(Score)
+    from augment.turbo.results import MixMetrics
+    from swiftwrf.metrics import ErrorSummary
 
 
 class RunMetrics(TypedDict):
@@ -26,81 +21,6 @@ class RunMetrics(TypedDict):
     seed: int
     n_train: int
     n_test: int
-
-
-class SynthesisMetrics(TypedDict):
-    """Quality of one field model at the test positions; seconds to `fit` and to `synthesize`, means of the repeats."""
-
-    psnr_db: ErrorSummary
-    ssim: ErrorSummary
-    l1: ErrorSummary
-    seconds: dict[str, float]
-
-
-class MethodMetrics(TypedDict):
-    """Errors of one condition; seconds to `train` and to `estimate`, means of the repeats.
-
-    `changes`, of conditions with synthetic spectra, is the change of the angular error by the method that it is compared to:
-    the same estimator on measured spectra, and the best one on measured spectra. Its interval is paired over test positions.
-    """
-
-    estimator: str
-    training: str
-    synthesizer: str
-    n_synthetic: int
-    azimuth_deg: ErrorSummary
-    elevation_deg: ErrorSummary
-    great_circle_deg: ErrorSummary
-    changes: dict[str, ChangeMetrics]
-    seconds: dict[str, float]
-
-
-class ChoiceMetrics(TypedDict):
-    """Chosen field model; trimmed mean PSNR [dB] and seconds of each candidate; reasons why others could not be fitted."""
-
-    name: str
-    psnr_db: dict[str, float]
-    seconds: dict[str, float]
-    left_out: dict[str, str]
-
-
-class LocatingMetrics(TypedDict):
-    """Metrics of located test positions.
-
-    Position error [m], fraction of the test positions inside their 80 % credible region, fraction of ambiguous spectra, and
-    weights of the likelihoods (first repeat). Seconds, means of the repeats, are those to find the `room`, to `fit` the
-    locator and to `locate` all test spectra.
-    """
-
-    position_error_m: ErrorSummary
-    coverage_80: float
-    ambiguous: float
-    weights: list[float]
-    seconds: dict[str, float]
-
-
-class MixMetrics(TypedDict):
-    """Metrics of one measured fraction.
-
-    `choice`, `cross_validation` (by field model) and `estimator_choice` are of the first repeat. `counts` are spectra by
-    origin in each training set. Seconds are those to `fit` and `synthesize` of the trained field models and to `train` all
-    networks.
-
-    The method on measured spectra with the smallest test error, without matched-field processing, is the `reference`. Values
-    of `locating` are by method. Values of `left_out` are reasons why a method is missing.
-    """
-
-    n_measured: int
-    counts: dict[str, dict[str, int]]
-    choice: ChoiceMetrics | None
-    cross_validation: dict[str, CrossValidationMetrics] | None
-    estimator_choice: EstimatorChoiceMetrics | None
-    synthesis: dict[str, SynthesisMetrics]
-    methods: dict[str, MethodMetrics]
-    reference: str
-    locating: dict[str, LocatingMetrics]
-    left_out: dict[str, str]
-    seconds: dict[str, float]
 
 
 class AoaMetrics(RunMetrics):

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import io
 import json
-import math
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from swiftwrf.errors import InputError
-from swiftwrf.runtime.durable import replacing, write_text
+from swiftwrf.runtime.durable import write_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,29 +36,6 @@ DECIMALS = {"m": 3, "db": 2, "dbm": 2, "deg": 4}  # of numbers, by the unit at t
 DEGREE_DECIMALS = 8  # of latitude and longitude: 1 mm
 SIGNIFICANT_DIGITS = 4  # of magnitudes
 FORMULA = re.compile(r"^'*[=+\-@\t\r]")
-
-
-def strict(value: Any) -> Any:
-    """Return the value as strict JSON carries it: nan and infinity become None, keys become text.
-
-    Example:
-        >>> strict({1: (0.5, float("nan"))})
-        {'1': [0.5, None]}
-    """
-    if isinstance(value, dict):
-        return {str(key): strict(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [strict(item) for item in value]
-    if hasattr(value, "tolist"):  # tensors and arrays
-        return strict(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
-def write_json(file: Path, content: Any) -> None:
-    """Write a value as strict JSON."""
-    write_text(file, json.dumps(strict(content), indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
 
 def read_json(file: Path) -> Row:
@@ -152,14 +128,6 @@ def read_table(file: Path) -> pd.DataFrame:
             lambda text: text[1:] if text.startswith("'") and FORMULA.match(text) else text, na_action="ignore"
         )
     return table
-
-
-def write_npz(file: Path, arrays: Mapping[str, Any]) -> None:
-    """Write arrays by name."""
-    import numpy as np
-
-    with replacing(file) as temporary, temporary.open("wb") as stream:
-        np.savez_compressed(stream, **arrays)
 
 
 def read_npz(

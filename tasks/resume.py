@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from swiftwrf.errors import InputError
+from swiftwrf.runtime.durable import strict
 from tasks.claim import CONFIG, ENVIRONMENT
-from tasks.records import Row, read_json, strict
+from tasks.records import Row, read_json
 
 PARTIAL = ".partial"  # suffix of a run that is not finished
 

@@ -3,53 +3,19 @@
 from __future__ import annotations
 
 import time
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 from swiftwrf import InputError
+from swiftwrf.runtime.steps import Context, Step, walk
 from tasks.claim import ENVIRONMENT
 from tasks.directory import Run
 from tasks.records import Row
 from tasks.terminal import terminal
 from tasks.workers import Workers, local_processes
-
-Context = TypeVar("Context")
-"""data and configuration that all steps of a run share"""
-
-
-class Step(ABC, Generic[Context]):
-    """One computation of a run. Its fields are small, because it is sent to workers and read from results.
-
-    Large data are in the context, and in files of the run's directory, which all workers share.
-    """
-
-    @property
-    @abstractmethod
-    def name(self) -> str:
-        """Key of the kept result. Steps with one name are one step."""
-
-    @property
-    def title(self) -> str:
-        """Description of the step for the terminal."""
-        return self.name
-
-    @abstractmethod
-    def compute(self, context: Context, folder: Path) -> Row:
-        """Return plain values. Files are read and written in `folder`, the run's directory."""
-
-    @property
-    def priority(self) -> int:
-        """Priority among the steps that could begin: 2 if other steps wait for this one, 1 if it takes long, else 0."""
-        return 2 if type(self).then is not Step.then else 0
-
-    def then(self, context: Context, value: Row) -> Sequence[Step[Context]]:
-        """Return the steps that follow from the result."""
-        return ()
-
 
 Arrived = Callable[[Step[Context], Row], None]
 """function that shows a result when it arrives"""
@@ -83,21 +49,20 @@ def run_steps(
     elif run.processes > 1:
         with local_processes(run.processes, run.folder) as processes:
             _compute_on(processes, run, steps, context, arrived)
-    yield from _in_order(run, steps, context, arrived)
 
+    def expect(some: Iterable[Step[Context]]) -> None:
+        terminal.expect(len({step.name for step in some if not run.holds(step.name)}))
 
-def _in_order(
-    run: Run, steps: Sequence[Step[Context]], context: Context, arrived: Arrived[Context]
-) -> Iterator[tuple[Step[Context], Row]]:
-    """Yield each step with its result, computed in this process unless it is kept, and the steps that follow."""
-    terminal.expect(len({step.name for step in steps if not run.holds(step.name)}))
-    for step in steps:
+    def compute(step: Step[Context]) -> Row:
         is_new = not run.holds(step.name)
         value = run.step(step.name, step.title, partial(step.compute, context, run.folder))
         if is_new:
             arrived(step, value)
-        yield step, value
-        yield from _in_order(run, step.then(context, value), context, arrived)
+        expect(step.then(context, value))
+        return value
+
+    expect(steps)
+    yield from walk(steps, context, compute)
 
 
 def _compute_on(

@@ -3,66 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
-import numpy as np
-from numpy.typing import NDArray
 from pandas import DataFrame, Series
 
-from swiftwrf.metrics import ErrorSummary, paired_difference, summary
+from swiftwrf.metrics import paired_difference
 
 MAX_COVERAGE_ERROR = 0.05  # difference from the nominal coverage below which intervals count as calibrated
 MIN_RELEVANT = 0.02  # difference of mean errors, relative to them, below which methods are equal in practice
 MAX_SPREAD = 0.5  # of labels about their mean direction, relative to the error of the peaks, for a warning
 SHORTEST = 1e-5  # seconds: what took less is drawn here, for logarithmic axes have no zero
-
-
-def summaries(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dict[str, ErrorSummary]]:
-    """Return a summary of each column over all test rows and repeats, for each value of `by`.
-
-    Args:
-        table: A row for each value of `by`, `repeat` and `index`, the test row.
-        by: Column of names.
-        columns: Columns of errors.
-    """
-    return {
-        str(name): {column: repeated_summary(by_repeat(part, column)) for column in columns}
-        for name, part in table.groupby(by, sort=False)
-    }
-
-
-def by_repeat(table: DataFrame, column: str) -> NDArray[np.float64]:
-    """Return a column with a row for each test row and a column for each repeat, (n, repeats)."""
-    values: NDArray[np.float64] = table.pivot(index="index", columns="repeat", values=column).to_numpy(np.float64)
-    return values
-
-
-def repeated_summary(values: NDArray[np.float64]) -> ErrorSummary:
-    """Return the summary of all values (n, repeats), with the number of test rows.
-
-    Repeats of a test row are not independent, so they do not narrow the interval of the median as independent values would
-    (quantiles in cluster samples: R. S. Woodruff, JASA 47, 1952).
-
-    Example:
-        >>> once = np.arange(100.0)[:, None]
-        >>> found = repeated_summary(np.repeat(once, 3, axis=1))
-        >>> found["median"], found["n"], (found["low"], found["high"])
-        (49.5, 100, (40.0, 59.0))
-    """
-    found = summary(values.ravel())
-    rows = values[np.isfinite(values).any(axis=1)]
-    if values.shape[1] > 1 and len(rows):
-        below = np.nanmean(np.where(np.isnan(rows), np.nan, rows <= found["median"]), axis=1)
-        margin = 1.96 * below.std() / math.sqrt(len(rows))
-        low, high = np.nanquantile(rows, (max(0.0, 0.5 - margin), min(1.0, 0.5 + margin))).tolist()
-        found = {**found, "low": low, "high": high}
-    return {**found, "n": len(rows)}
-
-
-def averaged(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Return the mean of each column for each value of `by`."""
-    means: dict[str, dict[str, float]] = table.groupby(by, sort=False)[list(columns)].mean().to_dict("index")
-    return means
 
 
 def comparison_sentence(

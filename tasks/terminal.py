@@ -18,9 +18,9 @@ from rich.logging import RichHandler
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from swiftwrf.runtime.durable import strict
 from swiftwrf.runtime.progress import forwarding
 from tasks.options import Answered, Output
-from tasks.records import strict
 
 if TYPE_CHECKING:
     from swiftwrf.metrics import ErrorSummary

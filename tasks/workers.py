@@ -28,8 +28,8 @@ import torch
 
 from swiftwrf import FitError, InputError
 from swiftwrf.runtime.progress import silent
+from swiftwrf.runtime.steps import STEPS
 from swiftwrf.runtime.threads import set_threads, to_device
-from tasks.claim import STEPS
 from tasks.environment import machine, packages
 from tasks.preload import process_context, without_main
 from tasks.terminal import console

@@ -105,7 +105,7 @@ def aoa_run(tmp_path_factory: pytest.TempPathFactory, room: Spectra) -> Path:
     (folder / "data").mkdir()
     write_spectra(room, folder / "data")
     options = ("--synthesizer", "swiftwrf", "--extra", 0, "--data", folder / "data", "--out", folder / "run")
-    with mock.patch("tasks.aoa.context.candidates", return_value=["idw"]):  # finding a room has tests of its own
+    with mock.patch("augment.turbo.experiment.candidates", return_value=["idw"]):  # finding a room has tests of its own
         assert quick.run("aoa", "--mix", 0.5, 1, *options) == 0
     make_model("idw").fit(room).save(folder / "run" / "model-mix1.safetensors")
     return folder / "run"

@@ -15,13 +15,13 @@ from small import glances, small_published, small_swiftwrf
 
 from augment.estimators import ESTIMATORS
 from augment.estimators.baselines import Constant
+from augment.turbo.condition import NETWORKS
 from swiftwrf import AngularGrid, RssiModel, rssi_room, simulated_room
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.errors import MAX_LENGTH
 from swiftwrf.rssi import RssiConfig
 from swiftwrf.runtime.validation import configuration
 from tasks.aoa import experiment as aoa
-from tasks.aoa.condition import NETWORKS
 from tasks.aoa.options import AoaConfig
 from tasks.command_line import command_line
 from tasks.convert.options import ConvertConfig

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import torch
 
 from swiftwrf import InputError
+from swiftwrf.runtime.steps import Step
 from tasks.aoa.options import AoaConfig
 from tasks.directory import Run
-from tasks.steps import Step, run_steps
+from tasks.steps import run_steps
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ from quick import PREDICTORS_KEPT, TASKS, QuickNetwork, QuickRssiConfig
 from small import glances
 
 from augment.estimators import ESTIMATORS
+from augment.turbo.condition import NETWORKS
 from swiftwrf import RssiModel
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.rssi import RssiConfig
-from tasks.aoa.condition import NETWORKS
 from tasks.command_line import command_line
 
 TEXT = (Path(__file__).parent.parent / "docs" / "tutorial.md").read_text()

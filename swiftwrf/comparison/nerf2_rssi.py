@@ -27,9 +27,9 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.comparison.base import Config, Count, Depth, Training, draw_parameters, restored
 from swiftwrf.comparison.nerf2 import MAX_SAMPLES_ON_CPU, Field, received
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.models.base import check_finite
+from swiftwrf.models.base import CPU, check_finite
 from swiftwrf.positions import frame, normalise
-from swiftwrf.rssi.base import RssiFitContext, RssiPredictor, fingerprint
+from swiftwrf.rssi.base import RssiPredictor, fingerprint
 from swiftwrf.runtime.checkpoint import Header, Saved, expect
 from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration, from_plain
 
@@ -109,13 +109,10 @@ class NeRF2Rssi(RssiPredictor, Saved):
     receiver: Tensor
     """positions of the receivers, (R, 3) [m]"""
 
-    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+    def _fit(self, train: Rssi, *, device: torch.device = CPU, **arguments: Any) -> None:
         self.centre, self.receiver = frame(train.transmitter_position)[0], train.receiver_position.double()
         owner = fingerprint(self.config, train, train)
-        training = self._training(train, context.device)
-        self.field = training.trained(
-            owner, checkpoint=context.checkpoint, on_record=context.on_record, progress=context.progress
-        ).cpu()
+        self.field = self._training(train, device).trained(owner, **arguments).cpu()
 
     def _training(self, train: Rssi, device: torch.device) -> Training[Field]:
         """Return the descent of the squared error of amplitudes where RSSI was detected."""

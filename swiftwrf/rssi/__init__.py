@@ -1,6 +1,6 @@
 """RSSI at fixed receivers from the position of the transmitter."""
 
-from swiftwrf.rssi.base import Map, RssiConfig, RssiFitContext, RssiPredictor
+from swiftwrf.rssi.base import Map, RssiConfig, RssiPredictor
 from swiftwrf.rssi.comparison import RssiComparison, compare
 from swiftwrf.rssi.model import RssiModel, fit_rssi
 from swiftwrf.rssi.pairs import PairConfig, PairModel, PairPredictor
@@ -25,7 +25,6 @@ __all__ = [
     "PathLoss",
     "RssiComparison",
     "RssiConfig",
-    "RssiFitContext",
     "RssiModel",
     "RssiPaperConfig",
     "RssiPaperModel",

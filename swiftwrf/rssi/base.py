@@ -8,7 +8,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from copy import copy
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
@@ -22,7 +22,7 @@ from swiftwrf.data.rssi import Offsets, Rssi
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.errors import InputError, listed
 from swiftwrf.gp import Kernel
-from swiftwrf.models.base import CPU, FieldConfig, check_checkpoint
+from swiftwrf.models.base import FieldConfig, check_checkpoint
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Displayed
 from swiftwrf.positions import check_positions, to_tensor
@@ -67,25 +67,6 @@ class RssiConfig(FieldConfig):
     for Gaussian noise), since packets have outliers"""
     max_locations: Annotated[int, Ge(10)] = 1500
     """location bins that the rows are averaged in; the time of a fit grows with the cube of their number"""
-
-
-@dataclass(frozen=True)
-class RssiFitContext:
-    """Arguments of `RssiPredictor.fit` other than the training rows; see there.
-
-    Example:
-        >>> import swiftwrf
-        >>> data = swiftwrf.rssi_room(n=20)
-        >>> RssiFitContext(data).pool is data
-        True
-    """
-
-    pool: Rssi
-    parallel: Map | None = None
-    device: torch.device = CPU
-    checkpoint: Path | None = None
-    on_record: Callable[[Record], None] | None = None
-    progress: bool = False
 
 
 class RssiPredictor(Configured, Displayed, ABC):
@@ -190,8 +171,8 @@ class RssiPredictor(Configured, Displayed, ABC):
             self.attenuation = estimate_floor_attenuation(train, pool)
             pool = replace(self.attenuation, receiver_floor=tuple(receiver_floors(pool).tolist())).removed(pool)
             train = self.attenuation.removed(train)
-        context = RssiFitContext(pool, parallel, to_device(device), checkpoint, on_record, progress)
-        self._fit(train, context)
+        others = {"parallel": parallel, "checkpoint": checkpoint, "on_record": on_record, "progress": progress}
+        self._fit(train, pool=pool, device=to_device(device), **others)
         return self
 
     @checked
@@ -251,8 +232,14 @@ class RssiPredictor(Configured, Displayed, ABC):
         raise NotImplementedError
 
     @abstractmethod
-    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
-        """Fit to checked data."""
+    def _fit(self, train: Rssi, *, pool: Rssi, **arguments: Any) -> None:
+        """Fit to checked data.
+
+        Args:
+            train: Training rows.
+            pool: The same rows at all receivers.
+            arguments: The other arguments of `fit`. A predictor declares those that it uses, and ignores the rest by `**_`.
+        """
 
     @abstractmethod
     def _predict(self, position: Tensor) -> tuple[Tensor, Tensor | None]:

@@ -20,8 +20,8 @@ from torch import Tensor, from_numpy
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.data import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
-from swiftwrf.models.base import FieldConfig
-from swiftwrf.rssi.base import RssiFitContext, RssiPredictor
+from swiftwrf.models.base import CPU, FieldConfig
+from swiftwrf.rssi.base import Map, RssiPredictor
 from swiftwrf.rssi.comparison import make_predictor
 from swiftwrf.rssi.pairs import PairPredictor
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, fit_shared_path_loss, log_distance
@@ -43,7 +43,7 @@ class Mean(RssiPredictor):
 
     name = "mean"
 
-    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+    def _fit(self, train: Rssi, **_: Any) -> None:
         self._mean = train.rssi_dbm.nanmean(dim=0).nan_to_num(float(train.rssi_dbm.nanmean()))
 
     def _predict(self, position: Tensor) -> tuple[Tensor, None]:
@@ -61,9 +61,9 @@ class SharedPathLoss(RssiPredictor):
     name = "mri_pooled"
     requires_receiver_position = True
 
-    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+    def _fit(self, train: Rssi, *, pool: Rssi, **_: Any) -> None:
         self._receiver = train.receiver_position
-        self._path_loss = _fit_shared(context.pool, train)
+        self._path_loss = _fit_shared(pool, train)
 
     def _predict(self, position: Tensor) -> tuple[Tensor, None]:
         return self._path_loss(log_distance(position, self._receiver)), None
@@ -74,7 +74,7 @@ class ReceiverPathLoss(SharedPathLoss):
 
     name = "mri_receiver"
 
-    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+    def _fit(self, train: Rssi, **_: Any) -> None:
         self._receiver = train.receiver_position
         detected = (~train.rssi_dbm.isnan()).any(dim=0)
         own = fit_path_loss(log_distance(train.transmitter_position, train.receiver_position), train.rssi_dbm)
@@ -102,7 +102,7 @@ class ReceiverRegressors(RssiPredictor):
     def _regressor(self, x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> Any:
         """Return a regressor fitted to positions (n, 3) and values (n,) of one receiver."""
 
-    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+    def _fit(self, train: Rssi, **_: Any) -> None:
         residual, base = train.rssi_dbm, self._base(train)
         self._simpler = base and base.fit(train)
         if self._simpler is not None:
@@ -263,7 +263,16 @@ class Blend(RssiPredictor):
     weights: dict[str, float]
     """weight of each member, set by `fit`"""
 
-    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+    def _fit(
+        self, train: Rssi, *, pool: Rssi, device: torch.device = CPU, parallel: Map | None = None, **_: Any
+    ) -> None:
+        def member(name: str, kept: Tensor) -> RssiPredictor:
+            """Return a member, fitted to the kept rows (rows,)."""
+            rows = kept.nonzero()[:, 0]
+            options = {"validation": self.config.validation, "seed": self.config.seed}
+            unfitted = make_predictor(name, self.config.member_preset, **options)
+            return unfitted.fit(train.subset(rows), pool=pool.subset(rows), device=device, parallel=parallel)
+
         names = [name for name in self.config.members if not RSSI_PREDICTORS[name].lacking(train)]
         fold = folds(train.transmitter_position, self.config.validation, self.config.seed, session=train.session)
         held_out = torch.full((len(names), *train.rssi_dbm.shape), torch.nan, dtype=torch.float64)
@@ -271,20 +280,10 @@ class Blend(RssiPredictor):
             out = fold == number
             position = train.transmitter_position[out]
             for i, name in enumerate(names):
-                held_out[i, out] = self._member(name, train, context, ~out).predict(position).mean.double()
+                held_out[i, out] = member(name, ~out).predict(position).mean.double()
         self.weights = dict(zip(names, mixing_weights(held_out, train.rssi_dbm).tolist(), strict=True))
         every = torch.ones_like(fold, dtype=torch.bool)
-        self._members = {name: self._member(name, train, context, every) for name in names if self.weights[name] > 0}
-
-    def _member(self, name: str, train: Rssi, context: RssiFitContext, kept: Tensor) -> RssiPredictor:
-        """Return a member, fitted to the kept rows (rows,)."""
-        rows = kept.nonzero()[:, 0]
-        member = make_predictor(
-            name, self.config.member_preset, validation=self.config.validation, seed=self.config.seed
-        )
-        return member.fit(
-            train.subset(rows), pool=context.pool.subset(rows), device=context.device, parallel=context.parallel
-        )
+        self._members = {name: member(name, every) for name in names if self.weights[name] > 0}
 
     def _predict(self, position: Tensor) -> tuple[Tensor, None]:
         parts = [self.weights[name] * member.predict(position).mean.double() for name, member in self._members.items()]

@@ -18,8 +18,9 @@ from torch import Tensor
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, subsample
+from swiftwrf.models.base import CPU
 from swiftwrf.plotting import Axes
-from swiftwrf.rssi.base import RssiConfig, RssiFitContext, SavedRssiPredictor, map_threads
+from swiftwrf.rssi.base import Map, RssiConfig, SavedRssiPredictor, map_threads
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.path_loss import N_HARMONICS, harmonics, log_distance
@@ -97,39 +98,49 @@ class RssiModel(SavedRssiPredictor):
     _posterior: RssiPosterior | None
     """least squares of the fit, which `update` continues; None for `RssiPaperModel`"""
 
-    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
-        training = prepare(train, context.pool, self.config)
-        found = self._receivers(training, context)
-        weight = self._mixing_weights(train, training, found["held_out"], context)
+    def _fit(self, train: Rssi, *, pool: Rssi, **arguments: Any) -> None:
+        training = prepare(train, pool, self.config)
+        found = self._receivers(training, **arguments)
+        weight = self._mixing_weights(train, pool, training, found["held_out"], **arguments)
         self._assemble(train, training, found, weight[:, None].repeat(1, len(training.receiver_names)))
 
-    def _receivers(self, training: RssiTraining, context: RssiFitContext) -> dict[str, Tensor]:
+    def _receivers(
+        self,
+        training: RssiTraining,
+        device: torch.device = CPU,
+        parallel: Map | None = None,
+        progress: bool = False,
+        **_: Any,
+    ) -> dict[str, Tensor]:
         """Fit each receiver, and return the tensors of `fit_receiver` for all of them."""
-        task = partial(fit_receiver, data=training, config=self.config, device=context.device)
+        task = partial(fit_receiver, data=training, config=self.config, device=device)
         parts = [slice(r, r + 1) for r in range(len(training.receiver_names))]
-        with progress_bar(context.progress) as bar:
-            fits = (context.parallel or map_threads)(task, parts)
+        with progress_bar(progress) as bar:
+            fits = (parallel or map_threads)(task, parts)
             results = list(bar.track(fits, total=len(parts), description="receivers"))
         return {name: torch.cat([result[name] for result in results]) for name in results[0]}
 
-    def _mixing_weights(self, train: Rssi, training: RssiTraining, held_out: Tensor, context: RssiFitContext) -> Tensor:
+    def _mixing_weights(
+        self, train: Rssi, pool: Rssi, training: RssiTraining, held_out: Tensor, **arguments: Any
+    ) -> Tensor:
         """Return the weights (4,) of the field and the simpler predictors with the lowest error on held-out rows.
 
         The weights are those of all receivers: the few folds determine no weights for each of them. They follow from the
         receivers of the pool, so that a receiver's prediction is the same whichever others are fitted with it.
         """
-        pool = representative_receivers(context.pool)
-        if set(pool.receiver_names) <= set(train.receiver_names):
-            columns = [train.receiver_names.index(name) for name in pool.receiver_names]
+        some = representative_receivers(pool)
+        if set(some.receiver_names) <= set(train.receiver_names):
+            columns = [train.receiver_names.index(name) for name in some.receiver_names]
             predictors = _held_out_predictors(training, held_out)[:, :, columns]
         else:
-            others = prepare(pool, context.pool, self.config, training)
-            quiet = replace(context, progress=False)
-            predictors = _held_out_predictors(others, self._receivers(others, quiet)["held_out"])
+            others = prepare(some, pool, self.config, training)
+            predictors = _held_out_predictors(
+                others, self._receivers(others, **arguments | {"progress": False})["held_out"]
+            )
         predicted = predictors[:, training.bin_of_row]
-        if not comparable(predicted, pool.rssi_dbm).any():
+        if not comparable(predicted, some.rssi_dbm).any():
             return FIELD_ALONE
-        return mixing_weights(predicted, pool.rssi_dbm, 0.05)  # by nested cross-validation
+        return mixing_weights(predicted, some.rssi_dbm, 0.05)  # by nested cross-validation
 
     @single_thread()
     def _assemble(self, train: Rssi, training: RssiTraining, found: dict[str, Tensor], weight: Tensor) -> None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from itertools import groupby
 from statistics import NormalDist
-from typing import ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -25,7 +25,7 @@ from swiftwrf.gp.process import N_NEIGHBOURS, local_weights
 from swiftwrf.models.base import FieldConfig
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import Neighbours, check_positions, distance
-from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiFitContext, RssiPredictor, SavedRssiPredictor
+from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiPredictor, SavedRssiPredictor
 from swiftwrf.rssi.path_loss import PairPathLoss
 from swiftwrf.rssi.training import LEVEL, rounding_std
 from swiftwrf.runtime import checkpoint as files
@@ -84,7 +84,7 @@ class PairPredictor(RssiPredictor):
     def _at_pairs(self, pair: Tensor) -> tuple[Tensor, Tensor | None]:
         """Return RSSI (m,) [dBm] and its standard deviation, or None, at pairs (m, 6) [m]."""
 
-    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+    def _fit(self, train: Rssi, **_: Any) -> None:
         row, column = train.detected.nonzero(as_tuple=True)
         pair = torch.cat([train.transmitter_position[row], train.receiver_position[column]], dim=1)
         session = None if train.session is None else train.session[row]

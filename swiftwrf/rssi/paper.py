@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -17,7 +18,8 @@ from torch.nn import functional
 
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.errors import FitError
-from swiftwrf.rssi.base import RssiConfig, RssiFitContext
+from swiftwrf.models.base import CPU
+from swiftwrf.rssi.base import Map, RssiConfig
 from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
 from swiftwrf.rssi.model import FIELD_ALONE, RssiModel
 from swiftwrf.rssi.path_loss import N_HARMONICS
@@ -77,21 +79,30 @@ class RssiPaperModel(RssiModel):
     config_type = RssiPaperConfig
     slow = True
 
-    def _fit(self, train: Rssi, context: RssiFitContext) -> None:
+    def _fit(
+        self,
+        train: Rssi,
+        *,
+        pool: Rssi,
+        device: torch.device = CPU,
+        parallel: Map | None = None,
+        progress: bool = False,
+        **_: Any,
+    ) -> None:
         config, bins = self.config, binned(train, self.config)
-        pool_rssi = bin_locations(context.pool, config.max_locations)[1]
+        pool_rssi = bin_locations(pool, config.max_locations)[1]
         pool_residual = pool_rssi - pool_rssi.nanmean(dim=0)
-        self.kernel, _ = choose_residual_kernel(bins.position, pool_residual, bins.fold, train.floors is not None)
+        self.kernel = choose_residual_kernel(bins.position, pool_residual, bins.fold, train.floors is not None)[0]
         prior_db = prior_std(bins.rssi - bins.rssi.nanmean(dim=0), pool_residual, self.kernel)
         covariance = self.kernel(bins.position, bins.position)
         covariance.diagonal().add_(1e-3)  # bins may nearly coincide
         root = torch.linalg.cholesky(covariance)  # the latent field in the bins is this times standard normal numbers
-        task = partial(learn_receivers, bins=bins, root=root, prior_db=prior_db, config=config, device=context.device)
+        task = partial(learn_receivers, bins=bins, root=root, prior_db=prior_db, config=config, device=device)
         n_receivers = len(bins.receiver_names)
         parts = [slice(start, start + 4) for start in range(0, n_receivers, 4)]
-        with progress_bar(context.progress) as bar:
+        with progress_bar(progress) as bar:
             # compiled rasterizers are not safe in several threads
-            fits = (context.parallel or map)(task, parts)
+            fits = (parallel or map)(task, parts)
             results = list(bar.track(fits, total=len(parts), description="receivers"))
         held_out, white, rendered = (torch.cat(values) for values in zip(*results, strict=True))
         self._calibrate(train, bins, prior_db, held_out.T)

@@ -8,10 +8,13 @@ second the old file.
 from __future__ import annotations
 
 import errno
+import json
+import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from swiftwrf.errors import InputError
 
@@ -86,3 +89,34 @@ def rename(source: Path, target: Path) -> None:
     """Rename a file or directory within its directory, and wait until the disk has it."""
     os.replace(source, target)
     sync(target.parent)
+
+
+def strict(value: Any) -> Any:
+    """Return the value as strict JSON carries it: nan and infinity become None, keys become text.
+
+    Example:
+        >>> strict({1: (0.5, float("nan"))})
+        {'1': [0.5, None]}
+    """
+    if isinstance(value, dict):
+        return {str(key): strict(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [strict(item) for item in value]
+    if hasattr(value, "tolist"):  # tensors and arrays
+        return strict(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def write_json(file: Path, content: Any) -> None:
+    """Write a value as strict JSON."""
+    write_text(file, json.dumps(strict(content), indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def write_npz(file: Path, arrays: Mapping[str, Any]) -> None:
+    """Write arrays by name."""
+    import numpy as np
+
+    with replacing(file) as temporary, temporary.open("wb") as stream:
+        np.savez_compressed(stream, **arrays)

@@ -2,29 +2,43 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
-from augment import withhold
-from swiftwrf import InputError, Spectra, simulated_room
+import torch
+
+from augment.turbo.choice import Suggestion, first_steps
+from augment.turbo.experiment import Experiment
+from augment.turbo.locating import Locating
+from augment.turbo.results import Results, rows_of
+from augment.turbo.synthesis import Evaluation, Synthesis, as_bytes
+from swiftwrf import Spectra, simulated_room
+from swiftwrf.choices import RAYTRACE, fraction_key
 from swiftwrf.data import load_spectra
 from swiftwrf.data.files import sha256
 from swiftwrf.data.raytraced import sionna
-from tasks.aoa.condition import MeasuredSubset
-from tasks.aoa.context import Experiment
-from tasks.aoa.options import RAYTRACE, AoaConfig, check_data, fraction_key, n_synthetic
+from swiftwrf.metrics import angle_errors, covered
+from swiftwrf.runtime.steps import Step
+from tasks.aoa.options import AoaConfig
 from tasks.aoa.page import page
 from tasks.aoa.page.summary import answer
-from tasks.aoa.results import Results
-from tasks.aoa.steps import first_steps
-from tasks.aoa.suggestion import Suggestion
 from tasks.metrics import AoaMetrics
 from tasks.page.page import reporting
 from tasks.page.records import Records
-from tasks.run import Run, choose_device
+from tasks.run import Row, Run, choose_device
 from tasks.source import located, reading
-from tasks.steps import Step, run_steps
+from tasks.steps import run_steps
 from tasks.terminal import console, terminal
 from tasks.workers import connected
+
+EXAMPLE_QUANTILES = (
+    1.0,
+    0.8,
+    0.6,
+    0.4,
+    0.2,
+    0.0,
+)  # of the PSNR at the test positions, from the best spectrum to the worst
 
 
 def run(config: AoaConfig, resume: Path | None = None) -> None:
@@ -40,17 +54,20 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
     data = measurements(config)
     for note in data.notes:
         console.print(f"{data.name}: {note}")
-    check_data(data, config)
     train, test = data.split(config.split, config.seed)
-    if len(test) == 0:
-        raise InputError(f"split {config.split!r} of {data.name} has no test spectra")
-    for fraction in config.mix:
-        withhold(train, fraction, config.seed)  # refuses before anything is written
-    experiment = Experiment(config, train, test, n_synthetic(data, config), device)
-    subsets = [MeasuredSubset(fraction, repeat) for repeat in range(config.repeats) for fraction in config.mix]
-    steps: list[Step[Experiment]] = [step for subset in subsets for step in first_steps(experiment, subset)]
-    if config.suggest:
-        steps += [Suggestion(subset) for subset in subsets if subset.repeat == 0]
+    experiment = Experiment(
+        train,
+        test,
+        config.mix,
+        config.synthesizer,
+        extra=config.extra,
+        preset=config.preset,
+        repeats=config.repeats,
+        seed=config.seed,
+        scene=config.scene,
+        suggest=config.suggest,
+        device=device,
+    )
     source = data.source
     if config.scene is not None and Path(config.scene).is_file():
         source = {**source, f"scene {Path(config.scene).name}": sha256(Path(config.scene))}
@@ -59,11 +76,19 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
         connected(config.scheduler, device) as cluster,
         Run("aoa", config.out, label, config, device, source, resume, 1 if cluster else config.processes) as directory,
     ):
-        results = Results(experiment, directory)
+        results, told = Results(experiment), 0
         with terminal.progress():
-            for step, value in run_steps(directory, steps, experiment, cluster, results.show):
+            for step, value in run_steps(
+                directory, first_steps(experiment), experiment, cluster, partial(_show, experiment)
+            ):
                 results.add(step, value)
-        results.write()
+                _write_files(step, value, experiment.test, directory)
+                for note in results.notes[told:]:
+                    console.print(note)
+                told = len(results.notes)
+        tables = {"errors": results.errors(), "synthesis": results.synthesis, "history": results.history}
+        for name, rows in (tables | ({"positions": found} if (found := results.positions()) else {})).items():
+            directory.write_csv(f"{name}.csv", rows)
         metrics: AoaMetrics = {
             "task": "aoa",
             "data": data.name,
@@ -93,3 +118,54 @@ def measurements(config: AoaConfig) -> Spectra:
     if config.data is None:
         return simulated_room(seed=config.seed, moving=config.moving or "transmitter")
     return load_spectra(located(config.data), **reading(config).given)
+
+
+def _show(experiment: Experiment, step: Step[Experiment], value: Row) -> None:
+    """Show the median angular error of a condition on the terminal."""
+    if not isinstance(step, Evaluation | Locating) or "refused" in value:
+        return
+    condition = step.condition
+    error = angle_errors(torch.tensor(value["estimate"], dtype=torch.float64), experiment.test.label)["great_circle"]
+    name = f"{condition.estimator}, {condition.meaning}"
+    if condition.training != "all" and len(experiment.fractions) > 1:
+        name = f"{condition.measured_fraction:.0%}: {name}"
+    terminal.result(name, f"{float(error.nanquantile(0.5).rad2deg()):.2f} deg")
+
+
+def _write_files(step: Step[Experiment], value: Row, test: Spectra, run: Run) -> None:
+    """Write what the report shows of a step: suggested positions, or synthetic spectra of the first trained field model."""
+    match step:
+        case Suggestion():
+            name = f"suggested-mix{step.subset.key}"
+            tensors = {
+                key: torch.tensor(value[key], dtype=torch.float64) for key in ("measured", "position", "variance")
+            }
+            coordinates = dict(zip(("x_m", "y_m", "z_m"), tensors["position"].T, strict=True))
+            run.write_csv(f"{name}.csv", rows_of({}, coordinates | {"variance_left": tensors["variance"][1:]}))
+            names = {"measured": "measured", "suggested": "position", "left": "variance"}
+            run.write_npz(f"{name}.npz", {array: tensors[key].numpy() for array, key in names.items()})
+        case Synthesis(trains=True) if "refused" not in value and step.subset.repeat == 0:
+            file = f"examples-mix{step.subset.key}.npz"
+            if not run.path(file).exists():
+                run.write_npz(file, _examples(step, torch.tensor(value["scores"]["psnr_db"]), test, run.folder))
+
+
+def _examples(step: Synthesis, score: torch.Tensor, test: Spectra, folder: Path) -> Row:
+    """Return measured and synthetic spectra at the test positions with given quantiles of their PSNR (n,)."""
+    spectra = step.test_spectra(folder)
+    measured, synthetic = test.store, spectra["test"]
+    order = score.argsort()
+    chosen = order[[round(q * (len(order) - 1)) for q in EXAMPLE_QUANTILES]]
+    examples = {
+        "measured": as_bytes(measured[chosen]).numpy(),
+        "synthetic": as_bytes(synthetic[chosen]).numpy(),
+        "synthesizer": step.synthesizer,
+        "index": test.index[chosen].numpy(),
+        "psnr_db": score[chosen].numpy(),
+    }
+    if "test_std" in spectra:
+        std = spectra["test_std"]
+        examples["deviation"] = as_bytes(std[chosen]).numpy()
+        triples = zip(synthetic.batches(), measured.batches(), std.batches(), strict=True)
+        examples["coverage"] = float(torch.cat([covered(s, d, m) for s, m, d in triples]).mean())
+    return examples

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
-from swiftwrf.choices import FIELD_MODELS, MAX_SUGGESTIONS, Moving, check_scene
+from swiftwrf.choices import AUTO, FIELD_MODELS, MAX_SUGGESTIONS, RAYTRACE, Moving, check_scene, fraction_key
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.validation import Preset
 from tasks import labels
 from tasks.options import SEEDS, Output, SpectraSource, choice, command_options, given
 
-if TYPE_CHECKING:
-    from swiftwrf import Spectra
-
-AUTO = "auto"  # --synthesizer: the field model that cross-validation chooses
-RAYTRACE = "raytrace"  # the field model that takes --scene
 PAPER_FRACTIONS = (0.1, 0.3, 0.5, 0.7)
-DEFAULT_EXTRA = 3000  # extra synthetic positions where cross-validation recommends some
 
 
 @command_options
@@ -115,49 +109,5 @@ class AoaConfig(SpectraSource, Output):
         check_scene(scene, "--scene ")
 
 
-def fraction_key(fraction: float) -> str:
-    """Return the shortest text that reads back as the same number, for keys and file names.
-
-    Example:
-        >>> fraction_key(0.3), fraction_key(1.0), fraction_key(0.6666667)
-        ('0.3', '1', '0.6666667')
-    """
-    short = f"{fraction:g}"
-    return short if float(short) == fraction else repr(fraction)
-
-
 def _listed(fractions: tuple[float, ...]) -> str:
     return " ".join(map(fraction_key, fractions))
-
-
-def check_data(data: Spectra, config: AoaConfig) -> None:
-    """Refuse data that do not meet the requirements of the options.
-
-    Raises:
-        InputError: Spectra too small to compute their SSIM, or a field model needs the array or the fixed end, and neither
-            data nor command line describe it.
-    """
-    from swiftwrf.metrics import WINDOW  # imports torch
-
-    if min(data.grid.shape) < WINDOW:
-        raise InputError(
-            f"spectra of {data.name} have {data.grid.shape[0]} x {data.grid.shape[1]} pixels; SSIM, the measure "
-            f"of their quality, needs at least {WINDOW} x {WINDOW}"
-        )
-    for name in config.synthesizer:
-        missing = [] if name == AUTO else FIELD_MODELS[name].lacking(data)
-        if missing:
-            hint = "give it with --array" if "array" in missing else "the data must contain its position"
-            raise InputError(f"synthesizer {name} needs the {missing[0]}, which {data.name} does not describe; {hint}")
-
-
-def n_synthetic(data: Spectra, config: AoaConfig) -> int:
-    """Return the largest number of extra synthetic positions.
-
-    Raises:
-        InputError: --extra asks for some, but the direction at other positions is unknown.
-    """
-    if config.extra:
-        data.direction_at(data.position[:1])  # refuses unknown geometry
-    known = data.fixed_position is not None and data.rotation is not None
-    return config.extra if config.extra is not None else DEFAULT_EXTRA if known else 0

@@ -14,11 +14,11 @@ from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMAT
 from swiftwrf.data.formats.paths import read_paths
 from swiftwrf.data.writing import write_deepmimo, write_rssi, write_spectra
 from swiftwrf.diagnostics.calibration import Calibration, calibrate
+from swiftwrf.runtime.durable import write_json
 from tasks.convert.options import FILES, ConvertConfig
 from tasks.convert.outputs import map_of, saved_model, write_file
 from tasks.directory import check_new_file, new_directory
 from tasks.environment import invocation
-from tasks.records import write_json
 from tasks.source import located, reading
 from tasks.terminal import console
 

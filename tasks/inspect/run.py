@@ -9,12 +9,12 @@ from swiftwrf.array.beamforming import PHASE
 from swiftwrf.data import Rssi, Snapshots
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
 from swiftwrf.diagnostics.inspection import inspect, propose_offsets
+from swiftwrf.runtime.durable import write_json
 from tasks.directory import new_directory
 from tasks.environment import stamp
 from tasks.inspect.options import InspectConfig
 from tasks.inspect.page import page
 from tasks.page.page import write_page
-from tasks.records import write_json
 from tasks.source import located, reading
 from tasks.terminal import terminal
 

@@ -16,9 +16,10 @@ from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.locate import RssiLocator
 from swiftwrf.locate.baselines import PosteriorLocalizer
 from swiftwrf.locate.comparison import LocateSplit, Trial
+from swiftwrf.runtime.durable import write_npz
+from swiftwrf.runtime.steps import Step
 from tasks.claim import LOCATOR
-from tasks.records import Row, write_npz, write_table
-from tasks.steps import Step
+from tasks.records import Row, write_table
 
 MAPS = "maps.npz"
 SUGGESTED = "suggested"

@@ -13,7 +13,8 @@ from PIL import Image, UnidentifiedImageError
 from swiftwrf import InputError
 from swiftwrf.positions import MAX_COORDINATE_M
 from swiftwrf.runtime.checkpoint import refusing
-from tasks.records import read_npz, write_npz
+from swiftwrf.runtime.durable import write_npz
+from tasks.records import read_npz
 
 MAX_PLAN_PIXELS = 2**24
 STORED = "floor-plan.npz"  # in the directory of a run

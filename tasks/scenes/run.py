@@ -13,11 +13,11 @@ from swiftwrf import InputError
 from swiftwrf.data.files import sha256
 from swiftwrf.data.raytraced import ROOMS, FurnishedRoom, Scene, Tracing, trace
 from swiftwrf.data.writing import write_paths
+from swiftwrf.runtime.durable import write_json
 from tasks.directory import new_directory
 from tasks.environment import invocation
 from tasks.options import plain
 from tasks.page import figures
-from tasks.records import write_json
 from tasks.scenes.options import ScenesConfig
 from tasks.terminal import console, terminal
 

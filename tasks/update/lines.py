@@ -20,7 +20,7 @@ from swiftwrf.errors import CONTENT_ERRORS
 from swiftwrf.online import Step
 from swiftwrf.online.scores import LEVEL
 from swiftwrf.rssi import RssiModel
-from tasks.records import strict
+from swiftwrf.runtime.durable import strict
 from tasks.update.options import TABLE, UpdateConfig
 
 POLL_S = 0.2  # between two looks at a file that grows

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from swiftwrf import InputError
 from swiftwrf.online import Step
-from swiftwrf.runtime.durable import write_text
-from tasks.records import Row, as_table, read_json, write_json
+from swiftwrf.runtime.durable import write_json, write_text
+from tasks.records import Row, as_table, read_json
 
 TABLE, SUMMARY = "measurements.csv", "update.json"
 COLUMNS = (

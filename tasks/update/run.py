@@ -18,12 +18,12 @@ from swiftwrf.errors import with_article
 from swiftwrf.online import Follower, MonitorConfig
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime import checkpoint
+from swiftwrf.runtime.durable import write_json
 from tasks.claim import CONFIG, ENVIRONMENT, MODEL, Claim, begun
 from tasks.directory import new_directory, unchanged_environment
 from tasks.environment import environment, invocation
 from tasks.options import plain
 from tasks.page.page import write_page
-from tasks.records import write_json
 from tasks.source import aligned, located, reading
 from tasks.terminal import console, terminal
 from tasks.update.lines import answer, check_source, lines, measurement

@@ -189,12 +189,6 @@ def _nearest_direction(grid: AngularGrid) -> NDArray[np.integer]:
     return np.where(elevation < 0, -1, row.clip(0, grid.n_elevation - 1) * grid.n_azimuth + column)
 
 
-def data_of(layers: dict[str, Data], bar: Option | None = None) -> Option:
-    """Return an option that replaces the data of some layers, and the colour bar."""
-    option: Option = {"series": [{"id": name, "data": data} for name, data in layers.items()]}
-    return option if bar is None else option | {"visualMap": bar}
-
-
 def plan(corners: Sequence[float], layers: list[Option], bottom: int) -> Option:
     """Return the options of a chart of positions in plan, edges x0, x1, y0, y1 [m], with room below for a colour bar."""
     x0, x1, y0, y1 = corners

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from swiftwrf import InputError, Rssi, load
-from swiftwrf.errors import with_article
-from swiftwrf.locate import MatchedField, Posterior, RssiLocator
+from swiftwrf import Rssi
+from swiftwrf.locate import Posterior, RssiLocator
 from swiftwrf.locate.baselines import BATCH_ROWS
 from swiftwrf.locate.posterior import PlanMap
 from swiftwrf.locate.rssi import UNDETECTED_BELOW_DB
@@ -151,35 +149,6 @@ class RssiLocating:
         values = torch.full((len(position),), torch.nan, dtype=torch.float64)
         values[inside] = error.mean(dim=0)
         return PlanMap(x.numpy(), y.numpy(), values.reshape(len(y), len(x)).numpy())
-
-
-class SpectrumLocating:
-    """The locator that a run of tasks.aoa keeps; it is opened when it is first used.
-
-    Args:
-        file: File of the locator.
-    """
-
-    def __init__(self, file: Path) -> None:
-        self._file = file
-
-    @cached_property
-    def locator(self) -> MatchedField:
-        """The locator.
-
-        Raises:
-            InputError: The file contains none.
-        """
-        locator = load(self._file)
-        if not isinstance(locator, MatchedField):
-            raise InputError(
-                f"{self._file} holds {with_article(locator.kind)}, expected {with_article(MatchedField.kind)}"
-            )
-        return locator
-
-    def located(self, spectrum: Tensor, truth: Tensor) -> Located:
-        """Return the posterior of a spectrum (n_elevation, n_azimuth) that was measured at `truth`, (3,) [m]."""
-        return Located.of(self.locator.locate(spectrum[None]), truth)
 
 
 def _coarse_grid(locator: RssiLocator) -> tuple[Tensor, Tensor, Tensor, Tensor]:

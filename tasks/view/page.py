@@ -27,7 +27,6 @@ from tasks.view.charts import (
     Option,
     circle,
     crosses,
-    data_of,
     lines,
     paths,
     plan,
@@ -120,8 +119,10 @@ class Chart:
 
     def show(self, layers: dict[str, Data], bar: Option | None = None) -> None:
         """Replace the data of layers by their names, and the colour bar."""
-        option = json.dumps(data_of(layers, bar), allow_nan=False)
-        self.element.client.run_javascript(SET_OPTION % {"id": self.element.id, "option": option})
+        option: Option = {"series": [{"id": name, "data": data} for name, data in layers.items()]}
+        option |= {} if bar is None else {"visualMap": bar}
+        code = SET_OPTION % {"id": self.element.id, "option": json.dumps(option, allow_nan=False)}
+        self.element.client.run_javascript(code)
 
 
 class PlanChart(Chart):

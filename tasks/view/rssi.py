@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, get_args
@@ -13,8 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from swiftwrf import InputError, Prediction, Rssi, RssiModel
-from swiftwrf.positions import MAX_COORDINATE_M
+from swiftwrf import Prediction, Rssi, RssiModel
 from swiftwrf.rssi import LEVEL
 from swiftwrf.rssi.maps import RssiMap
 from tasks.page import maps
@@ -33,50 +32,25 @@ PLAN = {"plan": "u1 height width 3", "plan_extent": "f 4"}  # that maps.npz may 
 Values = NDArray[np.floating]
 
 
-@dataclass(frozen=True, eq=False)
-class MeasuredFloor:
-    """RSSI measurements on a floor.
+def rows_of_run(file: Path, receivers: tuple[str, ...]) -> tuple[Rssi, FloorPlan | None]:
+    """Return the measured rows and the floor plan in the `maps.npz` of a run.
 
-    Args:
-        position: Positions of the transmitter [m], (n, 3).
-        rssi_dbm: Measured RSSI [dBm], (n, R), nan where a receiver detected nothing.
-        receiver: Positions of the receivers [m], (R, 3), nan where they are unknown.
-        plan: Image of the floor. None if there is none.
+    Raises:
+        InputError: The file is damaged, or contains other receivers.
     """
+    stored, plan = read_npz(file, MAPS | PLAN, PLAN), None
+    if "plan" in stored:
+        x0, x1, y0, y1 = stored["plan_extent"].tolist()
+        plan = FloorPlan(stored["plan"], (x0, x1, y0, y1))
+    measured, position, receiver = stored["measured"], stored["measured_position"], stored["receiver"]
+    return Rssi(measured, position, receiver_position=receiver, receiver_names=receivers), plan
 
-    position: Values
-    rssi_dbm: Values
-    receiver: Values
-    plan: FloorPlan | None = None
 
-    def __post_init__(self) -> None:
-        known = [self.position, self.receiver[np.isfinite(self.receiver)]]
-        if not len(self.position) or any(not (np.abs(some) <= MAX_COORDINATE_M).all() for some in known):
-            raise InputError(f"expected positions of at most {MAX_COORDINATE_M:g} m, got none or others; restore them")
-
-    @classmethod
-    def from_run(cls, file: Path) -> MeasuredFloor:
-        """Return the measurements in the `maps.npz` of a run.
-
-        Raises:
-            InputError: The file is damaged.
-        """
-        maps, plan = read_npz(file, MAPS | PLAN, PLAN), None
-        if "plan" in maps:
-            x0, x1, y0, y1 = maps["plan_extent"].tolist()
-            plan = FloorPlan(maps["plan"], (x0, x1, y0, y1))
-        return cls(maps["measured_position"], maps["measured"], maps["receiver"], plan)
-
-    @classmethod
-    def from_model(cls, model: RssiModel) -> MeasuredFloor:
-        """Return the positions that a model contains, without the RSSI measured there."""
-        position = (model.anchor + model.centre).numpy()
-        return cls(position, np.full((len(position), len(model.receiver_names)), np.nan), model.receiver.numpy())
-
-    @classmethod
-    def from_rows(cls, rows: Rssi) -> MeasuredFloor:
-        """Return measured rows."""
-        return cls(rows.transmitter_position.numpy(), rows.rssi_dbm.numpy(), rows.receiver_position.numpy())
+def rows_of_model(model: RssiModel) -> Rssi:
+    """Return rows at the positions that a model contains, without the RSSI measured there."""
+    position, names = model.region(), model.receiver_names
+    empty = torch.full((len(position), len(names)), torch.nan)
+    return Rssi(empty, position, receiver_position=model.receiver_position, receiver_names=names)
 
 
 @dataclass(frozen=True)
@@ -133,7 +107,8 @@ class RssiView:
     Args:
         title: Title of the page.
         model: Fitted model.
-        floor: Measurements on the floor.
+        rows: Measured rows.
+        plan: Image of the floor. None if there is none.
         locating: Locator and the rows that it locates. None if there is no locator.
         notes: Remarks on the data, a sentence each.
         folder: Directory of the run, where a floor plan is saved. None for a saved model.
@@ -141,7 +116,8 @@ class RssiView:
 
     title: str
     model: RssiModel
-    floor: MeasuredFloor
+    rows: Rssi
+    plan: FloorPlan | None = None
     locating: RssiLocating | None = None
     notes: list[str] = field(default_factory=list)
     folder: Path | None = None
@@ -153,6 +129,11 @@ class RssiView:
         return self.model.receiver_names
 
     @property
+    def position(self) -> Values:
+        """Measured positions of the transmitter, (n, 3) [m]."""
+        return self.rows.transmitter_position.numpy()
+
+    @property
     def kinds(self) -> tuple[MapKind, ...]:
         """Available maps. The best receiver needs several receivers, the position a locator."""
         missing: tuple[MapKind, ...] = () if len(self.receivers) > 1 else ("best receiver",)
@@ -162,28 +143,26 @@ class RssiView:
     @property
     def heights(self) -> tuple[float, float, float]:
         """Lowest, median and highest height of the transmitter [m]."""
-        low, middle, high = np.quantile(self.floor.position[:, 2], (0, 0.5, 1)).tolist()
+        low, middle, high = np.quantile(self.position[:, 2], (0, 0.5, 1)).tolist()
         return low, middle, high
 
     def __post_init__(self) -> None:
-        if self.floor.receiver.shape != self.model.receiver.shape:
-            raise InputError("the model has other receivers than the measurements; restore the files of the run")
         if self.folder is not None and (stored := FloorPlan.load(self.folder)) is not None:
-            self.floor = replace(self.floor, plan=stored)
+            self.plan = stored
 
     def place(self, plan: FloorPlan) -> None:
         """Show a floor plan below the maps, and save it in the directory of the run."""
         if self.folder is not None:
             plan.save(self.folder)
-        self.floor, self._last = replace(self.floor, plan=plan), None
+        self.plan, self._last = plan, None
         self.__dict__.pop("inside", None)  # the map covers the plan, too
 
     @property
     def region(self) -> Values:
         """Positions (n, 2) [m] whose box the page covers: measurements, known receivers and the floor plan."""
-        receiver = self.floor.receiver[np.isfinite(self.floor.receiver).all(axis=1)]
-        corners = np.array(self.floor.plan.corners).reshape(2, 2).T if self.floor.plan else np.empty((0, 2))
-        return np.concatenate([self.model.region().numpy()[:, :2], receiver[:, :2], corners])
+        corners = np.array(self.plan.corners).reshape(2, 2).T if self.plan else np.empty((0, 2))
+        receiver = self.rows.receiver_position[self.rows.receiver_located]
+        return np.concatenate([self.model.region().numpy()[:, :2], receiver.numpy()[:, :2], corners])
 
     @property
     def chart(self) -> RssiMap:
@@ -204,7 +183,7 @@ class RssiView:
         mean = chart.mean
         match selection.kind:
             case "RSSI":
-                measured = self.floor.rssi_dbm[np.isfinite(self.floor.rssi_dbm)]
+                measured = self.rows.rssi_dbm[self.rows.detected].numpy()
                 low, high = np.percentile(measured if len(measured) else mean, (1, 99)).tolist()
                 return ColouredMap(mean[receiver], "viridis", low, high, "dBm", "both")
             case "interval":
@@ -240,7 +219,7 @@ class RssiView:
     @cached_property
     def inside(self) -> NDArray[np.bool_]:
         """True for each cell inside the measured positions, in plan (rows, columns)."""
-        return maps.inside(np.stack(np.meshgrid(self.chart.x, self.chart.y), axis=-1), self.floor.position)
+        return maps.inside(np.stack(np.meshgrid(self.chart.x, self.chart.y), axis=-1), self.position)
 
     def sentence(self, selection: MapSelection) -> str:
         """Describe the selected map in a few sentences."""
@@ -249,7 +228,7 @@ class RssiView:
         name = self.receivers[selection.receiver]
         match selection.kind:
             case "RSSI":
-                dots = np.isfinite(self.floor.rssi_dbm[:, selection.receiver]).any()
+                dots = bool(self.rows.detected[:, selection.receiver].any())
                 return f"Predicted RSSI of {name}{'; dots: measured, in the same colours' if dots else ''}."
             case "interval":
                 return f"Width of the {LEVEL:.0%} interval of a measurement at {name}."

@@ -138,23 +138,23 @@ class RssiPage:
 
     def _data(self, selection: MapSelection, coloured: ColouredMap) -> dict[str, Data]:
         """Return the data of all layers of the plan."""
-        view, floor, corners = self._view, self._view.floor, self._view.chart.corners
+        view, rows, corners = self._view, self._view.rows, self._view.chart.corners
         image = colour_image(coloured.values[::-1], coloured.colours, coloured.low, coloured.high)
         data: dict[str, Data] = {"floor": [], "outside": [], "rows": [], "measured": [], "receivers": []}
-        data["map"] = picture(image, coloured.corners or corners, 0.7 if floor.plan else 1.0)
-        if floor.plan:
-            data["floor"] = picture(Image.fromarray(floor.plan.pixels), floor.plan.corners)
+        data["map"] = picture(image, coloured.corners or corners, 0.7 if view.plan else 1.0)
+        if view.plan:
+            data["floor"] = picture(Image.fromarray(view.plan.pixels), view.plan.corners)
         if selection.kind not in LOCATING:  # grey where the map is extrapolated
             data["outside"] = picture(colour_image(np.where(view.inside, np.nan, 0.5)[::-1], "gray"), corners, 0.55)
         if selection.kind == "RSSI":
-            values = floor.rssi_dbm[:, selection.receiver]
-            detected = np.isfinite(values)
-            data["measured"] = points(floor.position[detected], values[detected])
+            detected = rows.detected[:, selection.receiver]
+            values = rows.rssi_dbm[detected, selection.receiver].numpy()
+            data["measured"] = points(view.position[detected.numpy()], values)
         found = None
         if selection.kind == "posterior" and view.locating is not None:
-            data["rows"], found = points(floor.position), view.locating.located(selection.row)
+            data["rows"], found = points(view.position), view.locating.located(selection.row)
         every = selection.kind in ("best receiver", *LOCATING)
-        for number, position in enumerate(floor.receiver):
+        for number, position in enumerate(rows.receiver_position.numpy()):
             if np.isfinite(position).all() and (every or number == selection.receiver):
                 colour = _colour(number) if selection.kind == "best receiver" else RECEIVER_MARK
                 data["receivers"].append(named(position, view.receivers[number], color=colour))

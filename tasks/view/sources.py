@@ -11,24 +11,25 @@ import torch
 
 from augment import withhold
 from augment.cross_validation import LOCATOR as MATCHED_FIELD
+from augment.turbo.artifacts import model_file
 from swiftwrf import FieldModel, InputError, RssiModel, Spectra, load
+from swiftwrf.choices import fraction_key
 from swiftwrf.errors import with_article
 from swiftwrf.locate import RssiLocator
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import Plane
 from swiftwrf.rssi.base import RssiPredictor
 from swiftwrf.runtime.checkpoint import Saved, refusing
-from tasks.aoa.artifacts import model_file
 from tasks.aoa.experiment import measurements as spectra_of
-from tasks.aoa.options import AoaConfig, fraction_key
+from tasks.aoa.options import AoaConfig
 from tasks.claim import CONFIG, ENVIRONMENT, LOCATOR, MODEL
 from tasks.locate.experiment import measurements as rssi_of
 from tasks.locate.options import LocateConfig
 from tasks.parsing import parse
 from tasks.records import Row, read_json
 from tasks.view.followed import FollowedView, open_followed
-from tasks.view.locating import RssiLocating, SpectrumLocating
-from tasks.view.rssi import MeasuredFloor, RssiView
+from tasks.view.locating import RssiLocating
+from tasks.view.rssi import RssiView, rows_of_model, rows_of_run
 from tasks.view.spectra import LoadedModel, SpectraView
 
 EXPECTED = "give the directory of a run of aoa, rssi, locate or update, or a saved model of spectra or RSSI"
@@ -67,7 +68,7 @@ def open_source(source: Path) -> SpectraView | RssiView | FollowedView:
 def _saved_model(file: Path) -> SpectraView | RssiView:
     model = load(file)
     if isinstance(model, RssiModel):
-        return RssiView(file.name, model, MeasuredFloor.from_model(model))
+        return RssiView(file.name, model, rows_of_model(model))
     if isinstance(model, RssiLocator):
         return _located(file.name, RssiLocating.of_training(model))
     field_model = _field_model(file, model)
@@ -101,13 +102,13 @@ def _aoa_run(folder: Path, content: Row) -> SpectraView:
                 measured, _ = withhold(train, fraction, config.seed)
                 in_training = np.isin(data.index.numpy(), measured.index.numpy())
             located_by = model_file(folder, MATCHED_FIELD, fraction_key(fraction))
-            locating = SpectrumLocating(located_by) if located_by.is_file() else None
+            locator_file = located_by if located_by.is_file() else None
             files = {name: model_file(folder, name, fraction_key(fraction)) for name in FIELD_MODELS}
             for name in (name for name, file in files.items() if file.is_file()):
                 model = _field_model(files[name], load(files[name]))
                 planes = _planes(model) or _planes_of_run(folder, fraction)
                 models.append(
-                    LoadedModel(f"{name}, {100 * fraction:g}% measured", model, planes, in_training, locating)
+                    LoadedModel(f"{name}, {100 * fraction:g}% measured", model, planes, in_training, locator_file)
                 )
     if not models:
         raise InputError(f"{folder} holds no model; run tasks.aoa with a --synthesizer that can be saved")
@@ -161,8 +162,7 @@ def _locate_run(folder: Path, content: Row) -> RssiView:
 def _located(
     title: str, locating: RssiLocating, notes: list[str] | None = None, folder: Path | None = None
 ) -> RssiView:
-    floor = MeasuredFloor.from_rows(locating.rows)
-    return RssiView(title, locating.locator.model, floor, locating, notes or [], folder)
+    return RssiView(title, locating.locator.model, locating.rows, None, locating, notes or [], folder)
 
 
 def _rssi_run(folder: Path) -> RssiView:
@@ -173,4 +173,5 @@ def _rssi_run(folder: Path) -> RssiView:
     if not isinstance(model, RssiModel):
         raise _not_shown(file, model)
     with refusing(f"the maps in {folder} are not those of a run"):
-        return RssiView(folder.name, model, MeasuredFloor.from_run(folder / "maps.npz"), folder=folder)
+        rows, plan = rows_of_run(folder / "maps.npz", model.receiver_names)
+        return RssiView(folder.name, model, rows, plan, folder=folder)

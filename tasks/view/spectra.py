@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,15 +13,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from swiftwrf import AngularGrid, FieldModel, Spectra
+from swiftwrf import AngularGrid, FieldModel, InputError, Spectra, load
 from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.array.planar import PlanarArray, folded_angles
 from swiftwrf.choices import Moving
 from swiftwrf.data.spectra import direction_of_link
+from swiftwrf.errors import with_article
+from swiftwrf.locate import MatchedField
 from swiftwrf.positions import distance
 from tasks.aoa.page.room import MARGIN, extent
 from tasks.page.maps import inside
-from tasks.view.locating import Located, SpectrumLocating
+from tasks.view.locating import Located
 
 MAX_DRAG_SECONDS = 0.02  # of one prediction while the moving end is dragged
 MAX_BEYOND_DATA = 1.5  # margin of the page around the measured positions, in units of their extent
@@ -36,14 +39,28 @@ class LoadedModel:
         model: Field model.
         planes: Planes of the room as in `geometry-mix*.json`. Defaults to those of the model.
         in_training: Whether each measured spectrum trained the model, (n,). None if that is unknown.
-        locating: Locator that was fitted to the same spectra. None if there is none.
+        locator_file: Matched field that was fitted to the same spectra. None if there is none.
     """
 
     title: str
     model: FieldModel
     planes: list[dict[str, Any]]
     in_training: NDArray[np.bool_] | None = None
-    locating: SpectrumLocating | None = None
+    locator_file: Path | None = None
+
+    @cached_property
+    def locator(self) -> MatchedField:
+        """The locator, opened when it is first used.
+
+        Raises:
+            InputError: The file contains none.
+        """
+        assert self.locator_file is not None
+        locator = load(self.locator_file)
+        if not isinstance(locator, MatchedField):
+            kinds = with_article(locator.kind), with_article(MatchedField.kind)
+            raise InputError(f"{self.locator_file} holds {kinds[0]}, expected {kinds[1]}")
+        return locator
 
     @cached_property
     def drag_grid(self) -> AngularGrid:
@@ -183,8 +200,7 @@ class SpectraView:
     def located(self, loaded: LoadedModel, index: int) -> Located:
         """Return the posterior over the position of a measured spectrum."""
         assert self.data is not None
-        assert loaded.locating is not None
-        return loaded.locating.located(self.data.store[index : index + 1][0], self.data.position[index].double())
+        return Located.of(loaded.locator.locate(self.data.store[index : index + 1]), self.data.position[index].double())
 
 
 def peak(spectrum: Tensor, grid: AngularGrid, array: PlanarArray | None = None) -> Direction:

@@ -171,7 +171,7 @@ class SpectraPage:
             chart.lay_out(self._polar.value)
         self._shown_measurement = -1
         self._measured.column.set_visibility(self._view.data is not None)
-        self._locate.set_visibility(self._view.data is not None and self._model.locating is not None)
+        self._locate.set_visibility(self._view.data is not None and self._model.locator_file is not None)
         self._plan.show(self._background())
         self._request(dragging=False)
 
@@ -238,7 +238,7 @@ class SpectraPage:
         """Show the posterior of the nearest measured spectrum; while dragging, only its removal."""
         image: Data = []
         located, described = None, ""
-        if not dragging and self._locate.value and self._view.data is not None and loaded.locating is not None:
+        if not dragging and self._locate.value and self._view.data is not None and loaded.locator_file is not None:
             index, _ = self._view.nearest(position)
             self._located.set_text("The nearest measured spectrum is being located.")
             located = await run.io_bound(self._view.located, loaded, index)

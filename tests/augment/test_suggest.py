@@ -9,14 +9,13 @@ import pytest
 import torch
 
 from augment.suggest import suggest
+from augment.turbo.choice import Suggestion
+from augment.turbo.condition import MeasuredSubset
 from swiftwrf import AngularGrid, InputError, fit, simulated_room
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import choose_kernel, most_informative
 from swiftwrf.metrics import psnr
-from tasks.aoa.condition import MeasuredSubset
-from tasks.aoa.options import AoaConfig
-from tasks.aoa.results import Results
-from tasks.aoa.suggestion import Suggestion
+from tasks.aoa.experiment import _write_files
 
 
 def test_suggestions_lie_in_the_region_and_lower_the_variance(room):
@@ -38,10 +37,9 @@ def test_suggested_positions_keep_the_digits_of_maps(room):
     directory = SimpleNamespace(
         write_csv=lambda name, rows: kept.update({name: rows}), write_npz=lambda name, arrays: None
     )
-    experiment = SimpleNamespace(test=measured, config=AoaConfig((0.5,)), lacking={})
-    results = Results(experiment, directory)
     positions = {"measured": measured.position.tolist(), "position": found.position.tolist()}
-    results.add(Suggestion(MeasuredSubset(0.5)), positions | {"variance": found.variance.tolist()})
+    value = positions | {"variance": found.variance.tolist()}
+    _write_files(Suggestion(MeasuredSubset(0.5)), value, measured, directory)
     rows = kept["suggested-mix0.5.csv"]
     assert [[row["x_m"], row["y_m"], row["z_m"]] for row in rows] == found.position.tolist()
 

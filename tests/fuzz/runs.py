@@ -39,13 +39,13 @@ from swiftwrf import (
 )
 from swiftwrf.errors import MAX_LENGTH
 from swiftwrf.online import Follower
+from swiftwrf.runtime.durable import write_json
 from tasks.aoa.options import AoaConfig
 from tasks.aoa.page.room import in_plan
 from tasks.command import run_command
 from tasks.locate.options import LocateConfig
 from tasks.options import plain
 from tasks.page.floor_plan import FloorPlan
-from tasks.records import write_json
 from tasks.update import lines
 from tasks.update.record import TABLE, Record
 from tasks.view.charts import around, picture, points
@@ -114,9 +114,9 @@ def _show_rssi(view: RssiView) -> None:
         view.coloured(selection)
         view.sentence(selection)
         view.describe(selection, x, y)
-    json.dumps([around(view.region), points(view.floor.position)], allow_nan=False)
-    if view.floor.plan is not None:
-        picture(Image.fromarray(view.floor.plan.pixels), view.floor.plan.corners)
+    json.dumps([around(view.region), points(view.position)], allow_nan=False)
+    if view.plan is not None:
+        picture(Image.fromarray(view.plan.pixels), view.plan.corners)
 
 
 # followed sources

@@ -73,7 +73,9 @@ def test_rssi_has_the_same_bits(cluster):
 
 @pytest.mark.long
 def test_aoa_has_the_same_numbers(local, tmp_path, monkeypatch):
-    monkeypatch.setattr("tasks.aoa.context.candidates", lambda data: ["idw", "gp"])  # rooms have tests of their own
+    monkeypatch.setattr(
+        "augment.turbo.experiment.candidates", lambda data: ["idw", "gp"]
+    )  # rooms have tests of their own
     assert run(*AOA, "--out", tmp_path / "here") == 0
     assert run(*AOA, "--scheduler", local.scheduler_address, "--out", tmp_path / "there") == 0
     same_results("aoa", tmp_path / "here", tmp_path / "there")

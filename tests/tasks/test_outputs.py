@@ -302,7 +302,7 @@ def test_deepmimo_folders_are_made_of_ray_paths(paths, tmp_path, capsys):
     ("arguments", "reason"),
     [
         (("out.tif",), "holds a map of RSSI"),
-        (("out.csv", "--cell", "1"), "are for models"),
+        (("out.csv", "--cell", "1"), "are for maps of RSSI models"),
         (("out.mat", "--deepmimo"), "give a directory"),
         (("out.mat", "--calibrate"), "writes a directory"),
         (("out.png", "--cell", "0"), "above 0 m"),

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from tasks.aoa.condition import terms
+from augment.cross_validation import LOCATOR
+from augment.estimators import ESTIMATORS
+from augment.turbo.condition import NETWORKS
+from tasks import labels
 from tasks.aoa.page.cost import sizes, speed_section, time_section, trainings
 from tasks.aoa.page.field import field_section
 from tasks.aoa.page.locating import locating_section
@@ -86,3 +89,18 @@ def _limits(run: AoaRecords) -> Section:
             "These spectra are simulated: image sources in an idealised room. They show that the software works, no more."
         )
     return Section("What this does not show", texts)
+
+
+def terms() -> dict[str, str]:
+    """Return what the parts of the names of methods mean."""
+    return {
+        "measured_only": "lower reference: trained on the measured spectra alone",
+        "measured_all": "upper reference: trained on all training spectra, measured",
+        "turbo_NAME": "trained on the measured spectra and on spectra that NAME predicts at the withheld positions",
+        "turbo_NAME_extra": "turbo_NAME with synthetic spectra at extra positions, their number by --extra",
+        "turbo_auto": "the choice of each repeat by cross-validation, where repeats chose differently",
+        **{name: label.meaning for name, label in labels.labels(ESTIMATORS, labels.ESTIMATORS).items()},
+        LOCATOR: labels.ESTIMATORS[LOCATOR].meaning,
+        "no estimator's name": f"the network ({' or '.join(NETWORKS.values())}); the name of another estimator alone: "
+        "trained on measured spectra",
+    }

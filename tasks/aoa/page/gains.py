@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from augment.turbo.condition import headline
 from swiftwrf.metrics import ChangeMetrics
-from tasks.aoa.condition import headline
 from tasks.aoa.page.records import FractionRecords
 from tasks.page.page import Table
 from tasks.page.provenance import number

@@ -9,12 +9,12 @@ from pathlib import Path
 
 from pandas import DataFrame
 
-from augment.cross_validation import STAND_IN
+from augment.turbo.condition import Condition, chosen_file, conditions_of
+from augment.turbo.results import MixMetrics
+from swiftwrf.choices import AUTO, fraction_key
 from swiftwrf.models import FIELD_MODELS
 from tasks import labels
-from tasks.aoa.condition import MEASURED_STAND_IN, Condition, conditions_of
-from tasks.aoa.options import AUTO, fraction_key
-from tasks.metrics import AoaMetrics, MixMetrics
+from tasks.metrics import AoaMetrics
 from tasks.page.palette import Palette
 from tasks.page.records import Records
 
@@ -69,12 +69,7 @@ class FractionRecords:
     def chosen_file(self) -> Path | None:
         """File of the estimator that cross-validation chose. None if nothing was chosen, or what needs no file."""
         choice = self.mix["estimator_choice"]
-        condition = self.conditions.get(choice["name"]) if choice else None
-        if condition is None:
-            return None
-        name = MEASURED_STAND_IN if condition.method == STAND_IN else condition.estimator
-        file = self.run.folder / f"{name}-mix{self.key}.safetensors"
-        return file if file.is_file() else None
+        return chosen_file(self.run.folder, self.key, self.conditions.get(choice["name"]) if choice else None)
 
     @property
     def percent(self) -> str:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from augment.cross_validation import LOCATOR
+from augment.turbo.results import Angle
 from tasks.aoa.page.gains import gain_table, turbo_method
 from tasks.aoa.page.overview import BASELINES
 from tasks.aoa.page.records import FractionRecords
-from tasks.metrics import Angle
 from tasks.page import figures
 from tasks.page.comparison import with_interval
 from tasks.page.page import Plot, Section, Table

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from augment.cross_validation import LOCATOR
 from augment.estimators import ESTIMATORS
-from tasks.aoa.condition import MEASURED_STAND_IN
+from augment.turbo.condition import MEASURED_STAND_IN
 from tasks.aoa.page.gains import change_text, gain_sentence, judgement, learner, turbo_method
 from tasks.aoa.page.overview import overview
 from tasks.aoa.page.records import AoaRecords, FractionRecords

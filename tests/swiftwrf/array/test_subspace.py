@@ -12,15 +12,13 @@ from samples import snapshots, write_snapshots
 
 from augment import Mixed
 from augment.estimators import make_estimator
+from augment.turbo.choice import first_steps
+from augment.turbo.experiment import Experiment
 from swiftwrf import InputError, load_spectra
 from swiftwrf.array.angles import angular_distance
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.array.subspace import esprit, maximum_likelihood, music
 from swiftwrf.metrics import angle_errors
-from tasks.aoa.condition import MeasuredSubset
-from tasks.aoa.context import Experiment
-from tasks.aoa.options import AoaConfig
-from tasks.aoa.steps import first_steps
 
 SQUARE = PlanarArray.square(4, 2.4e9)
 ROW = PlanarArray(torch.arange(8, dtype=torch.float64)[:, None] * torch.tensor([[0.03, 0.04]]), SQUARE.wavelength)
@@ -126,14 +124,14 @@ def test_estimators_use_the_snapshots_of_measured_spectra(tmp_path):
         errors[name] = float(angle_errors(estimate, data.label)["great_circle"].rad2deg().median())
     assert all(errors[name] < errors["peak"] for name in ON_SNAPSHOTS)
     train, test = data.split()
-    experiment = Experiment(AoaConfig((0.5,)), train, test, 0, torch.device("cpu"))
-    steps = {step.name: step for step in first_steps(experiment, MeasuredSubset(0.5))}
+    experiment = Experiment(train, test, (0.5,), extra=0)
+    steps = {step.name: step for step in first_steps(experiment)}
     for name in ON_SNAPSHOTS:
         step = steps[f"{name}-mix0.5-r0"]
         assert f"{name}-r0" not in steps  # there is no training that more spectra improve
         assert step.compute(experiment, tmp_path)["estimate"].shape == (len(test), 2)
     spectra = replace(experiment, test=replace(test, channel=None))
-    assert not {*ON_SNAPSHOTS} & {step.name.split("-")[0] for step in first_steps(spectra, MeasuredSubset(0.5))}
+    assert not {*ON_SNAPSHOTS} & {step.name.split("-")[0] for step in first_steps(spectra)}
 
 
 @pytest.mark.parametrize(

@@ -26,8 +26,8 @@ from swiftwrf.data.splits import folds, random_split, repeated_fraction
 from swiftwrf.data.writing import write_rssi
 from swiftwrf.locate import RssiLocator
 from swiftwrf.rssi import estimate_offsets
-from tasks.locate.experiment import run as locate
-from tasks.locate.options import LocateConfig
+from tasks.predict.options import PredictConfig
+from tasks.predict.run import run as predict
 
 FEW_CELLS = ("--cells", "200")
 NAMES = ["ap-a", "ap-b", "ap-c", "ap-d"]
@@ -380,8 +380,8 @@ def test_outputs_of_a_table_in_degrees(tmp_path):
     locator.save(tmp_path / "locator.safetensors")
     assert load(tmp_path / "locator.safetensors").model.origin == data.origin
     found = tmp_path / "positions.csv"
-    locate(
-        LocateConfig(model=str(tmp_path / "locator.safetensors"), source=str(tmp_path / "later.csv"), out=str(found))
+    predict(
+        PredictConfig(model=str(tmp_path / "locator.safetensors"), source=str(tmp_path / "later.csv"), out=str(found))
     )
     positions = pd.read_csv(found)
     truth = data.origin.to_metres(degrees[40:])
@@ -461,8 +461,8 @@ def test_a_run_with_offsets(tmp_path, capsys):
             tmp_path / f"{other}.csv", index=False
         )
         out = tmp_path / f"{other}-positions.csv"
-        locate(
-            LocateConfig(
+        predict(
+            PredictConfig(
                 model=str(tmp_path / "locator.safetensors"), source=str(tmp_path / f"{other}.csv"), out=str(out)
             )
         )

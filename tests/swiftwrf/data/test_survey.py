@@ -238,7 +238,7 @@ def test_refuses(tmp_path, name):
 
 def test_parquet_without_its_library(tmp_path, monkeypatch):
     (tmp_path / "walk.parquet").write_bytes(b"")
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     with pytest.raises(InputError, match=r"pip install 'swiftwrf-tasks\[formats\]'"):
         load_rssi(tmp_path)
 

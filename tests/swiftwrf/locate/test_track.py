@@ -11,8 +11,8 @@ from swiftwrf import InputError, Rssi, rssi_room
 from swiftwrf.locate import Posterior, RssiLocator, smoothed, track
 from swiftwrf.locate.posterior import normalised
 from tasks.command_line import command_line
-from tasks.locate import experiment
-from tasks.locate.options import LocateConfig
+from tasks.predict.options import PredictConfig
+from tasks.predict.run import run as predict
 
 STEP_M, NOISE_M = 0.4, 1.5
 
@@ -133,7 +133,7 @@ def test_other_speeds_and_times_are_refused(time, speed, message):
 
 
 def locate(*arguments):
-    return command_line("tasks.locate", LocateConfig, experiment.run, [str(a) for a in arguments])
+    return command_line("tasks.predict", PredictConfig, predict, [str(a) for a in arguments])
 
 
 def times(table, **options):
@@ -186,7 +186,5 @@ def test_positions_of_a_walk(tmp_path, capsys):
     assert tracked[["x_m", "y_m"]].std().sum() < 0.5 * alone[["x_m", "y_m"]].std().sum()
     assert (tracked.credible_radius_80_m <= alone.credible_radius_80_m + 0.5).all()
     capsys.readouterr()
-    assert locate("--track", 1.0) == 2
-    assert "--track is for observations" in capsys.readouterr().err
     assert locate(file, tmp_path / "walk.csv", "--track", 0, "--out", tmp_path / "out.csv") == 2
     assert "speed is a number above 0" in capsys.readouterr().err

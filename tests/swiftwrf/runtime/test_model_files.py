@@ -197,7 +197,7 @@ def test_estimators_are_opened_with_swiftwrf_alone(tmp_path):
     (installed / "METADATA").write_text("Metadata-Version: 2.1\nName: project\nVersion: 1\n")
     lines = [f"{name} = {value}" for name, value in points.items()]
     (installed / "entry_points.txt").write_text("\n".join(["[swiftwrf.estimators]", *lines]))
-    from tasks.aoa import estimators  # noqa: F401 (defines the kinds)
+    import augment.estimators  # noqa: F401 (defines the kinds)
 
     kinds = {kind for kind, made in Saved.kinds.items() if made.__module__.startswith("augment.estimators")}
     assert kinds

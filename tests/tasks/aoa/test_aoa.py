@@ -22,18 +22,21 @@ from augment.estimators.aann import AANN, AANNConfig
 from augment.estimators.aann_kernel import AANNKernel, AANNKernelConfig
 from augment.estimators.baselines import Constant, NearestSpectrum, Peak
 from augment.estimators.kernel_regression import KernelRegression
+from augment.turbo import experiment as context
+from augment.turbo.condition import Condition, MeasuredSubset, conditions_of, headline
+from augment.turbo.experiment import Experiment
+from augment.turbo.synthesis import Evaluation
 from swiftwrf import AngularGrid, InputError, load, make_model, simulated_room
+from swiftwrf.choices import fraction_key
 from swiftwrf.data.store import Store
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import model as geometry
-from tasks.aoa import context, experiment
+from tasks.aoa import experiment
 from tasks.aoa import synthesis as synthesizing
-from tasks.aoa.condition import Condition, MeasuredSubset, conditions_of, headline
-from tasks.aoa.options import AoaConfig, fraction_key
+from tasks.aoa.options import AoaConfig
 from tasks.aoa.page.records import palette
-from tasks.aoa.synthesis import Evaluation
 from tasks.command_line import command_line
 from tasks.page.palette import Palette
 from tasks.report.run import merge
@@ -325,6 +328,7 @@ def pretended(monkeypatch, room, errors):
     return cross_validation.cross_validate(folds, n_synthetic=3000, seed=0).metrics
 
 
+@pytest.mark.usefixtures("without_annotation_checks")
 @pytest.mark.parametrize(
     ("factors", "recommended"),
     [((0.9, 0.8, 0.5), 3000), ((0.9, 1.1, 0.5), 0), ((0.9, 0.5, 0.8), 1000), ((1.2, 1.1, 1.3), 0)],
@@ -337,6 +341,7 @@ def test_further_positions_are_recommended_if_each_number_of_them_gains(monkeypa
     assert given["helps"] == (recommended > 0)
 
 
+@pytest.mark.usefixtures("without_annotation_checks")
 def test_the_interval_of_cross_validation_is_that_of_the_rule(monkeypatch, room):
     """Errors without any gain on average: the best number of each fold is chance, and other folds do not confirm it."""
     generator = np.random.default_rng(1)
@@ -543,18 +548,16 @@ def test_fractions_of_many_digits_have_results_of_their_own(small, tmp_path, mon
 
 def test_labels_of_synthetic_spectra_are_those_of_their_positions(small, tmp_path, monkeypatch):
     """Stored with the spectra: a program that chooses positions differently does not mislabel those of an earlier one."""
-    given = AoaConfig((0.5,), synthesizer=("idw",), extra=20)
-    train, test = small.split("random", 0)
-    data = context.Experiment(given, train, test, 20, torch.device("cpu"))
+    data = Experiment(*small.split("random", 0), (0.5,), ("idw",), extra=20)
     synthesis = synthesizing.Synthesis(MeasuredSubset(0.5), "idw", trains=True, n_synthetic=20)
     (tmp_path / "steps").mkdir()
     synthesis.compute(data, tmp_path)
     measured, _ = data.withhold(synthesis.subset)
     position = sample_positions(measured.position, 20, 0)
-    for place in ("augment.positions.sample_positions", "tasks.aoa.synthesis.synthetic_positions"):
+    for place in ("augment.positions.sample_positions", "augment.turbo.synthesis.synthetic_positions"):
         monkeypatch.setattr(place, lambda *_: pytest.fail("positions were computed again"))
     condition = Condition("kernel_regression", "turbo_extra", "idw", 20, 0.5)
-    mixed = Evaluation(condition, synthesis)._training_set(data, tmp_path)
+    mixed = Evaluation(condition, synthesis).training_set(data, tmp_path)
     torch.testing.assert_close(mixed.label[-20:], small.direction_at(position))
     expected = make_model("idw").fit(measured).synthesize(position)
     torch.testing.assert_close(mixed.spectrum[-20:], expected, atol=1 / 255, rtol=0)
@@ -562,9 +565,8 @@ def test_labels_of_synthetic_spectra_are_those_of_their_positions(small, tmp_pat
 
 def test_models_for_comparison_are_always_quick(small, monkeypatch):
     """A field model asked for by name does not bring fits of the published size of others along."""
-    given = AoaConfig((0.5,), synthesizer=("idw",), preset="paper", extra=0)
     train, test = small.split("random", 0)
-    data = context.Experiment(given, train, test, 0, torch.device("cpu"))
+    data = Experiment(train, test, (0.5,), ("idw",), preset="paper", extra=0)
     made = []
 
     def model_type(name, preset):
@@ -579,9 +581,7 @@ def test_models_for_comparison_are_always_quick(small, monkeypatch):
 
 def test_the_room_is_searched_once_for_all_models_with_one(room, glances, tmp_path, monkeypatch):
     """Its time counts as part of the fit of each of them."""
-    given = AoaConfig((0.5,), synthesizer=("hybrid",), extra=0)
-    train, test = room.split("random", 0)
-    data = context.Experiment(given, train, test, 0, torch.device("cpu"))
+    data = Experiment(*room.split("random", 0), (0.5,), ("hybrid",), extra=0)
     monkeypatch.setattr(context, "candidates", lambda data: ["geometry", "hybrid"])
     searched, search = [], geometry.search_room
     monkeypatch.setattr(geometry, "search_room", lambda *given: searched.append(1) or search(*given))
@@ -591,22 +591,20 @@ def test_the_room_is_searched_once_for_all_models_with_one(room, glances, tmp_pa
     syntheses = first.then(data, value)
     assert [synthesis.synthesizer for synthesis in syntheses] == ["hybrid", "geometry"]
     for synthesis in syntheses:
-        assert synthesis.reads == (first.file,)
         assert synthesis.compute(data, tmp_path)["seconds"]["fit"] > value["seconds"]
     assert len(searched) == 1
 
 
 def test_cross_validation_is_that_of_each_field_model(small):
     """A model without cross-validation adds no extra positions by default."""
-    given = AoaConfig((0.5,), synthesizer=("idw", "gp", "vae"))
-    train, test = small.split("random", 0)
-    data = context.Experiment(given, train, test, 3000, torch.device("cpu"))
+    names = ("idw", "gp", "vae")
+    data = Experiment(*small.split("random", 0), (0.5,), names)
     validation = {
         "idw": {"recommended_n_synthetic": 300},
         "gp": {"recommended_n_synthetic": 0},
     }
-    found = {s.synthesizer: s for s in synthesizing.syntheses(data, MeasuredSubset(0.5), given.synthesizer, validation)}
-    assert {name: found[name].n_synthetic for name in given.synthesizer} == {"idw": 3000, "gp": 0, "vae": 0}
+    found = {s.synthesizer: s for s in synthesizing.syntheses(data, MeasuredSubset(0.5), names, validation)}
+    assert {name: found[name].n_synthetic for name in names} == {"idw": 3000, "gp": 0, "vae": 0}
 
 
 @pytest.mark.parametrize(

@@ -19,14 +19,15 @@ from small import with_defaults
 from augment import Fold, cross_validation
 from augment.cross_validation import LOCATOR
 from augment.estimators import ESTIMATORS
+from augment.turbo.condition import NETWORKS
+from augment.turbo.experiment import Experiment
+from augment.turbo.locating import Locating, containing_level
 from swiftwrf import MatchedField, load, make_model
 from swiftwrf.locate import MatchedFieldConfig, Posterior, matched_field
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import model as geometry
 from swiftwrf.models.geometry.planes import Plane
 from tasks.aoa import experiment
-from tasks.aoa.condition import NETWORKS
-from tasks.aoa.locating import Locating, containing_level
 from tasks.aoa.options import AoaConfig
 from tasks.command_line import command_line
 from tasks.predict.options import PredictConfig
@@ -62,7 +63,7 @@ def quickly(data, planes=PLANES):
             mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
             *(
                 mock.patch(f"{place}.candidates", lambda data: [n for n in ("idw", "geometry") if not lacking(n, data)])
-                for place in ("tasks.aoa.context", "augment.choose")
+                for place in ("augment.turbo.experiment", "augment.choose")
             ),
         ):
             patches.enter_context(patch)
@@ -141,7 +142,7 @@ def test_the_recommendation_does_not_depend_on_the_field_models_asked_for(closed
 
 def test_a_better_method_that_is_not_recommended_has_a_reason(closed_form, tmp_path):
     """Here the search finds no planes without the spectra of a fold."""
-    with quickly(closed_form), mock.patch("tasks.aoa.steps.located_errors", return_value=None):
+    with quickly(closed_form), mock.patch("augment.turbo.choice.located_errors", return_value=None):
         assert run("--mix", 0.6, "--extra", 0, "--synthesizer", "idw", "--out", tmp_path / "run") == 0
     choice = mix_of(tmp_path / "run")["estimator_choice"]
     assert LOCATOR not in choice["held_out_deg"]
@@ -153,7 +154,7 @@ def test_the_report_shows_where_it_was(finished):
     html = (finished / "report.html").read_text()
     assert "Where was it?" in html
     assert f"Take {LOCATOR} on this data" in html
-    assert f"{LOCATOR}-mix0.6.safetensors" in html
+    assert f"tasks.predict {finished} SOURCE" in html.replace("<span>", "").replace("</span>", "")
     for kind in ("located", "posteriors"):
         assert list((finished / "figures").glob(f"{kind}-mix0.6-*.csv"))
 
@@ -223,10 +224,8 @@ def test_without_array_or_planes_it_is_left_out_with_one_sentence(closed_form, t
 
 def test_fractions_and_repeats_share_the_search_in_all_spectra(closed_form, tmp_path):
     with quickly(closed_form):
-        config = AoaConfig((0.5, 1.0), extra=0, repeats=2)
-        train, test = closed_form.split()
-        data = experiment.Experiment(config, train, test, 0, torch.device("cpu"))
-        subsets = [experiment.MeasuredSubset(fraction, repeat) for repeat in range(2) for fraction in config.mix]
+        data = Experiment(*closed_form.split(), (0.5, 1.0), extra=0, repeats=2)
+        subsets = data.subsets
         own = {subset: [condition.result_name for condition in data.located_by(subset)] for subset in subsets}
     everything = [f"{LOCATOR}_measured_all-r{repeat}" for repeat in (0, 0, 1, 1)]
     assert own[subsets[0]] == [f"{LOCATOR}-mix0.5-r0"]

@@ -12,18 +12,17 @@ import torch
 from pandas import DataFrame
 
 from augment.cross_validation import LOCATOR
+from augment.turbo.condition import Condition
+from augment.turbo.results import Results, repeated_summary, summaries
+from augment.turbo.synthesis import Evaluation
 from swiftwrf import simulated_room
 from swiftwrf.metrics import median_interval, paired_change
 from swiftwrf.metrics import summary as error_summary
-from tasks.aoa.condition import Condition
 from tasks.aoa.options import AoaConfig
 from tasks.aoa.page.gains import gain_sentence, gain_table
 from tasks.aoa.page.records import FractionRecords
 from tasks.aoa.page.summary import summary
-from tasks.aoa.results import Results
-from tasks.aoa.synthesis import Evaluation
 from tasks.page.records import Records
-from tasks.summarise import repeated_summary, summaries
 
 MEASURED = Condition("aann_kernel", "measured", measured_fraction=0.3)
 TURBO = replace(MEASURED, training="turbo", synthesizer="gp")
@@ -80,7 +79,7 @@ def test_one_repeat_has_the_interval_of_independent_values():
 def results_of(errors):
     """Return the results of conditions with these elevation errors [deg] at the test positions."""
     room = simulated_room(n=20)
-    found = Results(SimpleNamespace(test=room, train=room, config=AoaConfig((0.3,)), lacking={}), SimpleNamespace())
+    found = Results(SimpleNamespace(test=room, train=room, fractions=(0.3,), models=("auto",), lacking={}))
     for condition, error in errors.items():
         off = torch.stack([torch.zeros(20), torch.as_tensor(error)], dim=1).double().deg2rad()
         value = {"estimate": (room.label - off).tolist(), "seconds": {"train": 1.0, "estimate": 1.0}, "history": []}

@@ -9,12 +9,11 @@ from unittest import mock
 import pandas as pd
 from quick import run
 
+from augment.turbo.choice import choose_model
+from augment.turbo.condition import Condition, MeasuredSubset, pooled
+from augment.turbo.results import Results
+from augment.turbo.synthesis import Evaluation
 from swiftwrf import simulated_room
-from tasks.aoa.condition import Condition, MeasuredSubset, pooled
-from tasks.aoa.options import AoaConfig
-from tasks.aoa.results import Results
-from tasks.aoa.steps import choose_model
-from tasks.aoa.synthesis import Evaluation
 
 MEASURED = Condition("aann_kernel", "measured", measured_fraction=0.3)
 GP, IDW = (Condition("aann_kernel", "turbo", name, measured_fraction=0.3) for name in ("gp", "idw"))
@@ -81,9 +80,7 @@ def test_the_time_of_all_networks_counts():
     room = simulated_room(n=20)
     trained = results((GP,), (IDW, IDW_EXTRA))
     for synthesizer in (("auto",), ("gp", "idw")):
-        config = AoaConfig((0.3,), synthesizer=synthesizer)
-        experiment = SimpleNamespace(test=room, train=room, config=config, lacking={})
-        found = Results(experiment, SimpleNamespace())
+        found = Results(SimpleNamespace(test=room, train=room, fractions=(0.3,), models=synthesizer, lacking={}))
         for condition, _ in trained:
             value = {
                 "estimate": room.label.tolist(),
@@ -111,8 +108,10 @@ def test_a_run_whose_repeats_choose_differently(tmp_path):
         return replace(choose_model(measured, ("gp", "idw"), **options), name=next(chosen))
 
     with (
-        mock.patch("tasks.aoa.steps.choose_model", choose),
-        mock.patch("tasks.aoa.context.candidates", return_value=[]),  # a search for rooms would take most of the time
+        mock.patch("augment.turbo.choice.choose_model", choose),
+        mock.patch(
+            "augment.turbo.experiment.candidates", return_value=[]
+        ),  # a search for rooms would take most of the time
     ):
         assert run("aoa", "--mix", 0.7, "--repeats", 2, "--extra", 0, "--out", tmp_path / "run") == 0
     methods = json.loads((tmp_path / "run" / "metrics.json").read_text())["mixes"]["0.7"]["methods"]

@@ -139,7 +139,7 @@ class Outside(RssiPredictor):
 
     name = "outside"
 
-    def _fit(self, train, context):
+    def _fit(self, train, **_):
         self.n = len(train.receiver_names)
 
     def _predict(self, position):

@@ -216,7 +216,7 @@ def test_room_of_another_model_on_the_same_spectra(aoa_run, tmp_path):
 def test_maps_are_those_of_the_model(rssi_run):
     view = open_source(rssi_run)
     assert view.receivers == ("receiver01", "receiver06", "receiver12")
-    assert view.floor.plan.corners == (0, 20, 0, 15)
+    assert view.plan.corners == (0, 20, 0, 15)
     i, j = 5, 17
     place = view.chart.x[j], view.chart.y[i]
     at = torch.tensor([[*place, 1.2]], dtype=torch.float64)
@@ -281,7 +281,7 @@ def test_one_receiver_has_no_best(rssi_run):
 def test_an_rssi_model_by_itself(rssi_run):
     view = open_source(rssi_run / "model.safetensors")
     assert np.isfinite(view.coloured(MapSelection("RSSI", 0, view.heights[1])).values).all()
-    assert np.isnan(view.floor.rssi_dbm).all()
+    assert view.rows.rssi_dbm.isnan().all()
 
 
 @pytest.fixture(scope="module")
@@ -352,7 +352,7 @@ def test_view_of_a_locator_by_itself(located_floor, tmp_path):
     view = open_source(tmp_path / "locator.safetensors")
     assert view.kinds[-2:] == ("posterior", "expected error")
     train = data.subset(in_training)
-    np.testing.assert_allclose(view.floor.rssi_dbm, train.rssi_dbm, atol=1e-4)
+    np.testing.assert_allclose(view.rows.rssi_dbm, train.rssi_dbm, atol=1e-4)
     assert view.locating.in_training.all()
     selection = MapSelection("posterior", 0, 1.2, row=3)
     coloured = view.coloured(selection)
@@ -377,7 +377,7 @@ def test_view_of_a_run_of_locate(located_floor, tmp_path):
     view = open_source(folder)
     assert not view.notes
     np.testing.assert_array_equal(view.locating.in_training, in_training)
-    np.testing.assert_allclose(view.floor.position, data.transmitter_position)
+    np.testing.assert_allclose(view.position, data.transmitter_position)
     (tmp_path / "survey.csv").write_text("changed")
     view = open_source(folder)
     assert len(view.notes) == 1
@@ -394,7 +394,7 @@ def test_posterior_of_a_spectrum_is_that_of_the_locator(aoa_run, room, tmp_path)
         locator = MatchedField(max_cells=200, n_best=20, n_background=10, n_rounds=1).fit(room)
     locator.save(folder / "matched_field-mix1.safetensors")
     view = open_source(folder)
-    assert view.models[0].locating is None
+    assert view.models[0].locator_file is None
     found, posterior = view.located(view.models[1], 3), locator.locate(view.data.store[3:4])
     np.testing.assert_allclose(found.median, posterior.median[0], atol=1e-3)
     np.testing.assert_allclose(found.truth, room.position[3], atol=1e-6)
@@ -405,7 +405,7 @@ def test_posterior_of_a_spectrum_is_that_of_the_locator(aoa_run, room, tmp_path)
     assert np.nanmax(found.density.values) == 1
     shutil.copy(folder / "model-mix1.safetensors", folder / "matched_field-mix1.safetensors")
     with pytest.raises(InputError, match="expected a matched-field locator"):
-        open_source(folder).models[1].locating.locator  # noqa: B018
+        open_source(folder).models[1].locator  # noqa: B018
 
 
 def said(capsys, *arguments) -> str:
@@ -462,10 +462,10 @@ def test_a_dropped_floor_plan_lies_at_its_scale_and_origin_and_stays(rssi_run, t
     before = view.inside.shape
     pixels = np.full((30, 80, 3), 9, dtype=np.uint8)
     view.place(FloorPlan.scaled(pixels, 0.5, (4, 26)))  # y counts down from the upper edge
-    assert view.floor.plan.corners == (-2, 38, -2, 13)
+    assert view.plan.corners == (-2, 38, -2, 13)
     assert view.chart.corners[1] == pytest.approx(38)
     assert view.inside.shape == view.map(1.0).mean.shape[1:] != before
-    again = open_source(folder).floor.plan
+    again = open_source(folder).plan
     assert again.corners == (-2, 38, -2, 13)
     np.testing.assert_array_equal(again.pixels, pixels)
     for scale, origin in ((0.0, (0, 0)), (np.nan, (0, 0)), (1.0, (np.inf, 0)), (1e308, (1, 1)), (1.0, (1e300, 0))):

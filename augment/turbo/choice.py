@@ -1,4 +1,4 @@
-"""First steps of the experiment: reference conditions, and the comparison of field models and estimators."""
+"""First steps of turbo learning: reference conditions, and the comparison of field models and estimators."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from augment import Fold, ModelChoice, choose_model
+from augment.choose import Fold, ModelChoice, choose_model
 from augment.cross_validation import (
     STAND_IN,
     CrossValidationMetrics,
@@ -17,41 +17,41 @@ from augment.cross_validation import (
     located_folds,
     measured_errors,
 )
+from augment.suggest import suggest
+from augment.turbo.condition import EVERYTHING, NETWORKS, Condition, MeasuredSubset, Row, Training
+from augment.turbo.experiment import ROOM_MODEL, Experiment
+from augment.turbo.synthesis import Evaluation, RoomSearch, syntheses
 from swiftwrf import GeometryModel, InputError, Spectra, load
-from swiftwrf.models import FIELD_MODELS
-from tasks.aoa.condition import EVERYTHING, NETWORKS, Condition, MeasuredSubset, Training, estimators, trainable
-from tasks.aoa.context import ROOM_MODEL, Experiment
-from tasks.aoa.options import AUTO
-from tasks.aoa.synthesis import Evaluation, RoomSearch, syntheses
-from tasks.claim import STEPS
-from tasks.records import read_json
-from tasks.run import Row
-from tasks.steps import Step
+from swiftwrf.choices import AUTO
+from swiftwrf.runtime.steps import STEPS, Step
 
 
-def first_steps(experiment: Experiment, subset: MeasuredSubset) -> list[Step[Experiment]]:
+def first_steps(experiment: Experiment) -> list[Step[Experiment]]:
+    """Return the steps from which all others follow."""
+    steps = [step for subset in experiment.subsets for step in _first_steps(experiment, subset)]
+    suggested = [subset for subset in experiment.subsets if experiment.suggest and subset.repeat == 0]
+    return [*steps, *map(Suggestion, suggested)]
+
+
+def _first_steps(experiment: Experiment, subset: MeasuredSubset) -> list[Step[Experiment]]:
     """Return the reference conditions of a measured subset, and the step that the turbo conditions follow from."""
     fraction, repeat = subset.measured_fraction, subset.repeat
-    named = [name for name in experiment.config.synthesizer if name != AUTO]
-    compared = tuple(name for name in named if not FIELD_MODELS[name].slow)
+    named = [name for name in experiment.models if name != AUTO]
+    compared = tuple(name for name in named if not experiment.model_type(name).slow)
 
     def reference(estimator: str, training: Training) -> Evaluation:
         return Evaluation(Condition(estimator, training, measured_fraction=fraction, repeat=repeat))
 
     steps: list[Step[Experiment]] = [
-        *(
-            reference(name, "measured")
-            for name in estimators(experiment.config.preset)
-            if name not in experiment.lacking
-        ),
+        *(reference(name, "measured") for name in experiment.evaluated if name not in experiment.lacking),
         *(syntheses(experiment, subset, named, {}) if named and not compared else [CrossValidation(subset, compared)]),
     ]
-    config, has_room = experiment.config, ROOM_MODEL in experiment.candidates
-    if has_room:
-        shared = subset == MeasuredSubset(config.mix[0]) and 1.0 not in config.mix
+    if ROOM_MODEL in experiment.candidates:
+        fractions = experiment.fractions
+        shared = subset == MeasuredSubset(fractions[0]) and 1.0 not in fractions
         steps.append(RoomSearch(subset, (), experiment.located_by(subset), EVERYTHING if shared else None))
     # independent of the measured fraction, so all fractions share these steps
-    return [*steps, *(reference(estimator, "all") for estimator in trainable(experiment.config.preset))]
+    return [*steps, *(reference(estimator, "all") for estimator in experiment.trainable)]
 
 
 @dataclass(frozen=True)
@@ -76,9 +76,10 @@ class CrossValidation(Step[Experiment]):
 
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         measured, _ = experiment.withhold(self.subset)
-        seed = experiment.seed(self.subset)
+        seed = experiment.seed_of(self.subset)
+        compared = [experiment.own_models.get(name, name) for name in self.compared]
         try:
-            choice = choose_model(measured, self.compared or None, seed=seed, device=experiment.device)
+            choice = choose_model(measured, compared or None, seed=seed, device=experiment.device)
         except InputError:
             if not self.compared:
                 raise
@@ -92,10 +93,11 @@ class CrossValidation(Step[Experiment]):
         errors |= {turbo.method: first.turbo} if first.turbo else {}
         folds = choice.folds[trained[0]]
         tests = [experiment.with_snapshots(fold.test) for fold in folds]
-        for name in estimators(experiment.config.preset):
+        for name in experiment.evaluated:
             if name not in (*NETWORKS.values(), STAND_IN, *experiment.lacking):
                 errors[name] = [
-                    measured_errors(fold, name, test, seed) for fold, test in zip(folds, tests, strict=True)
+                    measured_errors(fold, experiment.make_estimator(name, self.subset), test)
+                    for fold, test in zip(folds, tests, strict=True)
                 ]
         with_room = self._with_room(experiment, measured, choice)
         return {
@@ -116,7 +118,7 @@ class CrossValidation(Step[Experiment]):
         if folds or not self.compared or ROOM_MODEL not in experiment.candidates:
             return folds
         try:
-            seed = experiment.seed(self.subset)
+            seed = experiment.seed_of(self.subset)
             return choose_model(measured, (ROOM_MODEL,), seed=seed, device=experiment.device).folds[ROOM_MODEL]
         except InputError:
             return []
@@ -134,9 +136,12 @@ class CrossValidation(Step[Experiment]):
         return Condition(STAND_IN, "turbo_extra" if number else "turbo", synthesizer, number)
 
     def then(self, experiment: Experiment, value: Row) -> Sequence[Step[Experiment]]:
-        named = [name for name in experiment.config.synthesizer if name != AUTO]
+        named = [name for name in experiment.models if name != AUTO]
         followed = syntheses(experiment, self.subset, named or [value["choice"]["name"]], value["cross_validation"])
-        located = [FoldLocating(self, int(number), entry["file"]) for number, entry in value.get("folds", {}).items()]
+        located = [
+            FoldLocating(self, int(number), entry["file"], tuple(entry["train"]), tuple(entry["test"]))
+            for number, entry in value.get("folds", {}).items()
+        ]
         return [*followed, *located]
 
 
@@ -147,12 +152,16 @@ class FoldLocating(Step[Experiment]):
     Args:
         compared: Comparison of field models that has the fold.
         number: Number of the fold.
-        room_file: File of the fold's room in the run's directory.
+        room_file: File of the fold's room.
+        train: Training spectra of the fold, by their numbers in the data set.
+        test: Test spectra of the fold, in the same way.
     """
 
     compared: CrossValidation
     number: int
     room_file: str
+    train: tuple[int, ...]
+    test: tuple[int, ...]
 
     @property
     def name(self) -> str:
@@ -164,11 +173,34 @@ class FoldLocating(Step[Experiment]):
 
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         measured, _ = experiment.withhold(self.compared.subset)
-        entry = read_json(folder / STEPS / f"{self.compared.name}.json")["value"]["folds"][str(self.number)]
         room = load(folder / self.room_file)
         assert isinstance(room, GeometryModel)
         train, test = (
-            measured.subset(torch.isin(measured.index, torch.tensor(entry[part])).nonzero()[:, 0])
-            for part in ("train", "test")
+            measured.subset(torch.isin(measured.index, torch.tensor(part)).nonzero()[:, 0])
+            for part in (self.train, self.test)
         )
-        return {"errors": located_errors(Fold(room, train, test), experiment.seed(self.compared.subset))}
+        return {"errors": located_errors(Fold(room, train, test), experiment.seed_of(self.compared.subset))}
+
+
+@dataclass(frozen=True)
+class Suggestion(Step[Experiment]):
+    """Suggest positions for the next measurements.
+
+    Args:
+        subset: Measured spectra.
+    """
+
+    subset: MeasuredSubset
+
+    @property
+    def name(self) -> str:
+        return f"suggestion-mix{self.subset.key}"
+
+    @property
+    def title(self) -> str:
+        return "choosing positions to measure next"
+
+    def compute(self, experiment: Experiment, folder: Path) -> Row:
+        measured, _ = experiment.withhold(self.subset)
+        found = suggest(measured, experiment.suggest, experiment.seed)
+        return {"measured": measured.position, "position": found.position, "variance": found.variance}

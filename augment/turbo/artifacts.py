@@ -9,12 +9,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from augment import sample_positions
+from augment.positions import sample_positions
 from swiftwrf import Spectra, SwiftWRF
 from swiftwrf.models import FieldModel
 from swiftwrf.models.neighbours import MemoryModel
 from swiftwrf.models.swiftwrf_paper import SwiftWRFPaper
-from tasks.records import write_json, write_npz
+from swiftwrf.runtime.durable import write_json, write_npz
 
 MODEL_FILE = "model"  # name of the file of a swiftwrf model; other field models have their own names
 N_MAP_POSITIONS = 2000  # positions of the map: dense on half a page

@@ -1,68 +1,141 @@
-"""Results of a run: tables of errors, scores and histories, and the numbers of metrics.json."""
+"""Results of turbo learning: errors of each condition and test spectrum, scores, histories, and their summaries."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
+from typing import Literal, TypedDict, get_args
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from pandas import DataFrame
 from torch import Tensor
 
-from augment.cross_validation import LOCATOR, STAND_IN, EstimatorChoiceMetrics, choose_estimator
-from swiftwrf.metrics import ChangeMetrics, angle_errors, covered, paired_change
+from augment.cross_validation import (
+    LOCATOR,
+    STAND_IN,
+    CrossValidationMetrics,
+    EstimatorChoiceMetrics,
+    choose_estimator,
+)
+from augment.turbo.choice import CrossValidation, FoldLocating
+from augment.turbo.condition import EVERYTHING, Condition, MeasuredSubset, Row, pooled, reference_of
+from augment.turbo.experiment import ROOM_MODEL, Experiment
+from augment.turbo.locating import LEVEL, NO_PLANE, Locating
+from augment.turbo.synthesis import Evaluation, RoomSearch, Synthesis
+from swiftwrf.choices import AUTO, fraction_key
+from swiftwrf.metrics import ChangeMetrics, ErrorSummary, angle_errors, paired_change, summary
 from swiftwrf.models import FIELD_MODELS
-from tasks.aoa.condition import EVERYTHING, Condition, MeasuredSubset, pooled, reference_of
-from tasks.aoa.context import ROOM_MODEL, Experiment
-from tasks.aoa.locating import LEVEL, NO_PLANE, Locating
-from tasks.aoa.options import AUTO, fraction_key
-from tasks.aoa.steps import CrossValidation, FoldLocating
-from tasks.aoa.suggestion import Suggestion
-from tasks.aoa.synthesis import Evaluation, RoomSearch, Synthesis, as_bytes
-from tasks.metrics import ANGLES, SCORES, LocatingMetrics, MethodMetrics, MixMetrics, SynthesisMetrics
-from tasks.run import Row, Run
-from tasks.steps import Step
-from tasks.summarise import averaged, by_repeat, summaries
-from tasks.terminal import console, terminal
+from swiftwrf.runtime.steps import Step
 
-EXAMPLE_QUANTILES = (
-    1.0,
-    0.8,
-    0.6,
-    0.4,
-    0.2,
-    0.0,
-)  # of the PSNR at the test positions, from the best spectrum to the worst
+Angle = Literal["azimuth_deg", "elevation_deg", "great_circle_deg"]
+Score = Literal["psnr_db", "ssim", "l1"]
+ANGLES: tuple[Angle, ...] = get_args(Angle)
+SCORES: tuple[Score, ...] = get_args(Score)
+
+
+class SynthesisMetrics(TypedDict):
+    """Quality of one field model at the test positions; seconds to `fit` and to `synthesize`, means of the repeats."""
+
+    psnr_db: ErrorSummary
+    ssim: ErrorSummary
+    l1: ErrorSummary
+    seconds: dict[str, float]
+
+
+class MethodMetrics(TypedDict):
+    """Errors of one condition; seconds to `train` and to `estimate`, means of the repeats.
+
+    `changes`, of conditions with synthetic spectra, is the change of the angular error by the method that it is compared to:
+    the same estimator on measured spectra, and the best one on measured spectra. Its interval is paired over test positions.
+    """
+
+    estimator: str
+    training: str
+    synthesizer: str
+    n_synthetic: int
+    azimuth_deg: ErrorSummary
+    elevation_deg: ErrorSummary
+    great_circle_deg: ErrorSummary
+    changes: dict[str, ChangeMetrics]
+    seconds: dict[str, float]
+
+
+class ChoiceMetrics(TypedDict):
+    """Chosen field model; trimmed mean PSNR [dB] and seconds of each candidate; reasons why others could not be fitted."""
+
+    name: str
+    psnr_db: dict[str, float]
+    seconds: dict[str, float]
+    left_out: dict[str, str]
+
+
+class LocatingMetrics(TypedDict):
+    """Metrics of located test positions.
+
+    Position error [m], fraction of the test positions inside their 80 % credible region, fraction of ambiguous spectra, and
+    weights of the likelihoods (first repeat). Seconds, means of the repeats, are those to find the `room`, to `fit` the
+    locator and to `locate` all test spectra.
+    """
+
+    position_error_m: ErrorSummary
+    coverage_80: float
+    ambiguous: float
+    weights: list[float]
+    seconds: dict[str, float]
+
+
+class MixMetrics(TypedDict):
+    """Metrics of one measured fraction.
+
+    `choice`, `cross_validation` (by field model) and `estimator_choice` are of the first repeat. `counts` are spectra by
+    origin in each training set. Seconds are those to `fit` and `synthesize` of the trained field models and to `train` all
+    networks.
+
+    The method on measured spectra with the smallest test error, without matched-field processing, is the `reference`. Values
+    of `locating` are by method. Values of `left_out` are reasons why a method is missing.
+    """
+
+    n_measured: int
+    counts: dict[str, dict[str, int]]
+    choice: ChoiceMetrics | None
+    cross_validation: dict[str, CrossValidationMetrics] | None
+    estimator_choice: EstimatorChoiceMetrics | None
+    synthesis: dict[str, SynthesisMetrics]
+    methods: dict[str, MethodMetrics]
+    reference: str
+    locating: dict[str, LocatingMetrics]
+    left_out: dict[str, str]
+    seconds: dict[str, float]
 
 
 class Results:
-    """Results of the steps of a run.
+    """Results of the steps, collected one by one.
 
     Args:
-        experiment: Data and options of the run.
-        run: Directory of the run.
+        experiment: Data and options that the steps share.
     """
 
-    def __init__(self, experiment: Experiment, run: Run) -> None:
-        self.experiment, self.test, self.run = experiment, experiment.test, run
+    def __init__(self, experiment: Experiment) -> None:
+        self.experiment, self.test = experiment, experiment.test
         self.evaluated: list[tuple[Condition, Row]] = []
         self.synthesis: list[Row] = []  # scores of each test spectrum
         self.synthesis_seconds: list[Row] = []
         self.history: list[Row] = []
         self.chosen: dict[str, Row] = {}  # by measured fraction, of the first repeat
         self.located_folds: dict[str, dict[int, list[float] | None]] = {}  # errors by fold, in the same way
-        self.left_out: dict[Condition, str] = {}  # conditions of matched-field processing, and why
-        self._examples: set[str] = set()
-        self._sentences: set[str] = set()
-        fractions = [MeasuredSubset(fraction) for fraction in experiment.config.mix]
+        self.left_out: dict[Condition, str] = {}  # conditions, and why
+        self.notes: list[str] = []  # a sentence each on what is left out
+        fractions = [MeasuredSubset(fraction) for fraction in experiment.fractions]
         for name, reason in experiment.lacking.items():
             self.left_out |= {Condition(name, "measured", **subset.columns): reason for subset in fractions}
         for reason in dict.fromkeys(experiment.lacking.values()):
             names = ", ".join(name for name, own in experiment.lacking.items() if own == reason)
-            console.print(f"left out: {names}, because {reason}")
+            self.notes.append(f"left out: {names}, because {reason}")
         if missing := FIELD_MODELS[ROOM_MODEL].lacking(self.test):
             reason = f"it needs the {missing[0]}, which {self.test.name} does not describe"
-            console.print(f"{LOCATOR} is left out: {reason}")
+            self.notes.append(f"{LOCATOR} is left out: {reason}")
             located = (c for subset in (*fractions, EVERYTHING) for c in experiment.located_by(subset))
             self.left_out |= dict.fromkeys(located, reason)
 
@@ -74,7 +147,7 @@ class Results:
             case FoldLocating() if step.compared.subset.repeat == 0:
                 self.located_folds.setdefault(step.compared.subset.key, {})[step.number] = value["errors"]
             case Synthesis() if "refused" in value:
-                console.print(f"{step.synthesizer} is left out of the comparison: {value['refused']}")
+                self._note(f"{step.synthesizer} is left out of the comparison: {value['refused']}")
             case Synthesis():
                 self._add_synthesis(step, value)
             case RoomSearch() if not value.get("planes"):
@@ -84,32 +157,11 @@ class Results:
             case Evaluation() | Locating():
                 self.evaluated.append((step.condition, value))
                 self.history += [step.condition.columns | row for row in value["history"]]
-            case Suggestion():
-                self._add_suggestion(step, value)
-
-    def show(self, step: Step[Experiment], value: Row) -> None:
-        """Show the median angular error of a condition on the terminal."""
-        if not isinstance(step, Evaluation | Locating) or "refused" in value:
-            return
-        condition = step.condition
-        error = angle_errors(torch.tensor(value["estimate"], dtype=torch.float64), self.test.label)["great_circle"]
-        name = f"{condition.estimator}, {condition.meaning}"
-        if condition.training != "all" and len(self.experiment.config.mix) > 1:
-            name = f"{condition.measured_fraction:.0%}: {name}"
-        terminal.result(name, f"{float(error.nanquantile(0.5).rad2deg()):.2f} deg")
 
     @property
     def pooled(self) -> list[tuple[Condition, Row]]:
         """Results by condition, such that each condition has all repeats."""
-        return pooled(self.evaluated, self.experiment.config.synthesizer == (AUTO,))
-
-    def write(self) -> None:
-        """Write the tables of the run."""
-        self.run.write_csv("errors.csv", self.errors())
-        if positions := self.positions():
-            self.run.write_csv("positions.csv", positions)
-        self.run.write_csv("synthesis.csv", self.synthesis)
-        self.run.write_csv("history.csv", self.history)
+        return pooled(self.evaluated, self.experiment.models == (AUTO,))
 
     def errors(self) -> list[Row]:
         """Return one row for each condition and test spectrum: truth, estimate and errors."""
@@ -126,7 +178,7 @@ class Results:
             }
             errors = angle_errors(estimate, self.test.label)
             columns |= {f"{angle}_deg": error.rad2deg() for angle, error in errors.items()}
-            rows += _rows(condition.columns, columns)
+            rows += rows_of(condition.columns, columns)
         return rows
 
     def positions(self) -> list[Row]:
@@ -148,56 +200,26 @@ class Results:
                 "containing_level": found["level"],
                 "ambiguous": found["ambiguous"],
             }
-            rows += _rows(condition.columns, columns)
+            rows += rows_of(condition.columns, columns)
         return rows
 
     def _leave_out(self, conditions: Iterable[Condition], reason: str) -> None:
-        """Record and print why conditions are not in the results, each sentence once."""
+        """Record why conditions are not in the results."""
         for condition in conditions:
             share = "everything" if condition.training == "all" else f"{condition.measured_fraction:.0%}"
-            sentence = f"{condition.method} is left out with {share} measured: {reason}"
-            if sentence not in self._sentences:
-                console.print(sentence)
-            self._sentences.add(sentence)
+            self._note(f"{condition.method} is left out with {share} measured: {reason}")
             self.left_out[condition] = reason
+
+    def _note(self, sentence: str) -> None:
+        if sentence not in self.notes:
+            self.notes.append(sentence)
 
     def _add_synthesis(self, step: Synthesis, value: Row) -> None:
         key = step.subset.columns | {"synthesizer": step.synthesizer}
         columns = {score: torch.tensor(values) for score, values in value["scores"].items()}
-        self.synthesis += _rows(key, {"index": self.test.index} | columns)
+        self.synthesis += rows_of(key, {"index": self.test.index} | columns)
         self.synthesis_seconds.append(key | value["seconds"] | {"trains": step.trains})
         self.history += [key | row for row in value["history"]]
-        if step.subset.repeat == 0 and step.trains and step.subset.key not in self._examples:
-            self._examples.add(step.subset.key)
-            self._write_examples(step, torch.tensor(value["scores"]["psnr_db"]))
-
-    def _add_suggestion(self, step: Suggestion, value: Row) -> None:
-        name = f"suggested-mix{step.subset.key}"
-        tensors = {key: torch.tensor(value[key], dtype=torch.float64) for key in ("measured", "position", "variance")}
-        coordinates = dict(zip(("x_m", "y_m", "z_m"), tensors["position"].T, strict=True))
-        self.run.write_csv(f"{name}.csv", _rows({}, coordinates | {"variance_left": tensors["variance"][1:]}))
-        names = {"measured": "measured", "suggested": "position", "left": "variance"}
-        self.run.write_npz(f"{name}.npz", {array: tensors[key].numpy() for array, key in names.items()})
-
-    def _write_examples(self, step: Synthesis, score: Tensor) -> None:
-        """Write measured and synthetic spectra at the test positions with given quantiles of their PSNR (n,)."""
-        spectra = step.test_spectra(self.run.folder)
-        measured, synthetic = self.test.store, spectra["test"]
-        order = score.argsort()
-        chosen = order[[round(q * (len(order) - 1)) for q in EXAMPLE_QUANTILES]]
-        examples = {
-            "measured": as_bytes(measured[chosen]).numpy(),
-            "synthetic": as_bytes(synthetic[chosen]).numpy(),
-            "synthesizer": step.synthesizer,
-            "index": self.test.index[chosen].numpy(),
-            "psnr_db": score[chosen].numpy(),
-        }
-        if "test_std" in spectra:
-            std = spectra["test_std"]
-            examples["deviation"] = as_bytes(std[chosen]).numpy()
-            triples = zip(synthetic.batches(), measured.batches(), std.batches(), strict=True)
-            examples["coverage"] = float(torch.cat([covered(s, d, m) for s, m, d in triples]).mean())
-        self.run.write_npz(f"examples-mix{step.subset.key}.npz", examples)
 
     def summary(self, fraction: float) -> MixMetrics:
         """Return the numbers of metrics.json for one measured fraction."""
@@ -336,6 +358,55 @@ def _synthesis_metrics(scores: DataFrame, seconds: DataFrame) -> dict[str, Synth
     }
 
 
-def _rows(key: Row, columns: dict[str, Tensor]) -> list[Row]:
+def rows_of(key: Row, columns: dict[str, Tensor]) -> list[Row]:
+    """Return the rows of a table of columns, each with the same key."""
     lists = {name: column.tolist() for name, column in columns.items()}
     return [key | dict(zip(lists, values, strict=True)) for values in zip(*lists.values(), strict=True)]
+
+
+def summaries(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dict[str, ErrorSummary]]:
+    """Return a summary of each column over all test rows and repeats, for each value of `by`.
+
+    Args:
+        table: A row for each value of `by`, `repeat` and `index`, the test row.
+        by: Column of names.
+        columns: Columns of errors.
+    """
+    return {
+        str(name): {column: repeated_summary(by_repeat(part, column)) for column in columns}
+        for name, part in table.groupby(by, sort=False)
+    }
+
+
+def by_repeat(table: DataFrame, column: str) -> NDArray[np.float64]:
+    """Return a column with a row for each test row and a column for each repeat, (n, repeats)."""
+    values: NDArray[np.float64] = table.pivot(index="index", columns="repeat", values=column).to_numpy(np.float64)
+    return values
+
+
+def repeated_summary(values: NDArray[np.float64]) -> ErrorSummary:
+    """Return the summary of all values (n, repeats), with the number of test rows.
+
+    Repeats of a test row are not independent, so they do not narrow the interval of the median as independent values would
+    (quantiles in cluster samples: R. S. Woodruff, JASA 47, 1952).
+
+    Example:
+        >>> once = np.arange(100.0)[:, None]
+        >>> found = repeated_summary(np.repeat(once, 3, axis=1))
+        >>> found["median"], found["n"], (found["low"], found["high"])
+        (49.5, 100, (40.0, 59.0))
+    """
+    found = summary(values.ravel())
+    rows = values[np.isfinite(values).any(axis=1)]
+    if values.shape[1] > 1 and len(rows):
+        below = np.nanmean(np.where(np.isnan(rows), np.nan, rows <= found["median"]), axis=1)
+        margin = 1.96 * below.std() / math.sqrt(len(rows))
+        low, high = np.nanquantile(rows, (max(0.0, 0.5 - margin), min(1.0, 0.5 + margin))).tolist()
+        found = {**found, "low": low, "high": high}
+    return {**found, "n": len(rows)}
+
+
+def averaged(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Return the mean of each column for each value of `by`."""
+    means: dict[str, dict[str, float]] = table.groupby(by, sort=False)[list(columns)].mean().to_dict("index")
+    return means

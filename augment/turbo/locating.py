@@ -11,16 +11,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from augment import Mixed
 from augment.cross_validation import LOCATOR
+from augment.mix import Mixed
+from augment.turbo.condition import Condition, Row
+from augment.turbo.experiment import Experiment
 from swiftwrf import FitError, InputError, Spectra, load
 from swiftwrf.locate import MatchedField, Posterior
 from swiftwrf.models import FieldModel
-from tasks.aoa.condition import Condition
-from tasks.aoa.context import Experiment
-from tasks.records import write_npz
-from tasks.run import Row
-from tasks.steps import Step
+from swiftwrf.runtime.durable import write_npz
+from swiftwrf.runtime.steps import Step
 
 LEVEL = 0.8  # of the credible regions
 NO_PLANE = "no plane explains the spectra"  # why there is nothing to locate by
@@ -59,7 +58,7 @@ class Locating(Step[Experiment]):
         assert isinstance(room, FieldModel)
         began = time.perf_counter()
         try:
-            locator = MatchedField(seed=experiment.seed(condition.subset)).fit(measured, room=room)
+            locator = MatchedField(seed=experiment.seed_of(condition.subset)).fit(measured, room=room)
         except (InputError, FitError) as error:
             return {"refused": str(error)}
         fitted = time.perf_counter()

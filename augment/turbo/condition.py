@@ -1,17 +1,17 @@
-"""Conditions of the experiment: which estimator is trained on which spectra. They are the key of every result."""
+"""Conditions of turbo learning: which estimator is trained on which spectra. They are the key of every result."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from augment.cross_validation import LOCATOR, STAND_IN
-from augment.estimators import ESTIMATORS
-from tasks import labels
-from tasks.aoa.options import AUTO, fraction_key
-from tasks.run import Preset, Row
+from swiftwrf.choices import AUTO, fraction_key
+from swiftwrf.runtime.validation import Preset
 
+Row = dict[str, Any]
 Training = Literal["measured", "turbo", "turbo_extra", "all"]
 NETWORKS: dict[Preset, str] = {"quick": "aann_kernel", "paper": "aann"}
 """network that a run of each preset trains; names of its conditions omit it"""
@@ -145,20 +145,24 @@ class Condition:
 DESCRIPTION = ("estimator", "training", "synthesizer", "n_synthetic")
 
 
-def estimators(preset: Preset) -> list[str]:
-    """Return the names of the estimators that a run trains, the network first."""
-    network = NETWORKS[preset]
-    return [network, *(name for name in ESTIMATORS if name not in NETWORKS.values())]
-
-
-def trainable(preset: Preset) -> list[str]:
-    """Return the names of those estimators that improve with the number of training spectra, the network first."""
-    return [name for name in estimators(preset) if ESTIMATORS[name].trainable]
-
-
 def conditions_of(methods: Mapping[str, Mapping[str, Any]]) -> dict[str, Condition]:
     """Return the condition of each method of metrics.json."""
     return {method: Condition(**{name: entry[name] for name in DESCRIPTION}) for method, entry in methods.items()}
+
+
+def chosen_file(folder: Path, measured_fraction: str, condition: Condition | None) -> Path | None:
+    """Return the file of a chosen condition in the directory of a run, or None if there is none.
+
+    Args:
+        folder: Directory of the run.
+        measured_fraction: Measured fraction in file names.
+        condition: Condition that cross-validation chose, if any.
+    """
+    if condition is None:
+        return None
+    name = MEASURED_STAND_IN if condition.method == STAND_IN else condition.estimator
+    file = folder / f"{name}-mix{measured_fraction}.safetensors"
+    return file if file.is_file() else None
 
 
 def headline(conditions: Iterable[Condition]) -> Condition:
@@ -227,18 +231,3 @@ def pooled(results: list[tuple[Condition, Value]], auto: bool) -> list[tuple[Con
         if extra not in own and any(extra in others for others in repeats.values()):
             found.append((replace(condition, training="turbo_extra"), value))
     return found
-
-
-def terms() -> dict[str, str]:
-    """Return what the parts of the names of methods mean."""
-    return {
-        "measured_only": "lower reference: trained on the measured spectra alone",
-        "measured_all": "upper reference: trained on all training spectra, measured",
-        "turbo_NAME": "trained on the measured spectra and on spectra that NAME predicts at the withheld positions",
-        "turbo_NAME_extra": "turbo_NAME with synthetic spectra at extra positions, their number by --extra",
-        "turbo_auto": "the choice of each repeat by cross-validation, where repeats chose differently",
-        **{name: label.meaning for name, label in labels.labels(ESTIMATORS, labels.ESTIMATORS).items()},
-        LOCATOR: labels.ESTIMATORS[LOCATOR].meaning,
-        "no estimator's name": f"the network ({' or '.join(NETWORKS.values())}); the name of another estimator alone: "
-        "trained on measured spectra",
-    }

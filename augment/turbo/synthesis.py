@@ -1,4 +1,4 @@
-"""Steps of the experiment: the room is found, field models predict spectra, and estimators are trained and tested."""
+"""Steps of turbo learning: the room is found, field models predict spectra, and estimators are trained and tested."""
 
 from __future__ import annotations
 
@@ -11,22 +11,21 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from augment import Mixed, SyntheticPositions, mix, synthetic_positions
 from augment.cross_validation import STAND_IN, CrossValidationMetrics
-from augment.estimators import SavedEstimator, make_estimator
+from augment.estimators import SavedEstimator
+from augment.mix import Mixed, mix
+from augment.positions import SyntheticPositions, synthetic_positions
+from augment.turbo.artifacts import save_artifacts
+from augment.turbo.condition import MEASURED_STAND_IN, NETWORKS, Condition, MeasuredSubset, Row, Training
+from augment.turbo.experiment import ROOM_MODEL, Experiment
+from augment.turbo.locating import Locating
 from swiftwrf import FitError, GeometryModel, InputError, Spectra, load
+from swiftwrf.choices import AUTO
 from swiftwrf.data.store import Store
 from swiftwrf.metrics import l1, psnr, ssim
 from swiftwrf.models import FieldModel
 from swiftwrf.runtime.checkpoint import read, write
-from tasks.aoa.artifacts import save_artifacts
-from tasks.aoa.condition import MEASURED_STAND_IN, NETWORKS, Condition, MeasuredSubset, Training, trainable
-from tasks.aoa.context import ROOM_MODEL, Experiment
-from tasks.aoa.locating import Locating
-from tasks.aoa.options import AUTO
-from tasks.claim import STEPS
-from tasks.run import Row
-from tasks.steps import Step
+from swiftwrf.runtime.steps import STEPS, Step
 
 KIND = "synthetic spectra"
 SCORE = {"psnr_db": psnr, "ssim": ssim, "l1": l1}
@@ -181,7 +180,7 @@ class Synthesis(Step[Experiment]):
             tensors["test_std"] = _as_bytes_at(test, std)
         parts = {"withheld": withheld} if self.trains else {}
         if self.n_synthetic:
-            parts["extra"] = synthetic_positions(measured, self.n_synthetic, experiment.seed(self.subset))
+            parts["extra"] = synthetic_positions(measured, self.n_synthetic, experiment.seed_of(self.subset))
         for part, positions in parts.items():
             tensors[part] = _as_bytes_at(positions.position, model.synthesize)
             tensors |= {f"{part}_{name}": tensor for name, tensor in vars(positions).items()}
@@ -198,7 +197,7 @@ class Synthesis(Step[Experiment]):
 
     def _fitted(self, experiment: Experiment, measured: Spectra, history: _FitHistory, folder: Path) -> FieldModel:
         # models that are only compared are as small as in the choice
-        preset = experiment.config.preset if self.trains else "quick"
+        preset = experiment.preset if self.trains else "quick"
         room = load(folder / self.room.file) if self.room else None
         assert room is None or isinstance(room, FieldModel)
         history.begin()
@@ -219,7 +218,7 @@ class Synthesis(Step[Experiment]):
         return [
             Evaluation(Condition(estimator, training, self.synthesizer, number, fraction, repeat), self)
             for training, number in trainings
-            for estimator in trainable(experiment.config.preset)
+            for estimator in experiment.trainable
             # a training of the network takes most of the time
             if training == trainings[-1][0] or estimator not in NETWORKS.values()
         ]
@@ -255,10 +254,9 @@ class Evaluation(Step[Experiment]):
         return int(self.condition.is_network)
 
     def compute(self, experiment: Experiment, folder: Path) -> Row:
-        train = self._training_set(experiment, folder)
-        config, name = experiment.config, self.condition.estimator
-        estimator = make_estimator(name, len(experiment.train), config.preset, seed=experiment.seed(self.subset))
+        train = self.training_set(experiment, folder)
         began = time.perf_counter()
+        estimator = experiment.make_estimator(self.condition.estimator, self.subset)
         estimator.fit(train, device=experiment.device)
         fitted = time.perf_counter()
         estimate = estimator.estimate(experiment.test)
@@ -276,11 +274,12 @@ class Evaluation(Step[Experiment]):
             return ""
         if self.synthesis is None:
             return MEASURED_STAND_IN if self.condition.method == STAND_IN else ""
-        first = experiment.config.synthesizer[0] in (AUTO, self.synthesis.synthesizer)
+        first = experiment.models[0] in (AUTO, self.synthesis.synthesizer)
         is_complete = self.condition.n_synthetic == self.synthesis.n_synthetic
         return self.condition.estimator if first and is_complete else ""
 
-    def _training_set(self, experiment: Experiment, folder: Path) -> Mixed:
+    def training_set(self, experiment: Experiment, folder: Path) -> Mixed:
+        """Return the spectra that train the estimator."""
         if self.condition.training == "all":
             return Mixed.measured(experiment.train)
         measured, _ = experiment.withhold(self.subset)

@@ -1,0 +1,189 @@
+"""Turbo learning in one call, on spectra in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+from pandas import DataFrame
+
+from augment.cross_validation import LOCATOR, EstimatorChoiceMetrics
+from augment.estimators import Estimator
+from augment.turbo.choice import first_steps
+from augment.turbo.condition import Row, chosen_file, conditions_of
+from augment.turbo.experiment import ROOM_MODEL, Experiment
+from augment.turbo.results import MixMetrics, Results
+from augment.turbo.synthesis import Evaluation
+from swiftwrf.choices import AUTO, fraction_key
+from swiftwrf.data import Spectra
+from swiftwrf.errors import InputError
+from swiftwrf.locate import MatchedField
+from swiftwrf.models import FieldModel
+from swiftwrf.runtime.checkpoint import load
+from swiftwrf.runtime.durable import strict
+from swiftwrf.runtime.steps import STEPS, Step, walk
+from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, Preset, checked
+
+
+class TurboResult:
+    """Errors of estimators trained on measured, synthetic and all spectra, and the one that cross-validation chose.
+
+    Attributes:
+        errors: A row for each condition and test spectrum: estimator, training set, truth, estimate and errors [deg].
+        positions: A row for each condition that locates and test spectrum: truth, estimate and error [m].
+        metrics: All summaries, as in metrics.json of a run: errors with intervals, paired changes, quality of the synthetic
+            spectra, choices, times.
+        best: The estimator that cross-validation on the measured spectra chose, trained. None if nothing was compared.
+        left_out: A sentence for each method that is missing.
+    """
+
+    def __init__(self, results: Results, fraction: float, best: Estimator | MatchedField | None) -> None:
+        self.errors, self.positions = DataFrame(results.errors()), DataFrame(results.positions())
+        self.metrics: MixMetrics = results.summary(fraction)
+        self.best, self.left_out = best, list(results.notes)
+
+    @property
+    def choice(self) -> EstimatorChoiceMetrics | None:
+        """Choice of the estimator by cross-validation; `choice["name"]` is its method. None if nothing was compared."""
+        return self.metrics["estimator_choice"]
+
+    def summary(self) -> DataFrame:
+        """Return a row for each method, the smallest median first.
+
+        Columns are `median` [deg] of the angle between true and estimated direction, `low` and `high` of its 95 % interval,
+        `p90`, and `change` [%] with `change_low` and `change_high` by synthetic spectra, relative to the same estimator on
+        the measured spectra alone, paired over the test spectra.
+        """
+        conditions = conditions_of(self.metrics["methods"])
+        rows: list[Row] = []
+        for method, found in self.metrics["methods"].items():
+            error = found["great_circle_deg"]
+            change = found["changes"].get(conditions[method].measured_only.method)
+            row: Row = {name: error[name] for name in ("median", "low", "high", "p90")}
+            if change is not None:
+                row |= {
+                    "change": 100 * change["change"],
+                    "change_low": 100 * change["low"],
+                    "change_high": 100 * change["high"],
+                }
+            rows.append(row)
+        return DataFrame(rows, index=list(self.metrics["methods"])).sort_values("median")
+
+    def __repr__(self) -> str:
+        error = self.summary()["median"]
+        chosen = f", chosen: {self.choice['name']}" if self.choice else ""
+        return f"<TurboResult: {len(error)} methods, best {error.index[0]} at {error.iloc[0]:.2f} degrees{chosen}>"
+
+
+@checked
+def turbo_learning(
+    data: Spectra,
+    *,
+    measured: float = 0.3,
+    split: str = "random",
+    models: str | Sequence[str | FieldModel] = AUTO,
+    estimators: Sequence[str | Estimator] | None = None,
+    extra: NonNegativeInt | None = None,
+    preset: Preset = "quick",
+    repeats: PositiveInt = 1,
+    seed: NonNegativeInt = 0,
+    device: torch.device | str = "cpu",
+) -> TurboResult:
+    """Train estimators on few measured spectra, on these and synthetic ones, and on all, and compare their errors.
+
+    A part of the training spectra counts as measured. Field models fitted to it predict spectra at the withheld positions
+    and at extra ones. Errors are those on the test part of the split, which takes no part in any fit or choice.
+
+    Args:
+        data: Labelled spectra.
+        measured: Fraction of the training spectra that counts as measured, in (0, 1].
+        split: Split that comes with the data, or a seeded one: random or block.
+        models: Field models of the synthetic spectra: names, models of your own, or "auto" for the one that predicts
+            held-out measured spectra best.
+        estimators: Estimators beside kernel regression: names such as "aann_kernel", or estimators of your own.
+            Defaults to all, and to a comparison of all fast field models.
+        extra: Number of extra synthetic positions. Defaults to 3,000 where cross-validation recommends some.
+        preset: "quick", or "paper" for the sizes of the publication.
+        repeats: Number of random measured subsets, whose errors are pooled.
+        seed: Seed of everything random.
+        device: Device to compute on.
+
+    Raises:
+        InputError: A split, name or fraction that does not exist, or data that do not suffice.
+        FitError: A fit diverged.
+
+    Source:
+        W. Zheng et al., "SwiftWRF", case study on angle of arrival.
+
+    Example:
+        >>> import swiftwrf
+        >>> data = swiftwrf.simulated_room(n=40, grid=swiftwrf.AngularGrid.hemisphere(10, 40))
+        >>> result = turbo_learning(data, measured=0.5, models=["idw"], estimators=["peak"], extra=0)
+        >>> bool(result.summary().loc["kernel_regression", "median"] < result.summary().loc["peak", "median"])
+        True
+    """
+    own_models = {model.name: model for model in models if isinstance(model, FieldModel)}
+    named = tuple(one for one in estimators or () if isinstance(one, str))
+    names = (models,) if isinstance(models, str) else tuple(one if isinstance(one, str) else one.name for one in models)
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"two field models have the name {twice!r}; leave one out, or give it another `name`")
+    own_estimators = {type(one).__name__: one for one in estimators or () if isinstance(one, Estimator)}
+    train, test = data.split(split, seed)
+    experiment = Experiment(
+        train,
+        test,
+        (measured,),
+        names,
+        None if estimators is None else tuple(name for name in named if name != LOCATOR),
+        None if estimators is None else (ROOM_MODEL,) * (LOCATOR in named),
+        own_models,
+        own_estimators,
+        extra,
+        preset,
+        repeats,
+        seed,
+        device=device,
+    )
+    results, known, steps = Results(experiment), dict[str, Any](), list[Step[Experiment]]()
+    with TemporaryDirectory(prefix="swiftwrf-") as name:
+        folder = Path(name)
+        (folder / STEPS).mkdir()
+
+        def compute(step: Step[Experiment]) -> Row:
+            if step.name not in known:
+                known[step.name] = strict(step.compute(experiment, folder))
+            value: Row = known[step.name]
+            return value
+
+        for step, value in walk(first_steps(experiment), experiment, compute):
+            results.add(step, value)
+            steps.append(step)
+        return TurboResult(results, measured, _best(experiment, results, steps, folder))
+
+
+def _best(
+    experiment: Experiment, results: Results, steps: Sequence[Step[Experiment]], folder: Path
+) -> Estimator | MatchedField | None:
+    """Return the estimator that cross-validation chose in the first repeat, trained."""
+    metrics = results.summary(experiment.fractions[0])
+    choice = metrics["estimator_choice"]
+    condition = conditions_of(metrics["methods"])[choice["name"]] if choice else None
+    file = chosen_file(folder, fraction_key(experiment.fractions[0]), condition)
+    if file is not None:
+        found = load(file)
+        assert isinstance(found, Estimator | MatchedField)
+        return found
+    for step in steps:
+        if (
+            isinstance(step, Evaluation)
+            and condition
+            and step.condition.method == condition.method
+            and not step.subset.repeat
+        ):
+            estimator = experiment.make_estimator(step.condition.estimator, step.subset)
+            return estimator.fit(step.training_set(experiment, folder), device=experiment.device)
+    return None

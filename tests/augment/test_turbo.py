@@ -1,0 +1,82 @@
+"""Turbo learning in one call equals the command, and takes field models and estimators of one's own."""
+
+from __future__ import annotations
+
+import pandas as pd
+import pytest
+import torch
+from quick import run
+
+from augment import turbo_learning
+from augment.estimators import Estimator
+from swiftwrf import AngularGrid, InputError, make_model, simulated_room
+from swiftwrf.metrics import angle_errors
+from swiftwrf.models.neighbours import NearestModel
+
+
+class Zenith(Estimator):
+    """Answers the same direction to everything."""
+
+    def _fit(self, train, device):
+        self.label = train.label.mean(dim=0)
+
+    def predict(self, spectra):
+        return self.label.expand(len(spectra), 2)
+
+
+class Renamed(NearestModel):
+    name = "renamed"
+
+
+@pytest.fixture(scope="module")
+def data():
+    return simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))  # as the quick tasks have it
+
+
+def test_models_and_estimators_of_ones_own(data):
+    result = turbo_learning(data, measured=0.5, models=[Renamed(), "idw"], estimators=["peak", Zenith()], extra=0)
+    methods = {
+        "peak",
+        "Zenith",
+        "Zenith_turbo_renamed",
+        "kernel_regression_turbo_renamed",
+        "kernel_regression_turbo_idw",
+    }
+    assert methods <= set(result.summary().index)
+    assert not {"measured_only", "matched_field"} & set(
+        result.summary().index
+    )  # neither network nor room was asked for
+    assert result.summary()["median"].is_monotonic_increasing
+    assert set(result.metrics["synthesis"]) == {"renamed", "idw"}
+    change = result.summary().loc["Zenith_turbo_renamed"]
+    assert change["change_low"] <= change["change"] <= change["change_high"]
+    own = result.errors[result.errors.method == result.choice["name"]]
+    test = data.subset(torch.tensor(own["index"].tolist()))
+    error = angle_errors(result.best.predict(test.spectrum), test.label)["great_circle"].rad2deg()
+    torch.testing.assert_close(
+        error.double(), torch.tensor(own["great_circle_deg"].tolist()).double(), atol=1e-2, rtol=0
+    )
+
+
+def test_the_call_gives_the_errors_of_the_command(data, tmp_path):
+    result = turbo_learning(data, measured=0.5, models=["idw"], estimators=["peak", "nearest_spectrum"], extra=0)
+    assert run("aoa", "--mix", 0.5, "--synthesizer", "idw", "--extra", 0, "--out", tmp_path / "run") == 0
+    command = pd.read_csv(tmp_path / "run" / "errors.csv").set_index(["method", "index"])["great_circle_deg"]
+    found = result.errors.set_index(["method", "index"])["great_circle_deg"]
+    pd.testing.assert_series_equal(found, command.loc[found.index], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"measured": 0.0}, "in \\(0, 1\\]"),
+        ({"split": "nowhere"}, "choose one of block, random"),
+        ({"models": ["oracle"]}, "unknown field model"),
+        ({"estimators": ["oracle"]}, "unknown estimator"),
+        ({"measured": 0.1}, "leaves 2 of 24"),
+        ({"models": [make_model("idw"), "idw"]}, "two field models have the name 'idw'"),
+    ],
+)
+def test_what_does_not_exist_is_refused(data, options, reason):
+    with pytest.raises(InputError, match=reason):
+        turbo_learning(data, **options)
