@@ -38,6 +38,13 @@ class TurboResult:
             spectra, choices, times.
         best: The estimator that cross-validation on the measured spectra chose, trained. None if nothing was compared.
         left_out: A sentence for each method that is missing.
+
+    Example:
+        >>> import swiftwrf
+        >>> data = swiftwrf.simulated_room(n=40, grid=swiftwrf.AngularGrid.hemisphere(10, 40))
+        >>> result = turbo_learning(data, measured=0.5, models=["nearest"], estimators=["peak"], extra=0)
+        >>> result.choice["name"], type(result.best).__name__
+        ('kernel_regression', 'KernelRegression')
     """
 
     def __init__(self, results: Results, fraction: float, best: Estimator | MatchedField | None) -> None:
@@ -53,9 +60,9 @@ class TurboResult:
     def summary(self) -> DataFrame:
         """Return a row for each method, the smallest median first.
 
-        Columns are `median` [deg] of the angle between true and estimated direction, `low` and `high` of its 95 % interval,
-        `p90`, and `change` [%] with `change_low` and `change_high` by synthetic spectra, relative to the same estimator on
-        the measured spectra alone, paired over the test spectra.
+        `median`, `p90`, and `low` and `high` of the median's 95 % interval are those of the angle between true and estimated
+        direction [deg]. `change` [%] is that of the median by synthetic spectra, relative to the same estimator on the
+        measured spectra alone. Its interval, `change_low` and `change_high`, is paired over the test spectra.
         """
         conditions = conditions_of(self.metrics["methods"])
         rows: list[Row] = []

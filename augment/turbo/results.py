@@ -126,7 +126,7 @@ class Results:
         self.chosen: dict[str, Row] = {}  # by measured fraction, of the first repeat
         self.located_folds: dict[str, dict[int, list[float] | None]] = {}  # errors by fold, in the same way
         self.left_out: dict[Condition, str] = {}  # conditions, and why
-        self.notes: list[str] = []  # a sentence each on what is left out
+        self.notes: list[str] = []  # a sentence for each method that is missing
         fractions = [MeasuredSubset(fraction) for fraction in experiment.fractions]
         for name, reason in experiment.lacking.items():
             self.left_out |= {Condition(name, "measured", **subset.columns): reason for subset in fractions}

@@ -1,1 +1,1 @@
-"""What a saved model says of new measurements or positions: directions, positions, spectra or RSSI."""
+"""Answers of a saved model to new measurements or positions: directions, positions, spectra or RSSI."""
