@@ -563,6 +563,7 @@ def test_labels_of_synthetic_spectra_are_those_of_their_positions(small, tmp_pat
     torch.testing.assert_close(mixed.spectrum[-20:], expected, atol=1 / 255, rtol=0)
 
 
+@pytest.mark.usefixtures("without_annotation_checks")
 def test_models_for_comparison_are_always_quick(small, monkeypatch):
     """A field model asked for by name does not bring fits of the published size of others along."""
     train, test = small.split("random", 0)
@@ -677,7 +678,7 @@ def test_report_refuses_unfinished_runs(tmp_path):
 
 
 def test_metrics_are_strict_json(tmp_path):
-    from tasks.records import strict
+    from swiftwrf.runtime.durable import strict
 
     assert strict({"a": math.nan, "b": [math.inf, 1.0], "c": (1, 2)}) == {"a": None, "b": [None, 1.0], "c": [1, 2]}
 
