@@ -71,11 +71,11 @@ def test_prime_numbers_of_rows_leave_the_network_something():
 
 
 def test_small_spectra_are_refused_before_the_training():
+    from augment import turbo_learning
     from swiftwrf import simulated_room
-    from tasks.aoa.options import AoaConfig, check_data
 
     with pytest.raises(InputError, match="7 x 7"):
-        check_data(simulated_room(n=20, grid=AngularGrid.hemisphere(4, 16)), AoaConfig((0.5,)))
+        turbo_learning(simulated_room(n=20, grid=AngularGrid.hemisphere(4, 16)), measured=0.5)
 
 
 def test_an_installation_without_a_place_for_caches(tmp_path):
