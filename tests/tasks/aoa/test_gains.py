@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from pandas import DataFrame
 
 from augment.cross_validation import LOCATOR
 from augment.turbo.condition import Condition
+from augment.turbo.experiment import Experiment
 from augment.turbo.results import Results, repeated_summary, summaries
 from augment.turbo.synthesis import Evaluation
 from swiftwrf import simulated_room
@@ -79,7 +79,7 @@ def test_one_repeat_has_the_interval_of_independent_values():
 def results_of(errors):
     """Return the results of conditions with these elevation errors [deg] at the test positions."""
     room = simulated_room(n=20)
-    found = Results(SimpleNamespace(test=room, train=room, fractions=(0.3,), models=("auto",), lacking={}))
+    found = Results(Experiment(room, room, (0.3,), estimators=()))
     for condition, error in errors.items():
         off = torch.stack([torch.zeros(20), torch.as_tensor(error)], dim=1).double().deg2rad()
         value = {"estimate": (room.label - off).tolist(), "seconds": {"train": 1.0, "estimate": 1.0}, "history": []}

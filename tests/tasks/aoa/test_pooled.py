@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from itertools import cycle
-from types import SimpleNamespace
 from unittest import mock
 
 import pandas as pd
@@ -11,6 +10,7 @@ from quick import run
 
 from augment.turbo.choice import choose_model
 from augment.turbo.condition import Condition, MeasuredSubset, pooled
+from augment.turbo.experiment import Experiment
 from augment.turbo.results import Results
 from augment.turbo.synthesis import Evaluation
 from swiftwrf import simulated_room
@@ -80,7 +80,7 @@ def test_the_time_of_all_networks_counts():
     room = simulated_room(n=20)
     trained = results((GP,), (IDW, IDW_EXTRA))
     for synthesizer in (("auto",), ("gp", "idw")):
-        found = Results(SimpleNamespace(test=room, train=room, fractions=(0.3,), models=synthesizer, lacking={}))
+        found = Results(Experiment(room, room, (0.3,), synthesizer, estimators=()))
         for condition, _ in trained:
             value = {
                 "estimate": room.label.tolist(),
