@@ -79,7 +79,7 @@ def test_one_repeat_has_the_interval_of_independent_values():
 def results_of(errors):
     """Return the results of conditions with these elevation errors [deg] at the test positions."""
     room = simulated_room(n=20)
-    found = Results(Experiment(room, room, (0.3,), estimators=()))
+    found = Results(Experiment(simulated_room(n=40), room, (0.3,), estimators=()))
     for condition, error in errors.items():
         off = torch.stack([torch.zeros(20), torch.as_tensor(error)], dim=1).double().deg2rad()
         value = {"estimate": (room.label - off).tolist(), "seconds": {"train": 1.0, "estimate": 1.0}, "history": []}

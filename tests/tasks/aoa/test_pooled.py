@@ -80,7 +80,7 @@ def test_the_time_of_all_networks_counts():
     room = simulated_room(n=20)
     trained = results((GP,), (IDW, IDW_EXTRA))
     for synthesizer in (("auto",), ("gp", "idw")):
-        found = Results(Experiment(room, room, (0.3,), synthesizer, estimators=()))
+        found = Results(Experiment(simulated_room(n=40), room, (0.3,), synthesizer, estimators=()))
         for condition, _ in trained:
             value = {
                 "estimate": room.label.tolist(),
