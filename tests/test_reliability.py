@@ -38,9 +38,9 @@ def finished(tmp_path_factory):
 
 @pytest.fixture
 def stopped(tmp_path, monkeypatch):
-    """An RSSI run that was interrupted after its first step, and what it was asked for."""
+    """An RSSI run that was interrupted after its steps, and what it was asked for."""
     with monkeypatch.context() as patch:
-        patch.setattr(rssi._Tables, "overall", _interrupt)
+        patch.setattr(rssi, "_metrics", _interrupt)
         assert run("rssi", "--rx", "1", "--out", tmp_path / "run") == 130
     return tmp_path / "run.partial"
 
@@ -85,10 +85,10 @@ def test_a_run_stopped_while_it_finishes_can_be_finished(finished, tmp_path, mon
 
 
 def test_a_failed_start_leaves_nothing(tmp_path, monkeypatch):
-    def refuse(*_):
+    def refuse(*_, **options):
         raise InputError("no")
 
-    monkeypatch.setattr(rssi._Tables, "add", refuse)
+    monkeypatch.setattr(rssi, "compare", refuse)
     assert run("rssi", "--rx", "1", "--out", tmp_path / "run") == 2
     assert not list(tmp_path.iterdir())
 
@@ -121,7 +121,7 @@ def test_resume_refuses_changed_data(tmp_path, monkeypatch, capsys):
     plan = tmp_path / "plan.png"
     Image.new("RGB", (4, 4)).save(plan)
     with monkeypatch.context() as patch:
-        patch.setattr(rssi._Tables, "overall", _interrupt)
+        patch.setattr(rssi, "_metrics", _interrupt)
         floor = ("--floor-plan", plan, "--floor-extent", 0, 1, 0, 1)
         assert run("rssi", "--rx", "1", *floor, "--out", tmp_path / "run") == 130
     Image.new("RGB", (5, 4)).save(plan)
