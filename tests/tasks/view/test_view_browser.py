@@ -14,7 +14,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -94,12 +94,16 @@ def browser(serve, tmp_path):
 
 
 def until(check):
-    """Waits for something true, and returns it."""
+    """Waits for something true, and returns it. An element that is drawn anew meanwhile counts as not yet there."""
+    from selenium.common.exceptions import StaleElementReferenceException
+
     end = time.monotonic() + PATIENCE
-    while not (value := check()):
+    while True:
+        with suppress(StaleElementReferenceException):
+            if value := check():
+                return value
         assert time.monotonic() < end, check
         time.sleep(0.05)
-    return value
 
 
 def find(browser, selector):
@@ -107,13 +111,15 @@ def find(browser, selector):
 
 
 def said(browser, name):
-    return find(browser, f"#{name}").text
+    """Return the text of an element, read in one step: the page may draw it anew at any time."""
+    return browser.execute_script("return document.getElementById(arguments[0]).innerText", name)
 
 
 def shown(browser, name):
-    """Return the picture of a chart, None if it has none yet."""
-    drawn = browser.find_elements("css selector", f"#{name} image")
-    return drawn[0].get_attribute("href") or drawn[0].get_attribute("xlink:href") if drawn else None
+    """Return the picture of a chart, None if it has none yet; in one step, too."""
+    image = "const image = document.querySelector(arguments[0]);"
+    script = f"{image} return image && (image.getAttribute('href') || image.getAttribute('xlink:href'))"
+    return browser.execute_script(script, f"#{name} image")
 
 
 def press(browser, label):
@@ -132,6 +138,12 @@ def pointer(browser):
     from selenium.webdriver import ActionChains
 
     return ActionChains(browser, duration=16)  # [ms] a move
+
+
+def pressed_at(browser, selector, x, y):
+    """Click beside the middle of an element that the page may draw anew; True."""
+    pointer(browser).move_to_element_with_offset(find(browser, selector), x, y).click().perform()
+    return True
 
 
 def opened(browser, address, name, label):
@@ -157,7 +169,7 @@ def follows_the_pointer(browser, plan):
     return 1e3 * (len(frames) - 1) / (frames[-1] - frames[0])
 
 
-def has_views_models_and_keys(browser, plan):
+def has_views_models_and_keys(browser):
     from selenium.webdriver.common.keys import Keys
 
     rectangular = until(lambda: shown(browser, "measured"))
@@ -168,7 +180,7 @@ def has_views_models_and_keys(browser, plan):
     until(lambda: browser.find_elements("css selector", ".q-item"))
     browser.find_elements("css selector", ".q-item")[1].click()  # a model that does not know its deviation
     until(lambda: not find(browser, "#deviation").is_displayed())
-    pointer(browser).move_to_element_with_offset(plan, 20, 10).click().perform()
+    until(lambda: pressed_at(browser, "#plan", 20, 10))
     for key in (Keys.ARROW_RIGHT, Keys.ARROW_UP, Keys.PAGE_UP):
         before = said(browser, "where")
         pointer(browser).send_keys(key).perform()
@@ -192,7 +204,7 @@ def test_page_of_spectra(browser, serve, aoa_run, record_property):
     rate = follows_the_pointer(browser, plan)
     record_property("frames_per_second", rate)
     print(f"{rate:.1f} frames a second while dragging")
-    has_views_models_and_keys(browser, plan)
+    has_views_models_and_keys(browser)
     assert_fits(browser, "plan")
 
 
