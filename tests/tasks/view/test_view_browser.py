@@ -94,7 +94,7 @@ def browser(serve, tmp_path):
 
 
 def until(check):
-    """Waits for something true, and returns it. An element that is drawn anew meanwhile counts as not yet there."""
+    """Waits for something true, and returns it. An element that the page replaces meanwhile counts as missing."""
     from selenium.common.exceptions import StaleElementReferenceException
 
     end = time.monotonic() + PATIENCE
@@ -111,7 +111,7 @@ def find(browser, selector):
 
 
 def said(browser, name):
-    """Return the text of an element, read in one step: the page may draw it anew at any time."""
+    """Return the text of an element, read in one step, because the page may replace the element."""
     return browser.execute_script("return document.getElementById(arguments[0]).innerText", name)
 
 
@@ -141,7 +141,7 @@ def pointer(browser):
 
 
 def pressed_at(browser, selector, x, y):
-    """Click beside the middle of an element that the page may draw anew; True."""
+    """Click beside the middle of an element that is searched for first. Return True, which ends `until`."""
     pointer(browser).move_to_element_with_offset(find(browser, selector), x, y).click().perform()
     return True
 
