@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import shutil
+from os.path import isfile  # unlike Path.is_file, it is False for names that are too long
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -14,6 +15,11 @@ from swiftwrf.runtime.steps import STEPS
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # errors of file systems without locks
 LOCK, CONFIG, ENVIRONMENT = "lock", "config.json", "environment.json"
 MODEL, LOCATOR = "model.safetensors", "locator.safetensors"  # fitted RSSI models of runs
+
+
+def model_file(folder: Path) -> Path | None:
+    """Return the file of the RSSI model or of the locator that a run keeps, None if it keeps neither."""
+    return next((file for name in (MODEL, LOCATOR) if isfile(file := folder / name)), None)
 
 
 def begun(folder: Path) -> bool:

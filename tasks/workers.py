@@ -119,11 +119,10 @@ def local_processes(number: int, folder: Path) -> Iterator[Workers]:
     files: list[Path] = []
 
     def hold(thing: object) -> Path:
-        files.append(
-            folder / STEPS / f".{uuid4().hex}"
-        )  # the end of the run removes it, even if this process is killed
-        files[-1].write_bytes(pickle.dumps(thing))
-        return files[-1]
+        file = folder / STEPS / f".{uuid4().hex}"  # the end of the run removes it, even if this process is killed
+        files.append(file)
+        file.write_bytes(pickle.dumps(thing))
+        return file
 
     pool = ProcessPoolExecutor(number, process_context(), _begin)
     started = pool._processes  # the user's program may have other children

@@ -13,7 +13,7 @@ from pandas import DataFrame
 from augment.cross_validation import LOCATOR, EstimatorChoiceMetrics
 from augment.estimators import Estimator
 from augment.turbo.choice import first_steps
-from augment.turbo.condition import Row, chosen_file, conditions_of
+from augment.turbo.condition import Condition, Row, chosen_file, conditions_of
 from augment.turbo.experiment import ROOM_MODEL, Experiment
 from augment.turbo.results import MixMetrics, Results
 from augment.turbo.synthesis import Evaluation
@@ -47,10 +47,9 @@ class TurboResult:
         ('kernel_regression', 'KernelRegression')
     """
 
-    def __init__(self, results: Results, fraction: float, best: Estimator | MatchedField | None) -> None:
+    def __init__(self, results: Results, metrics: MixMetrics, best: Estimator | MatchedField | None) -> None:
         self.errors, self.positions = DataFrame(results.errors()), DataFrame(results.positions())
-        self.metrics: MixMetrics = results.summary(fraction)
-        self.best, self.left_out = best, list(results.notes)
+        self.metrics, self.best, self.left_out = metrics, best, results.notes
 
     @property
     def choice(self) -> EstimatorChoiceMetrics | None:
@@ -123,7 +122,8 @@ def turbo_learning(
         FitError: A fit diverged.
 
     Source:
-        W. Zheng et al., "SwiftWRF", case study on angle of arrival.
+        M. Liu et al., "Deformable 2D Gaussian Splatting for Efficient Wireless Radiance Field Rendering", 2025: the case
+        study on angle of arrival.
 
     Example:
         >>> import swiftwrf
@@ -132,13 +132,13 @@ def turbo_learning(
         >>> bool(result.summary().loc["kernel_regression", "median"] < result.summary().loc["peak", "median"])
         True
     """
+    models = (models,) if isinstance(models, str) else models
     own_models = {model.name: model for model in models if isinstance(model, FieldModel)}
-    named = tuple(one for one in estimators or () if isinstance(one, str))
-    names = (models,) if isinstance(models, str) else tuple(one if isinstance(one, str) else one.name for one in models)
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"two field models have the name {twice!r}; leave one out, or give it another `name`")
     own_estimators = {type(one).__name__: one for one in estimators or () if isinstance(one, Estimator)}
+    names = tuple(one if isinstance(one, str) else one.name for one in models)
+    named = tuple(one for one in estimators or () if isinstance(one, str))
+    _check_unique("field models", names)
+    _check_unique("estimators", [one if isinstance(one, str) else type(one).__name__ for one in estimators or ()])
     train, test = data.split(split, seed)
     experiment = Experiment(
         train,
@@ -169,28 +169,30 @@ def turbo_learning(
         for step, value in walk(first_steps(experiment), experiment, compute):
             results.add(step, value)
             steps.append(step)
-        return TurboResult(results, measured, _best(experiment, results, steps, folder))
+        metrics = results.summary(measured)
+        choice = metrics["estimator_choice"]
+        condition = conditions_of(metrics["methods"])[choice["name"]] if choice else None
+        best = None if condition is None else _trained(condition, experiment, steps, folder)
+        return TurboResult(results, metrics, best)
 
 
-def _best(
-    experiment: Experiment, results: Results, steps: Sequence[Step[Experiment]], folder: Path
+def _check_unique(things: str, names: Sequence[str]) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"two {things} have the name {name!r}; leave one out, or give it another name")
+
+
+def _trained(
+    condition: Condition, experiment: Experiment, steps: Sequence[Step[Experiment]], folder: Path
 ) -> Estimator | MatchedField | None:
-    """Return the estimator that cross-validation chose in the first repeat, trained."""
-    metrics = results.summary(experiment.fractions[0])
-    choice = metrics["estimator_choice"]
-    condition = conditions_of(metrics["methods"])[choice["name"]] if choice else None
-    file = chosen_file(folder, fraction_key(experiment.fractions[0]), condition)
-    if file is not None:
+    """Return the estimator of a condition as the first repeat trained it: from its file, or trained again without one."""
+    if file := chosen_file(folder, fraction_key(experiment.fractions[0]), condition):
         found = load(file)
         assert isinstance(found, Estimator | MatchedField)
         return found
-    for step in steps:
-        if (
-            isinstance(step, Evaluation)
-            and condition
-            and step.condition.method == condition.method
-            and not step.subset.repeat
-        ):
-            estimator = experiment.make_estimator(step.condition.estimator, step.subset)
-            return estimator.fit(step.training_set(experiment, folder), device=experiment.device)
-    return None
+    evaluations = (step for step in steps if isinstance(step, Evaluation) and step.subset.repeat == 0)
+    own = next((step for step in evaluations if step.condition.method == condition.method), None)
+    if own is None:
+        return None
+    estimator = experiment.make_estimator(condition.estimator, own.subset)
+    return estimator.fit(own.training_set(experiment, folder), device=experiment.device)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Literal, TypedDict, get_args
 
 import numpy as np
@@ -115,9 +115,10 @@ class Results:
 
     Args:
         experiment: Data and options that the steps share.
+        on_note: Called with each new sentence about a method that is missing.
     """
 
-    def __init__(self, experiment: Experiment) -> None:
+    def __init__(self, experiment: Experiment, on_note: Callable[[str], object] | None = None) -> None:
         self.experiment, self.test = experiment, experiment.test
         self.evaluated: list[tuple[Condition, Row]] = []
         self.synthesis: list[Row] = []  # scores of each test spectrum
@@ -127,15 +128,16 @@ class Results:
         self.located_folds: dict[str, dict[int, list[float] | None]] = {}  # errors by fold, in the same way
         self.left_out: dict[Condition, str] = {}  # conditions, and why
         self.notes: list[str] = []  # a sentence for each method that is missing
+        self._on_note = on_note
         fractions = [MeasuredSubset(fraction) for fraction in experiment.fractions]
         for name, reason in experiment.lacking.items():
             self.left_out |= {Condition(name, "measured", **subset.columns): reason for subset in fractions}
         for reason in dict.fromkeys(experiment.lacking.values()):
             names = ", ".join(name for name, own in experiment.lacking.items() if own == reason)
-            self.notes.append(f"left out: {names}, because {reason}")
+            self._note(f"left out: {names}, because {reason}")
         if missing := FIELD_MODELS[ROOM_MODEL].lacking(self.test):
             reason = f"it needs the {missing[0]}, which {self.test.name} does not describe"
-            self.notes.append(f"{LOCATOR} is left out: {reason}")
+            self._note(f"{LOCATOR} is left out: {reason}")
             located = (c for subset in (*fractions, EVERYTHING) for c in experiment.located_by(subset))
             self.left_out |= dict.fromkeys(located, reason)
 
@@ -213,6 +215,8 @@ class Results:
     def _note(self, sentence: str) -> None:
         if sentence not in self.notes:
             self.notes.append(sentence)
+            if self._on_note is not None:
+                self._on_note(sentence)
 
     def _add_synthesis(self, step: Synthesis, value: Row) -> None:
         key = step.subset.columns | {"synthesizer": step.synthesizer}

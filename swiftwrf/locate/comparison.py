@@ -182,7 +182,7 @@ class LocateComparison:
     @cached_property
     def errors(self) -> DataFrame:
         """Position errors of the localizers with all data, a row for each method and test row."""
-        return concat([self._table(trial) for trial in self.values if trial.is_whole], ignore_index=True)
+        return concat([table for trial, table in self._tables.items() if trial.is_whole], ignore_index=True)
 
     def summary(self) -> DataFrame:
         """Return a row for each method: errors [m], and their mean difference to the posterior; see `method_summary`."""
@@ -199,8 +199,8 @@ class LocateComparison:
         """Position errors in space and in plan [m] of each localizer with all data, and its seconds."""
         return {
             trial.localizer: {
-                "position_error_m": summary((table := self._table(trial))["position_error_m"]),
-                "horizontal_error_m": summary(table["horizontal_error_m"]),
+                "position_error_m": summary(self._tables[trial]["position_error_m"]),
+                "horizontal_error_m": summary(self._tables[trial]["horizontal_error_m"]),
                 "seconds": values["seconds"],
             }
             for trial, values in self.values.items()
@@ -211,7 +211,11 @@ class LocateComparison:
         """Return trials and their position errors [m] for fractions `by` "rows" or "receivers", with everything included."""
         trials = [t for t in self.values if (t.receivers if by == "rows" else t.rows) == 1]
         names = {trial.localizer for trial in trials if not trial.is_whole}
-        return [(t, summary(self._table(t)["position_error_m"])) for t in trials if t.localizer in names]
+        return [(t, summary(self._tables[t]["position_error_m"])) for t in trials if t.localizer in names]
+
+    @cached_property
+    def _tables(self) -> dict[Trial, DataFrame]:
+        return {trial: self._table(trial) for trial in self.values}
 
     def _table(self, trial: Trial) -> DataFrame:
         values = self.values[trial]

@@ -31,14 +31,8 @@ from tasks.steps import run_steps
 from tasks.terminal import console, terminal
 from tasks.workers import connected
 
-EXAMPLE_QUANTILES = (
-    1.0,
-    0.8,
-    0.6,
-    0.4,
-    0.2,
-    0.0,
-)  # of the PSNR at the test positions, from the best spectrum to the worst
+# of the PSNR at the test positions, from the best spectrum to the worst
+EXAMPLE_QUANTILES = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
 
 
 def run(config: AoaConfig, resume: Path | None = None) -> None:
@@ -76,16 +70,13 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
         connected(config.scheduler, device) as cluster,
         Run("aoa", config.out, label, config, device, source, resume, 1 if cluster else config.processes) as directory,
     ):
-        results, told = Results(experiment), 0
+        results = Results(experiment, console.print)
         with terminal.progress():
             for step, value in run_steps(
                 directory, first_steps(experiment), experiment, cluster, partial(_show, experiment)
             ):
                 results.add(step, value)
                 _write_files(step, value, experiment.test, directory)
-                for note in results.notes[told:]:
-                    console.print(note)
-                told = len(results.notes)
         tables = {"errors": results.errors(), "synthesis": results.synthesis, "history": results.history}
         for name, rows in (tables | ({"positions": found} if (found := results.positions()) else {})).items():
             directory.write_csv(f"{name}.csv", rows)

@@ -17,7 +17,7 @@ from swiftwrf.rssi.base import RssiPredictor
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.durable import replacing
-from tasks.claim import CONFIG, LOCATOR, MODEL
+from tasks.claim import CONFIG, model_file
 from tasks.convert.options import MAPS, ConvertConfig
 from tasks.environment import command
 from tasks.page.raster import colour_image
@@ -32,9 +32,10 @@ def saved_model(source: Path) -> RssiModel | None:
     Raises:
         InputError: A run without an RSSI model, or a model of which no map is written.
     """
-    file = next((file for name in (MODEL, LOCATOR) if isfile(file := source / name)), source)
-    if file == source and isfile(source / CONFIG):
+    kept = model_file(source)
+    if kept is None and isfile(source / CONFIG):
         raise InputError(f"{source} is a run without an RSSI model; name one of its models, {source}/....safetensors")
+    file = kept or source
     if file.suffix != ".safetensors":
         return None
     model: Saved = load(file)

@@ -12,7 +12,7 @@ from swiftwrf.errors import with_article
 from swiftwrf.locate import MatchedField, RssiLocator
 from swiftwrf.rssi.base import RssiPredictor
 from tasks.aoa.page.records import AoaRecords, FractionRecords
-from tasks.claim import CONFIG, LOCATOR, MODEL
+from tasks.claim import CONFIG, model_file
 from tasks.convert.outputs import write_file
 from tasks.directory import check_new_file
 from tasks.environment import stamp
@@ -37,9 +37,15 @@ def run(config: PredictConfig) -> None:
     check_new_file(out, "--out ")
     file = saved_file(Path(config.model))
     model = load(file)
-    of_rssi, at_positions = isinstance(model, RssiLocator), isinstance(model, FieldModel | RssiPredictor)
-    for refused, kinds in ((TableSource, "RSSI"), (SpectraSource, "spectra")):
-        if (at_positions or of_rssi == (refused is SpectraSource)) and (unused := given(config, refused)):
+    read = (
+        None
+        if isinstance(model, FieldModel | RssiPredictor)
+        else "RSSI"
+        if isinstance(model, RssiLocator)
+        else "spectra"
+    )
+    for kinds, options in (("RSSI", TableSource), ("spectra", SpectraSource)):
+        if kinds != read and (unused := given(config, options)):
             raise InputError(f"--{unused[0]} is for reading {kinds}, and {file} holds {with_article(model.kind)}")
     if config.track is not None and not isinstance(model, RssiLocator | MatchedField):
         raise InputError(
@@ -78,9 +84,8 @@ def saved_file(model: Path) -> Path:
     """
     if not isfile(model / CONFIG):
         return model
-    for name in (MODEL, LOCATOR):
-        if isfile(model / name):
-            return model / name
+    if kept := model_file(model):
+        return kept
     records: AoaRecords = Records(model)
     fractions = FractionRecords.of(records) if "mixes" in records.metrics else []
     chosen = max(fractions, key=lambda fraction: float(fraction.key)).chosen_file if fractions else None

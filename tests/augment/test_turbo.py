@@ -75,6 +75,7 @@ def test_the_call_gives_the_errors_of_the_command(data, tmp_path):
         ({"estimators": ["oracle"]}, "unknown estimator"),
         ({"measured": 0.1}, "leaves 2 of 24"),
         ({"models": [make_model("idw"), "idw"]}, "two field models have the name 'idw'"),
+        ({"estimators": [Zenith(), Zenith()]}, "two estimators have the name 'Zenith'"),
     ],
 )
 def test_what_does_not_exist_is_refused(data, options, reason):
