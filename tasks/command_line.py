@@ -12,14 +12,11 @@ from pathlib import Path
 from typing import TypeVar
 
 from swiftwrf.errors import FitError, InputError, one_line
-from swiftwrf.runtime.durable import strict
-from tasks.options import OUTPUT, Options
-from tasks.parsing import file_options, general_options, parse
-from tasks.resume import saved_config
+from tasks.options import Answered, Options
+from tasks.parsing import file_of_options, file_options, parse
 from tasks.terminal import terminal
 
 Config = TypeVar("Config", bound=Options)
-CHANGING = ("scheduler", "processes", *OUTPUT)  # options of a run that may change when it is resumed
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 BROKEN_PIPE = 141  # exit code that shells show for a process ended by SIGPIPE
 
@@ -27,7 +24,7 @@ BROKEN_PIPE = 141  # exit code that shells show for a process ended by SIGPIPE
 def command_line(
     name: str,
     config_type: type[Config],
-    task: Callable[..., None],
+    task: Callable[[Config], None],
     arguments: Sequence[str],
     program: str | None = None,
 ) -> int:
@@ -89,42 +86,25 @@ def _no_access(error: OSError) -> str:
 def execute(
     name: str,
     config_type: type[Config],
-    task: Callable[..., None],
+    task: Callable[[Config], None],
     arguments: Sequence[str],
     program: str | None = None,
 ) -> None:
     """Parse a command line and run the task.
 
-    A resumable task takes a second argument, the directory to resume or None. For such a task `--resume DIR` takes the
-    configuration of an interrupted run. Only the options in `CHANGING` may be given with it.
-
     Args:
         name: Module of the task, e.g. tasks.aoa.
         config_type: Dataclass of the options. Its docstring is the description in the help.
-        task: Function of the configuration and, if it can be resumed, of the directory.
+        task: Function of the configuration.
         arguments: Options of the command line.
         program: Name of the command in the help. Defaults to `python -m NAME`.
 
     Raises:
         InputError: Wrong options, or the error of the task.
     """
-    general, others = general_options(arguments)
-    program, folder = program or f"python -m {name}", None
-    if general.resume is None:
-        saved = file_options(Path(general.config)) if general.config else None
-        config = parse(config_type, others, program, saved, general.config)
-    elif not config_type.resumable:
-        raise InputError(f"a run of {name} cannot be resumed; start it again")
-    else:
-        folder = Path(general.resume)
-        saved = saved_config(folder, name.removeprefix("tasks."))
-        saved = {key: value for key, value in saved.items() if key not in CHANGING}
-        config = parse(config_type, others, program, saved, folder)
-        changed = [key for key, value in saved.items() if strict(getattr(config, key)) != value]
-        if changed or general.config:
-            flag = changed[0].replace("_", "-") if changed else "config"
-            allowed = ", ".join(f"--{key}" for key in CHANGING)
-            raise InputError(f"--{flag} cannot change the run that --resume continues; only {allowed} can")
+    file = file_of_options(arguments)
+    saved = None if file is None else file_options(Path(file))
+    config = parse(config_type, arguments, program or f"python -m {name}", saved, file)
     config.check()
-    with terminal.of(config, general.verbose):
-        task(*((config, folder) if config_type.resumable else (config,)))
+    with terminal.of(getattr(config, "output", Answered()), config.verbose):
+        task(config)

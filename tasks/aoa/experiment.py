@@ -23,6 +23,7 @@ from tasks.aoa.options import AoaConfig
 from tasks.aoa.page import page
 from tasks.aoa.page.summary import answer
 from tasks.metrics import AoaMetrics
+from tasks.options import TableSource
 from tasks.page.page import reporting
 from tasks.page.records import Records
 from tasks.run import Row, Run, choose_device
@@ -108,7 +109,7 @@ def measurements(config: AoaConfig) -> Spectra:
     """
     if config.data is None:
         return simulated_room(seed=config.seed, moving=config.moving or "transmitter")
-    return load_spectra(located(config.data), **reading(config).given)
+    return load_spectra(located(config.data), **reading(config.spectra, TableSource()).given)
 
 
 def _show(experiment: Experiment, step: Step[Experiment], value: Row) -> None:

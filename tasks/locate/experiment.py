@@ -30,7 +30,7 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
     data = measurements(config)
     for note in data.notes:
         console.print(f"{data.name}: {note}")
-    measured = LocateSplit.of(data, config.split, config.cells, config.seed, config.reference)
+    measured = LocateSplit.of(data, config.split, config.cells, config.seed, config.table.reference)
     if measured.n_undetected:
         console.print(f"{data.name}: test rows that no receiver detected are left out: {measured.n_undetected}")
     if measured.train.offsets is not None:
@@ -58,7 +58,7 @@ def measurements(config: LocateConfig) -> Rssi:
     Raises:
         InputError: The data cannot be read, or have no such receiver.
     """
-    measured = measured_rssi(config.data, config)
+    measured = measured_rssi(config.data, config.table)
     return (rssi_room(seed=config.seed) if measured is None else measured).receivers(config.rx)
 
 

@@ -70,7 +70,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
                 seed=config.seed,
                 also=config.also,
                 preset=config.preset,
-                reference=config.reference,
+                reference=config.table.reference,
                 device=device,
                 parallel=cluster.map if cluster else None,
                 keep=keep,
@@ -87,7 +87,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
 
 
 def _load(config: RssiTaskConfig) -> Rssi:
-    measured = measured_rssi(config.data, config)
+    measured = measured_rssi(config.data, config.table)
     return rssi_room(seed=config.seed) if measured is None else measured
 
 
@@ -105,7 +105,7 @@ def _metrics(config: RssiTaskConfig, data: Rssi, result: RssiComparison, model: 
     seconds: dict[str, PredictorSeconds] = {
         name: {"fit": value["fit"], "predict": value["predict"]} for name, value in result.values.items()
     }
-    notes = [*split_notes(train, result.test, config.split), *offset_notes(data, config), *data.notes]
+    notes = [*split_notes(train, result.test, config.split), *offset_notes(data, config.table), *data.notes]
     if train.offsets is not None:
         notes.append(train.offsets.note())
         console.print(f"{data.name}: {notes[-1]}")

@@ -1,0 +1,8 @@
+"""Run `python -m tasks.resume runs/aoa/first.partial`."""
+
+import sys
+
+from tasks.command import run_command
+
+if __name__ == "__main__":
+    sys.exit(run_command("resume", sys.argv[1:]))
