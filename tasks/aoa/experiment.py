@@ -22,11 +22,13 @@ from swiftwrf.runtime.steps import Step
 from tasks.aoa.options import AoaConfig
 from tasks.aoa.page import page
 from tasks.aoa.page.summary import answer
+from tasks.directory import Run
+from tasks.environment import choose_device
 from tasks.metrics import AoaMetrics
 from tasks.options import TableSource
 from tasks.page.page import reporting
 from tasks.page.records import Records
-from tasks.run import Row, Run, choose_device
+from tasks.records import Row
 from tasks.source import located, reading
 from tasks.steps import run_steps
 from tasks.terminal import console, terminal

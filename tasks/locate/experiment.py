@@ -6,6 +6,8 @@ from pathlib import Path
 
 from swiftwrf import Rssi, rssi_room
 from swiftwrf.locate.comparison import LocateComparison, LocateSplit, Trial
+from tasks.directory import Run
+from tasks.environment import choose_device
 from tasks.locate.options import LocateConfig
 from tasks.locate.page import page
 from tasks.locate.page.summary import answer
@@ -13,7 +15,6 @@ from tasks.locate.steps import Localization
 from tasks.metrics import LocateMetrics, StudyMetrics
 from tasks.page.page import reporting
 from tasks.page.records import Records
-from tasks.run import Run, choose_device
 from tasks.source import measured_rssi, split_notes
 from tasks.steps import run_steps
 from tasks.terminal import console, terminal

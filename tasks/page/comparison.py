@@ -9,9 +9,8 @@ import numpy as np
 
 from swiftwrf.metrics import ErrorSummary
 from tasks.page import figures
-from tasks.page.page import Plot, Table
-from tasks.page.palette import MAX_CURVES, Palette
-from tasks.page.provenance import number
+from tasks.page.figures import MAX_CURVES, Palette
+from tasks.page.page import Plot, Table, number
 
 NONE = (np.nan, np.nan, np.nan)
 

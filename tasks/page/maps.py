@@ -5,14 +5,17 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike, NDArray
+from PIL import Image
 from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
 from swiftwrf.plotting import corners_of
 
 MIN_REACH = 1.5  # of the largest distance between neighbours, for positions on a line
 HATCH = "#555b66"
+TRANSPARENT = 255  # palette index of pixels without a value
 Corners = tuple[float, float, float, float]  # x0, x1, y0, y1 [m]
 
 
@@ -88,3 +91,22 @@ def draw(
     axes.set(xlabel="x [m]", ylabel="y [m]")
     axes.grid(visible=False)
     return drawn
+
+
+def colour_image(values: NDArray[np.floating], colours: str, low: float = 0.0, high: float = 1.0) -> Image.Image:
+    """Return an image of values (rows, columns), the first row on top; nan is transparent.
+
+    Args:
+        values: Values of the pixels.
+        colours: Name of a matplotlib colour map.
+        low: Value of its first colour.
+        high: Value of its last colour.
+    """
+    scaled = (values - low) * (TRANSPARENT - 1) / (high - low or 1.0)
+    image = Image.fromarray(
+        np.where(np.isnan(values), TRANSPARENT, np.clip(scaled, 0, TRANSPARENT - 1)).astype(np.uint8)
+    )
+    rgb = colormaps[colours](np.linspace(0, 1, TRANSPARENT), bytes=True)[:, :3]
+    image.putpalette(rgb.tobytes() + b"\0\0\0")
+    image.info["transparency"] = TRANSPARENT
+    return image

@@ -8,8 +8,8 @@ from pathlib import Path
 from swiftwrf.errors import InputError
 from tasks.claim import CONFIG, ENVIRONMENT, PARTIAL
 from tasks.command import COMMANDS, run_task
+from tasks.command_line import parse
 from tasks.directory import digest
-from tasks.parsing import parse
 from tasks.records import Row, read_json
 from tasks.resume.options import ResumeConfig
 

@@ -15,14 +15,16 @@ from swiftwrf.rssi import LEVEL, PairModel, RssiComparison, RssiModel, RssiPredi
 from swiftwrf.rssi.comparison import compared, model_of
 from swiftwrf.rssi.maps import RssiMap
 from tasks.claim import MODEL
+from tasks.directory import Run
+from tasks.environment import choose_device
 from tasks.metrics import PredictorSeconds, RssiMetrics
 from tasks.page.floor_plan import read_pixels
 from tasks.page.page import reporting
 from tasks.page.records import Records
+from tasks.records import Row
 from tasks.rssi.options import RssiTaskConfig
 from tasks.rssi.page import page
 from tasks.rssi.page.summary import answer
-from tasks.run import Row, Run, choose_device
 from tasks.source import measured_rssi, offset_notes, split_notes
 from tasks.terminal import console, terminal
 from tasks.workers import connected

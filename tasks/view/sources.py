@@ -23,9 +23,9 @@ from swiftwrf.runtime.checkpoint import Saved, refusing
 from tasks.aoa.experiment import measurements as spectra_of
 from tasks.aoa.options import AoaConfig
 from tasks.claim import CONFIG, ENVIRONMENT, LOCATOR, MODEL
+from tasks.command_line import parse
 from tasks.locate.experiment import measurements as rssi_of
 from tasks.locate.options import LocateConfig
-from tasks.parsing import parse
 from tasks.records import Row, read_json
 from tasks.view.followed import FollowedView, open_followed
 from tasks.view.locating import RssiLocating

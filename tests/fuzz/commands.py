@@ -24,9 +24,8 @@ from swiftwrf import InputError, load_rssi
 from swiftwrf.data.writing import write_rssi
 from swiftwrf.errors import MAX_LENGTH
 from swiftwrf.runtime.validation import check_value
-from tasks.command_line import execute
+from tasks.command_line import _defaults, execute
 from tasks.options import by_name
-from tasks.parsing import _defaults
 
 VALUES = [
     "", "0", "1", "-1", "0.5", "1.5", "nan", "inf", "-inf", "1e400", "1e-320", "4294967296", "99999999999999999999",

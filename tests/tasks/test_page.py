@@ -19,10 +19,10 @@ from tasks.aoa.page.records import CHOSEN, LOWER_REFERENCE, UPPER_REFERENCE
 from tasks.inspect.page import page as inspection
 from tasks.locate.page.drawing import posteriors
 from tasks.page import figures
+from tasks.page.figures import Palette
+from tasks.page.maps import colour_image
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table, write_page
-from tasks.page.palette import Palette
 from tasks.page.polar import SCALES, spectra
-from tasks.page.raster import colour_image
 from tasks.records import read_table
 
 

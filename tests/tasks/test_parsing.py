@@ -15,11 +15,10 @@ import pytest
 from swiftwrf import InputError
 from tasks.aoa.options import AoaConfig
 from tasks.command import COMMANDS, main
-from tasks.command_line import command_line, execute
+from tasks.command_line import _defaults, command_line, execute, file_options, parse
 from tasks.directory import digest
 from tasks.inspect.options import InspectConfig
 from tasks.options import OffsetSource, Output, by_name, plain
-from tasks.parsing import _defaults, file_options, parse
 from tasks.report.options import ReportConfig
 from tasks.rssi.options import RssiTaskConfig
 

@@ -12,10 +12,9 @@ from pandas import DataFrame, concat
 from swiftwrf.models import FIELD_MODELS
 from tasks.aoa.page.records import FractionRecords
 from tasks.page import figures
-from tasks.page.page import Plot, Section, Table
-from tasks.page.palette import MAX_CURVES
+from tasks.page.figures import MAX_CURVES
+from tasks.page.page import Plot, Section, Table, number
 from tasks.page.polar import MAX_DIFFERENCE, Direction, spectra
-from tasks.page.provenance import number
 
 
 @dataclass(frozen=True)

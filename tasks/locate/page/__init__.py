@@ -15,8 +15,7 @@ from tasks.locate.page import drawing
 from tasks.locate.page.summary import LEVEL, NEIGHBOURS, OWN, LocateRecords, by_method, conclusion, summary
 from tasks.locate.steps import SUGGESTED
 from tasks.page.comparison import Compared, comparison, with_interval
-from tasks.page.page import Page, Plot, Section, Summary, Table, sections_of
-from tasks.page.provenance import number, provenance
+from tasks.page.page import Page, Plot, Section, Summary, Table, number, provenance, sections_of
 from tasks.page.suggestion import suggestion_plot, worth
 
 

@@ -7,8 +7,7 @@ from tasks.environment import command
 from tasks.labels import PREDICTORS as LABELS
 from tasks.labels import labels
 from tasks.page.comparison import Compared, comparison
-from tasks.page.page import Number, Page, Section, Summary, sections_of
-from tasks.page.provenance import provenance
+from tasks.page.page import Number, Page, Section, Summary, provenance, sections_of
 from tasks.page.records import notes
 from tasks.rssi.page import errors
 from tasks.rssi.page.maps import CERTAINTY, COVERED_DBM, Maps

@@ -38,7 +38,7 @@ from tasks.aoa import experiment
 from tasks.aoa.options import AoaConfig
 from tasks.aoa.page.records import palette
 from tasks.command_line import command_line
-from tasks.page.palette import Palette
+from tasks.page.figures import Palette
 from tasks.report.run import merge
 from tasks.resume.options import ResumeConfig
 from tasks.resume.run import run as resume
