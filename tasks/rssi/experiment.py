@@ -18,7 +18,7 @@ from tasks.claim import MODEL
 from tasks.directory import Run
 from tasks.environment import choose_device
 from tasks.metrics import PredictorSeconds, RssiMetrics
-from tasks.page.floor_plan import read_pixels
+from tasks.page.maps import read_pixels
 from tasks.page.page import reporting
 from tasks.page.records import Records
 from tasks.records import Row

@@ -28,7 +28,7 @@ class FollowedPage:
 
     def __init__(self, view: FollowedView) -> None:
         self._view, self._shown, self._busy = view, Version(), False
-        header(view.title, view.notes)
+        header(view.title, [])
         self._sentences = ui.label().classes("numbers").props('id="sentence"').style("white-space: pre-line")
         self._figures = {}
         with ui.row().classes("w-full items-start gap-8"):

@@ -17,7 +17,7 @@ from tasks.aoa.page.summary import conclusion, next_steps, summary
 from tasks.aoa.page.synthesis import similarity, synthesis_section
 from tasks.environment import command
 from tasks.page.page import Page, Plot, Section, Summary, provenance, sections_of
-from tasks.page.suggestion import suggestion_plot, worth
+from tasks.page.shared import suggestion_plot, worth
 
 
 def page(runs: list[AoaRecords]) -> Page:

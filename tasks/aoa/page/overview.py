@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from augment.cross_validation import LOCATOR
 from tasks.aoa.page.records import FractionRecords, palette
 from tasks.aoa.page.room import FIXED, draw_in_plan, extent
-from tasks.aoa.page.synthesis import examples
+from tasks.aoa.page.synthesis import examples, spectra
 from tasks.page import figures
-from tasks.page.comparison import Compared, comparison, interval
 from tasks.page.page import Plot, Table
-from tasks.page.polar import spectra
+from tasks.page.shared import Compared, comparison, interval
 
 BASELINES = ("peak", "constant")  # in every table and figure of errors: others must beat them
 SHOWN_SPECTRUM = 3  # of the examples, quantile 0.4 of the quality

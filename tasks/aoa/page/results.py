@@ -8,10 +8,10 @@ from swiftwrf.metrics import ChangeMetrics
 from tasks.aoa.page.overview import BASELINES
 from tasks.aoa.page.records import FractionRecords
 from tasks.page import figures
-from tasks.page.comparison import with_interval
 from tasks.page.figures import MAX_CURVES
 from tasks.page.page import Plot, Section, Table, number
 from tasks.page.records import notes
+from tasks.page.shared import with_interval
 
 ERRORS: dict[Angle, str] = {
     "azimuth_deg": "azimuth",

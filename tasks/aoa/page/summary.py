@@ -11,7 +11,7 @@ from tasks.aoa.page.results import change_text, choice_sentence, gain_sentence, 
 from tasks.aoa.page.room import cross_validation_sentences
 from tasks.environment import command
 from tasks.page.page import Number, Summary
-from tasks.page.suggestion import worth
+from tasks.page.shared import worth
 from tasks.summarise import fingerprinting
 from tasks.terminal import Answer
 

@@ -31,8 +31,7 @@ from tasks.command_line import command_line
 from tasks.convert.outputs import saved_model
 from tasks.locate.options import LocateConfig
 from tasks.options import plain
-from tasks.page.floor_plan import FloorPlan
-from tasks.page.maps import colour_image
+from tasks.page.maps import FloorPlan, colour_image
 from tasks.update.record import Record
 from tasks.view import charts, spectra
 from tasks.view.locating import N_POSITIONS, RssiLocating
