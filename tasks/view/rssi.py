@@ -180,8 +180,8 @@ class RssiView:
         if (found := self._located(selection)) is not None:
             if selection.kind == "posterior":
                 return ColouredMap(found.values, "magma", 0.0, 1.0, "of the maximum", corners=found.corners)
-            high = float(np.nanpercentile(found.values, 98))
-            return ColouredMap(found.values, "viridis", 0.0, high, "m", "max", found.corners)
+            most = float(np.nanpercentile(found.values, 98))
+            return ColouredMap(found.values, "viridis", 0.0, most, "m", "max", found.corners)
         chart, receiver = self.map(selection.height), selection.receiver
         mean = chart.mean
         match selection.kind:

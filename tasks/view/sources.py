@@ -75,22 +75,24 @@ def _saved_model(file: Path) -> SpectraView | RssiView:
         return RssiView(file.name, model, rows_of_model(model))
     if isinstance(model, RssiLocator):
         return _located(file.name, RssiLocating.of_training(model))
-    field_model = _expected(FieldModel, model, file)
-    return SpectraView(file.name, [LoadedModel(model.kind, field_model, _planes(field_model))])
+    if not isinstance(model, FieldModel):
+        raise _not_shown(model, file)
+    return SpectraView(file.name, [LoadedModel(model.kind, model, _planes(model))])
 
 
-def _expected(kind: type[Kind], model: Saved, file: Path) -> Kind:
-    if isinstance(model, kind):
-        return model
+def _not_shown(model: Saved, file: Path) -> InputError:
     instead = "the report of its run shows its maps" if isinstance(model, RssiPredictor) else EXPECTED
-    raise InputError(f"{file} holds {with_article(model.kind)}, which cannot be shown; {instead}")
+    return InputError(f"{file} holds {with_article(model.kind)}, which cannot be shown; {instead}")
 
 
 def _kept(kind: type[Kind], file: Path) -> Kind:
     """Return the model that a run keeps."""
     if not file.is_file():
         raise InputError(f"{file.parent} holds no model: it has no {file.name}; the run did not end")
-    return _expected(kind, load(file), file)
+    model = load(file)
+    if not isinstance(model, kind):
+        raise _not_shown(model, file)
+    return model
 
 
 def _planes(model: FieldModel) -> list[dict[str, Any]]:
@@ -129,7 +131,9 @@ def _aoa_run(folder: Path, content: Row) -> SpectraView:
             files = {name: file for name in names if (file := model_file(folder, name, key)).is_file()}
             locator_file = files.pop(MATCHED_FIELD, None)
             for name, file in files.items():
-                model = _expected(FieldModel, load(file), file)
+                model = load(file)
+                if not isinstance(model, FieldModel):
+                    raise _not_shown(model, file)
                 planes = _planes(model) or _planes_of_run(folder / f"geometry-mix{key}.json")
                 title = f"{name}, {100 * fraction:g}% measured"
                 models.append(LoadedModel(title, model, planes, in_training, locator_file))
