@@ -26,6 +26,7 @@ from swiftwrf.models.base import FieldConfig, check_checkpoint
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Displayed
 from swiftwrf.positions import check_positions, to_tensor
+from swiftwrf.rssi.detection import NotDetected
 from swiftwrf.rssi.path_loss import FloorAttenuation, estimate_floor_attenuation, receiver_floors
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.session import Record
@@ -67,6 +68,9 @@ class RssiConfig(FieldConfig):
     for Gaussian noise), since packets have outliers"""
     max_locations: Annotated[int, Ge(10)] = 1500
     """location bins that the rows are averaged in; the time of a fit grows with the cube of their number"""
+    not_detected: NotDetected = "auto"
+    """what an empty cell says: "weak", the power was below the limit of detection; "unknown", nothing; "auto" decides for
+    each receiver by whether its empty cells are where its path loss expects no value"""
 
 
 class RssiPredictor(Configured, Displayed, ABC):
@@ -167,12 +171,16 @@ class RssiPredictor(Configured, Displayed, ABC):
             raise InputError(lacking)
         self.receiver_names, self.receiver_position = tuple(map(str, train.receiver_names)), train.receiver_position
         self.origin, self.offsets, self.attenuation = train.origin, train.offsets, None
+        shift = torch.zeros_like(pool.rssi_dbm)
+        if train.offsets is not None:
+            shift = shift + train.offsets.of(pool)[:, None]
         if train.floors is not None:
             self.attenuation = estimate_floor_attenuation(train, pool)
-            pool = replace(self.attenuation, receiver_floor=tuple(receiver_floors(pool).tolist())).removed(pool)
-            train = self.attenuation.removed(train)
+            of_pool = replace(self.attenuation, receiver_floor=tuple(receiver_floors(pool).tolist()))
+            shift = shift + of_pool.of(pool.transmitter_position)
+            train, pool = self.attenuation.removed(train), of_pool.removed(pool)
         others = {"parallel": parallel, "checkpoint": checkpoint, "on_record": on_record, "progress": progress}
-        self._fit(train, pool=pool, device=to_device(device), **others)
+        self._fit(train, pool=pool, shift=shift, device=to_device(device), **others)
         return self
 
     @checked
@@ -238,7 +246,8 @@ class RssiPredictor(Configured, Displayed, ABC):
         Args:
             train: Training rows.
             pool: The same rows at all receivers.
-            arguments: The other arguments of `fit`. A predictor declares those that it uses, and ignores the rest by `**_`.
+            arguments: The other arguments of `fit`, and `shift`, the received power less the RSSI of the pool [dB], by
+                floors and offsets that were removed. A predictor declares those that it uses, and ignores the rest by `**_`.
         """
 
     @abstractmethod
@@ -341,8 +350,9 @@ def check_training(train: Rssi, pool: Rssi) -> None:
     if detected < MIN_TRAINING:
         names = ", ".join(train.receiver_names)
         raise InputError(f"{names}: detected in {detected} training rows in all; at least {MIN_TRAINING} are needed")
-    if not torch.equal(pool.transmitter_position, train.transmitter_position):
-        raise InputError("the pool must hold the same rows as the training part, at more receivers")
+    more = set(train.receiver_names) <= set(pool.receiver_names)
+    if not more or not torch.equal(pool.transmitter_position, train.transmitter_position):
+        raise InputError("the pool must hold the same rows as the training part, at the same receivers and more")
 
 
 def fingerprint(config: Any, train: Rssi, pool: Rssi) -> str:
