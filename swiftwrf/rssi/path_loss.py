@@ -440,7 +440,7 @@ class FloorAttenuation:
 def estimate_floor_attenuation(train: Rssi, pool: Rssi | None = None) -> FloorAttenuation:
     """Estimate the attenuation of a floor jointly with the path-loss models of the receivers; see `fit_path_losses`.
 
-    The floor of a receiver of unknown position is the one with its strongest mean RSSI.
+    A receiver of unknown position counts as on the floor of its strongest mean RSSI, amid its three strongest rows.
 
     Args:
         train: Training rows with floors.
@@ -457,7 +457,10 @@ def estimate_floor_attenuation(train: Rssi, pool: Rssi | None = None) -> FloorAt
     assert train.floors is not None
     where = receiver_floors(pool)
     crossed = (train.floors.number(train.transmitter_position)[:, None] - where).abs().double()
-    found = fit_path_losses(pool.transmitter_position, pool.receiver_position, pool.rssi_dbm, crossed=crossed)
+    strongest = pool.rssi_dbm.nan_to_num(-torch.inf).topk(min(3, len(pool)), dim=0).indices
+    nearby = pool.transmitter_position[strongest].mean(dim=0)
+    receiver = pool.receiver_position.where(pool.receiver_located[:, None], nearby)
+    found = fit_path_losses(pool.transmitter_position, receiver, pool.rssi_dbm, crossed=crossed)
     measured = pool.detected.sum(dim=0).double()
     db = float(found.floor_db @ measured / measured.sum())
     number = dict(zip(pool.receiver_names, where.tolist(), strict=True))
