@@ -6,6 +6,7 @@ from typing import Annotated
 
 import tyro
 
+from swiftwrf.runtime.validation import PositiveInt
 from tasks.options import Options, Output, options
 
 
@@ -20,6 +21,6 @@ class ResumeConfig(Options):
     """directory of the run, DIR.partial"""
     scheduler: str | None = None
     """address of a Dask scheduler whose workers compute the steps (extra: cluster)"""
-    processes: int | None = None
+    processes: PositiveInt | None = None
     """processes of this machine that compute the steps of aoa (default: one a thread, at most 4; one on a GPU)"""
     output: Output = Output()
