@@ -84,7 +84,11 @@ class AoaConfig(Options):
             if name != AUTO:
                 FIELD_MODELS.check(name)
         if self.scene is not None:
-            self._check_scene(self.scene)
+            if RAYTRACE not in self.synthesizer:
+                raise InputError(
+                    f"--scene is for synthesizer {RAYTRACE}; add it to --synthesizer, or leave --scene out"
+                )
+            check_scene(self.scene, "--scene ")
         if self.moving is not None and self.data is not None:
             raise InputError("--moving is for the built-in room; with --data the data determine which end moves")
         if not self.mix or not all(0 < fraction <= 1 for fraction in self.mix):
@@ -97,11 +101,6 @@ class AoaConfig(Options):
             raise InputError("--processes and --scheduler exclude each other; leave out one")
         if self.seed + self.repeats > SEEDS:
             raise InputError(f"--seed {self.seed} leaves no seeds for {self.repeats} repeats; choose a smaller one")
-
-    def _check_scene(self, scene: str) -> None:
-        if RAYTRACE not in self.synthesizer:
-            raise InputError(f"--scene is for synthesizer {RAYTRACE}; add it to --synthesizer, or leave --scene out")
-        check_scene(scene, "--scene ")
 
 
 def _listed(fractions: tuple[float, ...]) -> str:
