@@ -39,7 +39,7 @@ def options(cls: Class) -> Class:
 
 
 def _default(value: str) -> str:
-    """Return what the help says of a default; one that is None, False or empty needs no word."""
+    """Return the text of a default in the help, which is empty for None, False and no values."""
     return "" if value in ("None", "False", "") else f"(default: {value})"
 
 
@@ -107,7 +107,7 @@ class Options:
 
 @options
 class Answered:
-    """What the command prints."""
+    """Output of a command."""
 
     quiet: bool = False
     """print the answer only, no progress and no notes"""
@@ -117,7 +117,7 @@ class Answered:
 
 @options
 class Output(Answered):
-    """What the command prints and shows."""
+    """Output and report of a command."""
 
     open: bool = False
     """open the report in the browser at the end"""
@@ -150,7 +150,7 @@ def choice(meaning: str, registry: Registry[Any] | None, known: Mapping[str, lab
 
 @options
 class SpectraSource:
-    """How spectra are read or computed."""
+    """Options of reading or computing spectra."""
 
     array: tuple[int, float, float] | tuple[int, int, float, float] | None = None
     """array of the spectra if the data do not describe it, or for which spectra of ray paths are computed: elements a side,
@@ -195,7 +195,7 @@ class SpectraSource:
 
 @options
 class TableSource:
-    """How RSSI is read."""
+    """Options of reading RSSI."""
 
     columns: tuple[str, ...] = ()
     """names of columns of a survey table that are not recognised: x=NAME y=NAME receiver=NAME rssi=NAME
@@ -239,7 +239,7 @@ class TableSource:
 
 @options
 class OffsetSource(TableSource):
-    """How RSSI of several devices or channels is read."""
+    """Options of reading RSSI of several devices or channels."""
 
     offset_by: str | None = None
     """column of a survey table with groups of rows, e.g. devices, whose constant offsets are estimated; COLUMN=VALUE makes
