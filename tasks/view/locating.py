@@ -14,7 +14,6 @@ from swiftwrf import Rssi
 from swiftwrf.locate import Posterior, RssiLocator
 from swiftwrf.locate.baselines import BATCH_ROWS
 from swiftwrf.locate.posterior import PlanMap
-from swiftwrf.locate.rssi import UNDETECTED_BELOW_DB
 from swiftwrf.positions import nearest
 
 LEVELS = (0.5, 0.8)  # probabilities of the credible regions that are shown
@@ -88,11 +87,9 @@ class RssiLocating:
     @classmethod
     def of_training(cls, locator: RssiLocator) -> RssiLocating:
         """Return a locator with its training rows, if the measurements are not known."""
-        known = locator.likelihoods.fingerprints
-        rssi = known.rssi.double()
-        rssi[known.rssi < known.floor + UNDETECTED_BELOW_DB / 2] = torch.nan
+        known = locator.likelihoods.fingerprints.fingerprints
         rows = Rssi(
-            rssi,
+            known.rssi.double(),
             known.position,
             receiver_position=locator.model.receiver,
             receiver_names=locator.receiver_names,

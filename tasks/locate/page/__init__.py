@@ -95,9 +95,12 @@ def _table(run: LocateRecords) -> Table:
                 number(error["mean"]),
                 number(horizontal["median"]),
                 seconds,
+                *([f"{entry['floor_hit_rate']:.1%}"] if "floor_hit_rate" in entry else []),
             ]
         )
     columns = ["localizer", "median [m]", "90 % [m]", "mean [m]", "median in plan [m]", "fit + locate [s]"]
+    if rows and len(rows[0]) > len(columns):
+        columns.append("floors right")
     return Table(columns, rows, "Position error of the test rows; median with its 95 % interval.", frozenset([OWN]))
 
 
