@@ -8,7 +8,7 @@ from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.errors import InputError
 from swiftwrf.rssi.detection import NotDetected
 from swiftwrf.runtime.validation import Preset
-from tasks.options import OffsetSource, Options, Output, options
+from tasks.options import OffsetSource, Options, Output, Seed, options
 
 
 @options
@@ -41,7 +41,7 @@ class RssiTaskConfig(Options):
     """x0 x1 y0 y1 of that image [m]"""
     scheduler: str | None = None
     """address of a Dask scheduler whose workers fit groups of receivers (extra: cluster)"""
-    seed: int = 0
+    seed: Seed = 0
     """seed of everything random"""
     out: str | None = None
     """directory of the run; must not exist (default: a new one under runs/rssi)"""

@@ -133,7 +133,7 @@ def room_section(fraction: FractionRecords) -> Section | None:
         f"{1 - room['score_held_out']:.3f} with measured ones that the first stage of the search did not use. "
         f"`geometry-mix{fraction.key}.json` contains the planes."
     )
-    points = fraction.run.arrays(f"room-mix{fraction.key}")
+    points = fraction.arrays("room")
     plot = Plot(
         f"room-{fraction.file_name}",
         _room_panels(room["planes"], points),
