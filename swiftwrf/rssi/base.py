@@ -26,7 +26,7 @@ from swiftwrf.models.base import FieldConfig, check_checkpoint
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Displayed
 from swiftwrf.positions import check_positions, to_tensor
-from swiftwrf.rssi.detection import NotDetected
+from swiftwrf.rssi.detection import Detection, NotDetected
 from swiftwrf.rssi.path_loss import FloorAttenuation, estimate_floor_attenuation, receiver_floors
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.session import Record
@@ -116,6 +116,8 @@ class RssiPredictor(Configured, Displayed, ABC):
     """positions of the receivers, float64 (R, 3) [m], nan where unknown, set by `fit`"""
     origin: GeodeticOrigin | None
     """latitude and longitude of x = y = 0, if the positions were projected from degrees, set by `fit`"""
+    detection: Detection | None
+    """curve of detection of the training rows; None if every cell has a value; set by `fit`"""
     offsets: Offsets | None
     """offsets that were removed from the training rows, set by `fit`; predictions are of their reference"""
     attenuation: FloorAttenuation | None = None
@@ -180,6 +182,12 @@ class RssiPredictor(Configured, Displayed, ABC):
             shift = shift + of_pool.of(pool.transmitter_position)
             train, pool = self.attenuation.removed(train), of_pool.removed(pool)
         others = {"parallel": parallel, "checkpoint": checkpoint, "on_record": on_record, "progress": progress}
+        received = (
+            train.rssi_dbm
+            if self.attenuation is None
+            else train.rssi_dbm + self.attenuation.of(train.transmitter_position)
+        )
+        self.detection = Detection.estimate(train.transmitter_position, received)
         self._fit(train, pool=pool, shift=shift, device=to_device(device), **others)
         return self
 
@@ -289,6 +297,25 @@ class RssiPredictor(Configured, Displayed, ABC):
         self.check_measurements(data)
         return self.predict(data.transmitter_position)
 
+    @checked
+    def predict_detection(self, position: Numbers) -> Tensor:
+        """Return the probability that each receiver detects a packet, float64 (n, R), at positions (n, 3) [m].
+
+        A predictor without a probability has 1 where its mean is above the limit of detection, else 0. All is 1 if every
+        cell of the training rows has a value.
+
+        Raises:
+            InputError: As `predict`.
+
+        Example:
+            >>> import swiftwrf
+            >>> swiftwrf.RssiModel().fit(swiftwrf.rssi_room(n=60)).predict_detection([[1.0, 2.0, 1.2]]).shape
+            torch.Size([1, 12])
+        """
+        with torch.no_grad():
+            mean = self.predict(position).mean.double()
+        return torch.ones_like(mean) if self.detection is None else (mean > self.detection.limit).double()
+
     def _facts(self) -> dict[str, str]:
         return {"model": self.name, "receivers": listed(getattr(self, "receiver_names", ())) or "not fitted"}
 
@@ -335,7 +362,7 @@ class SavedRssiPredictor(RssiPredictor, Saved):
         predictor.origin = GeodeticOrigin(*map(float, header["origin"])) if header.get("origin") else None
         predictor.attenuation = FloorAttenuation.from_plain(header.get("attenuation"))
         predictor.offsets = Offsets(**header["offsets"]) if header.get("offsets") else None
-        predictor.kernel = Kernel(**header["kernel"])
+        predictor.kernel, predictor.detection = Kernel(**header["kernel"]), None
         return predictor
 
 

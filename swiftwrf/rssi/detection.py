@@ -25,7 +25,7 @@ NotDetected = Literal["auto", "weak", "unknown"]
 NEIGHBOURS, FEWEST = 6, 3  # rows beside a cell, and values among them, that tell its level
 MISSED = 1e-3  # share of random misses at least: no value is impossible
 MISSES_WORTH = 30.0  # strong cells of a receiver that count as much as the share of misses of all receivers
-MAX_CELLS = 1000  # that determine the curve
+MAX_ROWS, MAX_CELLS = 1500, 1000  # that determine the curve
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,14 +70,16 @@ class Detection:
             >>> -61 < Detection.estimate(room.transmitter_position, weak).limit < -58
             True
         """
-        seen = ~rssi.isnan()
-        if bool(seen.all()) or len(position) < 2:
+        if bool(rssi.isfinite().all()) or len(position) < 2:
             return None
+        is_limit = rssi.isnan().any(dim=0)
+        position, rssi = subsample(position, rssi, rows=MAX_ROWS)
+        seen = ~rssi.isnan()
         number = Neighbours(position)(position, min(NEIGHBOURS + 1, len(position)))[1]
         near = rssi[number].masked_fill((number == torch.arange(len(rssi))[:, None])[..., None], torch.nan)  # (n, 7, R)
         level, usable = near.nanmean(dim=1), (~near.isnan()).sum(dim=1) >= FEWEST
         lowest = float(rssi[seen].min())
-        missed, is_limit = torch.full((rssi.shape[1],), MISSED, dtype=torch.float64), (~seen).any(dim=0)
+        missed = torch.full((rssi.shape[1],), MISSED, dtype=torch.float64)
         if int((usable & ~seen).sum()) < 5 or int((usable & seen).sum()) < 5:
             return cls(lowest, 0.5, missed, is_limit)
         value, kept_level, lost_level = rssi[usable & seen], level[usable & seen], level[usable & ~seen]

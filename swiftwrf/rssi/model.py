@@ -91,10 +91,8 @@ class RssiModel(SavedRssiPredictor):
     """log10 of the distance at which levels are compared, float64 (R,)"""
     covariance: Tensor
     """calibrated covariance of level at that distance and slope, float64 (R, 2, 2)"""
-    detection: Detection | None
-    """curve of detection; None if no cell is empty, or if empty cells tell nothing"""
     detection_field: DetectionField | None
-    """probability of a detection; None likewise"""
+    """probability of a detection; None if every cell has a value, or if empty cells tell nothing"""
     directivity: Tensor
     """coefficients of the harmonics, (R, 8) [dB]"""
     anchor: Tensor
@@ -316,7 +314,7 @@ class RssiModel(SavedRssiPredictor):
             InputError: As `check_measurements`.
         """
         prediction = super().predict_detected(data)
-        if self.detection is None:
+        if self.detection is None or self.detection_field is None:
             return prediction
         assert prediction.std is not None
         mean, std = self.detection.given_detection(prediction.mean.double(), prediction.std.double())
@@ -324,23 +322,11 @@ class RssiModel(SavedRssiPredictor):
 
     @checked
     def predict_detection(self, position: Numbers) -> Tensor:
-        """Return the probability that each receiver detects a packet, float64 (n, R), at positions (n, 3) [m].
-
-        It is 1 if every cell of the training rows has a value, or if empty cells tell nothing.
-
-        Raises:
-            InputError: As `predict`.
-
-        Example:
-            >>> import swiftwrf
-            >>> model = RssiModel().fit(swiftwrf.rssi_room(n=60))
-            >>> model.predict_detection([[1.0, 2.0, 1.2]]).shape
-            torch.Size([1, 12])
-        """
-        level = self.predict(position).mean.detach().double()
         if self.detection_field is None:
-            return torch.ones_like(level)
-        return self.detection_field.probability(level, check_positions(position).detach() - self.centre)
+            return super().predict_detection(position)
+        with torch.no_grad():
+            level = self.predict(position).mean.double()
+        return self.detection_field.probability(level, check_positions(position) - self.centre)
 
     def plot(self, receiver: str | None = None, height_m: float | None = None, ax: Axes | None = None) -> Axes:
         """Draw the map of the predicted RSSI over the measured region, seen from above.

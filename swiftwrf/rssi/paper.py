@@ -114,7 +114,7 @@ class RssiPaperModel(RssiModel):
         self.centre, self.anchor, self.rendered = bins.centre, bins.position.float(), rendered
         self.level = LEVEL_DBM + HeadTable(rendered)(per_receiver[None])[0][0]
         self.slope, self.middle = per_receiver, per_receiver.clone()
-        self.detection, self.detection_field = None, None
+        self.detection_field = None
         self.covariance = torch.zeros(n_receivers, 2, 2, dtype=torch.float64)
         self.directivity = torch.zeros(n_receivers, N_HARMONICS)
         dual = torch.linalg.solve_triangular(root.T, white.T.double() * prior_db[0], upper=True)

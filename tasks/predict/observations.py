@@ -36,7 +36,7 @@ def positions_of_rssi(locator: RssiLocator, config: PredictConfig) -> Columns:
     Raises:
         InputError: RSSI that cannot be read, receivers that moved or that the locator does not have, or nothing detected.
     """
-    source, options = config.source, reading(config)
+    source, options = config.source, reading(config.spectra, config.table)
     offsets = locator.model.offsets
     if offsets is not None and has_column(source, offsets.column):
         options = replace(options, offset_by=offsets.column)
@@ -96,7 +96,7 @@ def directions(estimator: SavedEstimator, config: PredictConfig) -> Columns:
     Raises:
         InputError: Spectra that cannot be read, or on another grid.
     """
-    store, known = observed_spectra(config.source, reading(config), estimator.grid, "estimator")
+    store, known = observed_spectra(config.source, reading(config.spectra, config.table), estimator.grid, "estimator")
     estimate = torch.cat([estimator.predict(part) for part in store.batches()])
     return {"index": torch.arange(len(store)) if known is None else known.index} | _directions(estimate, known)
 
@@ -107,7 +107,7 @@ def positions_of_spectra(locator: MatchedField, config: PredictConfig) -> Column
     Raises:
         InputError: Spectra that cannot be read, on another grid or of another array.
     """
-    store, known = observed_spectra(config.source, reading(config), locator.grid, "locator")
+    store, known = observed_spectra(config.source, reading(config.spectra, config.table), locator.grid, "locator")
     if known is not None and known.array is not None and known.array != locator.room.array:
         raise InputError(f"{config.source} has spectra of another array than those that {config.model} was fitted to")
     found: list[Tensor] = []

@@ -118,10 +118,6 @@ class RssiLocating:
         part = "training" if self.in_training[row] else "test"
         return f"Posterior of {part} row {int(self.rows.index[row])}: {self.located(row).describe()}"
 
-    def map(self, row: int | None) -> PlanMap:
-        """Return the posterior of a row in plan, or the expected error for None."""
-        return self.expected_error if row is None else self.located(row).density
-
     @property
     def summary(self) -> str:
         """Describe the expected error in a few sentences."""

@@ -204,7 +204,7 @@ def test_an_interrupted_run_goes_on_to_the_same_numbers(finished, tmp_path):
     partial = tmp_path / "run.partial"
     kept = {file.stem for file in (partial / "steps").iterdir()}
     assert {"posterior", "knn", "knn_difference"} <= kept
-    assert run("--resume", partial) == 0
+    assert quick.run("resume", partial) == 0
     same, other = (pd.read_csv(folder / "errors.csv") for folder in (finished, out))
     pd.testing.assert_frame_equal(same, other)
     assert strict_json(out / "metrics.json")["calibration"] == strict_json(finished / "metrics.json")["calibration"]
