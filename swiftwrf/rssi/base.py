@@ -182,12 +182,8 @@ class RssiPredictor(Configured, Displayed, ABC):
             shift = shift + of_pool.of(pool.transmitter_position)
             train, pool = self.attenuation.removed(train), of_pool.removed(pool)
         others = {"parallel": parallel, "checkpoint": checkpoint, "on_record": on_record, "progress": progress}
-        received = (
-            train.rssi_dbm
-            if self.attenuation is None
-            else train.rssi_dbm + self.attenuation.of(train.transmitter_position)
-        )
-        self.detection = Detection.estimate(train.transmitter_position, received)
+        curve, names = Detection.estimate(pool.transmitter_position, pool.rssi_dbm + shift), list(pool.receiver_names)
+        self.detection = curve and curve.columns(torch.tensor([names.index(name) for name in self.receiver_names]))
         self._fit(train, pool=pool, shift=shift, device=to_device(device), **others)
         return self
 

@@ -256,7 +256,7 @@ def compare(
 
 
 def _detection(predictor: RssiPredictor, test: Rssi) -> tuple[float, float] | None:
-    """Return the shares of detected and of empty test cells that are predicted as such; None if all cells are of one kind."""
+    """Return the shares of detected and of empty test cells that are predicted as such; None if there is one kind only."""
     detected = test.detected
     if predictor.detection is None or bool(detected.all()) or test.receiver_moves:
         return None

@@ -10,6 +10,7 @@ misclassification: J. Tobin, Econometrica 26, 1958; J. A. Hausman et al., Journa
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, Self
 
@@ -17,6 +18,7 @@ import torch
 from sklearn.linear_model import LogisticRegression
 from torch import Tensor
 
+from swiftwrf.errors import listed
 from swiftwrf.gp import GaussianProcess, Kernel, leave_folds_out, subsample
 from swiftwrf.positions import Neighbours, to_tensor
 from swiftwrf.runtime.checkpoint import Header
@@ -97,6 +99,21 @@ class Detection:
         strong = usable & (level > found[0] + 2 * math.hypot(spread, found[1]))
         lost_count = (strong & ~seen).sum(dim=0).double() + MISSES_WORTH * float(misses.flatten()[at_misses])
         return cls(*found, lost_count / (strong.sum(dim=0) + MISSES_WORTH), is_limit)
+
+    def note(self, receiver_names: Sequence[str]) -> str:
+        """Return a sentence on what empty cells of these R receivers say."""
+        weak = [name for name, limit in zip(receiver_names, self.is_limit.tolist(), strict=True) if limit]
+        others = [name for name in receiver_names if name not in weak]
+        missed = float(self.missed[self.is_limit].mean()) if weak else 0.0
+        said = []
+        if weak:
+            said.append(f"an empty cell says that the signal was below about {self.limit:.0f} dBm")
+            if missed > 0.03:
+                said.append(f"{missed:.0%} of all packets are missed at any power")
+        if others:
+            where = f"at {len(others)} of {len(receiver_names)} receivers ({listed(others[:5])})" if weak else "here"
+            said.append(f"{where} empty cells say nothing")
+        return ", ".join(said)
 
     def columns(self, number: Tensor) -> Self:
         """Return the curve of some receivers."""

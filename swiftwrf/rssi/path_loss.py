@@ -31,6 +31,7 @@ N_HARMONICS = 8  # real spherical harmonics of degree 1 and 2
 MAX_ROUNDS = 40  # of expectation maximisation
 SLOPE_PRIOR = -30.0, 15.0  # of the slope of all receivers: path-loss exponents of 1.5 to 4.5 [dB a decade]
 SPREAD_DB, SPREAD_WORTH = 6.0, 4.0  # prior of the spread over receivers, and the number of receivers that it counts as
+FLOOR_STD_DB = 20.0  # prior standard deviation of the attenuation of a floor about 0
 ROWS_WORTH = 10.0  # rows of a receiver that count as much as the variance of all receivers
 MAX_UNEXPLAINED = 0.4  # share of empty cells where a value was expected, beyond which those of a receiver tell nothing
 MAX_ROWS = 300  # of a receiver, from which offsets are estimated; the cost grows with their cube
@@ -160,6 +161,7 @@ class PathLosses(NamedTuple):
             shared ones, with the uncertainty of the latter, (R, 2).
         variance: Variance of the measurements about the receiver's model, (R,) [dB^2].
         detection: Curve of detection; None if no cell is empty, or if empty cells are ignored.
+        floor_db: Attenuation of a floor for each receiver's kind, (R,) [dB]; 0 without floors.
     """
 
     own: PathLoss
@@ -168,13 +170,14 @@ class PathLosses(NamedTuple):
     std: Tensor
     variance: Tensor
     detection: Detection | None
+    floor_db: Tensor
 
     def columns(self, number: Tensor) -> PathLosses:
         """Return the path loss of some receivers."""
         own, shared = (PathLoss(*(value[number] for value in model)) for model in (self.own, self.shared))
         detection = self.detection and self.detection.columns(number)
         rest = (value[number] for value in (self.centre, self.std, self.variance))
-        return PathLosses(own, shared, *rest, detection)
+        return PathLosses(own, shared, *rest, detection, self.floor_db[number])
 
 
 @single_thread()
@@ -185,6 +188,7 @@ def fit_path_losses(
     not_detected: NotDetected = "auto",
     shift: Tensor | None = None,
     detection: Detection | None = None,
+    crossed: Tensor | None = None,
 ) -> PathLosses:
     """Fit the path-loss models of all receivers together, by expectation maximisation.
 
@@ -199,6 +203,8 @@ def fit_path_losses(
         not_detected: "weak" if empty cells are limits at all receivers, "unknown" if they tell nothing.
         shift: Received power less `rssi`, e.g. by floors that were removed, (n, R) [dB]. Defaults to 0.
         detection: Curve of detection. Defaults to an estimate.
+        crossed: Number of floors between both ends, float64 (n, R), whose attenuation is fitted, too. Distances are then
+            horizontal. Defaults to none.
 
     Example:
         >>> import swiftwrf
@@ -208,7 +214,9 @@ def fit_path_losses(
         True
     """
     shift = torch.zeros_like(rssi) if shift is None else shift
-    located, distance = ~receiver.isnan().any(dim=1), log_distance(position, receiver)
+    plane = torch.tensor([1.0, 1.0, 1.0 if crossed is None else 0.0], dtype=torch.float64)
+    located, distance = ~receiver.isnan().any(dim=1), log_distance(position * plane, receiver * plane)
+    floors = torch.zeros_like(rssi) if crossed is None else crossed
     if not_detected == "unknown":
         detection = None
     elif detection is None:
@@ -220,19 +228,21 @@ def fit_path_losses(
     def fit(curve: Detection | None) -> tuple[PathLosses, Tensor]:
         mean, none = rssi.nanmean().repeat(len(receiver)), torch.zeros(len(receiver), dtype=torch.float64)
         # a kind of receivers that measured nothing has the mean of the others
-        values = {"own_level": mean, "shared_level": mean.clone()}
-        values |= {name: none.clone() for name in ("own_slope", "shared_slope", "centre", "unexplained")}
-        values["std"] = torch.full((len(receiver), 2), SPREAD_DB, dtype=torch.float64)
-        values["variance"] = torch.full((len(receiver),), SPREAD_DB**2, dtype=torch.float64)
+        fields = {"own_level": mean, "shared_level": mean.clone()}
+        fields |= {name: none.clone() for name in ("own_slope", "shared_slope", "centre", "unexplained", "floor_db")}
+        fields["std"] = torch.full((len(receiver), 2), SPREAD_DB, dtype=torch.float64)
+        fields["variance"] = torch.full((len(receiver),), SPREAD_DB**2, dtype=torch.float64)
         for kind in (located, ~located):
             if bool(rssi[:, kind].isfinite().any()):
                 of_kind = curve and curve.columns(kind)
-                found = _maximise(distance[:, kind], rssi[:, kind], shift[:, kind], of_kind, repeats)
+                each = (values[:, kind] for values in (distance, floors, rssi, shift))
+                found = _maximise(*each, of_kind, repeats)
                 for name, value in found.items():
-                    values[name][kind] = value
-        own, shared = (PathLoss(values[f"{of}_level"], values[f"{of}_slope"] * located) for of in ("own", "shared"))
-        std = torch.stack([values["std"][:, 0], values["std"][:, 1] * located], dim=1)
-        return PathLosses(own, shared, values["centre"], std, values["variance"], curve), values["unexplained"]
+                    fields[name][kind] = value
+        own, shared = (PathLoss(fields[f"{of}_level"], fields[f"{of}_slope"] * located) for of in ("own", "shared"))
+        std = torch.stack([fields["std"][:, 0], fields["std"][:, 1] * located], dim=1)
+        found = PathLosses(own, shared, fields["centre"], std, fields["variance"], curve, fields["floor_db"])
+        return found, fields["unexplained"]
 
     found, unexplained = fit(detection)
     if not_detected == "auto" and detection is not None:
@@ -243,12 +253,13 @@ def fit_path_losses(
 
 
 def _maximise(
-    distance: Tensor, rssi: Tensor, shift: Tensor, detection: Detection | None, repeats: float
+    distance: Tensor, crossed: Tensor, rssi: Tensor, shift: Tensor, detection: Detection | None, repeats: float
 ) -> dict[str, Tensor]:
     """Fit the path loss of receivers of one kind; see `fit_path_losses`.
 
     Args:
         distance: log10 of the distances [m], (n, R).
+        crossed: Number of floors between both ends, (n, R).
         rssi: Measurements (n, R) [dBm], nan where not detected.
         shift: See `fit_path_losses`.
         detection: Curve of detection of these receivers.
@@ -259,9 +270,10 @@ def _maximise(
     """
     seen, n_receivers = ~rssi.isnan(), rssi.shape[1]
     centre = distance[seen].mean()
-    feature = torch.stack([torch.ones_like(distance), distance - centre], dim=-1)
-    eye, spread = torch.eye(2, dtype=torch.float64), torch.full((2,), SPREAD_DB**2, dtype=torch.float64)
-    expected, known = SLOPE_PRIOR
+    feature = torch.stack([torch.ones_like(distance), distance - centre, -crossed], dim=-1)
+    eye, spread = torch.eye(3, dtype=torch.float64), torch.tensor([SPREAD_DB, SPREAD_DB, 1e-3]).double().square()
+    (expected, known), of_floor = SLOPE_PRIOR, FLOOR_STD_DB
+    certain = torch.tensor([1e-6, known**-2, of_floor**-2], dtype=torch.float64)
     value, weight, extra = rssi.nan_to_num(), seen.double(), torch.zeros_like(rssi)
     variance = rssi[seen].var(correction=0).clamp_min(1e-6).expand(n_receivers)
     missed = torch.zeros(n_receivers).double() if detection is None else detection.missed
@@ -272,16 +284,16 @@ def _maximise(
         normal = torch.einsum("nrk,nr,nrl->rkl", feature, weight, feature) / scale[:, None, None]
         right = torch.einsum("nrk,nr->rk", feature, weight * value) / scale[:, None]
         shrink = torch.linalg.inv(eye + normal @ spread.diag())
-        total = (shrink @ normal).sum(dim=0) + torch.tensor([1e-6, known**-2]).double().diag()
-        pull = (shrink @ right[..., None]).sum(dim=0)[:, 0] + torch.tensor([0.0, expected / known**2]).double()
+        total = (shrink @ normal).sum(dim=0) + certain.diag()
+        pull = (shrink @ right[..., None]).sum(dim=0)[:, 0] + torch.tensor([0.0, expected / known**2, 0.0]).double()
         shared = torch.linalg.solve(total, pull)
         posterior = torch.linalg.inv(spread.reciprocal().diag() + normal)
         deviation = (posterior @ (right - normal @ shared)[..., None])[..., 0]
         # received power does not rise with the distance; the level follows the slope
         excess = (shared[1] + deviation[:, 1]).clamp_min(0)
-        deviation = deviation - posterior[:, :, 1] / posterior[:, 1:, 1] * excess[:, None]
-        spread = deviation.square() + posterior.diagonal(dim1=1, dim2=2)
-        spread = (spread.sum(dim=0) + SPREAD_WORTH * SPREAD_DB**2) / (n_receivers + SPREAD_WORTH)
+        deviation = deviation - posterior[:, :, 1] / posterior[:, 1:2, 1] * excess[:, None]
+        moments = (deviation.square() + posterior.diagonal(dim1=1, dim2=2))[:, :2].sum(dim=0)
+        spread[:2] = (moments + SPREAD_WORTH * SPREAD_DB**2) / (n_receivers + SPREAD_WORTH)  # floors are alike
         own = shared + deviation
         mean = (feature * own).sum(dim=-1)
         squares = weight * (value - mean).square() + extra
@@ -313,7 +325,8 @@ def _maximise(
         "shared_level": shared_level.expand(n_receivers),
         "shared_slope": shared[1].expand(n_receivers),
         "centre": centre.expand(n_receivers),
-        "std": uncertain.expand(n_receivers, 2),
+        "std": uncertain[:2].expand(n_receivers, 2),
+        "floor_db": shared[2].clamp_min(0).expand(n_receivers),
         "variance": variance,
         "unexplained": unexplained,
     }
@@ -425,9 +438,9 @@ class FloorAttenuation:
 
 
 def estimate_floor_attenuation(train: Rssi, pool: Rssi | None = None) -> FloorAttenuation:
-    """Estimate the attenuation of a floor by least squares, jointly with the path-loss model of each receiver.
+    """Estimate the attenuation of a floor jointly with the path-loss models of the receivers; see `fit_path_losses`.
 
-    Distances are horizontal. The floor of a receiver of unknown position is the one with its strongest mean RSSI.
+    The floor of a receiver of unknown position is the one with its strongest mean RSSI.
 
     Args:
         train: Training rows with floors.
@@ -442,20 +455,11 @@ def estimate_floor_attenuation(train: Rssi, pool: Rssi | None = None) -> FloorAt
     """
     pool = pool or train
     assert train.floors is not None
-    floor = train.floors.number(train.transmitter_position)
     where = receiver_floors(pool)
-    flat = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
-    apart = distance(pool.transmitter_position * flat, pool.receiver_position * flat).clamp_min(MIN_DISTANCE_M)
-    log_apart, top, bottom = apart.log10().nan_to_num(0.0), 0.0, 0.0
-    for r, rssi in enumerate(pool.rssi_dbm.T):
-        rows = ~rssi.isnan()
-        crossed = (floor[rows] - where[r]).abs().double()
-        free = torch.stack([torch.ones_like(crossed), log_apart[rows, r]], dim=1)
-        both = torch.stack([rssi[rows], crossed], dim=1)
-        left = both - free @ torch.linalg.lstsq(free, both, driver="gelsd").solution
-        top += float(left[:, 0] @ left[:, 1])
-        bottom += float(left[:, 1] @ left[:, 1])
-    db = max(-top / bottom, 0.0) if bottom > 0 else 0.0
+    crossed = (train.floors.number(train.transmitter_position)[:, None] - where).abs().double()
+    found = fit_path_losses(pool.transmitter_position, pool.receiver_position, pool.rssi_dbm, crossed=crossed)
+    measured = pool.detected.sum(dim=0).double()
+    db = float(found.floor_db @ measured / measured.sum())
     number = dict(zip(pool.receiver_names, where.tolist(), strict=True))
     return FloorAttenuation(train.floors, tuple(number[name] for name in train.receiver_names), db)
 
@@ -464,10 +468,10 @@ def receiver_floors(data: Rssi) -> Tensor:
     """Return the floor of each receiver by its position, or by where its mean RSSI is strongest, int64 (R,)."""
     assert data.floors is not None
     floor, mean = data.floors.number(data.transmitter_position), []
+    rssi = data.rssi_dbm.nan_to_num(float(data.rssi_dbm[data.detected].min()))  # what was not received was weak
     for number in range(len(data.floors.names)):
-        rssi = data.rssi_dbm[floor == number]
-        enough = (~rssi.isnan()).sum(dim=0) >= 3
-        mean.append(rssi.nanmean(dim=0).where(enough, -torch.inf))
+        enough = data.detected[floor == number].sum(dim=0) >= 3
+        mean.append(rssi[floor == number].mean(dim=0).where(enough, -torch.inf))
     strongest = torch.stack(mean).argmax(dim=0)
     return data.floors.number(data.receiver_position.nan_to_num(0.0)).where(data.receiver_located, strongest)
 

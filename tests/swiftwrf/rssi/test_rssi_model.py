@@ -81,6 +81,7 @@ def training_of(data, n_primitives=50):
             std=torch.full((r, 2), PATH_LOSS_STD_DB).double(),
             variance=torch.full((r,), FIELD_DB**2 + NOISE_DB**2).double(),
             detection=None,
+            floor_db=torch.zeros(r).double(),
         ),
         limit=torch.full((n, r), torch.nan).double(),
         field_db=torch.full((r,), FIELD_DB, dtype=torch.float64),
