@@ -132,6 +132,10 @@ class SpectraSource(Options):
     """reads one measurement of that many"""
     station: int | None = None
     """number of the array in a file with several, counted from 1"""
+    subcarriers: int | None = None
+    """number of subcarriers at which the channel is computed from ray paths (default: spectra alone)"""
+    bandwidth: float | None = None
+    """distance of the first and the last of these subcarriers [Hz]"""
     drop_null: bool = False
     """leave out null subcarriers of array snapshots, which are the same at every position and element"""
     round_trip: bool = False
@@ -145,7 +149,7 @@ class SpectraSource(Options):
             self._check_array(*self.array)
         if self.grid is not None and min(self.grid) < 2:
             raise InputError(f"--grid takes numbers of elevations and azimuths, each at least 2, got {self.grid}")
-        for name, value in (("every", self.every), ("station", self.station)):
+        for name, value in (("every", self.every), ("station", self.station), ("subcarriers", self.subcarriers)):
             if value is not None and value < 1:
                 raise InputError(f"--{name} must be at least 1, got {value}")
 

@@ -36,6 +36,8 @@ def reading(config: SpectraSource | TableSource) -> ReadOptions:
             grid=AngularGrid.hemisphere(*config.grid) if config.grid else None,
             every=config.every,
             station=config.station,
+            subcarriers=config.subcarriers,
+            bandwidth=config.bandwidth,
             drop_null=config.drop_null,
             round_trip=config.round_trip,
         )
