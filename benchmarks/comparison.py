@@ -37,7 +37,7 @@ from tasks.aoa.experiment import run
 from tasks.aoa.options import AoaConfig
 from tasks.environment import machine
 from tasks.page import figures
-from tasks.page.palette import Palette
+from tasks.page.figures import Palette
 from tasks.workers import Workers, connected
 
 MEASURED = (("s23-200", "random"), ("s23-200", "block"), ("newrf-bedroom", "random"), ("newrf-office", "random"))

@@ -89,11 +89,12 @@ class RssiMetrics(RunMetrics):
 
 
 class LocalizerMetrics(TypedDict):
-    """Position errors of one localizer, in space and in plan, and its seconds."""
+    """Position errors of one localizer, in space and in plan, its seconds, and with floors the fraction of right ones."""
 
     position_error_m: ErrorSummary
     horizontal_error_m: ErrorSummary
     seconds: PredictorSeconds
+    floor_hit_rate: NotRequired[float]
 
 
 class StudyMetrics(TypedDict):

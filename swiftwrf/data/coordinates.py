@@ -186,6 +186,10 @@ class Floors:
         height = torch.tensor(self.height_m, dtype=torch.float64)
         return (position[:, 2:].double() - height).abs().argmin(dim=1)
 
+    def named(self, position: Tensor) -> list[str]:
+        """Return the name of the floor of each position (n, 3)."""
+        return [self.names[number] for number in self.number(position).tolist()]
+
 
 def floors_of(floor: list[str], z: Floats) -> Floors | None:
     """Return the floors by the name of each row's floor and its height z (n,) [m]; None if there is one only.

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from swiftwrf.choices import AUTO, FIELD_MODELS, MAX_SUGGESTIONS, RAYTRACE, Moving, check_scene, fraction_key
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.validation import Preset
 from tasks import labels
-from tasks.options import SEEDS, Output, SpectraSource, choice, command_options, given
+from tasks.options import SEEDS, Options, Output, SpectraSource, choice, given, options
 
 PAPER_FRACTIONS = (0.1, 0.3, 0.5, 0.7)
 
 
-@command_options
-class AoaConfig(SpectraSource, Output):
+@options
+class AoaConfig(Options):
     """Angle of arrival with few measured spectra: turbo learning against its references and baselines.
 
-    Without --data the built-in simulated room is used. --resume DIR.partial continues an interrupted run, on a cluster with
-    --scheduler.
+    Without --data the built-in simulated room is used. swiftwrf resume DIR.partial continues an interrupted run.
 
     Example: python -m tasks.aoa --mix 0.3 --data DIR --split block
     """
-
-    resumable: ClassVar[bool] = True
 
     mix: tuple[float, ...] = ()
     """measured fractions in (0, 1]: 0.3 keeps 30 % of the training spectra and synthesizes the others. Required, except with
@@ -66,6 +63,8 @@ class AoaConfig(SpectraSource, Output):
     """directory of the run; must not exist (default: a new one under runs/aoa)"""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """device to compute on"""
+    output: Output = Output()
+    spectra: SpectraSource = SpectraSource()
 
     def __post_init__(self) -> None:
         if self.preset == "paper":
@@ -94,7 +93,7 @@ class AoaConfig(SpectraSource, Output):
             raise InputError(f"--mix takes measured fractions in (0, 1], got {_listed(self.mix) or 'none'}")
         if len(set(self.mix)) < len(self.mix):
             raise InputError(f"--mix names a fraction twice: {_listed(self.mix)}")
-        if self.data is None and (names := given(self, SpectraSource)):
+        if self.data is None and (names := given(self.spectra)):
             raise InputError(f"--{names[0]} is an option of the reader; give it with --data")
         if self.processes is not None and (self.processes < 1 or self.scheduler is not None):
             raise InputError(f"--processes takes a number from 1, without --scheduler, got {self.processes}")

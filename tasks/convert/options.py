@@ -8,14 +8,14 @@ from typing import Annotated
 import tyro
 
 from swiftwrf.errors import InputError
-from tasks.options import SpectraSource, TableSource, command_options
+from tasks.options import Answered, Options, SpectraSource, TableSource, options
 
 FILES = (".csv", ".mat", ".tif", ".geojson", ".png")  # suffixes of files; other names are directories
 MAPS = (".tif", ".geojson", ".png")  # suffixes of files that hold a map only
 
 
-@command_options
-class ConvertConfig(SpectraSource, TableSource):
+@options
+class ConvertConfig(Options):
     """Convert measurements and RSSI maps: OUT is a directory in the toolkit's own layout, or a file.
 
     SOURCE is measurements of any known format (see docs/formats.md), the directory of a run of tasks.rssi or tasks.locate,
@@ -47,6 +47,9 @@ class ConvertConfig(SpectraSource, TableSource):
     """edge of the map's cells [m] (default: 1/120 of the longer side)"""
     height: float | None = None
     """height of the transmitter on the map [m] (default: the median of the training positions)"""
+    output: Answered = Answered()
+    spectra: SpectraSource = SpectraSource()
+    table: TableSource = TableSource()
 
     @property
     def suffix(self) -> str:

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 from swiftwrf.choices import MAX_SUGGESTIONS
 from swiftwrf.errors import InputError
-from tasks.options import OffsetSource, Output, command_options
+from tasks.options import OffsetSource, Options, Output, options
 
 
-@command_options
-class LocateConfig(OffsetSource, Output):
+@options
+class LocateConfig(Options):
     """Compare localizers on a split of measured RSSI, by default of the built-in simulated floor, and report their errors.
 
-    Continue an interrupted run with --resume DIR.partial. Positions of new rows: python -m tasks.predict.
+    swiftwrf resume DIR.partial continues an interrupted run. Positions of new rows: python -m tasks.predict.
 
     Example: python -m tasks.locate --rx all --data DIR
     """
-
-    resumable: ClassVar[bool] = True
 
     data: str | None = None
     """survey table (CSV or Parquet), folder in NeRF2 layout, or name of a public data set"""
@@ -36,10 +32,12 @@ class LocateConfig(OffsetSource, Output):
     """seed of everything random"""
     out: str | None = None
     """directory of the run (default: a new one under runs/locate); must not exist"""
+    output: Output = Output()
+    table: OffsetSource = OffsetSource()
 
     def check(self) -> None:
         super().check()
-        self.check_used(self.data)
+        self.table.check_used(self.data)
         if not 10 <= self.cells <= 1_000_000:
             raise InputError(f"--cells takes 10 to 1,000,000, got {self.cells}")
         if not 0 <= self.suggest <= MAX_SUGGESTIONS:

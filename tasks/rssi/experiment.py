@@ -15,14 +15,16 @@ from swiftwrf.rssi import LEVEL, PairModel, RssiComparison, RssiModel, RssiPredi
 from swiftwrf.rssi.comparison import compared, model_of
 from swiftwrf.rssi.maps import RssiMap
 from tasks.claim import MODEL
+from tasks.directory import Run
+from tasks.environment import choose_device
 from tasks.metrics import PredictorSeconds, RssiMetrics
-from tasks.page.floor_plan import read_pixels
+from tasks.page.maps import read_pixels
 from tasks.page.page import reporting
 from tasks.page.records import Records
+from tasks.records import Row
 from tasks.rssi.options import RssiTaskConfig
 from tasks.rssi.page import page
 from tasks.rssi.page.summary import answer
-from tasks.run import Row, Run, choose_device
 from tasks.source import measured_rssi, offset_notes, split_notes
 from tasks.terminal import console, terminal
 from tasks.workers import connected
@@ -70,7 +72,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
                 seed=config.seed,
                 also=config.also,
                 preset=config.preset,
-                reference=config.reference,
+                reference=config.table.reference,
                 device=device,
                 parallel=cluster.map if cluster else None,
                 keep=keep,
@@ -87,7 +89,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
 
 
 def _load(config: RssiTaskConfig) -> Rssi:
-    measured = measured_rssi(config.data, config)
+    measured = measured_rssi(config.data, config.table)
     return rssi_room(seed=config.seed) if measured is None else measured
 
 
@@ -105,7 +107,7 @@ def _metrics(config: RssiTaskConfig, data: Rssi, result: RssiComparison, model: 
     seconds: dict[str, PredictorSeconds] = {
         name: {"fit": value["fit"], "predict": value["predict"]} for name, value in result.values.items()
     }
-    notes = [*split_notes(train, result.test, config.split), *offset_notes(data, config), *data.notes]
+    notes = [*split_notes(train, result.test, config.split), *offset_notes(data, config.table), *data.notes]
     if train.offsets is not None:
         notes.append(train.offsets.note())
         console.print(f"{data.name}: {notes[-1]}")

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.validation import Preset
-from tasks.options import OffsetSource, Output, command_options
+from tasks.options import OffsetSource, Options, Output, options
 
 
-@command_options
-class RssiTaskConfig(OffsetSource, Output):
+@options
+class RssiTaskConfig(Options):
     """RSSI of a moving transmitter at fixed receivers, against baselines.
 
-    Without --data the built-in simulated floor is used. Continue an interrupted run with --resume DIR.partial, and with
-    --scheduler ADDRESS to continue on a cluster.
+    Without --data the built-in simulated floor is used. swiftwrf resume DIR.partial continues an interrupted run.
 
     Example: python -m tasks.rssi --rx 6 --data DIR
     """
-
-    resumable: ClassVar[bool] = True
 
     rx: tuple[str, ...]
     """receivers: names, numbers counted from 1, or all"""
@@ -46,12 +43,14 @@ class RssiTaskConfig(OffsetSource, Output):
     """directory of the run; must not exist (default: a new one under runs/rssi)"""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """where to compute; RSSI models are small, so auto is the CPU"""
+    output: Output = Output()
+    table: OffsetSource = OffsetSource()
 
     def check(self) -> None:
         super().check()
         for name in self.also:
             RSSI_PREDICTORS.check(name)
-        self.check_used(self.data)
+        self.table.check_used(self.data)
         if (self.floor_plan is None) != (self.floor_extent is None):
             raise InputError("--floor-plan needs --floor-extent x0 x1 y0 y1 [m], and the other way round")
         if self.floor_extent is not None:

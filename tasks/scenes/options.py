@@ -8,7 +8,7 @@ import tyro
 
 from swiftwrf.choices import CARRIERS_HZ, ROOMS, SCENE_FILE, Moving, check_scene
 from swiftwrf.errors import InputError
-from tasks.options import Output, command_options
+from tasks.options import Options, Output, options
 
 RANGES = {"positions": (2, 100_000), "frequency": CARRIERS_HZ, "order": (0, 8), "scattering": (0, 1)}
 ROOM_HELP = "a Mitsuba scene with radio materials (FILE.xml), or a built-in room: " + "; ".join(
@@ -16,8 +16,8 @@ ROOM_HELP = "a Mitsuba scene with radio materials (FILE.xml), or a built-in room
 )
 
 
-@command_options
-class ScenesConfig(Output):
+@options
+class ScenesConfig(Options):
     """Ray paths in a room with furniture or in a scene file of Mitsuba, traced by Sionna RT (extra: raytrace).
 
     The directory holds paths.npz, which --data of the tasks reads, and scene.svg, a plan of the room and the positions.
@@ -46,6 +46,7 @@ class ScenesConfig(Output):
     """region of the moving end: opposite corners x y z x y z [m] (default: that of the room)"""
     seed: int = 0
     """seed of positions, rays and scattered phases"""
+    output: Output = Output()
 
     def check(self) -> None:
         super().check()

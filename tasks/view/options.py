@@ -7,12 +7,12 @@ from typing import Annotated
 import tyro
 
 from swiftwrf.errors import InputError
-from tasks.options import Options, command_options
+from tasks.options import Options, options
 
 MAX_PORT = 65535
 
 
-@command_options
+@options
 class ViewConfig(Options):
     """A page to explore a fitted model: drag the moving end and see its spectrum, or hover over a map of RSSI.
 

@@ -7,8 +7,7 @@ from pandas import DataFrame, concat
 
 from tasks.aoa.page.records import FractionRecords
 from tasks.page import figures
-from tasks.page.page import Plot, Section, Table
-from tasks.page.provenance import number
+from tasks.page.page import Plot, Section, Table, number
 
 LEVELS = np.linspace(0, 1, 21)  # of credible regions
 TRUTH, ESTIMATE, MASS = "#2a9165", "#cf4a4a", "#3a7fd5"

@@ -16,8 +16,7 @@ from swiftwrf.models import FIELD_MODELS
 from tasks import labels
 from tasks.aoa.page.records import FractionRecords
 from tasks.page import figures
-from tasks.page.page import Plot, Section, Table
-from tasks.page.provenance import number
+from tasks.page.page import Plot, Section, Table, number
 from tasks.records import read_json
 
 MARGIN = 0.5  # [m] around the room in a plan

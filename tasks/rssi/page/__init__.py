@@ -6,10 +6,9 @@ from swiftwrf.choices import RSSI_PREDICTORS
 from tasks.environment import command
 from tasks.labels import PREDICTORS as LABELS
 from tasks.labels import labels
-from tasks.page.comparison import Compared, comparison
-from tasks.page.page import Number, Page, Section, Summary, sections_of
-from tasks.page.provenance import provenance
+from tasks.page.page import Number, Page, Section, Summary, provenance, sections_of
 from tasks.page.records import notes
+from tasks.page.shared import Compared, comparison
 from tasks.rssi.page import errors
 from tasks.rssi.page.maps import CERTAINTY, COVERED_DBM, Maps
 from tasks.rssi.page.summary import RssiRecords, best_baseline, conclusion, model_of, next_steps, title

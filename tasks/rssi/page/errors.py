@@ -12,10 +12,9 @@ from swiftwrf.metrics import paired_difference
 from tasks.labels import PREDICTORS as LABELS
 from tasks.labels import labels
 from tasks.page import figures
-from tasks.page.comparison import with_interval
-from tasks.page.page import Plot, Table
-from tasks.page.palette import Palette
-from tasks.page.provenance import number
+from tasks.page.figures import Palette
+from tasks.page.page import Plot, Table, number
+from tasks.page.shared import with_interval
 from tasks.rssi.page.maps import MAX_VECTOR_DOTS
 from tasks.rssi.page.summary import RssiRecords, best_baseline, by_method, model_of, title
 from tasks.summarise import SHORTEST, running_median

@@ -13,7 +13,7 @@ import pytest
 from fuzz.runs import followed_run, run_of_locate, show
 
 from swiftwrf import InputError
-from tasks.page.floor_plan import FloorPlan
+from tasks.page.maps import FloorPlan
 
 OPENED = (
     "config.json",
