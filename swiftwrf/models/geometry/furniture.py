@@ -1,4 +1,4 @@
-"""What stands in a room: absorption in voxels and reflectivity in cells on each plane, estimated from channels.
+"""Furniture of a room: absorption in voxels and reflectivity in cells on each plane, estimated from channels.
 
 The path of an image reflects at planes w in cells c and crosses voxels v along lengths l_v. Its gain
 
