@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from torch import Tensor
 from torch.nn.functional import softplus
@@ -35,9 +36,11 @@ from swiftwrf.models.geometry.images import (
     visibility,
 )
 from swiftwrf.models.geometry.planes import advantage, log_explained
+from swiftwrf.plotting import Axes, corners_of, hatch, plan_map
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.threads import parallel_map, single_thread
 
+Floats = NDArray[np.float64]
 MAX_VOXELS = 50_000
 N_STEPS = 150  # of Adam
 TENSORS = ("low", "absorption", "reflectivity", "crossed_m")
@@ -91,6 +94,44 @@ class Furniture:
             return (-found.sum(-1) * group.step_m).exp()
 
         return _gains(self._crossings(planes, scene), planes, transmission, self.reflectivity)
+
+    def in_plan(self, low_m: float = -math.inf, high_m: float = math.inf) -> tuple[Floats, Floats, Floats]:
+        """Return what stands between two heights, seen from above.
+
+        Args:
+            low_m: Lower height [m].
+            high_m: Upper height [m].
+
+        Returns:
+            Centres of the columns (X,) and of the rows (Y,) [m], and the largest absorption (Y, X) [dB / m], nan where no
+            measured path crosses a voxel.
+        """
+        x, y, z = (
+            (start + self.voxel_m * (torch.arange(size) + 0.5)).numpy()
+            for start, size in zip(self.low, self.absorption.shape, strict=True)
+        )
+        layer = torch.from_numpy((z > low_m) & (z < high_m))
+        decibel = torch.where(self.crossed_m > 0, 20 / math.log(10) * self.absorption, -1.0)[:, :, layer]
+        values = decibel.amax(dim=2).T if bool(layer.any()) else -torch.ones(len(y), len(x))
+        return x, y, torch.where(values < 0, torch.nan, values).double().numpy()
+
+    def plot(self, low_m: float = -math.inf, high_m: float = math.inf, ax: Axes | None = None) -> Axes:
+        """Draw what stands between two heights, seen from above, hatched where it is unknown.
+
+        Args:
+            low_m: Lower height [m].
+            high_m: Upper height [m].
+            ax: Axes to draw into. Defaults to those of a new figure.
+
+        Example:
+            >>> low, empty = torch.zeros(3, dtype=torch.float64), torch.zeros(4, 3, 2)
+            >>> Furniture(low, 0.25, empty, torch.ones(6, 12), torch.ones(4, 3, 2), 1e-3).plot(0.0, 0.25).get_ylabel()
+            'y [m]'
+        """
+        x, y, values = self.in_plan(low_m, high_m)
+        ax = plan_map(corners_of(x, y), values, "absorption [dB/m]", ax)
+        hatch(ax, x, y, np.isnan(values))
+        return ax
 
     def _crossings(self, planes: PlaneSet, scene: PhaseObservations) -> list[_Crossings]:
         sequence: list[Sequence] = [(), *planes.sequence]

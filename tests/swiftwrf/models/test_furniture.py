@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from rooms import mirror_room
 
+from augment.turbo.artifacts import save_artifacts
 from swiftwrf import AngularGrid, InputError, MatchedField, Spectra, load, simulated_room
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data import PropagationPaths, Snapshots
@@ -17,6 +19,7 @@ from swiftwrf.models.geometry import GeometryModel, Plane, furniture
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.geometry.furniture import Furniture, coherence, field, waves
 from swiftwrf.models.geometry.images import PlaneSet
+from tasks.aoa.page.room import furniture_panels
 
 WALLS = [
     Plane(normal, offset, 0.9)
@@ -114,6 +117,23 @@ def test_furniture_is_found_where_it_stands_and_explains_new_channels(moving, tm
     assert room.furniture.crossed_m.min() == 0  # what no path crosses is unknown
     room.save(tmp_path / "room.safetensors")
     assert torch.equal(load(tmp_path / "room.safetensors").channel(test.position), room.channel(test.position))
+
+
+def test_furniture_is_drawn_by_height_and_hatched_where_it_is_unknown(tmp_path):
+    data, walls = measured(0.0, n=20)
+    shown = furnished(walls, 2.0)
+    shown = replace(shown, crossed_m=(torch.arange(14) > 1).float().expand(26, 22, 14).clone())
+    x, y, values = shown.in_plan(0.5, 1.0)
+    assert (len(x), len(y), values.shape) == (26, 22, (22, 26))
+    assert values[(y > 1.0) & (y < 3.5)][:, (x > 2.5) & (x < 3.5)].min() == pytest.approx(2 * 20 / math.log(10))
+    assert values[0, 0] == 0
+    assert math.isnan(shown.in_plan(0.0, 0.24)[2][0, 0])
+    assert shown.plot(0.0, 0.24).get_xlabel() == "x [m]"
+    walls.furniture = shown
+    save_artifacts(walls, "0.3", data, data, tmp_path)
+    points = dict(np.load(tmp_path / "room-mix0.3.npz"))
+    assert points["plan"].shape == (3, 22, 26)
+    assert len(furniture_panels(walls.to_json()["planes"], points)) == 3
 
 
 def test_an_empty_room_has_no_furniture_and_spectra_alone_have_none():
