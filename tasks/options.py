@@ -164,6 +164,10 @@ class SpectraSource:
     """reads one measurement of that many"""
     station: PositiveInt | None = None
     """number of the array in a file with several, counted from 1"""
+    subcarriers: PositiveInt | None = None
+    """number of subcarriers at which the channel is computed from ray paths (default: spectra alone)"""
+    bandwidth: PositiveFloat | None = None
+    """distance of the first and the last of these subcarriers [Hz]"""
     drop_null: bool = False
     """leave out null subcarriers of array snapshots, which are the same at every position and element"""
     round_trip: bool = False
