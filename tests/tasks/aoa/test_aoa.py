@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from quick import sketched
 from sklearn.model_selection import KFold
 from small import FIT, with_defaults
 
@@ -56,7 +57,8 @@ def small(monkeypatch):
         )
     for config in (AANNConfig, AANNKernelConfig):
         monkeypatch.setattr(config, "quick", lambda n_spectra, **options: AANNKernelConfig(steps=2, batch=4, **options))
-    return room
+    with sketched():
+        yield room
 
 
 def run(*arguments):
