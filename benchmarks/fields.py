@@ -29,7 +29,7 @@ from typing import Any, Literal, get_args
 
 import torch
 import tyro
-from record import CPU, ROOT, load, options, provenance, write_result
+from record import CPU, ROOT, kept, load, options, provenance, write_result
 from scipy.cluster.hierarchy import fclusterdata
 from sklearn.model_selection import GroupKFold
 from torch import Tensor
@@ -180,9 +180,8 @@ def main(config: Config) -> None:
     torch.set_num_threads(1)
     work = config.work / config.result
     work.mkdir(parents=True, exist_ok=True)
-    content = load(config.result)
-    rows = {_key(row): row for row in content.get("rows", [])}
-    described = content.get("described", {})
+    rows = {_key(row): row for row in kept(config.result, "rows")}
+    described = load(config.result).get("described", {})
     with connected(config.scheduler, CPU) as cluster:
         for scene in STUDIES[config.study](config):
             described |= {scene.name: scene.described} if scene.described else {}
@@ -210,7 +209,7 @@ def main(config: Config) -> None:
 
 
 def _key(row: Row) -> tuple[str, str, str, int]:
-    return row["scene"], row["split"], row["method"], row["n_train"]
+    return row["scene"], row["split"], row["method"], row.get("n_train", 0)
 
 
 def in_words(row: Row) -> str:

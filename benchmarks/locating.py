@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import torch
 import tyro
-from record import load, options, write_result
+from record import kept, options, write_result
 
 from swiftwrf import Rssi, load_rssi, rssi_room
 from swiftwrf.locate.baselines import LOCALIZERS
@@ -35,7 +35,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Measure each data set and write `results/locating_rssi.json`."""
-    found: dict[str, Any] = load(RESULT).get("sets", {})
+    found: dict[str, Any] = dict(kept(RESULT, "sets"))
     for text in config.sets:
         name, _, split = text.partition(":")
         data = read(None if name == BUILT_IN else config.folder / name).receivers(["all"])

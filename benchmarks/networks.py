@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from record import load, options, write_result
+from record import kept, options, write_result
 from torch import Tensor
 
 from augment import Mixed, SyntheticPositions, mix, synthetic_positions, withhold
@@ -73,7 +73,7 @@ class TimedNetwork(AANNKernel):
 def main(config: Config) -> None:
     """Measure every method on every training set and write the result after each of them."""
     torch.set_num_threads(1)
-    scenes: dict[str, Any] = load(config.name).get("scenes", {})
+    scenes: dict[str, Any] = dict(kept(config.name, "scenes"))
     for scene in config.scenes:
         data = simulated_room() if scene == "room" else load_spectra(config.data / scene)
         train, _ = data.split("random")

@@ -15,8 +15,8 @@ from pathlib import Path
 from subprocess import run
 from typing import Any
 
-TESTS = Path(__file__).parent.parent / "tests"
-sys.path[:0] = [str(TESTS), str(TESTS / "swiftwrf/diagnostics")]
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "swiftwrf/diagnostics"))
 
 import numpy as np
 import pandas as pd

@@ -48,7 +48,16 @@ def without_folders(command: Sequence[str]) -> str:
 
 def provenance(device: torch.device = CPU) -> dict[str, Any]:
     """Return the command, the commit, the versions and the machine of a measurement."""
-    return {"command": without_folders(["python", *sys.argv]), "environment": environment(device, {})}
+    return _provenance(without_folders(["python", *sys.argv]), environment(device, {}))
+
+
+def _provenance(command: str, environment: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "command": command,
+        "commit": environment["commit"],
+        "versions": environment["packages"],
+        "machine": environment["device"],
+    }
 
 
 def write_result(
@@ -65,14 +74,14 @@ def write_result(
         content: Result.
         device: Device that measured it.
         folder: Folder of the result.
-        rows: Parts of the content that were measured at different times. Parts without a provenance receive that of now.
+        rows: Parts of the content that this command measured, where it kept others.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    measured = provenance(device)
+    head = {"command": without_folders(["python", *sys.argv]), "environment": environment(device, {})}
     for row in rows:
-        row.setdefault("provenance", measured)
+        row["provenance"] = _provenance(**head)
     file = folder / f"{name}.json"
-    file.write_text(json.dumps(measured | content, indent=1, allow_nan=False) + "\n")
+    file.write_text(json.dumps(head | content, indent=1, allow_nan=False) + "\n")
     print(f"wrote {file}")
 
 
@@ -81,6 +90,15 @@ def load(name: str) -> dict[str, Any]:
     file = RESULTS / f"{name}.json"
     content: dict[str, Any] = json.loads(file.read_text()) if file.is_file() else {}
     return content
+
+
+def kept(name: str, key: str) -> Any:
+    """Return the parts of a result that were measured before, a list or a dictionary, each with its provenance."""
+    content = load(name)
+    parts = content.get(key, [])
+    for part in parts.values() if isinstance(parts, dict) else parts:
+        part.setdefault("provenance", _provenance(content["command"], content["environment"]))
+    return parts
 
 
 def markdown(columns: list[str], rows: list[list[str]]) -> str:

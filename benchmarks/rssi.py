@@ -18,7 +18,7 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
-from record import load, options, write_result
+from record import kept, options, write_result
 from torch import Tensor
 
 from swiftwrf import Rssi, load_rssi
@@ -59,7 +59,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Measure each split and write `results/rssi.json`."""
-    found: dict[str, Row] = load(RESULT).get("sets", {})
+    found: dict[str, Row] = dict(kept(RESULT, "sets"))
     for name, split in splits(config.sets):
         key = f"{name} {split}"
         if config.resume and key in found:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from multiprocessing import get_context
 
 import torch
-from record import load, options, write_result
+from record import kept, options, write_result
 from scaling import measuring
 
 from swiftwrf import Rssi, fit_rssi, rssi_room
@@ -46,7 +46,7 @@ def measure(n: int, receivers: int) -> dict[str, float]:
 
 def main(config: Config) -> None:
     """Measure each point and write `results/scaling_rssi.json`."""
-    rows = load("scaling_rssi").get("rows", [])
+    rows = kept("scaling_rssi", "rows")
     for n, receivers in config.points:
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as fresh:
             found = fresh.submit(measure, n, receivers).result()

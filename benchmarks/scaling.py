@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from record import ROOT, load, options, write_result
+from record import ROOT, kept, options, write_result
 
 from augment import Mixed
 from augment.estimators.aann import AANN
@@ -56,7 +56,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Measure each stage of each size, write `results/scaling.json` and draw the figure."""
-    rows = {row["n"]: row for row in load("scaling").get("rows", [])}
+    rows = {row["n"]: row for row in kept("scaling", "rows")}
     for n in config.sizes:
         with tempfile.TemporaryDirectory(dir=config.folder) as folder:
             rows[n] = {"n": n, "stages": {stage: run(stage, n, folder) for stage in STAGES}}

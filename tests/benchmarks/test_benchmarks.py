@@ -17,13 +17,13 @@ METHODS = ("mean", "nearest", "swiftwrf", "vae")
 
 
 @pytest.fixture
-def study(monkeypatch, small_published):
+def study(tmp_path, monkeypatch, small_published):
     """The comparison of few methods on a small room, and what it writes."""
     data = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
     written = []
     monkeypatch.setattr(fields, "scenes", lambda config: [("room", data, "random")])
     monkeypatch.setattr(fields, "COMPARED", METHODS)
-    monkeypatch.setattr(fields, "load", lambda name: {})
+    monkeypatch.setattr(record, "RESULTS", tmp_path)
     monkeypatch.setitem(fields.QUICK_DIVISOR, "comparison", 1)
     monkeypatch.setattr(fields, "write_result", lambda name, content: written.append((name, content)))
     return written
@@ -55,7 +55,7 @@ def test_a_study_goes_on_after_the_rows_that_are_there(study, tmp_path, monkeypa
     for row in rows.values():
         assert row["ms"]["low"] <= row["ms"]["median"]
         assert (row["n_train"], row["n_test"]) == (24, 6)
-        assert {"command", "environment"} <= set(row["provenance"])
+        assert {"command", "commit", "versions", "machine"} == set(row["provenance"])
     assert not list(tmp_path.rglob("*.state"))
 
 
@@ -70,12 +70,15 @@ def test_every_study_of_the_room_has_its_rows_and_its_table(name, study, tmp_pat
     assert len(content["rows"]) == {"synthesis": 7, "model_size": 8, "ablation": 9}[name]
 
 
-def test_rows_measured_at_different_times_have_a_provenance_each(tmp_path):
-    rows = [{"n": 1, "provenance": {"command": "earlier"}}, {"n": 2}]
-    record.write_result("made", {"rows": rows}, folder=tmp_path, rows=rows)
-    first, second = json.loads((tmp_path / "made.json").read_text())["rows"]
-    assert first["provenance"] == {"command": "earlier"}
-    assert {"commit", "packages", "device"} <= set(second["provenance"]["environment"])
+def test_rows_measured_at_different_times_have_a_provenance_each(tmp_path, monkeypatch):
+    monkeypatch.setattr(record, "RESULTS", tmp_path)
+    for number, command in enumerate(("first.py", "folder/second.py --n 2")):
+        monkeypatch.setattr(record.sys, "argv", command.split())
+        new = {"n": number}
+        record.write_result("made", {"rows": [*record.kept("made", "rows"), new]}, folder=tmp_path, rows=[new])
+    measured = [row["provenance"] for row in json.loads((tmp_path / "made.json").read_text())["rows"]]
+    assert [row["command"] for row in measured] == ["python first.py", "python second.py --n 2"]
+    assert all(set(row) == {"command", "commit", "versions", "machine"} for row in measured)
 
 
 def test_uncommitted_code_is_not_measured(monkeypatch):

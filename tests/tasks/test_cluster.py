@@ -88,6 +88,7 @@ def test_a_study_has_the_same_rows(local, tmp_path, monkeypatch, small_published
     written = []
     monkeypatch.setattr(fields, "scenes", lambda config: [("room", data, "random")])
     monkeypatch.setattr(fields, "COMPARED", ("mean", "nearest", "vae"))
+    monkeypatch.setattr(fields, "kept", lambda name, key: [])
     monkeypatch.setattr(fields, "load", lambda name: {})
     monkeypatch.setattr(fields, "write_result", lambda name, content: written.append(content["rows"]))
     monkeypatch.setattr(fields, "draw", lambda rows: None)
