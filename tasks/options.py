@@ -15,7 +15,7 @@ from docstring_parser import parse_from_object
 
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.registry import Registry
-from swiftwrf.runtime.validation import PositiveInt, check_value
+from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, check_value
 from tasks import labels
 
 SEEDS = 2**32  # number of seeds that the generators of scikit-learn and NumPy accept
