@@ -51,12 +51,12 @@ from swiftwrf.models.neighbours import MemoryModel
 from swiftwrf.positions import Neighbours
 from swiftwrf.runtime.durable import write_text
 from swiftwrf.runtime.threads import set_threads
+from swiftwrf.runtime.validation import Preset
 from tasks import labels
 from tasks.aoa.experiment import run as run_aoa
 from tasks.aoa.options import AoaConfig
 from tasks.page import figures
-from tasks.page.palette import Palette
-from tasks.run import Preset
+from tasks.page.figures import Palette
 from tasks.scenes.options import ScenesConfig
 from tasks.scenes.run import run as trace
 from tasks.workers import connected
