@@ -17,7 +17,7 @@ from committed import (
 )
 from comparison_tables import comparison, comparison_cost, comparison_counts, comparison_turbo
 from geometry import SIDES, WALLS, nearest
-from locating_tables import locating_rssi, locating_spectra
+from locating_tables import locating_benchmark, locating_rssi, locating_spectra
 from measured_tables import measured_spectra
 from paper_scale_tables import (
     paper_scale,
@@ -298,6 +298,7 @@ TABLES = {
     "headline_rssi": headline_rssi,
     "locating_spectra": locating_spectra,
     "locating_rssi": locating_rssi,
+    "locating_benchmark": locating_benchmark,
     "reliability": reliability,
     "synthesis": synthesis,
     "measured_spectra": measured_spectra,

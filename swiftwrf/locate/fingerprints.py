@@ -15,6 +15,7 @@ from swiftwrf.data.rssi import Rssi
 
 NEIGHBOUR_COUNTS = (1, 2, 3, 4, 5, 7, 9, 12, 16, 20)
 METRICS = ("sorensen", "manhattan", "euclidean")  # the first one unless another has a significantly lower error
+MIN_VOTERS = 3  # places that vote for a floor: two have no majority
 MAX_HELD_OUT = 1000  # rows that choose the settings
 SMALLEST_DISTANCE = 1e-3  # of fingerprints, whose inverse is a weight
 Votes = tuple[Tensor, Tensor, Tensor]  # each floor's part of the weights, its mean position, and the estimate
@@ -70,7 +71,8 @@ class Fingerprints:
         parts = [((fold == number) & held_out, fold != number) for number in fold.unique()]
         errors: dict[tuple[str, int], Tensor] = {}
         fewest = min(len(train.transmitter_position[kept].unique(dim=0)) for _, kept in parts)
-        counts = [k for k in NEIGHBOUR_COUNTS if k <= fewest]
+        least = MIN_VOTERS if train.floors else 1
+        counts = [k for k in NEIGHBOUR_COUNTS if min(least, fewest) <= k <= fewest]
         for metric in METRICS:
             error = []
             for out, kept in parts:
@@ -89,7 +91,8 @@ class Fingerprints:
 
     @cached_property
     def _places(self) -> tuple[Tensor, Tensor]:
-        return self.position.unique(dim=0, return_inverse=True)
+        found: tuple[Tensor, Tensor] = self.position.unique(dim=0, return_inverse=True)
+        return found
 
     @cached_property
     def _known(self) -> tuple[Tensor, Tensor]:

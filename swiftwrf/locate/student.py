@@ -74,7 +74,8 @@ class Student:
         """Return the log-likelihoods (n,) of residuals (n, F), float64."""
         root = torch.linalg.cholesky(self.scale)
         white = torch.linalg.solve_triangular(root, residual.T, upper=False)
-        return self.log_density(white.square().sum(dim=0)) - root.diagonal().log().sum()
+        density: Tensor = self.log_density(white.square().sum(dim=0)) - root.diagonal().log().sum()
+        return density
 
 
 def covariance(residual: Tensor, shrinkage: Tensor, degrees: float, floor: float) -> Tensor:
