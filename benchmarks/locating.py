@@ -11,8 +11,7 @@ from typing import Annotated, Any
 
 import torch
 import tyro
-from committed import RESULTS, load
-from record import write_result
+from record import kept, options, write_result
 
 from swiftwrf import Rssi, load_rssi, rssi_room
 from swiftwrf.datasets import DATA_SETS, fetch
@@ -37,7 +36,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Measure each data set and write `results/locating_rssi.json`."""
-    found = earlier()
+    found: dict[str, Any] = dict(kept(RESULT, "sets"))
     for text in config.sets:
         name, _, split = text.partition(":")
         measured = measure(read(name), split or "random", config)
@@ -45,13 +44,7 @@ def main(config: Config) -> None:
         for localizer, entry in measured["localizers"].items():
             error = entry["position_error_m"]
             print(f"{text} {localizer}: median {error['median']:.2f} m, mean {error['mean']:.2f} m", flush=True)
-        write_result(RESULT, {"threads": torch.get_num_threads(), "sets": dict(sorted(found.items()))})
-
-
-def earlier() -> dict[str, Any]:
-    """Return the sets that are in the results already."""
-    sets: dict[str, Any] = load(RESULT)["sets"] if (RESULTS / f"{RESULT}.json").is_file() else {}
-    return sets
+        write_result(RESULT, {"threads": torch.get_num_threads(), "sets": dict(sorted(found.items()))}, rows=[measured])
 
 
 def read(name: str) -> Rssi:
@@ -87,4 +80,4 @@ def measure(data: Rssi, split: str, config: Config) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    main(options(Config))

@@ -34,6 +34,8 @@ def reading(spectra: SpectraSource, table: TableSource) -> ReadOptions:
         grid=AngularGrid.hemisphere(*spectra.grid) if spectra.grid else None,
         every=spectra.every,
         station=spectra.station,
+        subcarriers=spectra.subcarriers,
+        bandwidth=spectra.bandwidth,
         drop_null=spectra.drop_null,
         round_trip=spectra.round_trip,
         columns=table.column_names,

@@ -91,8 +91,8 @@ class Fingerprints:
 
     @cached_property
     def _places(self) -> tuple[Tensor, Tensor]:
-        found: tuple[Tensor, Tensor] = self.position.unique(dim=0, return_inverse=True)
-        return found
+        place, row = self.position.unique(dim=0, return_inverse=True)
+        return place, row
 
     @cached_property
     def _known(self) -> tuple[Tensor, Tensor]:

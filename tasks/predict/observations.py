@@ -112,7 +112,10 @@ def positions_of_spectra(locator: MatchedField, config: PredictConfig) -> Column
         raise InputError(f"{config.source} has spectra of another array than those that {config.model} was fitted to")
     found: list[Tensor] = []
     index = torch.arange(len(store)) if known is None else known.index
-    posteriors: Iterable[Posterior] = map(locator.locate, _batches(store))
+    batches: Iterable[Tensor] = _batches(store)
+    if known is not None and known.channel is not None:
+        batches = known.channel.split(BATCH_ROWS) if locator.n_snapshots else batches
+    posteriors: Iterable[Posterior] = map(locator.locate, batches)
     if config.track is not None:
         posteriors = _tracked(posteriors, index.double(), config.track)
 

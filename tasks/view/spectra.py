@@ -195,7 +195,7 @@ class SpectraView:
     def located(self, loaded: LoadedModel, index: int) -> Located:
         """Return the posterior over the position of a measured spectrum."""
         assert self.data is not None
-        return Located.of(loaded.locator.locate(self.data.store[index : index + 1]), self.data.position[index].double())
+        return Located.of(loaded.locator.locate(self.data[index : index + 1]), self.data.position[index].double())
 
 
 def peak(spectrum: Tensor, grid: AngularGrid, array: PlanarArray | None = None) -> Direction:
