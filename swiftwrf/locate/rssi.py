@@ -27,6 +27,7 @@ from swiftwrf.locate.rssi_likelihood import (
     ValueLikelihood,
     maps_at,
 )
+from swiftwrf.metrics import NORMAL_80
 from swiftwrf.positions import to_tensor
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime.checkpoint import Header, Saved, expect
@@ -34,6 +35,7 @@ from swiftwrf.runtime.progress import progress as tracked
 from swiftwrf.runtime.validation import Configured, NonNegativeInt, PositiveInt, all_or_nothing, checked, configuration
 
 UNDETECTED_DBM = -1000.0  # stands for what is not detected in a file, which holds finite values only
+LEVEL = 0.8  # coverage that is calibrated
 MAX_HELD_OUT = 2000  # rows that determine the distributions
 
 
@@ -180,7 +182,9 @@ class RssiLocator(Configured, Saved):
         self.weight = pooled_weights(torch.cat(truth, dim=1), candidates, volume)
         log_mass = torch.einsum("k,knm->nm", self.weight, candidates) + volume
         held_out = self._posterior(log_mass)
-        self.inflation = inflation(held_out, position)
+        # so that the coverage at new places is 80 % or more with a probability of 90 %: rows at one place are not independent
+        margin = NORMAL_80 * (LEVEL * (1 - LEVEL) / len(position.unique(dim=0))) ** 0.5
+        self.inflation = inflation(held_out, position, LEVEL, margin)
 
     def _posterior(self, log_mass: Tensor, inflation: float = 1.0) -> Posterior:
         cells = self.cells
