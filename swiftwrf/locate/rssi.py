@@ -182,7 +182,7 @@ class RssiLocator(Configured, Saved):
         self.weight = pooled_weights(torch.cat(truth, dim=1), candidates, volume)
         log_mass = torch.einsum("k,knm->nm", self.weight, candidates) + volume
         held_out = self._posterior(log_mass)
-        # so that the coverage at new places is 80 % or more with a probability of 90 %: rows at one place are not independent
+        # the coverage at new places is then 80 % or more with a probability of 90 %; rows of one place count once
         margin = NORMAL_80 * (LEVEL * (1 - LEVEL) / len(position.unique(dim=0))) ** 0.5
         self.inflation = inflation(held_out, position, LEVEL, margin)
 
