@@ -74,9 +74,9 @@ class _Part:
 class RssiLocator(Configured, Saved):
     """Posterior over the position of the transmitter, given its RSSI at the receivers.
 
-    Three likelihoods are pooled: the values under the radio maps with their uncertainty and correlated errors, which
+    Three likelihoods are pooled: the values under the radio maps with their uncertainty and a common offset of a row, which
     receivers detect the transmitter at all, and the position of similar training rows. Held-out rows determine their
-    distributions and weights.
+    distributions and weights. In a building with floors the candidate positions are on the floors.
 
     Args:
         config: Options as one object. Defaults to `RssiLocatorConfig()`.
@@ -126,12 +126,12 @@ class RssiLocator(Configured, Saved):
         fingerprints = Fingerprints.fit(train, fold, config.seed)
         numbers = tracked(fold.unique().tolist(), "held-out folds", progress)
         parts = [self._part(train, fold, number, fingerprints) for number in numbers]
-        self.region = region or Region(
+        prior = region or Region(
             known,
             0.25 if config.validation == "block" else 0.03,  # a block of a fifth may lie beyond the known positions
             outside_mass([part.region for part in parts], [part.position for part in parts]),
-            train.floors,
         )
+        self.region = replace(prior, floors=train.floors)
         self.cells = self.region.cells(config.n_cells)
         self._maps = maps_at(self.model, self.cells.position)
         rssi, position = (torch.cat([getattr(part, name) for part in parts]) for name in ("rssi", "position"))
@@ -216,7 +216,7 @@ class RssiLocator(Configured, Saved):
     @torch.no_grad()
     @checked
     def sample(self, position: Numbers, n: PositiveInt, generator: torch.Generator) -> Tensor:
-        """Sample rows of RSSI from the fitted distributions: values with correlated errors, and lost packets.
+        """Sample rows of RSSI from the fitted distributions: values with a common offset, and lost packets.
 
         Args:
             position: Positions of the transmitter, float64 (m, 3) [m].
