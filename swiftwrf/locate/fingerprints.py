@@ -15,7 +15,6 @@ from swiftwrf.data.rssi import Rssi
 
 NEIGHBOUR_COUNTS = (1, 2, 3, 4, 5, 7, 9, 12, 16, 20)
 METRICS = ("sorensen", "manhattan", "euclidean")  # the first one unless another has a significantly lower error
-MIN_VOTERS = 3  # places that vote for a floor: two have no majority
 MAX_HELD_OUT = 1000  # rows that choose the settings
 SMALLEST_DISTANCE = 1e-3  # of fingerprints, whose inverse is a weight
 Votes = tuple[Tensor, Tensor, Tensor]  # each floor's part of the weights, its mean position, and the estimate
@@ -71,8 +70,7 @@ class Fingerprints:
         parts = [((fold == number) & held_out, fold != number) for number in fold.unique()]
         errors: dict[tuple[str, int], Tensor] = {}
         fewest = min(len(train.transmitter_position[kept].unique(dim=0)) for _, kept in parts)
-        least = MIN_VOTERS if train.floors else 1
-        counts = [k for k in NEIGHBOUR_COUNTS if min(least, fewest) <= k <= fewest]
+        counts = [k for k in NEIGHBOUR_COUNTS if k <= fewest]
         for metric in METRICS:
             error = []
             for out, kept in parts:
