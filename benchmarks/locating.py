@@ -1,6 +1,6 @@
 """Measure how accurately each localizer locates transmitters from measured RSSI, and the time it takes.
 
-python benchmarks/locating.py tetam-tracks:spatial tetam-tracks:block floor --folder DATA
+python benchmarks/locating.py tetam-tracks:spatial ts-tut5:published floor
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import tyro
 from record import kept, options, write_result
 
 from swiftwrf import Rssi, load_rssi, rssi_room
+from swiftwrf.datasets import DATA_SETS, fetch
 from swiftwrf.locate.baselines import LOCALIZERS
 from swiftwrf.locate.comparison import LocateComparison, LocateSplit, Trial
 
@@ -24,10 +25,10 @@ BUILT_IN = "floor"
 @dataclass(frozen=True)
 class Config:
     sets: Annotated[tuple[str, ...], tyro.conf.Positional]
-    """data sets and splits, NAME or NAME:SPLIT (default split: random); floor is the built-in one. Other sets that were
-    measured before are kept"""
-    folder: Path = Path()
-    """folder of the data sets"""
+    """public data sets or folders and splits, NAME or NAME:SPLIT (default split: random); floor is the built-in one.
+    Other sets that were measured before are kept"""
+    localizers: tuple[str, ...] = tuple(LOCALIZERS)
+    """localizers that are compared"""
     cells: int = 4000
     """number of candidate positions of the posterior"""
     seed: int = 0
@@ -38,33 +39,41 @@ def main(config: Config) -> None:
     found: dict[str, Any] = dict(kept(RESULT, "sets"))
     for text in config.sets:
         name, _, split = text.partition(":")
-        data = read(None if name == BUILT_IN else config.folder / name).receivers(["all"])
-        measured = measure(data, split or "random", config.cells, config.seed)
+        measured = measure(read(name), split or "random", config)
         found[f"{name} {split or 'random'}"] = measured
         for localizer, entry in measured["localizers"].items():
             error = entry["position_error_m"]
-            print(f"{text} {localizer}: median {error['median']:.2f} m, 90 % {error['p90']:.2f} m", flush=True)
+            print(f"{text} {localizer}: median {error['median']:.2f} m, mean {error['mean']:.2f} m", flush=True)
         write_result(RESULT, {"threads": torch.get_num_threads(), "sets": dict(sorted(found.items()))}, rows=[measured])
 
 
-def read(source: Path | None) -> Rssi:
-    """Return a data set. None is the built-in floor."""
-    return rssi_room() if source is None else load_rssi(source)
+def read(name: str) -> Rssi:
+    """Return a data set: the built-in floor, a public one or that of a folder."""
+    if name == BUILT_IN:
+        return rssi_room()
+    return load_rssi(fetch(name) if name in DATA_SETS else Path(name))
 
 
-def measure(data: Rssi, split: str, cells: int, seed: int) -> dict[str, Any]:
-    """Return errors and seconds of every localizer on a split, and the coverage of the posterior's credible regions."""
-    measured = LocateSplit.of(data, split, cells, seed)
-    values = {trial: measured.fit(trial)[1] for trial in map(Trial, LOCALIZERS)}
+def measure(data: Rssi, split: str, config: Config) -> dict[str, Any]:
+    """Return errors and seconds of the localizers on a split, and the coverage of the posterior's credible regions.
+
+    The benchmark's nearest neighbour has all receivers, the others those that detected at least 10 rows.
+    """
+    measured = LocateSplit.of(data.receivers(["all"]), split, config.cells, config.seed)
+    whole = LocateSplit.of(data, split, config.cells, config.seed)
+    values = {
+        trial: (whole if trial.localizer == "nearest" else measured).fit(trial)[1]
+        for trial in map(Trial, config.localizers)
+    }
     result = LocateComparison(measured, values)
     return {
         "n_train": len(measured.train),
         "n_test": len(measured.test),
         "n_receivers": len(measured.train.receiver_names),
         "n_undetected": measured.n_undetected,
-        "seed": seed,
+        "seed": config.seed,
         "weights": values[Trial("posterior")]["weights"],
-        "cells": cells,
+        "cells": config.cells,
         "localizers": result.overall,
         "coverage": {str(level): fraction for level, fraction in result.coverage.items()},
     }

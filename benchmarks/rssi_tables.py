@@ -126,10 +126,43 @@ def _cells(median: dict[str, Any]) -> list[str]:
     ]
 
 
+# mean 3D error [m] and right floors of published methods on the same rows, best first: 1-NN of the comparisons by
+# J. Torres-Sospedra et al., CNN-ELM (D. Quezada-Gaibor et al.), CNNLoc (X. Song et al.)
+PUBLISHED: dict[str, tuple[dict[str, float], dict[str, float]]] = {
+    "ts-dsi1": ({"1-NN": 4.95}, {}),
+    "ts-lib1": ({"1-NN": 3.04}, {"CNN-ELM": 0.999, "1-NN": 0.992}),
+    "ts-lib2": ({"1-NN": 4.20}, {"1-NN": 0.998, "CNN-ELM": 0.991}),
+    "ts-tut2": ({"1-NN": 12.89}, {"1-NN": 0.943, "CNN-ELM": 0.921}),
+    "ts-tut5": ({"1-NN": 6.92}, {"CNN-ELM": 0.983, "CNNLoc": 0.981}),
+    "ts-uji1": ({"CNNLoc": 8.46, "1-NN": 10.81}, {}),
+    "ts-ujib1": ({"1-NN": 3.08}, {}),
+}
+
+
+def locating_benchmark() -> str:
+    """Return mean 3D errors [m] and right floors on public splits beside published ones."""
+    rows = []
+    for name, measured in load("locating_rssi")["sets"].items():
+        if (known := PUBLISHED.get(name.split()[0])) is None:
+            continue
+        found = [measured["localizers"].get(n) for n in ("nearest", "knn", "posterior")]
+        errors = [f"{one['position_error_m']['mean']:.2f}" if one else "" for one in found]
+        floors = [f"{one['floor_hit_rate']:.1%}" if one and "floor_hit_rate" in one else "" for one in found[1:]]
+        published = (", ".join(f"{method} {value:.2f}" for method, value in known[0].items()),)
+        published += (", ".join(f"{method} {value:.1%}" for method, value in known[1].items()),)
+        n_test, seconds = measured["n_test"], measured["localizers"]["posterior"]["seconds"]
+        regions = [f"{measured['coverage']['0.8']:.0%}", f"{seconds['fit'] + seconds['predict']:.0f} s"]
+        rows.append([name, str(n_test), published[0], *errors, published[1], *floors, *regions])
+    columns = ["data, split", "test rows", "published [m]", "nearest [m]", "knn [m]", "posterior [m]"]
+    floors = ["published floors", "knn floors", "posterior floors"]
+    return markdown([*columns, *floors, "80 % regions hold", "fit and locate"], rows)
+
+
 def locating_rssi() -> str:
     """Return position errors of each localizer, median and 90 % [m]."""
-    rows, names = [], list(dict.fromkeys(n for s in load("locating_rssi")["sets"].values() for n in s["localizers"]))
-    for name, measured in load("locating_rssi")["sets"].items():
+    sets = {name: one for name, one in load("locating_rssi")["sets"].items() if name.split()[0] not in PUBLISHED}
+    rows, names = [], list(dict.fromkeys(n for one in sets.values() for n in one["localizers"]))
+    for name, measured in sets.items():
         errors = {n: entry["position_error_m"] for n, entry in measured["localizers"].items()}
         cells = [f"{errors[n]['median']:.2f} / {errors[n]['p90']:.2f}" if n in errors else "" for n in names]
         coverage = measured["coverage"]["0.8"]

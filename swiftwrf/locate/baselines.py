@@ -159,7 +159,8 @@ class NearestFingerprint(NearestFingerprints):
     name = "nearest"
 
     def fit(self, train: Rssi) -> Self:
-        self.fingerprints = Fingerprints.of(train, "manhattan", 1)
+        # rows without a detection are rows of the benchmark
+        self.fingerprints = Fingerprints(train.transmitter_position, train.rssi_dbm.float(), None, "manhattan", 1)
         return self
 
 

@@ -323,7 +323,7 @@ def pooled_weights(at_truth: Tensor, at_candidates: Tensor, log_volume: Tensor) 
     return torch.from_numpy(found.x)
 
 
-def inflation(posterior: Posterior, truth: Tensor, level: float = 0.8) -> float:
+def inflation(posterior: Posterior, truth: Tensor, level: float = 0.8, margin: float = 0.0) -> float:
     """Return the factor of credible radii for which regions of `level` contain that fraction of held-out positions.
 
     The weights of largest posterior density leave regions too small if the likelihoods are wrong in ways that no weight
@@ -334,9 +334,10 @@ def inflation(posterior: Posterior, truth: Tensor, level: float = 0.8) -> float:
         posterior: Posterior of held-out observations.
         truth: Their true positions, (n, 3) [m].
         level: Nominal coverage.
+        margin: What is added to the fraction that the regions contain.
     """
     ratio = (posterior.median - truth).norm(dim=1) / posterior.credible_radius(level).clamp_min(1e-9)
-    return float(ratio.quantile(level))
+    return float(ratio.quantile(min(level + margin, 1.0)))
 
 
 def read_inflation(header: Header) -> float:

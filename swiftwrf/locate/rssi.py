@@ -27,6 +27,7 @@ from swiftwrf.locate.rssi_likelihood import (
     ValueLikelihood,
     maps_at,
 )
+from swiftwrf.metrics import NORMAL_80
 from swiftwrf.positions import to_tensor
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime.checkpoint import Header, Saved, expect
@@ -34,6 +35,7 @@ from swiftwrf.runtime.progress import progress as tracked
 from swiftwrf.runtime.validation import Configured, NonNegativeInt, PositiveInt, all_or_nothing, checked, configuration
 
 UNDETECTED_DBM = -1000.0  # stands for what is not detected in a file, which holds finite values only
+LEVEL = 0.8  # coverage that is calibrated
 MAX_HELD_OUT = 2000  # rows that determine the distributions
 
 
@@ -72,9 +74,9 @@ class _Part:
 class RssiLocator(Configured, Saved):
     """Posterior over the position of the transmitter, given its RSSI at the receivers.
 
-    Three likelihoods are pooled: the values under the radio maps with their uncertainty and correlated errors, which
+    Three likelihoods are pooled: the values under the radio maps with their uncertainty and a common offset of a row, which
     receivers detect the transmitter at all, and the position of similar training rows. Held-out rows determine their
-    distributions and weights.
+    distributions and weights. In a building with floors the candidate positions are on the floors.
 
     Args:
         config: Options as one object. Defaults to `RssiLocatorConfig()`.
@@ -124,12 +126,12 @@ class RssiLocator(Configured, Saved):
         fingerprints = Fingerprints.fit(train, fold, config.seed)
         numbers = tracked(fold.unique().tolist(), "held-out folds", progress)
         parts = [self._part(train, fold, number, fingerprints) for number in numbers]
-        self.region = region or Region(
+        prior = region or Region(
             known,
             0.25 if config.validation == "block" else 0.03,  # a block of a fifth may lie beyond the known positions
             outside_mass([part.region for part in parts], [part.position for part in parts]),
-            train.floors,
         )
+        self.region = replace(prior, floors=train.floors)
         self.cells = self.region.cells(config.n_cells)
         self._maps = maps_at(self.model, self.cells.position)
         rssi, position = (torch.cat([getattr(part, name) for part in parts]) for name in ("rssi", "position"))
@@ -180,7 +182,9 @@ class RssiLocator(Configured, Saved):
         self.weight = pooled_weights(torch.cat(truth, dim=1), candidates, volume)
         log_mass = torch.einsum("k,knm->nm", self.weight, candidates) + volume
         held_out = self._posterior(log_mass)
-        self.inflation = inflation(held_out, position)
+        # the coverage at new places is then 80 % or more with a probability of 90 %; rows of one place count once
+        margin = NORMAL_80 * (LEVEL * (1 - LEVEL) / len(position.unique(dim=0))) ** 0.5
+        self.inflation = inflation(held_out, position, LEVEL, margin)
 
     def _posterior(self, log_mass: Tensor, inflation: float = 1.0) -> Posterior:
         cells = self.cells
@@ -212,7 +216,7 @@ class RssiLocator(Configured, Saved):
     @torch.no_grad()
     @checked
     def sample(self, position: Numbers, n: PositiveInt, generator: torch.Generator) -> Tensor:
-        """Sample rows of RSSI from the fitted distributions: values with correlated errors, and lost packets.
+        """Sample rows of RSSI from the fitted distributions: values with a common offset, and lost packets.
 
         Args:
             position: Positions of the transmitter, float64 (m, 3) [m].
