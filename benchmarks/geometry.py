@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import torch
-from record import write_result
+from record import check_committed, write_result
 
 from swiftwrf import Spectra, load_spectra, simulated_room
 from swiftwrf.choices import Moving
@@ -88,4 +88,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    check_committed()
     main()

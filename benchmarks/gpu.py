@@ -30,7 +30,7 @@ from rasterize import (
     timed,
     with_gradients,
 )
-from record import RESULTS, write_result
+from record import RESULTS, options, write_result
 from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
@@ -296,4 +296,4 @@ PARTS = {
 }
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    main(options(Config))

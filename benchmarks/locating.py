@@ -11,8 +11,7 @@ from typing import Annotated, Any
 
 import torch
 import tyro
-from committed import RESULTS, load
-from record import write_result
+from record import kept, options, write_result
 
 from swiftwrf import Rssi, load_rssi, rssi_room
 from swiftwrf.locate.baselines import LOCALIZERS
@@ -36,7 +35,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Measure each data set and write `results/locating_rssi.json`."""
-    found = earlier()
+    found: dict[str, Any] = dict(kept(RESULT, "sets"))
     for text in config.sets:
         name, _, split = text.partition(":")
         data = read(None if name == BUILT_IN else config.folder / name).receivers(["all"])
@@ -45,13 +44,7 @@ def main(config: Config) -> None:
         for localizer, entry in measured["localizers"].items():
             error = entry["position_error_m"]
             print(f"{text} {localizer}: median {error['median']:.2f} m, 90 % {error['p90']:.2f} m", flush=True)
-        write_result(RESULT, {"threads": torch.get_num_threads(), "sets": dict(sorted(found.items()))})
-
-
-def earlier() -> dict[str, Any]:
-    """Return the sets that are in the results already."""
-    sets: dict[str, Any] = load(RESULT)["sets"] if (RESULTS / f"{RESULT}.json").is_file() else {}
-    return sets
+        write_result(RESULT, {"threads": torch.get_num_threads(), "sets": dict(sorted(found.items()))}, rows=[measured])
 
 
 def read(source: Path | None) -> Rssi:
@@ -78,4 +71,4 @@ def measure(data: Rssi, split: str, cells: int, seed: int) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    main(options(Config))

@@ -19,8 +19,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-import tyro
-from record import RESULTS, write_result
+from record import RESULTS, options, write_result
 
 from augment import Mixed, withhold
 from augment.estimators import make_estimator
@@ -193,4 +192,4 @@ def median_of(rows: list[Row]) -> Row:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    main(options(Config))

@@ -17,9 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-import tyro
-from committed import load
-from record import RESULTS, write_result
+from record import kept, options, write_result
 from torch import Tensor
 
 from augment import Mixed, SyntheticPositions, mix, synthetic_positions, withhold
@@ -75,7 +73,7 @@ class TimedNetwork(AANNKernel):
 def main(config: Config) -> None:
     """Measure every method on every training set and write the result after each of them."""
     torch.set_num_threads(1)
-    scenes: dict[str, Any] = load(config.name)["scenes"] if (RESULTS / f"{config.name}.json").is_file() else {}
+    scenes: dict[str, Any] = dict(kept(config.name, "scenes"))
     for scene in config.scenes:
         data = simulated_room() if scene == "room" else load_spectra(config.data / scene)
         train, _ = data.split("random")
@@ -97,7 +95,7 @@ def main(config: Config) -> None:
                 row["change"] = paired_change(methods.get(REFERENCE, row)["errors_deg"], row["errors_deg"])
                 methods[name] = row
                 print(scene, training, name, f"{row['change']['median_deg']:.2f} deg", row["seconds"], flush=True)
-                write_result(config.name, {"scenes": scenes})
+                write_result(config.name, {"scenes": scenes}, rows=[row])
 
 
 def has_room(data: Spectra) -> bool:
@@ -147,4 +145,4 @@ def estimates(mixed: Mixed, measured: Spectra, training: Training, held_out: Spe
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    main(options(Config))

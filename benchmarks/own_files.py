@@ -16,11 +16,12 @@ from subprocess import run
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "swiftwrf/diagnostics"))
 
 import numpy as np
 import pandas as pd
 import torch
-from record import write_result
+from record import check_committed, write_result
 from samples import snapshots, write_snapshots
 from test_calibration import errors, spoilt
 
@@ -99,4 +100,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    check_committed()
     main()

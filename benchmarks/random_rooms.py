@@ -10,7 +10,7 @@ import time
 from typing import Any, get_args
 
 import torch
-from record import write_result
+from record import check_committed, write_result
 from rooms import mirror_room
 
 from swiftwrf.choices import Moving
@@ -78,4 +78,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    check_committed()
     main()

@@ -16,8 +16,7 @@ from typing import Any, Literal
 import numba
 import numpy as np
 import torch
-import tyro
-from record import RESULTS, write_result
+from record import RESULTS, options, write_result
 from torch import Tensor
 
 from swiftwrf import AngularGrid, SwiftWRF, rasterize
@@ -220,4 +219,4 @@ def report(row: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    main(options(Config))

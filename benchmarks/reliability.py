@@ -1,12 +1,7 @@
-"""Attack readers, commands and runs and record how they end: the long version of tests/fuzz and test_interrupts.py.
-
-python benchmarks/reliability.py [--mutations 10000 --attempts 5000 --commands 200 --right 20 --kills 50 --disks 10
---races 5]
-"""
+"""Attack readers, commands and runs and record how they end: the long version of tests/fuzz and test_interrupts.py."""
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import os
@@ -14,36 +9,39 @@ import random
 import sys
 import tempfile
 from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "tasks"))
 
 import test_interrupts as interrupts
 from fuzz.commands import command_lines, right_command_lines
 from fuzz.kinds import ATTEMPTS, KINDS
 from fuzz.test_fuzz import SHORT, attack
 from quick import run
-from record import write_result
+from record import options, write_result
 
 PAGES = [kind for kind in KINDS if kind.endswith("on the page")]
 CommandLines = Callable[[random.Random, Path, int], Iterator[tuple[str, list[str]]]]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    numbers = {
-        "mutations": 10_000,
-        "attempts": 5_000,
-        "commands": 200,
-        "right": 20,
-        "kills": 50,
-        "disks": 10,
-        "races": 5,
-    }
-    for name, number in numbers.items():
-        parser.add_argument(f"--{name}", type=int, default=number)
-    asked = parser.parse_args()
+@dataclass(frozen=True)
+class Config:
+    """Numbers of attacks of each kind."""
+
+    mutations: int = 10_000
+    attempts: int = 5_000
+    commands: int = 200
+    right: int = 20
+    kills: int = 50
+    disks: int = 10
+    races: int = 5
+
+
+def main(asked: Config) -> None:
+    """Make every attack and write `results/reliability.json`."""
     root, done = Path(tempfile.mkdtemp()), {}
     parts: dict[str, Callable[[], dict[str, Any]]] = {
         "mutations": lambda: mutations(root, KINDS, asked.mutations),
@@ -139,4 +137,4 @@ def races(root: Path, count: int) -> dict[str, int]:
 
 if __name__ == "__main__":
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    main()
+    main(options(Config))

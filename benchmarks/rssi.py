@@ -4,35 +4,28 @@
 
 python benchmarks/rssi.py --data DATA
 
-Every predictor is fitted to the training rows of a split and predicts its test rows. Seconds are processor time. The result
-is written after each split, and `--resume` skips the splits that it contains.
+Every predictor is fitted to the training rows of a split and predicts its test rows. The result is
+written after each split, and `--resume` skips the splits that it contains.
 """
 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-import numpy as np
 import torch
-import tyro
-from committed import RESULTS, load
-from numpy.typing import NDArray
-from pandas import DataFrame
-from record import write_result
+from record import kept, options, write_result
 from torch import Tensor
 
 from swiftwrf import Rssi, load_rssi
-from swiftwrf.choices import RSSI_PREDICTORS
-from swiftwrf.data.rssi import PLACE
-from swiftwrf.metrics import paired_difference, summary
-from swiftwrf.rssi import LEVEL, PairModel, RssiModel
-from swiftwrf.rssi.comparison import make_predictor
+from swiftwrf.metrics import method_summary, summary
+from swiftwrf.models.prediction import Prediction
+from swiftwrf.rssi import LEVEL, RssiModel
+from swiftwrf.rssi.comparison import compare
 from swiftwrf.rssi.head import DB_PER_UNIT, Head, render
 
 RESULT = "rssi"
@@ -66,7 +59,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Measure each split and write `results/rssi.json`."""
-    found: dict[str, Row] = load(RESULT)["sets"] if (RESULTS / f"{RESULT}.json").is_file() else {}
+    found: dict[str, Row] = dict(kept(RESULT, "sets"))
     for name, split in splits(config.sets):
         key = f"{name} {split}"
         if config.resume and key in found:
@@ -76,7 +69,7 @@ def main(config: Config) -> None:
         for method, row in found[key]["methods"].items():
             error = row["abs_error_db"]
             print(f"{key} {method}: median {error['median']:.3f} dB, mean {error['mean']:.3f} dB", flush=True)
-        write_result(RESULT, {"sets": found})
+        write_result(RESULT, {"sets": found}, rows=[found[key]])
 
 
 def splits(names: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]:
@@ -88,50 +81,40 @@ def splits(names: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]:
 
 def measure(data: Rssi, split: str, also: tuple[str, ...] = ()) -> Row:
     """Return errors, differences to the best baseline, coverage of intervals and seconds of every predictor on a split."""
-    data = data.receivers(["all"])
-    train, test = data.split(split)
-    compared = [name for name in RSSI_PREDICTORS if RSSI_PREDICTORS[name].compared(data) or name in also]
-    names = [name for name in compared if not RSSI_PREDICTORS[name].lacking(data)]
-    methods, errors = {}, {}
-    for name in (*names, IDENTITY):
-        methods[name], errors[name] = _measured(name, train, test, split)
-    row, receiver = test.detected.nonzero().T.numpy()
-    pairs = DataFrame(errors | {"index": row, "receiver": receiver}).set_index(["index", "receiver"])
-    median = {name: entry["abs_error_db"]["median"] for name, entry in methods.items()}
-    best = min((name for name in names if name not in OWN), key=lambda name: median[name])
-    for name, entry in methods.items():
-        mean, low, high = paired_difference(pairs, name, best)
+    result = compare(data, split=split, also=also)
+    with patch("swiftwrf.rssi.training.render", in_phase):
+        identity = compare(
+            data,
+            split=split,
+            also=also,
+            keep=lambda name, compute: compute()[1] if name == RssiModel.name else result.values[name],
+        )
+    result = replace(result, values={**result.values, IDENTITY: identity.values[RssiModel.name]})
+    median = {name: values["median_db"] for name, values in result.values.items()}
+    best = min((name for name in median if name not in OWN), key=lambda name: median[name])
+    table = method_summary(result.errors, "abs_error_db", best)
+    methods: dict[str, Row] = {}
+    for name, own in result.errors.groupby("method", sort=False)["abs_error_db"]:
+        values, change = result.values[name], table.loc[name]
         # few test rows have no interval
-        interval = {key: value for key, value in {"low": low, "high": high}.items() if math.isfinite(value)}
-        entry["difference_db"] = {"median": median[name] - median[best], "mean": mean, **interval}
+        ends = {end: float(change[f"difference_{end}"]) for end in ("low", "high")}
+        ends = {end: value for end, value in ends.items() if math.isfinite(value)}
+        difference = {"median": median[name] - median[best], "mean": float(change["difference"]), **ends}
+        seconds = {part: values[part] for part in ("fit", "predict")}
+        methods[name] = {"abs_error_db": summary(own), "seconds": seconds, "difference_db": difference}
+        if values["std"] is not None:
+            error, std = torch.tensor(own.to_numpy()), torch.as_tensor(values["std"]).double()
+            _, half_width = Prediction(torch.zeros_like(std), std).interval(LEVEL)
+            methods[name]["coverage"] = float((error <= half_width).double().mean())
     return {
         "n_rows": len(data),
-        "n_train": len(train),
-        "n_test": len(test),
+        "n_train": len(result.train),
+        "n_test": len(result.test),
         "n_receivers": len(data.receiver_names),
-        "model": PairModel.name if data.receiver_moves else RssiModel.name,
+        "model": result.model,
         "best_baseline": best,
         "methods": methods,
     }
-
-
-def _measured(name: str, train: Rssi, test: Rssi, split: str) -> tuple[Row, NDArray[np.float64]]:
-    """Return the entry of one predictor, and its absolute errors at the detected test pairs [dB]."""
-    options = {"validation": train.validation_for(split, test), "new_places": split == PLACE}
-    predictor = make_predictor(RssiModel.name if name == IDENTITY else name, **options)
-    began = time.process_time()
-    with patch("swiftwrf.rssi.training.render", in_phase if name == IDENTITY else render):
-        predictor.fit(train)
-    fitted = time.process_time()
-    prediction = predictor.predict_detected(test)
-    seconds = {"fit": fitted - began, "predict": time.process_time() - fitted}
-    error = (prediction.mean - test.rssi_dbm)[test.detected].abs().numpy()
-    entry: Row = {"abs_error_db": summary(error), "seconds": seconds}
-    if prediction.std is not None:
-        low, high = (end[test.detected] for end in prediction.interval(LEVEL))
-        measured = test.rssi_dbm[test.detected]
-        entry["coverage"] = float(((low <= measured) & (measured <= high)).double().mean())
-    return entry, error
 
 
 def in_phase(heads: Iterable[Head]) -> Tensor:
@@ -143,4 +126,4 @@ def in_phase(heads: Iterable[Head]) -> Tensor:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    main(options(Config))

@@ -5,15 +5,12 @@ Each point runs in a separate process, for its own peak of memory. Seconds are p
 
 from __future__ import annotations
 
-import json
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
 
 import torch
-import tyro
-from committed import RESULTS
-from record import write_result
+from record import kept, options, write_result
 from scaling import measuring
 
 from swiftwrf import Rssi, fit_rssi, rssi_room
@@ -49,16 +46,17 @@ def measure(n: int, receivers: int) -> dict[str, float]:
 
 def main(config: Config) -> None:
     """Measure each point and write `results/scaling_rssi.json`."""
-    kept = RESULTS / "scaling_rssi.json"
-    rows = json.loads(kept.read_text())["rows"] if kept.is_file() else []
+    rows = kept("scaling_rssi", "rows")
     for n, receivers in config.points:
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as fresh:
             found = fresh.submit(measure, n, receivers).result()
         print(found, flush=True)
         rows = [row for row in rows if (row["rows"], row["receivers"]) != (n, receivers)] + [found]
         rows.sort(key=lambda row: (row["receivers"], row["rows"]))
-        write_result("scaling_rssi", {"threads": torch.get_num_threads(), "predicted": PREDICTED, "rows": rows})
+        write_result(
+            "scaling_rssi", {"threads": torch.get_num_threads(), "predicted": PREDICTED, "rows": rows}, rows=[found]
+        )
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    main(options(Config))

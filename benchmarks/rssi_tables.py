@@ -1,11 +1,12 @@
-"""Tables of all measured RSSI data sets, from the result of rssi.py."""
+"""Tables of measured RSSI, and of locating: matched fields on spectra, localizers on RSSI."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from committed import load, markdown
+from record import load, markdown
 
+SPECTRA = ("locating_rooms", "locating_newrf")  # results of locating_aoa.py
 RELEVANT_DB = 0.02  # difference of medians below which predictors are level
 
 
@@ -64,3 +65,73 @@ def _outcome(difference_db: float) -> str:
 
 def _interval(difference: dict[str, Any]) -> str:
     return f"{difference['mean']:+.2f} [{difference['low']:+.2f}, {difference['high']:+.2f}]"
+
+
+def headline_rssi() -> str:
+    """Return errors of RSSI and of positions on the measured sets of which both are known."""
+    located, rows = load("locating_rssi")["sets"], []
+    for name, found in load("rssi")["sets"].items():
+        if name not in located:
+            continue
+        methods, best = found["methods"], found["best_baseline"]
+        own = methods["swiftwrf"]
+        errors = (methods["mri_receiver"], methods[best], own)
+        cells = [f"{entry['abs_error_db']['median']:.2f} / {entry['abs_error_db']['p90']:.1f}" for entry in errors]
+        cells[1] += f" (`{best}`)"
+        position = {method: entry["position_error_m"] for method, entry in located[name]["localizers"].items()}
+        cells.append(f"{own['coverage']:.0%}")
+        cells += [
+            f"{position[method]['median']:.2f} / {position[method]['p90']:.2f}" for method in ("knn", "posterior")
+        ]
+        rows.append([name, *cells, f"{located[name]['coverage']['0.8']:.0%}"])
+    columns = ["RSSI [dB]: path-loss model", "best baseline", "SwiftWRF", "80 % intervals cover"]
+    columns += ["position [m]: nearest fingerprints", "posterior", "80 % regions cover"]
+    return markdown(["data, split", *columns], rows)
+
+
+def locating_spectra() -> str:
+    """Return errors of directions and positions by matched-field processing, medians over the draws."""
+    rows = []
+    for name in SPECTRA:
+        for scene, fractions in load(name).get("scenes", {}).items():
+            for fraction, entry in fractions.items():
+                rows.append([scene, f"{float(fraction):.0%}", str(len(entry["draws"])), *_cells(entry["median"])])
+    columns = [
+        "scene",
+        "measured",
+        "random choices",
+        "kernel regression [deg]",
+        "matched field [deg]",
+        "position [m]",
+        "80 % regions hold",
+        "fit",
+        "200 spectra",
+    ]
+    return markdown(columns, rows)
+
+
+def _cells(median: dict[str, Any]) -> list[str]:
+    def both(name: str, digits: int) -> str:
+        value = median.get(name)
+        return f"{value['median']:.{digits}f} / {value['p90']:.{digits}f}" if value else ""
+
+    seconds = median.get("seconds")
+    return [
+        both("kernel_regression_angle_deg", 2),
+        both("angle_deg", 2),
+        both("position_m", 3),
+        f"{median['coverage_80']:.0%}" if "coverage_80" in median else "",
+        f"{seconds['fit']:.0f} s" if seconds else "",
+        f"{seconds['locate']:.0f} s" if seconds else "",
+    ]
+
+
+def locating_rssi() -> str:
+    """Return position errors of each localizer, median and 90 % [m]."""
+    rows, names = [], list(dict.fromkeys(n for s in load("locating_rssi")["sets"].values() for n in s["localizers"]))
+    for name, measured in load("locating_rssi")["sets"].items():
+        errors = {n: entry["position_error_m"] for n, entry in measured["localizers"].items()}
+        cells = [f"{errors[n]['median']:.2f} / {errors[n]['p90']:.2f}" if n in errors else "" for n in names]
+        coverage = measured["coverage"]["0.8"]
+        rows.append([name, str(next(iter(errors.values()))["n"]), *cells, f"{coverage:.0%}"])
+    return markdown(["data, split", "test rows", *names, "80 % regions hold"], rows)

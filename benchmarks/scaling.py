@@ -7,7 +7,6 @@ is the peak of memory that it cannot reclaim.
 
 from __future__ import annotations
 
-import json
 import os
 import tempfile
 import threading
@@ -23,9 +22,7 @@ from typing import Any
 
 import numpy as np
 import torch
-import tyro
-from committed import RESULTS, ROOT
-from record import write_result
+from record import ROOT, kept, options, write_result
 
 from augment import Mixed
 from augment.estimators.aann import AANN
@@ -59,13 +56,14 @@ class Config:
 
 def main(config: Config) -> None:
     """Measure each stage of each size, write `results/scaling.json` and draw the figure."""
-    kept = RESULTS / "scaling.json"
-    rows = {row["n"]: row for row in json.loads(kept.read_text())["rows"]} if kept.is_file() else {}
+    rows = {row["n"]: row for row in kept("scaling", "rows")}
     for n in config.sizes:
         with tempfile.TemporaryDirectory(dir=config.folder) as folder:
             rows[n] = {"n": n, "stages": {stage: run(stage, n, folder) for stage in STAGES}}
         ordered = [rows[n] for n in sorted(rows)]
-        write_result("scaling", {"threads": torch.get_num_threads(), "rows": ordered, "slopes": slopes(ordered)})
+        write_result(
+            "scaling", {"threads": torch.get_num_threads(), "rows": ordered, "slopes": slopes(ordered)}, rows=[rows[n]]
+        )
         draw(ordered)
 
 
@@ -172,7 +170,7 @@ def generate(folder: Path, n: int, found: dict[str, float]) -> None:
             write_spectra(simulated(at), folder / name)
 
 
-def load(folder: Path, n: int, found: dict[str, float]) -> None:
+def open_walk(folder: Path, n: int, found: dict[str, float]) -> None:
     """Open the walk."""
     with measuring(found):
         assert len(load_spectra(folder / "walk")) == n
@@ -203,8 +201,8 @@ def train(folder: Path, n: int, found: dict[str, float]) -> None:
 
 STAGES: dict[str, Callable[[Path, int, dict[str, float]], None]] = {
     "generate": generate,
-    "load first": load,
-    "load again": load,
+    "load first": open_walk,
+    "load again": open_walk,
     **{name: predicting(name) for name in MODELS},
     "train": train,
 }
@@ -218,4 +216,4 @@ def measure(stage: str, folder: Path, n: int) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    main(options(Config))

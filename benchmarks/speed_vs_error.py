@@ -14,9 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import tyro
-from record import write_result
-from synthesis import load
+from fields import load_scene
+from record import options, write_result
 from torch import Tensor
 
 from swiftwrf import (
@@ -59,7 +58,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Measure every setting, write `results/speed_NAME.json` and draw `docs/figures/speed_NAME.svg`."""
-    data = load(config.data) if config.data else simulated_room(seed=config.seed)
+    data = load_scene(config.data) if config.data else simulated_room(seed=config.seed)
     if config.array is not None:
         side, spacing, frequency = config.array
         data = replace(data, array=PlanarArray.square(side, frequency, spacing))
@@ -234,4 +233,4 @@ def draw(content: dict[str, Any], file: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    main(options(Config))

@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
-import tyro
 from hard_cases import HARD_CASES, field_errors, magnitude_errors
-from record import write_result
+from record import options, write_result
 from tolerances import GRADIENT_TOLERANCE, VALUE_TOLERANCE
 from torch import Tensor
 
@@ -198,4 +197,4 @@ def fit_case(name: str, many: int, n_primitives: int | Literal["auto"] = "auto")
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    main(options(Config))

@@ -16,8 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import tyro
-from record import write_result
+from record import options, write_result
 
 HERE = Path(__file__).parent.parent
 ROUNDS = 5
@@ -84,4 +83,4 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    main(options(Config))

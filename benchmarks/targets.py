@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from committed import aoa_shares, change_text, load, markdown, turbo_condition
+from aoa_tables import aoa_shares, change_text, turbo_condition
+from record import load, markdown
 
 # by scene and split: SSIM and PSNR [dB], with the digits they were asked for
 SYNTHESIS: dict[str, tuple[str, str]] = {
@@ -50,10 +51,9 @@ def _state(missed: Sequence[str]) -> str:
 def synthesis_targets() -> str:
     """Return SSIM and PSNR of swiftwrf at unseen positions beside their targets."""
     rows = []
-    scenes = load("synthesis")["scenes"]
+    found = {f"{row['scene']} {row['split']}": row for row in load("synthesis")["rows"] if row["method"] == "swiftwrf"}
     for scene, (ssim, psnr) in SYNTHESIS.items():
-        scores = scenes[scene]["synthesizers"]["swiftwrf"]
-        own = {name: scores[name]["median"] for name in ("ssim", "psnr_db")}
+        own = {name: found[scene][name]["median"] for name in ("ssim", "psnr_db")}
         missed = _missed(own["ssim"], ssim, "(SSIM)", True) + _missed(own["psnr_db"], psnr, "dB", True)
         rows.append([scene, f"{ssim} / {psnr}", f"{own['ssim']:.3f} / {own['psnr_db']:.1f}", _state(missed)])
     return markdown(["scene, split", "target", "swiftwrf", ""], rows)

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import torch
-import tyro
-from committed import RESULTS
-from record import write_result
+from record import load, options, write_result
 from rooms import room_with_box
 
 import swiftwrf
@@ -145,8 +142,7 @@ def tracks(config: Config) -> dict[str, Any]:
 
 def main(config: Config) -> None:
     """Measure each part and write `results/update.json`."""
-    file = RESULTS / "update.json"
-    kept = json.loads(file.read_text()) if file.is_file() else {}
+    kept = load("update")
     found = {part: kept[part] for part in get_args(Part) if part in kept}
     for part in config.only:
         if part == "tracks" and config.tracks is None:
@@ -156,4 +152,4 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    main(options(Config))

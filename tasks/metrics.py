@@ -50,9 +50,10 @@ class ReceiverMetrics(TypedDict):
 
 
 class PredictorMetrics(ReceiverMetrics):
-    """Errors of a predictor at all receivers, and its seconds."""
+    """Errors of a predictor at all receivers, its seconds, and the shares of detected and empty cells predicted as such."""
 
     seconds: PredictorSeconds
+    detection: NotRequired[tuple[float, float] | None]
 
 
 class IntervalMetrics(TypedDict):

@@ -5,17 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, fields, is_dataclass
-from typing import Annotated, Any, Literal, TypeVar, dataclass_transform, get_args, get_type_hints
+from types import NoneType
+from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_type_hints
 from unicodedata import category
 
 import tyro
+from annotated_types import Ge, Lt
 from docstring_parser import parse_from_object
 
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.registry import Registry
+from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, check_value
 from tasks import labels
 
 SEEDS = 2**32  # number of seeds that the generators of scikit-learn and NumPy accept
+Seed = Annotated[int, Ge(0), Lt(SEEDS)]
 MAX_SIDE = 32  # elements: spectra of 32 x 32 elements have 7,938 independent numbers
 
 Class = TypeVar("Class", bound=type)
@@ -35,8 +39,14 @@ def options(cls: Class) -> Class:
 
 
 def _default(value: str) -> str:
-    """Return what the help says of a default; one that is None, False or empty needs no word."""
+    """Return the text of a default in the help, which is empty for None, False and no values."""
     return "" if value in ("None", "False", "") else f"(default: {value})"
+
+
+def _without_none(hint: Any) -> Any:
+    """Return the type of an option that is given."""
+    kinds = get_args(get_args(hint)[0]) if hasattr(hint, "__metadata__") else ()
+    return Union[tuple(kind for kind in kinds if kind is not NoneType)] if NoneType in kinds else hint  # noqa: UP007
 
 
 def by_name(config: Any) -> dict[str, Any]:
@@ -71,7 +81,7 @@ class Options:
         """Refuse options that are wrong whatever the data. Subclasses extend it.
 
         Raises:
-            InputError: Empty text, control characters, a number that is not finite, or a seed that generators do not accept.
+            InputError: Empty text, control characters, or a number that is not finite or outside its declared range.
         """
         for name, given in by_name(self).items():
             flag = f"--{name.replace('_', '-')}"
@@ -84,16 +94,20 @@ class Options:
                     )
                 if isinstance(value, float) and not math.isfinite(value):
                     raise InputError(f"{flag} takes finite numbers, got {value}")
-            if name == "seed" and not 0 <= given < SEEDS:
-                raise InputError(f"--seed must be from 0 to {SEEDS - 1}, got {given}")
-        for option in fields(self):
-            if isinstance(group := getattr(self, option.name), SpectraSource | TableSource):
+        groups = [value for value in vars(self).values() if is_dataclass(value)]
+        for group in (self, *groups):
+            hints = get_type_hints(type(group), include_extras=True)
+            for option in fields(group):
+                if (value := getattr(group, option.name)) is not None:
+                    check_value(f"--{option.name.replace('_', '-')}", value, _without_none(hints[option.name]))
+        for group in groups:
+            if isinstance(group, SpectraSource | TableSource):
                 group.check()
 
 
 @options
 class Answered:
-    """What the command prints."""
+    """Output of a command."""
 
     quiet: bool = False
     """print the answer only, no progress and no notes"""
@@ -103,7 +117,7 @@ class Answered:
 
 @options
 class Output(Answered):
-    """What the command prints and shows."""
+    """Output and report of a command."""
 
     open: bool = False
     """open the report in the browser at the end"""
@@ -136,7 +150,7 @@ def choice(meaning: str, registry: Registry[Any] | None, known: Mapping[str, lab
 
 @options
 class SpectraSource:
-    """How spectra are read or computed."""
+    """Options of reading or computing spectra."""
 
     array: tuple[int, float, float] | tuple[int, int, float, float] | None = None
     """array of the spectra if the data do not describe it, or for which spectra of ray paths are computed: elements a side,
@@ -146,13 +160,13 @@ class SpectraSource:
     )
     grid: tuple[int, int] | None = None
     """elevations and azimuths of computed spectra (default: 90 360)"""
-    every: int | None = None
+    every: PositiveInt | None = None
     """reads one measurement of that many"""
-    station: int | None = None
+    station: PositiveInt | None = None
     """number of the array in a file with several, counted from 1"""
-    subcarriers: int | None = None
+    subcarriers: PositiveInt | None = None
     """number of subcarriers at which the channel is computed from ray paths (default: spectra alone)"""
-    bandwidth: float | None = None
+    bandwidth: PositiveFloat | None = None
     """distance of the first and the last of these subcarriers [Hz]"""
     drop_null: bool = False
     """leave out null subcarriers of array snapshots, which are the same at every position and element"""
@@ -163,7 +177,7 @@ class SpectraSource:
         """Refuse options that are wrong whatever the data.
 
         Raises:
-            InputError: An unknown beamformer, or a number out of its range.
+            InputError: An unknown beamformer, or an array that is none.
         """
         if self.beamformer is not None and self.beamformer not in labels.BEAMFORMERS:
             raise InputError(f"unknown beamformer {self.beamformer!r}; choose from {', '.join(labels.BEAMFORMERS)}")
@@ -171,9 +185,6 @@ class SpectraSource:
             self._check_array(*self.array)
         if self.grid is not None and min(self.grid) < 2:
             raise InputError(f"--grid takes numbers of elevations and azimuths, each at least 2, got {self.grid}")
-        for name, value in (("every", self.every), ("station", self.station), ("subcarriers", self.subcarriers)):
-            if value is not None and value < 1:
-                raise InputError(f"--{name} must be at least 1, got {value}")
 
     def _check_array(self, *array: float) -> None:
         *sides, spacing, frequency = array
@@ -188,7 +199,7 @@ class SpectraSource:
 
 @options
 class TableSource:
-    """How RSSI is read."""
+    """Options of reading RSSI."""
 
     columns: tuple[str, ...] = ()
     """names of columns of a survey table that are not recognised: x=NAME y=NAME receiver=NAME rssi=NAME
@@ -232,7 +243,7 @@ class TableSource:
 
 @options
 class OffsetSource(TableSource):
-    """How RSSI of several devices or channels is read."""
+    """Options of reading RSSI of several devices or channels."""
 
     offset_by: str | None = None
     """column of a survey table with groups of rows, e.g. devices, whose constant offsets are estimated; COLUMN=VALUE makes

@@ -105,8 +105,8 @@ def aoa_run(tmp_path_factory: pytest.TempPathFactory, room: Spectra) -> Path:
     (folder / "data").mkdir()
     write_spectra(room, folder / "data")
     options = ("--synthesizer", "swiftwrf", "--extra", 0, "--data", folder / "data", "--out", folder / "run")
-    with mock.patch("augment.turbo.experiment.candidates", return_value=["idw"]):  # finding a room has tests of its own
-        assert quick.run("aoa", "--mix", 0.5, 1, *options) == 0
+    with mock.patch("augment.turbo.experiment.candidates", return_value=["idw"]):
+        assert quick.run("aoa", "--mix", 0.5, 1, *options, drawn=True) == 0
     make_model("idw").fit(room).save(folder / "run" / "model-mix1.safetensors")
     return folder / "run"
 
@@ -119,5 +119,5 @@ def rssi_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("rssi")
     Image.new("RGB", (40, 30), "white").save(folder / "plan.png")
     plan = ("--floor-plan", folder / "plan.png", "--floor-extent", 0, 20, 0, 15)
-    assert quick.run("rssi", "--rx", 1, 6, 12, *plan, "--out", folder / "run") == 0
+    assert quick.run("rssi", "--rx", 1, 6, 12, *plan, "--out", folder / "run", drawn=True) == 0
     return folder / "run"

@@ -8,10 +8,11 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from unittest import mock
 
-from small import glances, small_published, small_swiftwrf
+from matplotlib.figure import Figure
+from small import known_planes, small_published, small_swiftwrf
 
 from augment.estimators import ESTIMATORS
 from augment.estimators.baselines import Constant
@@ -23,6 +24,8 @@ from swiftwrf.rssi import RssiConfig
 from swiftwrf.runtime.validation import configuration
 from tasks.aoa import experiment as aoa
 from tasks.aoa.options import AoaConfig
+from tasks.aoa.page import synthesis
+from tasks.aoa.page.records import FractionRecords
 from tasks.command_line import command_line
 from tasks.convert.options import ConvertConfig
 from tasks.convert.run import run as convert
@@ -81,29 +84,45 @@ class QuickNetwork(Constant):
 
 
 @contextmanager
-def quick() -> Iterator[None]:
-    """Few spectra, few steps, few methods."""
+def sketched() -> Iterator[None]:
+    """Write reports with empty figures, which otherwise take most of the time of a small run."""
+
+    def outline(figure: Figure, title: str | None = None) -> str:
+        return "<svg></svg>\n"
+
+    def first(fraction: FractionRecords) -> list[synthesis.Example]:
+        return every(fraction)[:1]
+
+    every = synthesis.examples
+    with mock.patch("tasks.page.page.as_svg", outline), mock.patch.object(synthesis, "examples", first):
+        yield
+
+
+@contextmanager
+def quick(drawn: bool = False) -> Iterator[None]:
+    """Few spectra, few steps, few methods, no planes; figures of the report are drawn if asked for."""
     spectra = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
     floor = rssi_room(n=40)
     with (
         small_published(),
         small_swiftwrf(),
-        glances(),
+        known_planes(),
         mock.patch.object(aoa, "simulated_room", return_value=spectra),
         mock.patch.object(rssi, "rssi_room", return_value=floor),
         mock.patch.object(locate, "rssi_room", return_value=rssi_room(n=80)),
         mock.patch.object(RssiModel, "config_type", QuickRssiConfig),
         mock.patch("swiftwrf.rssi.maps.CELLS", 8),
+        nullcontext() if drawn else sketched(),
         mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
         mock.patch.object(RSSI_PREDICTORS, "_registered", {name: RSSI_PREDICTORS[name] for name in PREDICTORS_KEPT}),
     ):
         yield
 
 
-def run(task: str, *arguments: object) -> int:
+def run(task: str, *arguments: object, drawn: bool = False) -> int:
     """A task's command line on the toy; its exit code."""
     config, function = TASKS[task]
-    with quick():
+    with quick(drawn):
         return command_line(f"tasks.{task}", config, function, [str(a) for a in arguments])
 
 

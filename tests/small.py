@@ -19,9 +19,9 @@ from swiftwrf.comparison import (
     WrfGsConfig,
 )
 from swiftwrf.models import FIELD_MODELS
-from swiftwrf.models.geometry import GeometryConfig
+from swiftwrf.models.geometry import GeometryConfig, GeometryModel
 from swiftwrf.models.geometry.fit import search_room
-from swiftwrf.models.geometry.planes import RoomEstimate
+from swiftwrf.models.geometry.planes import Plane, RoomEstimate
 from swiftwrf.models.geometry.search import Search
 from swiftwrf.models.swiftwrf import SwiftWRFConfig
 from swiftwrf.models.swiftwrf_paper import SwiftWRFPaperConfig
@@ -71,6 +71,17 @@ def small_published() -> Iterator[None]:
 def small_swiftwrf() -> Iterator[None]:
     """Give SwiftWRF few primitives; the search for their number has its own tests."""
     with mock.patch.object(FIELD_MODELS["swiftwrf"], "config_type", with_defaults(FIT)):
+        yield
+
+
+@contextmanager
+def known_planes(*planes: Plane) -> Iterator[None]:
+    """Let every search for a room give these planes at once."""
+
+    def search(train: Spectra, config: GeometryConfig, progress: bool = False) -> RoomEstimate:
+        return GeometryModel.of_planes(train, list(planes)).estimate
+
+    with mock.patch("swiftwrf.models.geometry.model.search_room", search):
         yield
 
 

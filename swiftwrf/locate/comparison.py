@@ -15,7 +15,7 @@ from torch import Tensor
 
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
-from swiftwrf.data.splits import matching_validation
+from swiftwrf.data.splits import matching_validation, places
 from swiftwrf.errors import InputError
 from swiftwrf.locate.baselines import LEVELS, LOCALIZERS, Localizer, PosteriorLocalizer
 from swiftwrf.metrics import ErrorSummary, method_summary, summary
@@ -210,8 +210,8 @@ class LocateComparison:
                 continue
             table = self._tables[trial]
             found[trial.localizer] = {
-                "position_error_m": summary(table["position_error_m"]),
-                "horizontal_error_m": summary(table["horizontal_error_m"]),
+                "position_error_m": summary(table["position_error_m"], table["place"]),
+                "horizontal_error_m": summary(table["horizontal_error_m"], table["place"]),
                 "seconds": values["seconds"],
             }
             if "floor" in table:
@@ -222,7 +222,8 @@ class LocateComparison:
         """Return trials and their position errors [m] for fractions `by` "rows" or "receivers", with everything included."""
         trials = [t for t in self.values if (t.receivers if by == "rows" else t.rows) == 1]
         names = {trial.localizer for trial in trials if not trial.is_whole}
-        return [(t, summary(self._tables[t]["position_error_m"])) for t in trials if t.localizer in names]
+        tables = ((t, self._tables[t]) for t in trials if t.localizer in names)
+        return [(t, summary(table["position_error_m"], table["place"])) for t, table in tables]
 
     @cached_property
     def _tables(self) -> dict[Trial, DataFrame]:
@@ -232,7 +233,7 @@ class LocateComparison:
         values = self.values[trial]
         truth, estimate = (torch.as_tensor(values[name], dtype=torch.float64) for name in ("truth", "estimate"))
         away = estimate - truth
-        columns: Values = {"index": values["index"]}
+        columns: Values = {"index": values["index"], "place": places(truth, 2)}
         columns |= {"position_error_m": away.norm(dim=1), "horizontal_error_m": away[:, :2].norm(dim=1)}
         columns |= dict(zip(("x_m", "y_m", "z_m"), estimate.T, strict=True))
         columns |= dict(zip(("truth_x_m", "truth_y_m", "truth_z_m"), truth.T, strict=True))

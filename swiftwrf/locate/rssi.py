@@ -118,7 +118,7 @@ class RssiLocator(Configured, Saved):
             model.check_measurements(train)
             train = train.about(model.origin)
         self.receiver_names = train.receiver_names
-        self.model = model or RssiModel(validation=config.validation, seed=config.seed).fit(train)
+        self.model = model or self._radio_maps(train)
         known = train.transmitter_position
         fold = folds(known, config.validation, config.seed, session=train.session)
         fingerprints = Fingerprints.fit(train, fold, config.seed)
@@ -145,12 +145,16 @@ class RssiLocator(Configured, Saved):
         self._calibrate(parts)
         return self
 
+    def _radio_maps(self, train: Rssi) -> RssiModel:
+        # which receivers detect the transmitter is a likelihood of its own
+        return RssiModel(validation=self.config.validation, seed=self.config.seed, not_detected="unknown").fit(train)
+
     def _part(self, train: Rssi, fold: Tensor, number: int, fingerprints: Fingerprints) -> _Part:
         generator = torch.Generator().manual_seed(self.config.seed)
         out, kept = ((fold == number) & train.detected.any(dim=1)).nonzero()[:, 0], train.subset(fold != number)
         out = out[torch.randperm(len(out), generator=generator)[: MAX_HELD_OUT // FOLDS]]
         rssi, position = train.rssi_dbm[out], train.transmitter_position[out]
-        model = RssiModel(validation=self.config.validation, seed=self.config.seed).fit(kept)
+        model = self._radio_maps(kept)
         found = Fingerprints.of(kept, fingerprints.metric, fingerprints.k)
         region = Region(kept.transmitter_position, floors=train.floors)
         return _Part(rssi, position, region, model, maps_at(model, position), found, found.votes(rssi))

@@ -14,14 +14,13 @@ from PIL import Image, UnidentifiedImageError
 from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
 from swiftwrf import InputError
-from swiftwrf.plotting import corners_of
+from swiftwrf.plotting import corners_of, hatch
 from swiftwrf.positions import MAX_COORDINATE_M
 from swiftwrf.runtime.checkpoint import refusing
 from swiftwrf.runtime.durable import write_npz
 from tasks.records import read_npz
 
 MIN_REACH = 1.5  # of the largest distance between neighbours, for positions on a line
-HATCH = "#555b66"
 TRANSPARENT = 255  # palette index of pixels without a value
 MAX_PLAN_PIXELS = 2**24
 STORED = "floor-plan.npz"  # in the directory of a run
@@ -51,20 +50,6 @@ def inside(position: ArrayLike, known: ArrayLike) -> NDArray[np.bool_]:
         return np.asarray(tree.query(at)[0] <= MIN_REACH * max(float(apart.max()), 1e-6))
 
 
-def hatch(axes: Axes, x: NDArray[Any], y: NDArray[Any], known: ArrayLike) -> None:
-    """Hatch the cells of a map with centres x (W,) and y (H,) [m] that lie outside of the known positions (n, 2 or 3)."""
-    outside = np.pad(~inside(np.stack(np.meshgrid(x, y), axis=-1), known), 1, mode="edge")
-    x0, x1, y0, y1 = corners_of(x, y)
-    x, y = np.concatenate([[x0], x, [x1]]), np.concatenate([[y0], y, [y1]])
-    if outside.any():
-        with np.errstate(all="ignore"):
-            drawn = axes.contourf(
-                x, y, outside.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"], zorder=2
-            )
-        drawn.set_edgecolor(HATCH)
-        drawn.set_linewidth(0)
-
-
 def draw(
     axes: Axes,
     x: NDArray[Any],
@@ -74,9 +59,10 @@ def draw(
     colours: str,
     limits: tuple[float, float],
     known: ArrayLike,
+    silent: NDArray[np.bool_] | None = None,
     plan: tuple[NDArray[Any], Corners] | None = None,
 ) -> Any:
-    """Draw a map with hatching where it is extrapolated; return the image for a colour bar.
+    """Draw a map with hatching where it is extrapolated or silent; return the image for a colour bar.
 
     Args:
         axes: Axes to draw in.
@@ -86,6 +72,7 @@ def draw(
         colours: Name of a matplotlib colour map.
         limits: Values of the first and the last colour.
         known: Measured positions (n, 2 or 3) [m].
+        silent: Cells where a detection is less likely than not, (H, W), hatched the other way.
         plan: Image of the floor and its corners x0, x1, y0, y1 [m], drawn below.
     """
     extent = corners_of(x, y)
@@ -96,7 +83,9 @@ def draw(
     drawn = axes.imshow(
         values, origin="lower", extent=extent, cmap=colours, vmin=low, vmax=high, alpha=alpha, zorder=1, aspect="equal"
     )
-    hatch(axes, x, y, known)
+    hatch(axes, x, y, ~inside(np.stack(np.meshgrid(x, y), axis=-1), known))
+    if silent is not None:
+        hatch(axes, x, y, silent, "\\\\\\\\")
     axes.set(xlabel="x [m]", ylabel="y [m]")
     axes.grid(visible=False)
     return drawn

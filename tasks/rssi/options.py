@@ -6,8 +6,9 @@ from typing import Literal
 
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.errors import InputError
+from swiftwrf.rssi.detection import NotDetected
 from swiftwrf.runtime.validation import Preset
-from tasks.options import OffsetSource, Options, Output, options
+from tasks.options import OffsetSource, Options, Output, Seed, options
 
 
 @options
@@ -29,6 +30,9 @@ class RssiTaskConfig(Options):
     also: tuple[str, ...] = ()
     """predictors that are compared only when named: nerf2 and blend take minutes; pairs and knn_pairs are for data with both
     ends moving, where they are compared anyway"""
+    not_detected: NotDetected = "auto"
+    """what an empty cell says: weak, the signal was below the limit of detection; unknown, nothing; auto decides for each
+    receiver by the data"""
     preset: Preset = "quick"
     """of SwiftWRF and NeRF2: quick, or paper for the published head and field"""
     floor_plan: str | None = None
@@ -37,7 +41,7 @@ class RssiTaskConfig(Options):
     """x0 x1 y0 y1 of that image [m]"""
     scheduler: str | None = None
     """address of a Dask scheduler whose workers fit groups of receivers (extra: cluster)"""
-    seed: int = 0
+    seed: Seed = 0
     """seed of everything random"""
     out: str | None = None
     """directory of the run; must not exist (default: a new one under runs/rssi)"""

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from annotated_types import Gt, Lt
 
 from swiftwrf.errors import InputError
 from tasks.options import Options, Output, SpectraSource, TableSource, options
@@ -35,7 +36,7 @@ class UpdateConfig(Options):
     data: str | None = None
     """training measurements of the model in their order, which calibrate the test for changes of spectra, and show what
     stands in a room"""
-    false_alarm_rate: float = 1e-4
+    false_alarm_rate: Annotated[float, Gt(0), Lt(1)] = 1e-4
     """false alarms a measurement"""
     follow: bool = False
     """take measurements line by line as they come, and print a line for each"""
@@ -45,8 +46,6 @@ class UpdateConfig(Options):
 
     def check(self) -> None:
         super().check()
-        if not 0 < self.false_alarm_rate < 1:
-            raise InputError(f"--false-alarm-rate must be between 0 and 1, got {self.false_alarm_rate}")
         if self.follow and self.source != "-" and Path(self.source).suffix.lower() not in FOLLOWED:
             raise InputError(f"--follow takes {' or '.join(FOLLOWED)} files or -, got {self.source}")
         if self.follow and (self.output.open or self.output.json):

@@ -1,56 +1,92 @@
-"""The comparison of all methods can be stopped at any time; networks are compared on held-out spectra."""
+"""Studies can be stopped at any time and state what measured their rows; networks are compared on held-out spectra."""
 
 from __future__ import annotations
 
-from pathlib import Path
+import json
+from argparse import Namespace
+from contextlib import nullcontext
 
-import comparison
+import fields
 import networks
 import pytest
+import record
 
 from swiftwrf import AngularGrid, simulated_room
 
+METHODS = ("mean", "nearest", "swiftwrf", "vae")
 
-def test_the_comparison_goes_on_after_the_rows_that_are_there(tmp_path, monkeypatch, small_published):
+
+@pytest.fixture
+def study(tmp_path, monkeypatch, small_published):
+    """The comparison of few methods on a small room, and what it writes."""
     data = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
     written = []
-    monkeypatch.setattr(comparison, "scenes", lambda config: [("room random", data, "random")])
-    monkeypatch.setattr(comparison, "QUICK_DIVISOR", 1)
-    monkeypatch.setattr(comparison, "write_result", lambda name, content: written.append((name, content)))
-    config = comparison.Config(data=Path(), quick=True, work=tmp_path)
-    honest, measured = comparison.row, []
+    monkeypatch.setattr(fields, "scenes", lambda config: [("room", data, "random")])
+    monkeypatch.setattr(fields, "COMPARED", METHODS)
+    monkeypatch.setattr(record, "RESULTS", tmp_path)
+    monkeypatch.setitem(fields.QUICK_DIVISOR, "comparison", 1)
+    monkeypatch.setattr(fields, "write_result", lambda name, content: written.append((name, content)))
+    return written
 
-    def row(method, *others):
-        if len(measured) == 6:
+
+def test_a_study_goes_on_after_the_rows_that_are_there(study, tmp_path, monkeypatch):
+    config = fields.Config("comparison", quick=True, parts=("scenes",), work=tmp_path)
+    honest, measured = fields.measure, []
+
+    def measure(parts, fit, state):
+        if len(measured) == 2:
             raise KeyboardInterrupt
-        measured.append(method)
-        return honest(method, *others)
+        measured.append(fit.name)
+        return honest(parts, fit, state)
 
-    monkeypatch.setattr(comparison, "row", row)
+    monkeypatch.setattr(fields, "measure", measure)
     with pytest.raises(KeyboardInterrupt):
-        comparison.main(config)
+        fields.main(config)
     before = list(measured)
     measured.clear()
-    comparison.main(config)
-    methods = [*comparison.BASELINES, *comparison.LEARNT]
-    assert before + measured == methods
-    ((name, content),) = written
+    fields.main(config)
+    assert tuple(before + measured) == METHODS
+    ((name, content),) = study
     assert name == "comparison_quick"
-    rows = content["scenes"]["room random"]["24"]
-    assert list(rows) == methods
-    assert rows["nerf2"]["parameters"] < rows["nearest"]["parameters"] == 24 * 8 * 32
-    assert all(row["ms"]["low"] <= row["ms"]["median"] and row["n_test"] == 6 for row in rows.values())
+    rows = {row["method"]: row for row in content["rows"]}
+    assert tuple(rows) == METHODS
+    assert rows["vae"]["steps"] > 0
+    assert rows["nearest"]["parameters"] == 24 * 8 * 32
+    for row in rows.values():
+        assert row["ms"]["low"] <= row["ms"]["median"]
+        assert (row["n_train"], row["n_test"]) == (24, 6)
+        assert {"command", "commit", "versions", "machine"} == set(row["provenance"])
     assert not list(tmp_path.rglob("*.state"))
 
 
-def test_the_comparison_gathers_rows_in_the_order_of_scenes_and_methods(tmp_path):
-    rows = {"room random 24 gp": 1, "room random 24 mean": 2, "room random 80 gp": 3, "attic random 9 swiftwrf": 4}
-    for name, ms in rows.items():
-        (tmp_path / f"{name}.json").write_text(f'{{"ms": {ms}}}')
-    found = comparison.gathered(tmp_path)
-    assert list(found) == ["attic random", "room random"]
-    assert list(found["room random"]) == ["80", "24"]
-    assert list(found["room random"]["24"].items()) == [("mean", {"ms": 2}), ("gp", {"ms": 1})]
+@pytest.mark.parametrize("name", ["synthesis", "model_size", "ablation"])
+def test_every_study_of_the_room_has_its_rows_and_its_table(name, study, tmp_path, monkeypatch):
+    monkeypatch.setattr(fields, "simulated_room", lambda: simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32)))
+    monkeypatch.setattr(fields, "measure", lambda parts, fit, state: measured | {"n_train": fit.n or 24})
+    measured = {"n_test": 6, "fit_seconds": 1.0, "psnr_db": {"median": 20.0}}
+    fields.main(fields.Config(name, work=tmp_path))
+    ((result, content),) = study
+    assert result == name
+    assert len(content["rows"]) == {"synthesis": 7, "model_size": 8, "ablation": 9}[name]
+
+
+def test_rows_measured_at_different_times_have_a_provenance_each(tmp_path, monkeypatch):
+    monkeypatch.setattr(record, "RESULTS", tmp_path)
+    for number, command in enumerate(("first.py", "folder/second.py --n 2")):
+        monkeypatch.setattr(record.sys, "argv", command.split())
+        new = {"n": number}
+        record.write_result("made", {"rows": [*record.kept("made", "rows"), new]}, folder=tmp_path, rows=[new])
+    measured = [row["provenance"] for row in json.loads((tmp_path / "made.json").read_text())["rows"]]
+    assert [row["command"] for row in measured] == ["python first.py", "python second.py --n 2"]
+    assert all(set(row) == {"command", "commit", "versions", "machine"} for row in measured)
+
+
+def test_uncommitted_code_is_not_measured(monkeypatch):
+    monkeypatch.setattr(record.tyro, "cli", lambda config_type: config_type())
+    for changed in ("", " M swiftwrf/gp/kernel.py\n"):
+        monkeypatch.setattr(record.subprocess, "run", lambda *_, changed=changed, **options: Namespace(stdout=changed))
+        with pytest.raises(SystemExit, match=r"commit them:\n M swiftwrf/gp") if changed else nullcontext():
+            assert record.options(dict) == {}
 
 
 def test_networks_are_compared_on_training_spectra_that_are_held_out(monkeypatch):
@@ -58,7 +94,7 @@ def test_networks_are_compared_on_training_spectra_that_are_held_out(monkeypatch
     held_out = room.split("random")[0].split("random", seed=1)[1]
     monkeypatch.setattr(networks, "simulated_room", lambda: room)
     monkeypatch.setattr(networks, "has_room", lambda data: False)
-    monkeypatch.setattr(networks, "write_result", lambda name, content: written.append(content))
+    monkeypatch.setattr(networks, "write_result", lambda name, content, rows: written.append(content))
     networks.main(networks.Config(trainings=("measured", "turbo"), steps=(1,), name="none"))
     rows = written[-1]["scenes"]["room"]
     assert [entry["n_train"] for entry in rows.values()] == [11, 38]

@@ -19,8 +19,8 @@ def results(monkeypatch):
     data = rssi_room(n=60).columns([0, 1])
     monkeypatch.setattr(rssi, "SPLITS", {"a": ("random", "block"), "b": ("random",)})
     monkeypatch.setattr(rssi, "load_rssi", lambda path, transmitter: data)
-    monkeypatch.setattr(rssi, "RESULTS", Path("missing"))
-    monkeypatch.setattr(rssi, "write_result", lambda name, content: written.append(content["sets"]))
+    monkeypatch.setattr(rssi, "kept", lambda name, key: {})
+    monkeypatch.setattr(rssi, "write_result", lambda name, content, rows: written.append(content["sets"]))
     return written
 
 
@@ -38,11 +38,9 @@ def test_every_predictor_has_the_same_pairs_and_a_difference_to_the_best_baselin
         assert "| b random |" in table()
 
 
-def test_measured_splits_are_skipped_on_resume(results, tmp_path, monkeypatch):
-    (tmp_path / "rssi.json").touch()
+def test_measured_splits_are_skipped_on_resume(results, monkeypatch):
     kept = {"a random": {"methods": {}}, "b random": {"methods": {}}}
-    monkeypatch.setattr(rssi, "RESULTS", tmp_path)
-    monkeypatch.setattr(rssi, "load", lambda name: {"sets": dict(kept)})
+    monkeypatch.setattr(rssi, "kept", lambda name, key: kept)
     monkeypatch.setattr(rssi, "measure", lambda data, split, also: {"methods": {}, "split": split})
     rssi.main(rssi.Config(data=Path(), resume=True))
     assert [list(sets) for sets in results] == [["a random", "a block", "b random"]]

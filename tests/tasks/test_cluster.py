@@ -10,8 +10,8 @@ import sys
 import time
 from pathlib import Path
 
-import comparison
 import dask
+import fields
 import pytest
 import torch
 from quick import run, said
@@ -83,21 +83,22 @@ def test_aoa_has_the_same_numbers(local, tmp_path, monkeypatch):
     assert "workers" in (tmp_path / "there" / "report.html").read_text()
 
 
-def test_the_comparison_has_the_same_rows(local, tmp_path, monkeypatch, small_published):
+def test_a_study_has_the_same_rows(local, tmp_path, monkeypatch, small_published):
     data = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
     written = []
-    monkeypatch.setattr(comparison, "scenes", lambda config: [("room random", data, "random")])
-    monkeypatch.setattr(comparison, "BASELINES", ("mean", "nearest"))
-    monkeypatch.setattr(comparison, "LEARNT", ("vae",))
-    monkeypatch.setattr(comparison, "write_result", lambda name, content: written.append(content["scenes"]))
-    monkeypatch.setattr(comparison, "draw", lambda found: None)
+    monkeypatch.setattr(fields, "scenes", lambda config: [("room", data, "random")])
+    monkeypatch.setattr(fields, "COMPARED", ("mean", "nearest", "vae"))
+    monkeypatch.setattr(fields, "kept", lambda name, key: [])
+    monkeypatch.setattr(fields, "load", lambda name: {})
+    monkeypatch.setattr(fields, "write_result", lambda name, content: written.append(content["rows"]))
+    monkeypatch.setattr(fields, "draw", lambda rows: None)
     for address in (None, local.scheduler_address):
         work = tmp_path / ("here" if address is None else "there")
-        comparison.main(comparison.Config(Path(), parts=("scenes",), work=work, scheduler=address))
+        fields.main(fields.Config("comparison", parts=("scenes",), work=work, scheduler=address))
         assert not list(work.rglob("*.state"))
-    here, there = (found["room random"]["24"] for found in written)
-    assert list(there) == list(here) == ["mean", "nearest", "vae"]
-    assert [row["psnr_db"] for row in there.values()] == [row["psnr_db"] for row in here.values()]
+    here, there = written
+    assert [row["method"] for row in there] == ["mean", "nearest", "vae"]
+    assert [row["psnr_db"] for row in there] == [row["psnr_db"] for row in here]
 
 
 def test_workers_take_the_threads_of_the_run(cluster):

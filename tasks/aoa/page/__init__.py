@@ -67,10 +67,8 @@ def _more(fraction: FractionRecords) -> Section | None:
 
 def _suggestion_section(fraction: FractionRecords) -> Section | None:
     """Return a plan of the suggested positions and the expected variance after measuring there; None without suggestions."""
-    name = f"suggested-mix{fraction.key}"
-    if not fraction.run.holds(name):
+    if not (arrays := fraction.arrays("suggested")):
         return None
-    arrays = fraction.run.arrays(name)
     suggested, left = arrays["suggested"], arrays["left"]
     text = (
         f"Measuring at {len(suggested)} more positions (suggested-mix{fraction.key}.csv, the most informative first) would "

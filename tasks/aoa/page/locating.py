@@ -54,7 +54,7 @@ def locating_section(fraction: FractionRecords) -> Section | None:
         "over positions. The estimate is the posterior median."
     )
     plots = [_errors(fraction)]
-    if fraction.run.holds(f"located-mix{fraction.key}"):
+    if fraction.arrays("located"):
         plots.append(_posteriors(fraction))
     return Section(title, [text, *notes], [Table(columns, rows, caption)], plots)
 
@@ -86,7 +86,7 @@ def _errors(fraction: FractionRecords) -> Plot:
 
 def _posteriors(fraction: FractionRecords) -> Plot:
     """Return maps of the posteriors of six test spectra, from the best to the worst."""
-    example = fraction.run.arrays(f"located-mix{fraction.key}")
+    example = fraction.arrays("located")
     error, panels = np.linalg.norm(example["estimate"] - example["truth"], axis=1), []
     for row in range(len(error)):
         figure, ax = figures.panel(3.6, 3.6)

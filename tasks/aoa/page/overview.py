@@ -39,7 +39,7 @@ def overview(fraction: FractionRecords) -> Plot:
         "A spectrum at a position without a measurement, measured and predicted (cross: true direction, ring: peak). "
     )
     caption += "Median angular error with its 95 % interval; `peak` and `constant` need no training."
-    if fraction.run.holds(f"located-mix{fraction.key}"):
+    if fraction.arrays("located"):
         panels.insert(0, located_plan(fraction))
         caption = (
             "The room that was found (dashed walls are not identifiable), and test positions with the errors of their "
@@ -55,7 +55,7 @@ def located_plan(fraction: FractionRecords) -> Figure:
     own = table[(table["method"] == LOCATOR) & (table["repeat"] == 0)]
     truth, estimate = own[["truth_x_m", "truth_y_m"]].to_numpy(), own[["estimate_x_m", "estimate_y_m"]].to_numpy()
     figure, plan = figures.panel(4.8, 3.8)
-    draw_room(plan, fraction.run.arrays(f"located-mix{fraction.key}"))
+    draw_room(plan, fraction.arrays("located"))
     highest = max(float(own["error_m"].quantile(0.95)), 1e-3)
     for at, to in zip(truth, estimate, strict=True):
         plan.plot(*zip(at, to, strict=True), color=figures.RULE, linewidth=1, zorder=2)

@@ -6,7 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
+from numpy.typing import NDArray
 from pandas import DataFrame
 
 from augment.turbo.condition import Condition, chosen_file, conditions_of, headline
@@ -69,6 +71,11 @@ class FractionRecords:
     def table(self, name: str) -> DataFrame:
         """Return the rows of a table of the run, e.g. `errors`, with this measured fraction."""
         return of_fraction(self.run.table(name), self.key)
+
+    def arrays(self, kind: str) -> dict[str, NDArray[Any]]:
+        """Return the arrays of one kind, e.g. `located`, that the run left; none if it left no such file."""
+        name = f"{kind}-mix{self.key}"
+        return self.run.arrays(name) if self.run.holds(name) else {}
 
     def synthesizers(self, methods: Iterable[str]) -> list[str]:
         """Return the field models behind these methods, that of the first repeat where repeats chose differently."""

@@ -131,9 +131,8 @@ def next_steps(fraction: FractionRecords) -> list[str]:
         f"Predict spectra anywhere: `swiftwrf.load({f'{path}/{name}-mix{key}.safetensors'!r}).predict(positions)`."
         for name in sorted(files - estimators)
     ]
-    if (fraction.run.folder / f"suggested-mix{key}.csv").is_file():
-        left = fraction.run.arrays(f"suggested-mix{key}")["left"]
-        steps.append(f"Where to measure next is in suggested-mix{key}.csv. {worth(left)}")
+    if suggested := fraction.arrays("suggested"):
+        steps.append(f"Where to measure next is in suggested-mix{key}.csv. {worth(suggested['left'])}")
     else:
         steps.append("Ask where to measure next with `--suggest 20`.")
     if metrics["repeats"] == 1:

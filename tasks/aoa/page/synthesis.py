@@ -48,7 +48,7 @@ class Example:
 
 def examples(fraction: FractionRecords) -> list[Example]:
     """Return test spectra from the best to the worst prediction."""
-    stored = _stored(fraction)
+    stored = fraction.arrays("examples")
     labels = fraction.table("errors").drop_duplicates("index").set_index("index")
     found = []
     for row, index in enumerate(stored["index"].tolist()):
@@ -80,7 +80,7 @@ def synthesis_section(fraction: FractionRecords) -> Section:
 
 
 def _examples(fraction: FractionRecords) -> Plot:
-    stored = _stored(fraction)
+    stored = fraction.arrays("examples")
     text = (
         f"Spectra at positions without a measurement, by {stored.get('synthesizer', 'swiftwrf')}, from the best to the "
         "worst by PSNR (quantiles 1, 0.8, ..., 0). The zenith is in the middle; cross: true direction, ring: peak. "
@@ -102,10 +102,6 @@ def similarity(fraction: FractionRecords) -> Plot:
     figures.cdf(axes, fraction.palette, groups, "SSIM", limit=1)
     caption = f"Distribution of the SSIM over the test spectra, {fraction.title}."
     return Plot(f"ssim-{fraction.file_name}", [figure], caption, own[["repeat", "index", "synthesizer", "ssim"]])
-
-
-def _stored(fraction: FractionRecords) -> dict[str, NDArray[Any]]:
-    return fraction.run.arrays(f"examples-mix{fraction.key}")
 
 
 def _pixels(example: dict[str, NDArray[Any]]) -> DataFrame:

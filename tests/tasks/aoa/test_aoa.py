@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from quick import sketched
 from sklearn.model_selection import KFold
 from small import FIT, with_defaults
 
@@ -58,7 +59,8 @@ def small(monkeypatch):
         )
     for config in (AANNConfig, AANNKernelConfig):
         monkeypatch.setattr(config, "quick", lambda n_spectra, **options: AANNKernelConfig(steps=2, batch=4, **options))
-    return room
+    with sketched():
+        yield room
 
 
 def run(*arguments):
@@ -373,7 +375,7 @@ def test_a_training_is_as_long_as_the_scene_needs():
 
 def test_whole_run(small, tmp_path):
     out = tmp_path / "run"
-    more = ("--repeats", 2, "--extra", 20, "--suggest", 4)
+    more = ("--extra", 20, "--suggest", 4)
     assert run("--mix", 0.5, 1.0, "--synthesizer", "swiftwrf", "idw", *more, "--out", out) == 0
     metrics = json.loads((out / "metrics.json").read_text(), parse_constant=lambda name: pytest.fail(name))
     assert (metrics["task"], metrics["data"], metrics["split"], metrics["seed"]) == (
@@ -398,7 +400,7 @@ def test_whole_run(small, tmp_path):
     assert set(metrics["mixes"]["1"]["seconds"]) == {"fit", "synthesize", "train"}
 
     errors = pd.read_csv(out / "errors.csv")
-    assert len(errors) == 2 * 2 * 18 * 10  # fractions, repeats, methods, test spectra
+    assert len(errors) == 2 * 18 * 10  # fractions, methods, test spectra
     own = errors[(errors.measured_fraction == 0.5) & (errors.method == "turbo_swiftwrf_extra")]
     assert set(own.estimator) == {"aann_kernel"}
     assert set(own.training) == {"turbo_extra"}

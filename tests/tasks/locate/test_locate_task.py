@@ -308,8 +308,8 @@ def test_positions_and_directions_of_spectra(matched, tmp_path, capsys):
 def test_the_benchmark_measures_every_localizer(monkeypatch):
     written = {}
     monkeypatch.setattr(locating, "read", lambda source: rssi_room(n=60))
-    monkeypatch.setattr(locating, "write_result", lambda name, content: written.update({name: content}))
-    monkeypatch.setattr(locating, "earlier", dict)
+    monkeypatch.setattr(locating, "write_result", lambda name, content, rows: written.update({name: content}))
+    monkeypatch.setattr(locating, "kept", lambda name, key: {})
     cheap = Registry("localizer")
     cheap._registered = {name: LOCALIZERS[name] for name in ("posterior", "knn")}
     monkeypatch.setattr(locating, "LOCALIZERS", cheap)

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from fuzz.runs import followed_run, run_of_locate, show
+from fuzz.runs import followed_run, run_of_aoa, run_of_locate, run_of_rssi, show
 
 from swiftwrf import InputError
-from tasks.page.maps import FloorPlan
 
 OPENED = (
     "config.json",
@@ -28,25 +26,7 @@ OPENED = (
 OTHER_JSON = (None, "x", 1e400, [[]], {"a": None})
 
 
-@pytest.fixture
-def run(name, request, tmp_path):
-    """A copy of a small finished run."""
-    folder = tmp_path / "run"
-    if name in ("aoa", "rssi"):
-        shutil.copytree(request.getfixturevalue(f"{name}_run"), folder)
-    match name:
-        case "aoa":
-            plane = {"normal": [1.0, 0, 0], "offset_m": 6.0, "gain": -0.5, "std_mm": 1.0, "certain": True}
-            (folder / "geometry-mix1.json").write_text(json.dumps({"planes": [plane]}))
-        case "rssi":
-            FloorPlan.scaled(np.zeros((6, 8, 3), np.uint8), 2.0, (0, 6)).save(folder)
-        case "locate":
-            folder.mkdir()
-            run_of_locate(folder)
-        case "followed":
-            folder.mkdir()
-            followed_run(folder)
-    return folder
+RUNS = {"aoa": run_of_aoa, "rssi": run_of_rssi, "locate": run_of_locate, "followed": followed_run}
 
 
 def damaged_bytes(content: bytes) -> dict[str, bytes]:
@@ -129,8 +109,11 @@ def damages(file: Path) -> dict[str, Callable[[], object]]:
     return found
 
 
-@pytest.mark.parametrize("name", ["aoa", "rssi", "locate", "followed"])
-def test_a_damaged_run_is_shown_or_refused(run):
+@pytest.mark.parametrize("name", RUNS)
+def test_a_damaged_run_is_shown_or_refused(name, tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    RUNS[name](run)
     show(run)
     wrong, n = [], 0
     for file in sorted({file for pattern in OPENED for file in run.glob(pattern)}):
