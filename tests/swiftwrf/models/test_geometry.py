@@ -446,11 +446,11 @@ def test_the_gradient_of_path_gains_is_that_of_their_definition(prior):
     wave, gain = paths(room, scene)
     root = torch.linalg.cholesky(kernel.covariance(scene.moving.double())).float()
     generator = torch.Generator().manual_seed(1)
-    sample, normal = (torch.randn(30, 8, len(gain), 2, generator=generator) for _ in range(2))
+    sample, normal = (torch.randn(30, 8, gain.shape[1], 2, generator=generator) for _ in range(2))
     normal.requires_grad_()
 
     change = torch.tensor(prior.std) * torch.einsum("mn,nfsc->mfsc", root, normal)
-    field = (gain + torch.view_as_complex(change)) @ wave
+    field = (gain[:, None] + torch.view_as_complex(change)) @ wave
     match = torch.einsum("nfk,nak->nfa", field.sgn(), scene.channel.conj())
     missing = 1 - match.abs().square().amax(-1) / field.shape[-1] ** 2
     loss = missing.sum() / prior.missing_scale + (normal - sample).square().sum() / 2
