@@ -92,6 +92,13 @@ def glances() -> Iterator[None]:
 
 
 @pytest.fixture
+def floor_alone() -> Iterator[None]:
+    """The floor as the only plane that any search for a room finds, without a search."""
+    with small.known_planes(small.FLOOR):
+        yield
+
+
+@pytest.fixture
 def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 

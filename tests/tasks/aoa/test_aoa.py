@@ -582,7 +582,7 @@ def test_models_for_comparison_are_always_quick(small, monkeypatch):
     assert made == [("idw", "paper"), ("gp", "quick"), ("coarray", "quick")]
 
 
-def test_the_room_is_searched_once_for_all_models_with_one(room, glances, tmp_path, monkeypatch):
+def test_the_room_is_searched_once_for_all_models_with_one(room, floor_alone, tmp_path, monkeypatch):
     """Its time counts as part of the fit of each of them."""
     data = Experiment(*room.split("random", 0), (0.5,), ("hybrid",), extra=0)
     monkeypatch.setattr(context, "candidates", lambda data: ["geometry", "hybrid"])
