@@ -70,7 +70,7 @@ def damaged_values(content: object, others: tuple[object, ...] = OTHER_JSON) -> 
     if isinstance(content, dict):
         for number, (key, value) in enumerate(content.items()):
             few = damaged_values(value, others[:-2])
-            for kind in list(few)[number % 2 :: 2]:  # of so many values half are enough
+            for kind in list(few)[number % 2 :: 2]:  # half of the values are enough
                 found[f"{key} {kind}"] = content | {key: few[kind]}
             found[f"{key} missing"] = {name: value for name, value in content.items() if name != key}
     if isinstance(content, list) and content:
