@@ -21,7 +21,7 @@ from torch import Tensor
 from augment import Fold, Mixed, synthetic_positions
 from augment.choose import BLIND_FOLDS
 from augment.estimators import Estimator, make_estimator
-from swiftwrf import FitError, InputError, Spectra
+from swiftwrf import FitError, InputError
 from swiftwrf.gp import subsample
 from swiftwrf.locate import MatchedField, MatchedFieldConfig
 from swiftwrf.metrics import ChangeMetrics, angle_errors, paired_change
@@ -129,15 +129,14 @@ def cross_validate(folds: Sequence[Fold], n_synthetic: int, seed: int) -> CrossV
     return CrossValidation(validation, alone, by_rule)
 
 
-def measured_errors(fold: Fold, estimator: Estimator, test: Spectra) -> Errors:
+def measured_errors(fold: Fold, estimator: Estimator) -> Errors:
     """Return the angular errors [deg] of an estimator, trained on the measured spectra of a fold, on its test spectra.
 
     Args:
-        fold: Training spectra.
+        fold: Training and held-out spectra.
         estimator: Estimator, which is trained here.
-        test: Held-out spectra of the fold, with their snapshots if they have any.
     """
-    return _degrees(estimator.fit(Mixed.measured(fold.train)).estimate(test), test.label)
+    return _degrees(estimator.fit(Mixed.measured(fold.train)).estimate(fold.test), fold.test.label)
 
 
 def located_folds(folds: Sequence[Fold]) -> dict[int, Fold]:
@@ -160,7 +159,7 @@ def located_errors(fold: Fold, seed: int) -> Errors | None:
         locator = MatchedField(FOLD_LOCATOR, seed=seed).fit(fold.train, room=room)
     except (InputError, FitError):
         return None
-    return _degrees(locator.predict(test.spectrum), test.label)
+    return _degrees(locator.predict(test), test.label)
 
 
 def choose_estimator(

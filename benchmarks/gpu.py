@@ -51,7 +51,7 @@ from swiftwrf.models.geometry.planes import Plane
 from swiftwrf.models.swiftwrf_paper import SwiftWRFPaper
 from swiftwrf.online import prequential
 from swiftwrf.rasterize import rasterize_magnitude
-from tasks.run import choose_device
+from tasks.environment import choose_device
 
 FORWARD = {10_000: (600e3, 1e6), 1000: (1.8e6, 1.8e6)}  # by N: spectra a second that drawing should reach, and the goal
 WITH_GRADIENTS = {1000: (600e3, 600e3)}

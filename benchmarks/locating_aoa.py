@@ -1,15 +1,18 @@
-"""Directions and positions by matched-field processing on few measured spectra, optionally beside kernel regression.
+"""Directions and positions by matched-field processing on few measured spectra or channels, and predicted channels.
 
 python benchmarks/locating_aoa.py --data /data/newrf-bedroom /data/newrf-office --fractions 0.1 0.3 --draws 3 --kernel
 
-The split is the random one of seed 0. Draws differ in the spectra that count as measured. Test spectra take no part in any
-fit.
+With --subcarriers, channels are computed from ray paths, and predicted at the test positions, too. The split is the random
+one of seed 0.
+Draws differ in the spectra that count as measured. Test spectra take no part in any fit.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -22,9 +25,21 @@ from augment import Mixed, withhold
 from augment.estimators import make_estimator
 from augment.turbo.experiment import ROOM_MODEL
 from augment.turbo.locating import LEVEL, NO_PLANE, located
-from swiftwrf import FitError, InputError, MatchedField, Spectra, load_spectra, make_model, simulated_room
+from swiftwrf import (
+    FitError,
+    GeometryModel,
+    InputError,
+    MatchedField,
+    Spectra,
+    load_spectra,
+    make_model,
+    simulated_room,
+)
 from swiftwrf.choices import fraction_key
+from swiftwrf.data.splits import folds
+from swiftwrf.gp import GaussianProcess, choose_kernel
 from swiftwrf.metrics import angle_errors, summary
+from swiftwrf.models.geometry.furniture import coherence, field, waves
 
 N_LOCATED = 200  # spectra whose time is measured
 KERNEL = "kernel_regression"
@@ -41,6 +56,10 @@ class Config:
     """measured fractions of the training spectra"""
     draws: int = 3
     """draws of the measured spectra"""
+    subcarriers: int | None = None
+    """number of subcarriers at which channels of ray paths are used; spectra alone by default"""
+    bandwidth: float | None = None
+    """distance of the first and the last of them [Hz]"""
     kernel: bool = False
     """measure kernel regression on the same spectra, too"""
     name: str = "locating_spectra"
@@ -70,7 +89,7 @@ def scenes(config: Config) -> Iterator[tuple[str, Spectra]]:
     for name in config.scenes:
         yield name, simulated_room(moving="transmitter" if name == "room" else "receiver")
     for folder in config.data:
-        yield folder.name, load_spectra(folder)
+        yield folder.name, load_spectra(folder, subcarriers=config.subcarriers, bandwidth=config.bandwidth)
 
 
 def measure(measured: Spectra, test: Spectra, draw: int, kernel: bool) -> Row:
@@ -83,13 +102,15 @@ def measure(measured: Spectra, test: Spectra, draw: int, kernel: bool) -> Row:
     try:
         room = make_model(ROOM_MODEL, seed=draw).fit(measured)
         searched = time.perf_counter()
+        if measured.channel is not None:
+            row["channel"] = channel_scores(room.room, measured, test, draw)
         if room.room is None or not room.room.planes:
             return row | {"left_out": NO_PLANE}
         locator = MatchedField(seed=draw).fit(measured, room=room)
     except (InputError, FitError) as error:
         return row | {"left_out": str(error)}
     fitted = time.perf_counter()
-    timed = test.subset(torch.arange(N_LOCATED) % len(test)).spectrum
+    timed = test.subset(torch.arange(N_LOCATED) % len(test))
     ready = time.perf_counter()
     locator.predict(timed)
     seconds = {"room": searched - began, "fit": fitted - searched, "locate": time.perf_counter() - ready}
@@ -102,6 +123,46 @@ def measure(measured: Spectra, test: Spectra, draw: int, kernel: bool) -> Row:
         f"coverage_{100 * LEVEL:.0f}": float((result["level"] < LEVEL).double().mean()),
         "ambiguous": float(result["ambiguous"].double().mean()),
         "seconds": seconds,
+    }
+
+
+def channel_scores(room: GeometryModel, measured: Spectra, test: Spectra, seed: int) -> Row:
+    """Return coherence and normalised mean squared error [dB] of channels predicted at the test positions, by method.
+
+    The factor that planes and furniture leave open is fitted to the measured channels.
+    """
+    known, truth = room.channels(measured), room.channels(test)
+    value, fold = torch.view_as_real(known.value).flatten(1), folds(measured.position, "random", seed)
+    process = GaussianProcess.regress(
+        choose_kernel(measured.position, value[:, None], fold),
+        measured.position,
+        value,
+        exact=True,
+        dtype=torch.float32,
+    )
+    mean = process.mean(test.position).reshape(*truth.value.shape, 2)
+    closest = torch.cdist(test.position, measured.position).argmin(dim=1)
+    predicted = {
+        "mean": known.value.mean(dim=0).expand_as(truth.value),
+        "nearest": known.value[closest],
+        "gaussian_process": torch.view_as_complex(mean.contiguous()),
+    }
+    walls = copy(room)
+    walls.furniture = None
+    for name, model in {"planes": walls, "furniture": room}.items():
+        at_known, at_test = (
+            field(model.gains(part.scene), waves(model.tensors(), part.scene, part.frequency))
+            for part in (known, truth)
+        )
+        factor = (at_known.conj() * known.value).sum() / at_known.abs().square().sum()
+        predicted[name] = factor * at_test
+    power = truth.value.abs().square().sum()
+    return {
+        name: {
+            "coherence": float(coherence(truth.value, channel).mean()),
+            "nmse_db": 10 * math.log10(float((truth.value - channel).abs().square().sum() / power)),
+        }
+        for name, channel in predicted.items()
     }
 
 

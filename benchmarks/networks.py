@@ -29,7 +29,7 @@ from augment.turbo.experiment import ROOM_MODEL
 from swiftwrf import MatchedField, Spectra, load_spectra, make_model, simulated_room
 from swiftwrf.metrics import angle_errors, paired_change, summary
 from swiftwrf.models import FIELD_MODELS
-from tasks.run import Preset
+from swiftwrf.runtime.validation import Preset
 
 REFERENCE = "kernel_regression"  # estimator to which others are compared
 N_EXTRA = 3000  # extra synthetic positions in rooms

@@ -23,7 +23,7 @@ from swiftwrf import AngularGrid, SwiftWRF, rasterize
 from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.models import swiftwrf as model_module
 from swiftwrf.rasterize import Backend, rasterize_magnitude
-from tasks.run import choose_device
+from tasks.environment import choose_device
 
 Rate = dict[str, float]
 CUTOFF = 1e-3

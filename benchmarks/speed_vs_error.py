@@ -33,7 +33,7 @@ from swiftwrf.models.coarray import project
 from swiftwrf.rasterize import Backend, prepare, rasterize_magnitude
 from tasks import labels
 from tasks.page import figures
-from tasks.page.palette import Palette
+from tasks.page.figures import Palette
 
 CUTOFFS = (None, 1e-5, 1e-4, 1e-3, 1e-2)
 GRIDS = ((45, 180), (90, 360), (180, 720))

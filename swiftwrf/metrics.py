@@ -7,12 +7,13 @@ SSIM is scikit-image's default (7 x 7 uniform window, sample covariance, borders
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from functools import lru_cache
 from typing import TypedDict
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from pandas import DataFrame
 from scipy import stats
 from torch import Tensor
@@ -179,8 +180,27 @@ class ErrorSummary(TypedDict):
     n: int
 
 
-def summary(errors: ArrayLike) -> ErrorSummary:
+def resampled(group: ArrayLike, n: int = 1000) -> Iterator[NDArray[np.int64]]:
+    """Yield n bootstrap samples of rows (rows,) in which rows of one group, e.g. scans at one place, stay together.
+
+    Example:
+        >>> [sorted(rows.tolist()) for rows in resampled(["a", "a", "b"], 2)]
+        [[2, 2], [0, 1, 2]]
+    """
+    number = np.unique(np.asarray(group), return_inverse=True, axis=0)[1]
+    rows = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number))[:-1])
+    draw = np.random.default_rng(0)
+    for _ in range(n):
+        yield np.concatenate([rows[chosen] for chosen in draw.integers(len(rows), size=len(rows))])
+
+
+def summary(errors: ArrayLike, group: ArrayLike | None = None) -> ErrorSummary:
     """Return `median`, `p90`, `mean`, `n` and the 95 % interval of the median (`low`, `high`) of finite errors (n,).
+
+    Args:
+        errors: Errors (n,).
+        group: Group of each error, e.g. its place, (n,) or (n, k). Errors of one group are not independent, so the interval
+            is a bootstrap over groups. Defaults to independent errors.
 
     Example:
         >>> found = summary([1.0, 2.0, 3.0, float("nan")])
@@ -188,7 +208,8 @@ def summary(errors: ArrayLike) -> ErrorSummary:
         (2.0, 3)
     """
     values = np.asarray(errors, dtype=float)
-    values = values[np.isfinite(values)]
+    finite = np.isfinite(values)
+    values = values[finite]
     if len(values) == 0:
         return {
             "median": float("nan"),
@@ -199,6 +220,10 @@ def summary(errors: ArrayLike) -> ErrorSummary:
             "n": 0,
         }
     low, high = median_interval(values)
+    group = None if group is None else np.asarray(group)[finite]
+    if group is not None and len(np.unique(group, axis=0)) < len(values):
+        medians = [float(np.median(values[rows])) for rows in resampled(group)]
+        low, high = (float(bound) for bound in np.percentile(medians, (2.5, 97.5)))
     return {
         "median": float(np.median(values)),
         "p90": float(np.percentile(values, 90)),
@@ -246,16 +271,17 @@ def paired_change(before: ArrayLike, after: ArrayLike) -> ChangeMetrics:
 def paired_difference(errors: DataFrame, method: str, other: str) -> tuple[float, float, float]:
     """Return the mean of one method's errors minus another's on equal pairs, and its 95 % interval.
 
-    The interval is a bootstrap over test rows, because the receivers of one row are not independent. It is nan for fewer
-    than 10 rows, with which a bootstrap finds false differences.
+    The interval is a bootstrap over test rows, because the receivers of one row are not independent, or over places if rows
+    repeat them. It is nan for fewer than 10 of them, with which a bootstrap finds false differences.
 
     Args:
-        errors: Errors with a column for each method and a row for each pair, indexed by `index` (the test row) and
-            `receiver`.
+        errors: Errors with a column for each method and a row for each pair, indexed by `index` (the test row), and
+            `receiver` and `place` if they exist.
         method: Column of the method.
         other: Column of the method that it is compared to.
     """
-    difference = (errors[method] - errors[other]).groupby(level="index").agg(["sum", "count"]).to_numpy()
+    level = "place" if "place" in errors.index.names else "index"
+    difference = (errors[method] - errors[other]).groupby(level=level).agg(["sum", "count"]).to_numpy()
     mean = float(difference[:, 0].sum() / difference[:, 1].sum())
     if len(difference) < MIN_ROWS:
         return mean, math.nan, math.nan
@@ -269,7 +295,8 @@ def method_summary(errors: DataFrame, column: str, reference: str) -> DataFrame:
     """Return a summary of the errors of each method, and their mean difference to those of a reference.
 
     Args:
-        errors: A row for each `method` and test row `index`, and `receiver` where a row has several errors.
+        errors: A row for each `method` and test row `index`, `receiver` where a row has several errors, and `place` where
+            rows repeat places.
         column: Column of errors.
         reference: Method of the differences, which are paired over test rows.
 
@@ -278,10 +305,15 @@ def method_summary(errors: DataFrame, column: str, reference: str) -> DataFrame:
         `difference_high`.
     """
     pairs = errors.pivot_table(
-        index=[name for name in ("index", "receiver") if name in errors], columns="method", values=column
+        index=[name for name in ("index", "receiver", "place") if name in errors], columns="method", values=column
     )
     rows = {}
-    for name, own in errors.groupby("method", sort=False)[column]:
+    for name, own in errors.groupby("method", sort=False):
         mean, low, high = paired_difference(pairs, name, reference)
-        rows[name] = {**summary(own), "difference": mean, "difference_low": low, "difference_high": high}
+        rows[name] = {
+            **summary(own[column], own.get("place")),
+            "difference": mean,
+            "difference_low": low,
+            "difference_high": high,
+        }
     return DataFrame.from_dict(rows, orient="index").rename_axis("method")

@@ -18,6 +18,7 @@ else:
     Axes = Any
 
 MARK = "#cc3311"  # of a true or estimated value in a figure, distinct from all colours of viridis
+HATCH = "#555b66"
 
 
 class Displayed:
@@ -157,6 +158,18 @@ def plan_map(
     image = ax.imshow(value, origin="lower", extent=corners)
     ax.figure.colorbar(image, ax=ax, label=label)
     return ax
+
+
+def hatch(ax: Axes, x: NDArray[Any], y: NDArray[Any], where: NDArray[np.bool_], pattern: str = "////") -> None:
+    """Hatch cells of a map with centres x (columns,) and y (rows,) [m] where a mask (rows, columns) is true."""
+    if not where.any():
+        return
+    mask, (x0, x1, y0, y1) = np.pad(where, 1, mode="edge").astype(float), corners_of(x, y)
+    x, y = np.concatenate([[x0], x, [x1]]), np.concatenate([[y0], y, [y1]])
+    with np.errstate(all="ignore"):
+        drawn = ax.contourf(x, y, mask, levels=[0.5, 1.5], colors="none", hatches=[pattern], zorder=2)
+    drawn.set_edgecolor(HATCH)
+    drawn.set_linewidth(0)
 
 
 def plan_axes(ax: Axes | None = None) -> Axes:

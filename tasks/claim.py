@@ -14,6 +14,7 @@ from swiftwrf.runtime.steps import STEPS
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # errors of file systems without locks
 LOCK, CONFIG, ENVIRONMENT = "lock", "config.json", "environment.json"
+PARTIAL = ".partial"  # suffix of a run that is not finished
 MODEL, LOCATOR = "model.safetensors", "locator.safetensors"  # fitted RSSI models of runs
 
 
@@ -74,7 +75,7 @@ class Claim:
         if not self.folder.is_dir() or begun(self.folder):
             raise InputError(
                 f"{self.folder} exists already and a run is never overwritten; choose another --out or go on with "
-                f"--resume {self.folder}"
+                f"swiftwrf resume {self.folder}"
             )
 
     def discard_if_empty(self) -> bool:

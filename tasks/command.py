@@ -45,10 +45,10 @@ COMMANDS = {
     "inspect": Command("check measurements before a run: counts, frames, calibration", "InspectConfig"),
     "convert": Command("write measurements and RSSI maps in other formats", "ConvertConfig"),
     "update": Command("update a fitted model with new measurements, and detect changes", "UpdateConfig"),
+    "resume": Command("continue an interrupted run: swiftwrf resume DIR.partial", "ResumeConfig"),
     "scenes": Command("trace ray paths in a room (extra: raytrace)", "ScenesConfig"),
     "view": Command("show a fitted field in the browser (extra: view)", "ViewConfig"),
 }
-RESUME = "continue an interrupted run: swiftwrf resume DIR.partial [--scheduler ADDRESS] [--processes N]"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -75,10 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
             return without_reader()
         return 0
-    if name == "resume":
-        return _resume(options)
     if name not in COMMANDS:
-        print(f"error: unknown command {name!a}; choose from {', '.join((*COMMANDS, 'resume'))}", file=sys.stderr)
+        print(f"error: unknown command {name!a}; choose from {', '.join(COMMANDS)}", file=sys.stderr)
         return 2
     return run_command(name, options, f"swiftwrf {name}")
 
@@ -92,45 +90,23 @@ def run_command(name: str, options: Sequence[str], program: str | None = None) -
         program: Name of the program in the help. Defaults to `python -m tasks.NAME`.
     """
     _shorten_waits()
-    from tasks.command_line import exit_code
+    from tasks.command_line import command_line
 
-    return exit_code(partial(_execute, name, options, program))
-
-
-def _resume(options: Sequence[str]) -> int:
-    if not options or options[0].startswith("-"):
-        print(f"usage: swiftwrf resume DIR.partial [OPTIONS]\n\n{RESUME}")
-        return 0 if options[:1] in (["-h"], ["--help"]) else 2
-    _shorten_waits()
-    from swiftwrf.errors import InputError
-    from tasks.command_line import exit_code
-    from tasks.resume import interrupted
-
-    def action() -> None:
-        task = interrupted(Path(options[0])).get("task")
-        if task not in COMMANDS:
-            raise InputError(f"{options[0]} is a run of the unknown task {task!a}; restore its config.json")
-        _execute(task, ["--resume", *options], None)
-
-    return exit_code(action)
+    config_type = getattr(import_module(f"tasks.{name}.options"), COMMANDS[name].options)
+    return command_line(f"tasks.{name}", config_type, partial(run_task, name), options, program)
 
 
-def _execute(name: str, options: Sequence[str], program: str | None) -> None:
-    from tasks.command_line import execute
+def run_task(name: str, config: Any, *folder: Path) -> None:
+    """Run a command with checked options, or continue its run in a directory."""
     from tasks.preload import preload
 
     command = COMMANDS[name]
-
-    def task(config: Any, *folder: Any) -> None:
-        preload(command.preloaded if getattr(config, "processes", None) != 1 else ())
-        import_module(f"tasks.{name}.{command.module}").run(config, *folder)
-
-    execute(f"tasks.{name}", getattr(import_module(f"tasks.{name}.options"), command.options), task, options, program)
+    preload(command.preloaded if getattr(config, "processes", None) != 1 else ())
+    import_module(f"tasks.{name}.{command.module}").run(config, *folder)
 
 
 def _help() -> str:
-    summaries = {name: command.summary for name, command in COMMANDS.items()} | {"resume": RESUME}
-    lines = (f"  {name:<9} {summary}" for name, summary in summaries.items())
+    lines = (f"  {name:<9} {command.summary}" for name, command in COMMANDS.items())
     return "\n".join(
         ["usage: swiftwrf COMMAND [OPTIONS]", "", *lines, "", "options of a command: swiftwrf COMMAND --help"]
     )

@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 import errno
+import inspect
+import json
 import os
 import sys
-from collections.abc import Callable, Sequence
+from argparse import ArgumentError, ArgumentParser
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import MISSING, fields, is_dataclass
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar, get_type_hints
+
+import tyro
+import yaml
+from tyro.constructors import ConstructorRegistry, PrimitiveTypeInfo
 
 from swiftwrf.errors import FitError, InputError, one_line
-from swiftwrf.runtime.durable import strict
-from tasks.options import OUTPUT, Options
-from tasks.parsing import file_options, general_options, parse
-from tasks.resume import saved_config
+from tasks.options import Answered, Options
 from tasks.terminal import terminal
 
 Config = TypeVar("Config", bound=Options)
-CHANGING = ("scheduler", "processes", *OUTPUT)  # options of a run that may change when it is resumed
+STYLE = (tyro.conf.OmitArgPrefixes, tyro.conf.PositionalMetavarFromFieldName, tyro.conf.DisallowNone)
+MAX_CONFIG_BYTES = 2**20
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 BROKEN_PIPE = 141  # exit code that shells show for a process ended by SIGPIPE
 
@@ -27,7 +33,7 @@ BROKEN_PIPE = 141  # exit code that shells show for a process ended by SIGPIPE
 def command_line(
     name: str,
     config_type: type[Config],
-    task: Callable[..., None],
+    task: Callable[[Config], None],
     arguments: Sequence[str],
     program: str | None = None,
 ) -> int:
@@ -89,42 +95,133 @@ def _no_access(error: OSError) -> str:
 def execute(
     name: str,
     config_type: type[Config],
-    task: Callable[..., None],
+    task: Callable[[Config], None],
     arguments: Sequence[str],
     program: str | None = None,
 ) -> None:
     """Parse a command line and run the task.
 
-    A resumable task takes a second argument, the directory to resume or None. For such a task `--resume DIR` takes the
-    configuration of an interrupted run. Only the options in `CHANGING` may be given with it.
-
     Args:
         name: Module of the task, e.g. tasks.aoa.
         config_type: Dataclass of the options. Its docstring is the description in the help.
-        task: Function of the configuration and, if it can be resumed, of the directory.
+        task: Function of the configuration.
         arguments: Options of the command line.
         program: Name of the command in the help. Defaults to `python -m NAME`.
 
     Raises:
         InputError: Wrong options, or the error of the task.
     """
-    general, others = general_options(arguments)
-    program, folder = program or f"python -m {name}", None
-    if general.resume is None:
-        saved = file_options(Path(general.config)) if general.config else None
-        config = parse(config_type, others, program, saved, general.config)
-    elif not config_type.resumable:
-        raise InputError(f"a run of {name} cannot be resumed; start it again")
-    else:
-        folder = Path(general.resume)
-        saved = saved_config(folder, name.removeprefix("tasks."))
-        saved = {key: value for key, value in saved.items() if key not in CHANGING}
-        config = parse(config_type, others, program, saved, folder)
-        changed = [key for key, value in saved.items() if strict(getattr(config, key)) != value]
-        if changed or general.config:
-            flag = changed[0].replace("_", "-") if changed else "config"
-            allowed = ", ".join(f"--{key}" for key in CHANGING)
-            raise InputError(f"--{flag} cannot change the run that --resume continues; only {allowed} can")
+    file = file_of_options(arguments)
+    saved = None if file is None else file_options(Path(file))
+    config = parse(config_type, arguments, program or f"python -m {name}", saved, file)
     config.check()
-    with terminal.of(config, general.verbose):
-        task(*((config, folder) if config_type.resumable else (config,)))
+    with terminal.of(getattr(config, "output", Answered()), config.verbose):
+        task(config)
+
+
+def file_of_options(arguments: Sequence[str]) -> str | None:
+    """Return the value of --config on a command line, None without one.
+
+    Raises:
+        InputError: It is given twice or lacks its value.
+
+    Example:
+        >>> file_of_options(["--seed", "7", "--config=options.yaml"])
+        'options.yaml'
+    """
+    parser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--config", action="append", default=[])
+    try:
+        files = parser.parse_known_args(arguments)[0].config
+    except ArgumentError as error:
+        raise InputError(f"{error.argument_name}: {error.message}; --help shows its use") from None
+    if len(files) > 1:
+        raise InputError(f"--config is given twice: {' and '.join(files)}; give one")
+    return files[0] if files else None
+
+
+def parse(
+    config_type: type[Config],
+    arguments: Sequence[str],
+    program: str,
+    saved: Mapping[str, Any] | None = None,
+    origin: object = "",
+) -> Config:
+    """Return the options of a command line.
+
+    Args:
+        config_type: Dataclass of the options. Its docstring is the description in the help.
+        arguments: Options of the command line.
+        program: Name of the command in the help.
+        saved: Values of `file_options` or of a run by name, in place of the defaults.
+        origin: File or directory of the saved values, for messages.
+
+    Raises:
+        InputError: A saved value that is not of its option's type, or an unknown name.
+        SystemExit: Help, or options that do not exist or cannot be read.
+    """
+    left = dict(saved or {})
+    defaults = _defaults(config_type, left, origin)
+    for name in left:
+        raise InputError(f"{origin} names {name!a}, which is no option of this command; --help lists them")
+    # a flag that a file sets needs its negation on the command line
+    style = STYLE if saved else (*STYLE, tyro.conf.FlagCreatePairsOff)
+    description = inspect.cleandoc(config_type.__doc__ or "")
+    found: Config = tyro.cli(
+        config_type, prog=program, description=description, args=arguments, default=defaults, config=style
+    )
+    return found
+
+
+def _defaults(kind: type[Any], saved: dict[str, Any], origin: object) -> Any:
+    """Return options with the values that are taken from `saved`, and the others as they are by default.
+
+    Raises:
+        InputError: A value that its option does not take.
+    """
+    made, hints = object.__new__(kind), get_type_hints(kind, include_extras=True)  # required ones may be missing
+    for option in fields(kind):
+        default = tyro.MISSING if option.default is MISSING else option.default
+        if is_dataclass(default):
+            default = _defaults(type(default), saved, origin)
+        elif (value := saved.pop(option.name, None)) is not None:
+            default = _typed(option.name, value, hints[option.name], origin)
+        object.__setattr__(made, option.name, default)
+    return made
+
+
+def _typed(name: str, value: Any, hint: Any, origin: object) -> Any:
+    """Return a saved value in the type of its option, read like the words of a command line.
+
+    Raises:
+        InputError: The option does not take it.
+    """
+    items = value if isinstance(value, list) else [value]
+    spec: Any = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(hint, set()))
+    is_fitting = spec.nargs == "*" or len(items) in (spec.nargs if isinstance(spec.nargs, tuple) else (spec.nargs,))
+    try:
+        if not is_fitting or any(isinstance(item, dict | list) for item in items):
+            raise ValueError
+        return spec.instance_from_str([str(item) for item in items])
+    except ValueError:
+        raise InputError(f"{origin}: {name} takes {spec.metavar}, got {value!a}") from None
+
+
+def file_options(file: Path) -> dict[str, Any]:
+    """Return the options of a file by name. The config.json of a run holds them under `config`; its `out` is taken.
+
+    Raises:
+        InputError: No such file, or one that holds no names and values.
+    """
+    try:
+        if not file.is_file() or file.stat().st_size > MAX_CONFIG_BYTES:
+            raise OSError(f"expected a file of at most {MAX_CONFIG_BYTES} bytes")
+        text = file.read_text(encoding="utf-8-sig")
+        content = json.loads(text) if file.suffix == ".json" else yaml.safe_load(text)
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
+        raise InputError(f"--config {file} cannot be read ({error})") from None
+    if isinstance(content, dict) and isinstance(content.get("config"), dict):
+        content = content["config"] | {"out": None}
+    if not isinstance(content, dict):
+        raise InputError(f"--config {file} must hold options by name, got {type(content).__name__}")
+    return {str(name): value for name, value in content.items()}

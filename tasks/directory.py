@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import re
 import secrets
@@ -20,11 +22,10 @@ from swiftwrf import InputError
 from swiftwrf.runtime.durable import rename, strict, write_json, write_npz
 from swiftwrf.runtime.steps import STEPS
 from swiftwrf.runtime.threads import set_threads
-from tasks.claim import CONFIG, ENVIRONMENT, LOCK, Claim
+from tasks.claim import CONFIG, ENVIRONMENT, LOCK, PARTIAL, Claim
 from tasks.environment import environment, invocation, now, number_of_processes, stamp
 from tasks.options import plain
 from tasks.records import Row, read_json, write_table
-from tasks.resume import PARTIAL, digest
 from tasks.terminal import terminal
 
 MAX_LABEL = 60  # characters of the label in the name of a directory under runs/
@@ -81,6 +82,11 @@ def unchanged_environment(folder: Path, source: dict[str, str]) -> Row:
             f"the input has changed since {folder} began ({', '.join(changed)}); restore it or start a new run"
         )
     return found
+
+
+def digest(config: Any) -> str:
+    """Return the SHA-256 of a configuration of plain values."""
+    return hashlib.sha256(json.dumps(strict(config), sort_keys=True).encode()).hexdigest()
 
 
 class Run:

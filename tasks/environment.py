@@ -17,6 +17,7 @@ from typing import Any
 import torch
 
 from swiftwrf import InputError
+from swiftwrf.runtime.threads import to_device
 from tasks.preload import MAX_PROCESSES
 
 CODE = ("swiftwrf", "augment", "tasks")  # packages whose files decide the results of a run
@@ -48,6 +49,17 @@ def command(task: str, *arguments: str) -> str:
         "python -m tasks.view 'my run'"
     """
     return shlex.join(["python", "-m", f"tasks.{task}", *arguments])
+
+
+def choose_device(name: str) -> torch.device:
+    """Return the device of that name. With `auto` it is the GPU if there is one.
+
+    Raises:
+        InputError: There is no GPU.
+    """
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    return to_device(name)
 
 
 def number_of_processes(device: torch.device, asked: int | None = None, threads: int = 1) -> int:

@@ -91,8 +91,9 @@ LOCALIZERS = {
         "the median of the posterior over positions: radio maps with their uncertainty, detections, similar training rows",
         "#3a7fd5",
     ),
-    "knn": Label("the inverse-distance mean position of the k training rows with the most similar RSSI", "#1b8fa6"),
+    "knn": Label("the inverse-distance mean position of the k places with the most similar RSSI", "#1b8fa6"),
     "knn_difference": Label("knn on differences to the row's strongest value, without the device's offset", "#d1620f"),
+    "nearest": Label("the single most similar training row by Manhattan distance, the field's benchmark", "#a0559c"),
     "gp": Label("Gaussian-process regression from RSSI to coordinates", "#2a9165"),
     "mean": Label("the mean training position", "#7f8794"),
 }

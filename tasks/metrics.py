@@ -50,9 +50,10 @@ class ReceiverMetrics(TypedDict):
 
 
 class PredictorMetrics(ReceiverMetrics):
-    """Errors of a predictor at all receivers, and its seconds."""
+    """Errors of a predictor at all receivers, its seconds, and the shares of detected and empty cells predicted as such."""
 
     seconds: PredictorSeconds
+    detection: NotRequired[tuple[float, float] | None]
 
 
 class IntervalMetrics(TypedDict):
@@ -89,11 +90,12 @@ class RssiMetrics(RunMetrics):
 
 
 class LocalizerMetrics(TypedDict):
-    """Position errors of one localizer, in space and in plan, and its seconds."""
+    """Position errors of one localizer, in space and in plan, its seconds, and with floors the fraction of right ones."""
 
     position_error_m: ErrorSummary
     horizontal_error_m: ErrorSummary
     seconds: PredictorSeconds
+    floor_hit_rate: NotRequired[float]
 
 
 class StudyMetrics(TypedDict):

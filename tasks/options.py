@@ -1,59 +1,90 @@
-"""Options of commands: their base classes, and the checks that need no data. Importable without torch."""
+"""Options of commands: groups that they share, and the checks that need no data. Importable without torch."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, Field, asdict, dataclass, fields
-from inspect import get_annotations
-from typing import Annotated, Any, ClassVar, Literal, TypeVar, dataclass_transform
+from dataclasses import KW_ONLY, dataclass, fields, is_dataclass
+from types import NoneType
+from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_type_hints
 from unicodedata import category
 
 import tyro
+from annotated_types import Ge, Lt
+from docstring_parser import parse_from_object
 
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.registry import Registry
+from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, check_value
 from tasks import labels
 
 SEEDS = 2**32  # number of seeds that the generators of scikit-learn and NumPy accept
+Seed = Annotated[int, Ge(0), Lt(SEEDS)]
 MAX_SIDE = 32  # elements: spectra of 32 x 32 elements have 7,938 independent numbers
 
 Class = TypeVar("Class", bound=type)
 
 
 @dataclass_transform(frozen_default=True)
-def command_options(cls: Class) -> Class:
-    """Make a class a frozen dataclass whose help lists required options first and inherited ones last."""
-    made: Any = dataclass(frozen=True)(cls)
-    own = cls.__annotations__
-
-    def place(item: tuple[str, Field[Any]]) -> tuple[bool, bool]:
-        return item[1].default is not MISSING, item[0] not in own
-
-    made.__dataclass_fields__ = dict(sorted(made.__dataclass_fields__.items(), key=place))
+def options(cls: Class) -> Class:
+    """Make a class a frozen dataclass of options. The text below each one is its help."""
+    hints = get_type_hints(cls, include_extras=True)
+    for option in parse_from_object(cls).params:
+        hint, text = hints[option.arg_name], " ".join((option.description or "").split())
+        if not any(hasattr(extra, "help_behavior_hint") for extra in get_args(hint)):
+            hint = Annotated[hint, tyro.conf.arg(help=text, help_behavior_hint=_default)]
+        cls.__annotations__[option.arg_name] = hint
+    dataclass(frozen=True)(cls)
     return cls
 
 
-@dataclass(frozen=True, kw_only=True)
+def _default(value: str) -> str:
+    """Return the text of a default in the help, which is empty for None, False and no values."""
+    return "" if value in ("None", "False", "") else f"(default: {value})"
+
+
+def _without_none(hint: Any) -> Any:
+    """Return the type of an option that is given."""
+    kinds = get_args(get_args(hint)[0]) if hasattr(hint, "__metadata__") else ()
+    return Union[tuple(kind for kind in kinds if kind is not NoneType)] if NoneType in kinds else hint  # noqa: UP007
+
+
+def by_name(config: Any) -> dict[str, Any]:
+    """Return the options of a command, those of its groups included.
+
+    Example:
+        >>> by_name(Output(json=True))
+        {'quiet': False, 'json': True, 'open': False}
+    """
+    found: dict[str, Any] = {}
+    for option in fields(config):
+        value = getattr(config, option.name)
+        found |= by_name(value) if is_dataclass(value) else {option.name: value}
+    return found
+
+
+@options
 class Options:
     """Base class of the options of a command. The docstring of a subclass is the description in its help.
 
-    `check` runs before the modules of the command are imported, so a wrong value is refused at once.
+    A field that is a dataclass is a group of the help. `check` runs before the modules of the command are imported, so a
+    wrong value is refused at once.
     """
 
-    group: ClassVar[str] = "command"
-    """group of the options in the help of a command that inherits them"""
-    resumable: ClassVar[bool] = False
-    """whether an interrupted run of the command can be continued"""
+    _: KW_ONLY
+    config: str | None = None
+    """FILE.yaml or FILE.json with options by name, e.g. the config.json of a run; options of the command line win"""
+    verbose: bool = False
+    """print what is read and computed, with times"""
 
     def check(self) -> None:
         """Refuse options that are wrong whatever the data. Subclasses extend it.
 
         Raises:
-            InputError: Empty text, control characters, a number that is not finite, or a seed that generators do not accept.
+            InputError: Empty text, control characters, or a number that is not finite or outside its declared range.
         """
-        for option in fields(self):
-            flag, given = f"--{option.name.replace('_', '-')}", getattr(self, option.name)
+        for name, given in by_name(self).items():
+            flag = f"--{name.replace('_', '-')}"
             for value in given if isinstance(given, tuple) else (given,):
                 if value == "":
                     raise InputError(f"{flag} is empty; give it a value or leave it out")
@@ -63,15 +94,20 @@ class Options:
                     )
                 if isinstance(value, float) and not math.isfinite(value):
                     raise InputError(f"{flag} takes finite numbers, got {value}")
-            if option.name == "seed" and not 0 <= given < SEEDS:
-                raise InputError(f"--seed must be from 0 to {SEEDS - 1}, got {given}")
+        groups = [value for value in vars(self).values() if is_dataclass(value)]
+        for group in (self, *groups):
+            hints = get_type_hints(type(group), include_extras=True)
+            for option in fields(group):
+                if (value := getattr(group, option.name)) is not None:
+                    check_value(f"--{option.name.replace('_', '-')}", value, _without_none(hints[option.name]))
+        for group in groups:
+            if isinstance(group, SpectraSource | TableSource):
+                group.check()
 
 
-@dataclass(frozen=True, kw_only=True)
-class Answered(Options):
-    """Options of a command with an answer. They are no part of a run's configuration."""
-
-    group: ClassVar[str] = "output"
+@options
+class Answered:
+    """Output of a command."""
 
     quiet: bool = False
     """print the answer only, no progress and no notes"""
@@ -79,22 +115,20 @@ class Answered(Options):
     """print the answer as one JSON object, and nothing else"""
 
 
-@dataclass(frozen=True, kw_only=True)
+@options
 class Output(Answered):
-    """Options of a command with an answer and a report."""
-
-    group: ClassVar[str] = "output"
+    """Output and report of a command."""
 
     open: bool = False
     """open the report in the browser at the end"""
 
 
-OUTPUT = tuple(option.name for option in fields(Output))
+PASSING = ("config", "verbose", *(option.name for option in fields(Output)))  # options that change no result
 
 
 def plain(config: Any) -> dict[str, Any]:
-    """Return the options of a command as plain values, without those of what it shows."""
-    return {name: value for name, value in asdict(config).items() if name not in OUTPUT}
+    """Return the options of a command as plain values by name, without those of what it shows."""
+    return {name: value for name, value in by_name(config).items() if name not in PASSING}
 
 
 def choice(meaning: str, registry: Registry[Any] | None, known: Mapping[str, labels.Label], default: str) -> Any:
@@ -114,11 +148,9 @@ def choice(meaning: str, registry: Registry[Any] | None, known: Mapping[str, lab
     return tyro.conf.arg(help=f"{meaning}:", help_behavior_hint=entries)
 
 
-@dataclass(frozen=True, kw_only=True)
-class SpectraSource(Options):
-    """Options of reading spectra."""
-
-    group: ClassVar[str] = "spectra"
+@options
+class SpectraSource:
+    """Options of reading or computing spectra."""
 
     array: tuple[int, float, float] | tuple[int, int, float, float] | None = None
     """array of the spectra if the data do not describe it, or for which spectra of ray paths are computed: elements a side,
@@ -128,26 +160,31 @@ class SpectraSource(Options):
     )
     grid: tuple[int, int] | None = None
     """elevations and azimuths of computed spectra (default: 90 360)"""
-    every: int | None = None
+    every: PositiveInt | None = None
     """reads one measurement of that many"""
-    station: int | None = None
+    station: PositiveInt | None = None
     """number of the array in a file with several, counted from 1"""
+    subcarriers: PositiveInt | None = None
+    """number of subcarriers at which the channel is computed from ray paths (default: spectra alone)"""
+    bandwidth: PositiveFloat | None = None
+    """distance of the first and the last of these subcarriers [Hz]"""
     drop_null: bool = False
     """leave out null subcarriers of array snapshots, which are the same at every position and element"""
     round_trip: bool = False
     """phases of array snapshots are those of the way there and back, as of RFID and backscatter"""
 
     def check(self) -> None:
-        super().check()
+        """Refuse options that are wrong whatever the data.
+
+        Raises:
+            InputError: An unknown beamformer, or an array that is none.
+        """
         if self.beamformer is not None and self.beamformer not in labels.BEAMFORMERS:
             raise InputError(f"unknown beamformer {self.beamformer!r}; choose from {', '.join(labels.BEAMFORMERS)}")
         if self.array is not None:
             self._check_array(*self.array)
         if self.grid is not None and min(self.grid) < 2:
             raise InputError(f"--grid takes numbers of elevations and azimuths, each at least 2, got {self.grid}")
-        for name, value in (("every", self.every), ("station", self.station)):
-            if value is not None and value < 1:
-                raise InputError(f"--{name} must be at least 1, got {value}")
 
     def _check_array(self, *array: float) -> None:
         *sides, spacing, frequency = array
@@ -160,19 +197,15 @@ class SpectraSource(Options):
             )
 
 
-@dataclass(frozen=True, kw_only=True)
-class TableSource(Options):
+@options
+class TableSource:
     """Options of reading RSSI."""
-
-    group: ClassVar[str] = "table"
 
     columns: tuple[str, ...] = ()
     """names of columns of a survey table that are not recognised: x=NAME y=NAME receiver=NAME rssi=NAME
     floor=NAME ... (several with rssi='WAP*')"""
-    filler: tuple[float, ...] = ()
-    """values of RSSI that stand for not detected (default: those that are recognised)"""
-    keep_filler: bool = False
-    """count all values of RSSI as measured"""
+    filler: tuple[float, ...] | Literal["none"] = ()
+    """values of RSSI that stand for not detected; none counts all as measured (default: those that are recognised)"""
     coordinates: Literal["degrees", "metres"] | None = None
     """unit of the positions in a survey table (default: the one that is recognised)"""
     transmitter: tuple[str, ...] = ()
@@ -188,7 +221,11 @@ class TableSource(Options):
         return {role: name for role, _, name in (text.partition("=") for text in self.columns)} or None
 
     def check(self) -> None:
-        super().check()
+        """Refuse options that are wrong whatever the data.
+
+        Raises:
+            InputError: A column without a name, or named twice, or too many columns of positions.
+        """
         for text in self.columns:
             role, _, name = text.partition("=")
             if not role or not name:
@@ -197,16 +234,14 @@ class TableSource(Options):
             raise InputError(f"--columns names something twice: {' '.join(self.columns)}")
         if len(self.transmitter) > 3:
             raise InputError(f"--transmitter takes 1 to 3 columns, got {' '.join(self.transmitter)}")
-        if self.filler and self.keep_filler:
-            raise InputError("--filler and --keep-filler exclude each other")
 
     @property
     def fillers(self) -> tuple[float, ...] | None:
-        """Values that stand for not detected, none with --keep-filler. None for those that are recognised."""
-        return self.filler if self.filler or self.keep_filler else None
+        """Values that stand for not detected. None for those that are recognised."""
+        return () if self.filler == "none" else self.filler or None
 
 
-@dataclass(frozen=True, kw_only=True)
+@options
 class OffsetSource(TableSource):
     """Options of reading RSSI of several devices or channels."""
 
@@ -225,17 +260,16 @@ class OffsetSource(TableSource):
         Raises:
             InputError: Such an option, but no data.
         """
-        if data is None and (names := given(self, TableSource, OffsetSource)):
+        if data is None and (names := given(self)):
             raise InputError(f"--{names[0]} is for measured RSSI; give it with --data")
 
 
-def given(config: Options, *groups: type[Options]) -> list[str]:
-    """Return the names of the options that are set, of those that these classes add to their bases.
+def given(group: Any) -> list[str]:
+    """Return the names of the options of a group that are set.
 
     Example:
-        >>> given(SpectraSource(every=2, drop_null=True), SpectraSource)
+        >>> given(SpectraSource(every=2, drop_null=True))
         ['every', 'drop-null']
     """
-    default = {option.name: option.default for option in fields(config)}
-    names = [name for group in groups for name in get_annotations(group) if name in default]
-    return [name.replace("_", "-") for name in names if getattr(config, name) != default[name]]
+    names = (option.name for option in fields(group) if getattr(group, option.name) != option.default)
+    return [name.replace("_", "-") for name in names]

@@ -25,38 +25,32 @@ from tasks.terminal import console
 BATCH_ROWS = 1024  # of an array that is read
 
 
-def reading(config: SpectraSource | TableSource) -> ReadOptions:
+def reading(spectra: SpectraSource, table: TableSource) -> ReadOptions:
     """Return the options of a command line for reading."""
-    options = ReadOptions()
-    if isinstance(config, SpectraSource):
-        options = replace(
-            options,
-            array=_array(config),
-            beamformer=config.beamformer,
-            grid=AngularGrid.hemisphere(*config.grid) if config.grid else None,
-            every=config.every,
-            station=config.station,
-            drop_null=config.drop_null,
-            round_trip=config.round_trip,
-        )
-    if isinstance(config, TableSource):
-        options = replace(
-            options,
-            columns=config.column_names,
-            filler=config.fillers,
-            coordinates=config.coordinates,
-            transmitter=config.transmitter,
-            pool_by=config.pool_by,
-        )
-    if isinstance(config, OffsetSource) and config.offset_by is not None:
-        options = replace(options, offset_by=config.offset_by.partition("=")[0])
-    return options
+    offset_by = table.offset_by if isinstance(table, OffsetSource) else None
+    return ReadOptions(
+        array=_array(spectra),
+        beamformer=spectra.beamformer,
+        grid=AngularGrid.hemisphere(*spectra.grid) if spectra.grid else None,
+        every=spectra.every,
+        station=spectra.station,
+        subcarriers=spectra.subcarriers,
+        bandwidth=spectra.bandwidth,
+        drop_null=spectra.drop_null,
+        round_trip=spectra.round_trip,
+        columns=table.column_names,
+        filler=table.fillers,
+        coordinates=table.coordinates,
+        transmitter=table.transmitter,
+        pool_by=table.pool_by,
+        offset_by=offset_by and offset_by.partition("=")[0],
+    )
 
 
-def _array(config: SpectraSource) -> PlanarArray | None:
-    if config.array is None:
+def _array(spectra: SpectraSource) -> PlanarArray | None:
+    if spectra.array is None:
         return None
-    *sides, spacing, frequency = config.array
+    *sides, spacing, frequency = spectra.array
     rows, columns = (int(side) for side in (sides[0], sides[-1]))
     if rows == columns:
         return PlanarArray.square(rows, frequency, spacing)
@@ -76,18 +70,18 @@ def located(source: str) -> str:
     return str(fetch(source))
 
 
-def measured_rssi(data: str | None, config: TableSource) -> Rssi | None:
+def measured_rssi(data: str | None, table: TableSource) -> Rssi | None:
     """Return the RSSI of an experiment in a folder or file, None without one.
 
     Raises:
         InputError: RSSI that cannot be read.
     """
-    return None if data is None else load_rssi(located(data), **reading(config).given)
+    return None if data is None else load_rssi(located(data), **reading(SpectraSource(), table).given)
 
 
-def offset_notes(data: Rssi, config: OffsetSource) -> list[str]:
+def offset_notes(data: Rssi, table: OffsetSource) -> list[str]:
     """Return a note on columns that may distinguish devices or channels and are not used, or none."""
-    if config.offset_by is not None or not data.labels:
+    if table.offset_by is not None or not data.labels:
         return []
     return [
         f"rows differ in {listed(data.labels)}; if tasks.inspect finds offsets between them, give --offset-by COLUMN"

@@ -90,9 +90,9 @@ class Terminal:
         self._began = 0.0  # of the current step [s]
 
     @contextmanager
-    def of(self, config: object, verbose: bool = False) -> Iterator[None]:
-        """Show what a configuration asks for, during the context; with `verbose` also the messages of `logging`."""
-        self._output = config if isinstance(config, Answered) else Answered()
+    def of(self, output: Answered, verbose: bool = False) -> Iterator[None]:
+        """Show what the options ask for, during the context; with `verbose` also the messages of `logging`."""
+        self._output = output
         self.console.quiet = self._output.quiet or self._output.json
         handler, loggers = RichHandler(console=self.console, show_path=False), [logging.getLogger(n) for n in LOGGERS]
         for logger in loggers if verbose else ():
@@ -159,8 +159,8 @@ class Terminal:
         )
 
     def page(self, values: Mapping[str, Any], text: str, page: Path | None = None) -> None:
-        """Print the text of a command, or its values with `--json`, and the place of its page if it has one."""
-        self._print(values, page, text)
+        """Print the text of a command, or its values with `--json`, and the place of its page. Both may be missing."""
+        self._print(values, page, *filter(None, [text]))
 
     def _print(self, values: Mapping[str, Any], page: Path | None, *parts: str | Table) -> None:
         if self._output.json:

@@ -38,7 +38,7 @@ CONNECT_S = 5  # until a scheduler has answered
 WORKERS_S = 30  # until workers have come, at the start and after all have gone
 POLL_S = 2  # between two checks that there are workers
 MAX_SECONDS_TO_END = 10.0  # from the signal to the end of a process
-CONTINUE = "go on with --resume DIR.partial here, with --scheduler ADDRESS on a cluster"
+CONTINUE = "go on with swiftwrf resume DIR.partial here, with --scheduler ADDRESS on a cluster"
 
 
 class Workers:

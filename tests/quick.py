@@ -37,6 +37,8 @@ from tasks.predict.options import PredictConfig
 from tasks.predict.run import run as predict
 from tasks.report.options import ReportConfig
 from tasks.report.run import run as report
+from tasks.resume.options import ResumeConfig
+from tasks.resume.run import run as resume
 from tasks.rssi import experiment as rssi
 from tasks.rssi.options import RssiTaskConfig
 from tasks.scenes.options import ScenesConfig
@@ -51,6 +53,7 @@ TASKS = {
     "rssi": (RssiTaskConfig, rssi.run),
     "locate": (LocateConfig, locate.run),
     "report": (ReportConfig, report),
+    "resume": (ResumeConfig, resume),
     "convert": (ConvertConfig, convert),
     "predict": (PredictConfig, predict),
     "inspect": (InspectConfig, inspect),

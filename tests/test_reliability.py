@@ -65,7 +65,7 @@ def test_a_report_without_out_is_new_each_time(finished, tmp_path, monkeypatch, 
 def test_a_damaged_step_does_not_cost_the_others(stopped, capsys, damage):
     (stopped / "steps" / "mean.json").write_text(damage)
     before = _files(stopped)
-    assert run("rssi", "--resume", stopped) == 2
+    assert run("resume", stopped) == 2
     assert "mean.json" in said(capsys)
     after = _files(stopped)
     assert {name: after[name] for name in before if name != "environment.json"} == {
@@ -78,7 +78,7 @@ def test_a_run_stopped_while_it_finishes_can_be_finished(finished, tmp_path, mon
         patch.setattr("tasks.directory.rename", _interrupt)
         assert run("rssi", "--rx", "1", "--out", tmp_path / "cut") == 130
     assert (tmp_path / "cut.partial" / "metrics.json").exists()
-    assert run("rssi", "--resume", tmp_path / "cut.partial") == 0
+    assert run("resume", tmp_path / "cut.partial") == 0
     assert sorted(p.name for p in (tmp_path / "cut").iterdir()) == sorted(p.name for p in finished.iterdir())
     for name in TABLES:
         assert (tmp_path / "cut" / name).read_bytes() == (finished / name).read_bytes()
@@ -104,14 +104,9 @@ def test_resume_refuses_another_configuration(stopped, capsys):
     content = json.loads(file.read_text())
     content["config"]["seed"] = 1
     file.write_text(json.dumps(content))
-    assert run("rssi", "--resume", stopped) == 2
+    assert run("resume", stopped) == 2
     assert "not what the run began with" in said(capsys)
     assert (stopped / "steps" / "mean.json").exists()
-
-
-def test_resume_refuses_another_task(stopped, capsys):
-    assert run("aoa", "--resume", stopped) == 2
-    assert "run of tasks.rssi" in said(capsys)
 
 
 def test_resume_refuses_changed_data(tmp_path, monkeypatch, capsys):
@@ -125,7 +120,7 @@ def test_resume_refuses_changed_data(tmp_path, monkeypatch, capsys):
         floor = ("--floor-plan", plan, "--floor-extent", 0, 1, 0, 1)
         assert run("rssi", "--rx", "1", *floor, "--out", tmp_path / "run") == 130
     Image.new("RGB", (5, 4)).save(plan)
-    assert run("rssi", "--resume", tmp_path / "run.partial") == 2
+    assert run("resume", tmp_path / "run.partial") == 2
     assert "changed since" in said(capsys)
     assert (tmp_path / "run.partial" / "steps" / "mean.json").exists()
 
@@ -135,16 +130,16 @@ def test_resume_refuses_other_versions(stopped, capsys):
     file = stopped / "environment.json"
     content = json.loads(file.read_text())
     file.write_text(json.dumps(content | {"packages": content["packages"] | {"torch": "0.1"}}))
-    assert run("rssi", "--resume", stopped) == 2
+    assert run("resume", stopped) == 2
     assert "began with torch 0.1; go on with these" in said(capsys)
     file.write_text(json.dumps(content | {"packages": content["packages"] | {"swiftwrf-tasks": "0.0.1"}}))
-    assert run("rssi", "--resume", stopped) == 2
+    assert run("resume", stopped) == 2
     assert "began with swiftwrf-tasks 0.0.1; go on with these" in said(capsys)
     file.write_text(json.dumps(content | {"commit": "0123456789ab"}))
-    assert run("rssi", "--resume", stopped) == 2
+    assert run("resume", stopped) == 2
     assert "began with commit 0123456789ab; go on with these" in said(capsys)
     file.write_text(json.dumps(content | {"packages": 3}))
-    assert run("rssi", "--resume", stopped) == 2
+    assert run("resume", stopped) == 2
     assert "began with other libraries" in said(capsys)
     assert (stopped / "steps" / "mean.json").exists()
 
@@ -153,7 +148,7 @@ def test_report_says_where_a_run_went_on(stopped):
     file = stopped / "environment.json"
     content = json.loads(file.read_text())
     file.write_text(json.dumps(content | {"device": "an abacus"}))
-    assert run("rssi", "--resume", stopped) == 0
+    assert run("resume", stopped) == 0
     report = (stopped.with_name("run") / "report.html").read_text()
     assert f"; device {content['device']})" in report
 
@@ -163,7 +158,7 @@ def test_resumed_run_keeps_its_number_of_threads(stopped):
     content, before = json.loads(file.read_text()), torch.get_num_threads()
     file.write_text(json.dumps(content | {"threads": before + 1}))
     try:
-        assert run("rssi", "--resume", stopped) == 0
+        assert run("resume", stopped) == 0
         assert torch.get_num_threads() == before + 1
     finally:
         torch.set_num_threads(before)
@@ -178,7 +173,7 @@ def test_a_directory_left_before_the_run_began_is_taken_over(tmp_path, capsys, l
     partial.mkdir()
     for name in left:
         (partial / name).mkdir() if name.endswith("/") else (partial / name).write_text("{}")
-    assert run("rssi", "--resume", partial) == 2
+    assert run("resume", partial) == 2
     assert "start the run again" in said(capsys)
     assert run("rssi", "--rx", "1", "--out", tmp_path / "run") == 0
 
@@ -193,7 +188,7 @@ def test_foreign_files_are_never_taken_over(tmp_path, capsys):
 
 def test_one_process_at_a_time(stopped, tmp_path, capsys):
     claim = Claim(stopped, new=False)
-    assert run("rssi", "--resume", stopped) == 2
+    assert run("resume", stopped) == 2
     assert "another process" in said(capsys)
     claim.release()
     new = Claim(tmp_path / "new.partial", new=True)
@@ -348,5 +343,5 @@ def test_a_full_disk_ends_in_a_sentence_and_can_be_resumed(tmp_path, capsys, mon
         patch.setattr(durable.os, "fsync", full)
         assert run("rssi", "--rx", "1", "--out", tmp_path / "run") == 2
     assert "no space left" in said(capsys)
-    assert run("rssi", "--resume", tmp_path / "run.partial") == 0
+    assert run("resume", tmp_path / "run.partial") == 0
     assert not list((tmp_path / "run").rglob(".*"))

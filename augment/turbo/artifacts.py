@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -20,6 +22,7 @@ MODEL_FILE = "model"  # name of the file of a swiftwrf model; other field models
 N_MAP_POSITIONS = 2000  # positions of the map: dense on half a page
 BATCH_SPECTRA = 250  # spectra held at a time
 N_WALK_POSITIONS = 120
+N_LAYERS = 3  # of heights between which furniture is shown
 MAX_PRIMITIVES = 40  # strongest primitives shown along the walk
 
 
@@ -58,7 +61,14 @@ def save_artifacts(model: FieldModel, key: str, measured: Spectra, test: Spectra
             "gain": gain,
             "order": order,
         }
-        write_npz(folder / f"room-{mix}.npz", {name: value.numpy() for name, value in places.items()})
+        arrays = {name: value.numpy() for name, value in places.items()}
+        if (furniture := model.room.furniture) is not None:
+            top = float(furniture.low[2]) + furniture.voxel_m * furniture.absorption.shape[2]
+            height = np.linspace(float(furniture.low[2]), top, N_LAYERS + 1)
+            layers = [furniture.in_plan(*ends) for ends in pairwise(height)]
+            arrays |= {"height": height, "plan_x": layers[0][0], "plan_y": layers[0][1]}
+            arrays["plan"] = np.stack([values for _, _, values in layers])
+        write_npz(folder / f"room-{mix}.npz", arrays)
     if not model.slow:
         write_npz(folder / f"field-{model.name}-{mix}.npz", peak_map(model, measured))
     if isinstance(model, SwiftWRF | SwiftWRFPaper):

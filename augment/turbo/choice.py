@@ -90,13 +90,9 @@ class CrossValidation(Step[Experiment]):
         errors = {Condition(STAND_IN, "measured").method: first.measured_only}
         errors |= {turbo.method: first.turbo} if first.turbo else {}
         folds = choice.folds[trained[0]]
-        tests = [experiment.with_snapshots(fold.test) for fold in folds]
         for name in experiment.evaluated:
             if name not in (*NETWORKS.values(), STAND_IN, *experiment.lacking):
-                errors[name] = [
-                    measured_errors(fold, experiment.make_estimator(name, self.subset), test)
-                    for fold, test in zip(folds, tests, strict=True)
-                ]
+                errors[name] = [measured_errors(fold, experiment.make_estimator(name, self.subset)) for fold in folds]
         with_room = self._with_room(experiment, measured, choice)
         return {
             "choice": {

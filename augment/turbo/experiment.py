@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from copy import copy, deepcopy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
@@ -110,13 +110,8 @@ class Experiment:
         return self.seed + subset.repeat
 
     def withhold(self, subset: MeasuredSubset) -> tuple[Spectra, SyntheticPositions]:
-        """Return the measured spectra without their snapshots, and the positions of the others."""
-        measured, withheld = withhold(self.train, subset.measured_fraction, self.seed_of(subset))
-        return replace(measured, channel=None), withheld  # snapshots train nothing, and every subset would copy them
-
-    def with_snapshots(self, measured: Spectra) -> Spectra:
-        """Return measured spectra with their snapshots, if the data contain them."""
-        return self.train.subset((self.train.index == measured.index[:, None]).nonzero()[:, 1])
+        """Return the measured spectra, and the positions of the others."""
+        return withhold(self.train, subset.measured_fraction, self.seed_of(subset))
 
     def model_type(self, name: str) -> type[FieldModel]:
         """Return the type of a field model by its name."""

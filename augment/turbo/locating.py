@@ -88,7 +88,7 @@ def located(locator: MatchedField, test: Spectra) -> dict[str, Tensor]:
         level: Smallest level whose credible region contains the true position, (n,).
         ambiguous: True where a second mode has much of the posterior mass, (n,).
     """
-    posterior = locator.locate(test.spectrum)
+    posterior = locator.locate(test)
     position = posterior.median
     return {
         "estimate": locator.direction(posterior),
@@ -133,7 +133,7 @@ def examples(
     """
     order = (found["position"] - test.position).norm(dim=1).argsort()
     chosen = order[[round(q * (len(order) - 1)) for q in EXAMPLE_QUANTILES]]
-    posterior = locator.locate(test.subset(chosen).spectrum)
+    posterior = locator.locate(test.subset(chosen))
     weight, best = posterior.weight.topk(min(MAX_CANDIDATES, posterior.weight.shape[1]), dim=1)
     planes = locator.room.planes
     tensors = {

@@ -14,7 +14,7 @@ from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.runtime.validation import PositiveInt, checked
+from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, checked
 
 
 @checked
@@ -26,6 +26,8 @@ def load_spectra(
     grid: AngularGrid | tuple[PositiveInt, PositiveInt] | None = None,
     every: PositiveInt | None = None,
     station: PositiveInt | None = None,
+    subcarriers: PositiveInt | None = None,
+    bandwidth: PositiveFloat | None = None,
     drop_null: bool = False,
     round_trip: bool = False,
 ) -> Spectra:
@@ -39,6 +41,8 @@ def load_spectra(
         grid: Directions of computed spectra, or their numbers of elevations and azimuths. Defaults to 90 x 360.
         every: Reads one measurement of that many.
         station: Number of the array in a file with several, counted from 1.
+        subcarriers: Number of subcarriers at which the channel is computed from ray paths. Defaults to spectra alone.
+        bandwidth: Distance of the first and the last of these subcarriers [Hz], at most the carrier.
         drop_null: Leaves out null subcarriers of array snapshots, which are the same at every position and element.
         round_trip: Phases of array snapshots are those of the way there and back, as of RFID and backscatter.
 
@@ -51,7 +55,17 @@ def load_spectra(
         swiftwrf.errors.InputError: nowhere is not a folder or file; expected measurements (formats: ...)
     """
     directions = None if grid is None else AngularGrid.of(grid)
-    options = ReadOptions(array, beamformer, directions, every, station, drop_null=drop_null, round_trip=round_trip)
+    options = ReadOptions(
+        array,
+        beamformer,
+        directions,
+        every,
+        station,
+        subcarriers,
+        bandwidth,
+        drop_null=drop_null,
+        round_trip=round_trip,
+    )
     data = read(path, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS)
     return data.spectra(options.grid, options.beamformer or PHASE) if isinstance(data, Snapshots) else data
 

@@ -31,7 +31,7 @@ ROLES = {  # names of columns, in lower case with underscores
     "floor": re.compile("floor(?:_?id)?"),
     "time": re.compile("time(?:_s)?|timestamp|t|date(?:_?time)?|first_?seen"),
     "session": re.compile("(?:session|run|walk)(?:_?id)?"),
-    "receiver": re.compile("receiver(?:_(?:name|id))?|rx|gateway|ap|bssid|mac|sensor|anchor"),
+    "receiver": re.compile("receiver(?:_(?:name|id))?|rx|gateway|ap(?:_(?:name|id))?|bssid|mac|sensor|anchor"),
     "rssi": re.compile("(?:rssi?|rsrp|signal|power)(?:_dbm)?|rss_dbm|dbm"),
 }
 EPOCH_UNITS = (  # of times since 1970 by their size, from the year 1973 on

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -21,6 +24,13 @@ MAX_EXTENT_DEG = 2.0  # of positions that are recognised as degrees
 NO_FIX = (0.0, -1.0, 999.0, -999.0, 9999.0, -9999.0)
 STOREY_M = 4.0  # height of a floor where heights are missing or count from the floor
 MIN_STOREY_M = 1.5  # difference of the heights of two floors
+BELOW_GROUND = re.compile(r"(?:b|ug|u\.g\.?|basement|cellar|keller|sub|lower)[ ._-]*(?:level|floor)?[ ._-]*(\d*)")
+FLOOR_NAMES = {  # numbers of floors without a digit in their name
+    **dict.fromkeys(("ground", "g", "gf", "eg", "erdgeschoss", "parterre", "rdc", "lobby", "pb"), 0.0),
+    **dict.fromkeys(("mezzanine", "zg"), 0.5),
+    **dict.fromkeys(("og", "obergeschoss", "upper"), 1.0),
+    **{name: n + 1.0 for n, name in enumerate(["first", "second", "third", "fourth", "fifth", "sixth", "seventh"])},
+}
 
 
 class GeodeticOrigin(NamedTuple):
@@ -186,6 +196,10 @@ class Floors:
         height = torch.tensor(self.height_m, dtype=torch.float64)
         return (position[:, 2:].double() - height).abs().argmin(dim=1)
 
+    def named(self, position: Tensor) -> list[str]:
+        """Return the name of the floor of each position (n, 3)."""
+        return [self.names[number] for number in self.number(position).tolist()]
+
 
 def floors_of(floor: list[str], z: Floats) -> Floors | None:
     """Return the floors by the name of each row's floor and its height z (n,) [m]; None if there is one only.
@@ -206,6 +220,27 @@ def floors_of(floor: list[str], z: Floats) -> Floors | None:
             levels.append([name])
     heights = (float(np.mean([height[name] for name in level])) for level in levels)
     return Floors(tuple(", ".join(level) for level in levels), tuple(heights)) if len(levels) > 1 else None
+
+
+def floor_numbers(names: Sequence[str]) -> Floats:
+    """Return the number of each floor by its name: a number, a word such as "ground" or "second", or a digit in the name.
+
+    Numbers of names that contain neither are nan. A basement is below 0.
+
+    Example:
+        >>> floor_numbers(["Ground", "2nd floor", "1.OG", "B2", "UG", "-1", "annex"]).tolist()
+        [0.0, 2.0, 1.0, -2.0, -1.0, -1.0, nan]
+    """
+
+    def number(name: str) -> float:
+        plain = name.strip().lower()
+        if below := BELOW_GROUND.fullmatch(plain):
+            return -float(below[1] or 1)
+        word = plain.removesuffix("floor").removesuffix("level").strip(" _-")
+        digits = re.findall(r"(?<![^\W_])-\d+|\d+", plain)
+        return FLOOR_NAMES[word] if word in FLOOR_NAMES else float(digits[0]) if len(digits) == 1 else math.nan
+
+    return np.array([number(name) for name in names], dtype=np.float64)
 
 
 def height_of_floors(z: Floats, floor: Floats) -> Floats:

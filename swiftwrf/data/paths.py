@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -99,8 +100,65 @@ class PropagationPaths:
         direction = self.direction if rotation is None else self.direction @ rotation
         return array.channel(direction, self.gain, self.owner, len(self.count))
 
+    def subcarriers(self, array: PlanarArray, number: int = 1, bandwidth_hz: float = 0.0) -> tuple[Tensor, Tensor]:
+        """Return the channel of a level array at frequencies around the carrier.
+
+        Args:
+            array: The array.
+            number: Number S of frequencies, at equal distances. One is that of the carrier.
+            bandwidth_hz: Distance of the first and the last frequency [Hz].
+
+        Returns:
+            Channels, complex128 (n, S, K), and frequencies, float64 (S,) [Hz].
+
+        Raises:
+            InputError: Several frequencies where the lengths of the paths are unknown, one frequency with a bandwidth, or a
+                bandwidth that no carrier has.
+
+        Example:
+            >>> ends = torch.zeros(1, 3).double(), torch.tensor([[3.0, 0, 0]]).double()
+            >>> one, back = torch.ones(1), torch.tensor([[-1.0, 0, 0]]).double()
+            >>> paths = PropagationPaths(*ends, one.long(), back, one.cdouble(), one.bool(), 2.4e9, length=3 * one.double())
+            >>> paths.subcarriers(PlanarArray.square(2, 2.4e9), 3, 40e6)[1].tolist()
+            [2380000000.0, 2400000000.0, 2420000000.0]
+        """
+        if not (bandwidth_hz == 0 if number == 1 else 1e3 <= bandwidth_hz < self.frequency_hz):
+            raise InputError(
+                f"a bandwidth in Hz goes with several subcarriers, got {bandwidth_hz:g} Hz and {number}; give e.g. 8 "
+                "subcarriers and 80e6 Hz"
+            )
+        offset = bandwidth_hz * (torch.arange(number, dtype=torch.float64) / max(1, number - 1) - (number > 1) / 2)
+        delay = (self._known_length() if bandwidth_hz else self.gain.abs()) / LIGHT_SPEED
+        channel = []
+        for change in offset.tolist():
+            at = PlanarArray(array.element, LIGHT_SPEED / (self.frequency_hz + change))
+            gain = self.gain * torch.polar(torch.ones_like(delay), -2 * math.pi * change * delay)
+            channel.append(at.channel(self.direction, gain, self.owner, len(self.count)))
+        return torch.stack(channel, dim=1), self.frequency_hz + offset
+
+    def _known_length(self) -> Tensor:
+        """Return the length of each path [m]. Free-space amplitudes contain it, and the phases show whether they do."""
+        if self.length is not None:
+            return self.length
+        wavelength = LIGHT_SPEED / self.frequency_hz
+        length = wavelength / (4 * math.pi * self.gain.abs())
+        turned = self.gain * torch.polar(torch.ones_like(length), 2 * math.pi / wavelength * length)
+        if not bool((turned.angle().abs() < 0.1).double().mean() > 0.99):
+            raise InputError(
+                "several subcarriers need the length of each path, and these paths have none; add the array length, or take "
+                "one subcarrier"
+            )
+        return length
+
     def spectra(
-        self, name: str, array: PlanarArray | None = None, grid: AngularGrid | None = None, **details: Any
+        self,
+        name: str,
+        array: PlanarArray | None = None,
+        grid: AngularGrid | None = None,
+        *,
+        subcarriers: int | None = None,
+        bandwidth_hz: float | None = None,
+        **details: Any,
     ) -> Spectra:
         """Return the spectra of a level array at each receiver, which folds paths from below to the upper half space.
 
@@ -108,10 +166,12 @@ class PropagationPaths:
             name: Name of the data set.
             array: The array. Defaults to 4 x 4 elements at half a wavelength.
             grid: Directions. Defaults to 90 x 360.
+            subcarriers: Number of frequencies at which the channel is kept. Defaults to spectra alone.
+            bandwidth_hz: Distance of the first and the last of them [Hz].
             details: index, named_splits, source and notes of `Spectra`.
 
         Raises:
-            InputError: An array for another carrier, or spectra of too many pixels.
+            InputError: An array for another carrier, spectra of too many pixels, or as `subcarriers`.
         """
         grid = grid or GRID
         check_pixels(name, len(self.count), grid)
@@ -124,8 +184,10 @@ class PropagationPaths:
         transmitters, receivers = (len(end.unique(dim=0)) for end in (self.transmitter, self.receiver))
         moving: Moving = "receiver" if receivers >= transmitters else "transmitter"
         position, fixed = (self.receiver, self.transmitter)[:: 1 if moving == "receiver" else -1]
+        channel, frequency = self.subcarriers(array, subcarriers or 1, bandwidth_hz or 0.0)
+        kept: dict[str, Any] = {"channel": channel, "frequency_hz": frequency} if subcarriers else {}
         return Spectra(
-            store=array_spectra(array, self.channel(array), grid),
+            store=array_spectra(array, channel, grid),
             position=position,
             array=array,
             grid=grid,
@@ -135,5 +197,6 @@ class PropagationPaths:
             name=name,
             fixed_position=fixed[0] if min(transmitters, receivers) == 1 else None,
             rotation=torch.eye(3, dtype=torch.float64),
+            **kept,
             **details,
         )

@@ -14,7 +14,7 @@ from swiftwrf.array.angles import AngularGrid, ArrayPose
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.dataset import Arrays, Numbers, PositionedData, to_positions, to_rotation
-from swiftwrf.data.spectra import GRID, Spectra, array_spectra, check_pixels
+from swiftwrf.data.spectra import GRID, Spectra, array_spectra, check_pixels, snapshot_frequencies
 from swiftwrf.errors import InputError, ranges
 from swiftwrf.positions import to_tensor
 from swiftwrf.runtime.validation import checked
@@ -34,6 +34,7 @@ class Snapshots(PositionedData):
         name: Name of the data set.
         fixed_position: Position of the array, (3,) [m], in place of `pose`.
         rotation: Matrix that rotates array into world coordinates, (3, 3), in place of `pose`.
+        frequency_hz: Frequency of each snapshot, (S,) [Hz]. Defaults to the carrier of the array, as of packets.
         details: index, named_splits, source and notes of `PositionedData`.
 
     Raises:
@@ -53,6 +54,7 @@ class Snapshots(PositionedData):
     rotation: Tensor
     line_of_sight: Tensor
     time: Tensor | None
+    frequency_hz: Tensor | None
 
     row_fields: ClassVar[tuple[str, ...]] = ("position", "channel", "line_of_sight", "time", "index")
 
@@ -69,6 +71,7 @@ class Snapshots(PositionedData):
         name: str = "snapshots",
         fixed_position: Numbers | None = None,
         rotation: Numbers | None = None,
+        frequency_hz: Numbers | None = None,
         **details: Any,
     ) -> None:
         if pose is not None:
@@ -79,17 +82,19 @@ class Snapshots(PositionedData):
         shape = (len(position), None, len(array.element))
         several = np.ndim(channel) == 3
         channel = to_tensor("channel", channel, torch.complex64, shape if several else shape[::2])
+        channel = channel if several else channel[:, None]
         free = torch.ones(len(position)) if line_of_sight is None else line_of_sight
         super().__init__(
             name,
             **details,
-            channel=channel if several else channel[:, None],
+            channel=channel,
             position=position,
             array=array,
             fixed_position=to_positions("fixed_position", fixed_position, (3,)),
             rotation=to_rotation(rotation),
             line_of_sight=to_tensor("line_of_sight", free, torch.bool, (None,)),
             time=None if time is None else to_tensor("time", time, torch.float64, (None,)),
+            frequency_hz=snapshot_frequencies(frequency_hz, channel),
         )
 
     @property
@@ -121,6 +126,7 @@ class Snapshots(PositionedData):
             "fixed_position",
             "rotation",
             "channel",
+            "frequency_hz",
         )
         return Spectra(
             store=array_spectra(self.array, self.channel, grid, beamformer),
@@ -163,26 +169,26 @@ def check_spacing(file: Path, array: PlanarArray) -> None:
         )
 
 
-def without_null(channel: Tensor, drop: bool) -> tuple[Tensor, tuple[str, ...]]:
-    """Return the channel (n, S, K), without null subcarriers on request, and a note that names them.
+def kept_subcarriers(channel: Tensor, drop: bool) -> tuple[Tensor, tuple[str, ...]]:
+    """Return which subcarriers of a channel (n, S, K) to use, (S,), all but the null ones on request, and a note on these.
 
     Null, guard and DC subcarriers hold a constant or nothing: they are the same at every position and element.
 
     Example:
         >>> channel = torch.randn(5, 4, 3, dtype=torch.complex64)
         >>> channel[:, 2] = 12 + 3j
-        >>> without_null(channel, drop=True)
-        (..., ('null subcarriers, the same at every position and element, are left out (1 of 4, counted from 0): 2',))
+        >>> kept_subcarriers(channel, drop=True)
+        (tensor([ True,  True, False,  True]), (...are left out (1 of 4, counted from 0): 2',))
     """
     first = channel[:1, :, :1]
     null = ((channel - first).abs() <= 1e-3 * first.abs()).all(dim=2).all(dim=0)
     if not bool(null.any()) or bool(null.all()) or len(channel) < 2:
-        return channel, ()
+        return torch.ones_like(null), ()
     which = f"({int(null.sum())} of {len(null)}, counted from 0): {ranges(null.nonzero()[:, 0].tolist())}"
     name = "null subcarriers, the same at every position and element, are"
     if drop:
-        return channel[:, ~null], (f"{name} left out {which}",)
-    return channel, (f"{name} used like the others {which}; --drop-null leaves them out",)
+        return ~null, (f"{name} left out {which}",)
+    return torch.ones_like(null), (f"{name} used like the others {which}; --drop-null leaves them out",)
 
 
 def round_trip_array(array: PlanarArray) -> tuple[PlanarArray, tuple[str, ...]]:

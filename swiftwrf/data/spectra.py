@@ -28,6 +28,7 @@ from swiftwrf.runtime.validation import checked
 
 GRID = AngularGrid.hemisphere(90, 360)  # of spectra that are computed
 DIRECTION = ("elevation", "azimuth")  # names of the dimensions of a spectrum
+MIN_FREQUENCY_HZ = 1e6  # lower ones are in another unit
 MAX_LABEL = torch.tensor([math.tau, math.pi / 2], dtype=torch.float64) + 1e-6  # azimuth and elevation [rad], rounded
 
 
@@ -51,6 +52,7 @@ class Spectra(PositionedData):
         rotation: Matrix that rotates array into world coordinates, (3, 3), in place of `pose`.
         store: Spectra as a `Store`, in place of `spectra`; readers of files give one.
         channel: Snapshots that the spectra are computed from, complex (n, S, K), if they are kept.
+        frequency_hz: Frequency of each snapshot, (S,) [Hz]. Defaults to the carrier of the array, as of packets.
         details: index, named_splits, source and notes of `PositionedData`.
 
     Raises:
@@ -73,6 +75,7 @@ class Spectra(PositionedData):
     fixed_position: Tensor | None
     rotation: Tensor | None
     channel: Tensor | None
+    frequency_hz: Tensor | None
 
     row_fields: ClassVar[tuple[str, ...]] = ("position", "store", "label", "line_of_sight", "index", "channel")
 
@@ -93,6 +96,7 @@ class Spectra(PositionedData):
         rotation: Numbers | None = None,
         store: Store | None = None,
         channel: Numbers | None = None,
+        frequency_hz: Numbers | None = None,
         **details: Any,
     ) -> None:
         if position is None or (spectra is None) == (store is None):
@@ -129,6 +133,8 @@ class Spectra(PositionedData):
         else:
             label = torch.full((len(position), 2), torch.nan, dtype=torch.float64)
         free = torch.ones(len(position)) if line_of_sight is None else line_of_sight
+        if channel is not None:
+            channel = to_tensor("channel", channel, torch.complex64, (None, None, None))
         super().__init__(
             name,
             **details,
@@ -141,7 +147,8 @@ class Spectra(PositionedData):
             array=array,
             fixed_position=fixed_position,
             rotation=rotation,
-            channel=None if channel is None else to_tensor("channel", channel, torch.complex64, (None, None, None)),
+            channel=channel,
+            frequency_hz=None if channel is None else snapshot_frequencies(frequency_hz, channel),
         )
 
     @property
@@ -239,6 +246,23 @@ class Spectra(PositionedData):
         rows, columns = self.grid.shape
         array = f", {self.array.summary}" if self.array else ""
         return f"{len(self)} spectra of {rows} x {columns} directions{array}, moving {self.moving}"
+
+
+def snapshot_frequencies(frequency_hz: Numbers | None, channel: Tensor) -> Tensor | None:
+    """Return the frequency of each snapshot of channels (n, S, K), float64 (S,) [Hz], checked; None if none are given.
+
+    Raises:
+        InputError: Another number of frequencies than snapshots, or one that no carrier has.
+    """
+    if frequency_hz is None:
+        return None
+    found = to_tensor("frequency_hz", frequency_hz, torch.float64, (channel.shape[1],))
+    if len(found) and not MIN_FREQUENCY_HZ <= float(found.min()) <= float(found.max()) <= 2 * float(found.min()):
+        raise InputError(
+            f"frequency_hz must be frequencies of one carrier's snapshots in Hz, got {float(found.min()):.6g} to "
+            f"{float(found.max()):.6g}; give e.g. 2.412e9"
+        )
+    return found
 
 
 def direction_coordinates(grid: AngularGrid) -> Arrays:

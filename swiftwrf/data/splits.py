@@ -6,8 +6,11 @@ import math
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.stats import wasserstein_distance
 from torch import Tensor
 
 from swiftwrf.data.files import read_text
@@ -218,6 +221,34 @@ def _whole(session: Tensor, number: int) -> Tensor:
 def validation_for(split: str) -> Validation:
     """Return the kind of folds that resembles a split: single rows for random splits, regions for all others."""
     return "random" if split == "random" else "block"
+
+
+def matching_validation(train: Tensor, test: Tensor) -> Validation:
+    """Return the kind of folds whose held-out distances resemble those of the test positions.
+
+    A distance is that to the nearest training position (C. Mila et al., Methods in Ecology and Evolution 13, 2022).
+
+    Args:
+        train: Training positions, (n, 3) [m].
+        test: Positions of the test rows, (m, 3) [m].
+
+    Example:
+        >>> line = torch.linspace(0, 99, 100)[:, None] * torch.tensor([1.0, 0.0, 0.0])
+        >>> matching_validation(line, line + 0.5), matching_validation(line, line + 50)
+        ('random', 'block')
+    """
+
+    def distances(known: Tensor, other: Tensor) -> NDArray[np.float64]:
+        found: NDArray[np.float64] = cKDTree(known.numpy()).query(other.numpy())[0]
+        return found
+
+    def misfit(validation: Validation) -> float:
+        fold = folds(train, validation, 0)
+        held_out = [distances(train[fold != number], train[fold == number]) for number in fold.unique()]
+        return float(wasserstein_distance(np.concatenate(held_out), distances(train, test)))
+
+    kinds: tuple[Validation, Validation] = ("random", "block")
+    return min(kinds, key=misfit)
 
 
 def choose_split(

@@ -40,6 +40,7 @@ from swiftwrf.data.coordinates import (
     Coordinates,
     GeodeticOrigin,
     degrees_in,
+    floor_numbers,
     floors_of,
     height_of_floors,
     without_fix,
@@ -205,19 +206,32 @@ def _coordinates(label: object, table: pd.DataFrame, roles: dict[str, str]) -> t
     notes = []
     if "z" in roles:
         z = column_of_numbers(label, table, roles["z"])
-        if "floor" in roles and not (numbers := parsed(table[roles["floor"]]))[1].any():
-            own, z = z, height_of_floors(z, numbers[0])
+        if "floor" in roles and not (floors := _floors(table[roles["floor"]]))[1]:
+            own, z = z, height_of_floors(z, floors[0])
             if z is not own:
                 notes.append(
                     f"heights count from the floor, so each floor of column {roles['floor']} adds {STOREY_M:g} m"
                 )
     elif "floor" in roles:
-        z = STOREY_M * column_of_numbers(label, table, roles["floor"])
+        numbers, unknown = _floors(table[roles["floor"]])
+        if unknown:
+            raise InputError(
+                f"{label} has no height, and the order of floor {unknown[0]!r} is unknown; number the floors or add column z"
+            )
+        z = STOREY_M * numbers
         notes.append(f"there is no height, so each floor of column {roles['floor']} counts as {STOREY_M:g} m")
     else:
         z = np.zeros(len(table))
         notes.append("there is no height, so z is 0 m everywhere")
     return np.stack([x, y, z], axis=1), notes
+
+
+def _floors(column: pd.Series) -> tuple[Floats, list[str]]:
+    """Return the number of the floor of each row, nan where it is empty, and the names whose number is unknown."""
+    numbers, text = parsed(column)
+    names = text_of(column)
+    numbers = np.where(text, floor_numbers(names.tolist()), numbers)
+    return numbers, sorted(set(names[text & np.isnan(numbers)]))
 
 
 def _long(

@@ -92,6 +92,38 @@ def _wifi_room(room: str) -> DataSet:
     )
 
 
+FINGERPRINTS = {  # sets of J. Torres-Sospedra's collection: content, and its citation
+    "dsi1": ("Wi-Fi, one floor, 230 places", "A. Moreira, I. Silva, doi 10.5281/zenodo.3778646, 2020"),
+    "dsi2": ("Wi-Fi, one floor, 230 places, means", "A. Moreira, I. Silva, doi 10.5281/zenodo.3778646, 2020"),
+    "lib1": ("Wi-Fi, two floors of a library, one month", "G. M. Mendoza-Silva et al., Data 3, 3, 2018"),
+    "lib2": ("Wi-Fi, two floors of a library, another month", "G. M. Mendoza-Silva et al., Data 3, 3, 2018"),
+    "tut1": ("Wi-Fi, four floors", "S. Shrestha, J. Talvitie, E. S. Lohan, ICL-GNSS 2013"),
+    "tut2": ("Wi-Fi, three floors", "S. Shrestha, J. Talvitie, E. S. Lohan, ICL-GNSS 2013"),
+    "tut3": ("Wi-Fi, five floors, crowdsourced", "E. S. Lohan et al., Data 2, 32, 2017"),
+    "tut4": ("Wi-Fi, five floors, crowdsourced, parts of tut3 exchanged", "E. S. Lohan et al., Data 2, 32, 2017"),
+    "tut5": ("Wi-Fi, three floors", "P. Richter, E. S. Lohan, J. Talvitie, WLAN RSS database, Zenodo, 2018"),
+    "tut6": ("Wi-Fi, four floors", "E. S. Lohan, Additional TAU datasets for Wi-Fi fingerprinting, Zenodo, 2020"),
+    "tut7": ("Wi-Fi, three floors", "E. S. Lohan, Additional TAU datasets for Wi-Fi fingerprinting, Zenodo, 2020"),
+    "uji1": ("Wi-Fi, UJIIndoorLoc, three buildings of up to five floors", "J. Torres-Sospedra et al., IPIN 2014"),
+    "ujib1": ("BLE, one room of University Jaume I", "G. M. Mendoza-Silva et al., Data 4, 12, 2019"),
+}
+
+
+def _fingerprints(name: str) -> DataSet:
+    content, citation = FINGERPRINTS[name]
+    return DataSet(
+        "rssi",
+        content,
+        "darwinquezada/SURIMI",
+        # the tables of BLE are in an earlier commit only
+        "bac90d1e715108a34fc5fea4979e4f9fd1ad6b5c" if name == "ujib1" else "d8fa76a3502b1697a5b03aa4639bf1991b0f6c3c",
+        "CC BY 4.0",
+        citation,
+        conversions.fingerprints,
+        CHECKSUMS / f"ts-{name}.txt",
+    )
+
+
 DATA_SETS = {
     "s23-200": DataSet(
         "spectra",
@@ -149,6 +181,7 @@ DATA_SETS = {
     "wifi-rooms/office": _wifi_room("office"),
     "wifi-rooms/lecture-theatre": _wifi_room("lecture-theatre"),
     "wifi-rooms/corridor": _wifi_room("corridor"),
+    **{f"ts-{name}": _fingerprints(name) for name in FINGERPRINTS},
 }
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import torch
 from numpy.typing import NDArray
+from scipy.io import loadmat
 
 from swiftwrf.data.columns import NOT_DETECTED_DBM
 from swiftwrf.data.paths import PropagationPaths
@@ -174,9 +175,21 @@ def lora(raw: Path, out: Path) -> None:
     )
     survey.to_csv(out / "survey.csv", index=False)
     (out / "receivers.csv").write_text("receiver,x,y,z\ngw_rssi,0,0,0\ned_rssi,0,0,0\n")
-    first = len(parts[0])
-    for part, rows in (("train", range(first)), ("test", range(first, len(table)))):
-        (out / f"{part}_index_foot.txt").write_text("".join(f"{row}\n" for row in rows))
+    _write_split(out, "foot", len(parts[0]), len(table))
+
+
+def fingerprints(raw: Path, out: Path) -> None:
+    """Write training and test part of a set of fingerprints as one table, with the split `published` between them."""
+    if files := [*raw.glob("original_datasets/*.mat")]:
+        data = loadmat(files[0])["database"][0, 0]
+        parts = [np.hstack([data[f"{part}Labels"][:, :4], data[f"{part}Macs"]]) for part in ("training", "test")]
+    else:  # values before longitude, latitude, altitude, floor and building
+        tables = [pd.read_csv(next(raw.glob(f"dataset/*/{part}.csv"))).to_numpy() for part in ("Train", "Test")]
+        parts = [np.hstack([table[:, -5:-1], table[:, :-5]]) for table in tables]
+    names = [f"WAP{number:03d}" for number in range(1, parts[0].shape[1] - 3)]
+    table = pd.DataFrame(np.vstack(parts), columns=["x", "y", "z", "floor", *names])
+    table.astype({"floor": int}).to_csv(out / "survey.csv", index=False)
+    _write_split(out, "published", len(parts[0]), len(table))
 
 
 def wifi_room(raw: Path, out: Path, room: str) -> None:
@@ -200,6 +213,12 @@ def wifi_room(raw: Path, out: Path, room: str) -> None:
 def _write_rssi(rssi: Any, position: Any, names: Any, places: Any, splits: dict[str, Split], out: Path) -> None:
     data = Rssi(rssi, position, receiver_names=list(names), receiver_position=places, named_splits=splits)
     write_rssi(data, out)
+
+
+def _write_split(out: Path, name: str, first: int, count: int) -> None:
+    """Write a split whose first rows train."""
+    for part, rows in (("train", range(first)), ("test", range(first, count))):
+        (out / f"{part}_index_{name}.txt").write_text("".join(f"{row}\n" for row in rows))
 
 
 def _parts(is_test: Mask) -> Split:

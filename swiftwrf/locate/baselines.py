@@ -16,13 +16,15 @@ from torch import Tensor
 
 from swiftwrf.data import Rssi
 from swiftwrf.data.splits import Validation, folds
-from swiftwrf.locate.rssi import UNDETECTED_BELOW_DB, RssiLocator
-from swiftwrf.rssi.baselines import choose_neighbours, fit_process
+from swiftwrf.locate.fingerprints import Fingerprints
+from swiftwrf.locate.rssi import RssiLocator
+from swiftwrf.rssi.baselines import fit_process
 from swiftwrf.runtime.registry import Registry
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
 
 LEVELS = (0.5, 0.8, 0.95)  # probabilities of the credible regions
 BATCH_ROWS = 128  # rows of RSSI whose posteriors are in memory together
+UNDETECTED_BELOW_DB = 5.0  # below the weakest value, of what is not detected, for gp
 
 
 @configuration
@@ -45,11 +47,14 @@ class Located:
         position: Estimates, float64 (n, 3) [m].
         radius: Radii of the credible regions of `LEVELS` around the estimates, (n, 3) [m]. None without a posterior.
         ambiguous: True where a second position is likely, bool (n,). None without a posterior.
+        floor_probability: Probability of the floor of the estimate, (n,): its part of the posterior or of the neighbours'
+            weights. None without floors.
     """
 
     position: Tensor
     radius: Tensor | None = None
     ambiguous: Tensor | None = None
+    floor_probability: Tensor | None = None
 
 
 class Localizer(ABC):
@@ -100,54 +105,41 @@ class PosteriorLocalizer(Localizer):
 
     def locate(self, rssi: Tensor) -> Located:
         parts = [located(self.locator, rows) for rows in rssi.split(BATCH_ROWS)]
-        return Located(*(torch.cat(values) for values in zip(*parts, strict=True)))
+        found = Located(*(torch.cat(values) for values in zip(*parts, strict=True)))
+        return found if self.locator.region.floors else replace(found, floor_probability=None)
 
 
-def located(locator: RssiLocator, rssi: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return estimates, radii and ambiguity of some rows of RSSI (n, R) [dBm]."""
+def located(locator: RssiLocator, rssi: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return estimates, radii, ambiguity and the probability of the floor of some rows of RSSI (n, R) [dBm]."""
     posterior = locator.locate(rssi)
     radius = torch.stack([posterior.credible_radius(level) for level in LEVELS], dim=1)
-    return posterior.median, radius, posterior.ambiguous
-
-
-class FingerprintLocalizer(Localizer):
-    """Base class: a regression from fingerprints, rows of RSSI in which undetected values are filled, to positions.
-
-    The filled value is 5 dB below the weakest one of the training rows.
-    """
-
-    def fit(self, train: Rssi) -> Self:
-        train = train.subset(train.detected.any(dim=1))
-        relative = self._relative(train.rssi_dbm)
-        self._undetected = float(relative[~relative.isnan()].min()) - UNDETECTED_BELOW_DB
-        fold = folds(train.transmitter_position, self.config.validation, self.config.seed, session=train.session)
-        fingerprint = self._fingerprint(train.rssi_dbm)
-        self._regressor = self._fitted(fingerprint, train.transmitter_position.numpy(), fold.numpy())
-        return self
-
-    def locate(self, rssi: Tensor) -> Located:
-        return Located(torch.from_numpy(self._regressor.predict(self._fingerprint(rssi))))
-
-    def _relative(self, rssi: Tensor) -> Tensor:
-        return rssi
-
-    def _fingerprint(self, rssi: Tensor) -> NDArray[np.float64]:
-        found: NDArray[np.float64] = self._relative(rssi.double()).nan_to_num(self._undetected).numpy()
-        return found
-
-    @abstractmethod
-    def _fitted(self, x: NDArray[np.float64], position: NDArray[np.float64], fold: NDArray[np.int64]) -> Any:
-        """Return a regressor of scikit-learn, fitted to fingerprints (n, R), positions (n, 3) [m] and folds (n,)."""
+    return posterior.median, radius, posterior.ambiguous, posterior.floor_probability.amax(dim=1)
 
 
 @LOCALIZERS.register("knn")
-class NearestFingerprints(FingerprintLocalizer):
-    """The inverse-distance mean position of the k training rows with the most similar RSSI; k by cross-validation."""
+class NearestFingerprints(Localizer):
+    """The inverse-distance mean position of the k places with the most similar RSSI, on the floor that they vote for.
+
+    Distance of RSSI and k by cross-validation, see `Fingerprints`.
+    """
 
     name = "knn"
 
-    def _fitted(self, x: NDArray[np.float64], position: NDArray[np.float64], fold: NDArray[np.int64]) -> Any:
-        return choose_neighbours(x, position, fold)
+    fingerprints: Fingerprints
+    """training rows, set by `fit`"""
+
+    def fit(self, train: Rssi) -> Self:
+        fold = folds(train.transmitter_position, self.config.validation, self.config.seed, session=train.session)
+        relative = train.derived(rssi_dbm=self._relative(train.rssi_dbm))
+        self.fingerprints = Fingerprints.fit(relative, fold, self.config.seed)
+        return self
+
+    def locate(self, rssi: Tensor) -> Located:
+        part, _, estimate = self.fingerprints.votes(self._relative(rssi))
+        return Located(estimate, floor_probability=part.amax(dim=1) if self.fingerprints.floors else None)
+
+    def _relative(self, rssi: Tensor) -> Tensor:
+        return rssi
 
 
 @LOCALIZERS.register("knn_difference")
@@ -160,9 +152,20 @@ class NearestDifferences(NearestFingerprints):
         return rssi - rssi.nan_to_num(-torch.inf).amax(dim=1, keepdim=True)
 
 
+@LOCALIZERS.register("nearest")
+class NearestFingerprint(NearestFingerprints):
+    """The position of the single training row with the most similar RSSI, by Manhattan distance: the field's benchmark."""
+
+    name = "nearest"
+
+    def fit(self, train: Rssi) -> Self:
+        self.fingerprints = Fingerprints.of(train, "manhattan", 1)
+        return self
+
+
 @LOCALIZERS.register("gp")
-class RegressedCoordinates(FingerprintLocalizer):
-    """Gaussian-process regression from RSSI to coordinates.
+class RegressedCoordinates(Localizer):
+    """Gaussian-process regression from RSSI to coordinates; what is not detected is 5 dB below the weakest training value.
 
     The kernel is Matern 3/2 and white noise, its parameters by marginal likelihood in the training rows (C. E. Rasmussen and
     C. K. I. Williams, 2006).
@@ -170,13 +173,24 @@ class RegressedCoordinates(FingerprintLocalizer):
 
     name = "gp"
 
-    def _fitted(self, x: NDArray[np.float64], position: NDArray[np.float64], fold: NDArray[np.int64]) -> Any:
+    def fit(self, train: Rssi) -> Self:
+        train = train.subset(train.detected.any(dim=1))
+        self._undetected = float(train.rssi_dbm[train.detected].min()) - UNDETECTED_BELOW_DB
+        x, position = self._filled(train.rssi_dbm), train.transmitter_position.numpy()
         scale = max(float(x.std()), 1e-6)
         length = Matern(2.0 * scale, (0.1 * scale, 100.0 * scale), nu=1.5)
         kernel = ConstantKernel(1.0, (0.01, 100.0)) * length + WhiteKernel(0.1, (1e-4, 10.0))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)  # a bound that is reached is the answer
-            return fit_process(kernel, x, position, self.config.seed, normalize=True)
+            self._regressor = fit_process(kernel, x, position, self.config.seed, normalize=True)
+        return self
+
+    def locate(self, rssi: Tensor) -> Located:
+        return Located(torch.from_numpy(self._regressor.predict(self._filled(rssi))))
+
+    def _filled(self, rssi: Tensor) -> NDArray[np.float64]:
+        found: NDArray[np.float64] = rssi.double().nan_to_num(self._undetected).numpy()
+        return found
 
 
 @LOCALIZERS.register("mean")

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
+from swiftwrf.data.splits import matching_validation, places
 from swiftwrf.errors import InputError
 from swiftwrf.locate.baselines import LEVELS, LOCALIZERS, Localizer, PosteriorLocalizer
 from swiftwrf.metrics import ErrorSummary, method_summary, summary
@@ -137,7 +138,10 @@ class LocateSplit:
     def fit(self, trial: Trial) -> tuple[Localizer, Values]:
         """Fit a localizer and locate the test rows. Return the localizer, and values for `LocateComparison`."""
         train, test = self.part(trial.rows, trial.receivers)
-        options = {"validation": train.validation_for(self.split, test), "n_cells": self.n_cells, "seed": self.seed}
+        validation = train.validation_for(self.split, test)
+        if validation == "block" and self.split != "block":
+            validation = matching_validation(train.transmitter_position, test.transmitter_position)
+        options = {"validation": validation, "n_cells": self.n_cells, "seed": self.seed}
         localizer = LOCALIZERS[trial.localizer](**options)
         began = time.perf_counter()
         localizer.fit(train)
@@ -153,8 +157,8 @@ class LocateSplit:
             "estimate": located.position,
             "median_m": summary(error)["median"],
         }
-        if located.radius is not None and located.ambiguous is not None:
-            values |= {"radius": located.radius, "ambiguous": located.ambiguous}
+        optional = {name: getattr(located, name) for name in ("radius", "ambiguous", "floor_probability")}
+        values |= {name: value for name, value in optional.items() if value is not None}
         if isinstance(localizer, PosteriorLocalizer):
             weight = localizer.locator.weight.tolist()
             values["weights"] = dict(zip(("values", "detections", "fingerprints"), weight, strict=True))
@@ -196,22 +200,30 @@ class LocateComparison:
 
     @property
     def overall(self) -> dict[str, Any]:
-        """Position errors in space and in plan [m] of each localizer with all data, and its seconds."""
-        return {
-            trial.localizer: {
-                "position_error_m": summary(self._tables[trial]["position_error_m"]),
-                "horizontal_error_m": summary(self._tables[trial]["horizontal_error_m"]),
+        """Position errors in space and in plan [m] of each localizer with all data, its seconds, and its floor hit rate.
+
+        The floor of an estimate is the one of the nearest height. Data without floors have no floor hit rate.
+        """
+        found: dict[str, Any] = {}
+        for trial, values in self.values.items():
+            if not trial.is_whole:
+                continue
+            table = self._tables[trial]
+            found[trial.localizer] = {
+                "position_error_m": summary(table["position_error_m"], table["place"]),
+                "horizontal_error_m": summary(table["horizontal_error_m"], table["place"]),
                 "seconds": values["seconds"],
             }
-            for trial, values in self.values.items()
-            if trial.is_whole
-        }
+            if "floor" in table:
+                found[trial.localizer]["floor_hit_rate"] = float((table["floor"] == table["truth_floor"]).mean())
+        return found
 
     def studied(self, by: str) -> list[tuple[Trial, ErrorSummary]]:
         """Return trials and their position errors [m] for fractions `by` "rows" or "receivers", with everything included."""
         trials = [t for t in self.values if (t.receivers if by == "rows" else t.rows) == 1]
         names = {trial.localizer for trial in trials if not trial.is_whole}
-        return [(t, summary(self._tables[t]["position_error_m"])) for t in trials if t.localizer in names]
+        tables = ((t, self._tables[t]) for t in trials if t.localizer in names)
+        return [(t, summary(table["position_error_m"], table["place"])) for t, table in tables]
 
     @cached_property
     def _tables(self) -> dict[Trial, DataFrame]:
@@ -221,11 +233,15 @@ class LocateComparison:
         values = self.values[trial]
         truth, estimate = (torch.as_tensor(values[name], dtype=torch.float64) for name in ("truth", "estimate"))
         away = estimate - truth
-        columns: Values = {"index": values["index"]}
+        columns: Values = {"index": values["index"], "place": places(truth, 2)}
         columns |= {"position_error_m": away.norm(dim=1), "horizontal_error_m": away[:, :2].norm(dim=1)}
         columns |= dict(zip(("x_m", "y_m", "z_m"), estimate.T, strict=True))
         columns |= dict(zip(("truth_x_m", "truth_y_m", "truth_z_m"), truth.T, strict=True))
         columns |= degree_columns(self.split.train.origin, estimate.numpy())
+        if (floors := self.split.train.floors) is not None:
+            columns["floor"], columns["truth_floor"] = (floors.named(at) for at in (estimate, truth))
+        if "floor_probability" in values:
+            columns["floor_probability"] = values["floor_probability"]
         if "radius" in values:
             radius = torch.as_tensor(values["radius"], dtype=torch.float64)
             columns |= {_radius(p): r for p, r in zip(LEVELS, radius.T, strict=True)}

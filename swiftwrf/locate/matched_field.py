@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Annotated, ClassVar, Self
 
@@ -13,7 +13,7 @@ from annotated_types import Ge, Le
 from torch import Tensor
 
 from swiftwrf.array.angles import to_angles, to_direction
-from swiftwrf.array.planar import differences
+from swiftwrf.array.planar import LIGHT_SPEED, differences
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.spectra import Spectra, check_training, direction_of_link
 from swiftwrf.data.splits import places
@@ -22,6 +22,7 @@ from swiftwrf.gp import subsample
 from swiftwrf.locate.posterior import Posterior, inflation, normalised, pooled_weights, read_inflation
 from swiftwrf.locate.region import Cells, Region, best_cells, outside_mass, refined
 from swiftwrf.locate.spectrum_likelihood import (
+    ChannelLikelihood,
     CoarrayLikelihood,
     Features,
     PathWaves,
@@ -34,6 +35,8 @@ from swiftwrf.locate.student import Student
 from swiftwrf.models.base import FieldModel
 from swiftwrf.models.geometry import GeometryModel
 from swiftwrf.models.geometry.fit import GeometryConfig, observe
+from swiftwrf.models.geometry.furniture import coherence
+from swiftwrf.models.geometry.model import kept_snapshots
 from swiftwrf.models.geometry.path_gains import PRIORS, PathGains, choose_prior, fit_path_gains, kernel_of
 from swiftwrf.positions import to_tensor
 from swiftwrf.runtime.checkpoint import Header, Saved, expect
@@ -41,6 +44,10 @@ from swiftwrf.runtime.threads import parallel_map
 from swiftwrf.runtime.validation import Configured, NonNegativeInt, PositiveInt, all_or_nothing, checked, configuration
 
 FOLDS = 5
+START_WEIGHTS = (0.05, 0.05, 0.3)  # of the likelihoods, by which the calibration searches
+START_WEIGHTS_CHANNEL = (0.1, 1.0)
+MAX_CHANNEL_CELLS = 200_000
+MIN_FLOOR = 1e-4  # of missing coherence, by rounding
 MIN_SPECTRA = 15
 BATCH_CANDIDATES = 2048  # whose waves are computed together: as many as a processor's cache holds
 
@@ -74,15 +81,17 @@ class MatchedFieldConfig:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """A room and path gains, fitted to some of the spectra."""
+    """A room and, of spectra, path gains, fitted to some of the data. Furniture has the place of path gains for channels."""
 
     room: GeometryModel
-    gains: PathGains
+    gains: PathGains | None
     phases: PhaseLikelihood
 
     @property
-    def features(self) -> tuple[Features, Features]:
-        """Co-array numbers by constant and by position-dependent path gains."""
+    def features(self) -> tuple[Features, ...]:
+        """Co-array numbers by constant and by position-dependent path gains; none for channels."""
+        if self.gains is None:
+            return ()
         return room_features(self.room.array), gain_features(self.room.array, self.gains)
 
 
@@ -91,7 +100,14 @@ class _Likelihoods:
     """Likelihoods that share a room."""
 
     room: GeometryModel
-    parts: tuple[CoarrayLikelihood, CoarrayLikelihood, PhaseLikelihood]
+    coarray: tuple[CoarrayLikelihood, ...]
+    phases: PhaseLikelihood
+    channel: tuple[ChannelLikelihood, ...]
+
+    @property
+    def parts(self) -> tuple[CoarrayLikelihood | PhaseLikelihood | ChannelLikelihood, ...]:
+        """All likelihoods, in the order of their weights."""
+        return *self.coarray, self.phases, *self.channel
 
     def __call__(self, position: Tensor, observed: SpectrumFeatures) -> Tensor:
         """Return log-likelihoods (k, n, m) of n observations at candidates (n, m, 3) [m]."""
@@ -122,19 +138,47 @@ class _Screen:
     def _squared(self) -> Tensor:
         return self.whitened.square().sum(dim=1)
 
-    def log_likelihood(self, coarray: Tensor) -> Tensor:
-        """Return the log-likelihoods (n, m) of observed co-array numbers (n, F), up to a constant of each observation."""
-        target = coarray @ self.distribution.whitening
+    def log_likelihood(self, observed: SpectrumFeatures) -> Tensor:
+        """Return the log-likelihoods (n, m) of n observations, up to a constant of each."""
+        target = observed.coarray @ self.distribution.whitening
         distance = torch.addmm(self._squared, target, self.whitened.T, alpha=-2)
         return self.distribution.log_density(distance.add_(target.square().sum(dim=1, keepdim=True)).clamp_min_(0))
+
+
+@dataclass(frozen=True, eq=False)
+class _ChannelScreen:
+    """Likelihood of channels at all cells of the region.
+
+    Args:
+        snapshot: Numbers of at most two snapshots that are compared.
+        predicted: Their channels at the cells, complex64 (F, m, K).
+        likelihood: Likelihood of all snapshots.
+    """
+
+    snapshot: Tensor
+    predicted: Tensor
+    likelihood: ChannelLikelihood
+
+    @cached_property
+    def _power(self) -> Tensor:
+        return self.predicted.abs().square().sum(dim=2)
+
+    def log_likelihood(self, observed: SpectrumFeatures) -> Tensor:
+        """Return the log-likelihoods (n, m) of n observations, up to a constant of each."""
+        assert observed.channel is not None
+        channel = observed.channel[:, self.snapshot].movedim(1, 0)  # (F, n, K)
+        match = (channel.conj() @ self.predicted.mT).abs().square().sum(dim=0)
+        power = channel.abs().square().sum(dim=2).T @ self._power
+        return self.likelihood.log_density(match / power.clamp_min(1e-30), observed.channel)
 
 
 class MatchedField(Configured, Saved):
     """Posterior over the position of the moving end, given a spectrum.
 
-    Three likelihoods are pooled: co-array numbers predicted by constant path gains, by position-dependent path gains, and
-    element phases under uncertain path gains. Their covariances come from held-out spectra, and their weights maximise the
-    posterior density at held-out positions, which also calibrates the posterior.
+    Three likelihoods of spectra are pooled: co-array numbers predicted by constant path gains, by position-dependent path
+    gains, and element phases under uncertain path gains. Of channels, these phases and the channel itself are pooled. The
+    covariances come from held-out positions, and so do the weights, which maximise the posterior density there. This also
+    calibrates the posterior.
 
     Args:
         config: Options as one object. Defaults to `MatchedFieldConfig()`.
@@ -189,47 +233,76 @@ class MatchedField(Configured, Saved):
         if room is not None and room.room is None:
             raise InputError(f"{with_article(room.kind)} has no room to locate by; fit geometry or hybrid")
         own = GeometryModel(seed=self.config.seed).fit(train, like=room, progress=progress)
-        features = SpectrumFeatures.of(train.store.batches(), own.array, train.grid, self.config.seed)
+        self.frequency_hz, self.n_snapshots = train.frequency_hz, 0
+        if train.channel is None:
+            features = SpectrumFeatures.of(train.store.batches(), own.array, train.grid, self.config.seed)
+        else:
+            self.n_snapshots = train.channel.shape[1]
+            features = SpectrumFeatures.of_channels(train.channel, train.frequency_hz, own.array)
         scene, rows = observe(train, GeometryConfig(seed=self.config.seed))
         fold = places(train.position, FOLDS) % FOLDS
         chosen, prior = own, next(iter(PRIORS))
-        if own.planes:
+        if own.planes and not self.n_snapshots:
             chosen, prior, _ = choose_prior(own, scene, fold[rows])
         kernel = kernel_of(scene.moving)
         self.grid = train.grid
 
         def fitted(kept: Tensor) -> _Fit:
             phases = scene.subset(kept[rows].nonzero()[:, 0])
-            part = chosen.refined_on(phases)
+            part = chosen.refined_on(phases).furnished_on(train.subset(kept))
             likelihood = PhaseLikelihood.fit(part, train.position[kept], features.subset(kept))
-            return _Fit(part, fit_path_gains(part, phases, kernel, prior), likelihood)
+            return _Fit(part, None if self.n_snapshots else fit_path_gains(part, phases, kernel, prior), likelihood)
 
         everything = torch.ones_like(fold, dtype=torch.bool)
         *parts, self._fit = parallel_map(fitted, [*(fold != number for number in range(FOLDS)), everything])
         # of every spectrum, by the fit without its fold
-        self.residual = torch.empty(2, *features.coarray.shape)
+        self.residual = torch.empty(len(self._fit.features), *features.coarray.shape)
+        missing = torch.ones(len(train))
         for number, part in enumerate(parts):
             waves = PathWaves.at(part.room, train.position[fold == number])
             for kind, predict in enumerate(part.features):
                 self.residual[kind, fold == number] = predict(waves) - features.coarray[fold == number]
+            if features.channel is not None:
+                predicted = ChannelLikelihood(part.room, self._frequency(part.room), 0.0).predict(waves)
+                missing[fold == number] = 1 - coherence(features.channel[fold == number], predicted)
+        self.floor = max(float(missing.median()), MIN_FLOOR)
         self.observed_power = float(features.coarray.square().mean())
         held_out = [train.position[fold == number] for number in range(FOLDS)]
         others = [Region(train.position[fold != number]) for number in range(FOLDS)]
         self.region = region or Region(train.position, outside=outside_mass(others, held_out))
         self._prepare()
         # weights by which the calibration searches
-        self.weight, self.inflation = torch.tensor([0.05, 0.05, 0.3], dtype=torch.float64), 1.0
+        weights = START_WEIGHTS if self.n_snapshots == 0 else START_WEIGHTS_CHANNEL
+        self.weight, self.inflation = torch.tensor(weights, dtype=torch.float64), 1.0
         self._calibrate(train.position, features, fold, parts)
         return self
+
+    _screens: Sequence[_Screen | _ChannelScreen]
 
     def _prepare(self) -> None:
         """Compute what all spectra share: cells of the region and their predicted co-array numbers."""
         extent = self.region.extent
         spacing = self.config.spacing * self.room.array.wavelength
         count = math.prod((extent / spacing).clamp_min(1).tolist())
-        self.cells = self.region.cells(int(min(max(count, 1), self.config.max_cells)))
+        # the channel at a cell takes several times as long as co-array numbers
+        limit = min(self.config.max_cells, MAX_CHANNEL_CELLS) if self.n_snapshots else self.config.max_cells
+        self.cells = self.region.cells(int(min(max(count, 1), limit)))
         self.likelihoods = self._likelihoods(self._fit)
-        constant, varying = self.likelihoods.parts[:2]
+        batches = self.cells.position.split(BATCH_CANDIDATES)
+        if self.likelihoods.channel:
+            (own,) = self.likelihoods.channel
+            snapshot = torch.arange(len(own.frequency))[:: max(1, len(own.frequency) - 1)]
+
+            few = replace(own, frequency=own.frequency[snapshot])
+
+            def predicted(position: Tensor) -> Tensor:
+                waves = PathWaves.at(self.room, position)
+                return few.predict(waves).movedim(1, 0)
+
+            self._screens = [_ChannelScreen(snapshot, torch.cat(parallel_map(predicted, batches), dim=1), own)]
+            return
+        constant, varying = self.likelihoods.coarray
+        assert self._fit.gains is not None
         # the mean of the path gains takes an eighth of the time of all their fields, and ranks cells nearly alike
         features = constant.features, gain_features(self.room.array, self._fit.gains.averaged())
         distributions = constant.distribution, varying.distribution
@@ -238,16 +311,26 @@ class MatchedField(Configured, Saved):
             waves = PathWaves.at(self.room, position)
             return [part(waves) @ own.whitening for part, own in zip(features, distributions, strict=True)]
 
-        parts = zip(*parallel_map(whitened, self.cells.position.split(BATCH_CANDIDATES)), strict=True)
+        parts = zip(*parallel_map(whitened, batches), strict=True)
         self._screens = [_Screen(torch.cat(part), own) for part, own in zip(parts, distributions, strict=True)]
 
     def _likelihoods(self, fit: _Fit, kept: Tensor | None = None) -> _Likelihoods:
         residual = self.residual if kept is None else self.residual[:, kept]
-        constant, varying = (
+        if self.n_snapshots:
+            channel = ChannelLikelihood(fit.room, self._frequency(fit.room), self.floor)
+            return _Likelihoods(fit.room, (), fit.phases, (channel,))
+        coarray = (
             CoarrayLikelihood(predict, part, self.observed_power)
             for predict, part in zip(fit.features, residual, strict=True)
         )
-        return _Likelihoods(fit.room, (constant, varying, fit.phases))
+        return _Likelihoods(fit.room, tuple(coarray), fit.phases, ())
+
+    def _frequency(self, room: GeometryModel) -> Tensor:
+        """Return the frequencies of the snapshots relative to the carrier, (F,)."""
+        kept = kept_snapshots(self.n_snapshots)
+        if self.frequency_hz is None:
+            return torch.ones(len(kept), dtype=torch.float64)
+        return self.frequency_hz[kept] * room.array.wavelength / LIGHT_SPEED
 
     def _calibrate(self, position: Tensor, features: SpectrumFeatures, fold: Tensor, parts: list[_Fit]) -> None:
         """Choose the weights of the likelihoods and the inflation of credible radii by held-out positions."""
@@ -277,8 +360,10 @@ class MatchedField(Configured, Saved):
             def evaluate(position: Tensor, part: SpectrumFeatures = part) -> Tensor:
                 return likelihoods(position, part)
 
-            constant, varying = (screen.log_likelihood(part.coarray) for screen in self._screens)
-            cells = best_cells(self.cells, constant.add_(varying).neg_(), config.n_best, config.n_background, generator)
+            total, *others = (screen.log_likelihood(part) for screen in self._screens)
+            for other in others:
+                total.add_(other)
+            cells = best_cells(self.cells, total.neg_(), config.n_best, config.n_background, generator)
             values = evaluate(cells.position)
             for _ in range(config.n_rounds):
                 cells, values = refined(cells, self._log_mass(cells, values), values, evaluate, config.n_split)
@@ -288,18 +373,33 @@ class MatchedField(Configured, Saved):
         return normalised(torch.einsum("k,knm->nm", self.weight, values.double()) + cells.log_volume)
 
     @torch.no_grad()
-    def locate(self, spectrum: Numbers) -> Posterior:
+    def locate(self, spectrum: Numbers | Spectra) -> Posterior:
         """Return the posterior over the position of the moving end for each spectrum.
 
         Args:
             spectrum: Magnitudes in [0, 1], tensor or array (n, n_elevation, n_azimuth) on the grid of the training spectra.
+                A locator that was fitted to channels takes channels in their place, complex (n, S, K). `Spectra` may contain
+                both.
 
         Raises:
-            InputError: Spectra on another grid, or not finite, or a locator that is not fitted.
+            InputError: Spectra on another grid, no channels where the training data had them, a number that is not finite,
+                or a locator that is not fitted.
         """
         self.check_fitted()
-        spectrum = to_tensor("spectra", spectrum, torch.float32, (None, *self.grid.shape))
-        observed = SpectrumFeatures.of([spectrum], self.room.array, self.grid, self.config.seed)
+        room = self.room
+        if self.n_snapshots:
+            channel = spectrum.channel if isinstance(spectrum, Spectra) else spectrum
+            if channel is None or not torch.as_tensor(channel).is_complex():
+                raise InputError(
+                    "this locator was fitted to channels; give channels, complex (n, S, K), in place of spectra"
+                )
+            shape = None, self.n_snapshots, len(room.array.element)
+            channel = to_tensor("channel", channel, torch.complex64, shape)
+            observed = SpectrumFeatures.of_channels(channel, self.frequency_hz, room.array)
+        else:
+            values = spectrum.spectrum if isinstance(spectrum, Spectra) else spectrum
+            magnitude = to_tensor("spectra", values, torch.float32, (None, *self.grid.shape))
+            observed = SpectrumFeatures.of([magnitude], room.array, self.grid, self.config.seed)
         parts = list(self._searched(observed, self.likelihoods))
         position = torch.cat([cells.position for cells, _ in parts])
         log_weight = torch.cat([self._log_mass(cells, values) for cells, values in parts])
@@ -312,7 +412,7 @@ class MatchedField(Configured, Saved):
         """Edge of the smallest cells [m]."""
         return float(self.cells.edge_m / 2**self.config.n_rounds)
 
-    def predict(self, spectrum: Numbers) -> Tensor:
+    def predict(self, spectrum: Numbers | Spectra) -> Tensor:
         """Return azimuth and elevation (n, 2) [rad] of the transmitter that minimise the expected angular error."""
         return self.direction(self.locate(spectrum))
 
@@ -331,10 +431,13 @@ class MatchedField(Configured, Saved):
     def state(self) -> tuple[dict[str, Tensor], Header]:
         """Return the fitted tensors by name, and plain values."""
         tensors, header = self.room.state()
-        gains, values = self._fit.gains.state()
+        gains, values = self._fit.gains.state() if self._fit.gains else ({}, {})
         own = {"statistics": self._fit.phases.log_variance, "residual": self.residual, "weight": self.weight}
         at, prior_values = self.region.state()
+        frequency = None if self.frequency_hz is None else self.frequency_hz.tolist()
+        channel = {"n_snapshots": self.n_snapshots, "frequency_hz": frequency, "floor": self.floor}
         plain = {"locator": asdict(self.config), "observed_power": self.observed_power, "inflation": self.inflation}
+        plain |= channel
         return tensors | gains | own | at, header | values | plain | prior_values
 
     @classmethod
@@ -342,18 +445,21 @@ class MatchedField(Configured, Saved):
         """Return the locator that `state` describes."""
         locator = cls(MatchedFieldConfig(**header["locator"]))
         room = GeometryModel.from_state(tensors, header)
-        features = 2 * len(differences(room.array))
+        features, is_channel = 2 * len(differences(room.array)), bool(header["n_snapshots"])
         n, known = tensors["residual"].shape[1], len(tensors["region"])
         shapes = {
             "statistics": (4 + len(room.planes),),
-            "residual": (2, n, features),
+            "residual": (0 if is_channel else 2, n, features),
             "region": (known, 3),
-            "weight": (3,),
+            "weight": (2 if is_channel else 3,),
         }
         expect(tensors, shapes)
         if n < MIN_SPECTRA or bool((tensors["statistics"].abs() > 30).any()):
             raise InputError("residuals, positions or variances are not those of a fitted locator")
-        gains = PathGains.from_state(tensors, header, room)
+        gains = None if is_channel else PathGains.from_state(tensors, header, room)
+        frequency = header["frequency_hz"]
+        locator.n_snapshots, locator.floor = int(header["n_snapshots"]), float(header["floor"])
+        locator.frequency_hz = None if frequency is None else torch.tensor(frequency, dtype=torch.float64)
         locator.grid = room.grid
         locator._fit = _Fit(room, gains, PhaseLikelihood(room, tensors["statistics"]))
         locator.residual, locator.weight = tensors["residual"], tensors["weight"]

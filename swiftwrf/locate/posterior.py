@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor
 
+from swiftwrf.data.coordinates import Floors
 from swiftwrf.errors import InputError
 from swiftwrf.plotting import MARK, Axes, Displayed, corners_of, plan
 from swiftwrf.positions import nearest
@@ -65,6 +66,7 @@ class Posterior(Displayed):
         resolution_m: Edge of the largest cell around a candidate [m].
         inflation: Factor of credible radii that held-out positions call for.
         mode_width_m: Least distance of two modes [m].
+        floors: Floors that the candidates are on. None if there is one only.
 
     Example:
         >>> at = torch.tensor([[[0.0, 0, 0], [1.0, 0, 0]]], dtype=torch.float64)
@@ -78,6 +80,7 @@ class Posterior(Displayed):
     resolution_m: float = 0.0
     inflation: float = 1.0
     mode_width_m: float = 0.0
+    floors: Floors | None = None
 
     def __repr__(self) -> str:
         head = f"<Posterior of {len(self)} observations on {self.log_weight.shape[1]} candidates,"
@@ -180,8 +183,37 @@ class Posterior(Displayed):
 
     @property
     def median(self) -> Tensor:
-        """Geometric median, which minimises the expected distance, (n, 3) [m] (E. Weiszfeld, Tohoku Math. J. 43, 1937)."""
-        return _geometric_median(self.position.expand(len(self), -1, -1), self.weight, self.mean, self.resolution_m)
+        """Geometric median, which minimises the expected distance, (n, 3) [m] (E. Weiszfeld, Tohoku Math. J. 43, 1937).
+
+        With floors it is that of the candidates on the most probable floor.
+        """
+        own, start = self.weight, self.mean
+        if self.floors is not None:
+            own = own * (self._floor_number == self.floor_probability.argmax(dim=1, keepdim=True))
+            own = own / own.sum(dim=1, keepdim=True)
+            start = torch.einsum("nm,nmk->nk", own, self.position.expand(len(self), -1, -1))
+        return _geometric_median(self.position.expand(len(self), -1, -1), own, start, self.resolution_m)
+
+    @property
+    def _floor_number(self) -> Tensor:
+        """Number of each candidate's floor, as `position`: (n, m) or (1, m)."""
+        if self.floors is None:
+            return torch.zeros(self.position.shape[:2], dtype=torch.int64)
+        return self.floors.number(self.position.reshape(-1, 3)).reshape(self.position.shape[:2])
+
+    @property
+    def floor_probability(self) -> Tensor:
+        """Posterior mass of each floor, (n, F), F = 1 without floors.
+
+        Example:
+            >>> at = torch.tensor([[[0.0, 0, 0], [0.0, 0, 3]]], dtype=torch.float64)
+            >>> weight = torch.tensor([[0.25, 0.75]], dtype=torch.float64)
+            >>> Posterior(at, weight.log(), floors=Floors(("ground", "first"), (0.0, 3.0))).floor_probability.tolist()
+            [[0.25, 0.75]]
+        """
+        count = 1 if self.floors is None else len(self.floors.names)
+        mass = torch.zeros(len(self), count, dtype=self.log_weight.dtype)
+        return mass.scatter_add(1, self._floor_number.expand(len(self), -1), self.weight)
 
     @property
     def covariance(self) -> Tensor:

@@ -5,16 +5,20 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from swiftwrf.data.coordinates import Floors
 from swiftwrf.errors import InputError
 from swiftwrf.positions import nearest
+from swiftwrf.runtime.validation import from_plain
 
+FLOOR_DISTANCE_M = 1e5  # of two floors, in the search for known positions near a cell
+MAX_CELLS = 200_000  # among which those near known positions are found
 Evaluate = Callable[[Tensor], Tensor]  # candidates (n, m, 3) to log-likelihoods (k, n, m)
 
 
@@ -45,12 +49,13 @@ class Region:
     """Prior over positions: a box around known positions, with most of the prior mass in their neighbourhood.
 
     The radius of the neighbourhood is the spacing of the known positions. So it follows a measured path and
-    fills a measured room.
+    fills a measured room. In a building with floors, the box is a plane of cells on each floor.
 
     Args:
         known: Known positions, float64 (n, 3) [m].
         margin: Fraction of the extent by which the box exceeds the known positions on each side.
         outside: Prior mass spread over the whole box.
+        floors: Floors of the building. Defaults to none.
 
     Raises:
         InputError: Fewer than 2 known positions, a negative margin, or a mass outside (0, 1].
@@ -65,6 +70,7 @@ class Region:
     known: Tensor
     margin: float = 0.03
     outside: float = 0.05
+    floors: Floors | None = None
 
     def __post_init__(self) -> None:
         if self.known.dim() != 2 or self.known.shape[1] != 3 or len(self.known) < 2:
@@ -72,31 +78,44 @@ class Region:
         if not self.margin >= 0 or not 0 < self.outside <= 1:
             raise InputError(f"a margin is at least 0 and a mass above 0, got {self.margin} and {self.outside}")
 
-    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
+    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Return the known positions by name, and the plain values."""
-        return {"region": self.known}, {"margin": self.margin, "outside": self.outside}
+        floors = self.floors and asdict(self.floors)
+        return {"region": self.known}, {"margin": self.margin, "outside": self.outside, "floors": floors}
 
     @classmethod
     def from_state(cls, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> Region:
         """Return the region that `state` describes."""
-        return cls(tensors["region"], float(header["margin"]), float(header["outside"]))
+        floors = from_plain(Floors, header["floors"]) if header.get("floors") else None
+        return cls(tensors["region"], float(header["margin"]), float(header["outside"]), floors)
 
     @cached_property
     def scale_m(self) -> float:
         """Distance [m] from the known positions that their neighbourhood covers."""
-        spots = self.known.unique(dim=0)
+        spots = self._apart(self.known).unique(dim=0)
         apart, _ = nearest(spots, spots, min(9, len(spots)))  # the nearest one is the position itself
         return float(apart[:, -1].quantile(0.95))
+
+    def _apart(self, position: Tensor) -> Tensor:
+        """Return positions (n, 3) [m] with floors so far apart that the neighbourhood of a position is on its floor."""
+        if self.floors is None:
+            return position
+        number = self.floors.number(position).double()[:, None]
+        return torch.cat([position[:, :2], FLOOR_DISTANCE_M * number], dim=1)
 
     @cached_property
     def _box(self) -> tuple[Tensor, Tensor, Tensor]:
         """Centre (3,), axes (d, 3) along which the positions extend, and half the extent along each (d,) [m]."""
         away = self.known - self.known[0]  # exactly 0 if all positions are one
+        if self.floors is not None:
+            away = away * away.new_tensor([1.0, 1.0, 0.0])
         middle = self.known[0] + away.mean(dim=0)
         _, size, axes = torch.linalg.svd(away - away.mean(dim=0), full_matrices=False)
         extended = size > 1e-3 * size[0].clamp_min(1e-12)
         # a region in all three dimensions is a box along the coordinates, as rooms are
         axes = torch.eye(3, dtype=torch.float64) if bool(extended.sum() == 3) else axes[extended]
+        if self.floors is not None and len(axes) == 2:
+            axes = torch.eye(3, dtype=torch.float64)[:2]
         along = (self.known - middle) @ axes.T
         low, high = along.amin(dim=0), along.amax(dim=0)
         return middle + (low + high) / 2 @ axes, axes, (high - low) * (0.5 + self.margin)
@@ -108,15 +127,32 @@ class Region:
 
     def is_near(self, position: Tensor) -> Tensor:
         """Return True for each position (n, 3) [m] in the neighbourhood of the known positions, (n,)."""
-        return nearest(position, self.known, 1)[0][:, 0] <= self.scale_m
+        return nearest(self._apart(position), self._apart(self.known), 1)[0][:, 0] <= self.scale_m
 
     def cells(self, count: int) -> Cells:
-        """Return about `count` cells of equal size that cover the box; `log_volume` is their prior mass."""
+        """Return about `count` cells of equal size that cover the box; `log_volume` is their prior mass.
+
+        On floors, they are the cells near known positions, and a sample of a tenth as many others.
+        """
+        if self.floors is None:
+            return self._covering(count)
+        found = self._covering(count)
+        near = float(self.is_near(found.position).double().mean())
+        found = self._covering(min(round(count / max(near, 0.01)), MAX_CELLS))
+        near = self.is_near(found.position)
+        others = (~near).nonzero()[:, 0]
+        others = others[:: max(1, 10 * len(others) // count)]
+        kept = torch.cat([near.nonzero()[:, 0], others]).sort().values
+        return Cells(found.position[kept], self.log_mass(found.position[kept]), found.edge, found.level[kept])
+
+    def _covering(self, count: int) -> Cells:
+        """Return about `count` cells of equal size that cover the box."""
         centre, axes, half = self._box
+        heights = [float(centre[2])] if self.floors is None else self.floors.height_m
         if not len(half):
             step, offset = torch.empty(0, dtype=torch.float64), torch.zeros(1, 0, dtype=torch.float64)
         else:
-            spacing = float((2 * half).prod() / count) ** (1 / len(half))
+            spacing = float((2 * half).prod() * len(heights) / count) ** (1 / len(half))
             numbers = (2 * half / spacing).round().clamp_min(1)
             step = 2 * half / numbers
             lines = [
@@ -125,6 +161,9 @@ class Region:
             ]
             offset = torch.cartesian_prod(*lines).reshape(-1, len(half))
         position = centre + offset @ axes
+        if self.floors is not None:
+            position = position.repeat(len(heights), 1)
+            position[:, 2] = torch.tensor(heights, dtype=torch.float64).repeat_interleave(len(offset))
         log_mass = self.log_mass(position)
         return Cells(position, log_mass, step[:, None] * axes, torch.zeros_like(log_mass))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Annotated, ClassVar, Self
 
 import numpy as np
@@ -14,20 +14,27 @@ from torch import Tensor
 from swiftwrf.data.columns import MAX_RSSI_DBM, MIN_RSSI_DBM, check_powers
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.splits import Validation, folds
-from swiftwrf.errors import InputError
+from swiftwrf.data.splits import FOLDS, Validation, folds
+from swiftwrf.errors import InputError, listed
+from swiftwrf.locate.fingerprints import METRICS, Fingerprints, Votes
 from swiftwrf.locate.posterior import Posterior, inflation, normalised, pooled_weights, read_inflation
 from swiftwrf.locate.region import Region, outside_mass
-from swiftwrf.locate.rssi_likelihood import DetectionLikelihood, FingerprintLikelihood, Maps, RssiLikelihoods, maps_at
-from swiftwrf.locate.student import Student, correlation
+from swiftwrf.locate.rssi_likelihood import (
+    DetectionLikelihood,
+    FingerprintLikelihood,
+    Maps,
+    RssiLikelihoods,
+    ValueLikelihood,
+    maps_at,
+)
 from swiftwrf.positions import to_tensor
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime.checkpoint import Header, Saved, expect
 from swiftwrf.runtime.progress import progress as tracked
 from swiftwrf.runtime.validation import Configured, NonNegativeInt, PositiveInt, all_or_nothing, checked, configuration
 
-NEIGHBOUR_COUNTS = (1, 2, 3, 5, 8, 13, 20)
-UNDETECTED_BELOW_DB = 5.0  # below the weakest value, of what is not detected, in the space of fingerprints
+UNDETECTED_DBM = -1000.0  # stands for what is not detected in a file, which holds finite values only
+MAX_HELD_OUT = 2000  # rows that determine the distributions
 
 
 @configuration
@@ -51,12 +58,15 @@ class RssiLocatorConfig:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """One held-out fold: its rows, and what follows from the others."""
+    """Some rows of a held-out fold, and what follows from the other folds."""
 
-    out: Tensor
-    kept: Tensor
+    rssi: Tensor
+    position: Tensor
+    region: Region
     model: RssiModel
     maps: Maps
+    fingerprints: Fingerprints
+    votes: Votes
 
 
 class RssiLocator(Configured, Saved):
@@ -108,77 +118,74 @@ class RssiLocator(Configured, Saved):
             model.check_measurements(train)
             train = train.about(model.origin)
         self.receiver_names = train.receiver_names
-        self.model = model or RssiModel(validation=config.validation, seed=config.seed).fit(train)
-        known, rssi = train.transmitter_position, train.rssi_dbm
-        self.floor_dbm = float(rssi[~rssi.isnan()].min()) - UNDETECTED_BELOW_DB
+        self.model = model or self._radio_maps(train)
+        known = train.transmitter_position
         fold = folds(known, config.validation, config.seed, session=train.session)
+        fingerprints = Fingerprints.fit(train, fold, config.seed)
         numbers = tracked(fold.unique().tolist(), "held-out folds", progress)
-        parts = [self._part(train, fold, number) for number in numbers]
+        parts = [self._part(train, fold, number, fingerprints) for number in numbers]
         self.region = region or Region(
             known,
             0.25 if config.validation == "block" else 0.03,  # a block of a fifth may lie beyond the known positions
-            outside_mass([Region(known[part.kept]) for part in parts], [known[part.out] for part in parts]),
+            outside_mass([part.region for part in parts], [part.position for part in parts]),
+            train.floors,
         )
         self.cells = self.region.cells(config.n_cells)
-        max_neighbours = min(len(part.kept) for part in parts)
-        self.likelihoods = self._likelihoods(train, parts, torch.arange(len(train)), max_neighbours)
-        self._calibrate(train, parts, max_neighbours)
         self._maps = maps_at(self.model, self.cells.position)
+        rssi, position = (torch.cat([getattr(part, name) for part in parts]) for name in ("rssi", "position"))
+        mean, std = (torch.cat(values) for values in zip(*(part.maps for part in parts), strict=True))
+        part, centre, estimate = (torch.cat(values) for values in zip(*(part.votes for part in parts), strict=True))
+        # positions are measured to a few centimetres at best
+        smallest_m = max(self.cells.edge_m, 0.05)
+        self.likelihoods = RssiLikelihoods(
+            ValueLikelihood.fit((mean, std), rssi),
+            DetectionLikelihood.fit(mean, ~rssi.isnan()),
+            FingerprintLikelihood.fit(fingerprints, (part, centre, estimate), position, smallest_m),
+        )
+        self._calibrate(parts)
         return self
 
-    def _part(self, train: Rssi, fold: Tensor, number: int) -> _Part:
-        out, kept = (fold == number).nonzero()[:, 0], (fold != number).nonzero()[:, 0]
-        model = RssiModel(validation=self.config.validation, seed=self.config.seed).fit(train.subset(kept))
-        return _Part(out, kept, model, maps_at(model, train.transmitter_position[out]))
+    def _radio_maps(self, train: Rssi) -> RssiModel:
+        # which receivers detect the transmitter is a likelihood of its own
+        return RssiModel(validation=self.config.validation, seed=self.config.seed, not_detected="unknown").fit(train)
 
-    def _likelihoods(self, train: Rssi, parts: list[_Part], rows: Tensor, max_neighbours: int) -> RssiLikelihoods:
-        """Fit the distributions to held-out folds, with `rows` of the training data as fingerprints."""
-        rssi = torch.cat([train.rssi_dbm[part.out] for part in parts])
-        mean, std = (torch.cat(values) for values in zip(*(part.maps for part in parts), strict=True))
+    def _part(self, train: Rssi, fold: Tensor, number: int, fingerprints: Fingerprints) -> _Part:
+        generator = torch.Generator().manual_seed(self.config.seed)
+        out, kept = ((fold == number) & train.detected.any(dim=1)).nonzero()[:, 0], train.subset(fold != number)
+        out = out[torch.randperm(len(out), generator=generator)[: MAX_HELD_OUT // FOLDS]]
+        rssi, position = train.rssi_dbm[out], train.transmitter_position[out]
+        model = self._radio_maps(kept)
+        found = Fingerprints.of(kept, fingerprints.metric, fingerprints.k)
+        region = Region(kept.transmitter_position, floors=train.floors)
+        return _Part(rssi, position, region, model, maps_at(model, position), found, found.votes(rssi))
 
-        def fingerprints(rows: Tensor, k: int, scale_m: Tensor) -> FingerprintLikelihood:
-            filled = train.rssi_dbm[rows].float().nan_to_num(self.floor_dbm)
-            return FingerprintLikelihood(train.transmitter_position[rows], filled, self.floor_dbm, k, scale_m)
-
-        def errors(k: int) -> Tensor:
-            found = (
-                fingerprints(part.kept, k, torch.ones(3)).estimate(train.rssi_dbm[part.out])
-                - train.transmitter_position[part.out]
-                for part in parts
-            )
-            return torch.cat(list(found))
-
-        counts = [k for k in NEIGHBOUR_COUNTS if k < len(rssi) / 2 and k <= max_neighbours]
-        k = min(counts, key=lambda k: float(errors(k).norm(dim=1).median()))
-        # positions are measured to a few centimetres at best
-        scale = (errors(k).abs().quantile(0.6, dim=0).square() + max(self.cells.edge_m, 0.05) ** 2).sqrt()
-        values = Student.fit((rssi.float() - mean) / std, correlation, (0.0, 0.1, 0.3, 0.6, 1.0), n_folds=2)
-        return RssiLikelihoods(values, DetectionLikelihood.fit(mean, ~rssi.isnan()), fingerprints(rows, k, scale))
-
-    def _calibrate(self, train: Rssi, parts: list[_Part], max_neighbours: int) -> None:
+    def _calibrate(self, parts: list[_Part]) -> None:
         """Choose the weights of the likelihoods by the posterior density at held-out positions.
 
-        The distributions of each fold are fitted to the other folds, and so is the prior over positions.
+        The distributions are those of all folds, whose few parameters depend little on a single one.
         """
         truth, values, positions, masses = [], [], [], []
-        fraction = min(1.0, self.config.n_calibration / len(train))
-        for number, part in enumerate(parts):
-            likelihoods = self._likelihoods(train, parts[:number] + parts[number + 1 :], part.kept, max_neighbours)
-            some = torch.linspace(0, len(part.out) - 1, max(1, round(fraction * len(part.out)))).long()
-            rssi, at = train.rssi_dbm[part.out[some]], train.transmitter_position[part.out[some]]
+        for part in parts:
+            own = replace(self.likelihoods.fingerprints, fingerprints=part.fingerprints)
+            likelihoods = replace(self.likelihoods, fingerprints=own)
+            some = slice(-(-self.config.n_calibration // len(parts)))
+            rssi, at = part.rssi[some], part.position[some]
             values.append(likelihoods(self.cells.position, maps_at(part.model, self.cells.position), rssi))
-            own = part.maps[0][some], part.maps[1][some]
-            truth.append(likelihoods(at, own, rssi).diagonal(dim1=1, dim2=2))
-            prior = Region(train.transmitter_position[part.kept], self.region.margin, self.region.outside)
+            maps = part.maps[0][some], part.maps[1][some]
+            truth.append(likelihoods(at, maps, rssi).diagonal(dim1=1, dim2=2))
+            prior = replace(part.region, margin=self.region.margin, outside=self.region.outside)
             masses.append(prior.log_mass(self.cells.position).expand(len(rssi), -1))
             positions.append(at)
         candidates, position, volume = torch.cat(values, dim=1), torch.cat(positions), torch.cat(masses)
         self.weight = pooled_weights(torch.cat(truth, dim=1), candidates, volume)
-        generator = torch.Generator().manual_seed(self.config.seed)
-        rows = torch.randperm(len(position), generator=generator)[:300]
-        log_mass = torch.einsum("k,knm->nm", self.weight, candidates[:, rows]) + volume[rows]
-        held_out = Posterior(self.cells.position[None], normalised(log_mass), self.cells.edge_m)
-        self.inflation = inflation(held_out, position[rows])
+        log_mass = torch.einsum("k,knm->nm", self.weight, candidates) + volume
+        held_out = self._posterior(log_mass)
+        self.inflation = inflation(held_out, position)
+
+    def _posterior(self, log_mass: Tensor, inflation: float = 1.0) -> Posterior:
+        cells = self.cells
+        floors = self.region.floors
+        return Posterior(cells.position[None], normalised(log_mass), cells.edge_m, inflation, floors=floors)
 
     @torch.no_grad()
     def locate(self, rssi: Numbers) -> Posterior:
@@ -200,7 +207,7 @@ class RssiLocator(Configured, Saved):
         at = self.cells.position
         values = self.likelihoods(at, self._maps, rssi)
         log_mass = torch.einsum("k,knm->nm", self.weight, values)
-        return Posterior(at[None], normalised(log_mass + self.cells.log_volume), self.cells.edge_m, self.inflation)
+        return self._posterior(log_mass + self.cells.log_volume, self.inflation)
 
     @torch.no_grad()
     @checked
@@ -217,8 +224,8 @@ class RssiLocator(Configured, Saved):
         """
         self.check_fitted()
         mean, std = (values.double() for values in maps_at(self.model, position))
-        draws = self.likelihoods.values.sample((n, len(mean)), generator)
-        rssi = (mean + std * draws).clamp(MIN_RSSI_DBM, MAX_RSSI_DBM)
+        error = self.likelihoods.values.sample(std.expand(n, -1, -1), generator)
+        rssi = (mean + error).clamp(MIN_RSSI_DBM, MAX_RSSI_DBM)
         chance = self.likelihoods.detections.probability(mean)
         lost = torch.rand(rssi.shape, generator=generator, dtype=torch.float64) >= chance
         strongest = torch.nn.functional.one_hot(rssi.argmax(dim=2), rssi.shape[2]).bool()
@@ -234,19 +241,20 @@ class RssiLocator(Configured, Saved):
         """Return the fitted tensors by name, and plain values."""
         self.check_fitted()
         tensors, header = self.model.state()
-        values, fingerprints = self.likelihoods.values, self.likelihoods.fingerprints
+        values, likelihood = self.likelihoods.values, self.likelihoods.fingerprints
+        known = likelihood.fingerprints
         own = {
-            "known": fingerprints.position,
-            "fingerprint": fingerprints.rssi,
-            "scale_m": fingerprints.scale_m,
-            "correlation": values.scale,
+            "known": known.position,
+            "fingerprint": known.rssi.nan_to_num(UNDETECTED_DBM),
+            "scale_m": likelihood.scale_m,
             "weight": self.weight,
         }
         plain = {
             "locator": asdict(self.config),
-            "floor_dbm": self.floor_dbm,
-            "k": fingerprints.k,
-            "degrees": None if math.isinf(values.degrees) else values.degrees,
+            "metric": known.metric,
+            "k": known.k,
+            "miss": likelihood.miss,
+            "values": [values.common_db, values.scale, None if math.isinf(values.degrees) else values.degrees],
             "detections": asdict(self.likelihoods.detections),
             "inflation": self.inflation,
         }
@@ -260,23 +268,22 @@ class RssiLocator(Configured, Saved):
         locator.model = RssiModel.from_state(tensors, header)
         locator.receiver_names = locator.model.receiver_names
         n, r = len(tensors["known"]), len(locator.receiver_names)
-        expect(
-            tensors, {"known": (n, 3), "fingerprint": (n, r), "scale_m": (3,), "correlation": (r, r), "weight": (3,)}
-        )
-        degrees, k = header["degrees"], int(header["k"])
-        if not 1 <= k <= n:
-            raise InputError(f"k must be between 1 and the number of rows, got {k}")
-        matrix, scale = tensors["correlation"], tensors["scale_m"]
-        definite = not bool(torch.linalg.cholesky_ex(matrix).info)
-        if not (definite and bool((scale > 0).all()) and (degrees is None or float(degrees) > 0)):
-            raise InputError("correlation, scale or degrees of freedom are those of no distribution")
-        locator.floor_dbm = float(header["floor_dbm"])
-        locator.likelihoods = RssiLikelihoods(
-            Student(matrix, math.inf if degrees is None else float(degrees)),
-            DetectionLikelihood(**header["detections"]),
-            FingerprintLikelihood(tensors["known"], tensors["fingerprint"], locator.floor_dbm, k, scale),
-        )
+        expect(tensors, {"known": (n, 3), "fingerprint": (n, r), "scale_m": (3,), "weight": (3,)})
+        (common_db, scale, degrees), k, metric = header["values"], int(header["k"]), str(header["metric"])
+        values = ValueLikelihood(float(common_db), float(scale), math.inf if degrees is None else float(degrees))
+        if not 1 <= k <= n or metric not in METRICS:
+            raise InputError(f"k must be 1 to the number of rows, the metric {listed(METRICS)}; got {k} and {metric!r}")
+        positive = values.common_db >= 0 and min(values.scale, values.degrees) > 0
+        if not (positive and bool((tensors["scale_m"] > 0).all()) and 0 < float(header["miss"]) < 1):
+            raise InputError("scales, degrees of freedom or a probability are those of no distribution")
         locator.region = Region.from_state(tensors, header)
+        rssi = tensors["fingerprint"].where(tensors["fingerprint"] > UNDETECTED_DBM, torch.nan)
+        known = Fingerprints(tensors["known"], rssi, locator.region.floors, metric, k)
+        locator.likelihoods = RssiLikelihoods(
+            values,
+            DetectionLikelihood(**header["detections"]),
+            FingerprintLikelihood(known, tensors["scale_m"], float(header["miss"])),
+        )
         locator.cells = locator.region.cells(locator.config.n_cells)
         locator.weight, locator.inflation = tensors["weight"], read_inflation(header)
         locator._maps = maps_at(locator.model, locator.cells.position)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,9 +13,14 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from swiftwrf.data.dataset import Numbers
-from swiftwrf.locate.student import Student
+from swiftwrf.locate.fingerprints import Fingerprints, Votes
+from swiftwrf.locate.student import DEGREES
 from swiftwrf.rssi import RssiModel
 
+COMMON_DB = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
+SCALES = (0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
+MAX_DETECTIONS = 200_000  # that determine the likelihood of detections
+MISSES = (0.003, 0.01, 0.03, 0.1, 0.2, 0.4)
 Maps = tuple[Tensor, Tensor]  # predicted RSSI and its standard deviation at m positions, float32 (m, R) [dBm], [dB]
 
 
@@ -22,6 +29,77 @@ def maps_at(model: RssiModel, position: Numbers) -> Maps:
     prediction = model.predict(position)
     assert prediction.std is not None
     return prediction.mean.float(), prediction.std.float().clamp_min(0.5)
+
+
+@dataclass(frozen=True)
+class ValueLikelihood:
+    """Student distribution of the errors of the radio maps, which share the offset of a row (device, body, weather).
+
+    Args:
+        common_db: Standard deviation of the offset [dB].
+        scale: Factor of the standard deviations of the maps.
+        degrees: Degrees of freedom; infinite for a Gaussian.
+    """
+
+    common_db: float
+    scale: float
+    degrees: float
+
+    @classmethod
+    def fit(cls, maps: Maps, rssi: Tensor) -> ValueLikelihood:
+        """Fit to the maps (n, R) and RSSI (n, R) [dBm], nan where not detected, of held-out rows by maximum likelihood."""
+        weight = (~rssi.isnan()).double() / maps[1].double().square()
+        error = (rssi - maps[0].double()).nan_to_num()
+        sums = weight.sum(dim=1), (weight * error).sum(dim=1), (weight * error.square()).sum(dim=1)
+        count = (weight > 0).sum(dim=1).double()
+        choices = (cls(*values) for values in itertools.product(COMMON_DB, SCALES, DEGREES))
+        return max(choices, key=lambda found: float(found._log_density(*sums, count).sum()))
+
+    def log_likelihood(self, maps: Maps, rssi: Tensor) -> Tensor:
+        """Return log-likelihoods (n, m) of RSSI (n, R) [dBm] at candidates with radio maps (m, R)."""
+        middle = maps[0].mean(dim=0).double()  # sums of squares cancel less about it
+        mean, weight = maps[0].double() - middle, 1 / maps[1].double().square()
+        detected = (~rssi.isnan()).double()
+        value = (rssi.double() - middle).nan_to_num()
+        total = detected @ weight.T
+        first = value @ weight.T - detected @ (weight * mean).T
+        second = value.square() @ weight.T - 2 * value @ (weight * mean).T + detected @ (weight * mean.square()).T
+        determinant = detected @ maps[1].double().log().T
+        return self._log_density(total, first, second, detected.sum(dim=1, keepdim=True)) - determinant
+
+    def sample(self, std: Tensor, generator: torch.Generator) -> Tensor:
+        """Sample errors [dB] at standard deviations of the maps, float64 (..., R) [dB]."""
+
+        def normal(*shape: int) -> Tensor:
+            return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+        offset = self.common_db * normal(*std.shape[:-1], 1)
+        error: Tensor = offset + self.scale * std * normal(*std.shape)
+        if math.isinf(self.degrees):
+            return error
+        # a Student variable is a Gaussian one over the root of a scaled chi-squared one
+        rng = np.random.default_rng(int(torch.randint(2**31, (), generator=generator)))
+        chi_squared = torch.from_numpy(rng.chisquare(self.degrees, offset.shape))
+        return error / (chi_squared / self.degrees).sqrt()
+
+    def _log_density(self, total: Tensor, first: Tensor, second: Tensor, count: Tensor) -> Tensor:
+        """Return the log-density, without the determinant of the maps' standard deviations.
+
+        Args:
+            total: Sum of the weights of the receivers, the inverse variances of the maps.
+            first: Weighted sum of the errors [dB].
+            second: Weighted sum of their squares.
+            count: Number of receivers.
+        """
+        variance = self.scale**2
+        ratio = self.common_db**2 / variance
+        distance = (second - first.square() * ratio / (1 + ratio * total)).clamp_min(0) / variance
+        determinant = count * math.log(self.scale) + torch.log1p(ratio * total) / 2
+        if math.isinf(self.degrees):
+            return -distance / 2 - determinant
+        half = (self.degrees + count) / 2
+        constant = torch.lgamma(half) - math.lgamma(self.degrees / 2) - count / 2 * math.log(self.degrees / 2)
+        return constant - half * torch.log1p(distance / self.degrees) - determinant
 
 
 @dataclass(frozen=True)
@@ -41,7 +119,8 @@ class DetectionLikelihood:
     @classmethod
     def fit(cls, mean: Tensor, detected: Tensor) -> DetectionLikelihood:
         """Fit to predicted RSSI (n, R) [dBm] and detections, bool (n, R), of held-out rows."""
-        m, d = mean.double().flatten(), detected.flatten()
+        step = -(-mean.numel() // MAX_DETECTIONS)
+        m, d = mean.double().flatten()[::step], detected.flatten()[::step]
 
         def loss(raw: NDArray[np.float64]) -> float:
             chance = cls._of(raw).probability(m).clamp(1e-4, 1 - 1e-4)
@@ -67,34 +146,54 @@ class DetectionLikelihood:
 
 @dataclass(frozen=True, eq=False)
 class FingerprintLikelihood:
-    """Student distribution of the position around the weighted mean of the k most similar training rows.
+    """Likelihood of the position by the k most similar places.
+
+    The floor has the neighbours' vote, with a probability that the vote misses it. On each floor the position has a Student
+    distribution around the weighted mean of the neighbours there.
 
     Args:
-        position: Training positions, float64 (n, 3) [m].
-        rssi: Training RSSI with a value for what is not detected, float32 (n, R) [dBm].
-        floor: That value [dBm].
-        k: Number of neighbours.
-        scale_m: Scale of the distribution along each axis [m].
+        fingerprints: Training rows.
+        scale_m: Scale of the distribution along each axis, (3,) [m].
+        miss: Probability that a floor is as likely as any other, whatever the vote.
         degrees: Degrees of freedom.
     """
 
-    position: Tensor
-    rssi: Tensor
-    floor: float
-    k: int
+    fingerprints: Fingerprints
     scale_m: Tensor
+    miss: float = 0.1
     degrees: float = 4.0
 
-    def estimate(self, rssi: Tensor) -> Tensor:
-        """Return the weighted mean position of the k most similar rows, (n, 3) [m]."""
-        apart, row = torch.cdist(rssi.float().nan_to_num(self.floor), self.rssi).topk(self.k, largest=False)
-        weight = 1 / apart.double().clamp_min(0.1)
-        return (weight[..., None] * self.position[row]).sum(dim=1) / weight.sum(dim=1, keepdim=True)
+    @classmethod
+    def fit(cls, fingerprints: Fingerprints, votes: Votes, truth: Tensor, smallest_m: float) -> FingerprintLikelihood:
+        """Fit to the votes of held-out rows.
+
+        Args:
+            fingerprints: Training rows.
+            votes: Votes of `Fingerprints.vote` for n held-out rows.
+            truth: Their positions, (n, 3) [m].
+            smallest_m: Smallest scale [m].
+        """
+        part, mean, _ = votes
+        rows, own = torch.arange(len(truth)), fingerprints.floor(truth)
+        right = part[rows, own]
+        error = (mean[rows, own] - truth)[right > 0]
+        scale = (error.abs().quantile(0.6, dim=0).square() + smallest_m**2).sqrt()
+
+        def density(miss: float) -> float:
+            return float(((1 - miss) * right + miss / part.shape[1]).log().mean())
+
+        return cls(fingerprints, scale, max(MISSES, key=density))
 
     def log_likelihood(self, position: Tensor, rssi: Tensor) -> Tensor:
         """Return log-likelihoods (n, m) of candidate positions (m, 3) [m]."""
-        away = (position - self.estimate(rssi)[:, None]) / self.scale_m
-        return -(self.degrees + 3) / 2 * torch.log1p(away.square().sum(dim=2) / self.degrees)
+        part, mean, estimate = self.fingerprints.votes(rssi)
+        mean = mean.where(part[..., None] > 0, estimate[:, None])
+        number = self.fingerprints.floor(position)
+        away = (position - mean[:, number]) / self.scale_m
+        if part.shape[1] > 1:
+            away[..., 2] = 0.0
+        floor = ((1 - self.miss) * part + self.miss / part.shape[1]).log()
+        return floor[:, number] - (self.degrees + 3) / 2 * torch.log1p(away.square().sum(dim=2) / self.degrees)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,20 +201,19 @@ class RssiLikelihoods:
     """Likelihoods of a row of RSSI that are pooled.
 
     Args:
-        values: Distribution of the standardised errors of the radio maps, correlated between receivers (device, body,
-            weather).
+        values: Distribution of the errors of the radio maps.
         detections: Likelihood of which receivers detect the transmitter.
         fingerprints: Likelihood of the position by similar training rows.
     """
 
-    values: Student
+    values: ValueLikelihood
     detections: DetectionLikelihood
     fingerprints: FingerprintLikelihood
 
     def __call__(self, position: Tensor, maps: Maps, rssi: Tensor) -> Tensor:
         """Return log-likelihoods, float64 (3, n, m), of RSSI (n, R) at candidates (m, 3) with radio maps (m, R)."""
         parts = (
-            self.values.log_likelihood(rssi.float(), *maps),
+            self.values.log_likelihood(maps, rssi),
             self.detections.log_likelihood(maps[0], rssi),
             self.fingerprints.log_likelihood(position, rssi),
         )

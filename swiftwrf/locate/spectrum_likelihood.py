@@ -1,17 +1,18 @@
-"""Likelihoods of spectra by the room that was found: co-array numbers, and element phases under uncertain path gains.
+"""Likelihoods by the room that was found: co-array numbers, element phases under uncertain path gains, and channels.
 
 A spectrum of K elements is exactly a few dozen co-array numbers, and its channel's phases follow from these by phase
 retrieval. Both are compared with predictions straight from the channel; no spectrum is rendered. Searching the position
 whose predicted field matches the observed one is matched-field processing (A. B. Baggeroer, W. A. Kuperman and
 P. N. Mikhalevsky, IEEE J. Oceanic Eng. 18, 1993; with uncertain surroundings: A. M. Richardson and L. W. Nolte,
-J. Acoust. Soc. Am. 89, 1991).
+J. Acoust. Soc. Am. 89, 1991). A measured channel gives both features directly, and its amplitudes and subcarriers, too.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Self
 
 import numpy as np
@@ -23,7 +24,10 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.locate.student import Student, covariance
-from swiftwrf.models.geometry.model import GeometryModel
+from swiftwrf.models.geometry.fit import carrier_phases
+from swiftwrf.models.geometry.furniture import coherence, field
+from swiftwrf.models.geometry.furniture import waves as path_waves
+from swiftwrf.models.geometry.model import GeometryModel, kept_snapshots
 from swiftwrf.models.geometry.path_gains import PathGains, paths
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation, coarray_numbers, retrieve_phases
 
@@ -32,15 +36,17 @@ BOUNDS = (-10.0, 6.0)  # of the logarithms of variances: products of four of the
 
 @dataclass(frozen=True, eq=False)
 class SpectrumFeatures:
-    """Features of the channel that a spectrum determines.
+    """Features of the channel that a spectrum determines, and the channel itself where it is measured.
 
     Args:
         coarray: Real and imaginary parts of the co-array numbers, float32 (n, F).
         phases: Element phasors of unit modulus and their indistinguishable aliases, complex64 (n, T, K), T = 1 or 2.
+        channel: Measured channels, complex64 (n, F, K), or None.
     """
 
     coarray: Tensor
     phases: Tensor
+    channel: Tensor | None = None
 
     @classmethod
     def of(cls, spectra: Iterable[Tensor], array: PlanarArray, grid: AngularGrid, seed: int = 0) -> SpectrumFeatures:
@@ -51,9 +57,17 @@ class SpectrumFeatures:
         aliases = [channel] if opposite is None else [channel, channel.conj()[:, opposite]]
         return cls(real_parts(numbers), torch.stack(aliases, dim=1).to(torch.complex64))
 
+    @classmethod
+    def of_channels(cls, channel: Tensor, frequency_hz: Tensor | None, array: PlanarArray) -> SpectrumFeatures:
+        """Compute the features of channels (n, S, K) at frequencies (S,) [Hz]."""
+        phases = carrier_phases(channel, frequency_hz, array)
+        kept = channel[:, kept_snapshots(channel.shape[1])]
+        return cls(real_parts(autocorrelation(phases, array)), phases[:, None], kept)
+
     def subset(self, rows: Tensor) -> SpectrumFeatures:
         """Return the features of some of the spectra."""
-        return SpectrumFeatures(self.coarray[rows], self.phases[rows])
+        channel = None if self.channel is None else self.channel[rows]
+        return SpectrumFeatures(self.coarray[rows], self.phases[rows], channel)
 
     def __len__(self) -> int:
         return len(self.coarray)
@@ -71,7 +85,7 @@ class PathWaves:
     Args:
         position: Candidate positions, float64 (m, 3) [m].
         wave: Wave of the direct path and of each image at the elements, complex64 (m, 1 + S, K).
-        gain: Gains of the paths, (1 + S,).
+        gain: Gains of the paths, (m, 1 + S).
     """
 
     position: Tensor
@@ -83,10 +97,10 @@ class PathWaves:
         """Compute the waves at positions (m, 3) [m]."""
         return cls(position, *paths(room, room.scene(position)))
 
-    @property
+    @cached_property
     def channel(self) -> Tensor:
-        """Channel of each element by constant path gains, complex64 (m, K)."""
-        return self.gain.to(self.wave.dtype) @ self.wave
+        """Channel of each element by the room's path gains, complex64 (m, K)."""
+        return (self.gain.to(self.wave.dtype)[:, None] @ self.wave)[:, 0]
 
 
 Features = Callable[[PathWaves], Tensor]
@@ -101,7 +115,7 @@ def gain_features(array: PlanarArray, gains: PathGains) -> Features:
     """Return a function from waves of m positions to co-array numbers by position-dependent path gains, float32 (m, F)."""
 
     def features(waves: PathWaves) -> Tensor:
-        channel = (waves.gain + gains.change(waves.position)) @ waves.wave
+        channel = (waves.gain[:, None] + gains.change(waves.position)) @ waves.wave
         return real_parts(autocorrelation(channel.sgn(), array).mean(dim=1))
 
     return features
@@ -189,6 +203,41 @@ class PhaseLikelihood:
         density = match + torch.special.i0e(match).log() - misfit
         total_density: Tensor = density.logsumexp(dim=1) - 2 * root.diagonal(dim1=1, dim2=2).real.log().sum(dim=1)
         return total_density
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelLikelihood:
+    """Likelihood of measured channels by the room's path gains, with an unknown phase of each snapshot.
+
+        l = -F K log(1 - coherence + floor)
+
+    With an unknown scale and an unknown power of white errors this is the logarithm of the concentrated normal likelihood.
+    The floor is the median missing coherence at held-out positions: below it, errors of the room decide.
+
+    Args:
+        room: Room with its furniture.
+        frequency: Frequencies of the snapshots relative to the carrier, (F,).
+        floor: Missing coherence at true positions.
+    """
+
+    room: GeometryModel
+    frequency: Tensor
+    floor: float
+
+    def predict(self, waves: PathWaves) -> Tensor:
+        """Return the channels at candidates, complex64 (m, F, K)."""
+        if bool((self.frequency == 1).all()):
+            return waves.channel[:, None].expand(-1, len(self.frequency), -1)
+        return field(waves.gain, path_waves(self.room.tensors(), self.room.scene(waves.position), self.frequency))
+
+    def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
+        """Return log-likelihoods (m,) of m observations at m candidates, up to a constant of each observation."""
+        assert observed.channel is not None
+        return self.log_density(coherence(observed.channel, self.predict(waves)), observed.channel)
+
+    def log_density(self, coherence: Tensor, channel: Tensor) -> Tensor:
+        """Return the log-likelihoods of coherences of any shape with channels (n, F, K)."""
+        return -math.prod(channel.shape[1:]) * ((1 - coherence).clamp_min(0) + self.floor).log()
 
 
 def _isotropic(room: GeometryModel) -> Tensor:

@@ -26,6 +26,7 @@ from swiftwrf.models.base import FieldConfig, check_checkpoint
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Displayed
 from swiftwrf.positions import check_positions, to_tensor
+from swiftwrf.rssi.detection import Detection, NotDetected
 from swiftwrf.rssi.path_loss import FloorAttenuation, estimate_floor_attenuation, receiver_floors
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.session import Record
@@ -67,6 +68,9 @@ class RssiConfig(FieldConfig):
     for Gaussian noise), since packets have outliers"""
     max_locations: Annotated[int, Ge(10)] = 1500
     """location bins that the rows are averaged in; the time of a fit grows with the cube of their number"""
+    not_detected: NotDetected = "auto"
+    """what an empty cell says: "weak", the power was below the limit of detection; "unknown", nothing; "auto" decides for
+    each receiver by whether its empty cells are where its path loss expects no value"""
 
 
 class RssiPredictor(Configured, Displayed, ABC):
@@ -112,6 +116,8 @@ class RssiPredictor(Configured, Displayed, ABC):
     """positions of the receivers, float64 (R, 3) [m], nan where unknown, set by `fit`"""
     origin: GeodeticOrigin | None
     """latitude and longitude of x = y = 0, if the positions were projected from degrees, set by `fit`"""
+    detection: Detection | None
+    """curve of detection of the training rows; None if every cell has a value; set by `fit`"""
     offsets: Offsets | None
     """offsets that were removed from the training rows, set by `fit`; predictions are of their reference"""
     attenuation: FloorAttenuation | None = None
@@ -167,12 +173,18 @@ class RssiPredictor(Configured, Displayed, ABC):
             raise InputError(lacking)
         self.receiver_names, self.receiver_position = tuple(map(str, train.receiver_names)), train.receiver_position
         self.origin, self.offsets, self.attenuation = train.origin, train.offsets, None
+        shift = torch.zeros_like(pool.rssi_dbm)
+        if train.offsets is not None:
+            shift = shift + train.offsets.of(pool)[:, None]
         if train.floors is not None:
             self.attenuation = estimate_floor_attenuation(train, pool)
-            pool = replace(self.attenuation, receiver_floor=tuple(receiver_floors(pool).tolist())).removed(pool)
-            train = self.attenuation.removed(train)
+            of_pool = replace(self.attenuation, receiver_floor=tuple(receiver_floors(pool).tolist()))
+            shift = shift + of_pool.of(pool.transmitter_position)
+            train, pool = self.attenuation.removed(train), of_pool.removed(pool)
         others = {"parallel": parallel, "checkpoint": checkpoint, "on_record": on_record, "progress": progress}
-        self._fit(train, pool=pool, device=to_device(device), **others)
+        curve, names = Detection.estimate(pool.transmitter_position, pool.rssi_dbm + shift), list(pool.receiver_names)
+        self.detection = curve and curve.columns(torch.tensor([names.index(name) for name in self.receiver_names]))
+        self._fit(train, pool=pool, shift=shift, device=to_device(device), **others)
         return self
 
     @checked
@@ -238,7 +250,8 @@ class RssiPredictor(Configured, Displayed, ABC):
         Args:
             train: Training rows.
             pool: The same rows at all receivers.
-            arguments: The other arguments of `fit`. A predictor declares those that it uses, and ignores the rest by `**_`.
+            arguments: The other arguments of `fit`, and `shift`, the received power less the RSSI of the pool [dB], by
+                floors and offsets that were removed. A predictor declares those that it uses, and ignores the rest by `**_`.
         """
 
     @abstractmethod
@@ -279,6 +292,25 @@ class RssiPredictor(Configured, Displayed, ABC):
         """
         self.check_measurements(data)
         return self.predict(data.transmitter_position)
+
+    @checked
+    def predict_detection(self, position: Numbers) -> Tensor:
+        """Return the probability that each receiver detects a packet, float64 (n, R), at positions (n, 3) [m].
+
+        A predictor without a probability has 1 where its mean is above the limit of detection, else 0. All is 1 if every
+        cell of the training rows has a value.
+
+        Raises:
+            InputError: As `predict`.
+
+        Example:
+            >>> import swiftwrf
+            >>> swiftwrf.RssiModel().fit(swiftwrf.rssi_room(n=60)).predict_detection([[1.0, 2.0, 1.2]]).shape
+            torch.Size([1, 12])
+        """
+        with torch.no_grad():
+            mean = self.predict(position).mean.double()
+        return torch.ones_like(mean) if self.detection is None else (mean > self.detection.limit).double()
 
     def _facts(self) -> dict[str, str]:
         return {"model": self.name, "receivers": listed(getattr(self, "receiver_names", ())) or "not fitted"}
@@ -326,7 +358,7 @@ class SavedRssiPredictor(RssiPredictor, Saved):
         predictor.origin = GeodeticOrigin(*map(float, header["origin"])) if header.get("origin") else None
         predictor.attenuation = FloorAttenuation.from_plain(header.get("attenuation"))
         predictor.offsets = Offsets(**header["offsets"]) if header.get("offsets") else None
-        predictor.kernel = Kernel(**header["kernel"])
+        predictor.kernel, predictor.detection = Kernel(**header["kernel"]), None
         return predictor
 
 
@@ -341,8 +373,9 @@ def check_training(train: Rssi, pool: Rssi) -> None:
     if detected < MIN_TRAINING:
         names = ", ".join(train.receiver_names)
         raise InputError(f"{names}: detected in {detected} training rows in all; at least {MIN_TRAINING} are needed")
-    if not torch.equal(pool.transmitter_position, train.transmitter_position):
-        raise InputError("the pool must hold the same rows as the training part, at more receivers")
+    more = set(train.receiver_names) <= set(pool.receiver_names)
+    if not more or not torch.equal(pool.transmitter_position, train.transmitter_position):
+        raise InputError("the pool must hold the same rows as the training part, at the same receivers and more")
 
 
 def fingerprint(config: Any, train: Rssi, pool: Rssi) -> str:

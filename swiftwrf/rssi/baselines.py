@@ -24,7 +24,7 @@ from swiftwrf.models.base import CPU, FieldConfig
 from swiftwrf.rssi.base import Map, RssiPredictor
 from swiftwrf.rssi.comparison import make_predictor
 from swiftwrf.rssi.pairs import PairPredictor
-from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, fit_shared_path_loss, log_distance
+from swiftwrf.rssi.path_loss import PathLoss, fit_path_losses, fit_shared_path_loss, log_distance
 from swiftwrf.rssi.training import mixing_weights
 from swiftwrf.runtime.threads import parallel_map
 from swiftwrf.runtime.validation import Preset, configuration
@@ -70,15 +70,15 @@ class SharedPathLoss(RssiPredictor):
 
 
 class ReceiverPathLoss(SharedPathLoss):
-    """A log-distance path-loss model for each receiver; a receiver never detected has the model of all receivers."""
+    """A log-distance path-loss model for each receiver, shrunk to that of all receivers; see `fit_path_losses`."""
 
     name = "mri_receiver"
 
-    def _fit(self, train: Rssi, **_: Any) -> None:
+    def _fit(self, train: Rssi, *, pool: Rssi, shift: Tensor, **_: Any) -> None:
         self._receiver = train.receiver_position
-        detected = (~train.rssi_dbm.isnan()).any(dim=0)
-        own = fit_path_loss(log_distance(train.transmitter_position, train.receiver_position), train.rssi_dbm)
-        self._path_loss = own.where(detected, _fit_shared(train, train))
+        found = fit_path_losses(pool.transmitter_position, pool.receiver_position, pool.rssi_dbm, shift=shift)
+        names = list(pool.receiver_names)
+        self._path_loss = found.columns(torch.tensor([names.index(name) for name in train.receiver_names])).own
 
 
 def _fit_shared(rows: Rssi, applied: Rssi) -> PathLoss:

@@ -21,6 +21,7 @@ from swiftwrf.metrics import method_summary
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import distance
 from swiftwrf.rssi.base import Map, RssiPredictor
+from swiftwrf.rssi.detection import NotDetected
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.pairs import PairModel
 from swiftwrf.rssi.paper import RssiPaperModel
@@ -79,7 +80,8 @@ class RssiComparison:
         train: Training rows, without offsets between groups.
         test: Test rows.
         values: What each predictor gave, by name: `predicted` at the detected test pairs (n,) [dBm], their standard
-            deviations `std` (n,) [dB] or None, median absolute error `median_db` [dB], seconds to `fit` and to `predict`.
+            deviations `std` (n,) [dB] or None, median absolute error `median_db` [dB], seconds to `fit` and to `predict`,
+            and `detection`, the share of the detected and of the empty test cells that are predicted as such, or None.
         left_out: Reason for each predictor that the data do not suffice for.
         predictors: Fitted predictors by name, without those whose values `keep` had.
 
@@ -145,8 +147,14 @@ class RssiComparison:
         return float(((measured >= low) & (measured <= high)).double().mean())
 
     def summary(self) -> DataFrame:
-        """Return a row for each method: errors [dB], and their mean difference to those of `model`; see `method_summary`."""
-        return method_summary(self.errors, "abs_error_db", self.model)
+        """Return a row for each method: errors [dB], and their mean difference to those of `model`; see `method_summary`.
+
+        `detection` is the balanced accuracy of predicting which test cells are empty, if there are empty ones: the mean of
+        the shares of detected and of empty cells that are predicted as such.
+        """
+        found = method_summary(self.errors, "abs_error_db", self.model)
+        right = {name: sum(value["detection"]) / 2 for name, value in self.values.items() if value.get("detection")}
+        return found.assign(detection=found.index.map(right)) if right else found
 
     @property
     def _pairs(self) -> tuple[Tensor, Tensor]:
@@ -183,6 +191,7 @@ def compare(
     also: Sequence[str] = (),
     preset: Preset = "quick",
     reference: str | None = None,
+    not_detected: NotDetected = "auto",
     device: torch.device | str = "cpu",
     parallel: Map | None = None,
     keep: Keep | None = None,
@@ -198,6 +207,7 @@ def compare(
         also: Predictors that are compared only when named, e.g. "blend".
         preset: "quick", or "paper" for published settings.
         reference: Group whose offset is 0. Defaults to the most frequent one.
+        not_detected: What an empty cell says; see `RssiConfig`.
         device: Device to compute on.
         parallel: Function that maps a picklable fit over receivers as `map` does.
         keep: Memo `keep(name, compute)`, which returns the values that it has under a name, or the second item of
@@ -223,6 +233,7 @@ def compare(
         train, pool = offsets.removed(train), offsets.removed(pool)
     offset = 0.0 if train.offsets is None else train.offsets.of(test)[:, None]
     options = {"validation": train.validation_for(split, test), "seed": seed, "new_places": split == PLACE}
+    options["not_detected"] = not_detected
     names, left_out = compared(chosen, also)
     predictors: dict[str, RssiPredictor] = {}
 
@@ -237,11 +248,20 @@ def compare(
         std = None if prediction.std is None else prediction.std[test.detected]
         error = (prediction.mean + offset - test.rssi_dbm)[test.detected].abs()
         values = {"predicted": prediction.mean[test.detected], "std": std, "median_db": float(error.quantile(0.5))}
-        return predictor, seconds | values
+        return predictor, seconds | values | {"detection": _detection(predictor, test)}
 
     keep = keep or (lambda name, compute: compute()[1])
     values = {name: keep(name, partial(compute, name)) for name in names}
     return RssiComparison(train, test, values, left_out, predictors)
+
+
+def _detection(predictor: RssiPredictor, test: Rssi) -> tuple[float, float] | None:
+    """Return the shares of detected and of empty test cells that are predicted as such; None if there is one kind only."""
+    detected = test.detected
+    if predictor.detection is None or bool(detected.all()) or test.receiver_moves:
+        return None
+    above = predictor.predict_detection(test.transmitter_position) > 0.5
+    return float(above[detected].double().mean()), float((~above)[~detected].double().mean())
 
 
 def pool_of(whole: Rssi, train: Rssi, test: Rssi, split: str, seed: int) -> Rssi:

@@ -16,7 +16,7 @@ from swiftwrf.data.dataset import DEGREE_UNITS, Arrays, Labelled, Numbers
 from swiftwrf.data.rssi import receiver_row
 from swiftwrf.errors import InputError, listed
 from swiftwrf.models.prediction import Prediction
-from swiftwrf.plotting import Axes, Displayed, corners_of, plan_map
+from swiftwrf.plotting import Axes, Displayed, corners_of, hatch, plan_map
 from swiftwrf.rssi.base import RssiPredictor
 
 CELLS = 120  # of a map, along its longer side
@@ -35,6 +35,7 @@ class RssiMap(Labelled, Displayed):
         cell: Edge of a cell [m].
         mean: Predictive mean (R, rows, columns) [dBm].
         std: Predictive standard deviation of a measurement (R, rows, columns) [dB].
+        detection: Probability of a detection (R, rows, columns).
         receiver_names: Names of the receivers.
         origin: Latitude and longitude of x = y = 0, if they are known.
     """
@@ -45,6 +46,7 @@ class RssiMap(Labelled, Displayed):
     cell: float
     mean: NDArray[np.float32]
     std: NDArray[np.float32]
+    detection: NDArray[np.float32]
     receiver_names: tuple[str, ...]
     origin: GeodeticOrigin | None = None
 
@@ -93,8 +95,9 @@ class RssiMap(Labelled, Displayed):
         with torch.no_grad():
             found = model.predict(grid)
         assert found.std is not None
-        mean, std = (values.T.reshape(-1, len(y), len(x)).float().numpy() for values in (found.mean, found.std))
-        return cls(x, y, z, cell, mean, std, model.receiver_names, model.origin)
+        each = (found.mean, found.std, model.predict_detection(grid))
+        fields = [values.T.reshape(-1, len(y), len(x)).float().numpy() for values in each]
+        return cls(x, y, z, cell, *fields, model.receiver_names, model.origin)
 
     def receivers(self, asked: Sequence[str]) -> RssiMap:
         """Return the map of some receivers.
@@ -107,7 +110,8 @@ class RssiMap(Labelled, Displayed):
         """
         rows = [receiver_row(self.receiver_names, name, "the map") for name in asked]
         names = tuple(self.receiver_names[row] for row in rows)
-        return replace(self, mean=self.mean[rows], std=self.std[rows], receiver_names=names)
+        fields = {name: getattr(self, name)[rows] for name in ("mean", "std", "detection")}
+        return replace(self, **fields, receiver_names=names)
 
     @property
     def prediction(self) -> Prediction:
@@ -120,7 +124,7 @@ class RssiMap(Labelled, Displayed):
         return corners_of(self.x, self.y, self.cell)
 
     def plot(self, receiver: str | None = None, ax: Axes | None = None) -> Axes:
-        """Draw the map of the predictive mean, seen from above.
+        """Draw the map of the predictive mean, seen from above; hatched where a detection is less likely than not.
 
         Args:
             receiver: Name of a receiver, or its number from 1. Defaults to the strongest RSSI at each position.
@@ -131,6 +135,7 @@ class RssiMap(Labelled, Displayed):
         """
         shown = self if receiver is None else self.receivers([receiver])
         ax = plan_map(self.corners, shown.mean.max(axis=0), "predicted RSSI [dBm]", ax)
+        hatch(ax, self.x, self.y, shown.detection.max(axis=0) < 0.5)
         ax.set_title(f"predicted RSSI of {'the strongest receiver' if receiver is None else shown.receiver_names[0]}")
         return ax
 
@@ -152,6 +157,7 @@ class RssiMap(Labelled, Displayed):
             receiver=np.repeat(self.receiver_names, len(x)),
             predicted_dbm=self.mean.ravel(),
             std_db=self.std.ravel(),
+            detection=self.detection.ravel(),
         )
 
     def coordinates(self) -> Arrays:
@@ -169,4 +175,6 @@ class RssiMap(Labelled, Displayed):
 
     def variables(self) -> Arrays:
         dimensions = ("receiver", "y", "x")
-        return {"rssi": (dimensions, self.mean, {"units": "dBm"}), "std": (dimensions, self.std, {"units": "dB"})}
+        detection = (dimensions, self.detection, {"long_name": "probability of a detection"})
+        values = {"rssi": (dimensions, self.mean, {"units": "dBm"}), "std": (dimensions, self.std, {"units": "dB"})}
+        return values | {"detection": detection}

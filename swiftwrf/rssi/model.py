@@ -15,22 +15,26 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
+from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.errors import InputError
-from swiftwrf.gp import GaussianProcess, subsample
 from swiftwrf.models.base import CPU
+from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Axes
+from swiftwrf.positions import check_positions
 from swiftwrf.rssi.base import Map, RssiConfig, SavedRssiPredictor, map_threads
+from swiftwrf.rssi.detection import Detection, DetectionField
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.path_loss import N_HARMONICS, harmonics, log_distance
 from swiftwrf.rssi.posterior import FitState, RssiPosterior
 from swiftwrf.rssi.training import (
-    MAX_VARIANCE_POSITIONS,
     RssiTraining,
+    Uncertainty,
     check_comparable,
     comparable,
     fit_receiver,
+    held_out_std,
     interval_scale,
     mixing_weights,
     prepare,
@@ -41,6 +45,7 @@ from swiftwrf.runtime import checkpoint as files
 from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import single_thread
+from swiftwrf.runtime.validation import checked
 
 FIELD_ALONE = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)  # mixing weights
 
@@ -50,9 +55,10 @@ class RssiModel(SavedRssiPredictor):
 
     Five held-out folds of the training rows determine the kernel, the presence of a field, the mixing weights and the scale
     of the standard deviation. The field is mixed with simpler predictors: the path-loss model of the receiver, that of all
-    receivers, and the mean of the receiver. All receivers share the mixing weights. A receiver detected in fewer than 10
-    rows falls back to the path-loss model of all receivers. If the positions of the receivers are unknown, a path-loss model
-    is a level.
+    receivers, and the mean of the receiver. All receivers share the mixing weights. The path loss of a receiver is shrunk to
+    that of all receivers, by what its rows determine. If the positions of the receivers are unknown, it is a level. An empty
+    cell is an upper limit of the received power where the empty cells of a receiver are those of weak signals, see
+    `RssiConfig.not_detected`. `predict` gives the power of all packets, `predict_detected` that of detected ones.
 
     Args:
         config: Options as one object. Defaults to `RssiConfig()`.
@@ -81,8 +87,12 @@ class RssiModel(SavedRssiPredictor):
     """RSSI at 1 m, float64 (R,) [dBm]"""
     slope: Tensor
     """float64 (R,) [dB a decade]"""
-    slope_std: Tensor
-    """standard deviation of the slope, float64 (R,) [dB a decade]"""
+    middle: Tensor
+    """log10 of the distance at which levels are compared, float64 (R,)"""
+    covariance: Tensor
+    """calibrated covariance of level at that distance and slope, float64 (R, 2, 2)"""
+    detection_field: DetectionField | None
+    """probability of a detection; None if every cell has a value, or if empty cells tell nothing"""
     directivity: Tensor
     """coefficients of the harmonics, (R, 8) [dB]"""
     anchor: Tensor
@@ -98,10 +108,10 @@ class RssiModel(SavedRssiPredictor):
     _posterior: RssiPosterior | None
     """least squares of the fit, which `update` continues; None for `RssiPaperModel`"""
 
-    def _fit(self, train: Rssi, *, pool: Rssi, **arguments: Any) -> None:
-        training = prepare(train, pool, self.config)
+    def _fit(self, train: Rssi, *, pool: Rssi, shift: Tensor, **arguments: Any) -> None:
+        training = prepare(train, pool, self.config, shift=shift)
         found = self._receivers(training, **arguments)
-        weight = self._mixing_weights(train, pool, training, found["held_out"], **arguments)
+        weight = self._mixing_weights(train, pool, training, found, shift, **arguments)
         self._assemble(train, training, found, weight[:, None].repeat(1, len(training.receiver_names)))
 
     def _receivers(
@@ -121,7 +131,13 @@ class RssiModel(SavedRssiPredictor):
         return {name: torch.cat([result[name] for result in results]) for name in results[0]}
 
     def _mixing_weights(
-        self, train: Rssi, pool: Rssi, training: RssiTraining, held_out: Tensor, **arguments: Any
+        self,
+        train: Rssi,
+        pool: Rssi,
+        training: RssiTraining,
+        found: dict[str, Tensor],
+        shift: Tensor,
+        **arguments: Any,
     ) -> Tensor:
         """Return the weights (4,) of the field and the simpler predictors with the lowest error on held-out rows.
 
@@ -130,13 +146,11 @@ class RssiModel(SavedRssiPredictor):
         """
         some = representative_receivers(pool)
         if set(some.receiver_names) <= set(train.receiver_names):
-            columns = [train.receiver_names.index(name) for name in some.receiver_names]
-            predictors = _held_out_predictors(training, held_out)[:, :, columns]
+            columns = torch.tensor([train.receiver_names.index(name) for name in some.receiver_names])
+            predictors = _held_out_predictors(training, found)[0][:, :, columns]
         else:
-            others = prepare(some, pool, self.config, training)
-            predictors = _held_out_predictors(
-                others, self._receivers(others, **arguments | {"progress": False})["held_out"]
-            )
+            others = prepare(some, pool, self.config, training, shift)
+            predictors = _held_out_predictors(others, self._receivers(others, **arguments | {"progress": False}))[0]
         predicted = predictors[:, training.bin_of_row]
         if not comparable(predicted, some.rssi_dbm).any():
             return FIELD_ALONE
@@ -145,29 +159,49 @@ class RssiModel(SavedRssiPredictor):
     @single_thread()
     def _assemble(self, train: Rssi, training: RssiTraining, found: dict[str, Tensor], weight: Tensor) -> None:
         """Mix the fits of all receivers with the simpler predictors by weights (4, R), and calibrate the deviation."""
-        predictors = _held_out_predictors(training, found["held_out"])
+        predictors, std = _held_out_predictors(training, found)
         check_comparable(predictors[:, training.bin_of_row], train.rssi_dbm)
         predicted = (weight[:, None] * predictors).where(weight[:, None] > 0, 0.0).sum(dim=0)
-        prior_db = training.field_db, training.noise_db
-        scale = interval_scale(training, training.kernel, prior_db, predicted, train)
+        of_row = training.bin_of_row
+        scale = interval_scale(predicted[of_row], std[of_row], train.rssi_dbm)
 
         def mixed(own: Tensor, baselines: Tensor) -> Tensor:
             return (weight * torch.cat([own[None], baselines])).sum(dim=0)
 
         self.n_primitives, self.kernel, self.mixing_weight = training.n_primitives, training.kernel, weight
-        self.centre = training.centre
+        self.centre, self.middle, self.detection = (
+            training.centre,
+            training.path_loss.centre,
+            training.path_loss.detection,
+        )
         self.level = mixed(found["level"], training.baselines.level)
         self.slope = mixed(found["slope"], training.baselines.slope)
         self.directivity = (weight[0][:, None] * found["directivity"]).float()
         self.anchor, self.coefficient = training.position.float(), found["coefficient"].T.float().contiguous()
         self.rendered = found["rendered"]
+        self.detection_field = None
+        if self.detection is not None:
+            level = found["held_out"].T.where(~found["held_out"].T.isnan(), training.baseline_held_out[0])
+            seen = ~training.rssi.isnan()
+            bins = training.position, seen, training.fold, level
+            self.detection_field = DetectionField.fit(training.kernel, *bins, self.detection.limit)
         rows = {name: found[name].T for name in ("dual", "tangent", "variance")}
         prior = {name: found[name] for name in ("prior_level", "prior_slope")}
-        variance = {"field_variance": training.field_db.square(), "noise_variance": training.noise_db.square()}
-        self._posterior = self._posterior_of(FitState(**rows, **prior, **variance))
+        state = FitState(
+            **rows,
+            **prior,
+            measured=(~training.rssi.isnan()).to(training.rssi),
+            middle=self.middle.clone(),
+            level_std=found["prior_std"][:, 0].clone(),
+            slope_std=found["prior_std"][:, 1].clone(),
+            field_variance=training.field_db.square(),
+            noise_variance=training.noise_db.square(),
+        )
+        self._posterior = self._posterior_of(state)
         noise_db = (scale * training.noise_db).clamp_min(rounding_std(train.rssi_dbm))
         self.field_db, self.noise_db = (scale * training.field_db).float(), noise_db.float()
-        self.slope_std = weight[:2].sum(dim=0) * found["slope_std"]  # only two predictors have the receiver's slope
+        # only two predictors have the receiver's path loss
+        self.covariance = (weight[:2].sum(dim=0) * scale).square()[:, None, None] * found["covariance"]
         self._precompute()
 
     @property
@@ -183,14 +217,11 @@ class RssiModel(SavedRssiPredictor):
         """Compute what all predictions share."""
         self._table = HeadTable(self.rendered)
         self._offset = self._table(torch.zeros(1, len(self.level)))[0]
-        self._process = self._variance_process()
+        self._uncertainty = self._uncertainty_of_rows()
 
-    def _variance_process(self) -> GaussianProcess:
-        """Return the process of centred log10 distances (n, R) at few measured positions, which determine the variance."""
-        known = subsample(self.anchor.double(), rows=MAX_VARIANCE_POSITIONS)[0]
-        distance = log_distance(known + self.centre, self.receiver)
-        self._middle = distance.mean(dim=0)
-        return GaussianProcess.regress(self.kernel, known, distance - self._middle)
+    def _uncertainty_of_rows(self) -> Uncertainty:
+        receiver = self.receiver_position - self.centre
+        return Uncertainty(self.kernel, self.anchor.double(), receiver, self.middle, self.covariance)
 
     def _posterior_of(self, state: FitState) -> RssiPosterior:
         table, receiver = HeadTable(self.rendered), self.receiver_position - self.centre
@@ -203,12 +234,15 @@ class RssiModel(SavedRssiPredictor):
             new = self.offsets.removed(new)
         new, before = new.about(self.origin), posterior.linear
         self._posterior = posterior.updated(new.transmitter_position - self.centre, new.rssi_dbm)
+        if self.detection_field is not None:
+            at = new.transmitter_position - self.centre
+            self.detection_field = self.detection_field.updated(at, new.detected)
         change = self.mixing_weight[0] * (self._posterior.linear - before).T  # (10, R)
         self.level, self.slope = self.level + change[0], self.slope + change[1]
         self.directivity = self.directivity + change[2:].T.float()
         folded = self._posterior.folded()
         self.anchor, self.coefficient = folded.anchor.float(), folded.coefficient.float()
-        self._process = self._variance_process()
+        self._uncertainty = self._uncertainty_of_rows()
 
     def with_chosen_kernel(self, without: Tensor | None = None) -> Self:
         """Return the model fitted again to all rows that it has learnt, with kernel, noise and mixing weights chosen again.
@@ -266,10 +300,33 @@ class RssiModel(SavedRssiPredictor):
         head = self._table(self.kernel(local, self.anchor) @ self.coefficient)[0] - self._offset
         mean = path_loss.float() + torch.einsum("brh,rh->br", bearing, self.directivity)
         mean = mean + self.mixing_weight[0].float() * head
-        variance = self.field_db.square() * self._process.variance(offset).float()[:, None]
-        # as of kriging with a trend: the slope is uncertain beyond the distances of the measurements
-        trend = (self.slope_std * (distance - self._middle - self._process.mean(offset))).square().float()
-        return mean, (self.noise_db.square() + variance + trend).sqrt()
+        variance, trend = self._uncertainty(offset)
+        variance = self.field_db.square() * variance.float()[:, None] + trend.float()
+        return mean, (self.noise_db.square() + variance).sqrt()
+
+    @checked
+    def predict_detected(self, data: Rssi) -> Prediction:
+        """Predict the RSSI of packets that are detected at the positions of the data; shapes as of `predict`.
+
+        Near the limit of detection it is above the received power of all packets, which `predict` returns.
+
+        Raises:
+            InputError: As `check_measurements`.
+        """
+        prediction = super().predict_detected(data)
+        if self.detection is None or self.detection_field is None:
+            return prediction
+        assert prediction.std is not None
+        mean, std = self.detection.given_detection(prediction.mean.double(), prediction.std.double())
+        return replace(prediction, mean=mean.float(), std=std.float())
+
+    @checked
+    def predict_detection(self, position: Numbers) -> Tensor:
+        if self.detection_field is None:
+            return super().predict_detection(position)
+        with torch.no_grad():
+            level = self.predict(position).mean.double()
+        return self.detection_field.probability(level, check_positions(position) - self.centre)
 
     def plot(self, receiver: str | None = None, height_m: float | None = None, ax: Axes | None = None) -> Axes:
         """Draw the map of the predicted RSSI over the measured region, seen from above.
@@ -293,9 +350,16 @@ class RssiModel(SavedRssiPredictor):
     def state(self) -> tuple[dict[str, Tensor], Header]:
         self.check_fitted()
         tensors = {name: getattr(self, name) for name in _shapes(0, 0)}
+        header = self._header() | {"n_primitives": self.n_primitives}
+        if self.detection is not None:
+            tensors |= {"missed": self.detection.missed, "is_limit": self.detection.is_limit}
+            header |= {"detection": [self.detection.limit, self.detection.width]}
+        if self.detection_field is not None:
+            of_field = self.detection_field.state()
+            tensors, header = tensors | of_field[0], header | of_field[1]
         if self._posterior is not None:
             tensors |= self._posterior.folded().state.tensors()
-        return tensors, self._header() | {"n_primitives": self.n_primitives}
+        return tensors, header
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
@@ -305,6 +369,17 @@ class RssiModel(SavedRssiPredictor):
         files.expect(tensors, shapes)
         for name in shapes:
             setattr(model, name, tensors[name])
+        model.detection, model.detection_field, n_receivers = None, None, len(model.receiver_names)
+        if "share" in header:
+            files.expect(
+                tensors,
+                {"share.mean": (n_receivers,), "share.coefficient": (len(tensors["share.position"]), n_receivers)},
+            )
+            model.detection_field = DetectionField.from_state(tensors, header)
+        if "detection" in header:
+            files.expect(tensors, dict.fromkeys(("missed", "is_limit"), (n_receivers,)))
+            limit, width = map(float, header["detection"])
+            model.detection = Detection(limit, width, tensors["missed"].double(), tensors["is_limit"].bool())
         model._posterior = None
         if "fit.dual" in tensors:
             files.expect(tensors, FitState.shapes(len(model.receiver_names), len(tensors["anchor"])))
@@ -326,8 +401,9 @@ def fit_rssi(train: Rssi, config: RssiConfig | None = None, **options: Any) -> R
 
 def _shapes(n_receivers: int, n_anchors: int) -> dict[str, tuple[int, ...]]:
     """Return the shape of every saved tensor."""
-    per_receiver = dict.fromkeys(("level", "slope", "slope_std", "field_db", "noise_db"), (n_receivers,))
+    per_receiver = dict.fromkeys(("level", "slope", "middle", "field_db", "noise_db"), (n_receivers,))
     return per_receiver | {
+        "covariance": (n_receivers, 2, 2),
         "mixing_weight": (4, n_receivers),
         "centre": (3,),
         "directivity": (n_receivers, N_HARMONICS),
@@ -337,7 +413,18 @@ def _shapes(n_receivers: int, n_anchors: int) -> dict[str, tuple[int, ...]]:
     }
 
 
-def _held_out_predictors(training: RssiTraining, held_out: Tensor) -> Tensor:
-    """Return held-out predictions of the field (R, n), and those of the simpler predictors after them, (4, n, R) [dBm]."""
-    field = held_out.T.where(~training.rssi.isnan(), torch.nan)
-    return torch.cat([field[None], training.baseline_held_out])
+def _held_out_predictors(training: RssiTraining, found: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    """Return predictions of held-out measured bins, and their standard deviation before it is calibrated.
+
+    Returns:
+        Those of the fits `found` and of the simpler predictors after them, (4, n, R) [dBm], given that the packets were
+        detected; and their standard deviation (n, R) [dB].
+    """
+    field = found["held_out"].T.where(~training.rssi.isnan(), torch.nan)
+    predictors = torch.cat([field[None], training.baseline_held_out])
+    prior_db, middle = (training.field_db, training.noise_db), training.path_loss.centre
+    std = held_out_std(training, training.kernel, prior_db, middle, found["covariance"])
+    if (detection := training.path_loss.detection) is not None:
+        given = [detection.given_detection(mean, std) for mean in predictors]
+        predictors, std = torch.stack([mean for mean, _ in given]), given[0][1].where(~field.isnan(), std)
+    return predictors, std

@@ -29,6 +29,7 @@ from swiftwrf.rssi.training import (
     binned,
     check_comparable,
     choose_residual_kernel,
+    held_out_std,
     interval_scale,
     prior_std,
     rounding_std,
@@ -93,7 +94,9 @@ class RssiPaperModel(RssiModel):
         pool_rssi = bin_locations(pool, config.max_locations)[1]
         pool_residual = pool_rssi - pool_rssi.nanmean(dim=0)
         self.kernel = choose_residual_kernel(bins.position, pool_residual, bins.fold, train.floors is not None)[0]
-        prior_db = prior_std(bins.rssi - bins.rssi.nanmean(dim=0), pool_residual, self.kernel)
+        variance = (bins.rssi - bins.rssi.nanmean(dim=0)).square().nanmean(dim=0)
+        variance = variance.nan_to_num(float(pool_residual.square().nanmean())).clamp_min(1e-6)
+        prior_db = prior_std(variance, self.kernel)
         covariance = self.kernel(bins.position, bins.position)
         covariance.diagonal().add_(1e-3)  # bins may nearly coincide
         root = torch.linalg.cholesky(covariance)  # the latent field in the bins is this times standard normal numbers
@@ -110,7 +113,9 @@ class RssiPaperModel(RssiModel):
         self.n_primitives, self.mixing_weight = config.n_primitives, FIELD_ALONE[:, None].repeat(1, n_receivers)
         self.centre, self.anchor, self.rendered = bins.centre, bins.position.float(), rendered
         self.level = LEVEL_DBM + HeadTable(rendered)(per_receiver[None])[0][0]
-        self.slope, self.slope_std = per_receiver, per_receiver.clone()
+        self.slope, self.middle = per_receiver, per_receiver.clone()
+        self.detection_field = None
+        self.covariance = torch.zeros(n_receivers, 2, 2, dtype=torch.float64)
         self.directivity = torch.zeros(n_receivers, N_HARMONICS)
         dual = torch.linalg.solve_triangular(root.T, white.T.double() * prior_db[0], upper=True)
         self.coefficient, self._posterior = dual.float(), None
@@ -121,7 +126,9 @@ class RssiPaperModel(RssiModel):
         out = ~bins.rssi.isnan() & (bins.fold == HELD_OUT_FOLD)[:, None]
         predicted = held_out.double().where(out, torch.nan)
         check_comparable(predicted[None, bins.bin_of_row], train.rssi_dbm)
-        scale = interval_scale(bins, self.kernel, prior_db, predicted, train)
+        none = torch.zeros(len(prior_db[0]), dtype=torch.float64)
+        std = held_out_std(bins, self.kernel, prior_db, none, none[:, None, None].repeat(1, 2, 2))
+        scale = interval_scale(predicted[bins.bin_of_row], std[bins.bin_of_row], train.rssi_dbm)
         field_db, noise_db = (scale * db for db in prior_db)
         self.field_db, self.noise_db = field_db.float(), noise_db.clamp_min(rounding_std(train.rssi_dbm)).float()
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple, Self
 
@@ -23,10 +23,17 @@ from swiftwrf.data.rssi import Offsets, Rssi
 from swiftwrf.errors import InputError, listed
 from swiftwrf.gp import Kernel
 from swiftwrf.positions import Neighbours, distance
+from swiftwrf.rssi.detection import Detection, NotDetected, empty_given
 from swiftwrf.runtime.threads import single_thread
 
 MIN_DISTANCE_M = 0.3  # shorter distances count as this one: the model does not hold in the near field
 N_HARMONICS = 8  # real spherical harmonics of degree 1 and 2
+MAX_ROUNDS = 40  # of expectation maximisation
+SLOPE_PRIOR = -30.0, 15.0  # of the slope of all receivers: path-loss exponents of 1.5 to 4.5 [dB a decade]
+SPREAD_DB, SPREAD_WORTH = 6.0, 4.0  # prior of the spread over receivers, and the number of receivers that it counts as
+FLOOR_STD_DB = 20.0  # prior standard deviation of the attenuation of a floor about 0
+ROWS_WORTH = 10.0  # rows of a receiver that count as much as the variance of all receivers
+MAX_UNEXPLAINED = 0.4  # share of empty cells where a value was expected, beyond which those of a receiver tell nothing
 MAX_ROWS = 300  # of a receiver, from which offsets are estimated; the cost grows with their cube
 
 
@@ -143,6 +150,188 @@ def fit_path_loss(distance: Tensor, rssi: Tensor, *, shared: bool = False) -> Pa
     return PathLoss((middle - slope * centre).reshape(-1), slope.reshape(-1))
 
 
+class PathLosses(NamedTuple):
+    """Path loss of R receivers that is learnt together: level and slope of each are normal about those of all.
+
+    Args:
+        own: Model of each receiver, (R,); that of all receivers where a receiver has no measurements.
+        shared: Model of all receivers of its kind, of known or of unknown position, (R,).
+        centre: log10 of the distance at which levels are compared, (R,); 0 for a receiver of unknown position.
+        std: Standard deviation of the receivers' level at that distance [dB] and of their slope [dB a decade] about the
+            shared ones, with the uncertainty of the latter, (R, 2).
+        variance: Variance of the measurements about the receiver's model, (R,) [dB^2].
+        detection: Curve of detection; None if no cell is empty, or if empty cells are ignored.
+        floor_db: Attenuation of a floor for each receiver's kind, (R,) [dB]; 0 without floors.
+    """
+
+    own: PathLoss
+    shared: PathLoss
+    centre: Tensor
+    std: Tensor
+    variance: Tensor
+    detection: Detection | None
+    floor_db: Tensor
+
+    def columns(self, number: Tensor) -> PathLosses:
+        """Return the path loss of some receivers."""
+        own, shared = (PathLoss(*(value[number] for value in model)) for model in (self.own, self.shared))
+        detection = self.detection and self.detection.columns(number)
+        rest = (value[number] for value in (self.centre, self.std, self.variance))
+        return PathLosses(own, shared, *rest, detection, self.floor_db[number])
+
+
+@single_thread()
+def fit_path_losses(
+    position: Tensor,
+    receiver: Tensor,
+    rssi: Tensor,
+    not_detected: NotDetected = "auto",
+    shift: Tensor | None = None,
+    detection: Detection | None = None,
+    crossed: Tensor | None = None,
+) -> PathLosses:
+    """Fit the path-loss models of all receivers together, by expectation maximisation.
+
+    A receiver has what its rows determine, and for the rest what the other receivers have (a hierarchical model: A. Gelman
+    et al., "Bayesian Data Analysis", 3rd ed., 2013, chapter 5). An empty cell is an upper limit of the power, see
+    `Detection`, unless most empty cells of its receiver are where the path loss expects a value.
+
+    Args:
+        position: Positions of the transmitter, (n, 3) [m].
+        receiver: Positions of the receivers, (R, 3) [m], nan where unknown.
+        rssi: Measurements (n, R) [dBm], nan where not detected.
+        not_detected: "weak" if empty cells are limits at all receivers, "unknown" if they tell nothing.
+        shift: Received power less `rssi`, e.g. by floors that were removed, (n, R) [dB]. Defaults to 0.
+        detection: Curve of detection. Defaults to an estimate.
+        crossed: Number of floors between both ends, float64 (n, R), whose attenuation is fitted, too. Distances are then
+            horizontal. Defaults to none.
+
+    Example:
+        >>> import swiftwrf
+        >>> room = swiftwrf.rssi_room(n=200)
+        >>> found = fit_path_losses(room.transmitter_position, room.receiver_position, room.rssi_dbm)
+        >>> -30 < float(found.own.slope.mean()) < -10
+        True
+    """
+    shift = torch.zeros_like(rssi) if shift is None else shift
+    plane = torch.tensor([1.0, 1.0, 1.0 if crossed is None else 0.0], dtype=torch.float64)
+    located, distance = ~receiver.isnan().any(dim=1), log_distance(position * plane, receiver * plane)
+    floors = torch.zeros_like(rssi) if crossed is None else crossed
+    if not_detected == "unknown":
+        detection = None
+    elif detection is None:
+        detection = Detection.estimate(position, rssi + shift)
+    extent = float((position.amax(dim=0) - position.amin(dim=0)).max()) or 1.0
+    n_cells = len((position / (extent / 10)).round().unique(dim=0))
+    repeats = max(1.0, len(rssi) / n_cells)  # rows near each other have like errors
+
+    def fit(curve: Detection | None) -> tuple[PathLosses, Tensor]:
+        mean, none = rssi.nanmean().repeat(len(receiver)), torch.zeros(len(receiver), dtype=torch.float64)
+        # a kind of receivers that measured nothing has the mean of the others
+        fields = {"own_level": mean, "shared_level": mean.clone()}
+        fields |= {name: none.clone() for name in ("own_slope", "shared_slope", "centre", "unexplained", "floor_db")}
+        fields["std"] = torch.full((len(receiver), 2), SPREAD_DB, dtype=torch.float64)
+        fields["variance"] = torch.full((len(receiver),), SPREAD_DB**2, dtype=torch.float64)
+        for kind in (located, ~located):
+            if bool(rssi[:, kind].isfinite().any()):
+                of_kind = curve and curve.columns(kind)
+                each = (values[:, kind] for values in (distance, floors, rssi, shift))
+                found = _maximise(*each, of_kind, repeats)
+                for name, value in found.items():
+                    fields[name][kind] = value
+        own, shared = (PathLoss(fields[f"{of}_level"], fields[f"{of}_slope"] * located) for of in ("own", "shared"))
+        std = torch.stack([fields["std"][:, 0], fields["std"][:, 1] * located], dim=1)
+        found = PathLosses(own, shared, fields["centre"], std, fields["variance"], curve, fields["floor_db"])
+        return found, fields["unexplained"]
+
+    found, unexplained = fit(detection)
+    if not_detected == "auto" and detection is not None:
+        explained = detection.is_limit & (unexplained <= MAX_UNEXPLAINED)
+        if bool((explained != detection.is_limit).any()):
+            found, _ = fit(replace(detection, is_limit=explained))
+    return found
+
+
+def _maximise(
+    distance: Tensor, crossed: Tensor, rssi: Tensor, shift: Tensor, detection: Detection | None, repeats: float
+) -> dict[str, Tensor]:
+    """Fit the path loss of receivers of one kind; see `fit_path_losses`.
+
+    Args:
+        distance: log10 of the distances [m], (n, R).
+        crossed: Number of floors between both ends, (n, R).
+        rssi: Measurements (n, R) [dBm], nan where not detected.
+        shift: See `fit_path_losses`.
+        detection: Curve of detection of these receivers.
+        repeats: Number of rows that count as one.
+
+    Returns:
+        The fields of `PathLosses` by name, and the share `unexplained` (R,) of empty cells where a value was expected.
+    """
+    seen, n_receivers = ~rssi.isnan(), rssi.shape[1]
+    centre = distance[seen].mean()
+    feature = torch.stack([torch.ones_like(distance), distance - centre, -crossed], dim=-1)
+    eye, spread = torch.eye(3, dtype=torch.float64), torch.tensor([SPREAD_DB, SPREAD_DB, 1e-3]).double().square()
+    (expected, known), of_floor = SLOPE_PRIOR, FLOOR_STD_DB
+    certain = torch.tensor([1e-6, known**-2, of_floor**-2], dtype=torch.float64)
+    value, weight, extra = rssi.nan_to_num(), seen.double(), torch.zeros_like(rssi)
+    variance = rssi[seen].var(correction=0).clamp_min(1e-6).expand(n_receivers)
+    missed = torch.zeros(n_receivers).double() if detection is None else detection.missed
+    unexplained, last = missed, None
+    limited = torch.zeros_like(seen) if detection is None else ~seen & detection.is_limit
+    for _ in range(MAX_ROUNDS):
+        scale = variance * repeats
+        normal = torch.einsum("nrk,nr,nrl->rkl", feature, weight, feature) / scale[:, None, None]
+        right = torch.einsum("nrk,nr->rk", feature, weight * value) / scale[:, None]
+        shrink = torch.linalg.inv(eye + normal @ spread.diag())
+        total = (shrink @ normal).sum(dim=0) + certain.diag()
+        pull = (shrink @ right[..., None]).sum(dim=0)[:, 0] + torch.tensor([0.0, expected / known**2, 0.0]).double()
+        shared = torch.linalg.solve(total, pull)
+        posterior = torch.linalg.inv(spread.reciprocal().diag() + normal)
+        deviation = (posterior @ (right - normal @ shared)[..., None])[..., 0]
+        # received power does not rise with the distance; the level follows the slope
+        excess = (shared[1] + deviation[:, 1]).clamp_min(0)
+        deviation = deviation - posterior[:, :, 1] / posterior[:, 1:2, 1] * excess[:, None]
+        moments = (deviation.square() + posterior.diagonal(dim1=1, dim2=2))[:, :2].sum(dim=0)
+        spread[:2] = (moments + SPREAD_WORTH * SPREAD_DB**2) / (n_receivers + SPREAD_WORTH)  # floors are alike
+        own = shared + deviation
+        mean = (feature * own).sum(dim=-1)
+        squares = weight * (value - mean).square() + extra
+        pooled = squares.sum() / weight.sum()
+        variance = (squares.sum(dim=0) + ROWS_WORTH * pooled) / (weight.sum(dim=0) + ROWS_WORTH)
+        variance = variance.clamp_min(1e-6)
+        if last is not None and float((own - last).abs().max()) < 0.01:
+            break
+        last = own
+        if detection is None or not limited.any():
+            continue
+        std = (variance + detection.width**2).sqrt()
+        z = (detection.limit - shift - mean) / std
+        ratio, weak = empty_given(z, unexplained)
+        hazard = (ratio / weak.clamp_min(1e-12)).clamp_max(40)
+        value = rssi.where(seen, mean - variance / std * hazard)
+        weight = torch.where(limited, weak, seen.double())
+        rest = 1 - variance / std.square() * hazard * (z + hazard)
+        extra = torch.where(limited, weak * variance * rest.clamp(0, 1), 0.0)
+        count, other = seen.sum(dim=0), (1 - weak).where(limited, 0.0).sum(dim=0)
+        share = (other + ROWS_WORTH * other.sum() / (count + other).sum()) / (count + other + ROWS_WORTH)
+        if bool((distance.std(dim=0) > 0).any()):  # without distances no power is expected anywhere
+            unexplained = missed.maximum(share)
+    own_level, shared_level = own[:, 0] - own[:, 1] * centre, shared[0] - shared[1] * centre
+    uncertain = (spread + total.inverse().diagonal()).sqrt()
+    return {
+        "own_level": own_level,
+        "own_slope": own[:, 1],
+        "shared_level": shared_level.expand(n_receivers),
+        "shared_slope": shared[1].expand(n_receivers),
+        "centre": centre.expand(n_receivers),
+        "std": uncertain[:2].expand(n_receivers, 2),
+        "floor_db": shared[2].clamp_min(0).expand(n_receivers),
+        "variance": variance,
+        "unexplained": unexplained,
+    }
+
+
 @dataclass(frozen=True, eq=False)
 class PairPathLoss:
     """The log-distance path-loss model over pairs of positions: one for all receivers, and corrections at some places.
@@ -249,9 +438,9 @@ class FloorAttenuation:
 
 
 def estimate_floor_attenuation(train: Rssi, pool: Rssi | None = None) -> FloorAttenuation:
-    """Estimate the attenuation of a floor by least squares, jointly with the path-loss model of each receiver.
+    """Estimate the attenuation of a floor jointly with the path-loss models of the receivers; see `fit_path_losses`.
 
-    Distances are horizontal. The floor of a receiver of unknown position is the one with its strongest mean RSSI.
+    A receiver of unknown position counts as on the floor of its strongest mean RSSI, amid its three strongest rows.
 
     Args:
         train: Training rows with floors.
@@ -266,20 +455,14 @@ def estimate_floor_attenuation(train: Rssi, pool: Rssi | None = None) -> FloorAt
     """
     pool = pool or train
     assert train.floors is not None
-    floor = train.floors.number(train.transmitter_position)
     where = receiver_floors(pool)
-    flat = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
-    apart = distance(pool.transmitter_position * flat, pool.receiver_position * flat).clamp_min(MIN_DISTANCE_M)
-    log_apart, top, bottom = apart.log10().nan_to_num(0.0), 0.0, 0.0
-    for r, rssi in enumerate(pool.rssi_dbm.T):
-        rows = ~rssi.isnan()
-        crossed = (floor[rows] - where[r]).abs().double()
-        free = torch.stack([torch.ones_like(crossed), log_apart[rows, r]], dim=1)
-        both = torch.stack([rssi[rows], crossed], dim=1)
-        left = both - free @ torch.linalg.lstsq(free, both, driver="gelsd").solution
-        top += float(left[:, 0] @ left[:, 1])
-        bottom += float(left[:, 1] @ left[:, 1])
-    db = max(-top / bottom, 0.0) if bottom > 0 else 0.0
+    crossed = (train.floors.number(train.transmitter_position)[:, None] - where).abs().double()
+    strongest = pool.rssi_dbm.nan_to_num(-torch.inf).topk(min(3, len(pool)), dim=0).indices
+    nearby = pool.transmitter_position[strongest].mean(dim=0)
+    receiver = pool.receiver_position.where(pool.receiver_located[:, None], nearby)
+    found = fit_path_losses(pool.transmitter_position, receiver, pool.rssi_dbm, crossed=crossed)
+    measured = pool.detected.sum(dim=0).double()
+    db = float(found.floor_db @ measured / measured.sum())
     number = dict(zip(pool.receiver_names, where.tolist(), strict=True))
     return FloorAttenuation(train.floors, tuple(number[name] for name in train.receiver_names), db)
 
@@ -288,10 +471,10 @@ def receiver_floors(data: Rssi) -> Tensor:
     """Return the floor of each receiver by its position, or by where its mean RSSI is strongest, int64 (R,)."""
     assert data.floors is not None
     floor, mean = data.floors.number(data.transmitter_position), []
+    rssi = data.rssi_dbm.nan_to_num(float(data.rssi_dbm[data.detected].min()))  # what was not received was weak
     for number in range(len(data.floors.names)):
-        rssi = data.rssi_dbm[floor == number]
-        enough = (~rssi.isnan()).sum(dim=0) >= 3
-        mean.append(rssi.nanmean(dim=0).where(enough, -torch.inf))
+        enough = data.detected[floor == number].sum(dim=0) >= 3
+        mean.append(rssi[floor == number].mean(dim=0).where(enough, -torch.inf))
     strongest = torch.stack(mean).argmax(dim=0)
     return data.floors.number(data.receiver_position.nan_to_num(0.0)).where(data.receiver_located, strongest)
 

@@ -24,8 +24,8 @@ from torch.nn import functional
 
 from swiftwrf.gp import Kernel
 from swiftwrf.rssi.head import HeadTable
-from swiftwrf.rssi.path_loss import harmonics, log_distance
-from swiftwrf.rssi.training import FEATURE_SCALE_DB, WEIGHT_TOLERANCE
+from swiftwrf.rssi.path_loss import N_HARMONICS, harmonics, log_distance
+from swiftwrf.rssi.training import WEIGHT_TOLERANCE, coefficient_scale, regressors
 
 MAX_NEW_ROWS = 256  # beyond, the weights of new rows are fixed and the inverses are computed again
 TOLERANCE = WEIGHT_TOLERANCE / 100  # of these weights, so that the order of the rows does not matter
@@ -36,11 +36,15 @@ class FitState:
     """Weighted least squares of R receivers in n location bins at the end of a fit.
 
     Args:
-        dual: Dual coefficients (n, R); 0 where not detected.
-        tangent: Slope of each head at the latent field, (n, R); 0 where not detected.
-        variance: Variance of the noise over the weight, (n, R) [dB^2]; 0 where not detected.
-        prior_level: Path-loss model that the fit started from, RSSI at 1 m, (R,) [dBm].
-        prior_slope: Its slope, (R,) [dB a decade]. A receiver of slope 0 has no regressor of the distance.
+        dual: Dual coefficients (n, R); 0 in bins that have no part in the fit.
+        tangent: Slope of each head at the latent field, (n, R); 0 there.
+        variance: Variance of the noise over the weight, (n, R) [dB^2]; 0 in bins that have no part in the fit.
+        measured: 1 where RSSI was measured and not only limited, (n, R).
+        prior_level: Prior path-loss model, RSSI at 1 m, (R,) [dBm].
+        prior_slope: Its slope, (R,) [dB a decade].
+        middle: log10 of the distance at which levels are compared, (R,).
+        level_std: Prior standard deviation of the level at that distance, (R,) [dB].
+        slope_std: Prior standard deviation of the slope, (R,) [dB a decade].
         field_variance: Prior variance of the latent field, (R,) [dB^2].
         noise_variance: Variance of one measurement, (R,) [dB^2].
     """
@@ -48,8 +52,12 @@ class FitState:
     dual: Tensor
     tangent: Tensor
     variance: Tensor
+    measured: Tensor
     prior_level: Tensor
     prior_slope: Tensor
+    middle: Tensor
+    level_std: Tensor
+    slope_std: Tensor
     field_variance: Tensor
     noise_variance: Tensor
 
@@ -65,7 +73,7 @@ class FitState:
     @classmethod
     def shapes(cls, n_receivers: int, n_bins: int) -> dict[str, tuple[int, ...]]:
         """Return the shape of each tensor in a file."""
-        rows = ("dual", "tangent", "variance")
+        rows = ("dual", "tangent", "variance", "measured")
         sizes = {field.name: (n_bins, n_receivers) if field.name in rows else (n_receivers,) for field in fields(cls)}
         return {f"fit.{name}": size for name, size in sizes.items()}
 
@@ -101,7 +109,7 @@ class NewRows:
         """Return no rows."""
         row = torch.zeros(n_receivers, 0, dtype=torch.float64)
         square, influence = row[..., None].expand(-1, 0, 0), torch.zeros(n_receivers, 0, n_bins)
-        gain = row.new_zeros(n_receivers, 0, len(FEATURE_SCALE_DB))
+        gain = row.new_zeros(n_receivers, 0, 2 + N_HARMONICS)
         return cls(row.new_zeros(0, 3), row, row, row, influence, gain, square, row, row)
 
     def solved(self, huber: float) -> NewRows:
@@ -137,7 +145,7 @@ class RssiPosterior:
 
     @cached_property
     def _feature(self) -> Tensor:
-        """Scaled regressors of the bins (R, n, k); 0 where not detected."""
+        """Scaled regressors of the bins (R, n, k); 0 in bins that have no part in the fit."""
         return self._regressors(self.anchor) * (self.state.variance > 0).T[..., None]
 
     @cached_property
@@ -162,16 +170,19 @@ class RssiPosterior:
 
     def _regressors(self, position: Tensor) -> Tensor:
         """Return the scaled regressors of level, slope and directivity at positions (m, 3), float64 (R, m, k)."""
-        distance, bearing = log_distance(position, self.receiver), harmonics(position, self.receiver)
-        distance = distance * (self.state.prior_slope < 0)
-        feature = torch.cat([torch.ones_like(distance)[..., None], distance[..., None], bearing], dim=-1)
-        return (feature * FEATURE_SCALE_DB).transpose(0, 1)
+        apart, bearing = log_distance(position, self.receiver), harmonics(position, self.receiver)
+        return regressors(apart, bearing, self.state.middle, self._prior_std)
+
+    @property
+    def _prior_std(self) -> Tensor:
+        return torch.stack([self.state.level_std, self.state.slope_std], dim=1)
 
     @property
     def linear(self) -> Tensor:
-        """Change of level, slope and directivity from the prior path-loss model, float64 (R, k) [dB]."""
+        """Change of level at 1 m, slope and directivity from the prior path-loss model, float64 (R, k) [dB]."""
         coefficient = self._fitted + self.new.gain.mT @ self.new.dual[..., None]
-        return coefficient[..., 0] * FEATURE_SCALE_DB
+        change = coefficient[..., 0] * coefficient_scale(self._prior_std)
+        return torch.cat([change[:, :1] - change[:, 1:2] * self.state.middle[:, None], change[:, 1:]], dim=1)
 
     def folded(self) -> RssiPosterior:
         """Return the fit with the new rows as rows of the fit, their weights fixed."""
@@ -182,6 +193,7 @@ class RssiPosterior:
             dual=torch.cat([dual, new.dual.T]),
             tangent=torch.cat([old.tangent, new.tangent.T]),
             variance=torch.cat([old.variance, (new.variance / new.weight).T]),
+            measured=torch.cat([old.measured, (new.variance > 0).T.to(old.measured)]),
         )
         anchor = torch.cat([self.anchor, new.position])
         return RssiPosterior(state, anchor, self.receiver, self.kernel, self.table, self.huber)
@@ -199,7 +211,7 @@ class RssiPosterior:
         fitted = state.prior_level + state.prior_slope * log_distance(self.anchor, self.receiver)
         fitted = fitted + (self._feature @ self._fitted)[..., 0].T
         fitted = fitted + self.table(latent)[0] - self.table(torch.zeros_like(latent))[0]
-        return (fitted + state.variance * state.dual).where(state.variance > 0, torch.nan)
+        return (fitted + state.variance * state.dual).where(state.measured > 0, torch.nan)
 
     def updated(self, position: Tensor, rssi: Tensor) -> RssiPosterior:
         """Return the posterior with more rows, RSSI (m, R) [dBm], nan where not detected, at positions (m, 3) [m]."""

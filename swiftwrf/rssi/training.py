@@ -19,23 +19,23 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.splits import MIN_TRAINING, folds
+from swiftwrf.data.splits import folds
 from swiftwrf.errors import FitError, InputError
 from swiftwrf.gp import GaussianProcess, Kernel, candidates, held_out_errors, subsample
 from swiftwrf.positions import cells
 from swiftwrf.rssi.base import RssiConfig
+from swiftwrf.rssi.detection import Detection, empty_given
 from swiftwrf.rssi.head import Head, HeadTable, render
-from swiftwrf.rssi.path_loss import N_HARMONICS, PathLoss, fit_path_loss, fit_shared_path_loss, harmonics, log_distance
+from swiftwrf.rssi.path_loss import N_HARMONICS, PathLoss, PathLosses, fit_path_losses, harmonics, log_distance
 from swiftwrf.runtime.threads import single_thread
 
 # variance of a packet relative to the variance of the field: fading is as large as shadowing
 RELATIVE_NOISE_VARIANCES = (0.3, 1.0, 2.0, 3.0)
 MAX_KERNEL_RECEIVERS = 12  # more do not change the chosen kernel or weights
-PATH_LOSS_STD_DB = 30.0  # prior of level and slope about their least squares: as good as none
-MAX_SLOPE_STD_DB = 10.0  # of a slope: path-loss exponents of 2 to 6 (Rappaport 2002, table 4.2) scatter no more
 DIRECTIVITY_STD_DB = 2.0  # prior of each harmonic of a receiver's antenna and surroundings
-# prior standard deviation of each coefficient that the regressors of level, slope and directivity are scaled by
-FEATURE_SCALE_DB = torch.tensor([PATH_LOSS_STD_DB] * 2 + [DIRECTIVITY_STD_DB] * N_HARMONICS, dtype=torch.float64)
+CERTAIN = 0.999  # probability of an empty cell by path loss alone, beyond which the cell tells nothing
+NO_SITE = 1e6  # variance of an empty cell that tells nothing [dB^2]
+DAMPING = 0.7  # of expectation propagation
 WEIGHT_TOLERANCE = 3e-3  # each weight is in (0, 1]
 LEVEL = 0.8  # nominal coverage of the interval that the standard deviation is calibrated for
 MAX_VARIANCE_POSITIONS = 200  # measured positions that determine where the field is known
@@ -75,7 +75,8 @@ class RssiTraining(Bins):
         kernel: Kernel of the latent field, lengths in [m].
         n_primitives: Number of primitives a receiver.
         rendered: Fields of each receiver's head, (R, 2, 2, directions).
-        prior_mean: Path-loss model of each receiver that its fit starts from, (R,).
+        path_loss: Path loss of the receivers, the prior of the fit.
+        limit: Upper limit in each empty cell that tells something, (n, R) [dBm], nan in all other cells.
         field_db: Prior standard deviation of the latent field, (R,) [dB].
         noise_db: Standard deviation of one measurement about it, (R,) [dB].
         baselines: Path-loss models of the simple predictors, (3, R): that of each receiver, that of all receivers, and the
@@ -86,7 +87,8 @@ class RssiTraining(Bins):
     kernel: Kernel
     n_primitives: int
     rendered: Tensor
-    prior_mean: PathLoss
+    path_loss: PathLosses
+    limit: Tensor
     field_db: Tensor
     noise_db: Tensor
     baselines: PathLoss
@@ -94,7 +96,9 @@ class RssiTraining(Bins):
 
 
 @single_thread()
-def prepare(train: Rssi, pool: Rssi, config: RssiConfig, like: RssiTraining | None = None) -> RssiTraining:
+def prepare(
+    train: Rssi, pool: Rssi, config: RssiConfig, like: RssiTraining | None = None, shift: Tensor | None = None
+) -> RssiTraining:
     """Average the rows by location bin, fit the path-loss models and choose the kernel.
 
     Args:
@@ -102,47 +106,60 @@ def prepare(train: Rssi, pool: Rssi, config: RssiConfig, like: RssiTraining | No
         pool: See `RssiModel.fit`.
         config: Options.
         like: Training data of the same pool whose kernel is taken. Defaults to a choice on held-out rows.
+        shift: Received power less RSSI of the pool, e.g. by floors that were removed, (rows, P) [dB]. Defaults to 0.
     """
     bins = binned(train, config)
-    rssi, fold, pool_rssi = bins.rssi, bins.fold, bin_locations(pool, config.max_locations)[1]
+    rssi, fold, every = bins.rssi, bins.fold, bin_locations(pool, config.max_locations)[1]
+    names, receiver = list(pool.receiver_names), pool.receiver_position.double() - bins.centre
+    own = torch.tensor([names.index(name) for name in train.receiver_names])
+    offset = torch.zeros_like(every) if shift is None else _bin_means(shift, bins.bin_of_row, len(fold))
+
+    def fit_baselines(rows: Tensor, detection: Detection | None = None) -> tuple[PathLosses, PathLoss]:
+        """Fit the simple predictors to some of the bins, the path loss of all receivers of the pool together."""
+        loss = fit_path_losses(bins.position[rows], receiver, every[rows], config.not_detected, offset[rows], detection)
+        mean = rssi[rows].nanmean(dim=0)
+        simple = loss.columns(own)
+        level = PathLoss(mean, torch.zeros_like(mean)).where(~mean.isnan(), simple.shared)
+        return loss, PathLoss(*(torch.stack(values) for values in zip(simple.own, simple.shared, level, strict=True)))
+
+    everything, baselines = fit_baselines(torch.ones_like(fold, dtype=torch.bool))
     distance = log_distance(bins.position, bins.receiver)
-    pool_distance = log_distance(bins.position, pool.receiver_position.double() - bins.centre)
-
-    def fit_baselines(rows: Tensor) -> PathLoss:
-        """Fit the simple predictors to some of the bins."""
-        detected = ~rssi[rows].isnan()
-        shared = fit_shared_path_loss(
-            pool_distance[rows], pool_rssi[rows], pool.receiver_located, train.receiver_located
-        )
-        own = fit_path_loss(distance[rows], rssi[rows]).where(detected.sum(dim=0) >= MIN_TRAINING, shared)
-        mean = PathLoss(rssi[rows].nanmean(dim=0), torch.zeros_like(own.slope)).where(detected.any(dim=0), shared)
-        return PathLoss(*(torch.stack(values) for values in zip(own, shared, mean, strict=True)))
-
-    baselines = fit_baselines(torch.ones_like(fold, dtype=torch.bool))
     held_out = torch.empty(3, *distance.shape, dtype=torch.float64)
     for number in fold.unique():
         out = fold == number
-        held_out[:, out] = fit_baselines(~out)(distance[out])
-    own = PathLoss(*(values[0] for values in baselines))
-    pool_residual = pool_rssi - fit_path_loss(pool_distance, pool_rssi)(pool_distance)
+        held_out[:, out] = fit_baselines(~out, everything.detection)[1](distance[out])
+    pool_residual = every - everything.own(log_distance(bins.position, receiver))
     if like is None:
         kernel, helps = choose_residual_kernel(bins.position, pool_residual, fold, train.floors is not None)
         n_primitives = config.n_primitives if helps else 0
     else:
         kernel, n_primitives = like.kernel, like.n_primitives
-    field_db, noise_db = prior_std(rssi - own(distance), pool_residual, kernel if n_primitives else None)
+    loss = everything.columns(own)
+    field_db, noise_db = prior_std(loss.variance, kernel if n_primitives else None)
     heads = [Head(name, n_primitives, config.seed).requires_grad_(False) for name in bins.receiver_names]
     return RssiTraining(
         **vars(bins),
         kernel=kernel,
         n_primitives=n_primitives,
         rendered=render(heads),
-        prior_mean=own,
+        path_loss=loss,
+        limit=_limits(rssi, loss, distance, offset[:, own]),
         field_db=field_db,
         noise_db=noise_db,
         baselines=baselines,
         baseline_held_out=held_out,
     )
+
+
+def _limits(rssi: Tensor, loss: PathLosses, distance: Tensor, offset: Tensor) -> Tensor:
+    """Return the upper limit in each empty cell (n, R) [dBm] that tells something beyond the path loss; nan elsewhere."""
+    if loss.detection is None:
+        return torch.full_like(rssi, torch.nan)
+    limit = loss.detection.limit - offset
+    std = (loss.variance + loss.detection.width**2).sqrt()
+    tells = torch.special.ndtr((limit - loss.own(distance)) / std) < CERTAIN
+    received = (~rssi.isnan()).any(dim=0)
+    return limit.where(rssi.isnan() & tells & loss.detection.is_limit & received, torch.nan)
 
 
 def binned(train: Rssi, config: RssiConfig) -> Bins:
@@ -162,43 +179,81 @@ def binned(train: Rssi, config: RssiConfig) -> Bins:
     )
 
 
-def prior_std(residual: Tensor, pool_residual: Tensor, kernel: Kernel | None) -> tuple[Tensor, Tensor]:
-    """Return prior standard deviations (R,) [dB] of latent field and noise, whose variances sum to that of the residuals.
+def prior_std(variance: Tensor, kernel: Kernel | None) -> tuple[Tensor, Tensor]:
+    """Return prior standard deviations (R,) [dB] of latent field and noise, whose variances sum to those given, (R,) [dB^2].
 
-    Args:
-        residual: Residuals of the prior mean (n, R) [dB], nan where not detected.
-        pool_residual: Those of the pool (n, P) [dB], for a receiver without measurements.
-        kernel: Kernel, whose noise is relative to the field. None without a field.
+    The noise of the kernel is relative to the field. Without a field the kernel is None.
     """
-    common = float(pool_residual.square().nanmean())
-    variance = residual.square().nanmean(dim=0).nan_to_num(common).clamp_min(1e-6)
     noise = 1.0 if kernel is None else kernel.noise / (1 + kernel.noise)
     return ((1 - noise) * variance).sqrt(), (noise * variance).sqrt()
 
 
-def interval_scale(
-    bins: Bins, kernel: Kernel, prior_db: tuple[Tensor, Tensor], predicted: Tensor, train: Rssi
+class Uncertainty:
+    """Variance of what n measured positions leave open: of the latent field, and of the path loss as a trend beside it.
+
+    The trend is that of universal kriging (N. Cressie, "Statistics for Spatial Data", revised ed., 1993, section 3.4): a
+    level or slope that the rows determine badly counts where the field does not follow from rows nearby.
+
+    Args:
+        kernel: Kernel of the latent field.
+        known: Measured positions less the centre, (n, 3) [m]; 200 of them count.
+        receiver: Positions of the receivers less the centre, (R, 3) [m].
+        middle: log10 of the distance at which levels are compared, (R,).
+        covariance: Covariance of level and slope of each receiver, (R, 2, 2).
+    """
+
+    def __init__(self, kernel: Kernel, known: Tensor, receiver: Tensor, middle: Tensor, covariance: Tensor) -> None:
+        (known,) = subsample(known, rows=MAX_VARIANCE_POSITIONS)
+        self._receiver, self._middle, self._covariance = receiver, middle, covariance
+        self._process = GaussianProcess.regress(kernel, known, self._trend(known))
+
+    def _trend(self, position: Tensor) -> Tensor:
+        """Return the regressors of level, and of the slope of each receiver, (n, 1 + R)."""
+        apart = log_distance(position, self._receiver) - self._middle
+        return torch.cat([torch.ones_like(apart[:, :1]), apart], dim=1)
+
+    def __call__(self, position: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the variance of the field (m,), relative to that far from all rows, and of the trend, (m, R) [dB^2]."""
+        level, slope = (self._trend(position) - self._process.mean(position)).split([1, len(self._middle)], dim=1)
+        of_level, both, of_slope = self._covariance[:, 0, 0], self._covariance[:, 0, 1], self._covariance[:, 1, 1]
+        trend = of_level * level.square() + 2 * both * level * slope + of_slope * slope.square()
+        return self._process.variance(position), trend.clamp_min(0)
+
+
+def held_out_std(
+    bins: Bins, kernel: Kernel, prior_db: tuple[Tensor, Tensor], middle: Tensor, covariance: Tensor
 ) -> Tensor:
+    """Return the standard deviations (n, R) [dB] that models without a bin's fold predict, before they are calibrated.
+
+    Args:
+        bins: Training rows by location bin.
+        kernel: Kernel of the latent field.
+        prior_db: Standard deviations of latent field and noise, each (R,) [dB].
+        middle: See `Uncertainty`.
+        covariance: See `Uncertainty`.
+    """
+    (field_db, noise_db), std = prior_db, torch.empty_like(bins.rssi)
+    for number in bins.fold.unique():
+        out = bins.fold == number
+        variance, trend = Uncertainty(kernel, bins.position[~out], bins.receiver, middle, covariance)(
+            bins.position[out]
+        )
+        std[out] = (noise_db.square() + field_db.square() * variance[:, None] + trend).sqrt()
+    return std
+
+
+def interval_scale(predicted: Tensor, std: Tensor, measured: Tensor) -> Tensor:
     """Return the factors (R,) of the standard deviations with which the 80 % intervals hold 80 % of the held-out rows.
 
     The interval is cross-conformal (V. Vovk, Annals of Mathematics and Artificial Intelligence 74, 2015): the error of each
     row is divided by the standard deviation that a model without the row's fold predicts.
 
     Args:
-        bins: Training rows by location bin.
-        kernel: Kernel of the latent field.
-        prior_db: Standard deviations of latent field and noise, each (R,) [dB].
-        predicted: Held-out predictions of the bins (n, R) [dBm], nan where there is none.
-        train: Training rows.
+        predicted: Held-out predictions of the rows (n, R) [dBm], nan where there is none.
+        std: Their standard deviations (n, R) [dB].
+        measured: Measurements of the rows, (n, R) [dBm].
     """
-    variance = torch.empty(len(bins.position), dtype=torch.float64)
-    for number in bins.fold.unique():
-        out = bins.fold == number
-        (known,) = subsample(bins.position[~out], rows=MAX_VARIANCE_POSITIONS)
-        variance[out] = GaussianProcess(kernel, known).variance(bins.position[out])
-    field_db, noise_db = prior_db
-    std = (noise_db.square() + field_db.square() * variance[:, None]).sqrt()
-    score = ((train.rssi_dbm - predicted[bins.bin_of_row]) / std[bins.bin_of_row]).abs()
+    score = ((measured - predicted) / std).abs()
     finite = score.where(score.isfinite(), torch.nan)
     quantile = finite.nanquantile(LEVEL, dim=0)
     few = (~finite.isnan()).sum(dim=0) < 30  # scores of all receivers count
@@ -260,15 +315,18 @@ def bin_locations(rows: Rssi, max_locations: int) -> tuple[Tensor, Tensor, Tenso
     if len(position) > max_locations:
         bin_of_row = cells(position, max_locations)[0]
     n = int(bin_of_row.max()) + 1
+    count = _bin_sums((~rows.rssi_dbm.isnan()).double(), bin_of_row, n)
+    rssi = _bin_sums(rows.rssi_dbm.nan_to_num(), bin_of_row, n) / count  # 0 / 0 is nan: not detected
+    return _bin_means(position, bin_of_row, n), rssi, count, bin_of_row
 
-    def mean(values: Tensor) -> tuple[Tensor, Tensor]:
-        total, count = (
-            torch.zeros(n, values.shape[1], dtype=torch.float64).index_add(0, bin_of_row, x.double())
-            for x in (values.nan_to_num(), ~values.isnan())
-        )
-        return total / count, count  # 0 / 0 is nan: not detected
 
-    return mean(position)[0], *mean(rows.rssi_dbm), bin_of_row
+def _bin_sums(values: Tensor, bin_of_row: Tensor, n: int) -> Tensor:
+    """Return the sums of values (rows, c) in n bins, float64 (n, c)."""
+    return torch.zeros(n, values.shape[1], dtype=torch.float64).index_add(0, bin_of_row, values.double())
+
+
+def _bin_means(values: Tensor, bin_of_row: Tensor, n: int) -> Tensor:
+    return _bin_sums(values, bin_of_row, n) / bin_of_row.bincount(minlength=n)[:, None]
 
 
 def choose_residual_kernel(
@@ -325,104 +383,179 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
         Tensors by name, with R = 1.
 
         - level (R,) [dBm], slope (R,) [dB a decade] and directivity (R, 8) [dB].
-        - prior_level and prior_slope (R,), where the fit starts; slope 0 and no regressor of distance if RSSI rises with it.
-        - slope_std (R,), the posterior standard deviation of the slope [dB a decade].
+        - covariance (R, 2, 2) of level and slope, given the rows.
+        - prior_level, prior_slope and prior_std (R,), (R,), (R, 2): the prior path loss. If RSSI would rise with the
+          distance, slope and its standard deviation are 0.
         - coefficient (R, n) of the kernel to the bins, whose sum is the latent field [dB].
         - dual, tangent and variance (R, n). See `posterior.FitState`.
         - rendered fields of the heads (R, 2, 2, directions).
-        - held_out (R, n), predictions of detected bins by all other folds [dBm].
+        - held_out (R, n), predictions of the bins of the fit by all other folds [dBm].
 
     Raises:
         FitError: A system that cannot be solved, for positions or values beyond any measurement.
     """
-    rssi, receiver = data.rssi[:, some][:, 0], data.receiver[some]
-    prior_mean = PathLoss(data.prior_mean.level[some], data.prior_mean.slope[some])
-    distance, bearing = log_distance(data.position, receiver), harmonics(data.position, receiver)[:, 0]
-    detected = (~rssi.isnan()).nonzero()[:, 0]
-    feature = torch.cat([torch.ones_like(distance), distance, bearing], dim=1) * FEATURE_SCALE_DB
-    error, linear, spread = torch.zeros_like(rssi), torch.zeros_like(FEATURE_SCALE_DB), distance.any().double()
-    dual, tangent, noise = (torch.zeros_like(rssi) for _ in range(3))
-    variance = float(data.field_db[some]) ** 2
-    if len(detected):
-        position = data.position[detected].to(device)
-        covariance = variance * data.kernel(position, position)
-        noise_db = (data.noise_db[some] / data.count[detected, some][:, 0].sqrt()).to(device)
-        rest = covariance, noise_db, HeadTable(data.rendered[some].to(device)), config.huber
+    rssi, receiver, limit = data.rssi[:, some][:, 0], data.receiver[some], data.limit[:, some][:, 0]
+    loss = data.path_loss.columns(torch.arange(len(data.receiver_names))[some])
+    prior, std = loss.shared, loss.std[0].clone()
+    distance = log_distance(data.position, receiver)
+    used = (~rssi.isnan() | ~limit.isnan()).nonzero()[:, 0]
+    n_used = len(used) if bool((~rssi.isnan()).any()) else 0
+    used = used[:n_used]
+    error, dual, tangent, variance = (torch.zeros_like(rssi) for _ in range(4))
+    feature = regressors(distance, harmonics(data.position, receiver), loss.centre, std[None])[0]
+    linear, covariance = torch.zeros(feature.shape[1]).double(), std.square().diag()
+    if n_used:
+        at, weak = data.position[used].to(device), limit[used].isnan().logical_not()
+        prior_covariance = float(data.field_db[some]) ** 2 * data.kernel(at, at)
+        noise_db = (data.noise_db[some] / data.count[used, some][:, 0].clamp_min(1).sqrt()).to(device)
+        detection = loss.detection
+        censored = None if detection is None or not weak.any() else (detection.width, float(detection.missed))
+        rest = prior_covariance, noise_db, HeadTable(data.rendered[some].to(device)), config.huber, censored
 
-        def solved(prior: PathLoss) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-            residual = rssi - prior(distance)[:, 0]
-            return solve(residual[detected].to(device), feature[detected].to(device), *rest)
+        def solved() -> tuple[Tensor, ...]:
+            value = (rssi.where(limit.isnan(), limit) - prior(distance)[:, 0])[used].to(device)
+            return solve(value, weak.to(device), feature[used].to(device), *rest)
 
         try:
-            *found, factor = solved(prior_mean)
-            along = feature[detected, 1].to(device)
-            spread *= (1 - along @ torch.cholesky_solve(along[:, None], factor)[:, 0]).clamp(0, 1).sqrt().cpu()
-            start = float(prior_mean.slope)
-            if bool(along.any()) and (start == 0 or start + PATH_LOSS_STD_DB * float(found[0] @ along) > 0):
-                prior_mean, feature[:, 1] = PathLoss(rssi.nanmean().reshape(1), torch.zeros(1).double()), 0.0
-                *found, factor = solved(prior_mean)
-            error[detected] = fold_errors(factor, found[0], data.fold[detected].to(device)).cpu()
+            *found, factor = solved()
+            slope = float(prior.slope + std[1] * (found[0].cpu() @ feature[used, 1]))
+            if slope > 0:
+                middle = prior.level + prior.slope * loss.centre
+                prior, std[1], feature[:, 1] = PathLoss(middle, torch.zeros(1).double()), 0.0, 0.0
+                *found, factor = solved()
+            trend = feature[used, :2].to(device)
+            open_ = torch.eye(2).double() - (trend.T @ torch.cholesky_solve(trend, factor)).cpu()
+            covariance = std[:, None] * open_ * std
+            error[used] = fold_errors(factor, found[0], data.fold[used].to(device)).cpu()
         except torch.linalg.LinAlgError as reason:  # type: ignore[attr-defined]
             raise FitError(
                 f"the RSSI fit of receiver {data.receiver_names[some][0]!r} broke ({reason}); are its values sane?"
             ) from None
-        dual[detected], tangent[detected], noise[detected] = (x.cpu() for x in found)
-        linear = FEATURE_SCALE_DB * (dual @ feature)
+        dual[used], tangent[used], variance[used], target = (x.cpu() for x in found)
+        linear = dual @ feature * coefficient_scale(std[None])[0]
+        error[used] -= target  # prediction less prior
     return {
-        "level": prior_mean.level + linear[0],
-        "slope": prior_mean.slope + linear[1],
-        "prior_level": prior_mean.level,
-        "prior_slope": prior_mean.slope,
-        "slope_std": (PATH_LOSS_STD_DB * spread).clamp_max(MAX_SLOPE_STD_DB)[None],
+        "level": prior.level + linear[0] - linear[1] * loss.centre,
+        "slope": prior.slope + linear[1],
+        "covariance": covariance[None],
+        "prior_level": prior.level,
+        "prior_slope": prior.slope,
+        "prior_std": std[None],
         "directivity": linear[None, 2:],
-        "coefficient": variance * (tangent * dual)[None],
+        "coefficient": float(data.field_db[some]) ** 2 * (tangent * dual)[None],
         "dual": dual[None],
         "tangent": tangent[None],
-        "variance": noise[None],
+        "variance": variance[None],
         "rendered": data.rendered[some],
-        "held_out": (rssi.nan_to_num() - error)[None],
+        "held_out": (prior(distance)[:, 0] - error).where(variance > 0, torch.nan)[None],
     }
 
 
-def solve(
-    residual: Tensor, feature: Tensor, covariance: Tensor, noise_db: Tensor, table: HeadTable, huber: float
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Fit residual = feature b + head(c) + noise in n bins, with b standard normal and c of a given covariance.
+def coefficient_scale(std: Tensor) -> Tensor:
+    """Return the prior standard deviations (R, 10) of level, slope and directivity; see `PathLosses.std`."""
+    return torch.cat([std, std.new_full((len(std), N_HARMONICS), DIRECTIVITY_STD_DB)], dim=1)
+
+
+def regressors(distance: Tensor, bearing: Tensor, middle: Tensor, std: Tensor) -> Tensor:
+    """Return the regressors of level, slope and directivity, scaled by the standard deviations of their coefficients.
 
     Args:
-        residual: RSSI less the prior mean, (n,) [dB].
+        distance: log10 of the distances [m], (n, R).
+        bearing: Harmonics of the directions, (n, R, 8).
+        middle: log10 of the distance at which levels are compared, (R,).
+        std: Prior standard deviation of level and slope, (R, 2).
+
+    Returns:
+        float64 (R, n, 10).
+    """
+    apart = (distance - middle)[..., None]
+    feature = torch.cat([torch.ones_like(apart), apart, bearing], dim=-1) * coefficient_scale(std)
+    return feature.transpose(0, 1)
+
+
+def solve(
+    value: Tensor,
+    weak: Tensor,
+    feature: Tensor,
+    covariance: Tensor,
+    noise_db: Tensor,
+    table: HeadTable,
+    huber: float,
+    censored: tuple[float, float] | None = None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Fit value = feature b + head(c) + noise in n bins, with b standard normal and c of a given covariance.
+
+    An upper limit enters as a value and a variance that match the moments of its likelihood (expectation propagation: C. E.
+    Rasmussen and C. K. I. Williams, "Gaussian Processes for Machine Learning", 2006, section 3.6).
+
+    Args:
+        value: RSSI, or its upper limit, less the prior mean, (n,) [dB].
+        weak: Whether a value is an upper limit, bool (n,).
         feature: Scaled regressors, (n, k).
         covariance: Covariance of the latent field c, (n, n) [dB^2].
         noise_db: Standard deviation of the noise, (n,) [dB].
         table: Head of the receiver.
         huber: See `RssiConfig`.
+        censored: Width of the limits [dB] and share of random misses. None without limits.
 
     Returns:
         Dual coefficients (n,), i.e. the inverse covariance of the data times the data; the slope of the tangent (n,); the
-        variance of the noise over the weights (n,) [dB^2]; the Cholesky factor of the covariance of the data (n, n).
+        variance of the noise over the weights (n,) [dB^2]; the values, with those in place of limits, (n,) [dB]; the
+        Cholesky factor of the covariance of the data (n, n).
     """
-    zero = table(torch.zeros(1, 1, dtype=torch.float64, device=residual.device))[0][0, 0]
-    weight, latent = torch.ones_like(residual), torch.zeros_like(residual)
+    zero = table(torch.zeros(1, 1, dtype=torch.float64, device=value.device))[0][0, 0]
+    weight, latent = torch.ones_like(value), torch.zeros_like(value)
+    target, noise = value.where(~weak, 0.0), noise_db.square()
+    precision, pull = torch.zeros_like(value), torch.zeros_like(value)  # of the sites of empty cells
     step, last = 1.0, math.inf
     for _ in range(30):
         head, slope = (x[:, 0] for x in table(latent[:, None]))
-        target = residual - (head - zero) + slope * latent
-        variance = noise_db.square() / weight
+        tangent = slope * latent - (head - zero)
+        variance = (noise / weight).where(~weak, 1 / precision.clamp_min(1 / NO_SITE))
         whole = (slope[:, None] * covariance).mul_(slope).addmm_(feature, feature.T)
         whole.diagonal().add_(variance)
         factor = torch.linalg.cholesky(whole)
-        dual = torch.cholesky_solve(target[:, None], factor)[:, 0]
+        used, dual = target, torch.cholesky_solve((target + tangent)[:, None], factor)[:, 0]
         change = covariance @ (slope * dual) - latent
         mean_change = float(change.abs().mean())
         if mean_change > 0.9 * last:  # oscillates where the head bends
             step /= 2
         latent, last = latent + step * change, mean_change
         previous, error = weight, (variance * dual).abs()  # of the data about the tangent
-        weight = (huber * noise_db / error.clamp_min(1e-12)).clamp_max(1)
+        weight = (huber * noise_db / error.clamp_min(1e-12)).clamp_max(1).where(~weak, 1.0)
         settled = float((weight - previous).abs().max()) < WEIGHT_TOLERANCE
+        if censored is not None:
+            own = torch.cholesky_inverse(factor).diagonal()
+            left_mean, left = used - dual / own, (1 / own - variance).clamp_min(1e-6)  # without the cell itself
+            site = _site(left_mean, left, value, noise, censored)
+            moved = DAMPING * (site - torch.stack([precision, pull])).where(weak, 0.0)
+            precision, pull = precision + moved[0], pull + moved[1]
+            told = precision > 1 / NO_SITE
+            previous, target = target, (pull / precision.clamp_min(1e-9)).where(told & weak, value.where(~weak, 0.0))
+            settled &= float(((target - previous) * precision.sqrt())[weak].abs().mean()) < 0.02
         if settled and (step == 1 or mean_change < 0.1):
             break
-    return dual, slope, variance, factor
+    return dual, slope, variance, used, factor
+
+
+def _site(mean: Tensor, variance: Tensor, limit: Tensor, noise: Tensor, censored: tuple[float, float]) -> Tensor:
+    """Return precision and precision times value, (2, n), that match the likelihood of empty cells; 0 if not concave.
+
+    Args:
+        mean: Mean of each value by all others, (n,) [dB].
+        variance: Its variance without noise [dB^2].
+        limit: Upper limits [dB].
+        noise: Variance of the noise [dB^2].
+        censored: See `solve`.
+    """
+    width, missed = censored
+    std = (variance + noise + width**2).sqrt()
+    z = (limit - mean) / std
+    first = -empty_given(z, torch.tensor(missed, dtype=torch.float64, device=z.device))[0] / std  # derivatives of log p
+    second = z * first / std - first.square()
+    concave = (second < 0) & (1 + second * variance > 1e-3)
+    found = torch.stack([-second, first - mean * second]) / (1 + second * variance)
+    return found.where(concave, 0.0)
 
 
 def fold_errors(factor: Tensor, dual: Tensor, fold: Tensor) -> Tensor:

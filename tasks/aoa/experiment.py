@@ -22,10 +22,13 @@ from swiftwrf.runtime.steps import Step
 from tasks.aoa.options import AoaConfig
 from tasks.aoa.page import page
 from tasks.aoa.page.summary import answer
+from tasks.directory import Run
+from tasks.environment import choose_device
 from tasks.metrics import AoaMetrics
+from tasks.options import TableSource
 from tasks.page.page import reporting
 from tasks.page.records import Records
-from tasks.run import Row, Run, choose_device
+from tasks.records import Row
 from tasks.source import located, reading
 from tasks.steps import run_steps
 from tasks.terminal import console, terminal
@@ -108,7 +111,7 @@ def measurements(config: AoaConfig) -> Spectra:
     """
     if config.data is None:
         return simulated_room(seed=config.seed, moving=config.moving or "transmitter")
-    return load_spectra(located(config.data), **reading(config).given)
+    return load_spectra(located(config.data), **reading(config.spectra, TableSource()).given)
 
 
 def _show(experiment: Experiment, step: Step[Experiment], value: Row) -> None:

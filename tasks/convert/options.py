@@ -8,14 +8,15 @@ from typing import Annotated
 import tyro
 
 from swiftwrf.errors import InputError
-from tasks.options import SpectraSource, TableSource, command_options
+from swiftwrf.runtime.validation import PositiveFloat
+from tasks.options import Answered, Options, Seed, SpectraSource, TableSource, options
 
 FILES = (".csv", ".mat", ".tif", ".geojson", ".png")  # suffixes of files; other names are directories
 MAPS = (".tif", ".geojson", ".png")  # suffixes of files that hold a map only
 
 
-@command_options
-class ConvertConfig(SpectraSource, TableSource):
+@options
+class ConvertConfig(Options):
     """Convert measurements and RSSI maps: OUT is a directory in the toolkit's own layout, or a file.
 
     SOURCE is measurements of any known format (see docs/formats.md), the directory of a run of tasks.rssi or tasks.locate,
@@ -37,16 +38,19 @@ class ConvertConfig(SpectraSource, TableSource):
     and to correct them"""
     split: str | None = None
     """with --calibrate: split whose training part is used (default: random); it is written beside the spectra"""
-    seed: int = 0
+    seed: Seed = 0
     """seed of that split"""
     deepmimo: bool = False
     """write ray paths (paths.npz) as a folder of DeepMIMO v4"""
     rx: tuple[str, ...] = ()
     """receivers of the map, names or numbers counted from 1 (default: all); a .png shows the strongest of them"""
-    cell: float | None = None
+    cell: PositiveFloat | None = None
     """edge of the map's cells [m] (default: 1/120 of the longer side)"""
     height: float | None = None
     """height of the transmitter on the map [m] (default: the median of the training positions)"""
+    output: Answered = Answered()
+    spectra: SpectraSource = SpectraSource()
+    table: TableSource = TableSource()
 
     @property
     def suffix(self) -> str:
@@ -62,5 +66,3 @@ class ConvertConfig(SpectraSource, TableSource):
             raise InputError(f"--deepmimo writes a folder; give a directory instead of {self.out}")
         if self.calibrate and (self.suffix or self.deepmimo):
             raise InputError("--calibrate writes a directory in the toolkit's own layout; give another OUT")
-        if self.cell is not None and self.cell <= 0:
-            raise InputError(f"--cell must be above 0 m, got {self.cell:g}")

@@ -20,7 +20,7 @@ from swiftwrf.runtime.durable import replacing
 from tasks.claim import CONFIG, model_file
 from tasks.convert.options import MAPS, ConvertConfig
 from tasks.environment import command
-from tasks.page.raster import colour_image
+from tasks.page.maps import colour_image
 from tasks.records import rounded, write_table
 
 WORLD_FILE = ".pgw"  # suffix beside a .png

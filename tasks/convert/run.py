@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -19,8 +19,9 @@ from tasks.convert.options import FILES, ConvertConfig
 from tasks.convert.outputs import map_of, saved_model, write_file
 from tasks.directory import check_new_file, new_directory
 from tasks.environment import invocation
+from tasks.options import plain
 from tasks.source import located, reading
-from tasks.terminal import console
+from tasks.terminal import console, terminal
 
 
 def run(config: ConvertConfig) -> None:
@@ -34,11 +35,15 @@ def run(config: ConvertConfig) -> None:
         with new_directory(Path(config.out), "a directory") as folder:
             paths = read_paths(source)
             write_deepmimo(paths, folder)
-        print(f"{len(paths.count)} receivers with {len(paths.gain)} paths: {config.out}")
+        _answer(config, f"{len(paths.count)} receivers with {len(paths.gain)} paths")
     elif (model := saved_model(source)) is not None or config.suffix:
         _write_new_file(config, model)
     else:
         _write_directory(config)
+
+
+def _answer(config: ConvertConfig, written: str) -> None:
+    terminal.page({"written": written, "out": config.out}, f"{written}: {config.out}")
 
 
 def _write_new_file(config: ConvertConfig, model: RssiModel | None) -> None:
@@ -51,16 +56,20 @@ def _write_new_file(config: ConvertConfig, model: RssiModel | None) -> None:
         raise InputError(
             f"--rx, --cell and --height are for maps of RSSI models, but {config.source} holds measurements"
         )
-    if model is not None and (options := reading(config).given):
+    if model is not None and (options := reading(config.spectra, config.table).given):
         raise InputError(f"{config.source} is a model; --{next(iter(options)).replace('_', '-')} is for measurements")
     check_new_file(out)
-    data = _spectra_or_rssi(_read(config), reading(config)) if model is None else map_of(model, config)
-    print(f"{write_file(data, out)}: {out}")
+    data = (
+        _spectra_or_rssi(_read(config), reading(config.spectra, config.table))
+        if model is None
+        else map_of(model, config)
+    )
+    _answer(config, write_file(data, out))
 
 
 def _read(config: ConvertConfig) -> Spectra | Snapshots | Rssi:
     data: Spectra | Snapshots | Rssi = read(
-        located(config.source), reading(config), SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS
+        located(config.source), reading(config.spectra, config.table), SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS
     )
     return data
 
@@ -70,7 +79,7 @@ def _spectra_or_rssi(data: Spectra | Snapshots | Rssi, options: ReadOptions) -> 
 
 
 def _write_directory(config: ConvertConfig) -> None:
-    options = reading(config)
+    options = reading(config.spectra, config.table)
     with new_directory(Path(config.out), "a directory") as folder:
         data = _read(config)
         found = None
@@ -81,13 +90,13 @@ def _write_directory(config: ConvertConfig) -> None:
         written = _write(data, options, folder)
         record = {
             "command": invocation("convert"),
-            "options": asdict(config),
+            "options": plain(config),
             "source_sha256": data.source,
             "notes": data.notes,
             "calibration": found.to_json() if found else None,
         }
         write_json(folder / "conversion.json", record)
-    print(f"{written}: {config.out}")
+    _answer(config, written)
 
 
 def _calibrated(data: Spectra | Snapshots | Rssi, config: ConvertConfig) -> tuple[Snapshots, Calibration]:

@@ -6,11 +6,11 @@ from typing import Annotated
 
 import tyro
 
-from tasks.options import Output, SpectraSource, TableSource, command_options
+from tasks.options import Options, Output, SpectraSource, TableSource, options
 
 
-@command_options
-class InspectConfig(SpectraSource, TableSource, Output):
+@options
+class InspectConfig(Options):
     """Inspect measurements of any known format: counts, extents, neighbours, frames, calibration, suspicious columns.
 
     Example: python -m tasks.inspect DIR
@@ -20,3 +20,6 @@ class InspectConfig(SpectraSource, TableSource, Output):
     """folder or file of measurements, or name of a public data set"""
     out: str | None = None
     """directory of the page; must not exist (default: a new one under runs/inspect)"""
+    output: Output = Output()
+    spectra: SpectraSource = SpectraSource()
+    table: TableSource = TableSource()

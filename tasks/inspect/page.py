@@ -38,23 +38,26 @@ def page(findings: Findings, kind: str, source: str) -> Page:
     data, warnings = findings.data, findings.warnings
     rows = [[finding.level, finding.text] for finding in findings.sentences]
     table = Table(["level", "finding"], rows, strong=frozenset(["warning"]), long=True)
-    plan, *plots = _rssi(data) if isinstance(data, Rssi) else _spectra(data)
-    position = data.transmitter_position if isinstance(data, Rssi) else data.position
+    if isinstance(data, Rssi):
+        position, task = data.transmitter_position, ("rssi", "--rx", "all")
+        plots = [_floor(data), *([_against_distance(data)] if data.located else []), _detected(data)]
+    else:
+        position, task = data.position, ("aoa", "--mix", "0.3")
+        plots = [_plan(data), _directions(data), *([_neighbours(data)] if len(data) > 1 else [])]
     extent = " x ".join(f"{side:.2f}" for side in (position.amax(dim=0) - position.amin(dim=0)).tolist())
     numbers = [
         Number(str(len(warnings)), "warning" if len(warnings) == 1 else "warnings"),
         Number(str(len(data)), f"measurements, read as {kind}"),
         Number(f"{extent} m", "extent of the positions, x by y by z"),
     ]
-    task = ("rssi", "--rx", "all") if isinstance(data, Rssi) else ("aoa", "--mix", "0.3")
     mend = [f"Correct the warnings and inspect again: `{command('inspect', source)}`."] if warnings else []
     steps = [*mend, f"Go on with `{command(*task, '--data', source)}`."]
     meaning = warnings or ["Nothing looks wrong. Errors that the files alone do not reveal remain possible."]
     conclusion = _fingerprinting(data) if isinstance(data, Spectra) else ""
     return Page(
         f"Inspection: {data.name}",
-        Summary(numbers, [plan], meaning, steps, conclusion),
-        [Section("Findings", tables=[table]), Section("Figures", plots=plots)],
+        Summary(numbers, plots[:1], meaning, steps, conclusion),
+        [Section("Findings", tables=[table]), Section("Figures", plots=plots[1:])],
     )
 
 
@@ -67,14 +70,6 @@ def _fingerprinting(data: Spectra) -> str:
     mean = torch.nn.functional.normalize(line.mean(dim=0), dim=0)
     spread, error = angular_distance(mean.expand_as(line), line), angular_distance(peak, line)
     return fingerprinting(*(float(angle.nanmedian().rad2deg()) for angle in (spread, error)))
-
-
-def _spectra(data: Spectra) -> list[Plot]:
-    return [_plan(data), _directions(data), *([_neighbours(data)] if len(data) > 1 else [])]
-
-
-def _rssi(data: Rssi) -> list[Plot]:
-    return [_floor(data), *([_against_distance(data)] if data.located else []), _detected(data)]
 
 
 def _places(position: Tensor, **columns: Tensor) -> DataFrame:

@@ -25,7 +25,7 @@ def run(config: InspectConfig) -> None:
     Raises:
         InputError: Measurements that cannot be read.
     """
-    source, options = located(config.source), reading(config)
+    source, options = located(config.source), reading(config.spectra, config.table)
     out = Path(config.out) if config.out else Path("runs") / "inspect" / stamp()
     with new_directory(out, "an inspection") as folder:
         data = read(source, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS)

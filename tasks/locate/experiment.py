@@ -6,6 +6,8 @@ from pathlib import Path
 
 from swiftwrf import Rssi, rssi_room
 from swiftwrf.locate.comparison import LocateComparison, LocateSplit, Trial
+from tasks.directory import Run
+from tasks.environment import choose_device
 from tasks.locate.options import LocateConfig
 from tasks.locate.page import page
 from tasks.locate.page.summary import answer
@@ -13,7 +15,6 @@ from tasks.locate.steps import Localization
 from tasks.metrics import LocateMetrics, StudyMetrics
 from tasks.page.page import reporting
 from tasks.page.records import Records
-from tasks.run import Run, choose_device
 from tasks.source import measured_rssi, split_notes
 from tasks.steps import run_steps
 from tasks.terminal import console, terminal
@@ -30,7 +31,7 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
     data = measurements(config)
     for note in data.notes:
         console.print(f"{data.name}: {note}")
-    measured = LocateSplit.of(data, config.split, config.cells, config.seed, config.reference)
+    measured = LocateSplit.of(data, config.split, config.cells, config.seed, config.table.reference)
     if measured.n_undetected:
         console.print(f"{data.name}: test rows that no receiver detected are left out: {measured.n_undetected}")
     if measured.train.offsets is not None:
@@ -58,7 +59,7 @@ def measurements(config: LocateConfig) -> Rssi:
     Raises:
         InputError: The data cannot be read, or have no such receiver.
     """
-    measured = measured_rssi(config.data, config)
+    measured = measured_rssi(config.data, config.table)
     return (rssi_room(seed=config.seed) if measured is None else measured).receivers(config.rx)
 
 

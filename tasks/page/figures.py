@@ -6,6 +6,7 @@ import io
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import matplotlib.style
@@ -17,9 +18,12 @@ from matplotlib.transforms import Bbox
 from numpy.typing import ArrayLike
 from pandas import DataFrame
 
-from tasks.page.palette import DASHES, MAX_CURVES, Palette
+from tasks.labels import OTHER_COLOURS, Label
 from tasks.summarise import pareto
 
+DASHES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (2, 1.5)), (0, (7, 2, 1.5, 2)))
+"""Line styles of the curves of one panel, in their order."""
+MAX_CURVES = len(DASHES)  # of one panel
 RULE, LINES, PAPER = "#7f8794", "#e4e8ef", "#fffffe"  # marks of reference, grid, background
 THEMED = {"#000000": "currentColor", LINES: "var(--lines)", PAPER: "var(--paper)"}  # colours that follow the page's
 MARKERS = "osD^"  # of the series of a dot plot
@@ -40,6 +44,30 @@ STYLE: dict[str, Any] = {
     "axes.facecolor": PAPER,
     **{f"axes3d.{axis}axis.panecolor": PAPER for axis in "xyz"},
 }
+
+
+@dataclass(frozen=True)
+class Palette:
+    """Colours of methods.
+
+    Args:
+        colours: Colours `#rrggbb` by name.
+
+    Example:
+        >>> Palette({"gp": "#d1620f"}).colour("gp")
+        '#d1620f'
+    """
+
+    colours: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, labels: Mapping[str, Label]) -> Palette:
+        """Return the palette of labelled methods."""
+        return cls({name: label.colour for name, label in labels.items() if label.colour})
+
+    def colour(self, name: str) -> str:
+        """Return the colour of a method. A method without a label has a colour that follows from its name."""
+        return self.colours.get(name) or OTHER_COLOURS[sum(name.encode()) % len(OTHER_COLOURS)]
 
 
 def new_figure(rows: int, columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:

@@ -1,18 +1,29 @@
-"""Maps in plan: values as colours, hatched where they are extrapolated."""
+"""Maps in plan: values as colours, hatched where they are extrapolated, above the image of a floor."""
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike, NDArray
+from PIL import Image, UnidentifiedImageError
 from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
-from swiftwrf.plotting import corners_of
+from swiftwrf import InputError
+from swiftwrf.plotting import corners_of, hatch
+from swiftwrf.positions import MAX_COORDINATE_M
+from swiftwrf.runtime.checkpoint import refusing
+from swiftwrf.runtime.durable import write_npz
+from tasks.records import read_npz
 
 MIN_REACH = 1.5  # of the largest distance between neighbours, for positions on a line
-HATCH = "#555b66"
+TRANSPARENT = 255  # palette index of pixels without a value
+MAX_PLAN_PIXELS = 2**24
+STORED = "floor-plan.npz"  # in the directory of a run
 Corners = tuple[float, float, float, float]  # x0, x1, y0, y1 [m]
 
 
@@ -39,20 +50,6 @@ def inside(position: ArrayLike, known: ArrayLike) -> NDArray[np.bool_]:
         return np.asarray(tree.query(at)[0] <= MIN_REACH * max(float(apart.max()), 1e-6))
 
 
-def hatch(axes: Axes, x: NDArray[Any], y: NDArray[Any], known: ArrayLike) -> None:
-    """Hatch the cells of a map with centres x (W,) and y (H,) [m] that lie outside of the known positions (n, 2 or 3)."""
-    outside = np.pad(~inside(np.stack(np.meshgrid(x, y), axis=-1), known), 1, mode="edge")
-    x0, x1, y0, y1 = corners_of(x, y)
-    x, y = np.concatenate([[x0], x, [x1]]), np.concatenate([[y0], y, [y1]])
-    if outside.any():
-        with np.errstate(all="ignore"):
-            drawn = axes.contourf(
-                x, y, outside.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"], zorder=2
-            )
-        drawn.set_edgecolor(HATCH)
-        drawn.set_linewidth(0)
-
-
 def draw(
     axes: Axes,
     x: NDArray[Any],
@@ -62,9 +59,10 @@ def draw(
     colours: str,
     limits: tuple[float, float],
     known: ArrayLike,
+    silent: NDArray[np.bool_] | None = None,
     plan: tuple[NDArray[Any], Corners] | None = None,
 ) -> Any:
-    """Draw a map with hatching where it is extrapolated; return the image for a colour bar.
+    """Draw a map with hatching where it is extrapolated or silent; return the image for a colour bar.
 
     Args:
         axes: Axes to draw in.
@@ -74,6 +72,7 @@ def draw(
         colours: Name of a matplotlib colour map.
         limits: Values of the first and the last colour.
         known: Measured positions (n, 2 or 3) [m].
+        silent: Cells where a detection is less likely than not, (H, W), hatched the other way.
         plan: Image of the floor and its corners x0, x1, y0, y1 [m], drawn below.
     """
     extent = corners_of(x, y)
@@ -84,7 +83,118 @@ def draw(
     drawn = axes.imshow(
         values, origin="lower", extent=extent, cmap=colours, vmin=low, vmax=high, alpha=alpha, zorder=1, aspect="equal"
     )
-    hatch(axes, x, y, known)
+    hatch(axes, x, y, ~inside(np.stack(np.meshgrid(x, y), axis=-1), known))
+    if silent is not None:
+        hatch(axes, x, y, silent, "\\\\\\\\")
     axes.set(xlabel="x [m]", ylabel="y [m]")
     axes.grid(visible=False)
     return drawn
+
+
+def colour_image(values: NDArray[np.floating], colours: str, low: float = 0.0, high: float = 1.0) -> Image.Image:
+    """Return an image of values (rows, columns), the first row on top; nan is transparent.
+
+    Args:
+        values: Values of the pixels.
+        colours: Name of a matplotlib colour map.
+        low: Value of its first colour.
+        high: Value of its last colour.
+    """
+    scaled = (values - low) * (TRANSPARENT - 1) / (high - low or 1.0)
+    image = Image.fromarray(
+        np.where(np.isnan(values), TRANSPARENT, np.clip(scaled, 0, TRANSPARENT - 1)).astype(np.uint8)
+    )
+    rgb = colormaps[colours](np.linspace(0, 1, TRANSPARENT), bytes=True)[:, :3]
+    image.putpalette(rgb.tobytes() + b"\0\0\0")
+    image.info["transparency"] = TRANSPARENT
+    return image
+
+
+@dataclass(frozen=True, eq=False)
+class FloorPlan:
+    """An image of a floor and its place.
+
+    Args:
+        pixels: Image (height, width, 3), the first row on top.
+        corners: Positions x0, x1, y0, y1 [m] of its edges.
+
+    Raises:
+        InputError: No pixels, or edges that are not in order or beyond 1e9 m.
+    """
+
+    pixels: NDArray[np.uint8]
+    corners: Corners
+
+    def __post_init__(self) -> None:
+        x0, x1, y0, y1 = self.corners
+        near = all(abs(edge) <= MAX_COORDINATE_M for edge in self.corners)  # false for nan
+        if not (near and x0 < x1 and y0 < y1 and self.pixels.size):
+            raise InputError(
+                f"a floor plan needs pixels, a positive scale [m a pixel] and an origin [pixels] with edges within "
+                f"{MAX_COORDINATE_M:g} m, got edges at {x0:g}, {x1:g}, {y0:g}, {y1:g} m"
+            )
+
+    @classmethod
+    def scaled(cls, pixels: NDArray[np.uint8], metres_per_pixel: float, origin: tuple[float, float]) -> FloorPlan:
+        """Return an image at the place that its scale and its origin determine.
+
+        Args:
+            pixels: Image (height, width, 3).
+            metres_per_pixel: Length of a pixel [m].
+            origin: Pixel at x = y = 0, counted to the right and down from the upper left corner.
+
+        Raises:
+            InputError: A scale that is not positive, or edges beyond 1e9 m.
+
+        Example:
+            >>> FloorPlan.scaled(np.zeros((30, 40, 3), np.uint8), 0.5, (0, 30)).corners
+            (0.0, 20.0, 0.0, 15.0)
+        """
+        height, width = pixels.shape[:2]
+        right, down = origin
+        edges = (-right, width - right, down - height, down)
+        x0, x1, y0, y1 = (float(metres_per_pixel * edge) for edge in edges)
+        return cls(pixels, (x0, x1, y0, y1))
+
+    def save(self, folder: Path) -> None:
+        """Write the plan into the directory of a run."""
+        write_npz(folder / STORED, {"pixels": self.pixels, "corners": np.array(self.corners)})
+
+    @classmethod
+    def load(cls, folder: Path) -> FloorPlan | None:
+        """Return the plan in the directory of a run, or None if it has none.
+
+        Raises:
+            InputError: The file of the plan is damaged.
+        """
+        file = folder / STORED
+        if not file.exists():
+            return None
+        with refusing(f"{file} holds no floor plan"):
+            stored = read_npz(file, {"pixels": "u1 height width 3", "corners": "f 4"})
+            x0, x1, y0, y1 = stored["corners"].tolist()
+            return cls(stored["pixels"], (x0, x1, y0, y1))
+
+
+def read_pixels(file: str | Path | BinaryIO, name: str) -> NDArray[np.uint8]:
+    """Return the pixels (height, width, 3) of a PNG or JPEG image.
+
+    Args:
+        file: File or its name.
+        name: Name of the image in errors.
+
+    Raises:
+        InputError: No readable image, or one of more than `MAX_PLAN_PIXELS`.
+    """
+    try:
+        # two formats only: Pillow starts other programs for some; the pixels are read here, since the file may be truncated
+        with Image.open(file, formats=("PNG", "JPEG")) as image:
+            if image.width * image.height > MAX_PLAN_PIXELS:
+                raise InputError(
+                    f"{name} has {image.width} x {image.height} pixels; give one of at most {MAX_PLAN_PIXELS}"
+                )
+            return np.asarray(image.convert("RGB"))
+    except InputError:
+        raise
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
+        raise InputError(f"{name} is not a readable image, PNG or JPEG ({error})") from None

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from augment.estimators import SavedEstimator
 from swiftwrf import InputError, Rssi, Spectra
 from swiftwrf.data import ReadOptions
-from swiftwrf.data.coordinates import degree_columns
+from swiftwrf.data.coordinates import Floors, degree_columns
 from swiftwrf.data.files import SUFFIXES, read_table
 from swiftwrf.data.formats import RSSI_FORMATS, read
 from swiftwrf.data.store import Store
@@ -24,7 +26,7 @@ from tasks.predict.options import PredictConfig
 from tasks.source import aligned, located, observed_spectra, reading
 from tasks.terminal import console
 
-Columns = dict[str, Tensor]
+Columns = dict[str, Any]  # of tensors, and arrays of names
 MAX_TRACKED = 20_000_000  # candidate positions of a walk that are in memory together
 
 
@@ -34,7 +36,7 @@ def positions_of_rssi(locator: RssiLocator, config: PredictConfig) -> Columns:
     Raises:
         InputError: RSSI that cannot be read, receivers that moved or that the locator does not have, or nothing detected.
     """
-    source, options = config.source, reading(config)
+    source, options = config.source, reading(config.spectra, config.table)
     offsets = locator.model.offsets
     if offsets is not None and has_column(source, offsets.column):
         options = replace(options, offset_by=offsets.column)
@@ -57,7 +59,8 @@ def positions_of_rssi(locator: RssiLocator, config: PredictConfig) -> Columns:
     posteriors: Iterable[Posterior] = map(locator.locate, data.rssi_dbm.split(BATCH_ROWS))
     if config.track is not None:
         posteriors = _tracked(posteriors, _times(source, data), config.track)
-    columns = _located(posteriors, data.index, data.transmitter_position if is_known else None)
+    truth = data.transmitter_position if is_known else None
+    columns = _located(posteriors, data.index, truth, locator.region.floors)
     degrees = degree_columns(origin, torch.stack([columns["x_m"], columns["y_m"]], dim=1).numpy())
     return columns | {name: torch.from_numpy(values.copy()) for name, values in degrees.items()}
 
@@ -93,7 +96,7 @@ def directions(estimator: SavedEstimator, config: PredictConfig) -> Columns:
     Raises:
         InputError: Spectra that cannot be read, or on another grid.
     """
-    store, known = observed_spectra(config.source, reading(config), estimator.grid, "estimator")
+    store, known = observed_spectra(config.source, reading(config.spectra, config.table), estimator.grid, "estimator")
     estimate = torch.cat([estimator.predict(part) for part in store.batches()])
     return {"index": torch.arange(len(store)) if known is None else known.index} | _directions(estimate, known)
 
@@ -104,12 +107,15 @@ def positions_of_spectra(locator: MatchedField, config: PredictConfig) -> Column
     Raises:
         InputError: Spectra that cannot be read, on another grid or of another array.
     """
-    store, known = observed_spectra(config.source, reading(config), locator.grid, "locator")
+    store, known = observed_spectra(config.source, reading(config.spectra, config.table), locator.grid, "locator")
     if known is not None and known.array is not None and known.array != locator.room.array:
         raise InputError(f"{config.source} has spectra of another array than those that {config.model} was fitted to")
     found: list[Tensor] = []
     index = torch.arange(len(store)) if known is None else known.index
-    posteriors: Iterable[Posterior] = map(locator.locate, _batches(store))
+    batches: Iterable[Tensor] = _batches(store)
+    if known is not None and known.channel is not None:
+        batches = known.channel.split(BATCH_ROWS) if locator.n_snapshots else batches
+    posteriors: Iterable[Posterior] = map(locator.locate, batches)
     if config.track is not None:
         posteriors = _tracked(posteriors, index.double(), config.track)
 
@@ -169,14 +175,21 @@ def _tracked(posteriors: Iterable[Posterior], time: Tensor, speed_m_s: float) ->
         yield replace(whole, position=position, log_weight=whole.log_weight[rows])
 
 
-def _located(posteriors: Iterable[Posterior], index: Tensor, truth: Tensor | None) -> Columns:
+def _located(
+    posteriors: Iterable[Posterior], index: Tensor, truth: Tensor | None, floors: Floors | None = None
+) -> Columns:
     """Return the columns of a table with the positions of observations, batch by batch."""
-    parts = ((each.median, each.std, each.credible_radius(0.8), each.ambiguous) for each in posteriors)
-    position, std, radius, ambiguous = (torch.cat(values) for values in zip(*parts, strict=True))
+    parts = (
+        (each.median, each.std, each.credible_radius(0.8), each.ambiguous, each.floor_probability.amax(dim=1))
+        for each in posteriors
+    )
+    position, std, radius, ambiguous, probability = (torch.cat(values) for values in zip(*parts, strict=True))
     columns: Columns = {"index": index}
     columns |= dict(zip(("x_m", "y_m", "z_m"), position.T, strict=True))
     columns |= dict(zip(("std_x_m", "std_y_m", "std_z_m"), std.T, strict=True))
     columns |= {"credible_radius_80_m": radius, "ambiguous": ambiguous}
+    if floors is not None:
+        columns |= {"floor": np.array(floors.named(position)), "floor_probability": probability}
     if truth is not None:
         columns |= dict(zip(("truth_x_m", "truth_y_m", "truth_z_m"), truth.T, strict=True))
         columns["position_error_m"] = (position - truth).norm(dim=1)

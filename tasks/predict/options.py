@@ -6,11 +6,11 @@ from typing import Annotated
 
 import tyro
 
-from tasks.options import Answered, SpectraSource, TableSource, command_options
+from tasks.options import Answered, Options, SpectraSource, TableSource, options
 
 
-@command_options
-class PredictConfig(SpectraSource, TableSource, Answered):
+@options
+class PredictConfig(Options):
     """Apply a saved model to new measurements or positions, and write a table.
 
     An estimator gives the directions of spectra, and a locator the positions of transmitters. A field model gives spectra,
@@ -32,3 +32,6 @@ class PredictConfig(SpectraSource, TableSource, Answered):
     """rows of SOURCE are a walk: smooths its positions by this typical speed [m/s]. Rows without times are 1 s apart"""
     out: str | None = None
     """table to write; of a field or RSSI model also .mat; must not exist (default: a new predicted-TIME.csv)"""
+    output: Answered = Answered()
+    spectra: SpectraSource = SpectraSource()
+    table: TableSource = TableSource()

@@ -16,7 +16,7 @@ from tasks.claim import CONFIG, model_file
 from tasks.convert.outputs import write_file
 from tasks.directory import check_new_file
 from tasks.environment import stamp
-from tasks.options import SpectraSource, TableSource, given
+from tasks.options import given
 from tasks.page.records import Records
 from tasks.predict.observations import directions, positions_of_rssi, positions_of_spectra
 from tasks.predict.options import PredictConfig
@@ -44,8 +44,8 @@ def run(config: PredictConfig) -> None:
         if isinstance(model, RssiLocator)
         else "spectra"
     )
-    for kinds, options in (("RSSI", TableSource), ("spectra", SpectraSource)):
-        if kinds != read and (unused := given(config, options)):
+    for kinds, options in (("RSSI", config.table), ("spectra", config.spectra)):
+        if kinds != read and (unused := given(options)):
             raise InputError(f"--{unused[0]} is for reading {kinds}, and {file} holds {with_article(model.kind)}")
     if config.track is not None and not isinstance(model, RssiLocator | MatchedField):
         raise InputError(

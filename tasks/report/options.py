@@ -6,10 +6,10 @@ from typing import Annotated
 
 import tyro
 
-from tasks.options import Options, command_options
+from tasks.options import Options, Output, options
 
 
-@command_options
+@options
 class ReportConfig(Options):
     """One report over several finished runs of one task.
 
@@ -20,3 +20,4 @@ class ReportConfig(Options):
     """directories of the runs"""
     out: str | None = None
     """directory of the report; must not exist (default: a new one under runs/report)"""
+    output: Output = Output()

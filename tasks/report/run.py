@@ -16,6 +16,7 @@ from tasks.page.page import Page, write_page
 from tasks.page.records import Records
 from tasks.report.options import ReportConfig
 from tasks.rssi import page as rssi
+from tasks.terminal import terminal
 
 PAGES: dict[str, Callable[[list[Records[Any]]], Page]] = {"aoa": aoa.page, "rssi": rssi.page, "locate": locate.page}
 
@@ -24,7 +25,8 @@ def run(config: ReportConfig) -> None:
     """Write the report and print its place."""
     out = Path(config.out) if config.out else Path("runs") / "report" / stamp()
     merge([Path(folder) for folder in config.runs], out)
-    print(f"report: {out / 'report.html'}")
+    page = out / "report.html"
+    terminal.page({"runs": list(config.runs)}, "", page)
 
 
 def merge(folders: list[Path], out: Path) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from swiftwrf import Rssi, load, rssi_room
 from swiftwrf.data.files import sha256
@@ -15,14 +16,16 @@ from swiftwrf.rssi import LEVEL, PairModel, RssiComparison, RssiModel, RssiPredi
 from swiftwrf.rssi.comparison import compared, model_of
 from swiftwrf.rssi.maps import RssiMap
 from tasks.claim import MODEL
+from tasks.directory import Run
+from tasks.environment import choose_device
 from tasks.metrics import PredictorSeconds, RssiMetrics
-from tasks.page.floor_plan import read_pixels
+from tasks.page.maps import read_pixels
 from tasks.page.page import reporting
 from tasks.page.records import Records
+from tasks.records import Row
 from tasks.rssi.options import RssiTaskConfig
 from tasks.rssi.page import page
 from tasks.rssi.page.summary import answer
-from tasks.run import Row, Run, choose_device
 from tasks.source import measured_rssi, offset_notes, split_notes
 from tasks.terminal import console, terminal
 from tasks.workers import connected
@@ -70,7 +73,8 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
                 seed=config.seed,
                 also=config.also,
                 preset=config.preset,
-                reference=config.reference,
+                not_detected=config.not_detected,
+                reference=config.table.reference,
                 device=device,
                 parallel=cluster.map if cluster else None,
                 keep=keep,
@@ -87,7 +91,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
 
 
 def _load(config: RssiTaskConfig) -> Rssi:
-    measured = measured_rssi(config.data, config)
+    measured = measured_rssi(config.data, config.table)
     return rssi_room(seed=config.seed) if measured is None else measured
 
 
@@ -105,13 +109,16 @@ def _metrics(config: RssiTaskConfig, data: Rssi, result: RssiComparison, model: 
     seconds: dict[str, PredictorSeconds] = {
         name: {"fit": value["fit"], "predict": value["predict"]} for name, value in result.values.items()
     }
-    notes = [*split_notes(train, result.test, config.split), *offset_notes(data, config), *data.notes]
+    notes = [*split_notes(train, result.test, config.split), *offset_notes(data, config.table), *data.notes]
     if train.offsets is not None:
         notes.append(train.offsets.note())
         console.print(f"{data.name}: {notes[-1]}")
     attenuation_db = None if model.attenuation is None else model.attenuation.db
     if attenuation_db is not None and train.floors is not None:
         notes.append(f"each of the {len(train.floors.names)} floors takes {attenuation_db:.1f} dB")
+    if model.detection is not None:
+        notes.append(model.detection.note(train.receiver_names))
+        console.print(f"{data.name}: {notes[-1]}")
     overall = {name: summary(errors) for name, errors in result.errors.groupby("method")["abs_error_db"]}
     at_receiver = {
         key: summary(errors) for key, errors in result.errors.groupby(["receiver", "method"])["abs_error_db"]
@@ -125,7 +132,10 @@ def _metrics(config: RssiTaskConfig, data: Rssi, result: RssiComparison, model: 
         "seed": config.seed,
         "n_train": len(train),
         "n_test": len(result.test),
-        "overall": {name: {"abs_error_db": overall[name], "seconds": seconds[name]} for name in result.values},
+        "overall": {
+            name: {"abs_error_db": overall[name], "seconds": seconds[name], "detection": value["detection"]}
+            for name, value in result.values.items()
+        },
         "left_out": result.left_out,
         "receivers": {
             receiver: {name: {"abs_error_db": at_receiver.get((receiver, name), summary([]))} for name in result.values}
@@ -142,20 +152,24 @@ def _metrics(config: RssiTaskConfig, data: Rssi, result: RssiComparison, model: 
 
 
 def _maps(model: RssiModel | PairModel, train: Rssi) -> dict[str, Any]:
-    """Return the prediction and the width of its interval over the floor, at the median height of the measurements."""
-    height, floors = None, train.floors
-    if floors is not None:  # the floor with most measurements, since the median may be between two
-        height = floors.height_m[int(floors.number(train.transmitter_position).mode().values)]
-    chart = RssiMap.predict(model, height=height)
-    lower, upper = chart.prediction.interval(LEVEL)
+    """Return predictions, widths of intervals and probabilities of a detection on each floor, (floors, R, H, W).
+
+    Without floors there is one map, at the median height of the measurements.
+    """
+    floors = train.floors
+    charts = [RssiMap.predict(model, height=height) for height in (floors.height_m if floors else [None])]
+    lower, upper = zip(*(chart.prediction.interval(LEVEL) for chart in charts), strict=True)
     maps = {
-        "x": chart.x,
-        "y": chart.y,
-        "predicted": chart.mean,
-        "width": (upper - lower).numpy(),
+        "x": charts[0].x,
+        "y": charts[0].y,
+        "predicted": np.stack([chart.mean for chart in charts]),
+        "width": (torch.stack(upper) - torch.stack(lower)).numpy(),
+        "detection": np.stack([chart.detection for chart in charts]),
         "measured_position": train.transmitter_position.numpy(),
         "measured": train.rssi_dbm.numpy(),
         "receiver": train.receiver_position.numpy(),
         "receiver_names": np.array(train.receiver_names),
+        "floor_names": np.array(floors.names if floors else [""]),
+        "floor_of_row": floors.number(train.transmitter_position).numpy() if floors else np.zeros(len(train), int),
     }
     return maps if train.origin is None else maps | {"origin": np.array(train.origin)}

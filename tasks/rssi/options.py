@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.errors import InputError
+from swiftwrf.rssi.detection import NotDetected
 from swiftwrf.runtime.validation import Preset
-from tasks.options import OffsetSource, Output, command_options
+from tasks.options import OffsetSource, Options, Output, Seed, options
 
 
-@command_options
-class RssiTaskConfig(OffsetSource, Output):
+@options
+class RssiTaskConfig(Options):
     """RSSI of a moving transmitter at fixed receivers, against baselines.
 
-    Without --data the built-in simulated floor is used. Continue an interrupted run with --resume DIR.partial, and with
-    --scheduler ADDRESS to continue on a cluster.
+    Without --data the built-in simulated floor is used. swiftwrf resume DIR.partial continues an interrupted run.
 
     Example: python -m tasks.rssi --rx 6 --data DIR
     """
-
-    resumable: ClassVar[bool] = True
 
     rx: tuple[str, ...]
     """receivers: names, numbers counted from 1, or all"""
@@ -32,6 +30,9 @@ class RssiTaskConfig(OffsetSource, Output):
     also: tuple[str, ...] = ()
     """predictors that are compared only when named: nerf2 and blend take minutes; pairs and knn_pairs are for data with both
     ends moving, where they are compared anyway"""
+    not_detected: NotDetected = "auto"
+    """what an empty cell says: weak, the signal was below the limit of detection; unknown, nothing; auto decides for each
+    receiver by the data"""
     preset: Preset = "quick"
     """of SwiftWRF and NeRF2: quick, or paper for the published head and field"""
     floor_plan: str | None = None
@@ -40,18 +41,20 @@ class RssiTaskConfig(OffsetSource, Output):
     """x0 x1 y0 y1 of that image [m]"""
     scheduler: str | None = None
     """address of a Dask scheduler whose workers fit groups of receivers (extra: cluster)"""
-    seed: int = 0
+    seed: Seed = 0
     """seed of everything random"""
     out: str | None = None
     """directory of the run; must not exist (default: a new one under runs/rssi)"""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """where to compute; RSSI models are small, so auto is the CPU"""
+    output: Output = Output()
+    table: OffsetSource = OffsetSource()
 
     def check(self) -> None:
         super().check()
         for name in self.also:
             RSSI_PREDICTORS.check(name)
-        self.check_used(self.data)
+        self.table.check_used(self.data)
         if (self.floor_plan is None) != (self.floor_extent is None):
             raise InputError("--floor-plan needs --floor-extent x0 x1 y0 y1 [m], and the other way round")
         if self.floor_extent is not None:

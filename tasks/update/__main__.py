@@ -4,5 +4,4 @@ import sys
 
 from tasks.command import run_command
 
-if __name__ == "__main__":
-    sys.exit(run_command("update", sys.argv[1:]))
+sys.exit(run_command("update", sys.argv[1:]))

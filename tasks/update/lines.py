@@ -152,7 +152,7 @@ def _number(value: object) -> float:
 
 def _of_row(text: str, config: UpdateConfig, model: RssiModel) -> Rssi:
     """Return the measurement in a table of one row; receivers that the model does not have are left out."""
-    columns, filler, coordinates = config.column_names, config.fillers, config.coordinates
+    columns, filler, coordinates = config.table.column_names, config.table.fillers, config.table.coordinates
     table = table_of("the table", text)
     data = Rssi.from_frame(table, columns=columns, filler=filler, coordinates=coordinates).about(model.origin)
     rssi = zip(data.receiver_names, data.rssi_dbm[0].tolist(), strict=True)

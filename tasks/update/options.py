@@ -6,16 +6,17 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from annotated_types import Gt, Lt
 
 from swiftwrf.errors import InputError
-from tasks.options import Output, SpectraSource, TableSource, command_options
+from tasks.options import Options, Output, SpectraSource, TableSource, options
 
 JSON_LINES, TABLE = (".ndjson", ".jsonl"), ".csv"
 FOLLOWED = (*JSON_LINES, TABLE)
 
 
-@command_options
-class UpdateConfig(SpectraSource, TableSource, Output):
+@options
+class UpdateConfig(Options):
     """Update a fitted model with new measurements. Each is predicted before the model learns it, and tested for a change.
 
     With --follow the measurements come one by one, a JSON object a line: {"position": [x, y, z], "rssi_dbm": {"NAME": -60}}
@@ -35,16 +36,17 @@ class UpdateConfig(SpectraSource, TableSource, Output):
     data: str | None = None
     """training measurements of the model in their order, which calibrate the test for changes of spectra, and show what
     stands in a room"""
-    false_alarm_rate: float = 1e-4
+    false_alarm_rate: Annotated[float, Gt(0), Lt(1)] = 1e-4
     """false alarms a measurement"""
     follow: bool = False
     """take measurements line by line as they come, and print a line for each"""
+    output: Output = Output()
+    spectra: SpectraSource = SpectraSource()
+    table: TableSource = TableSource()
 
     def check(self) -> None:
         super().check()
-        if not 0 < self.false_alarm_rate < 1:
-            raise InputError(f"--false-alarm-rate must be between 0 and 1, got {self.false_alarm_rate}")
         if self.follow and self.source != "-" and Path(self.source).suffix.lower() not in FOLLOWED:
             raise InputError(f"--follow takes {' or '.join(FOLLOWED)} files or -, got {self.source}")
-        if self.follow and (self.open or self.json):
+        if self.follow and (self.output.open or self.output.json):
             raise InputError("--follow prints JSON lines and writes no page; leave out --open and --json")

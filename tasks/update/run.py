@@ -45,7 +45,7 @@ def run(config: UpdateConfig) -> None:
         return
     with new_directory(Path(config.out), "an update") as folder:
         model = _model(config.model)
-        options = reading(config)
+        options = reading(config.spectra, config.table)
         new, train = _read(config.source, options, model), _training(config, options, model)
         follower = Follower(model, train, MonitorConfig(false_alarm_rate=config.false_alarm_rate))
         record = Record(config.source, _unit(model))
@@ -68,7 +68,7 @@ def follow(config: UpdateConfig) -> None:
     digests = {"model": sha256(Path(config.model))}
     model, settings = _model(config.model), MonitorConfig(false_alarm_rate=config.false_alarm_rate)
     check_source(config.source, model)
-    if (train := _training(config, reading(config), model)) is not None:
+    if (train := _training(config, reading(config.spectra, config.table), model)) is not None:
         digests |= train.source
     with _followed(Path(config.out), digests) as folder:
         file = folder / MODEL

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
 
@@ -33,20 +33,22 @@ class Snapshot:
     figures: dict[str, str]
 
 
-@dataclass(eq=False)
 class FollowedView:
     """Directory of an update, which may still grow.
 
     Args:
-        title: Title of the page.
         folder: The directory.
+
+    Raises:
+        InputError: It holds no record.
     """
 
-    title: str
-    folder: Path
-    notes: list[str] = field(default_factory=list)
-    _last: Snapshot | None = field(default=None, init=False, repr=False)
-    _lock: Lock = field(default_factory=Lock, init=False, repr=False)
+    def __init__(self, folder: Path) -> None:
+        if not (folder / SUMMARY).exists():
+            raise InputError(f"{folder} holds no record of an update: it has no {SUMMARY}")
+        self.title, self.folder = folder.name, folder
+        self._last: Snapshot | None = None
+        self._lock = Lock()
 
     @property
     def version(self) -> Version:
@@ -74,14 +76,3 @@ def _read(folder: Path, version: Version) -> Snapshot:
     plots = {"error": error_plot(record), "changes": map_plot(record)}
     svg = {name: for_page(as_svg(plot.panels[0], plot.caption), name) for name, plot in plots.items()}
     return Snapshot(version, record.sentences(), record.rows[: -LAST_ROWS - 1 : -1], svg)
-
-
-def open_followed(folder: Path) -> FollowedView:
-    """Open the directory of an update.
-
-    Raises:
-        InputError: It holds no record.
-    """
-    if not (folder / SUMMARY).exists():
-        raise InputError(f"{folder} holds no record of an update: it has no {SUMMARY}")
-    return FollowedView(folder.name, folder)

@@ -7,8 +7,8 @@ from nicegui import run, ui
 from swiftwrf import InputError
 from tasks.environment import command
 from tasks.records import Row, rounded
-from tasks.view.followed import FollowedView, Snapshot, Version
-from tasks.view.page import header
+from tasks.view.followed import FollowedView, Version
+from tasks.view.page import NewestOnly, header
 
 PERIOD_S = 1.0  # between two looks at the files
 COLUMNS = {
@@ -27,8 +27,8 @@ class FollowedPage:
     """The page for one visitor."""
 
     def __init__(self, view: FollowedView) -> None:
-        self._view, self._shown, self._busy = view, Version(), False
-        header(view.title, view.notes)
+        self._view, self._shown, self._requests = view, Version(), NewestOnly(self._show)
+        header(view.title, [])
         self._sentences = ui.label().classes("numbers").props('id="sentence"').style("white-space: pre-line")
         self._figures = {}
         with ui.row().classes("w-full items-start gap-8"):
@@ -43,21 +43,19 @@ class FollowedPage:
         ).classes("quiet")
         ui.timer(PERIOD_S, self._look)
 
-    async def _look(self) -> None:
-        """Show the record if its files have changed."""
-        if self._busy or self._view.version == self._shown:
-            return
-        self._busy = True
+    def _look(self) -> None:
+        if self._view.version != self._shown:
+            self._requests.submit()
+
+    async def _show(self) -> None:
+        """Show the record, whose files have changed."""
         try:
             found = await run.io_bound(self._view.snapshot)
-            if found is not None:  # the server is being ended
-                self._show(found)
         except InputError as error:
             self._sentences.set_text(str(error))
-        finally:
-            self._busy = False
-
-    def _show(self, found: Snapshot) -> None:
+            return
+        if found is None:  # the server is being ended
+            return
         self._shown = found.version
         self._sentences.set_text("\n".join(found.sentences))
         for name, box in self._figures.items():

@@ -14,7 +14,6 @@ from swiftwrf import Rssi
 from swiftwrf.locate import Posterior, RssiLocator
 from swiftwrf.locate.baselines import BATCH_ROWS
 from swiftwrf.locate.posterior import PlanMap
-from swiftwrf.locate.rssi import UNDETECTED_BELOW_DB
 from swiftwrf.positions import nearest
 
 LEVELS = (0.5, 0.8)  # probabilities of the credible regions that are shown
@@ -88,11 +87,9 @@ class RssiLocating:
     @classmethod
     def of_training(cls, locator: RssiLocator) -> RssiLocating:
         """Return a locator with its training rows, if the measurements are not known."""
-        known = locator.likelihoods.fingerprints
-        rssi = known.rssi.double()
-        rssi[known.rssi < known.floor + UNDETECTED_BELOW_DB / 2] = torch.nan
+        known = locator.likelihoods.fingerprints.fingerprints
         rows = Rssi(
-            rssi,
+            known.rssi.double(),
             known.position,
             receiver_position=locator.model.receiver,
             receiver_names=locator.receiver_names,
@@ -120,10 +117,6 @@ class RssiLocating:
         """Describe the posterior of a row in a few sentences."""
         part = "training" if self.in_training[row] else "test"
         return f"Posterior of {part} row {int(self.rows.index[row])}: {self.located(row).describe()}"
-
-    def map(self, row: int | None) -> PlanMap:
-        """Return the posterior of a row in plan, or the expected error for None."""
-        return self.expected_error if row is None else self.located(row).density
 
     @property
     def summary(self) -> str:

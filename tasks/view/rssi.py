@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from swiftwrf import Prediction, Rssi, RssiModel
+from swiftwrf.locate.posterior import PlanMap
 from swiftwrf.rssi import LEVEL
 from swiftwrf.rssi.maps import RssiMap
 from tasks.page import maps
-from tasks.page.floor_plan import FloorPlan
-from tasks.page.maps import Corners
+from tasks.page.maps import Corners, FloorPlan
 from tasks.records import as_table, read_npz, rounded
 from tasks.rssi.page.maps import MAX_WIDTH_DB
 from tasks.view.locating import RssiLocating
@@ -177,8 +177,11 @@ class RssiView:
 
     def coloured(self, selection: MapSelection) -> ColouredMap:
         """Return values and colours of the selected map."""
-        if selection.kind in LOCATING:
-            return self._located(selection)
+        if (found := self._located(selection)) is not None:
+            if selection.kind == "posterior":
+                return ColouredMap(found.values, "magma", 0.0, 1.0, "of the maximum", corners=found.corners)
+            most = float(np.nanpercentile(found.values, 98))
+            return ColouredMap(found.values, "viridis", 0.0, most, "m", "max", found.corners)
         chart, receiver = self.map(selection.height), selection.receiver
         mean = chart.mean
         match selection.kind:
@@ -196,13 +199,15 @@ class RssiView:
                 return ColouredMap(values, RECEIVER_COLOURS, 0, N_RECEIVER_COLOURS, "")
         raise AssertionError(selection.kind)
 
-    def _located(self, selection: MapSelection) -> ColouredMap:
-        assert self.locating is not None
-        found = self.locating.map(None if selection.kind == "expected error" else selection.row)
-        if selection.kind == "posterior":
-            return ColouredMap(found.values, "magma", 0.0, 1.0, "of the maximum", corners=found.corners)
-        high = float(np.nanpercentile(found.values, 98))
-        return ColouredMap(found.values, "viridis", 0.0, high, "m", "max", found.corners)
+    def _located(self, selection: MapSelection) -> PlanMap | None:
+        """Return the map of the locator. None for the maps of the model."""
+        if self.locating is None or selection.kind not in LOCATING:
+            return None
+        return (
+            self.locating.expected_error
+            if selection.kind == "expected error"
+            else self.locating.located(selection.row).density
+        )
 
     def _covered(self, selection: MapSelection) -> NDArray[np.bool_]:
         probability = probability_above(self.map(selection.height).prediction, selection)
@@ -255,8 +260,12 @@ class RssiView:
 
     def describe(self, selection: MapSelection, x: float, y: float) -> str:
         """Describe the predictions at a position [m] in lines of text."""
-        if self.locating is not None and selection.kind in LOCATING:
-            return f"at {x:.2f}, {y:.2f} m\n{self._located_at(selection, x, y)}"
+        if (found := self._located(selection)) is not None:
+            value, what = found.at(x, y), "outside the region of the measured positions"
+            if np.isfinite(value):
+                is_error = selection.kind == "expected error"
+                what = f"expected position error {value:.2f} m" if is_error else f"posterior {value:.1%} of its maximum"
+            return f"at {x:.2f}, {y:.2f} m\n{what}"
         rssi, r = self.at(selection, x, y), selection.receiver
         mean, (low, high) = rssi.mean, rssi.interval(LEVEL)
         lines = [
@@ -269,20 +278,11 @@ class RssiView:
             lines.append(f"best receiver: {self.receivers[int(mean.argmax())]}, {mean.max():.1f} dBm")
         return "\n".join(lines)
 
-    def _located_at(self, selection: MapSelection, x: float, y: float) -> str:
-        assert self.locating is not None
-        is_error = selection.kind == "expected error"
-        value = self.locating.map(None if is_error else selection.row).at(x, y)
-        if np.isnan(value):
-            return "outside the region of the measured positions"
-        return f"expected position error {value:.2f} m" if is_error else f"posterior {value:.1%} of its maximum"
-
     def table(self, selection: MapSelection) -> str:
         """Return the selected map as comma-separated values, a row a cell."""
-        if self.locating is not None and selection.kind in LOCATING:
+        if self.locating is not None and (found := self._located(selection)) is not None:
             is_error = selection.kind == "expected error"
             name = "expected_error_m" if is_error else f"posterior_of_row_{self.locating.rows.index[selection.row]}"
-            found = self.locating.map(None if is_error else selection.row)
             x, y = np.meshgrid(found.x, found.y)
             table = pd.DataFrame({"x_m": x.ravel(), "y_m": y.ravel(), name: found.values.ravel().round(4)}).dropna()
             return as_table(rounded(table.to_dict("records")))

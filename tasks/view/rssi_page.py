@@ -12,8 +12,7 @@ from nicegui import events, run, ui
 from PIL import Image
 
 from swiftwrf import InputError
-from tasks.page.floor_plan import FloorPlan, read_pixels
-from tasks.page.raster import colour_image
+from tasks.page.maps import FloorPlan, colour_image, read_pixels
 from tasks.view.charts import BAR, Data, around, colour_bar, crosses, dots, named, picture, pictures, points
 from tasks.view.page import (
     MAX_UPLOAD_BYTES,

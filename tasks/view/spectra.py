@@ -129,11 +129,6 @@ class SpectraView:
         return self.data.fixed_position, self.data.rotation, self.data.moving
 
     @property
-    def array(self) -> PlanarArray | None:
-        """Antenna array of the data. None if it is unknown."""
-        return None if self.data is None else self.data.array
-
-    @property
     def moving(self) -> str:
         """Name of the moving end."""
         if self.data is not None:
@@ -176,14 +171,14 @@ class SpectraView:
         began = time.perf_counter()
         with torch.no_grad():
             prediction = loaded.model.predict(query, grid)
-        seconds = time.perf_counter() - began
+        seconds, array = time.perf_counter() - began, None if self.data is None else self.data.array
         return PredictedSpectrum(
             np.asarray(position, dtype=float),
             grid,
             prediction.mean[0].numpy(),
             None if prediction.std is None else prediction.std[0].numpy(),
-            peak(prediction.mean[0], grid, self.array),
-            None if self.fixed_end is None else _degrees(direction_of_link(query, *self.fixed_end, self.array)[0]),
+            peak(prediction.mean[0], grid, array),
+            None if self.fixed_end is None else _degrees(direction_of_link(query, *self.fixed_end, array)[0]),
             seconds,
         )
 
@@ -200,7 +195,7 @@ class SpectraView:
     def located(self, loaded: LoadedModel, index: int) -> Located:
         """Return the posterior over the position of a measured spectrum."""
         assert self.data is not None
-        return Located.of(loaded.locator.locate(self.data.store[index : index + 1]), self.data.position[index].double())
+        return Located.of(loaded.locator.locate(self.data[index : index + 1]), self.data.position[index].double())
 
 
 def peak(spectrum: Tensor, grid: AngularGrid, array: PlanarArray | None = None) -> Direction:

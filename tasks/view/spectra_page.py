@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from swiftwrf import AngularGrid, Spectra
 from tasks.aoa.page.room import FIXED, MEASURED, in_plan
-from tasks.page.polar import MAX_DIFFERENCE
-from tasks.page.raster import colour_image
+from tasks.aoa.page.synthesis import MAX_DIFFERENCE
+from tasks.page.maps import colour_image
 from tasks.view.charts import (
     Data,
     around,

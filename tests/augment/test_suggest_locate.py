@@ -78,4 +78,4 @@ def test_suggestions_of_a_run(tmp_path, capsys):
     assert "Where to measure next" in (tmp_path / "run" / "report.html").read_text()
     capsys.readouterr()
     assert quick.run("locate", "--suggest", 501) == 2
-    assert "--suggest takes 0 to 500" in said(capsys)
+    assert "--suggest must be a whole number at least 0 and at most 500" in said(capsys)

@@ -10,7 +10,7 @@ import io
 import json
 import random
 from collections.abc import Iterator
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import get_type_hints
 
@@ -24,7 +24,8 @@ from swiftwrf import InputError, load_rssi
 from swiftwrf.data.writing import write_rssi
 from swiftwrf.errors import MAX_LENGTH
 from swiftwrf.runtime.validation import check_value
-from tasks.command_line import execute
+from tasks.command_line import _defaults, execute
+from tasks.options import by_name
 
 VALUES = [
     "", "0", "1", "-1", "0.5", "1.5", "nan", "inf", "-inf", "1e400", "1e-320", "4294967296", "99999999999999999999",
@@ -33,13 +34,14 @@ VALUES = [
     "[1]", "{}", "nearest", "swiftwrf", "receiver", "*",
 ]  # fmt: skip
 OPTIONS = {
-    task: ("--resume", *(f"--{option.name.replace('_', '-')}" for option in fields(config)))
+    task: [f"--{name.replace('_', '-')}" for name in by_name(_defaults(config, {}, ""))]
     for task, (config, _) in TASKS.items()
 }
 REQUIRED_OPTIONS = {
     "aoa": ["--mix", "0.5"],
     "rssi": ["--rx", "1"],
     "report": ["run"],
+    "resume": ["broken.partial"],
     "convert": ["data", "taken"],
     "inspect": ["data"],
     "view": ["data"],
@@ -89,7 +91,7 @@ def command_lines(draw: random.Random, folder: Path, count: int) -> Iterator[tup
             arguments += [draw.choice(values) for _ in range(draw.choice([0, 1, 1, 1, 2, 3, 4]))]
         if draw.random() < 0.1:
             arguments.append(draw.choice(values))
-        yield task, arguments if task in ("convert", "view") else [*arguments, "--out", str(taken)]
+        yield task, arguments if task in ("convert", "resume", "view") else [*arguments, "--out", str(taken)]
 
 
 def right_command_lines(draw: random.Random, folder: Path, count: int) -> Iterator[tuple[str, list[str]]]:
@@ -133,12 +135,13 @@ def config_file(draw: random.Random, folder: Path) -> None:
             execute(f"tasks.{task}", TASKS[task][0], lambda config, *_: found.append(config), options)
     except SystemExit as end:  # a required option is missing
         raise InputError(f"the parser ends with {end.code}") from None
-    hints = get_type_hints(TASKS[task][0], include_extras=True)
-    for option in fields(found[0]):
-        try:
-            check_value(option.name, getattr(found[0], option.name), hints[option.name])
-        except InputError as error:
-            raise AssertionError(error) from None
+    for group in (found[0], *filter(is_dataclass, vars(found[0]).values())):
+        hints = get_type_hints(type(group), include_extras=True)
+        for option in fields(group):
+            try:
+                check_value(option.name, getattr(group, option.name), hints[option.name])
+            except InputError as error:
+                raise AssertionError(error) from None
 
 
 def updates_and_conversions(draw: random.Random, folder: Path) -> None:

@@ -45,7 +45,7 @@ from tasks.aoa.page.room import in_plan
 from tasks.command import run_command
 from tasks.locate.options import LocateConfig
 from tasks.options import plain
-from tasks.page.floor_plan import FloorPlan
+from tasks.page.maps import FloorPlan
 from tasks.update import lines
 from tasks.update.record import TABLE, Record
 from tasks.view.charts import around, picture, points

@@ -177,7 +177,7 @@ def scheduler(tmp_path):
 
 def test_a_run_that_loses_its_scheduler_continues_here(scheduler, tmp_path):
     process, address = scheduler
-    with pytest.raises(FitError, match="went away; go on with --resume"), connected(address, CPU) as cluster:
+    with pytest.raises(FitError, match="went away; go on with swiftwrf resume"), connected(address, CPU) as cluster:
         results(tmp_path / "run", STEPS, cluster=cluster, act=process.kill)
     kept = {file.name for file in (tmp_path / "run.partial" / "steps").glob("*.json")}
     assert kept

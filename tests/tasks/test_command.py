@@ -9,7 +9,6 @@ import sys
 import time
 import tomllib
 from importlib import import_module
-from inspect import signature
 from pathlib import Path
 from typing import get_type_hints
 
@@ -40,7 +39,7 @@ def started(folder: Path, *arguments: str, **variables: str) -> subprocess.Compl
 
 def test_python_m_tasks_lists_the_commands():
     done = subprocess.run([sys.executable, "-m", "tasks"], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert re.findall(r"^  (\w+) +\S", done.stdout, flags=re.MULTILINE) == [*COMMANDS, "resume"]
+    assert re.findall(r"^  (\w+) +\S", done.stdout, flags=re.MULTILINE) == [*COMMANDS]
 
 
 def test_the_package_declares_the_script():
@@ -54,7 +53,7 @@ def test_help_lists_every_command_at_once(tmp_path):
     assert time.perf_counter() - began < 1.5
     assert done.returncode == 0
     listed = re.findall(r"^  (\w+) +\S", done.stdout, flags=re.MULTILINE)
-    assert listed == [*COMMANDS, "resume"]
+    assert listed == [*COMMANDS]
 
 
 @pytest.mark.parametrize("arguments", [("--help",), ("inspect", "--help")])
@@ -73,7 +72,6 @@ def test_every_command_has_options_and_a_package_of_its_name(name):
     config_type = get_type_hints(task)["config"]
     assert config_type is getattr(import_module(f"tasks.{name}.options"), COMMANDS[name].options)
     assert config_type.__doc__
-    assert config_type.resumable == ("resume" in signature(task).parameters)
     assert f'run_command("{name}"' in (ROOT / "tasks" / name / "__main__.py").read_text()
 
 
@@ -118,7 +116,6 @@ def test_unknown_commands_and_directories(tmp_path, capsys):
     assert "unknown command 'rsi'; choose from aoa, rssi" in said(capsys)
     assert main(["resume", str(tmp_path)]) == 2
     assert "no interrupted run" in said(capsys)
-    assert main(["resume"]) == 2
     (tmp_path / "old.partial").mkdir()
     (tmp_path / "old.partial" / "config.json").write_text('{"task": "other"}')
     assert main(["resume", str(tmp_path / "old.partial")]) == 2

@@ -109,7 +109,7 @@ def test_a_directory_of_something_else_is_refused_and_unchanged(follow, model, t
     assert (code, answers) == (2, [])
     assert said.startswith("error: ")
     assert said.count("\n") == 1
-    assert "--resume" not in said
+    assert "swiftwrf resume" not in said
     assert contents(folder) == {name: text.encode() for name, text in files.items()}
 
 
@@ -394,7 +394,7 @@ def test_a_full_disk_is_answered_with_the_right_advice(follow, model, monkeypatc
         code, _, said = follow(model, content=line(40))
     assert code == 2
     assert "free space and run the same command again" in said
-    assert "--resume" not in said
+    assert "swiftwrf resume" not in said
     assert follow(model, content=line(40))[0] == 0
 
 

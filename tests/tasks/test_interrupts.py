@@ -83,7 +83,7 @@ def kill_until_done(folder, asked, whole, draw, kills):
         process.communicate()
         hit += process.returncode == -signal.SIGKILL
         if (partial / "config.json").exists():
-            arguments = (asked[0], "--resume", partial)
+            arguments = ("resume", partial)
     if not out.exists():
         code, said = finished(start(folder, *arguments))
         assert code == 0, said
@@ -111,8 +111,9 @@ def fill_disk(folder, asked, whole, most_bytes):
     assert code == 2, said
     assert "no space left" in said, said
     assert not (folder / "cut").exists()
-    again = ("--resume", folder / "cut.partial") if (folder / "cut.partial" / "config.json").exists() else None
-    code, said = finished(start(folder, asked[0], *again) if again else start(folder, *asked, "--out", folder / "cut"))
+    has_begun = (folder / "cut.partial" / "config.json").exists()
+    again = ("resume", folder / "cut.partial") if has_begun else (*asked, "--out", folder / "cut")
+    code, said = finished(start(folder, *again))
     assert code == 0, said
     same_results(asked[0], whole, folder / "cut")
 

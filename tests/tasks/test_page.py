@@ -16,13 +16,13 @@ from swiftwrf import AngularGrid, Rssi, Spectra, plotting
 from swiftwrf.diagnostics.inspection import Findings
 from tasks import labels
 from tasks.aoa.page.records import CHOSEN, LOWER_REFERENCE, UPPER_REFERENCE
+from tasks.aoa.page.synthesis import SCALES, spectra
 from tasks.inspect.page import page as inspection
 from tasks.locate.page.drawing import posteriors
 from tasks.page import figures
+from tasks.page.figures import Palette
+from tasks.page.maps import colour_image
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table, write_page
-from tasks.page.palette import Palette
-from tasks.page.polar import SCALES, spectra
-from tasks.page.raster import colour_image
 from tasks.records import read_table
 
 

@@ -6,20 +6,20 @@ import json
 import logging
 import os
 import re
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from importlib import import_module
+from unittest import mock
 
 import pytest
 
 from swiftwrf import InputError
 from tasks.aoa.options import AoaConfig
 from tasks.command import COMMANDS, main
-from tasks.command_line import command_line, execute
+from tasks.command_line import _defaults, command_line, execute, file_options, parse
+from tasks.directory import digest
 from tasks.inspect.options import InspectConfig
-from tasks.options import plain
-from tasks.parsing import file_options, parse
+from tasks.options import OffsetSource, Output, by_name, plain
 from tasks.report.options import ReportConfig
-from tasks.resume import digest
 from tasks.rssi.options import RssiTaskConfig
 
 SOURCE = ("--data", "x", "--array", "4", "2", "0.06", "2.4e9", "--drop-null")
@@ -37,15 +37,12 @@ def test_help_has_groups_names_examples_and_one_default_an_option(name, capsys, 
     assert f"Example: python -m tasks.{name} " in text
     config_type = getattr(import_module(f"tasks.{name}.options"), COMMANDS[name].options)
     listed = [match[1] for option in options if (match := re.match(r"--([a-z-]+)", option))]
-    assert ("resume" in listed) == config_type.resumable
     assert {"config", "verbose"} <= {*listed}
-    for option in fields(config_type):
-        assert option.name.replace("_", "-") in listed or option.name.upper() in text.splitlines()[0]
-    if "required options" in text:
-        others = [
-            text.index(f"{group} options") for group in ("command", "output", "general") if f"{group} options" in text
-        ]
-        assert text.index("required options") < min(others)
+    groups = [option.name for option in fields(config_type) if is_dataclass(option.default)]
+    places = [text.index(f" {group} options ") for group in groups]
+    assert places == sorted(places)
+    for name in by_name(_defaults(config_type, {}, "")):
+        assert name.replace("_", "-") in listed or name.upper() in text.splitlines()[0]
 
 
 def test_a_run_is_repeated_from_its_configuration_and_the_command_line_wins(tmp_path):
@@ -66,13 +63,8 @@ def test_a_yaml_file_holds_options_and_positional_arguments(tmp_path):
     file = tmp_path / "inspect.yaml"
     file.write_text("source: DIR\nevery: 3\nround_trip: true\ncolumns: [x=a, y=b]\nout: null\n")
     found = parse(InspectConfig, [], "inspect", file_options(file))
-    assert (found.source, found.every, found.round_trip, found.columns, found.out) == (
-        "DIR",
-        3,
-        True,
-        ("x=a", "y=b"),
-        None,
-    )
+    assert (found.source, found.out, found.table.columns) == ("DIR", None, ("x=a", "y=b"))
+    assert (found.spectra.every, found.spectra.round_trip) == (3, True)
     assert parse(InspectConfig, ["OTHER"], "inspect", file_options(file)).source == "OTHER"
 
 
@@ -100,7 +92,7 @@ def test_files_that_hold_no_options_are_refused(tmp_path, content, sentence):
         ("seed: [1, 2]\n", "seed takes INT"),
         ("array: [4, 0.1]\n", "array takes"),
         ("preset: large\n", "preset takes"),
-        ("a: &a [x, x]\nsynthesizer: [*a, *a]\n", "names 'a'"),
+        ("a: &a [x, x]\nsynthesizer: [*a, *a]\n", "synthesizer takes"),
         ("synthesizer: [[x]]\n", "synthesizer takes"),
         ("[" * 5000, "cannot be read"),
         ("#" * 2**20 + "\n", "at most 1048576 bytes"),
@@ -115,7 +107,7 @@ def test_values_of_a_file_are_checked_as_those_of_a_command_line(tmp_path, conte
 def executed(config_type, *arguments):
     """Return the configuration with which a command line runs its task."""
     found = []
-    execute("tasks.rssi", config_type, lambda config, folder: found.append(config), [*map(str, arguments)])
+    execute("tasks.rssi", config_type, found.append, [*map(str, arguments)])
     return found[0]
 
 
@@ -128,13 +120,20 @@ def test_a_file_of_options_is_given_in_both_forms(tmp_path, form):
 
 
 def test_the_configuration_of_a_run_with_out_starts_another_run(tmp_path):
-    values = plain(RssiTaskConfig(("1",), out=str(tmp_path), keep_filler=True, data="x"))
+    values = plain(
+        RssiTaskConfig(("1",), out=str(tmp_path), data="x", table=OffsetSource(filler="none"), output=Output(json=True))
+    )
     (tmp_path / "config.json").write_text(json.dumps({"task": "rssi", "config": values}))
     found = executed(RssiTaskConfig, "--config", tmp_path / "config.json")
     assert plain(found) == values | {"out": None}
-    again = executed(RssiTaskConfig, "--config", tmp_path / "config.json", "--keep-filler", "--out", "other")
-    assert (again.keep_filler, again.out) == (True, "other")
-    assert not executed(RssiTaskConfig, "--config", tmp_path / "config.json", "--no-keep-filler").keep_filler
+    again = executed(RssiTaskConfig, "--config", tmp_path / "config.json", "--filler", -100, 100, "--out", "other")
+    assert (again.table.filler, again.out) == ((-100.0, 100.0), "other")
+
+
+def test_a_flag_that_a_file_sets_is_negated_on_the_command_line(tmp_path):
+    (tmp_path / "o.yaml").write_text("rx: [1]\njson: true\n")
+    assert executed(RssiTaskConfig, "--config", tmp_path / "o.yaml").output.json
+    assert not executed(RssiTaskConfig, "--config", tmp_path / "o.yaml", "--no-json").output.json
 
 
 @pytest.mark.parametrize("texts", [["--out", "X"], ["--help"], ["--config=x"], ["-1"]])
@@ -149,10 +148,8 @@ def test_values_of_a_file_are_no_flags(tmp_path, texts):
     [
         (("--config", "a", "--config=b"), "--config is given twice: a and b"),
         (("--config",), "--config: expected one argument"),
-        (("--verbose=1",), "--verbose"),
         (("--config", "/dev/zero"), "cannot be read"),
         (("--config", "fifo"), "cannot be read"),
-        (("--resume=x", "--resume", "y"), "--resume is given twice"),
     ],
 )
 def test_general_options_are_refused_in_a_sentence(tmp_path, monkeypatch, arguments, sentence):
@@ -162,19 +159,22 @@ def test_general_options_are_refused_in_a_sentence(tmp_path, monkeypatch, argume
         executed(RssiTaskConfig, "--rx", 1, *arguments)
 
 
-def test_resume_is_given_anywhere_and_changes_no_result(tmp_path):
+@pytest.mark.parametrize("given", [("--seed", "7"), ("--data", "x"), ("--processes", "2")])
+def test_resume_changes_no_result(tmp_path, given, capsys):
     folder = tmp_path / "x.partial"
     folder.mkdir()
     values = plain(RssiTaskConfig(("1",), scheduler="tcp://old:1"))
     (folder / "config.json").write_text(json.dumps({"task": "rssi", "config": values}))
     (folder / "environment.json").write_text(json.dumps({"config_sha256": digest(values)}))
-    for given in (("--resume", folder, "--json"), (f"--resume={folder}", "--json"), ("--json", f"--resume={folder}")):
-        found = executed(RssiTaskConfig, *given)
-        assert (plain(found), found.json) == (values | {"scheduler": None}, True)
-    assert executed(RssiTaskConfig, "--resume", folder, "--scheduler", "tcp://new:1").scheduler == "tcp://new:1"
-    for given, name in ((("--seed", 7), "seed"), (("--config", "x"), "config"), (("--keep-filler",), "keep-filler")):
-        with pytest.raises(InputError, match=f"--{name} cannot change the run that --resume continues"):
-            executed(RssiTaskConfig, *given, "--resume", folder)
+    with mock.patch("tasks.resume.run.run_task") as task:
+        assert main(["resume", str(folder), "--json"]) == 0
+        assert main(["resume", str(folder), "--scheduler", "tcp://new:1"]) == 0
+        with pytest.raises(SystemExit, match="2"):
+            main(["resume", str(folder), *given])
+    first, second = [call.args for call in task.call_args_list]
+    assert (first[0], plain(first[1]), first[2]) == ("rssi", values | {"scheduler": None}, folder)
+    assert second[1].scheduler == "tcp://new:1"
+    assert f"Unrecognized options: {given[0]}" in " ".join(capsys.readouterr().err.replace("│", "").split())
 
 
 def test_verbose_prints_messages_of_logging_and_only_during_the_command(capsys):

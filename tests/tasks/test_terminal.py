@@ -106,5 +106,5 @@ def test_an_interrupted_run_says_how_to_resume(tmp_path, capsys, monkeypatch):
     assert quick.run("rssi", "--rx", "1", "--quiet", "--out", tmp_path / "run") == 130
     assert capsys.readouterr().err == f"stopped; continue with: swiftwrf resume {tmp_path / 'run.partial'}\n"
     monkeypatch.undo()
-    assert quick.run("rssi", "--resume", tmp_path / "run.partial", "--json") == 0
+    assert quick.run("resume", tmp_path / "run.partial", "--json") == 0
     assert json.loads(capsys.readouterr().out)["rows"]

@@ -18,7 +18,7 @@ from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.registry import Registry
-from swiftwrf.runtime.validation import PositiveInt, configuration
+from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, configuration
 
 LINEAR_ARRAY = (
     "the elements lie on a line, so the array receives the angle to its axis only; directions are folded to the half-plane "
@@ -44,6 +44,8 @@ class ReadOptions:
     grid: AngularGrid | None = None
     every: PositiveInt | None = None
     station: PositiveInt | None = None
+    subcarriers: PositiveInt | None = None
+    bandwidth: PositiveFloat | None = None
     drop_null: bool = False
     round_trip: bool = False
     columns: Mapping[str, str] | None = None

@@ -52,7 +52,7 @@ NO_INTERACTIONS = (
 class DeepMimo(Format[Spectra]):
     """Paths of a ray tracer, from which spectra are computed; `station` chooses a pair of transmitter and receivers."""
 
-    takes = frozenset({"array", "grid", "every", "station"})
+    takes = frozenset({"array", "grid", "every", "station", "subcarriers", "bandwidth"})
 
     def recognises(self, path: Path) -> bool:
         return bool(_pairs(path))
@@ -84,6 +84,8 @@ class DeepMimo(Format[Spectra]):
             path.resolve().name,
             options.array,
             options.grid,
+            subcarriers=options.subcarriers,
+            bandwidth_hz=options.bandwidth,
             index=torch.from_numpy(index),
             source=digests([path / "params.json", *files]),
             notes=(*notes, *found),

@@ -36,7 +36,7 @@ MAX_GAIN = 1e100  # sums of larger ones overflow
 class PathArchive(Format[Spectra]):
     """Traced paths, from which spectra are computed."""
 
-    takes = frozenset({"array", "grid"})
+    takes = frozenset({"array", "grid", "subcarriers", "bandwidth"})
 
     def recognises(self, path: Path) -> bool:
         return (path / "paths.npz").is_file() or (path.suffix == ".npz" and "path_count" in array_names(path))
@@ -48,6 +48,8 @@ class PathArchive(Format[Spectra]):
             file.parent.resolve().name,
             options.array,
             options.grid,
+            subcarriers=options.subcarriers,
+            bandwidth_hz=options.bandwidth,
             named_splits=read_splits(file.parent, len(paths.count), first=1),
             source=digests([file], file.parent),
         )

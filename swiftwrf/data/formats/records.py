@@ -36,7 +36,7 @@ from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.archives import MAX_UNPACKED_BYTES
 from swiftwrf.data.files import check_carrier, digests, read_text
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
-from swiftwrf.data.snapshots import Snapshots, check_spacing, round_trip_array, without_null
+from swiftwrf.data.snapshots import Snapshots, check_spacing, kept_subcarriers, round_trip_array
 from swiftwrf.errors import InputError
 from swiftwrf.positions import MAX_COORDINATE_M, check_positions
 from swiftwrf.runtime.validation import PositiveFloat, check_value
@@ -115,13 +115,14 @@ class RecordFormat(Format[Snapshots]):
             raise InputError(f"{path} holds no record with a position and a channel")
         if without:
             notes = (*notes, f"records without a finite position or channel are left out: {without}")
-        kept, null = without_null(torch.from_numpy(np.stack(channels)), options.drop_null)
+        csi = torch.from_numpy(np.stack(channels))
+        kept, null = kept_subcarriers(csi, options.drop_null)
         turned: tuple[str, ...] = ()
         if options.round_trip:
             link["array"], turned = round_trip_array(link["array"])
         name = path.resolve().name if path.is_dir() else path.stem
         return Snapshots(
-            kept,
+            csi[:, kept],
             np.stack(positions),
             **link,
             name=f"{name}-{station}" if station else name,

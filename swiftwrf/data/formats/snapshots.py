@@ -14,15 +14,15 @@ from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.archives import ARCHIVES, Arrays, array_names, read_arrays
 from swiftwrf.data.files import check_carrier, digests
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
-from swiftwrf.data.snapshots import Snapshots, check_spacing, round_trip_array, without_null
+from swiftwrf.data.snapshots import Snapshots, check_spacing, kept_subcarriers, round_trip_array
 from swiftwrf.data.splits import read_splits
 from swiftwrf.errors import InputError
-from swiftwrf.positions import check_positions
+from swiftwrf.positions import check_positions, to_tensor
 
 REQUIRED_ARRAYS = ("csi", "position", "frequency_hz", "array_position", "array_orientation")
 OPTIONAL = ("element_position", "rows", "columns", "spacing_m", "line_of_sight", "time")
 SCALARS = ("frequency_hz", "rows", "columns", "spacing_m")
-VECTORS = ("array_position", "array_orientation", "line_of_sight", "time")
+VECTORS = ("array_position", "array_orientation", "line_of_sight", "time", "frequency_hz")
 
 
 @SNAPSHOT_FORMATS.register("snapshots")
@@ -62,11 +62,17 @@ def snapshots_of(
     arrays = arrays | {name: values.reshape(-1) for name, values in vectors.items() if 1 in values.shape}
     arrays |= {name: arrays[name].reshape(()) for name in SCALARS if name in arrays and arrays[name].size == 1}
     arrays, reversed_axes = _turned_round(arrays)
+    given, frequency = arrays["frequency_hz"], None
+    if given.ndim == 1 and arrays["csi"].ndim == 3:
+        arrays |= {"frequency_hz": given.mean()}
     position, array = check_positions(arrays["position"], f"{source}: position"), array_of(source, arrays)
     n, folder, pose = len(position), files[0].parent, _pose(source, arrays)
     raw = _channel(source, arrays["csi"], n, len(array.element))
-    raw, null = without_null(raw, options.drop_null)
-    channel = _scaled(source, raw)
+    kept, null = kept_subcarriers(raw, options.drop_null)
+    channel = _scaled(source, raw[:, kept])
+    if given.ndim == 1:
+        frequency = to_tensor(f"{source}: frequency_hz", given, torch.float64, (len(kept),))[kept]
+        frequency = 2 * frequency if options.round_trip else frequency
     array, turned = round_trip_array(array) if options.round_trip else (array, ())
     if bool((position == torch.tensor(pose.position, dtype=torch.float64)).all(dim=1).any()):
         raise InputError(f"{source} has a position equal to array_position, from which there is no direction")
@@ -80,6 +86,7 @@ def snapshots_of(
         source=digests(files, folder),
         line_of_sight=arrays.get("line_of_sight"),
         time=arrays.get("time"),
+        frequency_hz=frequency,
         notes=(*notes, *reversed_axes, *null, *turned),
     )
     return data if options.every in (None, 1) else data.subset(torch.arange(0, n, options.every))

@@ -10,6 +10,8 @@ import torch
 from annotated_types import Ge, Le
 from torch import Tensor
 
+from swiftwrf.array.beamforming import covariance
+from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import MIN_TRAINING, folds
 from swiftwrf.errors import InputError
@@ -252,7 +254,7 @@ def split(scene: PhaseObservations, fold: Tensor) -> Splits:
 
 
 def observe(train: Spectra, config: GeometryConfig | None = None) -> tuple[PhaseObservations, Tensor]:
-    """Retrieve the phases of the channel from the spectra.
+    """Return the phases of the channel: those of the snapshots if there are any, otherwise retrieved from the spectra.
 
     Returns:
         Observed phases of the spectra whose phases could be retrieved, and the row numbers of these spectra.
@@ -267,6 +269,10 @@ def observe(train: Spectra, config: GeometryConfig | None = None) -> tuple[Phase
     assert train.fixed_position is not None
     if len(train.position.unique(dim=0)) < MIN_TRAINING:
         raise InputError(f"the positions of {train.name} are fewer than {MIN_TRAINING} different ones")
+    if train.channel is not None:
+        described = train.fixed_position, train.moving, train.array, train.rotation
+        phases = carrier_phases(train.channel, train.frequency_hz, train.array)
+        return PhaseObservations.of(train.position, *described, phases, retrieved=False), rows
     channel, error = retrieve_phases(correlations(train), train.array, config.seed)
     solved = (error < 0.1).nonzero()[:, 0]  # relative error of the autocorrelation
     if len(solved) < max(MIN_TRAINING, len(train) / 2):
@@ -277,6 +283,22 @@ def observe(train: Spectra, config: GeometryConfig | None = None) -> tuple[Phase
         train.position[solved], train.fixed_position, train.moving, train.array, train.rotation, channel[solved]
     )
     return scene, rows[solved]
+
+
+def carrier_phases(channel: Tensor, frequency_hz: Tensor | None, array: PlanarArray) -> Tensor:
+    """Return the phasors of the elements at the carrier, complex64 (n, K) of modulus 1.
+
+    Args:
+        channel: Snapshots, complex (n, S, K).
+        frequency_hz: Their frequencies (S,) [Hz]. Of several snapshots at the carrier, the signal subspace counts.
+        array: Array of the carrier.
+    """
+    if frequency_hz is not None:
+        return channel[:, int((frequency_hz - LIGHT_SPEED / array.wavelength).abs().argmin())].sgn()
+    if channel.shape[1] == 1:
+        return channel[:, 0].sgn()
+    signal: Tensor = torch.linalg.eigh(covariance(channel)).eigenvectors[..., -1]
+    return signal.to(channel.dtype).sgn()
 
 
 def _held_out(rooms: list[PlaneSet], splits: Splits, steps: int = 4) -> list[Tensor]:

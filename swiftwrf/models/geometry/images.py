@@ -124,8 +124,9 @@ class PhaseObservations:
         end: The end that moves.
         element: Phase of a wave from unit vector u at each element is element @ u, float32 (K, 3) [rad].
         wavenumber: Wavenumber [rad / m].
-        channel: Observed phases, complex64 (n, 2, K) of unit modulus: the channel and its alternative, the conjugate
-            observed by an array rotated by half a turn. Spectra cannot distinguish them if each element has an opposite one.
+        channel: Observed phases, complex64 (n, T, K) of unit modulus. Of spectra T is 2: the channel and its alternative,
+            the conjugate observed by an array rotated by half a turn. Spectra cannot distinguish them if each element has an
+            opposite one. Of measured channels T is 1.
     """
 
     transmitter: Tensor
@@ -137,18 +138,37 @@ class PhaseObservations:
 
     @classmethod
     def of(
-        cls, position: Tensor, fixed: Tensor, moving: Moving, array: PlanarArray, rotation: Tensor, channel: Tensor
+        cls,
+        position: Tensor,
+        fixed: Tensor,
+        moving: Moving,
+        array: PlanarArray,
+        rotation: Tensor,
+        channel: Tensor,
+        retrieved: bool = True,
     ) -> PhaseObservations:
-        """Return the link of a moving end (n, 3) [m] and a fixed end (3,) [m], with a channel (n, K) of modulus 1."""
+        """Return the link of a moving end (n, 3) [m] and a fixed end (3,) [m].
+
+        Args:
+            position: Positions of the moving end (n, 3) [m].
+            fixed: Position of the fixed end (3,) [m].
+            moving: The end that moves.
+            array: Array at the receiver.
+            rotation: Matrix that rotates array into world coordinates, (3, 3).
+            channel: Phasors of the elements, complex (n, K) of modulus 1.
+            retrieved: True for phases from spectra, which have an alternative; False for those of measured channels.
+        """
         away = position - fixed
         size = away.abs().amax(dim=1, keepdim=True)
         position = torch.where(size > MAX_DISTANCE_M, fixed + MAX_DISTANCE_M * (away / size), position)
         transmitter, receiver = (position, fixed[None]) if moving == "transmitter" else (fixed[None], position)
         wavenumber = 2 * math.pi / array.wavelength
         element = wavenumber * array.element.double() @ rotation[:, :2].T.double()
-        opposite = array.opposite
-        both = torch.stack([channel, channel if opposite is None else channel.conj()[:, opposite]], dim=1)
-        return cls(transmitter, receiver, moving, element.float(), wavenumber, both.to(torch.complex64))
+        opposite = array.opposite if retrieved else None
+        found = [channel] if opposite is None else [channel, channel.conj()[:, opposite]]
+        return cls(
+            transmitter, receiver, moving, element.float(), wavenumber, torch.stack(found, dim=1).to(torch.complex64)
+        )
 
     def __len__(self) -> int:
         return len(self.moving)

@@ -10,15 +10,26 @@ import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
+from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.data.spectra import Spectra, check_training, fingerprint
+from swiftwrf.data.splits import folds
+from swiftwrf.errors import InputError
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, bounding_box
 from swiftwrf.models.geometry.fit import GeometryConfig, extend_room, observe, search_room, update_room
+from swiftwrf.models.geometry.furniture import Channels, Furniture, field, find_furniture, fit_furniture, waves
 from swiftwrf.models.geometry.images import PhaseObservations, PlaneSet, images
 from swiftwrf.models.geometry.planes import Plane, RoomEstimate, refine
 from swiftwrf.models.link import Link, Linked
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import checked
+
+MAX_SNAPSHOTS = 8
+
+
+def kept_snapshots(number: int) -> Tensor:
+    """Return the numbers of at most 8 snapshots, evenly chosen, that furniture is fitted to and positions are located by."""
+    return torch.linspace(0, number - 1, min(MAX_SNAPSHOTS, number)).long()
 
 
 class GeometryModel(Linked, FieldModel):
@@ -45,6 +56,8 @@ class GeometryModel(Linked, FieldModel):
     """planes with their uncertainty"""
     fingerprint: str
     """digest of the training spectra"""
+    furniture: Furniture | None = None
+    """what stands in the room; None if the training spectra have no channels, or if these do not need it"""
 
     @classmethod
     def accepts_like(cls, model: FieldModel) -> bool:
@@ -89,10 +102,40 @@ class GeometryModel(Linked, FieldModel):
         if known is None:
             self.estimate = search_room(train, self.config, progress)
         elif known.fingerprint == owner:
-            self.estimate = known.estimate
+            self.estimate, self.furniture, self.fingerprint = known.estimate, known.furniture, owner
+            return
         else:
             self.estimate = known.refined_on(observe(train, self.config)[0]).estimate
         self.fingerprint = owner
+        self._furnish(train)
+
+    def _furnish(self, train: Spectra) -> None:
+        """Estimate what stands in the room, if there are channels."""
+        self.furniture = None
+        if train.channel is not None and self.planes:
+            measured, fold = self.channels(train), folds(train.position, self.config.validation, self.config.seed)
+            constant = self.gains(measured.scene)[0]
+            self.furniture = find_furniture(self.tensors(), constant, measured, self.region(), fold)
+
+    def furnished_on(self, train: Spectra) -> Self:
+        """Return the room with its furniture fitted to the channels of other spectra, without another choice of options."""
+        model = copy(self)
+        if self.furniture is not None:
+            model.furniture = fit_furniture(self.tensors(), self.channels(train), self.furniture)
+        return model
+
+    def channels(self, data: Spectra) -> Channels:
+        """Return the channels of spectra as the room predicts them, of at most 8 snapshots.
+
+        Raises:
+            InputError: Spectra without channels.
+        """
+        if data.channel is None:
+            raise InputError(f"{data.name} contains spectra alone; give snapshots, or ray paths with --subcarriers")
+        rows = kept_snapshots(data.channel.shape[1])
+        carrier = LIGHT_SPEED / self.array.wavelength
+        frequency = torch.ones(len(rows)).double() if data.frequency_hz is None else data.frequency_hz[rows] / carrier
+        return Channels(self.scene(data.position), data.channel[:, rows], frequency)
 
     def _update(self, new: Spectra) -> None:
         if self.planes:
@@ -128,6 +171,7 @@ class GeometryModel(Linked, FieldModel):
         model = copy(self)
         model.grid, model.bounds = train.grid, bounding_box(train.position)
         model.estimate, model.fingerprint = estimate, fingerprint(train)
+        model._furnish(train)
         return model
 
     @single_thread()
@@ -167,9 +211,35 @@ class GeometryModel(Linked, FieldModel):
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         return self.array.spectrum(self.channel(position), grid), None
 
-    def channel(self, position: Tensor) -> Tensor:
-        """Return the channel of each element at positions (n, 3) [m], complex64 (n, K)."""
-        return self.tensors().channel(self.scene(position))
+    def channel(self, position: Tensor, frequency_hz: Tensor | None = None) -> Tensor:
+        """Predict the channel of each element, up to one complex factor.
+
+        Args:
+            position: Positions of the moving end, (n, 3) [m].
+            frequency_hz: Frequencies (F,) [Hz]. Defaults to the carrier alone.
+
+        Returns:
+            Channels, complex64 (n, F, K), or (n, K) at the carrier.
+
+        Example:
+            >>> import swiftwrf
+            >>> room = swiftwrf.simulated_room(n=20)
+            >>> model = GeometryModel.of_planes(room, [Plane((0.0, 0.0, -1.0), offset_m=0.0, gain=-0.6)])
+            >>> model.channel(room.position[:3], torch.tensor([2.40e9, 2.42e9])).shape
+            torch.Size([3, 2, 16])
+        """
+        scene = self.scene(position)
+        ratio = torch.ones(1) if frequency_hz is None else frequency_hz * self.array.wavelength / LIGHT_SPEED
+        found = field(self.gains(scene), waves(self.tensors(), scene, ratio))
+        return found[:, 0] if frequency_hz is None else found
+
+    def gains(self, scene: PhaseObservations) -> Tensor:
+        """Return the gains of the direct path and of each image at the positions of a scene, float32 (n, 1 + S)."""
+        room = self.tensors()
+        if self.furniture is not None:
+            return self.furniture.gains(room, scene)
+        constant = torch.cat([torch.ones(1), room.image_gain[0]]) if room.sequence else torch.ones(1)
+        return constant.expand(len(scene), -1)
 
     def scene(self, position: Tensor) -> PhaseObservations:
         """Return the link at positions (n, 3) [m], without observations."""
@@ -207,12 +277,16 @@ class GeometryModel(Linked, FieldModel):
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
         header = self.to_json() | {"conclusion": self.conclusion, "fingerprint": self.fingerprint}
-        return {"covariance": self.estimate.covariance}, header
+        if self.furniture is None:
+            return {"covariance": self.estimate.covariance}, header
+        tensors, own = self.furniture.state()
+        return {"covariance": self.estimate.covariance} | tensors, header | own
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         planes, order = header["planes"], header["order"]
         expect(tensors, {"covariance": (len(planes), len(planes))})
         self.fingerprint = str(header["fingerprint"])
+        self.furniture = Furniture.from_state(tensors, header, len(planes)) if "voxel_m" in header else None
         self.estimate = RoomEstimate(
             planes=[Plane(**{**plane, "normal": tuple(plane["normal"])}) for plane in planes],
             order=order,

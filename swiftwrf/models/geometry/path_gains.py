@@ -23,7 +23,8 @@ from torch import Tensor
 
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel
-from swiftwrf.models.geometry.images import PhaseObservations, images, visibility
+from swiftwrf.models.geometry.furniture import waves
+from swiftwrf.models.geometry.images import PhaseObservations
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation
 from swiftwrf.models.geometry.planes import advantage
@@ -105,7 +106,7 @@ class PathGains:
     def channel(self, geometry: GeometryModel, position: Tensor) -> Tensor:
         """Return the channel of each element in each of F fields at positions (n, 3) [m], complex64 (n, F, K)."""
         wave, gain = paths(geometry, geometry.scene(position))
-        return (gain + self.change(position)) @ wave
+        return (gain[:, None] + self.change(position)) @ wave
 
     def change(self, position: Tensor) -> Tensor:
         """Return the differences of the gains from those of the planes in each field, complex64 (n, F, S)."""
@@ -114,13 +115,9 @@ class PathGains:
 
 
 def paths(geometry: GeometryModel, scene: PhaseObservations) -> tuple[Tensor, Tensor]:
-    """Return the waves of the direct path and of each image, complex64 (n, 1 + S, K), and their gains (1 + S,)."""
-    room = geometry.tensors()
-    wave, strength = [scene.wave(scene.transmitter)[None]], [torch.ones(1)]
-    if room.sequence:
-        wave.append((scene.wave(images(scene, room)) * visibility(scene, room)[..., None])[0])
-        strength.append(room.image_gain[0])
-    return torch.cat([part.expand(-1, len(scene), -1) for part in wave]).transpose(0, 1), torch.cat(strength)
+    """Return the waves of the direct path and of each image, complex64 (n, 1 + S, K), and their gains, (n, 1 + S)."""
+    wave = waves(geometry.tensors(), scene, torch.ones(1))[:, :, 0]
+    return wave, geometry.gains(scene)
 
 
 @single_thread()
@@ -130,7 +127,7 @@ def fit_path_gains(
     """Fit path gains around several samples of their prior to the observed phases."""
     prior, (wave, gain) = PRIORS[name], paths(geometry, scene)
     root = torch.linalg.cholesky(kernel.covariance(scene.moving.double())).float()
-    shape = len(scene), 8, len(gain), 2  # eight fields, whose spectra are averaged
+    shape = len(scene), 8, gain.shape[1], 2  # eight fields, whose spectra are averaged
     sample = prior.sample_std * torch.randn(shape, generator=torch.Generator().manual_seed(0))
     gradient, normal = posterior_gradient(scene, wave, gain, root, sample, prior), sample.clone()
     optimiser = torch.optim.Adam([normal], lr=0.2, fused=True)
@@ -159,12 +156,12 @@ def posterior_gradient(
     Args:
         scene: Observed phases at n positions.
         wave: Waves of the paths, complex64 (n, S, K).
-        gain: Constant gains of the paths (S,).
+        gain: Gains of the paths (n, S) without those differences.
         root: Cholesky factor of the kernel matrix, lower triangle, (n, n).
         sample: Samples of the prior (n, F, S, 2).
         prior: Prior of the gains.
     """
-    without, conjugate = gain.to(wave.dtype)[None] @ wave, scene.channel.conj().resolve_conj()
+    without, conjugate = gain.to(wave.dtype)[:, None] @ wave, scene.channel.conj().resolve_conj()
     std = torch.tensor(prior.std).expand(sample.shape[1:]).contiguous()
     scale = 2 / (prior.missing_scale * wave.shape[-1] ** 2)
 

@@ -13,12 +13,11 @@ from tasks.aoa.page.overview import compared
 from tasks.aoa.page.records import AoaRecords, FractionRecords
 from tasks.aoa.page.results import results_section, turbo_distribution
 from tasks.aoa.page.room import choice_section, room_section
-from tasks.aoa.page.suggest import suggestion_section
 from tasks.aoa.page.summary import conclusion, next_steps, summary
 from tasks.aoa.page.synthesis import similarity, synthesis_section
 from tasks.environment import command
-from tasks.page.page import Page, Plot, Section, Summary, sections_of
-from tasks.page.provenance import provenance
+from tasks.page.page import Page, Plot, Section, Summary, provenance, sections_of
+from tasks.page.shared import suggestion_plot, worth
 
 
 def page(runs: list[AoaRecords]) -> Page:
@@ -62,8 +61,23 @@ def _positions(fraction: FractionRecords) -> Section | None:
 
 
 def _more(fraction: FractionRecords) -> Section | None:
-    parts = [part for make in (choice_section, suggestion_section) if (part := make(fraction))]
+    parts = [part for make in (choice_section, _suggestion_section) if (part := make(fraction))]
     return Section("", parts=parts) if parts else None
+
+
+def _suggestion_section(fraction: FractionRecords) -> Section | None:
+    """Return a plan of the suggested positions and the expected variance after measuring there; None without suggestions."""
+    if not (arrays := fraction.arrays("suggested")):
+        return None
+    suggested, left = arrays["suggested"], arrays["left"]
+    text = (
+        f"Measuring at {len(suggested)} more positions (suggested-mix{fraction.key}.csv, the most informative first) would "
+        f"reduce the predictive variance over the region from {left[0]:.0%} to {left[-1]:.0%} of the variance of the "
+        "spectra. The estimate is that of a Gaussian process on the measured spectra. "
+        f"{worth(left)}"
+    )
+    plot = suggestion_plot(f"suggested-{fraction.file_name}", arrays, "variance left in the region [%]")
+    return Section("Where to measure next", [text], plots=[plot])
 
 
 def _field_models(fraction: FractionRecords) -> list[Plot]:

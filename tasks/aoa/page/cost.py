@@ -9,9 +9,8 @@ from swiftwrf.models.swiftwrf import MIN_GAIN
 from tasks.aoa.page.overview import essential
 from tasks.aoa.page.records import AoaRecords, FractionRecords, first_history, fits
 from tasks.page import figures
-from tasks.page.page import Plot, Section, Table
-from tasks.page.palette import MAX_CURVES
-from tasks.page.provenance import number
+from tasks.page.figures import MAX_CURVES
+from tasks.page.page import Plot, Section, Table, number
 from tasks.summarise import SHORTEST, rms_of_psnr
 
 

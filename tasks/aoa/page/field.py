@@ -21,15 +21,10 @@ MIN_SHIFT_RAD = np.deg2rad(0.1)  # smallest visible shift of a primitive's mean 
 def field_section(fraction: FractionRecords) -> Section | None:
     """Return maps of the peak direction, and the primitives along a walk; None if the run has neither."""
     names = fraction.synthesizers(fraction.mix["methods"])
-    plots = [_map(fraction, name, field) for name in names if (field := _stored(fraction, f"field-{name}")) is not None]
-    if (motion := _stored(fraction, "motion")) is not None:
+    plots = [_map(fraction, name, field) for name in names if (field := fraction.arrays(f"field-{name}"))]
+    if motion := fraction.arrays("motion"):
         plots.append(_motion(fraction, motion))
     return Section("", plots=plots) if plots else None
-
-
-def _stored(fraction: FractionRecords, kind: str) -> dict[str, NDArray[Any]] | None:
-    name = f"{kind}-mix{fraction.key}"
-    return fraction.run.arrays(name) if fraction.run.holds(name) else None
 
 
 def _map(fraction: FractionRecords, name: str, field: dict[str, NDArray[Any]]) -> Plot:

@@ -7,8 +7,7 @@ from pandas import DataFrame, concat
 
 from tasks.aoa.page.records import FractionRecords
 from tasks.page import figures
-from tasks.page.page import Plot, Section, Table
-from tasks.page.provenance import number
+from tasks.page.page import Plot, Section, Table, number
 
 LEVELS = np.linspace(0, 1, 21)  # of credible regions
 TRUTH, ESTIMATE, MASS = "#2a9165", "#cf4a4a", "#3a7fd5"
@@ -55,7 +54,7 @@ def locating_section(fraction: FractionRecords) -> Section | None:
         "over positions. The estimate is the posterior median."
     )
     plots = [_errors(fraction)]
-    if fraction.run.holds(f"located-mix{fraction.key}"):
+    if fraction.arrays("located"):
         plots.append(_posteriors(fraction))
     return Section(title, [text, *notes], [Table(columns, rows, caption)], plots)
 
@@ -87,7 +86,7 @@ def _errors(fraction: FractionRecords) -> Plot:
 
 def _posteriors(fraction: FractionRecords) -> Plot:
     """Return maps of the posteriors of six test spectra, from the best to the worst."""
-    example = fraction.run.arrays(f"located-mix{fraction.key}")
+    example = fraction.arrays("located")
     error, panels = np.linalg.norm(example["estimate"] - example["truth"], axis=1), []
     for row in range(len(error)):
         figure, ax = figures.panel(3.6, 3.6)

@@ -8,14 +8,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from augment.cross_validation import LOCATOR
-from tasks.aoa.page.gains import turbo_method
 from tasks.aoa.page.records import FractionRecords, palette
 from tasks.aoa.page.room import FIXED, draw_in_plan, extent
-from tasks.aoa.page.synthesis import examples
+from tasks.aoa.page.synthesis import examples, spectra
 from tasks.page import figures
-from tasks.page.comparison import Compared, comparison, interval
 from tasks.page.page import Plot, Table
-from tasks.page.polar import spectra
+from tasks.page.shared import Compared, comparison, interval
 
 BASELINES = ("peak", "constant")  # in every table and figure of errors: others must beat them
 SHOWN_SPECTRUM = 3  # of the examples, quantile 0.4 of the quality
@@ -24,7 +22,7 @@ SHOWN_SPECTRUM = 3  # of the examples, quantile 0.4 of the quality
 def essential(fraction: FractionRecords) -> list[str]:
     """Return the methods of overviews, in their order: baselines, without synthetic spectra, with them, references."""
     choice = fraction.mix["estimator_choice"]
-    names = [*BASELINES, fraction.mix["reference"], "measured_only", turbo_method(fraction), LOCATOR]
+    names = [*BASELINES, fraction.mix["reference"], "measured_only", fraction.turbo_method, LOCATOR]
     names += [*([choice["name"]] if choice else []), "measured_all"]
     return [name for name in dict.fromkeys(names) if name in fraction.mix["methods"]]
 
@@ -41,7 +39,7 @@ def overview(fraction: FractionRecords) -> Plot:
         "A spectrum at a position without a measurement, measured and predicted (cross: true direction, ring: peak). "
     )
     caption += "Median angular error with its 95 % interval; `peak` and `constant` need no training."
-    if fraction.run.holds(f"located-mix{fraction.key}"):
+    if fraction.arrays("located"):
         panels.insert(0, located_plan(fraction))
         caption = (
             "The room that was found (dashed walls are not identifiable), and test positions with the errors of their "
@@ -57,7 +55,7 @@ def located_plan(fraction: FractionRecords) -> Figure:
     own = table[(table["method"] == LOCATOR) & (table["repeat"] == 0)]
     truth, estimate = own[["truth_x_m", "truth_y_m"]].to_numpy(), own[["estimate_x_m", "estimate_y_m"]].to_numpy()
     figure, plan = figures.panel(4.8, 3.8)
-    draw_room(plan, fraction.run.arrays(f"located-mix{fraction.key}"))
+    draw_room(plan, fraction.arrays("located"))
     highest = max(float(own["error_m"].quantile(0.95)), 1e-3)
     for at, to in zip(truth, estimate, strict=True):
         plan.plot(*zip(at, to, strict=True), color=figures.RULE, linewidth=1, zorder=2)
@@ -91,7 +89,7 @@ def compared(fractions: list[FractionRecords]) -> tuple[Table, Plot]:
     shown = [
         *BASELINES,
         *(fraction.mix["reference"] for fraction in fractions),
-        *map(turbo_method, fractions),
+        *(fraction.turbo_method for fraction in fractions),
         LOCATOR,
         "measured_all",
     ]

@@ -6,16 +6,18 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
+from numpy.typing import NDArray
 from pandas import DataFrame
 
-from augment.turbo.condition import Condition, chosen_file, conditions_of
+from augment.turbo.condition import Condition, chosen_file, conditions_of, headline
 from augment.turbo.results import MixMetrics
 from swiftwrf.choices import AUTO, fraction_key
 from swiftwrf.models import FIELD_MODELS
 from tasks import labels
 from tasks.metrics import AoaMetrics
-from tasks.page.palette import Palette
+from tasks.page.figures import Palette
 from tasks.page.records import Records
 
 AoaRecords = Records[AoaMetrics]
@@ -55,9 +57,25 @@ class FractionRecords:
         """Median angular error [deg] of each method."""
         return {name: method["great_circle_deg"]["median"] for name, method in self.mix["methods"].items()}
 
+    @property
+    def turbo_method(self) -> str:
+        """Method of the network, or of kernel regression without one, with all spectra of the first field model."""
+        return headline(self.conditions.values()).method
+
+    @property
+    def learner(self) -> str:
+        """Estimator of `turbo_method` in words."""
+        condition = headline(self.conditions.values())
+        return "the network" if condition.is_network else condition.estimator
+
     def table(self, name: str) -> DataFrame:
         """Return the rows of a table of the run, e.g. `errors`, with this measured fraction."""
         return of_fraction(self.run.table(name), self.key)
+
+    def arrays(self, kind: str) -> dict[str, NDArray[Any]]:
+        """Return the arrays of one kind, e.g. `located`, that the run left; none if it left no such file."""
+        name = f"{kind}-mix{self.key}"
+        return self.run.arrays(name) if self.run.holds(name) else {}
 
     def synthesizers(self, methods: Iterable[str]) -> list[str]:
         """Return the field models behind these methods, that of the first repeat where repeats chose differently."""

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from augment.cross_validation import LOCATOR
 from augment.turbo.results import Angle
-from tasks.aoa.page.gains import gain_table, turbo_method
+from swiftwrf.metrics import ChangeMetrics
 from tasks.aoa.page.overview import BASELINES
 from tasks.aoa.page.records import FractionRecords
 from tasks.page import figures
-from tasks.page.comparison import with_interval
-from tasks.page.page import Plot, Section, Table
-from tasks.page.palette import MAX_CURVES
-from tasks.page.provenance import number
+from tasks.page.figures import MAX_CURVES
+from tasks.page.page import Plot, Section, Table, number
 from tasks.page.records import notes
+from tasks.page.shared import with_interval
 
 ERRORS: dict[Angle, str] = {
     "azimuth_deg": "azimuth",
@@ -93,7 +92,7 @@ def choice_sentence(fraction: FractionRecords) -> str:
 def _cdf(fraction: FractionRecords) -> Plot:
     """Return the distributions of the errors of the baseline, the best one on measured spectra, and the networks."""
     table = fraction.table("errors")
-    wanted = ("peak", fraction.mix["reference"], turbo_method(fraction), LOCATOR, "measured_all")
+    wanted = ("peak", fraction.mix["reference"], fraction.turbo_method, LOCATOR, "measured_all")
     names = [name for name in dict.fromkeys(wanted) if name in fraction.mix["methods"]][:MAX_CURVES]
     panels = []
     for column, name in ERRORS.items():
@@ -124,3 +123,57 @@ def turbo_distribution(fraction: FractionRecords) -> list[Plot]:
         panels.append(figure)
     caption = "The network with spectra of each field model, between its references."
     return [Plot(f"turbo-{fraction.file_name}", panels, caption, own[["repeat", "index", "method", *ERRORS]])]
+
+
+def change_text(change: ChangeMetrics) -> str:
+    """Return a change with its 95 % interval.
+
+    Example:
+        >>> change_text({"median_deg": 1.0, "change": -0.49, "low": -0.6, "high": -0.3})
+        '-49% [-60%, -30%]'
+    """
+    return f"{change['change']:+.0%} [{change['low']:+.0%}, {change['high']:+.0%}]"
+
+
+def judgement(change: ChangeMetrics) -> str:
+    """Return whether a change is a gain, a loss or not significant, by its interval.
+
+    Example:
+        >>> judgement({"median_deg": 1.0, "change": -0.17, "low": -0.4, "high": 0.1})
+        'not significant'
+    """
+    if change["high"] < 0:
+        return "a gain"
+    return "a loss" if change["low"] > 0 else "not significant"
+
+
+def gain_sentence(fraction: FractionRecords) -> str:
+    """Return the change of the network's error by synthetic spectra, and whether it is significant."""
+    method = fraction.turbo_method
+    best = fraction.mix["reference"]
+    parts = [
+        f"{change_text(change)} against {other}"
+        f"{', the best one without synthetic spectra' if other == best else ''} ({judgement(change)})"
+        for other, change in fraction.mix["methods"][method]["changes"].items()
+    ]
+    return (
+        f"Synthetic spectra change the median angular error of {fraction.learner} ({method}) by {' and '.join(parts)}. "
+        "Intervals are paired over the test positions."
+    )
+
+
+def gain_table(fraction: FractionRecords) -> list[Table]:
+    """Return the changes of all methods with synthetic spectra."""
+    best = fraction.mix["reference"]
+    rows = []
+    for method in fraction.mix["methods"]:
+        for other, change in fraction.mix["methods"][method]["changes"].items():
+            name = f"{other} (best)" if other == best else other
+            rows.append([method, name, number(change["median_deg"]), change_text(change), judgement(change)])
+    caption = (
+        "Change of the median angular error by synthetic spectra, with its 95 % interval: a paired bootstrap over the test "
+        "positions. Medians are over all test spectra and repeats. Best: the smallest test error of all estimators without "
+        "synthetic spectra other than matched_field."
+    )
+    columns = ["method", "compared to", "median [deg]", "change", ""]
+    return [Table(columns, rows, caption)] if rows else []

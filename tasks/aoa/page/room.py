@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,11 @@ from pandas import DataFrame, concat
 from augment.cross_validation import CrossValidationMetrics, GainMetrics
 from swiftwrf.metrics import ChangeMetrics
 from swiftwrf.models import FIELD_MODELS
+from swiftwrf.plotting import corners_of, hatch
 from tasks import labels
 from tasks.aoa.page.records import FractionRecords
 from tasks.page import figures
-from tasks.page.page import Plot, Section, Table
-from tasks.page.provenance import number
+from tasks.page.page import Plot, Section, Table, number
 from tasks.records import read_json
 
 MARGIN = 0.5  # [m] around the room in a plan
@@ -134,7 +135,7 @@ def room_section(fraction: FractionRecords) -> Section | None:
         f"{1 - room['score_held_out']:.3f} with measured ones that the first stage of the search did not use. "
         f"`geometry-mix{fraction.key}.json` contains the planes."
     )
-    points = fraction.run.arrays(f"room-mix{fraction.key}")
+    points = fraction.arrays("room")
     plot = Plot(
         f"room-{fraction.file_name}",
         _room_panels(room["planes"], points),
@@ -142,7 +143,34 @@ def room_section(fraction: FractionRecords) -> Section | None:
         "order. The images of a moving transmitter are those of the array that sees it.",
         _places(points),
     )
-    return Section(title, [text], [table], [plot])
+    if "plan" not in points:
+        return Section(title, [text], [table], [plot])
+    furniture = Plot(
+        f"furniture-{fraction.file_name}",
+        furniture_panels(room["planes"], points),
+        "What stands in the room between three pairs of heights: the largest absorption of the amplitude. Hatched: unknown, "
+        "because no measured path crosses it. Held-out channels need this furniture.",
+    )
+    return Section(title, [text], [table], [plot, furniture])
+
+
+def furniture_panels(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) -> list[Figure]:
+    """Return a plan of the absorption between each pair of neighbouring heights, with the planes."""
+    x, y, height = points["plan_x"], points["plan_y"], points["height"]
+    low, high = extent(planes, np.concatenate([points["measured"], points["fixed"][None]]))
+    most = max(float(np.nanmax(points["plan"], initial=0.0)), 1.0)
+    panels = []
+    for values, ends in zip(points["plan"], pairwise(height), strict=True):
+        figure, ax = figures.panel(3.8, 3.6)
+        drawn = ax.imshow(values, origin="lower", extent=corners_of(x, y), vmin=0, vmax=most, cmap="Greys")
+        hatch(ax, x, y, np.isnan(values))
+        for plane in planes:
+            draw_in_plan(ax, plane, low, high)
+        ax.plot(*points["fixed"][:2], "*", color=FIXED, markersize=9)
+        ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title=f"z = {ends[0]:.2f} to {ends[1]:.2f} m")
+        figures.colour_bar(ax, drawn, "absorption [dB/m]")
+        panels.append(figure)
+    return panels
 
 
 def _places(points: dict[str, NDArray[Any]]) -> DataFrame:

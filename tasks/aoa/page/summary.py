@@ -5,14 +5,13 @@ from __future__ import annotations
 from augment.cross_validation import LOCATOR
 from augment.estimators import ESTIMATORS
 from augment.turbo.condition import MEASURED_STAND_IN
-from tasks.aoa.page.gains import change_text, gain_sentence, judgement, learner, turbo_method
 from tasks.aoa.page.overview import overview
 from tasks.aoa.page.records import AoaRecords, FractionRecords
-from tasks.aoa.page.results import choice_sentence
+from tasks.aoa.page.results import change_text, choice_sentence, gain_sentence, judgement
 from tasks.aoa.page.room import cross_validation_sentences
 from tasks.environment import command
 from tasks.page.page import Number, Summary
-from tasks.page.suggestion import worth
+from tasks.page.shared import worth
 from tasks.summarise import fingerprinting
 from tasks.terminal import Answer
 
@@ -22,7 +21,7 @@ def summary(fraction: FractionRecords) -> Summary:
     metrics, mix = fraction.run.metrics, fraction.mix
     meaning = [
         f"On {fraction.run.scene}, {mix['n_measured']} of {metrics['n_train']} training spectra are measured "
-        f"({fraction.percent}). The spectra at the other positions are synthesized, and {learner(fraction)} learns from "
+        f"({fraction.percent}). The spectra at the other positions are synthesized, and {fraction.learner} learns from "
         f"both. It is tested on {metrics['n_test']} spectra that take no part in any fit.",
         *(text for text in (choice_sentence(fraction), gain_sentence(fraction)) if text),
         *cross_validation_sentences(fraction),
@@ -32,7 +31,7 @@ def summary(fraction: FractionRecords) -> Summary:
 
 def _numbers(fraction: FractionRecords) -> list[Number]:
     """Return errors of the chosen estimator, the network and the strongest peak, and the quality of the spectra."""
-    turbo = turbo_method(fraction)
+    turbo = fraction.turbo_method
     choice = fraction.mix["estimator_choice"]
     first = choice["name"] if choice else turbo
     synthesizer = fraction.synthesizers([turbo])[0]
@@ -67,10 +66,10 @@ def conclusion(fraction: FractionRecords) -> str:
         for name, reason in list(choice["better"].items())[:1]:
             sentences.append(f"{name} has {medians[name]:.2f} degrees, but is not recommended: {reason}.")
     best = fraction.mix["reference"]
-    change = fraction.mix["methods"][turbo_method(fraction)]["changes"][best]
+    change = fraction.mix["methods"][fraction.turbo_method]["changes"][best]
     without = "that uses neither them nor the room" if LOCATOR in medians else "without them"
     sentences.append(
-        f"With synthetic spectra {learner(fraction)} changes the median error by {change_text(change)} against {best}, "
+        f"With synthetic spectra {fraction.learner} changes the median error by {change_text(change)} against {best}, "
         f"the best estimator {without}: {judgement(change)}."
     )
     if "peak" in medians and "constant" in medians:
@@ -132,9 +131,8 @@ def next_steps(fraction: FractionRecords) -> list[str]:
         f"Predict spectra anywhere: `swiftwrf.load({f'{path}/{name}-mix{key}.safetensors'!r}).predict(positions)`."
         for name in sorted(files - estimators)
     ]
-    if (fraction.run.folder / f"suggested-mix{key}.csv").is_file():
-        left = fraction.run.arrays(f"suggested-mix{key}")["left"]
-        steps.append(f"Where to measure next is in suggested-mix{key}.csv. {worth(left)}")
+    if suggested := fraction.arrays("suggested"):
+        steps.append(f"Where to measure next is in suggested-mix{key}.csv. {worth(suggested['left'])}")
     else:
         steps.append("Ask where to measure next with `--suggest 20`.")
     if metrics["repeats"] == 1:

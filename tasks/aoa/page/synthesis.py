@@ -5,17 +5,30 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import matplotlib.style
 import numpy as np
+import torch
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pandas import DataFrame, concat
 
+from swiftwrf import AngularGrid
 from swiftwrf.models import FIELD_MODELS
+from swiftwrf.plotting import polar_spectrum
 from tasks.aoa.page.records import FractionRecords
 from tasks.page import figures
-from tasks.page.page import Plot, Section, Table
-from tasks.page.palette import MAX_CURVES
-from tasks.page.polar import MAX_DIFFERENCE, Direction, spectra
-from tasks.page.provenance import number
+from tasks.page.figures import LABEL, MAX_CURVES, STYLE, colour_bar, plain
+from tasks.page.page import Plot, Section, Table, number
+
+MAX_DIFFERENCE = 0.5  # of a magnitude in [0, 1]: end of the scale of differences and standard deviations
+TRUTH, PEAK = "#ffffff", "#cf4a4a"
+Direction = tuple[float, float]  # azimuth, elevation [deg]
+SCALES = {
+    "measured": ("viridis", 0.0, 1.0),
+    "predicted": ("viridis", 0.0, 1.0),
+    "difference": ("RdBu_r", -MAX_DIFFERENCE, MAX_DIFFERENCE),
+    "standard deviation": ("magma", 0.0, MAX_DIFFERENCE),
+}
 
 
 @dataclass(frozen=True)
@@ -24,7 +37,7 @@ class Example:
 
     Args:
         title: Row and quality.
-        images: Values (n_elevation, n_azimuth) by kind, as `tasks.page.polar.spectra` takes them.
+        images: Values (n_elevation, n_azimuth) by kind, as `spectra` takes them.
         truth: True direction [deg]. None if it is unknown.
     """
 
@@ -35,7 +48,7 @@ class Example:
 
 def examples(fraction: FractionRecords) -> list[Example]:
     """Return test spectra from the best to the worst prediction."""
-    stored = _stored(fraction)
+    stored = fraction.arrays("examples")
     labels = fraction.table("errors").drop_duplicates("index").set_index("index")
     found = []
     for row, index in enumerate(stored["index"].tolist()):
@@ -67,7 +80,7 @@ def synthesis_section(fraction: FractionRecords) -> Section:
 
 
 def _examples(fraction: FractionRecords) -> Plot:
-    stored = _stored(fraction)
+    stored = fraction.arrays("examples")
     text = (
         f"Spectra at positions without a measurement, by {stored.get('synthesizer', 'swiftwrf')}, from the best to the "
         "worst by PSNR (quantiles 1, 0.8, ..., 0). The zenith is in the middle; cross: true direction, ring: peak. "
@@ -91,10 +104,6 @@ def similarity(fraction: FractionRecords) -> Plot:
     return Plot(f"ssim-{fraction.file_name}", [figure], caption, own[["repeat", "index", "synthesizer", "ssim"]])
 
 
-def _stored(fraction: FractionRecords) -> dict[str, NDArray[Any]]:
-    return fraction.run.arrays(f"examples-mix{fraction.key}")
-
-
 def _pixels(example: dict[str, NDArray[Any]]) -> DataFrame:
     """Return the pixels of the spectra in 256 steps, one row of pixels a row."""
     kinds = [kind for kind in ("measured", "synthetic", "deviation") if kind in example]
@@ -107,3 +116,46 @@ def _pixels(example: dict[str, NDArray[Any]]) -> DataFrame:
     }
     table = DataFrame(images.reshape(-1, columns), columns=[f"column_{i}" for i in range(columns)])
     return concat([DataFrame(names), table], axis=1)
+
+
+def spectra(images: dict[str, NDArray[Any]], title: str, truth: Direction | None = None) -> Figure:
+    """Return a panel with one hemisphere for each image, two in a row.
+
+    Azimuth runs counter-clockwise from the right. Magnitudes have the fixed scales of `SCALES`.
+
+    Args:
+        images: Values (n_elevation, n_azimuth) of a hemisphere whose last row is the zenith, by kind: keys of `SCALES`.
+        title: Title of the panel.
+        truth: True direction, a cross. The ring is the peak of each magnitude.
+    """
+    n_rows = -(-len(images) // 2)
+    with matplotlib.style.context(STYLE):
+        figure = Figure(figsize=(4.8, 0.3 + 2.2 * n_rows), layout="constrained")
+        axes = list(figure.subplots(n_rows, 2, squeeze=False, subplot_kw={"projection": "polar"}).flat)
+    for ax, (kind, image) in zip(axes, images.items(), strict=False):
+        colours, low, high = SCALES[kind]
+        grid, values = AngularGrid.hemisphere(*image.shape), torch.from_numpy(image)
+        polar_spectrum(values, grid, ax, colours, (low, high), label=None)
+        ax.set(yticks=(), xticks=np.deg2rad((0, 90, 180, 270)))
+        ax.tick_params(labelsize=LABEL, pad=-2)
+        ax.grid(visible=False)
+        ax.set_title(kind, fontsize=9)
+        if kind in ("measured", "predicted"):
+            azimuth, elevation = grid.peak_direction(values[None])[0].tolist()
+            _mark(ax, (azimuth, 90 - np.rad2deg(elevation)), "o", PEAK)
+            if truth is not None:
+                _mark(ax, (np.deg2rad(truth[0]), 90 - truth[1]), "x", TRUTH)
+        if kind == "measured":  # in the colours of the prediction beside it
+            continue
+        extend = {"difference": "both", "standard deviation": "max"}.get(kind, "neither")
+        colour_bar(ax, ax.collections[0], extend=extend, pad=0.12)
+    for ax in axes[len(images) :]:
+        ax.set_visible(False)
+    figure.suptitle(plain(title), fontsize=9)
+    return figure
+
+
+def _mark(ax: Any, at: tuple[float, float], marker: str, colour: str) -> None:
+    """Draw a mark with a dark rim, visible on any colour."""
+    for width, own in ((3.2, "#000001"), (1.6, colour)):
+        ax.plot(*at, marker, color=own, markersize=8, markerfacecolor="none", markeredgewidth=width, clip_on=False)

@@ -14,10 +14,8 @@ from tasks.labels import labels
 from tasks.locate.page import drawing
 from tasks.locate.page.summary import LEVEL, NEIGHBOURS, OWN, LocateRecords, by_method, conclusion, summary
 from tasks.locate.steps import SUGGESTED
-from tasks.page.comparison import Compared, comparison, with_interval
-from tasks.page.page import Page, Plot, Section, Summary, Table, sections_of
-from tasks.page.provenance import number, provenance
-from tasks.page.suggestion import suggestion_plot, worth
+from tasks.page.page import Page, Plot, Section, Summary, Table, number, provenance, sections_of
+from tasks.page.shared import Compared, comparison, suggestion_plot, with_interval, worth
 
 
 def page(runs: list[LocateRecords]) -> Page:
@@ -97,9 +95,12 @@ def _table(run: LocateRecords) -> Table:
                 number(error["mean"]),
                 number(horizontal["median"]),
                 seconds,
+                *([f"{entry['floor_hit_rate']:.1%}"] if "floor_hit_rate" in entry else []),
             ]
         )
     columns = ["localizer", "median [m]", "90 % [m]", "mean [m]", "median in plan [m]", "fit + locate [s]"]
+    if rows and len(rows[0]) > len(columns):
+        columns.append("floors right")
     return Table(columns, rows, "Position error of the test rows; median with its 95 % interval.", frozenset([OWN]))
 
 

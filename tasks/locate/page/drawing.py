@@ -21,7 +21,7 @@ from tasks.labels import labels
 from tasks.locate.page.summary import NEIGHBOURS, OWN
 from tasks.metrics import StudyMetrics
 from tasks.page import figures
-from tasks.page.palette import DASHES, MAX_CURVES, Palette
+from tasks.page.figures import DASHES, MAX_CURVES, Palette
 
 MAX_VECTOR_LINES = 300  # more lines become an image, so that the page stays small
 TRUTH, ESTIMATE = "#cf4a4a", "#ffffff"

@@ -76,5 +76,7 @@ def _next_steps(run: LocateRecords) -> list[str]:
 
 def by_method(run: LocateRecords) -> DataFrame:
     """Return the position errors, one row for each test row and one column for each localizer."""
-    errors: DataFrame = run.table("errors").pivot_table(index=["index"], columns="method", values="position_error_m")
+    errors: DataFrame = run.table("errors").pivot_table(
+        index=["index", "place"], columns="method", values="position_error_m"
+    )
     return errors

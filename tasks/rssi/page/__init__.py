@@ -6,13 +6,12 @@ from swiftwrf.choices import RSSI_PREDICTORS
 from tasks.environment import command
 from tasks.labels import PREDICTORS as LABELS
 from tasks.labels import labels
-from tasks.page.comparison import Compared, comparison
-from tasks.page.page import Number, Page, Section, Summary, sections_of
-from tasks.page.provenance import provenance
+from tasks.page.page import Number, Page, Section, Summary, provenance, sections_of
 from tasks.page.records import notes
+from tasks.page.shared import Compared, comparison
 from tasks.rssi.page import errors
-from tasks.rssi.page.maps import CERTAINTY, COVERED_DBM, Maps
-from tasks.rssi.page.summary import RssiRecords, best_baseline, conclusion, model_of, next_steps, title
+from tasks.rssi.page.maps import CERTAINTY, COVERED_DBM, Maps, RssiRecords
+from tasks.rssi.page.summary import best_baseline, conclusion, model_of, next_steps, title
 
 
 def page(runs: list[RssiRecords]) -> Page:
@@ -24,7 +23,7 @@ def page(runs: list[RssiRecords]) -> Page:
         _limits(runs[0]),
     ]
     if len(runs) > 1 or any(len(Maps(run).names) > 1 for run in runs):
-        sections.insert(1, sections_of("Maps", runs, lambda run: Section("", plots=Maps(run).by_receiver())))
+        sections.insert(1, sections_of("Maps", runs, _maps))
     speed = sections_of("Speed against error", runs, lambda run: Section("", plots=[errors.speed(run)]))
     names = ", ".join(dict.fromkeys(run.place for run in runs))
     first = _summary(runs[0]) if len(runs) == 1 else _comparison(runs)
@@ -34,8 +33,8 @@ def page(runs: list[RssiRecords]) -> Page:
 def _summary(run: RssiRecords) -> Summary:
     """Return the first screen of one run."""
     error = {name: entry["abs_error_db"] for name, entry in run.metrics["overall"].items()}
-    own, best, interval, maps = error[model_of(run)], best_baseline(run), run.metrics["interval"], Maps(run)
-    who = "a receiver" if len(maps.names) > 1 else "the receiver"
+    own, best, interval, floors = error[model_of(run)], best_baseline(run), run.metrics["interval"], Maps.of_floors(run)
+    who = "a receiver" if len(floors[0].names) > 1 else "the receiver"
     numbers = [
         Number(
             f"{own['median']:.2f} dB",
@@ -47,17 +46,29 @@ def _summary(run: RssiRecords) -> Summary:
             f"{interval['coverage']:.0%}",
             f"of the test measurements lie in the {interval['nominal']:.0%} interval of their prediction",
         ),
+    ]
+    numbers[:0] = [
         Number(
             f"{maps.covered:.0%}",
-            f"of the measured area has {who} above {COVERED_DBM:g} dBm with {CERTAINTY:.0%} certainty",
-        ),
+            f"of the {maps.titled('measured area')} has {who} above {COVERED_DBM:g} dBm with {CERTAINTY:.0%} certainty",
+        )
+        for maps in floors
     ]
+    if found := run.metrics["overall"][model_of(run)].get("detection"):
+        detected, empty = found
+        numbers.append(
+            Number(
+                f"{empty:.0%}", f"of the empty test cells are predicted as empty, and {detected:.0%} of the others not"
+            )
+        )
     receivers = len(run.metrics["receivers"])
     meaning = [
         f"On {run.scene}: {run.metrics['n_train']} training rows and {run.metrics['n_test']} test rows with {own['n']} "
         f"detected pairs at {receivers} {'receiver' if receivers == 1 else 'receivers'}.",
     ]
-    return Summary(numbers, [maps.summary()], meaning, next_steps(run), conclusion(run), notes=notes(run))
+    return Summary(
+        numbers, [maps.summary() for maps in floors], meaning, next_steps(run), conclusion(run), notes=notes(run)
+    )
 
 
 def _comparison(runs: list[RssiRecords]) -> Summary:
@@ -76,6 +87,10 @@ def _comparison(runs: list[RssiRecords]) -> Summary:
     return Summary([], [plot], meaning, steps, table=table)
 
 
+def _maps(run: RssiRecords) -> Section:
+    return Section("", plots=[plot for maps in Maps.of_floors(run) for plot in maps.by_receiver()])
+
+
 def _errors(run: RssiRecords) -> Section:
     left_out = [f"Left out: {reason}." for reason in run.metrics["left_out"].values()]
     plots = [errors.distribution(run)]
@@ -88,8 +103,8 @@ def _limits(run: RssiRecords) -> Section:
     texts = [
         "Single packets scatter about the mean of their position. BLE packets of unknown channel scatter by 2 to 3 dB. No "
         "predictor of the mean has a lower error than this scatter.",
-        "Values that were not detected are neither training nor test data. The report does not show where a receiver is out "
-        "of range.",
+        "Errors are those of detected values. How well empty cells are predicted is a number of its own, and where a packet "
+        "is more likely lost than received the maps are hatched.",
         "Intervals of medians treat pairs as independent. Along a walked path they are not, and the intervals are too "
         "narrow. The bootstrap of the paired table samples whole test rows, which corrects this in part.",
         "The paper's table (2.91 dB for SwiftWRF, 6.74 dB for MRI) is of other data. Compare methods in this report only.",

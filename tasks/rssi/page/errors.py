@@ -12,12 +12,11 @@ from swiftwrf.metrics import paired_difference
 from tasks.labels import PREDICTORS as LABELS
 from tasks.labels import labels
 from tasks.page import figures
-from tasks.page.comparison import with_interval
-from tasks.page.page import Plot, Table
-from tasks.page.palette import Palette
-from tasks.page.provenance import number
-from tasks.rssi.page.maps import MAX_VECTOR_DOTS
-from tasks.rssi.page.summary import RssiRecords, best_baseline, by_method, model_of, title
+from tasks.page.figures import Palette
+from tasks.page.page import Plot, Table, number
+from tasks.page.shared import with_interval
+from tasks.rssi.page.maps import MAX_VECTOR_DOTS, RssiRecords
+from tasks.rssi.page.summary import best_baseline, by_method, model_of, title
 from tasks.summarise import SHORTEST, running_median
 
 MAX_RECEIVERS = 40  # of the figure of differences; all are in its table
@@ -31,16 +30,30 @@ def palette() -> Palette:
 def table(run: RssiRecords) -> Table:
     """Return the errors of all methods, and the differences of the run's model from them."""
     errors, rows, own = by_method(run), [], model_of(run)
+    scored = any(entry.get("detection") for entry in run.metrics["overall"].values())
     for name, entry in sorted(run.metrics["overall"].items(), key=lambda item: item[1]["abs_error_db"]["median"]):
         error, difference = entry["abs_error_db"], ""
         if name != own:
             mean, low, high = paired_difference(errors, own, name)
             difference = f"{mean:+.2f}" + ("" if math.isnan(low) else f" [{low:+.2f}, {high:+.2f}]")
-        rows.append([name, with_interval(error), number(error["mean"]), number(error["p90"]), difference])
-    columns = ["method", "median [dB]", "mean [dB]", "90 % [dB]", f"{title(run)} minus method [dB]"]
+        detection = entry.get("detection")
+        right = [number(None if detection is None else sum(detection) / 2)] if scored else []
+        rows.append([name, with_interval(error), number(error["mean"]), number(error["p90"]), *right, difference])
+    columns = [
+        "method",
+        "median [dB]",
+        "mean [dB]",
+        "90 % [dB]",
+        *["detection"] * scored,
+        f"{title(run)} minus method [dB]",
+    ]
     caption = (
         "Absolute error over all detected test pairs; median with its 95 % interval. Last column: mean difference of the "
         "absolute errors on the same pairs; 95 % bootstrap over test rows."
+    ) + (
+        " Detection: mean of the shares of detected and of empty test cells that are predicted as such; 0.5 is chance."
+        if scored
+        else ""
     )
     return Table(columns, rows, caption, frozenset([own]))
 

@@ -15,9 +15,10 @@ from pandas import DataFrame
 from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
 from swiftwrf.plotting import corners_of
 from swiftwrf.rssi import LEVEL
+from tasks.metrics import RssiMetrics
 from tasks.page import figures, maps
 from tasks.page.page import Plot
-from tasks.rssi.page.summary import RssiRecords
+from tasks.page.records import Records
 
 MAX_MAPS = 24  # receivers with a map in the report; all are in the tables
 MAX_VECTOR_DOTS = 300  # more dots become an image: the page would grow to megabytes
@@ -26,25 +27,42 @@ COVERED_DBM, CERTAINTY = -75.0, 0.9  # coverage of the summary
 RECEIVER = "#cf4a4a"
 WIDTH_PER_STD = 2 * NormalDist().inv_cdf((1 + LEVEL) / 2)
 CAPTION = (
-    "Left: predicted RSSI. Right: width of the {level:.0%} interval of a measurement, on a scale from 0 to {most:g} dB that "
-    "is the same in all reports. Hatched: outside the measured positions, where predictions are extrapolated."
+    "First: predicted RSSI. Second: width of the {level:.0%} interval of a measurement, on a scale from 0 to {most:g} dB "
+    "that is the same in all reports. Hatched like /: outside the measured positions, where predictions are extrapolated. "
+    "Hatched like \\: a packet is more likely lost than received."
 )
+RssiRecords = Records[RssiMetrics]
 
 
 @dataclass(frozen=True)
 class Maps:
-    """Maps of one run.
+    """Maps of one floor of a run.
 
     Args:
         run: Records of the run.
+        floor: Number of the floor; 0 in data without floors.
     """
 
     run: RssiRecords
+    floor: int = 0
+
+    @classmethod
+    def of_floors(cls, run: RssiRecords) -> list[Maps]:
+        """Return the maps of each floor that was measured, from below."""
+        return [cls(run, int(floor)) for floor in np.unique(run.arrays("maps")["floor_of_row"])]
 
     @cached_property
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Content of `maps.npz`."""
-        return self.run.arrays("maps")
+        """Content of `maps.npz` for this floor."""
+        found = dict(self.run.arrays("maps"))
+        rows = found["floor_of_row"] == self.floor
+        found |= {name: found[name][self.floor] for name in ("predicted", "width", "detection")}
+        return found | {name: found[name][rows] for name in ("measured_position", "measured")}
+
+    def titled(self, title: str) -> str:
+        """Return a title with the name of the floor, if there are several."""
+        floors = self.arrays["floor_names"]
+        return title if len(floors) == 1 else f"{title}, floor {floors[self.floor]}"
 
     @property
     def names(self) -> list[str]:
@@ -52,11 +70,11 @@ class Maps:
         return [str(name) for name in self.arrays["receiver_names"]]
 
     @cached_property
-    def best(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Prediction [dBm] and width of its interval [dB] of the receiver with the highest prediction in each cell."""
+    def best(self) -> dict[str, NDArray[Any]]:
+        """Prediction [dBm], width of its interval [dB] and detection at the receiver of the highest one in each cell."""
         server = self.arrays["predicted"].argmax(axis=0)[None]
-        predicted, width = (np.take_along_axis(self.arrays[kind], server, 0)[0] for kind in ("predicted", "width"))
-        return predicted, width
+        kinds = ("predicted", "width", "detection")
+        return {kind: np.take_along_axis(self.arrays[kind], server, 0)[0] for kind in kinds}
 
     @cached_property
     def inside(self) -> NDArray[np.bool_]:
@@ -67,8 +85,7 @@ class Maps:
     @property
     def covered(self) -> float:
         """Fraction of the cells inside where a measurement at the best server is above `COVERED_DBM` with `CERTAINTY`."""
-        predicted, width = self.best
-        lower = predicted - NormalDist().inv_cdf(CERTAINTY) * width / WIDTH_PER_STD
+        lower = self.best["predicted"] - NormalDist().inv_cdf(CERTAINTY) * self.best["width"] / WIDTH_PER_STD
         return float((lower >= COVERED_DBM)[self.inside].mean()) if self.inside.any() else float("nan")
 
     @property
@@ -80,36 +97,44 @@ class Maps:
     def summary(self) -> Plot:
         """Return map and uncertainty of the only receiver, or of the best server."""
         several = len(self.names) > 1
-        predicted, width = self.best
         receiver = None if several else 0
-        title = "best server" if several else self.names[0]
-        panels = [self._panel(predicted, "predicted", title, receiver), self._panel(width, "width", title, receiver)]
+        title = self.titled("best server" if several else self.names[0])
+        panels = [self._panel(self.best, kind, title, receiver) for kind in ("predicted", "width")]
         caption = CAPTION.format(level=LEVEL, most=MAX_WIDTH_DB) + (
             " The best server is the receiver with the highest prediction; crosses mark receivers."
             if several
-            else " Dots: training measurements in the colours of the map; the cross marks the receiver."
+            else " Dots: training measurements in the colours of the map, hollow where nothing was received; the cross "
+            "marks the receiver."
         )
-        data = self._cells({"predicted_dbm": predicted[None], "width_db": width[None]}, [title])
-        return Plot("summary", panels, caption, data)
+        return Plot(
+            f"summary-{self.floor}", panels, caption, self._cells({k: v[None] for k, v in self.best.items()}, [title])
+        )
 
     def by_receiver(self) -> list[Plot]:
         """Return maps of the receivers that detected most rows: predictions, and widths of intervals."""
         shown = self.most_detected
-        names = [self.names[i] for i in shown]
-        data = self._cells(
-            {"predicted_dbm": self.arrays["predicted"][shown], "width_db": self.arrays["width"][shown]}, names
-        )
+        names, fields = [self.names[i] for i in shown], ("predicted", "width", "detection")
+        data = self._cells({kind: self.arrays[kind][shown] for kind in fields}, names)
         plots = []
         for kind, what in (("predicted", "Predicted RSSI"), ("width", f"Width of the {LEVEL:.0%} interval")):
-            panels = [self._panel(self.arrays[kind][i], kind, self.names[i], i, 3.6) for i in shown]
-            caption = f"{what} at each receiver. Hatched: outside the measured positions. A cross marks the receiver."
+            values = [{kind: self.arrays[kind][i] for kind in fields} for i in shown]
+            panels = [
+                self._panel(each, kind, self.titled(self.names[i]), i, 3.6)
+                for each, i in zip(values, shown, strict=True)
+            ]
+            caption = (
+                f"{what} at each receiver. Hatched like /: outside the measured positions; like \\: a packet is more likely "
+                "lost than received. Hollow dots: nothing was received. A cross marks the receiver."
+            )
             name = "map" if kind == "predicted" else "width"
-            plots.append(Plot(f"{name}-{self.run.file_name}", panels, caption, data))
+            plots.append(Plot(f"{name}-{self.run.file_name}-{self.floor}", panels, caption, data))
         return plots
 
-    def _panel(self, values: NDArray[Any], kind: str, title: str, receiver: int | None, width: float = 4.6) -> Figure:
+    def _panel(
+        self, fields: dict[str, NDArray[Any]], kind: str, title: str, receiver: int | None, width: float = 4.6
+    ) -> Figure:
         """Draw one map, with the measurements of a receiver, or with all receivers for None."""
-        a = self.arrays
+        a, values = self.arrays, fields[kind]
         x0, x1, y0, y1 = corners_of(a["x"], a["y"])
         shape = (y1 - y0) / (x1 - x0)
         figure, ax = figures.panel(width, 0.8 + (width - 1.2) * float(np.clip(shape, 0.4, 1.6)))
@@ -117,12 +142,16 @@ class Maps:
         if kind == "predicted" and receiver is None:
             limits = (float(values.min()), float(values.max()))
         plan = (a["plan"], tuple(a["plan_extent"].tolist())) if "plan" in a else None
-        known = a["measured_position"]
-        drawn = maps.draw(ax, a["x"], a["y"], values, colours=colours, limits=limits, known=known, plan=plan)
+        known, silent = a["measured_position"], fields["detection"] < 0.5
+        drawn = maps.draw(
+            ax, a["x"], a["y"], values, colours=colours, limits=limits, known=known, silent=silent, plan=plan
+        )
         if receiver is not None and kind == "predicted":
             detected = ~np.isnan(a["measured"][:, receiver])
+            many = len(detected) >= MAX_VECTOR_DOTS
+            ax.plot(*known[~detected, :2].T, "o", markersize=3, markerfacecolor="none", color="white", rasterized=many)
             style: dict[str, Any] = {"cmap": colours, "vmin": limits[0], "vmax": limits[1], "zorder": 3}
-            style |= {"edgecolors": "white", "linewidths": 0.4, "rasterized": detected.sum() >= MAX_VECTOR_DOTS}
+            style |= {"edgecolors": "white", "linewidths": 0.4, "rasterized": many}
             ax.scatter(known[detected, 0], known[detected, 1], s=9, c=a["measured"][detected, receiver], **style)
         for number, at in enumerate(a["receiver"]):
             if receiver in (None, number) and np.isfinite(at).all():
@@ -146,6 +175,7 @@ class Maps:
         origin = GeodeticOrigin(*a["origin"].tolist()) if "origin" in a else None
         degrees = {name: value.round(7) for name, value in degree_columns(origin, np.stack([xs, ys], axis=1)).items()}
         columns = {"receiver": names, "x_m": xs.round(3), "y_m": ys.round(3)} | degrees
-        columns |= {name: values.ravel().round(2) for name, values in fields.items()}
+        named = {"predicted": "predicted_dbm", "width": "width_db", "detection": "detection"}
+        columns |= {named[name]: values.ravel().round(2) for name, values in fields.items()}
         columns["inside"] = np.tile(self.inside.ravel(), len(receivers))
         return DataFrame(columns)

@@ -6,13 +6,10 @@ import numpy as np
 from pandas import DataFrame
 
 from tasks.environment import command
-from tasks.metrics import RssiMetrics
-from tasks.page.maps import inside
-from tasks.page.records import Records
+from tasks.rssi.page.maps import CERTAINTY, COVERED_DBM, Maps, RssiRecords
 from tasks.summarise import comparison_sentence, coverage_warning
 from tasks.terminal import Answer
 
-RssiRecords = Records[RssiMetrics]
 MIN_RATIO = 1.2  # of the widest interval inside to the median one, for which more positions are proposed
 
 
@@ -41,11 +38,18 @@ def best_baseline(run: RssiRecords) -> str:
 
 
 def conclusion(run: RssiRecords) -> str:
-    """Return a sentence that compares the model with the best baseline."""
-    best = best_baseline(run)
-    n_test = run.metrics["n_test"]
-    own, name = model_of(run), title(run)
-    return comparison_sentence(by_method(run), own, best, name=name, unit="dB", rows="pairs", n_test=n_test)
+    """Return coverage, error and intervals of the model, and how it compares with the best baseline."""
+    best, n_test, interval = best_baseline(run), run.metrics["n_test"], run.metrics["interval"]
+    own, name, floors = model_of(run), title(run), Maps.of_floors(run)
+    who = "a receiver" if len(run.metrics["receivers"]) > 1 else "the receiver"
+    covered = [f"{maps.covered:.0%} of the {maps.titled('measured area')}" for maps in floors]
+    error = run.metrics["overall"][own]["abs_error_db"]["median"]
+    compared = comparison_sentence(by_method(run), own, best, name=name, unit="dB", rows="pairs", n_test=n_test)
+    return (
+        f"{' and '.join(covered)} {'has' if len(covered) == 1 else 'have'} {who} above {COVERED_DBM:g} dBm with "
+        f"{CERTAINTY:.0%} certainty. Half of the errors at new positions are below {error:.1f} dB, and "
+        f"{interval['coverage']:.0%} of the measurements lie in their {interval['nominal']:.0%} intervals. {compared}"
+    )
 
 
 def next_steps(run: RssiRecords) -> list[str]:
@@ -70,9 +74,9 @@ def next_steps(run: RssiRecords) -> list[str]:
 
 def where_next(run: RssiRecords) -> str:
     """Return where to measure next, inside the measured positions, or that more positions hardly help."""
-    maps = run.arrays("maps")
+    most = int(np.bincount(run.arrays("maps")["floor_of_row"]).argmax())
+    maps, known = Maps(run, most).arrays, Maps(run, most).inside
     width = maps["width"].mean(axis=0)
-    known = inside(np.stack(np.meshgrid(maps["x"], maps["y"]), axis=-1), maps["measured_position"])
     if not known.any():
         return "Measure in a second dimension: the measured positions lie on a line."
     typical = float(np.median(width[known]))

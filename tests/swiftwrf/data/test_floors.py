@@ -10,8 +10,9 @@ import pytest
 import torch
 
 import swiftwrf
-from swiftwrf import PairModel, Rssi, RssiModel
+from swiftwrf import InputError, PairModel, Rssi, RssiModel
 from swiftwrf.choices import RSSI_PREDICTORS
+from swiftwrf.data.coordinates import Floors
 from swiftwrf.rssi import estimate_floor_attenuation
 
 FLOOR_DB, STOREY_M, SIDE_M = 15.0, 3.5, 30.0
@@ -53,6 +54,14 @@ def test_floors_by_number_without_heights_and_with_heights_above_the_floor():
         assert np.diff(data.floors.height_m) == pytest.approx([4.0, 4.0])
         assert any("each floor of column floor" in note for note in data.notes)
     assert np.diff(rssi(table).floors.height_m) == pytest.approx([STOREY_M, STOREY_M])
+
+
+def test_floors_by_name_without_heights():
+    table = building().drop(columns="z")
+    names = np.array(["Ground", "First", "Second"])[table["floor"]]
+    assert rssi(table.assign(floor=names)).floors == Floors(("Ground", "First", "Second"), (0.0, 4.0, 8.0))
+    with pytest.raises(InputError, match="the order of floor 'Annex' is unknown"):
+        rssi(table.assign(floor=np.where(names == "First", "Annex", names)))
 
 
 def test_floors_by_name():

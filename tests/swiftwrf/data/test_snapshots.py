@@ -102,7 +102,7 @@ REFUSED = {
         "along z",
     ),
     "carrier in GHz": ({"frequency_hz": 2.4}, "carrier in Hz"),
-    "carrier of a list": ({"frequency_hz": np.full(3, FREQUENCY)}, "one number"),
+    "frequencies of others": ({"frequency_hz": np.full(7, FREQUENCY)}, "frequency_hz"),
     "times of others": ({"time": np.zeros(3)}, "time has 3 rows"),
     "complex positions": ({"position": np.ones((120, 3), complex)}, "position must be real"),
 }

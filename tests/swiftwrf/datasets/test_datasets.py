@@ -17,6 +17,7 @@ import pandas as pd
 import pytest
 from PIL import Image
 from quick import said
+from scipy.io import savemat
 
 from swiftwrf import InputError, Rssi, Spectra, datasets, load_rssi, load_spectra
 from swiftwrf.datasets import DATA_SETS, DataSet, conversions
@@ -278,6 +279,27 @@ def test_lora(tmp_path):
     np.testing.assert_allclose(data.transmitter_position[[0, 2]], [[0, 110.57, -2], [103.37, 0, 0]], atol=0.01)
     assert data.rssi_dbm[0].tolist() == [-112, -102]
     assert data.named_splits["foot"][1].tolist() == [2]
+
+
+@pytest.mark.parametrize("suffix", ["mat", "csv"])
+def test_fingerprints(tmp_path, suffix):
+    train, test = np.array([[1.5, 2, 3.7, 1, 0, -60, 100]] * 7), np.array([[4.0, 5, 0, 0, 0, 100, -70]] * 5)
+    file = tmp_path / "raw" / ("original_datasets/TOY1.mat" if suffix == "mat" else "dataset/TOY1/Train.csv")
+    file.parent.mkdir(parents=True)
+    if suffix == "mat":
+        parts = {"training": train, "test": test}
+        database = {f"{name}Labels": rows[:, :5] for name, rows in parts.items()}
+        savemat(file, {"database": database | {f"{name}Macs": rows[:, 5:] for name, rows in parts.items()}})
+    else:
+        for name, rows in (("Train", train), ("Test", test)):
+            pd.DataFrame(np.hstack([rows[:, 5:], rows[:, :5]])).to_csv(file.with_stem(name), index=False)
+    (tmp_path / "out").mkdir()
+    conversions.fingerprints(tmp_path / "raw", tmp_path / "out")
+    data = load_rssi(tmp_path / "out")
+    assert data.floors.names == ("0", "1")
+    assert data.transmitter_position[[0, -1]].tolist() == [[1.5, 2, 3.7], [4, 5, 0]]
+    assert data.rssi_dbm[[0, -1]].nan_to_num(0).tolist() == [[-60, 0], [0, -70]]
+    assert data.named_splits["published"][1].tolist() == [7, 8, 9, 10, 11]
 
 
 def test_wifi_rooms(tmp_path):

@@ -9,15 +9,16 @@ import pytest
 import torch
 from rooms import mirror_room
 
-from swiftwrf import AngularGrid, InputError, load, rssi_room, simulated_room
+from swiftwrf import AngularGrid, InputError, Rssi, load, rssi_room, simulated_room
 from swiftwrf.array.angles import angular_distance, to_direction
+from swiftwrf.data.coordinates import Floors
 from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.locate import MatchedField, Posterior, Region, RssiLocator
+from swiftwrf.locate.fingerprints import METRICS, Fingerprints
 from swiftwrf.locate.posterior import normalised, pooled_weights
 from swiftwrf.locate.region import Cells, best_cells, refined
-from swiftwrf.locate.rssi_likelihood import DetectionLikelihood
+from swiftwrf.locate.rssi_likelihood import DetectionLikelihood, ValueLikelihood
 from swiftwrf.locate.spectrum_likelihood import BOUNDS, CoarrayLikelihood, PathWaves, PhaseLikelihood, SpectrumFeatures
-from swiftwrf.locate.student import Student
 from swiftwrf.models.geometry import GeometryModel, Plane
 from swiftwrf.models.geometry.path_gains import PathGains
 
@@ -216,7 +217,9 @@ def test_the_order_of_receivers_changes_nothing(floor):
 def test_rssi_is_located_better_than_by_fingerprints(floor):
     _, test, locator = floor
     found = (locator.locate(test.rssi_dbm).median - test.transmitter_position).norm(dim=1)
-    nearest = (locator.likelihoods.fingerprints.estimate(test.rssi_dbm) - test.transmitter_position).norm(dim=1)
+    nearest = (locator.likelihoods.fingerprints.fingerprints.estimate(test.rssi_dbm) - test.transmitter_position).norm(
+        dim=1
+    )
     assert found.median() < nearest.median()
 
 
@@ -260,12 +263,77 @@ def test_a_locator_that_is_not_fitted_is_refused(locator, tmp_path):
         unfitted.save(tmp_path / "locator.safetensors")
 
 
-def test_missing_values_count_as_missing():
-    observed, mean = torch.tensor([[-61.0, math.nan, -80.0]]), torch.tensor([[-60.0, -70.0, -80.0]])
-    std, kept = torch.full((1, 3), 2.0), [0, 2]
-    both, less = (Student(torch.eye(n, dtype=torch.float64), math.inf) for n in (3, 2))
-    expected = less.log_likelihood(observed[:, kept], mean[:, kept], std[:, kept])
-    assert torch.allclose(both.log_likelihood(observed, mean, std), expected)
+def test_values_have_the_density_of_a_common_offset_and_missing_ones_count_as_missing():
+    observed = torch.tensor([[-61.0, math.nan, -84.0], [-50.0, -71.0, -80.0]], dtype=torch.float64)
+    maps = torch.tensor([[-60.0, -70.0, -80.0], [-55.0, -66.0, -75.0]]), torch.tensor([[2.0, 3, 4], [1, 2, 5]])
+    found = ValueLikelihood(common_db=3.0, scale=1.5, degrees=math.inf).log_likelihood(maps, observed)
+    for n, m in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        kept = ~observed[n].isnan()
+        scale = 9.0 + torch.diag((1.5 * maps[1][m, kept].double()).square())
+        error = (observed[n] - maps[0][m])[kept]
+        expected = torch.distributions.MultivariateNormal(torch.zeros(len(error)).double(), scale).log_prob(error)
+        # the constant of the Gaussian is that of every candidate
+        assert found[n, m] == pytest.approx(float(expected) + len(error) / 2 * math.log(2 * math.pi), abs=1e-4)
+
+
+@pytest.fixture(scope="module")
+def building():
+    """RSSI on two floors of 30 x 12 m, 3 m apart, each with six access points; a floor takes 15 dB. Six scans a place."""
+    generator = torch.Generator().manual_seed(4)
+    place = torch.rand(90, 3, generator=generator, dtype=torch.float64) * torch.tensor([30.0, 12.0, 0.0])
+    place[45:, 2] = 3.0
+    source = torch.cartesian_prod(*(torch.tensor(x) for x in ([5.0, 15.0, 25.0], [3.0, 9.0], [2.5, 5.5]))).double()
+    at = place.repeat_interleave(6, dim=0)
+    apart = (at[:, None] - source).norm(dim=2).clamp_min(1.0)
+    through = 15 * ((at[:, None, 2] > 2) != (source[:, 2] > 4))
+    noise = 3 * torch.randn(len(at), 12, generator=generator, dtype=torch.float64)
+    rssi = -35 - 28 * apart.log10() - through + noise
+    rssi = rssi.masked_fill(rssi < -85, torch.nan)
+    return Rssi(rssi, at, floors=Floors(("ground", "first"), (0.0, 3.0)))
+
+
+def test_floors_are_located_with_their_probability(building, tmp_path):
+    train, test = building.split()
+    locator = RssiLocator(n_cells=400).fit(train)
+    posterior = locator.locate(test.rssi_dbm)
+    right = building.floors.number(posterior.median) == building.floors.number(test.transmitter_position)
+    probability = posterior.floor_probability
+    assert right.double().mean() >= 0.95
+    assert torch.allclose(probability.sum(dim=1), torch.ones(len(test), dtype=torch.float64))
+    assert probability.amax(dim=1).mean() == pytest.approx(float(right.double().mean()), abs=0.05)
+    assert (
+        set(locator.cells.position[:, 2].tolist())
+        == {0.0, 3.0}
+        == set(posterior.median[:, 2].round(decimals=6).tolist())
+    )
+    locator.save(tmp_path / "locator.safetensors")
+    assert torch.equal(load(tmp_path / "locator.safetensors").locate(test.rssi_dbm).log_weight, posterior.log_weight)
+
+
+def test_neighbours_are_places_that_vote_for_a_floor(building):
+    train, test = building.split()
+    known = Fingerprints.of(train, k=4)
+    distance, place = known.nearest(test.rssi_dbm, 4)
+    assert all(len(set(row)) == 4 for row in place.tolist())
+    assert (distance.diff(dim=1) >= 0).all()
+    part, mean, estimate = known.votes(test.rssi_dbm)
+    assert torch.allclose(part.sum(dim=1), torch.ones(len(test), dtype=torch.float64))
+    assert torch.equal(estimate, mean[torch.arange(len(test)), part.argmax(dim=1)])
+    assert set(estimate[:, 2].round(decimals=6).tolist()) <= {0.0, 3.0}
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_distances_of_fingerprints_are_the_definitions(building, metric):
+    known = Fingerprints.of(building, metric)
+    a, b = (known._excess(building.rssi_dbm[rows]) for rows in (slice(0, 3), slice(None)))
+    away = (a[:, None] - b).abs()
+    expected = {
+        "sorensen": away.sum(dim=2) / (a[:, None] + b).sum(dim=2),
+        "manhattan": away.sum(dim=2),
+        "euclidean": away.square().sum(dim=2).sqrt(),
+    }[metric]
+    expected = expected.reshape(3, -1, 6).amin(dim=2).sort(dim=1).values[:, :10]
+    assert torch.allclose(known.nearest(building.rssi_dbm[:3], 10)[0], expected, rtol=1e-3, atol=1e-3)
 
 
 def test_detections_are_learnt():

@@ -13,10 +13,9 @@ from swiftwrf import InputError, Rssi, RssiModel, fit_rssi, load, rssi_room
 from swiftwrf.gp import Kernel
 from swiftwrf.rssi import RssiConfig, RssiPaperModel
 from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
-from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, harmonics, log_distance
+from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, harmonics, log_distance
 from swiftwrf.rssi.training import (
     DIRECTIVITY_STD_DB,
-    PATH_LOSS_STD_DB,
     RssiTraining,
     bin_locations,
     fit_receiver,
@@ -26,7 +25,7 @@ from swiftwrf.runtime import checkpoint
 from swiftwrf.runtime.threads import threads_kept
 
 KERNEL = Kernel(4.0, 1.0, matern12_weight=0.6, noise=1.0)
-FIELD_DB, NOISE_DB = 3.0, 2.0
+FIELD_DB, NOISE_DB, PATH_LOSS_STD_DB = 3.0, 2.0, 30.0
 CPU, FIRST = torch.device("cpu"), slice(0, 1)
 
 
@@ -75,7 +74,16 @@ def training_of(data, n_primitives=50):
         kernel=KERNEL,
         n_primitives=n_primitives,
         rendered=render([Head(name, n_primitives, 0).requires_grad_(False) for name in data.receiver_names]),
-        prior_mean=path_loss,
+        path_loss=PathLosses(
+            own=path_loss,
+            shared=path_loss,
+            centre=torch.zeros(r).double(),
+            std=torch.full((r, 2), PATH_LOSS_STD_DB).double(),
+            variance=torch.full((r,), FIELD_DB**2 + NOISE_DB**2).double(),
+            detection=None,
+            floor_db=torch.zeros(r).double(),
+        ),
+        limit=torch.full((n, r), torch.nan).double(),
         field_db=torch.full((r,), FIELD_DB, dtype=torch.float64),
         noise_db=torch.full((r,), NOISE_DB, dtype=torch.float64),
         baselines=PathLoss(*(values.expand(3, -1) for values in path_loss)),
@@ -104,7 +112,7 @@ def test_solution_is_the_maximum_of_the_posterior():
     def predicted(parameters):
         level, slope = PATH_LOSS_STD_DB * parameters[0], PATH_LOSS_STD_DB * parameters[1]
         latent = FIELD_DB * root @ parameters[10:]
-        path_loss = training.prior_mean.level[0] + level + (training.prior_mean.slope[0] + slope) * distance
+        path_loss = training.path_loss.shared.level[0] + level + (training.path_loss.shared.slope[0] + slope) * distance
         head = mean_magnitude(rendered, latent[:, None]) - mean_magnitude(rendered, torch.zeros(1, 1).double())
         return path_loss + DIRECTIVITY_STD_DB * bearing @ parameters[2:10] + head[:, 0]
 

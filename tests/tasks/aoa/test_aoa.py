@@ -39,8 +39,10 @@ from tasks.aoa import experiment
 from tasks.aoa.options import AoaConfig
 from tasks.aoa.page.records import palette
 from tasks.command_line import command_line
-from tasks.page.palette import Palette
+from tasks.page.figures import Palette
 from tasks.report.run import merge
+from tasks.resume.options import ResumeConfig
+from tasks.resume.run import run as resume
 
 
 @pytest.fixture
@@ -508,7 +510,7 @@ def test_interrupted_run_goes_on_to_the_same_numbers(small, tmp_path, monkeypatc
     assert run(*arguments, tmp_path / "cut") == 130
     assert not (tmp_path / "cut").exists()
     monkeypatch.setattr(AANN, "fit", honest)
-    assert run("--resume", tmp_path / "cut.partial") == 0
+    assert command_line("tasks.resume", ResumeConfig, resume, [str(tmp_path / "cut.partial")]) == 0
     whole, cut = (
         json.loads((tmp_path / name / "metrics.json").read_text())["mixes"]["0.5"] for name in ("whole", "cut")
     )
@@ -538,7 +540,7 @@ def test_fractions_of_many_digits_have_results_of_their_own(small, tmp_path, mon
     with monkeypatch.context() as interrupted:
         interrupted.setattr(experiment, "reporting", lambda page: mock.Mock(side_effect=KeyboardInterrupt))
         assert run(*arguments) == 130
-    assert run("--resume", tmp_path / "run.partial") == 0
+    assert command_line("tasks.resume", ResumeConfig, resume, [str(tmp_path / "run.partial")]) == 0
     mixes = json.loads((tmp_path / "run" / "metrics.json").read_text())["mixes"]
     assert [float(key) for key in mixes] == list(fractions)
     for key in mixes:
@@ -623,12 +625,10 @@ def test_cross_validation_is_that_of_each_field_model(small):
         (("--mix", 0.5, "--repeats", 0), "--repeats"),
         (("--mix", 0.5, "--suggest", -1), "--suggest"),
         (("--mix", 0.5, "--data", "/nowhere"), "is not a folder"),
-        (("--resume", "nowhere"), "no interrupted run"),
     ],
 )
 def test_wrong_input_is_one_sentence_and_code_2(small, tmp_path, capsys, arguments, says):
-    extra = () if arguments[0] == "--resume" else ("--out", tmp_path / "run")
-    assert run(*arguments, *extra) == 2
+    assert run(*arguments, "--out", tmp_path / "run") == 2
     error = capsys.readouterr().err.strip()
     assert says in error
     assert error.count("\n") == 0

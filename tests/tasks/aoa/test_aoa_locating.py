@@ -34,6 +34,8 @@ from tasks.aoa.options import AoaConfig
 from tasks.command_line import command_line
 from tasks.predict.options import PredictConfig
 from tasks.predict.run import run as predict
+from tasks.resume.options import ResumeConfig
+from tasks.resume.run import run as resume
 
 PLANES = {(0.0, 0.0, -1.0): 0.0, (1.0, 0.0, 0.0): 5.0, (0.0, 1.0, 0.0): 4.0}  # outward normal to offset [m]
 FEW_CELLS = MatchedFieldConfig(max_cells=3000, n_best=60, n_background=20, n_rounds=1, n_calibration=16)
@@ -204,7 +206,7 @@ def test_a_resumed_run_has_equal_numbers(closed_form, finished, tmp_path, monkey
         monkeypatch.setattr(Locating, "compute", interrupt)
         assert run("--mix", 0.6, "--extra", 0, "--out", tmp_path / "cut") == 130
         monkeypatch.setattr(Locating, "compute", honest)
-        assert run("--resume", tmp_path / "cut.partial") == 0
+        assert command_line("tasks.resume", ResumeConfig, resume, [str(tmp_path / "cut.partial")]) == 0
     whole, cut = mix_of(finished), mix_of(tmp_path / "cut")
     for mix in (whole, cut):
         for entry in (*mix["methods"].values(), *mix["locating"].values()):

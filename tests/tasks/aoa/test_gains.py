@@ -19,8 +19,8 @@ from swiftwrf import simulated_room
 from swiftwrf.metrics import median_interval, paired_change
 from swiftwrf.metrics import summary as error_summary
 from tasks.aoa.options import AoaConfig
-from tasks.aoa.page.gains import gain_sentence, gain_table
 from tasks.aoa.page.records import FractionRecords
+from tasks.aoa.page.results import gain_sentence, gain_table
 from tasks.aoa.page.summary import summary
 from tasks.page.records import Records
 

@@ -311,10 +311,12 @@ def test_few_test_rows_tell_no_difference(rows, known):
 def test_an_interval_of_one_width_sends_nobody_to_measure():
     x, y = np.arange(5.0), np.arange(4.0)
     corners = np.array([[0, 0, 1], [4, 0, 1], [0, 3, 1], [4, 3, 1]], dtype=float)
-    maps = {"x": x, "y": y, "measured_position": corners, "width": np.full((2, 4, 5), [[[7.0]], [[8.0]]])}
+    width = np.tile([[[[7.0]], [[8.0]]]], (1, 1, 4, 5))
+    maps = {"x": x, "y": y, "measured_position": corners, "measured": corners[:, :2], "width": width}
+    maps |= {"predicted": width, "detection": width, "floor_of_row": np.zeros(4, int)}
     run = SimpleNamespace(arrays=lambda name: maps)
     assert "not worth it" in where_next(run)
-    maps["width"][:, 2, 3] += 4
+    maps["width"][:, :, 2, 3] += 4
     assert where_next(run).startswith("Measure around x = 3.0 m, y = 2.0 m")
     maps["measured_position"] = corners[[0, 1, 2]]  # x = 3, y = 2 is outside now
     assert "x = 3.0 m, y = 2.0 m" not in where_next(run)

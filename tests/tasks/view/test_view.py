@@ -10,7 +10,7 @@ import json
 import shutil
 import socket
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -30,8 +30,8 @@ from swiftwrf.online import Follower
 from tasks.command_line import command_line
 from tasks.convert.outputs import saved_model
 from tasks.locate.options import LocateConfig
-from tasks.page.floor_plan import FloorPlan
-from tasks.page.raster import colour_image
+from tasks.options import plain
+from tasks.page.maps import FloorPlan, colour_image
 from tasks.update.record import Record
 from tasks.view import charts, spectra
 from tasks.view.locating import N_POSITIONS, RssiLocating
@@ -371,7 +371,7 @@ def test_view_of_a_run_of_locate(located_floor, tmp_path):
     folder.mkdir()
     locator.save(folder / "locator.safetensors")
     read = load_rssi(tmp_path / "survey.csv")
-    config = {"task": "locate", "config": asdict(LocateConfig(data=str(tmp_path / "survey.csv")))}
+    config = {"task": "locate", "config": plain(LocateConfig(data=str(tmp_path / "survey.csv")))}
     (folder / "config.json").write_text(json.dumps(config))
     (folder / "environment.json").write_text(json.dumps({"input_sha256": dict(read.source)}))
     view = open_source(folder)

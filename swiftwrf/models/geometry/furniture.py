@@ -1,0 +1,435 @@
+"""Furniture of a room: absorption in voxels and reflectivity in cells on each plane, estimated from channels.
+
+The path of an image reflects at planes w in cells c and crosses voxels v along lengths l_v. Its gain
+
+    a = exp(-sum_v absorption_v l_v) prod_w sign_w reflectivity_wc
+
+depends on the position, because furniture hides paths from parts of a room. Measured channels x and the field h of the gains
+determine absorption and reflectivity: the mean of 1 - coherence(x, h) and a penalty are minimised. The penalty contains the
+total variation (L. I. Rudin, S. Osher and E. Fatemi, Physica D 60, 1992). Held-out positions choose its weight and the size
+of the voxels, and decide whether furniture explains the channels better than planes alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from swiftwrf.errors import InputError
+from swiftwrf.models.geometry.images import (
+    MAX_COSINE,
+    PhaseObservations,
+    PlaneSet,
+    Sequence,
+    images,
+    mirror,
+    visibility,
+)
+from swiftwrf.models.geometry.planes import advantage, log_explained
+from swiftwrf.plotting import Axes, corners_of, hatch, plan_map
+from swiftwrf.runtime.checkpoint import Header, expect
+from swiftwrf.runtime.threads import parallel_map, single_thread
+
+Floats = NDArray[np.float64]
+MAX_VOXELS = 50_000
+N_STEPS = 150  # of Adam
+TENSORS = ("low", "absorption", "reflectivity", "crossed_m")
+SETTINGS = ((2.0, 1e-3), (1.0, 1e-3), (2.0, 3e-3))  # edge of a voxel [wavelengths] and weight of the penalty
+SIGNIFICANCE = 2.5  # standard errors by which furniture must explain held-out channels better
+MAX_CHOICE = 200  # positions that choose the settings
+
+
+@dataclass(frozen=True, eq=False)
+class Furniture:
+    """Absorption in voxels and reflectivity in cells on the planes of a room.
+
+    Args:
+        low: Corner of the first voxel, float64 (3,) [m].
+        voxel_m: Edge of the voxels [m].
+        absorption: Absorption of the amplitude, float32 (X, Y, Z) [1 / m].
+        reflectivity: Modulus of the reflection gain of each plane by cells, float32 (P, cells). Cells are voxels projected
+            along the axis that is closest to the normal.
+        crossed_m: Length of the measured paths in each voxel, float32 (X, Y, Z) [m]. Where it is 0, absorption is unknown.
+        penalty: Weight of the penalty that held-out positions chose.
+    """
+
+    low: Tensor
+    voxel_m: float
+    absorption: Tensor
+    reflectivity: Tensor
+    crossed_m: Tensor
+    penalty: float
+
+    def state(self) -> tuple[dict[str, Tensor], Header]:
+        """Return the tensors by name, and plain values."""
+        return {name: getattr(self, name) for name in TENSORS}, {"voxel_m": self.voxel_m, "penalty": self.penalty}
+
+    @classmethod
+    def from_state(cls, tensors: dict[str, Tensor], header: Header, n_planes: int) -> Furniture:
+        """Return the furniture of a room of planes that `state` describes."""
+        shape = tuple(tensors["absorption"].shape)
+        n_cells = math.prod(shape) // max(1, min(shape, default=1))
+        expect(tensors, {"low": (3,), "absorption": shape, "crossed_m": shape, "reflectivity": (n_planes, n_cells)})
+        found = cls(**{name: tensors[name] for name in TENSORS}, voxel_m=header["voxel_m"], penalty=header["penalty"])
+        if len(shape) != 3 or not (found.voxel_m > 0 and float(found.absorption.min()) >= 0):
+            raise InputError("voxels of furniture need three dimensions, an edge above 0 and no negative absorption")
+        return found
+
+    def gains(self, planes: PlaneSet, scene: PhaseObservations) -> Tensor:
+        """Return the gains of the direct path and of each image at the positions of a scene, float32 (n, 1 + S)."""
+        padded = _padded(self.absorption)
+
+        def transmission(group: _Crossings) -> Tensor:
+            found = padded.index_select(0, group.voxel.flatten()).view(group.voxel.shape)
+            return (-found.sum(-1) * group.step_m).exp()
+
+        return _gains(self._crossings(planes, scene), planes, transmission, self.reflectivity)
+
+    def in_plan(self, low_m: float = -math.inf, high_m: float = math.inf) -> tuple[Floats, Floats, Floats]:
+        """Return what stands between two heights, seen from above.
+
+        Args:
+            low_m: Lower height [m].
+            high_m: Upper height [m].
+
+        Returns:
+            Centres of the columns (X,) and of the rows (Y,) [m], and the largest absorption (Y, X) [dB / m], nan where no
+            measured path crosses a voxel.
+        """
+        x, y, z = (
+            (start + self.voxel_m * (torch.arange(size) + 0.5)).numpy()
+            for start, size in zip(self.low, self.absorption.shape, strict=True)
+        )
+        layer = torch.from_numpy((z > low_m) & (z < high_m))
+        decibel = torch.where(self.crossed_m > 0, 20 / math.log(10) * self.absorption, -1.0)[:, :, layer]
+        values = decibel.amax(dim=2).T if bool(layer.any()) else -torch.ones(len(y), len(x))
+        return x, y, torch.where(values < 0, torch.nan, values).double().numpy()
+
+    def plot(self, low_m: float = -math.inf, high_m: float = math.inf, ax: Axes | None = None) -> Axes:
+        """Draw what stands between two heights, seen from above, hatched where it is unknown.
+
+        Args:
+            low_m: Lower height [m].
+            high_m: Upper height [m].
+            ax: Axes to draw into. Defaults to those of a new figure.
+
+        Example:
+            >>> low, empty = torch.zeros(3, dtype=torch.float64), torch.zeros(4, 3, 2)
+            >>> Furniture(low, 0.25, empty, torch.ones(6, 12), torch.ones(4, 3, 2), 1e-3).plot(0.0, 0.25).get_ylabel()
+            'y [m]'
+        """
+        x, y, values = self.in_plan(low_m, high_m)
+        ax = plan_map(corners_of(x, y), values, "absorption [dB/m]", ax)
+        hatch(ax, x, y, np.isnan(values))
+        return ax
+
+    def _crossings(self, planes: PlaneSet, scene: PhaseObservations) -> list[_Crossings]:
+        sequence: list[Sequence] = [(), *planes.sequence]
+        groups: dict[int, list[int]] = {}
+        for row, s in enumerate(sequence):
+            groups.setdefault(len(s), []).append(row)
+        return [self._crossed(planes, scene, [sequence[row] for row in rows], rows) for rows in groups.values()]
+
+    def _crossed(
+        self, planes: PlaneSet, scene: PhaseObservations, sequence: list[Sequence], rows_of: list[int]
+    ) -> _Crossings:
+        """Follow the paths of images with equally many reflections from the moving end to the fixed end.
+
+        A path is straight towards its image. Samples of it beyond a reflection are mirrored back into the room.
+        """
+        normal, offset, fixed = (
+            planes.normal[0],
+            planes.offset[0],
+            scene.receiver if scene.end == "transmitter" else scene.transmitter,
+        )
+        order = _orders(tuple(sequence), tuple(map(tuple, normal.tolist())))  # (S, Q, D)
+        if scene.end == "transmitter":
+            order = order.flip(-1)
+        source = [fixed[0].expand(*order.shape[:2], 3)]
+        for plane in order.unbind(-1):
+            source.append(mirror(source[-1].movedim(-1, 0), normal[plane].movedim(-1, 0), offset[plane]).movedim(0, -1))
+        start = scene.moving[:, None, None]
+        point, along = start.expand(-1, *order.shape[:2], -1), torch.zeros(len(scene), *order.shape[:2]).double()
+        exists = torch.ones_like(along, dtype=torch.bool)
+        hit, fraction = [], []  # from the moving end on
+        for depth in range(order.shape[2], 0, -1):
+            n, ray = normal[order[..., depth - 1]], source[depth] - point
+            share = (offset[order[..., depth - 1]] - (point * n).sum(-1)) / (ray * n).sum(-1)
+            exists = exists & (share > 0) & (share < 1)
+            point, along = point + share[..., None] * ray, along + share * (1 - along)
+            hit.append(point)
+            fraction.append(along)
+        best = exists.byte().argmax(-1)  # (n, S): of the orders of one image at most one exists
+
+        def of_best(values: Tensor) -> Tensor:
+            return values.gather(2, best[(...,) + (None,) * (values.dim() - 2)].expand(-1, -1, 1, *values.shape[3:]))[
+                :, :, 0
+            ]
+
+        every = order.expand(len(scene), *order.shape)
+        ray = source[-1][:, 0] - scene.moving[:, None]
+        length = ray.norm(dim=-1).float()
+        samples = max(2, math.ceil(float(length.max()) / self.voxel_m))
+        at = (torch.arange(samples) + 0.5) / samples
+        # straight pieces a + t b in padded voxels, with the fraction t of the path from the moving end
+        x = _pieces((scene.moving - self.low)[:, None] / self.voxel_m + 1, ray / self.voxel_m, at)
+        cell = torch.zeros(len(scene), len(sequence), order.shape[2], dtype=torch.int64)
+        for number, (where, when) in enumerate(zip(hit, fraction, strict=True)):
+            plane, point, begin = of_best(every[..., -1 - number]), of_best(where), of_best(when)
+            n = normal[plane]
+            ray = ray - 2 * (ray * n).sum(-1, keepdim=True) * n
+            begun = (point - self.low - begin[..., None] * ray) / self.voxel_m + 1
+            beyond = at > begin.float()[..., None]
+            pieces = _pieces(begun, ray / self.voxel_m, at)
+            x = [torch.where(beyond, after, before) for after, before in zip(pieces, x, strict=True)]
+            cell[..., number] = self._cell(plane, normal, point)
+        (i, j, k), (_, rows, columns) = x, (size + 2 for size in self.absorption.shape)
+        for values, size in zip(x, self.absorption.shape, strict=True):
+            values.floor_().clamp_(0, size + 1)
+        voxel = i.mul_(rows).add_(j).mul_(columns).add_(k).int()  # exact in float32 below 2^24
+        return _Crossings(torch.tensor(rows_of), voxel, length / samples, cell, of_best(exists))
+
+    def _cell(self, plane: Tensor, normal: Tensor, hit: Tensor) -> Tensor:
+        """Return the number of the cell, counted over all planes, of points (n, S, 3) on planes (n, S)."""
+        shape = torch.tensor(self.absorption.shape)
+        index = ((hit - self.low) / self.voxel_m).floor().long().clamp_min(0).minimum(shape - 1)
+        beside = torch.tensor([[1, 2], [0, 2], [0, 1]])[normal.abs().argmax(-1)][plane]
+        number = index.gather(-1, beside)
+        return plane * self.reflectivity.shape[1] + number[..., 0] * shape[beside[..., 1]] + number[..., 1]
+
+
+@dataclass(frozen=True, eq=False)
+class _Crossings:
+    """Voxels and cells of the paths of S images with D reflections to n positions.
+
+    Args:
+        image: Numbers of the images, the direct path is 0, (S,).
+        voxel: Number of the voxel at samples along each path, in the grid with a layer of empty voxels around it, int32
+            (n, S, M).
+        step_m: Distance of the samples (n, S) [m].
+        cell: Numbers of the cells (n, S, D).
+        exists: Whether there is such a path, (n, S).
+    """
+
+    image: Tensor
+    voxel: Tensor
+    step_m: Tensor
+    cell: Tensor
+    exists: Tensor
+
+    def lengths(self, n_voxels: int) -> csr_array:
+        """Return the length of each path in each voxel [m], (n S, voxels)."""
+        rows = np.arange(self.voxel.shape[0] * self.voxel.shape[1]).repeat(self.voxel.shape[2])
+        values = (self.step_m * self.exists)[..., None].expand_as(self.voxel).flatten().numpy()
+        entries = values, (rows, self.voxel.flatten().numpy())
+        return csr_array(entries, shape=(self.step_m.numel(), n_voxels), dtype=np.float32)
+
+
+def _padded(absorption: Tensor) -> Tensor:
+    """Return the absorption with a layer of empty voxels around it, flat."""
+    return torch.nn.functional.pad(absorption, (1,) * 6).flatten()
+
+
+def _pieces(start: Tensor, ray: Tensor, at: Tensor) -> list[Tensor]:
+    """Return the coordinates start + t ray, each (n, S, M), of points (n, S or 1, 3) at fractions t (M,)."""
+    both = (start.expand_as(ray), ray)
+    first, along = (values.nan_to_num(0, 0, 0).float().movedim(-1, 0)[..., None] for values in both)
+    return [torch.addcmul(a, at, b) for a, b in zip(first, along, strict=True)]
+
+
+def _gains(
+    crossings: list[_Crossings], planes: PlaneSet, transmission: Callable[[_Crossings], Tensor], reflectivity: Tensor
+) -> Tensor:
+    """Return the gains (n, 1 + S) of all paths; `transmission` gives those of a group without its reflections, (n, S)."""
+    sign = replace(planes, gain=planes.gain.sign()).image_gain[0] if planes.sequence else torch.ones(0)
+    gain = [transmission(group) * reflectivity.flatten()[group.cell].prod(-1) * group.exists for group in crossings]
+    order = torch.cat([group.image for group in crossings]).argsort()
+    return torch.cat(gain, dim=1)[:, order] * torch.cat([torch.ones(1), sign])
+
+
+class _Depth(torch.autograd.Function):
+    """Product of a sparse matrix of SciPy with a vector: several times as fast as gathering and its gradient."""
+
+    @staticmethod
+    def forward(context: Any, values: Tensor, lengths: csr_array, transposed: csr_array) -> Tensor:
+        context.transposed = transposed
+        return torch.from_numpy(lengths @ values.detach().numpy())
+
+    @staticmethod
+    def backward(context: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        return torch.from_numpy(context.transposed @ gradient.numpy()), None, None
+
+
+@lru_cache(maxsize=64)
+def _orders(sequence: tuple[Sequence, ...], normal: tuple[tuple[float, ...], ...]) -> Tensor:
+    """Return all orders of reflection with the image of each sequence, (S, Q, D), filled up with the first order.
+
+    Perpendicular planes one after the other may change places; which order exists depends on the position.
+    """
+    n = torch.tensor(normal, dtype=torch.float64).reshape(-1, 3)
+    cosine = (n @ n.T).abs()
+    found = []
+    for first in sequence:
+        orders, new = {first}, [first]
+        while new:
+            s = new.pop()
+            swapped = [
+                (*s[:i], s[i + 1], s[i], *s[i + 2 :]) for i in range(len(s) - 1) if cosine[s[i], s[i + 1]] < MAX_COSINE
+            ]
+            new += [other for other in swapped if other not in orders]
+            orders |= {*swapped}
+        found.append([first, *sorted(orders - {first})])
+    most = max(map(len, found))
+    return torch.tensor([orders + orders[:1] * (most - len(orders)) for orders in found], dtype=torch.int64)
+
+
+def coherence(observed: Tensor, predicted: Tensor) -> Tensor:
+    """Return |x^H h|^2 / (|x|^2 |h|^2) of channels (n, F, K), with an unknown phase of each of the F snapshots, (n,)."""
+    match = (observed.conj() * predicted).sum(-1).abs().square().sum(-1)
+    power = (observed.abs().square().sum(-1) * predicted.abs().square().sum(-1)).sum(-1)
+    found: Tensor = match / power.clamp_min(1e-30)
+    return found
+
+
+def field(gain: Tensor, wave: Tensor) -> Tensor:
+    """Return the sums of waves (n, 1 + S, F, K) with gains (n, 1 + S), complex64 (n, F, K)."""
+    total: Tensor = (gain.to(wave.dtype)[:, None] @ wave.flatten(2))[:, 0].unflatten(1, wave.shape[2:])
+    return total
+
+
+def waves(planes: PlaneSet, scene: PhaseObservations, frequency: Tensor) -> Tensor:
+    """Return the waves of the direct path and of each image, complex64 (n, 1 + S, F, K).
+
+    Args:
+        planes: Planes of one room.
+        scene: Positions.
+        frequency: Frequencies relative to the carrier, (F,).
+    """
+    source, there, found = scene.transmitter[None], torch.ones(1, 1), []
+    if planes.sequence:
+        source, exists = torch.cat([source, images(scene, planes)[0]]), visibility(scene, planes)[0]
+        there = torch.cat([torch.ones_like(exists[:1]), exists])
+    for ratio in frequency.tolist():
+        at = replace(scene, element=scene.element * ratio, wavenumber=scene.wavenumber * ratio)
+        found.append(at.wave(source).expand(-1, len(scene), -1) * there[..., None])
+    return torch.stack(found, dim=2).transpose(0, 1)
+
+
+def fit_furniture(planes: PlaneSet, measured: Channels, start: Furniture) -> Furniture:
+    """Fit absorption and reflectivity to measured channels, with the voxels and the penalty of `start`."""
+    scene, observed = measured.scene, measured.value
+    wave = waves(planes, scene, measured.frequency)
+    crossings = start._crossings(planes, scene)
+    shape = [size + 2 for size in start.absorption.shape]
+    parts = [group.lengths(math.prod(shape)) for group in crossings]
+    sparse = {id(group): (part, part.T.tocsr()) for group, part in zip(crossings, parts, strict=True)}
+    raw = torch.full(start.absorption.shape, -3.0, requires_grad=True)
+    strength = planes.gain[0].abs().clamp(0.05, 0.98)[:, None].expand_as(start.reflectivity)
+    logit = torch.special.logit(strength).clone().requires_grad_()
+    optimiser = torch.optim.Adam([{"params": [raw], "lr": 0.1}, {"params": [logit], "lr": 0.05}])
+    area, normal = start.voxel_m**2, planes.normal[0]
+    for _ in range(N_STEPS):
+        absorption, reflectivity = softplus(raw), logit.sigmoid()
+        values = _padded(absorption)
+
+        def transmission(group: _Crossings, values: Tensor = values) -> Tensor:
+            depth: Tensor = _Depth.apply(values, *sparse[id(group)])
+            return (-depth).exp().view_as(group.step_m)
+
+        gain = _gains(crossings, planes, transmission, reflectivity)
+        penalty = 10 * start.voxel_m**3 * absorption.sum() + area * _variation(absorption)
+        for axis, values in zip(normal.abs().argmax(-1).tolist(), reflectivity, strict=True):
+            sides = [size for other, size in enumerate(absorption.shape) if other != axis]
+            cells = values[: math.prod(sides)].reshape(sides)
+            penalty = penalty + start.voxel_m * _variation(cells) + area * (1 - cells).sum()
+        loss = 1 - coherence(observed, field(gain, wave)).mean() + start.penalty * penalty
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    crossed = torch.from_numpy(np.sum([part.sum(axis=0) for part in parts], axis=0))
+    return replace(
+        start,
+        absorption=softplus(raw).detach(),
+        reflectivity=logit.sigmoid().detach(),
+        crossed_m=crossed.reshape(shape)[1:-1, 1:-1, 1:-1],
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Channels:
+    """Measured channels at n positions.
+
+    Args:
+        scene: Positions.
+        value: Channels of F snapshots, complex64 (n, F, K).
+        frequency: Their frequencies relative to the carrier, (F,).
+    """
+
+    scene: PhaseObservations
+    value: Tensor
+    frequency: Tensor
+
+    def subset(self, rows: Tensor) -> Channels:
+        """Return the given positions."""
+        return replace(self, scene=self.scene.subset(rows), value=self.value[rows])
+
+    def coherence(self, planes: PlaneSet, gain: Tensor) -> Tensor:
+        """Return the coherence with the field of gains (n, 1 + S) at each position, (n,)."""
+        return coherence(self.value, field(gain, waves(planes, self.scene, self.frequency)))
+
+
+@single_thread()
+def find_furniture(
+    planes: PlaneSet, constant: Tensor, measured: Channels, corners: Tensor, fold: Tensor
+) -> Furniture | None:
+    """Estimate what stands in a room; None if it does not explain held-out channels better than planes alone.
+
+    Args:
+        planes: Planes of one room.
+        constant: Gains of the paths without furniture, (1 + S,).
+        measured: Measured channels.
+        corners: Points (m, 3) [m] that the voxels surround, besides the measured positions.
+        fold: Fold of each position.
+    """
+    wavelength = math.tau / measured.scene.wavenumber
+    region = torch.cat([corners, measured.scene.moving, measured.scene.transmitter, measured.scene.receiver])
+    low, high = region.amin(0) - wavelength, region.amax(0) + wavelength
+    smallest = float((high - low).prod() / MAX_VOXELS) ** (1 / 3)
+    empty = []
+    for wavelengths, penalty in SETTINGS:
+        voxel = max(wavelengths * wavelength, smallest)
+        shape = ((high - low) / voxel).ceil().int().tolist()
+        cells = torch.ones(planes.gain.shape[1], math.prod(shape) // min(shape))
+        empty.append(Furniture(low, voxel, torch.zeros(shape), cells, torch.zeros(shape), penalty))
+    some = torch.linspace(0, len(fold) - 1, min(MAX_CHOICE, len(fold))).long()
+    chosen, fold = measured.subset(some), fold[some]
+    splits = [((fold != number).nonzero()[:, 0], (fold == number).nonzero()[:, 0]) for number in fold.unique()[:2]]
+    tasks = [(start, split) for start in empty for split in splits]
+
+    def held_out(task: tuple[Furniture, tuple[Tensor, Tensor]]) -> Tensor:
+        start, (kept, held) = task
+        test, found = chosen.subset(held), fit_furniture(planes, chosen.subset(kept), start)
+        return log_explained(test.coherence(planes, found.gains(planes, test.scene)))
+
+    explained = torch.cat(parallel_map(held_out, tasks)).reshape(len(empty), -1)
+    held = chosen.subset(torch.cat([held for _, held in splits]))
+    alone = log_explained(held.coherence(planes, constant.expand(len(held.value), -1)))
+    best = int(explained.mean(dim=1).argmax())
+    if advantage(explained[best], alone) < SIGNIFICANCE:
+        return None
+    return fit_furniture(planes, measured, empty[best])
+
+
+def _variation(values: Tensor) -> Tensor:
+    """Return the sum of the moduli of the differences of neighbours, smoothed at 0."""
+    return torch.stack([(values.diff(dim=axis).square() + 1e-6).sqrt().sum() for axis in range(values.dim())]).sum()

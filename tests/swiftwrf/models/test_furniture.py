@@ -1,0 +1,231 @@
+"""Channels: at subcarriers of known paths, and furniture that is found in them and improves what follows from a room."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from rooms import mirror_room
+
+from augment.turbo.artifacts import save_artifacts
+from swiftwrf import AngularGrid, InputError, MatchedField, Spectra, load, simulated_room
+from swiftwrf.array.planar import PlanarArray
+from swiftwrf.data import PropagationPaths, Snapshots
+from swiftwrf.data.store import Store
+from swiftwrf.models.geometry import GeometryModel, Plane, furniture
+from swiftwrf.models.geometry.fit import observe
+from swiftwrf.models.geometry.furniture import Furniture, coherence, field, waves
+from swiftwrf.models.geometry.images import PlaneSet
+from tasks.aoa.page.room import furniture_panels
+
+WALLS = [
+    Plane(normal, offset, 0.9)
+    for normal, offset in [
+        ((-1.0, 0.0, 0.0), 0.0),
+        ((1.0, 0.0, 0.0), 6.0),
+        ((0.0, -1.0, 0.0), 0.0),
+        ((0.0, 1.0, 0.0), 5.0),
+        ((0.0, 0.0, -1.0), 0.0),
+        ((0.0, 0.0, 1.0), 3.0),
+    ]
+]
+LIGHT_SPEED = 299_792_458.0
+
+
+def furnished(room: GeometryModel, absorption: float) -> Furniture:
+    """A shelf of 1 x 2.5 x 0.5 m between half of the positions and the fixed end, in voxels of 0.25 m."""
+    low, shape = torch.full((3,), -0.25, dtype=torch.float64), (26, 22, 14)
+    values = torch.zeros(shape)
+    low_z = 3 if room.moving == "transmitter" else 8
+    values[11:15, 5:15, low_z : low_z + 2] = absorption
+    reflectivity = torch.full((len(room.planes), 26 * 22), 0.9)
+    return Furniture(low, 0.25, values, reflectivity, torch.zeros(shape), 1e-3)
+
+
+def measured(absorption: float, moving="transmitter", n: int = 100) -> tuple[Spectra, GeometryModel]:
+    """Return the channels of a furnished room at four subcarriers, and its walls."""
+    data = mirror_room({}, moving=moving, n=n)
+    walls = GeometryModel.of_planes(data, WALLS)
+    truth = GeometryModel.of_planes(data, WALLS)
+    truth.furniture = furnished(truth, absorption)
+    frequency = LIGHT_SPEED / data.array.wavelength + torch.linspace(-40e6, 40e6, 4, dtype=torch.float64)
+    channel = truth.channel(data.position, frequency)
+    phase = torch.randn(n, 4, 1, generator=torch.Generator().manual_seed(0))
+    channel = channel * torch.polar(torch.ones_like(phase), phase)  # of each snapshot, unknown
+    return replace(
+        data, store=Store(data.array.spectrum(channel, data.grid)), channel=channel, frequency_hz=frequency
+    ), walls
+
+
+def fitted(walls: GeometryModel, train: Spectra) -> GeometryModel:
+    """The room of known walls with the furniture that its channels show."""
+    walls._furnish(train)
+    return walls
+
+
+@pytest.fixture(autouse=True)
+def one_setting(monkeypatch):
+    """One size of voxels, because each fit takes a second."""
+    monkeypatch.setattr(furniture, "SETTINGS", ((1.0, 1e-3),))
+
+
+@pytest.mark.parametrize("moving", ["transmitter", "receiver"])
+def test_paths_through_voxels_are_those_of_the_image_sources(moving):
+    """Without furniture the gains are those of the planes, and the waves sum up to the channel of the planes."""
+    data = simulated_room(n=12, seed=2, grid=AngularGrid.hemisphere(8, 32), moving=moving)
+    room = GeometryModel.of_planes(data, WALLS, order=3)
+    scene, planes = room.scene(data.position), room.tensors()
+    gain = furnished(room, 0.0).gains(planes, scene)
+    assert torch.allclose(gain, room.gains(scene), atol=1e-5)
+    channel = field(gain, waves(planes, scene, torch.ones(1)))[:, 0]
+    assert torch.allclose(channel, planes.channel(scene), atol=1e-4)
+
+
+def test_a_voxel_attenuates_the_direct_path_by_its_length_in_it():
+    data = mirror_room({}, moving="transmitter", n=12)
+    room = GeometryModel.of_planes(data, [])
+    scene = room.scene(data.position)
+    start, ray = data.position, data.fixed_position - data.position
+    at = (torch.arange(20_000, dtype=torch.float64) + 0.5)[:, None, None] / 20_000
+    x = start + at * ray
+    low, high = torch.tensor([2.5, 1.0, 0.5]), torch.tensor([3.5, 3.5, 1.0])
+    inside = ((x >= low) & (x < high)).all(-1).double().mean(0) * ray.norm(dim=1)
+    gain = furnished(room, 1.5).gains(room.tensors(), scene)[:, 0]
+    assert torch.allclose(-gain.log() / 1.5, inside.float(), atol=0.26)  # a sample
+    assert float(inside.max()) > 0.2
+
+
+@pytest.mark.parametrize("moving", ["transmitter", "receiver"])
+def test_furniture_is_found_where_it_stands_and_explains_new_channels(moving, tmp_path):
+    data, walls = measured(6.0, moving)
+    train, test = data.subset(torch.arange(70)), data.subset(torch.arange(70, 100))
+    channels = walls.channels(test)
+    before = 1 - channels.coherence(walls.tensors(), walls.gains(channels.scene))
+    room = fitted(walls, train)
+    assert room.furniture is not None
+    after = 1 - channels.coherence(room.tensors(), room.gains(channels.scene))
+    assert float(after.mean()) < 0.5 * float(before.mean())
+    centre = (
+        (torch.tensor([2.75, 2.3, 0.7 if moving == "transmitter" else 2.1]).double() - room.furniture.low)
+        / room.furniture.voxel_m
+    ).long()
+    i, j, k = centre.tolist()
+    assert room.furniture.absorption[i, j, k] > 10 * room.furniture.absorption.median()
+    assert room.furniture.crossed_m.min() == 0  # what no path crosses is unknown
+    room.save(tmp_path / "room.safetensors")
+    assert torch.equal(load(tmp_path / "room.safetensors").channel(test.position), room.channel(test.position))
+
+
+def test_furniture_is_drawn_by_height_and_hatched_where_it_is_unknown(tmp_path):
+    data, walls = measured(0.0, n=20)
+    shown = furnished(walls, 2.0)
+    shown = replace(shown, crossed_m=(torch.arange(14) > 1).float().expand(26, 22, 14).clone())
+    x, y, values = shown.in_plan(0.5, 1.0)
+    assert (len(x), len(y), values.shape) == (26, 22, (22, 26))
+    assert values[(y > 1.0) & (y < 3.5)][:, (x > 2.5) & (x < 3.5)].min() == pytest.approx(2 * 20 / math.log(10))
+    assert values[0, 0] == 0
+    assert math.isnan(shown.in_plan(0.0, 0.24)[2][0, 0])
+    assert shown.plot(0.0, 0.24).get_xlabel() == "x [m]"
+    walls.furniture = shown
+    save_artifacts(walls, "0.3", data, data, tmp_path)
+    points = dict(np.load(tmp_path / "room-mix0.3.npz"))
+    assert points["plan"].shape == (3, 22, 26)
+    assert len(furniture_panels(walls.to_json()["planes"], points)) == 3
+
+
+def test_an_empty_room_has_no_furniture_and_spectra_alone_have_none():
+    data, walls = measured(0.0, n=60)
+    assert fitted(walls, data).furniture is None
+    walls._furnish(replace(data, channel=None))
+    assert walls.furniture is None
+    with pytest.raises(InputError, match="contains spectra alone"):
+        walls.channels(replace(data, channel=None))
+
+
+def test_phases_of_channels_have_no_alias_and_those_of_packets_are_the_signal():
+    data, _ = measured(0.0, n=20)
+    scene, rows = observe(data)
+    assert scene.channel.shape == (20, 1, 16)
+    assert len(rows) == 20
+    assert torch.allclose(scene.channel[:, 0], data.channel[:, 1].sgn())  # next to the carrier
+    packets = replace(data, channel=data.channel[:, [1] * 3], frequency_hz=None)
+    match = (observe(packets)[0].channel * scene.channel.conj()).sum(-1).abs() / 16
+    assert torch.allclose(match, torch.ones_like(match), atol=1e-5)
+
+
+def test_positions_are_located_by_channels_through_furniture(tmp_path):
+    data, walls = measured(6.0)
+    train, test = data.subset(torch.arange(80)), data.subset(torch.arange(80, 100))
+    options = {"n_best": 60, "n_background": 40, "n_split": 8, "spacing": 0.3, "n_calibration": 20, "max_cells": 20_000}
+    locator = MatchedField(**options).fit(train, room=fitted(walls, train))
+    posterior = locator.locate(test)
+    error = (posterior.median - test.position).norm(dim=1)
+    assert float(error.median()) < 0.5 * data.array.wavelength
+    locator.save(tmp_path / "locator.safetensors")
+    again = load(tmp_path / "locator.safetensors").locate(test.channel)
+    assert torch.equal(again.log_weight, posterior.log_weight)
+    with pytest.raises(InputError, match="was fitted to channels"):
+        locator.locate(test.spectrum)
+
+
+def paths(length: torch.Tensor | None) -> PropagationPaths:
+    """Two links with a path each along +x, 3 m long, of the amplitude of free space at 2.4 GHz."""
+    wavelength = LIGHT_SPEED / 2.4e9
+    gain = torch.polar(
+        torch.tensor(wavelength / (4 * math.pi * 3)).double(), torch.tensor(-6 * math.pi / wavelength).double()
+    )
+    receiver = torch.tensor([[3.0, 0, 0], [0, 3.0, 0]], dtype=torch.float64)
+    none = torch.zeros(2, 3, dtype=torch.float64)
+    return PropagationPaths(
+        none, receiver, torch.ones(2).long(), -receiver / 3, gain.expand(2), torch.ones(2).bool(), 2.4e9, length
+    )
+
+
+@pytest.mark.parametrize("length", [None, torch.full((2,), 3.0, dtype=torch.float64)])
+def test_the_phase_of_subcarriers_turns_by_the_delay_of_the_path(length):
+    array = PlanarArray.square(2, 2.4e9)
+    channel, frequency = paths(length).subcarriers(array, 3, 20e6)
+    assert frequency.tolist() == [2.39e9, 2.4e9, 2.41e9]
+    assert torch.allclose(channel[:, 1], paths(length).channel(array))
+    turned = (channel[:, 2] * channel[:, 0].conj()).angle()
+    expected = -math.tau * 20e6 / LIGHT_SPEED * (3 - paths(length).direction[:, :2] @ array.element.double().T)
+    assert torch.allclose(turned, expected, atol=1e-6)
+    spectra = paths(length).spectra("paths", subcarriers=3, bandwidth_hz=20e6, grid=AngularGrid.hemisphere(8, 32))
+    assert spectra.channel.shape == (2, 3, 16)
+    assert spectra.frequency_hz.tolist() == frequency.tolist()
+    assert paths(length).spectra("paths", grid=AngularGrid.hemisphere(8, 32)).channel is None
+
+
+def test_subcarriers_of_paths_without_lengths_are_refused():
+    other = replace(paths(None), gain=paths(None).gain * 1j)
+    with pytest.raises(InputError, match="need the length of each path"):
+        other.subcarriers(PlanarArray.square(2, 2.4e9), 2, 20e6)
+    other.subcarriers(PlanarArray.square(2, 2.4e9))
+    for number, bandwidth in ((8, 0.0), (1, 20e6), (8, 80.0), (8, 3e9)):
+        with pytest.raises(InputError, match="goes with several subcarriers"):
+            paths(None).subcarriers(PlanarArray.square(2, 2.4e9), number, bandwidth)
+
+
+@pytest.mark.parametrize("frequency", [[2.4e9], [2.4e3, 2.41e3], [2.4e9, 5.2e9]], ids=["one", "in MHz", "two bands"])
+def test_frequencies_of_snapshots_are_checked(frequency):
+    array = PlanarArray.square(2, 2.4e9)
+    channel = torch.ones(12, 2, 4, dtype=torch.complex64)
+    with pytest.raises(InputError, match="frequency_hz"):
+        Snapshots(
+            channel,
+            torch.rand(12, 3),
+            array=array,
+            fixed_position=(9, 9, 9),
+            rotation=torch.eye(3),
+            frequency_hz=frequency,
+        )
+
+
+def test_coherence_is_one_for_any_phase_of_each_snapshot():
+    channel = torch.randn(5, 3, 4, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
+    turned = channel * torch.polar(torch.ones(5, 3, 1), torch.rand(5, 3, 1)) * 7
+    assert torch.allclose(coherence(channel, turned), torch.ones(5))
+    assert isinstance(GeometryModel.of_planes(simulated_room(n=10), []).tensors(), PlaneSet)
