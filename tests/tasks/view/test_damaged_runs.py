@@ -12,7 +12,6 @@ import pytest
 from fuzz.runs import followed_run, run_of_aoa, run_of_locate, run_of_rssi, show
 
 from swiftwrf import InputError
-from tasks.page.maps import FloorPlan
 
 OPENED = (
     "config.json",
