@@ -93,5 +93,5 @@ def test_reports_of_rssi(browser, rssi_run, tmp_path):
 def test_reports_of_files(browser, room, tmp_path):
     (tmp_path / "data").mkdir()
     write_spectra(room, tmp_path / "data")
-    assert quick.run("inspect", tmp_path / "data", "--out", tmp_path / "inspection") == 0
+    assert quick.run("inspect", tmp_path / "data", "--out", tmp_path / "inspection", drawn=True) == 0
     fits(browser, (tmp_path / "inspection" / "report.html").as_uri())
