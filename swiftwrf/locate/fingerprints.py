@@ -89,7 +89,8 @@ class Fingerprints:
 
     @cached_property
     def _places(self) -> tuple[Tensor, Tensor]:
-        return self.position.unique(dim=0, return_inverse=True)
+        place, row = self.position.unique(dim=0, return_inverse=True)
+        return place, row
 
     @cached_property
     def _known(self) -> tuple[Tensor, Tensor]:

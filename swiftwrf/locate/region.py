@@ -137,8 +137,8 @@ class Region:
         if self.floors is None:
             return self._covering(count)
         found = self._covering(count)
-        near = float(self.is_near(found.position).double().mean())
-        found = self._covering(min(round(count / max(near, 0.01)), MAX_CELLS))
+        share = float(self.is_near(found.position).double().mean())
+        found = self._covering(min(round(count / max(share, 0.01)), MAX_CELLS))
         near = self.is_near(found.position)
         others = (~near).nonzero()[:, 0]
         others = others[:: max(1, 10 * len(others) // count)]

@@ -64,11 +64,13 @@ class Student:
         """
         f = len(self.scale)
         if math.isinf(self.degrees):
-            return -distance / 2 - f / 2 * math.log(2 * math.pi)
+            normal: Tensor = -distance / 2 - f / 2 * math.log(2 * math.pi)
+            return normal
         half = (self.degrees + f) / 2
         constant = math.lgamma(half) - math.lgamma(self.degrees / 2) - f / 2 * math.log(self.degrees * math.pi)
         # in place: a search has millions of distances
-        return (distance / self.degrees).log1p_().mul_(-half).add_(constant)
+        density: Tensor = (distance / self.degrees).log1p_().mul_(-half).add_(constant)
+        return density
 
     def log_likelihood(self, residual: Tensor) -> Tensor:
         """Return the log-likelihoods (n,) of residuals (n, F), float64."""

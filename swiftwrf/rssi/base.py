@@ -244,14 +244,14 @@ class RssiPredictor(Configured, Displayed, ABC):
         raise NotImplementedError
 
     @abstractmethod
-    def _fit(self, train: Rssi, *, pool: Rssi, **arguments: Any) -> None:
+    def _fit(self, train: Rssi, *, pool: Rssi, shift: Tensor, **arguments: Any) -> None:
         """Fit to checked data.
 
         Args:
             train: Training rows.
             pool: The same rows at all receivers.
-            arguments: The other arguments of `fit`, and `shift`, the received power less the RSSI of the pool [dB], by
-                floors and offsets that were removed. A predictor declares those that it uses, and ignores the rest by `**_`.
+            shift: Received power less the RSSI of the pool, by floors and offsets that were removed, (n, P) [dB].
+            arguments: The other arguments of `fit`. A predictor declares those that it uses, and ignores the rest by `**_`.
         """
 
     @abstractmethod

@@ -24,7 +24,7 @@ from swiftwrf.models.base import CPU, FieldConfig
 from swiftwrf.rssi.base import Map, RssiPredictor
 from swiftwrf.rssi.comparison import make_predictor
 from swiftwrf.rssi.pairs import PairPredictor
-from swiftwrf.rssi.path_loss import PathLoss, fit_path_losses, fit_shared_path_loss, log_distance
+from swiftwrf.rssi.path_loss import fit_path_losses, fit_shared_path_loss, log_distance
 from swiftwrf.rssi.training import mixing_weights
 from swiftwrf.runtime.threads import parallel_map
 from swiftwrf.runtime.validation import Preset, configuration
@@ -61,9 +61,11 @@ class SharedPathLoss(RssiPredictor):
     name = "mri_pooled"
     requires_receiver_position = True
 
-    def _fit(self, train: Rssi, *, pool: Rssi, **_: Any) -> None:
+    def _fit(self, train: Rssi, *, pool: Rssi, shift: Tensor, **_: Any) -> None:
         self._receiver = train.receiver_position
-        self._path_loss = _fit_shared(pool, train)
+        distance = log_distance(pool.transmitter_position, pool.receiver_position)
+        known = pool.receiver_located, train.receiver_located
+        self._path_loss = fit_shared_path_loss(distance, pool.rssi_dbm, *known)
 
     def _predict(self, position: Tensor) -> tuple[Tensor, None]:
         return self._path_loss(log_distance(position, self._receiver)), None
@@ -79,11 +81,6 @@ class ReceiverPathLoss(SharedPathLoss):
         found = fit_path_losses(pool.transmitter_position, pool.receiver_position, pool.rssi_dbm, shift=shift)
         names = list(pool.receiver_names)
         self._path_loss = found.columns(torch.tensor([names.index(name) for name in train.receiver_names])).own
-
-
-def _fit_shared(rows: Rssi, applied: Rssi) -> PathLoss:
-    distance = log_distance(rows.transmitter_position, rows.receiver_position)
-    return fit_shared_path_loss(distance, rows.rssi_dbm, rows.receiver_located, applied.receiver_located)
 
 
 class ReceiverRegressors(RssiPredictor):

@@ -232,7 +232,7 @@ def compare(
         offsets = estimate_offsets(pool, reference)
         train, pool = offsets.removed(train), offsets.removed(pool)
     offset = 0.0 if train.offsets is None else train.offsets.of(test)[:, None]
-    options = {"validation": train.validation_for(split, test), "seed": seed, "new_places": split == PLACE}
+    options: Values = {"validation": train.validation_for(split, test), "seed": seed, "new_places": split == PLACE}
     options["not_detected"] = not_detected
     names, left_out = compared(chosen, also)
     predictors: dict[str, RssiPredictor] = {}

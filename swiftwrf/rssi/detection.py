@@ -42,8 +42,8 @@ class Detection:
 
     Example:
         >>> curve = Detection(-90.0, 1.0, torch.tensor([0.001]).double(), torch.tensor([True]))
-        >>> curve.probability(torch.tensor([[-80.0], [-90.0], [-100.0]]), torch.tensor(2.0)).round(decimals=2)[:, 0]
-        tensor([1.0000, 0.5000, 0.0000], dtype=torch.float64)
+        >>> curve.given_detection(torch.tensor([[-80.0], [-95.0]]), torch.tensor(4.0))[0].round()[:, 0]
+        tensor([-80., -88.])
     """
 
     limit: float
@@ -118,10 +118,6 @@ class Detection:
     def columns(self, number: Tensor) -> Self:
         """Return the curve of some receivers."""
         return replace(self, missed=self.missed[number], is_limit=self.is_limit[number])
-
-    def probability(self, mean: Tensor, std: Tensor) -> Tensor:
-        """Return the probability of a detection (n, R) of packets of Gaussian power (n, R) [dBm], [dB]."""
-        return (1 - self.missed) * torch.special.ndtr((mean - self.limit) / (std.square() + self.width**2).sqrt())
 
     def given_detection(self, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean [dBm] and standard deviation [dB] of the power of packets that were detected, each (n, R).

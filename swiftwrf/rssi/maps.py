@@ -96,8 +96,8 @@ class RssiMap(Labelled, Displayed):
             found = model.predict(grid)
         assert found.std is not None
         each = (found.mean, found.std, model.predict_detection(grid))
-        fields = [values.T.reshape(-1, len(y), len(x)).float().numpy() for values in each]
-        return cls(x, y, z, cell, *fields, model.receiver_names, model.origin)
+        mean, std, detection = (values.T.reshape(-1, len(y), len(x)).float().numpy() for values in each)
+        return cls(x, y, z, cell, mean, std, detection, model.receiver_names, model.origin)
 
     def receivers(self, asked: Sequence[str]) -> RssiMap:
         """Return the map of some receivers.

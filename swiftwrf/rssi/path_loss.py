@@ -176,8 +176,8 @@ class PathLosses(NamedTuple):
         """Return the path loss of some receivers."""
         own, shared = (PathLoss(*(value[number] for value in model)) for model in (self.own, self.shared))
         detection = self.detection and self.detection.columns(number)
-        rest = (value[number] for value in (self.centre, self.std, self.variance))
-        return PathLosses(own, shared, *rest, detection, self.floor_db[number])
+        centre, std, variance, floor_db = (x[number] for x in (self.centre, self.std, self.variance, self.floor_db))
+        return PathLosses(own, shared, centre, std, variance, detection, floor_db)
 
 
 @single_thread()
@@ -235,14 +235,13 @@ def fit_path_losses(
         for kind in (located, ~located):
             if bool(rssi[:, kind].isfinite().any()):
                 of_kind = curve and curve.columns(kind)
-                each = (values[:, kind] for values in (distance, floors, rssi, shift))
-                found = _maximise(*each, of_kind, repeats)
-                for name, value in found.items():
+                cells = distance[:, kind], floors[:, kind], rssi[:, kind], shift[:, kind]
+                for name, value in _maximise(*cells, of_kind, repeats).items():
                     fields[name][kind] = value
         own, shared = (PathLoss(fields[f"{of}_level"], fields[f"{of}_slope"] * located) for of in ("own", "shared"))
         std = torch.stack([fields["std"][:, 0], fields["std"][:, 1] * located], dim=1)
-        found = PathLosses(own, shared, fields["centre"], std, fields["variance"], curve, fields["floor_db"])
-        return found, fields["unexplained"]
+        losses = PathLosses(own, shared, fields["centre"], std, fields["variance"], curve, fields["floor_db"])
+        return losses, fields["unexplained"]
 
     found, unexplained = fit(detection)
     if not_detected == "auto" and detection is not None:

@@ -150,6 +150,7 @@ def room_section(fraction: FractionRecords) -> Section | None:
         furniture_panels(room["planes"], points),
         "What stands in the room between three pairs of heights: the largest absorption of the amplitude. Hatched: unknown, "
         "because no measured path crosses it. Held-out channels need this furniture.",
+        _cells(points),
     )
     return Section(title, [text], [table], [plot, furniture])
 
@@ -171,6 +172,12 @@ def furniture_panels(planes: list[dict[str, Any]], points: dict[str, NDArray[Any
         figures.colour_bar(ax, drawn, "absorption [dB/m]")
         panels.append(figure)
     return panels
+
+
+def _cells(points: dict[str, NDArray[Any]]) -> DataFrame:
+    z, y, x = np.meshgrid(points["height"][:-1], points["plan_y"], points["plan_x"], indexing="ij")
+    columns = {"x_m": x, "y_m": y, "z_from_m": z, "absorption_db_per_m": points["plan"]}
+    return DataFrame({name: values.ravel().round(3) for name, values in columns.items()})
 
 
 def _places(points: dict[str, NDArray[Any]]) -> DataFrame:
