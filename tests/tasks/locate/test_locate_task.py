@@ -60,7 +60,7 @@ def write_rssi(file, data, located=True):
 def finished(tmp_path_factory):
     """The directory of a run on the built-in floor."""
     folder = tmp_path_factory.mktemp("locate") / "run"
-    assert run("--cells", 300, "--out", folder) == 0
+    assert quick.run("locate", "--cells", 300, "--out", folder, drawn=True) == 0
     return folder
 
 
