@@ -66,7 +66,7 @@ class Maps:
 
     @property
     def suffix(self) -> str:
-        """What tells the floors of a run apart in names of files."""
+        """End of the names of files of this floor, if there are several."""
         return "" if len(self.arrays["floor_names"]) == 1 else f"-{self.floor}"
 
     @property

@@ -73,7 +73,7 @@ def test_the_limit_and_random_misses_are_told_apart():
 
 
 def test_a_receiver_that_is_empty_beside_its_place_keeps_its_path_loss():
-    """It was off, so its empty cells say nothing; those of the others are still limits."""
+    """It was off, so its empty cells are no limits; those of the others are."""
     data, _ = survey()
     rssi = data.rssi_dbm.clone()
     near = log_distance(data.transmitter_position, RECEIVER)[:, 0] < 1.1
@@ -140,7 +140,7 @@ def test_the_attenuation_of_floors_counts_what_they_hide(located):
     rssi = rssi + 3.0 * torch.randn(240, 4, generator=generator)
     table = Rssi(rssi, position, receiver_position=receiver, receiver_names=list("abcd"), name="s").to_frame()
     table = table.rename(columns={"x_m": "x", "y_m": "y", "z_m": "z"}).assign(floor=floor.numpy())
-    places = {name: at for name, at in zip("abcd", receiver.tolist(), strict=True)} if located else None
+    places = dict(zip("abcd", receiver.tolist(), strict=True)) if located else None
     table[list("abcd")] = table[list("abcd")].where(table[list("abcd")] > LIMIT)
     data = Rssi.from_frame(table.reset_index(drop=True), receiver_position=places)
     assert estimate_floor_attenuation(data).db == pytest.approx(14, abs=3)
