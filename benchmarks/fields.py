@@ -56,7 +56,6 @@ from tasks import labels
 from tasks.aoa.experiment import run as run_aoa
 from tasks.aoa.options import AoaConfig
 from tasks.page import figures
-from tasks.page.figures import Palette
 from tasks.scenes.options import ScenesConfig
 from tasks.scenes.run import run as trace
 from tasks.workers import connected
@@ -535,7 +534,7 @@ def angles(work: Path) -> Row:
 
 def draw(rows: Sequence[Row]) -> None:
     """Draw speed against error on each scene, and SSIM against the number of training spectra."""
-    folder, palette = ROOT / "docs" / "figures", Palette.of(labels.FIELD_MODELS)
+    folder, palette = ROOT / "docs" / "figures", figures.Palette.of(labels.FIELD_MODELS)
     by_scene: dict[str, list[Row]] = {}
     for row in rows:
         by_scene.setdefault(f"{row['scene']} {row['split']}", []).append(row)

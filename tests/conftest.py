@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from unittest import mock
 
@@ -11,6 +11,7 @@ import jaxtyping
 import pytest
 import small
 import torch
+from filelock import FileLock
 from PIL import Image
 
 from swiftwrf import AngularGrid, InputError, Spectra, make_model, simulated_room
@@ -92,8 +93,26 @@ def glances() -> Iterator[None]:
 
 
 @pytest.fixture
+def floor_alone() -> Iterator[None]:
+    """The floor as the only plane that any search for a room finds, without a search."""
+    with small.known_planes(small.FLOOR):
+        yield
+
+
+@pytest.fixture
 def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
+
+
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
+    """Return a folder that the first of all workers makes, and that no test changes."""
+    base = factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
+    with FileLock(f"{folder}.lock"):
+        if not folder.exists():
+            folder.mkdir()
+            make(folder)
+    return folder
 
 
 @pytest.fixture(scope="session")
@@ -101,14 +120,15 @@ def aoa_run(tmp_path_factory: pytest.TempPathFactory, room: Spectra) -> Path:
     """A run of angle of arrival on files, whose second model does not know its deviation."""
     import quick  # the tasks are imported by the tests that run them
 
-    folder = tmp_path_factory.mktemp("aoa")
-    (folder / "data").mkdir()
-    write_spectra(room, folder / "data")
-    options = ("--synthesizer", "swiftwrf", "--extra", 0, "--data", folder / "data", "--out", folder / "run")
-    with mock.patch("augment.turbo.experiment.candidates", return_value=["idw"]):
-        assert quick.run("aoa", "--mix", 0.5, 1, *options, drawn=True) == 0
-    make_model("idw").fit(room).save(folder / "run" / "model-mix1.safetensors")
-    return folder / "run"
+    def make(folder: Path) -> None:
+        (folder / "data").mkdir()
+        write_spectra(room, folder / "data")
+        options = ("--synthesizer", "swiftwrf", "--extra", 0, "--data", folder / "data", "--out", folder / "run")
+        with mock.patch("augment.turbo.experiment.candidates", return_value=["idw"]):
+            assert quick.run("aoa", "--mix", 0.5, 1, *options, drawn=True) == 0
+        make_model("idw").fit(room).save(folder / "run" / "model-mix1.safetensors")
+
+    return made_once(tmp_path_factory, "aoa", make) / "run"
 
 
 @pytest.fixture(scope="session")
@@ -116,8 +136,9 @@ def rssi_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of RSSI at three receivers, over a floor plan."""
     import quick
 
-    folder = tmp_path_factory.mktemp("rssi")
-    Image.new("RGB", (40, 30), "white").save(folder / "plan.png")
-    plan = ("--floor-plan", folder / "plan.png", "--floor-extent", 0, 20, 0, 15)
-    assert quick.run("rssi", "--rx", 1, 6, 12, *plan, "--out", folder / "run", drawn=True) == 0
-    return folder / "run"
+    def make(folder: Path) -> None:
+        Image.new("RGB", (40, 30), "white").save(folder / "plan.png")
+        plan = ("--floor-plan", folder / "plan.png", "--floor-extent", 0, 20, 0, 15)
+        assert quick.run("rssi", "--rx", 1, 6, 12, *plan, "--out", folder / "run", drawn=True) == 0
+
+    return made_once(tmp_path_factory, "rssi", make) / "run"

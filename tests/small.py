@@ -74,6 +74,9 @@ def small_swiftwrf() -> Iterator[None]:
         yield
 
 
+FLOOR = Plane((0.0, 0.0, -1.0), offset_m=0.0, gain=-0.6)
+
+
 @contextmanager
 def known_planes(*planes: Plane) -> Iterator[None]:
     """Let every search for a room give these planes at once."""

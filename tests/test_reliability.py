@@ -297,7 +297,7 @@ def test_a_receiver_may_have_any_name(tmp_path, monkeypatch):
     from swiftwrf import rssi_room
 
     floor, names = rssi_room(n=40), ("NA", "$x^{$", "=cmd()", "12:34:56", "7", "<b>", "x" * 300)
-    with quick.quick():
+    with quick.quick(drawn=True):
         monkeypatch.setattr(
             rssi, "rssi_room", lambda seed: replace(floor, receiver_names=(*names, *floor.receiver_names[len(names) :]))
         )

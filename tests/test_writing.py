@@ -11,8 +11,6 @@ import re
 import tokenize
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted(
     file for folder in ("swiftwrf", "augment", "tasks", "benchmarks", "tests") for file in (ROOT / folder).rglob("*.py")
@@ -67,36 +65,34 @@ def _sentences(text: str) -> list[str]:
     return [part for part in parts if len(part.split()) > 2]
 
 
-@pytest.mark.parametrize("file", SOURCES, ids=lambda file: str(file.relative_to(ROOT)))
-def test_docstrings_use_the_fields_words(file):
-    if file == Path(__file__):
-        pytest.skip("holds the list")
+def test_docstrings_and_comments_use_the_fields_words():
     first = re.compile(rf"(?:{FIRST_WORDS})\b")
-    wrong = [f"{line}: begins with {text.split()[0]!r}" for line, text in _docstrings(file) if first.match(text)]
-    for line, text in _docstrings(file) + _comments(file):
-        wrong += [f"{line}: {match[0]!r} in {' '.join(text.split())[:90]!r}" for match in DENIED.finditer(text)]
-    for line, text in _docstrings(file):
-        wrong += [
-            f"{line}: {words} words in {sentence[:90]!r}"
-            for sentence in _docstring_sentences(text)
-            if (words := len(sentence.split())) > MAX_WORDS
-        ]
+    wrong = []
+    for file in set(SOURCES) - {Path(__file__)}:  # which holds the list
+        docstrings = _docstrings(file)
+        found = [f"{line}: begins with {text.split()[0]!r}" for line, text in docstrings if first.match(text)]
+        for line, text in docstrings + _comments(file):
+            found += [f"{line}: {match[0]!r} in {' '.join(text.split())[:90]!r}" for match in DENIED.finditer(text)]
+        for line, text in docstrings:
+            found += [
+                f"{line}: {words} words in {sentence[:90]!r}"
+                for sentence in _docstring_sentences(text)
+                if (words := len(sentence.split())) > MAX_WORDS
+            ]
+        wrong += [f"{file.relative_to(ROOT)}:{line}" for line in found]
     assert not wrong, "\n".join(wrong)
 
 
-@pytest.mark.parametrize("file", DOCUMENTS, ids=lambda file: str(file.relative_to(ROOT)))
-def test_documents_have_short_sentences_in_the_fields_words(file):
-    sentences = _sentences(file.read_text())
-    counts = [len(sentence.split()) for sentence in sentences]
-    wrong = [
-        sentence
-        for sentence, count in zip(sentences, counts, strict=True)
-        if count > MAX_WORDS or DENIED.search(sentence)
-    ]
+def test_documents_have_short_sentences_in_the_fields_words():
+    wrong = []
+    for file in DOCUMENTS:
+        sentences = _sentences(file.read_text())
+        counts = [len(sentence.split()) for sentence in sentences]
+        found = [s for s, count in zip(sentences, counts, strict=True) if count > MAX_WORDS or DENIED.search(s)]
+        if counts and sum(counts) / len(counts) > MAX_MEAN_WORDS:
+            found.append(f"{sum(counts) / len(counts):.1f} words a sentence")
+        wrong += [f"{file.relative_to(ROOT)}: {sentence}" for sentence in found]
     assert not wrong, "\n".join(wrong)
-    assert not counts or sum(counts) / len(counts) <= MAX_MEAN_WORDS, (
-        f"{sum(counts) / len(counts):.1f} words a sentence"
-    )
 
 
 def _public() -> list[tuple[str, object]]:
@@ -114,6 +110,5 @@ def _public() -> list[tuple[str, object]]:
     return list(found.values())
 
 
-@pytest.mark.parametrize(("name", "value"), [pytest.param(*item, id=item[0]) for item in _public()])
-def test_public_objects_have_an_example(name, value):
-    assert ">>>" in (inspect.getdoc(value) or ""), f"{name} has no example"
+def test_public_objects_have_an_example():
+    assert [name for name, value in _public() if ">>>" not in (inspect.getdoc(value) or "")] == []

@@ -46,7 +46,7 @@ from swiftwrf.runtime.validation import Configured, NonNegativeInt, PositiveInt,
 FOLDS = 5
 START_WEIGHTS = (0.05, 0.05, 0.3)  # of the likelihoods, by which the calibration searches
 START_WEIGHTS_CHANNEL = (0.1, 1.0)
-MAX_CHANNEL_CELLS = 200_000
+CHANNEL_SPLITS = 6  # times as many cells are split for channels, whose likelihood is narrower than a cell
 MIN_FLOOR = 1e-4  # of missing coherence, by rounding
 MIN_SPECTRA = 15
 BATCH_CANDIDATES = 2048  # whose waves are computed together: as many as a processor's cache holds
@@ -284,9 +284,7 @@ class MatchedField(Configured, Saved):
         extent = self.region.extent
         spacing = self.config.spacing * self.room.array.wavelength
         count = math.prod((extent / spacing).clamp_min(1).tolist())
-        # the channel at a cell takes several times as long as co-array numbers
-        limit = min(self.config.max_cells, MAX_CHANNEL_CELLS) if self.n_snapshots else self.config.max_cells
-        self.cells = self.region.cells(int(min(max(count, 1), limit)))
+        self.cells = self.region.cells(int(min(max(count, 1), self.config.max_cells)))
         self.likelihoods = self._likelihoods(self._fit)
         batches = self.cells.position.split(BATCH_CANDIDATES)
         if self.likelihoods.channel:
@@ -354,6 +352,7 @@ class MatchedField(Configured, Saved):
         """Yield cells (b, m) and log-likelihoods (k, b, m) of some observations at a time."""
         generator = torch.Generator().manual_seed(self.config.seed)
         config = self.config
+        n_split = config.n_split * (CHANNEL_SPLITS if self.n_snapshots else 1)
         for rows in torch.arange(len(observed)).split(16):  # likelihoods at all cells: 26 MB at most
             part = observed.subset(rows)
 
@@ -366,7 +365,7 @@ class MatchedField(Configured, Saved):
             cells = best_cells(self.cells, total.neg_(), config.n_best, config.n_background, generator)
             values = evaluate(cells.position)
             for _ in range(config.n_rounds):
-                cells, values = refined(cells, self._log_mass(cells, values), values, evaluate, config.n_split)
+                cells, values = refined(cells, self._log_mass(cells, values), values, evaluate, n_split)
             yield cells, values
 
     def _log_mass(self, cells: Cells, values: Tensor) -> Tensor:
@@ -460,6 +459,8 @@ class MatchedField(Configured, Saved):
         frequency = header["frequency_hz"]
         locator.n_snapshots, locator.floor = int(header["n_snapshots"]), float(header["floor"])
         locator.frequency_hz = None if frequency is None else torch.tensor(frequency, dtype=torch.float64)
+        if not locator.floor > 0 or (frequency is not None and len(frequency) != locator.n_snapshots):
+            raise InputError("frequencies and missing coherence are not those of a fitted locator")
         locator.grid = room.grid
         locator._fit = _Fit(room, gains, PhaseLikelihood(room, tensors["statistics"]))
         locator.residual, locator.weight = tensors["residual"], tensors["weight"]

@@ -80,8 +80,8 @@ class RssiComparison:
         train: Training rows, without offsets between groups.
         test: Test rows.
         values: What each predictor gave, by name: `predicted` at the detected test pairs (n,) [dBm], their standard
-            deviations `std` (n,) [dB] or None, median absolute error `median_db` [dB], seconds to `fit` and to `predict`,
-            and `detection`, the share of the detected and of the empty test cells that are predicted as such, or None.
+            deviations `std` (n,) [dB] or None, median absolute error `median_db` [dB], seconds to `fit` and to `predict`.
+            `detection` are the shares of detected and of empty test cells that are predicted as such, or None.
         left_out: Reason for each predictor that the data do not suffice for.
         predictors: Fitted predictors by name, without those whose values `keep` had.
 
@@ -207,7 +207,7 @@ def compare(
         also: Predictors that are compared only when named, e.g. "blend".
         preset: "quick", or "paper" for published settings.
         reference: Group whose offset is 0. Defaults to the most frequent one.
-        not_detected: What an empty cell says; see `RssiConfig`.
+        not_detected: Meaning of an empty cell; see `RssiConfig`.
         device: Device to compute on.
         parallel: Function that maps a picklable fit over receivers as `map` does.
         keep: Memo `keep(name, compute)`, which returns the values that it has under a name, or the second item of

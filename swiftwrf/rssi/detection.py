@@ -1,4 +1,4 @@
-"""What an empty cell says: the curve of detection, and received power given that a packet was, or was not, detected.
+"""Empty cells: the curve of detection, and received power given that a packet was, or was not, detected.
 
     p(detected | y) = (1 - missed_r) Phi((y - limit) / width)
 
@@ -24,7 +24,7 @@ from swiftwrf.positions import Neighbours, to_tensor
 from swiftwrf.runtime.checkpoint import Header
 
 NotDetected = Literal["auto", "weak", "unknown"]
-NEIGHBOURS, FEWEST = 6, 3  # rows beside a cell, and values among them, that tell its level
+NEIGHBOURS, FEWEST = 6, 3  # rows beside a cell, and values among them, that determine its level
 MISSED = 1e-3  # share of random misses at least: no value is impossible
 MISSES_WORTH = 30.0  # strong cells of a receiver that count as much as the share of misses of all receivers
 MAX_ROWS, MAX_CELLS = 1500, 1000  # that determine the curve
@@ -38,7 +38,7 @@ class Detection:
         limit: Received power at which half of the packets are detected [dBm].
         width: Standard deviation of the limit over packets [dB].
         missed: Share of packets of any power that each receiver misses, float64 (R,).
-        is_limit: Whether an empty cell is an upper limit for its receiver, bool (R,); else it tells nothing.
+        is_limit: Whether an empty cell is an upper limit for its receiver, bool (R,); else it is ignored.
 
     Example:
         >>> curve = Detection(-90.0, 1.0, torch.tensor([0.001]).double(), torch.tensor([True]))
@@ -101,7 +101,7 @@ class Detection:
         return cls(*found, lost_count / (strong.sum(dim=0) + MISSES_WORTH), is_limit)
 
     def note(self, receiver_names: Sequence[str]) -> str:
-        """Return a sentence on what empty cells of these R receivers say."""
+        """Return a sentence on the meaning of empty cells of these R receivers."""
         weak = [name for name, limit in zip(receiver_names, self.is_limit.tolist(), strict=True) if limit]
         others = [name for name in receiver_names if name not in weak]
         missed = float(self.missed[self.is_limit].mean()) if weak else 0.0
@@ -208,7 +208,7 @@ class DetectionField:
 
 
 def empty_given(z: Tensor, missed: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what an empty cell tells of a power that is z standard deviations below the limit.
+    """Return how an empty cell changes a power that is z standard deviations below the limit.
 
     With p = missed + (1 - missed) Phi(z), the probability of the empty cell, also for z far below 0:
 

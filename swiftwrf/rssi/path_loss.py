@@ -33,7 +33,7 @@ SLOPE_PRIOR = -30.0, 15.0  # of the slope of all receivers: path-loss exponents 
 SPREAD_DB, SPREAD_WORTH = 6.0, 4.0  # prior of the spread over receivers, and the number of receivers that it counts as
 FLOOR_STD_DB = 20.0  # prior standard deviation of the attenuation of a floor about 0
 ROWS_WORTH = 10.0  # rows of a receiver that count as much as the variance of all receivers
-MAX_UNEXPLAINED = 0.4  # share of empty cells where a value was expected, beyond which those of a receiver tell nothing
+MAX_UNEXPLAINED = 0.4  # share of empty cells where a value was expected, beyond which those of a receiver are ignored
 MAX_ROWS = 300  # of a receiver, from which offsets are estimated; the cost grows with their cube
 
 
@@ -200,7 +200,7 @@ def fit_path_losses(
         position: Positions of the transmitter, (n, 3) [m].
         receiver: Positions of the receivers, (R, 3) [m], nan where unknown.
         rssi: Measurements (n, R) [dBm], nan where not detected.
-        not_detected: "weak" if empty cells are limits at all receivers, "unknown" if they tell nothing.
+        not_detected: "weak" if empty cells are limits at all receivers, "unknown" if they are ignored.
         shift: Received power less `rssi`, e.g. by floors that were removed, (n, R) [dB]. Defaults to 0.
         detection: Curve of detection. Defaults to an estimate.
         crossed: Number of floors between both ends, float64 (n, R), whose attenuation is fitted, too. Distances are then
@@ -449,8 +449,8 @@ def estimate_floor_attenuation(train: Rssi, pool: Rssi | None = None) -> FloorAt
         >>> import pandas as pd
         >>> table = pd.DataFrame({"x": [0.0, 5, 9] * 4, "y": 0.0, "floor": [0] * 6 + [1] * 6})
         >>> table["hall"] = [-50.0, -60, -64] * 2 + [-65.0, -75, -79] * 2
-        >>> round(estimate_floor_attenuation(Rssi.from_frame(table)).db, 1)
-        15.0
+        >>> round(estimate_floor_attenuation(Rssi.from_frame(table)).db)
+        15
     """
     pool = pool or train
     assert train.floors is not None

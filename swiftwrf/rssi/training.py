@@ -33,8 +33,8 @@ from swiftwrf.runtime.threads import single_thread
 RELATIVE_NOISE_VARIANCES = (0.3, 1.0, 2.0, 3.0)
 MAX_KERNEL_RECEIVERS = 12  # more do not change the chosen kernel or weights
 DIRECTIVITY_STD_DB = 2.0  # prior of each harmonic of a receiver's antenna and surroundings
-CERTAIN = 0.999  # probability of an empty cell by path loss alone, beyond which the cell tells nothing
-NO_SITE = 1e6  # variance of an empty cell that tells nothing [dB^2]
+CERTAIN = 0.999  # probability of an empty cell by path loss alone, beyond which the cell is left out
+NO_SITE = 1e6  # variance of an empty cell without effect [dB^2]
 DAMPING = 0.7  # of expectation propagation
 WEIGHT_TOLERANCE = 3e-3  # each weight is in (0, 1]
 LEVEL = 0.8  # nominal coverage of the interval that the standard deviation is calibrated for
@@ -76,7 +76,7 @@ class RssiTraining(Bins):
         n_primitives: Number of primitives a receiver.
         rendered: Fields of each receiver's head, (R, 2, 2, directions).
         path_loss: Path loss of the receivers, the prior of the fit.
-        limit: Upper limit in each empty cell that tells something, (n, R) [dBm], nan in all other cells.
+        limit: Upper limit in each empty cell that has a part in the fit, (n, R) [dBm], nan in all other cells.
         field_db: Prior standard deviation of the latent field, (R,) [dB].
         noise_db: Standard deviation of one measurement about it, (R,) [dB].
         baselines: Path-loss models of the simple predictors, (3, R): that of each receiver, that of all receivers, and the
@@ -152,7 +152,7 @@ def prepare(
 
 
 def _limits(rssi: Tensor, loss: PathLosses, distance: Tensor, offset: Tensor) -> Tensor:
-    """Return the upper limit in each empty cell (n, R) [dBm] that tells something beyond the path loss; nan elsewhere."""
+    """Return the upper limit (n, R) [dBm] in each empty cell that the path loss does not explain; nan elsewhere."""
     if loss.detection is None:
         return torch.full_like(rssi, torch.nan)
     limit = loss.detection.limit - offset

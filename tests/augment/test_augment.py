@@ -233,7 +233,7 @@ def test_held_out_spectra_take_no_part_in_the_structure_search(n):
     assert len(searches) == (2 if n >= 18 else len(scored))
 
 
-def test_models_with_a_room_share_its_search(glances, monkeypatch):
+def test_models_with_a_room_share_its_search(floor_alone, monkeypatch):
     searched, search = [], geometry.search_room
     monkeypatch.setattr(geometry, "search_room", lambda *given: searched.append(1) or search(*given))
     choice = choose_model(TRAIN, ("geometry", "hybrid"))

@@ -11,7 +11,7 @@ import torch
 from augment.suggest import suggest
 from augment.turbo.choice import Suggestion
 from augment.turbo.condition import MeasuredSubset
-from swiftwrf import AngularGrid, InputError, fit, simulated_room
+from swiftwrf import AngularGrid, InputError, make_model, simulated_room
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import choose_kernel, most_informative
 from swiftwrf.metrics import psnr
@@ -53,7 +53,7 @@ def test_measuring_at_suggested_positions_beats_random_ones():
 
     def quality(more):
         """Mean PSNR of the model at the positions that stay unmeasured."""
-        model = fit(pool.subset(torch.cat([known, rest[more]])), progress=False)
+        model = make_model("gp").fit(pool.subset(torch.cat([known, rest[more]])))
         left = pool.subset(rest[[i for i in range(len(rest)) if i not in set(more.tolist())]])
         return float(psnr(model.synthesize(left.position), left.spectrum).mean())
 

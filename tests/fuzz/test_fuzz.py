@@ -1,6 +1,6 @@
 """Whatever is done to files and command lines, there is a result that is finite, or one sentence; never a traceback.
 
-80 mutations of files a kind and 12 attempts of any other kind with every test run. `pytest -m fuzz` makes 10,000 and 5,000
+40 mutations of files a kind and 12 attempts of any other kind with every test run. `pytest -m fuzz` makes 10,000 and 5,000
 more, 200 command lines, and some whole runs.
 """
 
@@ -26,7 +26,7 @@ from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMAT
 from swiftwrf.errors import MAX_LENGTH
 from swiftwrf.runtime.checkpoint import Saved
 
-SHORT = 80  # mutations a kind
+SHORT = 40  # mutations a kind
 SHORT_ATTEMPTS = 12
 LONG = -(-10_000 // len(KINDS))
 LONG_ATTEMPTS = -(-5_000 // len(ATTEMPTS))

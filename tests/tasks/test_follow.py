@@ -16,7 +16,7 @@ import torch
 
 from swiftwrf import AngularGrid, InputError, Rssi, RssiModel, load, make_model, rssi_room, simulated_room
 from swiftwrf.data.writing import write_rssi
-from swiftwrf.models.geometry import GeometryModel
+from swiftwrf.models.geometry import GeometryModel, Plane
 from swiftwrf.online import Follower
 from tasks.command import run_command
 from tasks.update import lines as followed_lines
@@ -239,7 +239,7 @@ def room():
 
 @cache
 def geometry():
-    return GeometryModel(small.GLANCE).fit(room().subset(torch.arange(40)))
+    return GeometryModel.of_planes(room().subset(torch.arange(40)), [small.FLOOR, Plane((1.0, 0.0, 0.0), 6.0, -0.5)])
 
 
 def spectrum_lines(first, last):

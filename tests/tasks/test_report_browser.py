@@ -1,4 +1,4 @@
-"""Reports and pages in a real browser: widths from a phone to a desktop, light and dark."""
+"""Reports in a real browser: widths from a phone to a desktop, light and dark."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from importlib.util import find_spec
 
 import pytest
 import quick
-from test_view_browser import PROGRAMS, chromium, serve, until  # noqa: F401, a fixture of the tests
+from test_view_browser import PROGRAMS, THEMES, WIDTHS, chromium, looks
 
 from swiftwrf.data.writing import write_spectra
 from tasks.report.run import merge
@@ -15,7 +15,6 @@ from tasks.report.run import merge
 missing = [name for name in ("selenium",) if find_spec(name) is None]
 missing += [name for name in PROGRAMS if not shutil.which(name)]
 pytestmark = pytest.mark.skipif(bool(missing), reason=f"needs {' and '.join(missing)}")
-WIDTHS, THEMES = (360, 700, 1400), ("light", "dark")
 MIN_CONTRAST = 3.0
 TOLERANCE_PX = 1.5
 BEYOND = """
@@ -61,14 +60,6 @@ def browser():
         yield driver
 
 
-def looks(browser, width, theme):
-    """Emulate a window of this width that prefers this theme."""
-    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-    preference = {"features": [{"name": "prefers-color-scheme", "value": theme}]}
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", preference)
-
-
 def fits(browser, address):
     """Open a report in every width and theme."""
     browser.get(address)
@@ -102,19 +93,5 @@ def test_reports_of_rssi(browser, rssi_run, tmp_path):
 def test_reports_of_files(browser, room, tmp_path):
     (tmp_path / "data").mkdir()
     write_spectra(room, tmp_path / "data")
-    assert quick.run("inspect", tmp_path / "data", "--out", tmp_path / "inspection") == 0
+    assert quick.run("inspect", tmp_path / "data", "--out", tmp_path / "inspection", drawn=True) == 0
     fits(browser, (tmp_path / "inspection" / "report.html").as_uri())
-
-
-@pytest.mark.skipif(find_spec("nicegui") is None, reason="needs nicegui")
-@pytest.mark.parametrize(("run", "name"), [("aoa_run", "plan"), ("rssi_run", "map")])
-def test_pages_to_explore(browser, serve, request, run, name):  # noqa: F811, the fixture
-    address = serve(request.getfixturevalue(run))
-    for theme in THEMES:
-        for width in WIDTHS:
-            looks(browser, width, theme)
-            browser.get(address)
-            until(lambda: browser.find_elements("id", name))
-            assert browser.execute_script("return document.documentElement.scrollWidth") <= width, (width, theme)
-            assert browser.execute_script("return document.querySelector('.q-layout').scrollWidth") <= width
-    browser.get("about:blank")  # before the server ends, whose page would try to connect again

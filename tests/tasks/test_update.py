@@ -33,7 +33,7 @@ def data(n=N + M):
 
 @cache
 def fitted(name):
-    with small.glances():
+    with small.known_planes(small.FLOOR):
         return make_model(name, **OPTIONS.get(name, {})).fit(data().subset(torch.arange(N)))
 
 

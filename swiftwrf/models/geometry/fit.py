@@ -270,8 +270,11 @@ def observe(train: Spectra, config: GeometryConfig | None = None) -> tuple[Phase
     if len(train.position.unique(dim=0)) < MIN_TRAINING:
         raise InputError(f"the positions of {train.name} are fewer than {MIN_TRAINING} different ones")
     if train.channel is not None:
-        described = train.fixed_position, train.moving, train.array, train.rotation
-        phases = carrier_phases(train.channel, train.frequency_hz, train.array)
+        array, phases = train.array, carrier_phases(train.channel, train.frequency_hz, train.array)
+        if train.frequency_hz is not None:
+            frequency = train.frequency_hz[_nearest(train.frequency_hz, array)]
+            array = PlanarArray(array.element, LIGHT_SPEED / float(frequency))
+        described = train.fixed_position, train.moving, array, train.rotation
         return PhaseObservations.of(train.position, *described, phases, retrieved=False), rows
     channel, error = retrieve_phases(correlations(train), train.array, config.seed)
     solved = (error < 0.1).nonzero()[:, 0]  # relative error of the autocorrelation
@@ -294,11 +297,16 @@ def carrier_phases(channel: Tensor, frequency_hz: Tensor | None, array: PlanarAr
         array: Array of the carrier.
     """
     if frequency_hz is not None:
-        return channel[:, int((frequency_hz - LIGHT_SPEED / array.wavelength).abs().argmin())].sgn()
+        return channel[:, _nearest(frequency_hz, array)].sgn()
     if channel.shape[1] == 1:
         return channel[:, 0].sgn()
     signal: Tensor = torch.linalg.eigh(covariance(channel)).eigenvectors[..., -1]
     return signal.to(channel.dtype).sgn()
+
+
+def _nearest(frequency_hz: Tensor, array: PlanarArray) -> int:
+    """Return the number of the snapshot closest to the carrier."""
+    return int((frequency_hz - LIGHT_SPEED / array.wavelength).abs().argmin())
 
 
 def _held_out(rooms: list[PlaneSet], splits: Splits, steps: int = 4) -> list[Tensor]:

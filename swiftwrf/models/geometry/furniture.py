@@ -147,65 +147,58 @@ class Furniture:
 
         A path is straight towards its image. Samples of it beyond a reflection are mirrored back into the room.
         """
-        normal, offset, fixed = (
-            planes.normal[0],
-            planes.offset[0],
-            scene.receiver if scene.end == "transmitter" else scene.transmitter,
-        )
-        order = _orders(tuple(sequence), tuple(map(tuple, normal.tolist())))  # (S, Q, D)
+        fixed = scene.receiver if scene.end == "transmitter" else scene.transmitter
+        order = _orders(tuple(sequence), tuple(map(tuple, planes.normal[0].tolist())))  # (S, Q, D)
         if scene.end == "transmitter":
             order = order.flip(-1)
-        source = [fixed[0].expand(*order.shape[:2], 3)]
+        # coordinates come first, in voxels from the corner of the layer of empty ones around the grid
+        normal, away = planes.normal[0].T, (planes.offset[0] - planes.normal[0] @ self.low) / self.voxel_m
+        away = away + planes.normal[0].sum(dim=1)
+        source = [((fixed[0] - self.low) / self.voxel_m + 1)[:, None, None].expand(-1, *order.shape[:2])]
         for plane in order.unbind(-1):
-            source.append(mirror(source[-1].movedim(-1, 0), normal[plane].movedim(-1, 0), offset[plane]).movedim(0, -1))
-        start = scene.moving[:, None, None]
-        point, along = start.expand(-1, *order.shape[:2], -1), torch.zeros(len(scene), *order.shape[:2]).double()
+            source.append(mirror(source[-1], normal[:, plane], away[plane]))
+        normal, away = normal.float(), away.float()
+        start = ((scene.moving - self.low) / self.voxel_m + 1).float().T[:, :, None, None]
+        point, along = start, torch.zeros(len(scene), *order.shape[:2])
         exists = torch.ones_like(along, dtype=torch.bool)
-        hit, fraction = [], []  # from the moving end on
+        hits = []  # points, fractions of the path and planes, from the moving end on
         for depth in range(order.shape[2], 0, -1):
-            n, ray = normal[order[..., depth - 1]], source[depth] - point
-            share = (offset[order[..., depth - 1]] - (point * n).sum(-1)) / (ray * n).sum(-1)
+            plane = order[..., depth - 1]
+            n, ray = normal[:, None, plane], source[depth].float()[:, None] - point
+            share = (away[plane] - (point * n).sum(0)) / (ray * n).sum(0)
             exists = exists & (share > 0) & (share < 1)
-            point, along = point + share[..., None] * ray, along + share * (1 - along)
-            hit.append(point)
-            fraction.append(along)
-        best = exists.byte().argmax(-1)  # (n, S): of the orders of one image at most one exists
+            point, along = point + share * ray, along + share * (1 - along)
+            hits.append((point, along, plane))
+        best = exists.byte().argmax(-1, keepdim=True)  # (n, S, 1): of the orders of one image at most one exists
 
         def of_best(values: Tensor) -> Tensor:
-            return values.gather(2, best[(...,) + (None,) * (values.dim() - 2)].expand(-1, -1, 1, *values.shape[3:]))[
-                :, :, 0
-            ]
+            whole = values.expand(*values.shape[:-3], *exists.shape)
+            return whole.gather(-1, best.expand(*whole.shape[:-1], 1))[..., 0]
 
-        every = order.expand(len(scene), *order.shape)
-        ray = source[-1][:, 0] - scene.moving[:, None]
-        length = ray.norm(dim=-1).float()
+        ray = source[-1][:, None, :, 0].float() - start[..., 0]
+        length = self.voxel_m * ray.square().sum(0).sqrt()
         samples = max(2, math.ceil(float(length.max()) / self.voxel_m))
         at = (torch.arange(samples) + 0.5) / samples
-        # straight pieces a + t b in padded voxels, with the fraction t of the path from the moving end
-        x = _pieces((scene.moving - self.low)[:, None] / self.voxel_m + 1, ray / self.voxel_m, at)
-        cell = torch.zeros(len(scene), len(sequence), order.shape[2], dtype=torch.int64)
-        for number, (where, when) in enumerate(zip(hit, fraction, strict=True)):
-            plane, point, begin = of_best(every[..., -1 - number]), of_best(where), of_best(when)
-            n = normal[plane]
-            ray = ray - 2 * (ray * n).sum(-1, keepdim=True) * n
-            begun = (point - self.low - begin[..., None] * ray) / self.voxel_m + 1
-            beyond = at > begin.float()[..., None]
-            pieces = _pieces(begun, ray / self.voxel_m, at)
-            x = [torch.where(beyond, after, before) for after, before in zip(pieces, x, strict=True)]
-            cell[..., number] = self._cell(plane, normal, point)
-        (i, j, k), (_, rows, columns) = x, (size + 2 for size in self.absorption.shape)
-        for values, size in zip(x, self.absorption.shape, strict=True):
-            values.floor_().clamp_(0, size + 1)
-        voxel = i.mul_(rows).add_(j).mul_(columns).add_(k).int()  # exact in float32 below 2^24
+        x = _straight(start[..., 0].expand_as(ray), ray, at)
+        cell = torch.zeros(*length.shape, len(hits), dtype=torch.int64)
+        for number, (point, along, plane) in enumerate(hits):
+            hit, begin, plane = of_best(point), of_best(along).nan_to_num(0, 0, 0), of_best(plane[None])
+            n = normal[:, plane]
+            ray = ray - 2 * (ray * n).sum(0) * n
+            x = torch.where(at > begin[..., None], _straight(hit - begin * ray, ray, at), x)
+            cell[..., number] = self._cell(plane, planes.normal[0], hit)
+        largest = torch.tensor(self.absorption.shape)[:, None, None, None] + 1
+        i, j, k = x.floor_().clamp_(torch.zeros(()), largest)
+        voxel = i.mul_(largest[1] + 1).add_(j).mul_(largest[2] + 1).add_(k).int()  # exact in float32 below 2^24
         return _Crossings(torch.tensor(rows_of), voxel, length / samples, cell, of_best(exists))
 
     def _cell(self, plane: Tensor, normal: Tensor, hit: Tensor) -> Tensor:
-        """Return the number of the cell, counted over all planes, of points (n, S, 3) on planes (n, S)."""
+        """Return the number of the cell, counted over all planes, of points (3, n, S) [voxels] on planes (n, S)."""
         shape = torch.tensor(self.absorption.shape)
-        index = ((hit - self.low) / self.voxel_m).floor().long().clamp_min(0).minimum(shape - 1)
-        beside = torch.tensor([[1, 2], [0, 2], [0, 1]])[normal.abs().argmax(-1)][plane]
-        number = index.gather(-1, beside)
-        return plane * self.reflectivity.shape[1] + number[..., 0] * shape[beside[..., 1]] + number[..., 1]
+        index = (hit.nan_to_num(0, 0, 0).floor() - 1).clamp(torch.zeros(()), shape[:, None, None] - 1).long()
+        beside = torch.tensor([[1, 2], [0, 2], [0, 1]])[normal.abs().argmax(-1)].T[:, plane]
+        number = index.gather(0, beside)
+        return plane * self.reflectivity.shape[1] + number[0] * shape[beside[1]] + number[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,11 +233,9 @@ def _padded(absorption: Tensor) -> Tensor:
     return torch.nn.functional.pad(absorption, (1,) * 6).flatten()
 
 
-def _pieces(start: Tensor, ray: Tensor, at: Tensor) -> list[Tensor]:
-    """Return the coordinates start + t ray, each (n, S, M), of points (n, S or 1, 3) at fractions t (M,)."""
-    both = (start.expand_as(ray), ray)
-    first, along = (values.nan_to_num(0, 0, 0).float().movedim(-1, 0)[..., None] for values in both)
-    return [torch.addcmul(a, at, b) for a, b in zip(first, along, strict=True)]
+def _straight(start: Tensor, ray: Tensor, at: Tensor) -> Tensor:
+    """Return the points start + t ray, (3, n, S, M), at fractions t (M,); paths that do not exist have any."""
+    return torch.addcmul(start.nan_to_num(0, 0, 0)[..., None], at, ray.nan_to_num(0, 0, 0)[..., None])
 
 
 def _gains(

@@ -65,6 +65,11 @@ class Maps:
         return title if len(floors) == 1 else f"{title}, floor {floors[self.floor]}"
 
     @property
+    def suffix(self) -> str:
+        """End of the names of files of this floor, if there are several."""
+        return "" if len(self.arrays["floor_names"]) == 1 else f"-{self.floor}"
+
+    @property
     def names(self) -> list[str]:
         """Names of the receivers."""
         return [str(name) for name in self.arrays["receiver_names"]]
@@ -107,7 +112,7 @@ class Maps:
             "marks the receiver."
         )
         return Plot(
-            f"summary-{self.floor}", panels, caption, self._cells({k: v[None] for k, v in self.best.items()}, [title])
+            f"summary{self.suffix}", panels, caption, self._cells({k: v[None] for k, v in self.best.items()}, [title])
         )
 
     def by_receiver(self) -> list[Plot]:
@@ -127,7 +132,7 @@ class Maps:
                 "lost than received. Hollow dots: nothing was received. A cross marks the receiver."
             )
             name = "map" if kind == "predicted" else "width"
-            plots.append(Plot(f"{name}-{self.run.file_name}-{self.floor}", panels, caption, data))
+            plots.append(Plot(f"{name}-{self.run.file_name}{self.suffix}", panels, caption, data))
         return plots
 
     def _panel(

@@ -6,10 +6,8 @@ Each is made from a floor with random positions, so that the expected measuremen
 from __future__ import annotations
 
 import json
-import os
 import re
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -477,30 +475,3 @@ def test_measured_tables_are_read_without_options(measured_data, name):
     fillers = [note for note in data.notes if "not detected" in note]
     assert all(note.startswith("-100 ") for note in fillers)
     assert data.located
-
-
-CASES = os.environ.get("SWIFTWRF_CASES")
-
-
-@pytest.mark.skipif(CASES is None, reason="set SWIFTWRF_CASES to the folder of inputs that went wrong")
-@pytest.mark.parametrize(
-    ("case", "rows", "n_detected", "note"),
-    [
-        ("01-rssi-127/input", 240, 1151, "127 counts as not detected: 49 "),
-        ("02-rssi-0-unknown/input", 240, 1057, "0 counts as not detected"),
-        ("03-filler-below-minus-100/input", 240, 532, "-105 counts as not detected"),
-        ("04-wigle-log/input", 240, 1200, "lines before the header"),
-        ("05-degrees-called-x-y/input", 240, 1200, "projected to local metres"),
-        ("06-rows-without-fix/input/empty", 228, 1140, "without a position"),
-        ("06-rows-without-fix/input/zero", 228, 1140, "at 0, 0"),
-        ("08-minus-inf/input", 240, 1125, "-inf counts as not detected"),
-        ("11-some-receivers-known/input", 240, 1200, "ap-south, ap-hall, ap-west"),
-        ("12-raw-nerf2-ble-layout/input", 240, 1200, ""),
-        ("13-receiver-moves-layout/input", 240, 1200, "the receiver moves"),
-        ("14-receiver-called-gateway/input", 240, 480, ""),
-    ],
-)
-def test_inputs_that_went_wrong(case, rows, n_detected, note):
-    data = load_rssi(Path(CASES) / case)
-    assert (len(data), int(data.detected.sum())) == (rows, n_detected)
-    assert not note or noted(data, note)

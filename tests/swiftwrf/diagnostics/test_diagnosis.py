@@ -6,19 +6,16 @@ Scenes are random: size of the room, shape, place and orientation of the array, 
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from swiftwrf import AngularGrid, load_spectra
+from swiftwrf import AngularGrid
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
-from swiftwrf.data import ReadOptions, Snapshots
-from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
+from swiftwrf.data import Snapshots
 from swiftwrf.diagnostics.inspection import inspect
 
 GRID = AngularGrid.hemisphere(18, 72)
@@ -256,39 +253,3 @@ def test_no_cause_is_stated_of_other_errors(name):
 def test_no_cause_is_stated_of_other_errors_in_further_scenes(name):
     for seed in range(34, 50):
         check_unknown(name, seed)
-
-
-CASES = os.environ.get("SWIFTWRF_CASES")
-
-
-@pytest.mark.skipif(CASES is None, reason="set SWIFTWRF_CASES to the folder of inputs that went wrong")
-@pytest.mark.parametrize(
-    ("case", "expected"),
-    [
-        ("07-image-axes", "y of the positions counts from the other side (y = 14.0 - y)"),
-        ("16-null-subcarriers", "(4 of 32, counted from 0): 0 to 1, 16, 31"),
-        ("17-coefficients-without-delay", "hardly depend on the position"),
-        ("18-square-axes-swapped", "csi.transpose(0, 2, 1)"),
-        ("19-linear-array", "angle to the array's axis) and follow it"),
-        ("20-behind-the-array", "50% of the positions lie behind the array"),
-        ("21-elements-column-by-column", "the elements are given column by column"),
-        ("22-normalised-positions", "look normalised"),
-        ("23-backscatter-phase", "there and back"),
-        ("24-sign-flips", "elements 9 to 16 jumps by half a turn"),
-        ("25-matlab-complex", "in one frame"),
-        ("26-deepmimo-aodt", "90 - aoa_el is taken"),
-        ("27-calibration-beyond-45-degrees", "the array's x and y are swapped"),
-    ],
-)
-def test_inputs_that_went_wrong(case, expected):
-    options = ReadOptions(beamformer="bartlett" if case.startswith("16") else None)
-    data = read(Path(CASES) / case / "input", options, SNAPSHOT_FORMATS, SPECTRA_FORMATS, RSSI_FORMATS)
-    findings = inspect(data, grid=GRID, beamformer=options.beamformer or "phase")
-    text = " ".join(finding.text for finding in findings.sentences)
-    assert expected in text
-    assert "--calibrate" not in text
-
-
-@pytest.mark.skipif(CASES is None, reason="set SWIFTWRF_CASES to the folder of inputs that went wrong")
-def test_grid_as_a_pair_in_an_input_that_went_wrong():
-    assert load_spectra(Path(CASES) / "28-grid-as-a-pair/input", grid=(30, 120)).grid.shape == (30, 120)

@@ -40,7 +40,7 @@ def fitted(room, device):
     """Fitted models by name, each fitted once, in their smallest size."""
     with ExitStack() as patches:
         patches.enter_context(small.small_published())
-        patches.enter_context(small.glances())
+        patches.enter_context(small.known_planes(small.FLOOR))
         yield cache(lambda name: make_model(name, **OPTIONS.get(name, {})).fit(room, device=device))
 
 

@@ -229,3 +229,12 @@ def test_coherence_is_one_for_any_phase_of_each_snapshot():
     turned = channel * torch.polar(torch.ones(5, 3, 1), torch.rand(5, 3, 1)) * 7
     assert torch.allclose(coherence(channel, turned), torch.ones(5))
     assert isinstance(GeometryModel.of_planes(simulated_room(n=10), []).tensors(), PlaneSet)
+
+
+def test_walls_follow_from_a_subcarrier_beside_the_carrier():
+    data, walls = measured(0.0, n=40)
+    moved = replace(walls.estimate, planes=[replace(p, offset_m=p.offset_m + 0.005) for p in walls.planes])
+    walls.estimate = moved
+    found = walls.refined_on(observe(data)[0])
+    for plane, truth in zip(found.planes, WALLS, strict=True):
+        assert plane.offset_m == pytest.approx(truth.offset_m, abs=1e-3)

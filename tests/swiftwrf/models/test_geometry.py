@@ -52,6 +52,11 @@ def fit(data, **changes):
     return GeometryModel(replace(QUICK, **changes)).fit(data)
 
 
+def known(data, order=2):
+    """Return the room of six planes, without a search."""
+    return GeometryModel.of_planes(data, [Plane(n, o, gain=-0.6) for n, o in SIX.items()], order)
+
+
 def errors(model, planes):
     """Distance of each true plane from the found one with that normal [mm], and that one's deviation [mm]."""
     found = []
@@ -400,7 +405,8 @@ def test_json_and_images_describe_the_room(room):
 def test_hybrid_is_not_worse_than_geometry():
     data = simulated_room(n=60, grid=GRID)
     train, test = data.split("random")
-    room = fit(train, max_extra_planes=0, beam_width=1)
+    walls = [Plane(tuple(n), o, gain=-0.6) for n, o in zip(SIDES.tolist(), (0.0, 6.0, 0.0, 5.0, 0.0, 3.0), strict=True)]
+    room = GeometryModel.of_planes(train, walls).refined_on(observe(train)[0])
     hybrid = HybridModel().fit(train, like=room)
     gained = psnr(hybrid.synthesize(test.position), test.spectrum) - psnr(room.synthesize(test.position), test.spectrum)
     assert float(gained.mean()) > -0.5
@@ -440,17 +446,17 @@ def test_path_gains_are_fitted_with_one_thread(monkeypatch):
 @pytest.mark.parametrize("prior", PRIORS.values(), ids=list(PRIORS))
 def test_the_gradient_of_path_gains_is_that_of_their_definition(prior):
     data = mirror_room(SIX, n=30)
-    room = GeometryModel.of_planes(data, [Plane(n, o, gain=-0.6) for n, o in SIX.items()], order=1)
+    room = known(data, order=1)
     scene = observe(data)[0]
     kernel = kernel_of(scene.moving)
     wave, gain = paths(room, scene)
     root = torch.linalg.cholesky(kernel.covariance(scene.moving.double())).float()
     generator = torch.Generator().manual_seed(1)
-    sample, normal = (torch.randn(30, 8, len(gain), 2, generator=generator) for _ in range(2))
+    sample, normal = (torch.randn(30, 8, gain.shape[1], 2, generator=generator) for _ in range(2))
     normal.requires_grad_()
 
     change = torch.tensor(prior.std) * torch.einsum("mn,nfsc->mfsc", root, normal)
-    field = (gain + torch.view_as_complex(change)) @ wave
+    field = (gain[:, None] + torch.view_as_complex(change)) @ wave
     match = torch.einsum("nfk,nak->nfa", field.sgn(), scene.channel.conj())
     missing = 1 - match.abs().square().amax(-1) / field.shape[-1] ** 2
     loss = missing.sum() / prior.missing_scale + (normal - sample).square().sum() / 2
@@ -492,31 +498,31 @@ def test_path_gains_are_held_out_from_spectra_without_observed_phases_too():
     kernel = Kernel(0.5, matern12_weight=1.0, noise=1e-3)
     few = GeometryConfig(max_spectra=40)
     hybrid, like = HybridModel(few), HybridModel()
-    hybrid._room, hybrid.grid = fit(data, max_extra_planes=0, beam_width=1, max_spectra=40), data.grid
+    hybrid._room, hybrid.grid = known(data), data.grid
     like._room = hybrid._room
     like.path_gains = PathGains(GaussianProcess(kernel, data.position, torch.zeros(80, 2)), 1)
-    known = hybrid._fit_path_gains(data, fold, like)
+    held_out = hybrid._fit_path_gains(data, fold, like)
     scene, rows = observe(data, few)
     assert len(rows) <= 40
     for number in range(3):
         fitted = fit_path_gains(hybrid.room, scene.subset((fold[rows] != number).nonzero()[:, 0]), kernel)
         expected = ARRAY.spectrum(fitted.channel(hybrid.room, data.position[fold == number]), GRID)
-        torch.testing.assert_close(known[fold == number], expected)
+        torch.testing.assert_close(held_out[fold == number], expected)
 
 
-@pytest.mark.parametrize(("known", "chosen"), [(1, 3), (2, 2)])
-def test_image_sources_of_a_higher_order_are_added_where_held_out_spectra_need_them(known, chosen):
+@pytest.mark.parametrize(("order", "chosen"), [(1, 3), (2, 2)])
+def test_image_sources_of_a_higher_order_are_added_where_held_out_spectra_need_them(order, chosen):
     """The spectra contain images up to the second order."""
     data = mirror_room(SIX, n=100)
-    found = GeometryModel.of_planes(data, [Plane(n, o, gain=-0.6) for n, o in SIX.items()], order=known)
+    found = known(data, order)
     room, prior, _ = choose_prior(found, observe(data)[0], torch.arange(100) % 5)
     assert (room.order, prior) == (chosen, "tight")
-    assert found.order == known
+    assert found.order == order
 
 
 def test_fits_that_the_choice_of_a_prior_hands_on_are_those_of_the_folds():
     data, fold = mirror_room(SIX, n=60), torch.arange(60) % 3
-    found = GeometryModel.of_planes(data, [Plane(n, o, gain=-0.6) for n, o in SIX.items()], order=1)
+    found = known(data, order=1)
     scene, _ = observe(data)
     room, prior, fits = choose_prior(found, scene, fold)
     assert fits
@@ -548,7 +554,7 @@ def test_priors_of_path_gains_are_checked(hybrid):
 
 def test_path_gains_stay_constant_where_nothing_is_hidden():
     data = mirror_room(SIX, n=120)
-    assert HybridModel().fit(data, like=fit(data, max_extra_planes=0, beam_width=1)).path_gains is None
+    assert HybridModel().fit(data, like=known(data)).path_gains is None
 
 
 @pytest.fixture(scope="module")

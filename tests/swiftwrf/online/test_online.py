@@ -212,43 +212,10 @@ def follow(model_file, source, out, **options):
     )
 
 
-def test_lines_are_answered_and_a_bad_one_is_left_out(tmp_path, model_file):
-    process = follow(model_file, "-", tmp_path / "out", stdin=subprocess.PIPE)
-    out, err = process.communicate("".join([rssi_lines()[60], "nonsense\n", rssi_lines()[61]]), timeout=300)
-    answers = [json.loads(line) for line in out.splitlines()]
-    assert [answer["measurement"] for answer in answers] == [1, 2]
-    assert answers[0].keys() >= {"predicted", "observed", "low", "high", "alarm"}
-    assert "line 2" in err
-    assert len(load(tmp_path / "out" / "model.safetensors").anchor) == 62
-
-
 def csv_rows(rows):
     header = ",".join(["x", "y", "z", *floor().receiver_names])
     cells = [[*floor().transmitter_position[i].tolist(), *floor().rssi_dbm[i].tolist()] for i in rows]
     return [header + "\n", *(",".join("" if x != x else f"{x:g}" for x in row) + "\n" for row in cells)]
-
-
-def test_rows_of_a_table_wait_until_they_are_complete(tmp_path, model_file):
-    rows, source = csv_rows([60, 61, 62]), tmp_path / "rows.csv"
-    source.write_text(rows[0] + rows[1] + "\n" + rows[2][:20])
-    process = follow(model_file, source, tmp_path / "out")
-    try:
-        first = json.loads(process.stdout.readline())
-        assert first["measurement"] == 1
-        observed = dict(zip(floor().receiver_names, floor().rssi_dbm[60].tolist(), strict=True))
-        assert all(x is None or x == pytest.approx(observed[name], abs=0.01) for name, x in first["observed"].items())
-        time.sleep(1)
-        with source.open("a") as file:
-            file.write(rows[2][20:] + "no,number\n" + rows[3])
-        answers = [json.loads(process.stdout.readline()) for _ in range(2)]
-    finally:
-        process.kill()
-        process.communicate(timeout=60)
-    assert [answer["measurement"] for answer in answers] == [2, 3]
-    assert answers[0]["position"] == pytest.approx(floor().transmitter_position[61].tolist(), abs=1e-4)
-    record = Record.read(tmp_path / "out")
-    assert [row["index"] for row in record.rows][:2] == [0, 1]
-    assert record.rows[1]["running_error"] == pytest.approx((record.rows[0]["error"] + record.rows[1]["error"]) / 2)
 
 
 def test_a_record_is_cut_to_what_the_model_has_learnt(tmp_path):

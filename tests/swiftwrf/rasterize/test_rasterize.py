@@ -63,14 +63,6 @@ def test_torch_keeps_its_threads():
         torch.set_num_threads(before)
 
 
-def test_the_first_rendering_keeps_the_number_of_threads():
-    """Numba starts its threads once a process, and they are as many as the processor has."""
-    code = "import torch; from swiftwrf.rasterize import prepare; prepare('cpu'); print(torch.get_num_threads())"
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True, check=True)
-    assert done.stdout == "1\n"
-
-
 def test_one_primitive_is_the_gaussian_of_the_formula():
     mean = torch.tensor([[[math.radians(90), math.radians(45)]]])
     cholesky = torch.tensor([[0.3, 0.1, 0.2]])
@@ -187,41 +179,37 @@ def test_magnitude_has_no_gradient_at_zero():
     assert torch.equal(field.grad, torch.zeros_like(field))
 
 
-def test_prepared_backends_compile_nothing_more():
-    """So that measured times do not include a compilation."""
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU's rasterizer speaks to torch's compiler")
+def test_preparing_compiles_once_and_leaves_threads_and_torchs_compiler_alone():
+    """Numba starts its threads once a process, as many as the processor has. Importing the compiler of torch takes a third
+    of the start of a command. Measured times do not include a compilation.
+    """
     code = """
-import torch
+import sys, torch
 from swiftwrf.rasterize import cpu, prepare, rasterize
 from scenes import GRID, random_scene
 
 prepare("cpu")
-print(len(cpu.render.signatures))
+print(torch.get_num_threads(), "torch._dynamo" in sys.modules, len(cpu.render.signatures))
 with torch.no_grad():
     for per_position in (True, False):
         mean, cholesky, weight = random_scene(per_position=per_position)
         rasterize(mean[:1].expand_as(mean), cholesky, weight, GRID, cutoff=None)
 print(len(cpu.render.signatures))
 """
-    done = subprocess.run([sys.executable, "-c", code], env=WITH_TESTS, stdout=subprocess.PIPE, text=True, check=True)
-    assert done.stdout.split() == ["1", "1"]
+    environment = WITH_TESTS | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True, check=True)
+    assert done.stdout.split() == ["1", "False", "1", "1"]
 
 
 def test_default_fits_and_predictions_of_spectra_need_no_numba():
     code = """
 import sys
-from swiftwrf import SwiftWRF, simulated_room
+from swiftwrf import AngularGrid, SwiftWRF, simulated_room
 
-room = simulated_room(n=30)
-SwiftWRF().fit(room).predict(room.position)
+room = simulated_room(n=20, grid=AngularGrid.hemisphere(8, 32))
+SwiftWRF(n_primitives=8).fit(room).predict(room.position)
 print("numba" in sys.modules)
 """
     done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True)
     assert done.stdout.split() == ["False"]
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU's rasterizer speaks to torch's compiler")
-def test_importing_and_rendering_leave_torchs_compiler_alone():
-    """Importing it takes a third of the start of a command, and half the time of a small fit."""
-    code = "import sys\nfrom swiftwrf.rasterize import prepare\nprepare('cpu')\nprint('torch._dynamo' in sys.modules)"
-    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert child.stdout.strip() == "False"

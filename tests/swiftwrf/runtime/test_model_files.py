@@ -166,7 +166,7 @@ def test_an_interrupted_fit_has_its_whole_history(room, tmp_path):
 
 
 @pytest.mark.parametrize("name", list(FIELD_MODELS))
-def test_far_positions_give_finite_spectra(room, small_published, glances, name):
+def test_far_positions_give_finite_spectra(room, small_published, floor_alone, name):
     model = make_model(name).fit(room)
     for far in (1e7, 1e9):
         assert model.synthesize(torch.full((1, 3), far, dtype=torch.float64)).isfinite().all()

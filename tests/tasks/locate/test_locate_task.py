@@ -60,7 +60,7 @@ def write_rssi(file, data, located=True):
 def finished(tmp_path_factory):
     """The directory of a run on the built-in floor."""
     folder = tmp_path_factory.mktemp("locate") / "run"
-    assert run("--cells", 300, "--out", folder) == 0
+    assert quick.run("locate", "--cells", 300, "--out", folder, drawn=True) == 0
     return folder
 
 
@@ -199,7 +199,7 @@ def test_rows_that_no_receiver_detected_are_left_out(tmp_path, capsys):
 
 def test_an_interrupted_run_goes_on_to_the_same_numbers(finished, tmp_path):
     out = tmp_path / "run"
-    with mock.patch.object(RegressedCoordinates, "_fitted", side_effect=KeyboardInterrupt):
+    with mock.patch.object(RegressedCoordinates, "fit", side_effect=KeyboardInterrupt):
         assert run("--cells", 300, "--out", out) == 130
     partial = tmp_path / "run.partial"
     kept = {file.stem for file in (partial / "steps").iterdir()}

@@ -35,6 +35,7 @@ missing = [name for name in LIBRARIES if find_spec(name) is None] + [
 ]
 pytestmark = pytest.mark.skipif(bool(missing), reason=f"needs {' and '.join(missing)}")
 ROOT = Path(__file__).parents[3]
+WIDTHS, THEMES = (360, 700, 1400), ("light", "dark")
 PATIENCE = 60  # [s], for machines that are busy
 MOVES = 60  # of a drag, one in 16 ms as a pointer's are
 COUNT = """
@@ -126,12 +127,22 @@ def press(browser, label):
     browser.find_element("xpath", f"//button[.//*[text()='{label}']]").click()
 
 
+def looks(browser, width, theme):
+    """Emulate a window of this width that prefers this theme."""
+    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    preference = {"features": [{"name": "prefers-color-scheme", "value": theme}]}
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", preference)
+
+
 def assert_fits(browser, name):
     """Nothing is wider than the window, and this element is to be seen, on a telephone, a tablet and a screen."""
-    for width in (360, 700, 1400):
-        browser.set_window_size(width, 900)
-        assert browser.execute_script("return document.querySelector('.q-layout').scrollWidth <= window.innerWidth")
-        assert find(browser, f"#{name} svg").rect["width"] > 0.7 * min(width, 620)
+    for theme in THEMES:
+        for width in WIDTHS:
+            looks(browser, width, theme)
+            for part in ("documentElement", "querySelector('.q-layout')"):
+                assert browser.execute_script(f"return document.{part}.scrollWidth") <= width, (width, theme)
+            assert find(browser, f"#{name} svg").rect["width"] > 0.7 * min(width, 620)
 
 
 def pointer(browser):

@@ -1,0 +1,151 @@
+"""Empty cells as upper limits: against a truth that is known below the limit of detection."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from swiftwrf import Rssi, RssiModel, load, rssi_room
+from swiftwrf.rssi import compare
+from swiftwrf.rssi.detection import Detection
+from swiftwrf.rssi.path_loss import estimate_floor_attenuation, fit_path_losses, log_distance
+
+LIMIT = -88.0
+RECEIVER = torch.tensor([[3.0, 3, 2], [27, 4, 2], [15, 18, 2], [5, 15, 2]], dtype=torch.float64)
+
+
+def survey(n=150, limit=LIMIT, missed=0.0, seed=0):
+    """Path loss, a smooth field and noise at four receivers, and what is below the limit missing; with the true power."""
+    generator = torch.Generator().manual_seed(seed)
+    position = torch.rand(n, 3, generator=generator).double() * torch.tensor([30.0, 20.0, 0.0]) + torch.tensor(
+        [0.0, 0, 1]
+    )
+    truth = -42.0 - 38.0 * log_distance(position, RECEIVER) + 3 * torch.sin(position[:, :1] / 4 + torch.arange(4))
+    rssi = truth + 2.0 * torch.randn(n, 4, generator=generator)
+    lost = (rssi < limit) | (torch.rand(n, 4, generator=generator) < missed)
+    data = Rssi(
+        rssi.where(~lost, torch.nan), position, receiver_position=RECEIVER, receiver_names=list("abcd"), name="s"
+    )
+    return data, truth
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    data, truth = survey()
+    return data, truth, RssiModel().fit(data)
+
+
+def test_the_map_is_weak_where_nothing_was_received(fitted):
+    data, truth, model = fitted
+    mean, weak = model.predict(data.transmitter_position).mean, truth < LIMIT - 3
+    ignoring = RssiModel(not_detected="unknown").fit(data).predict(data.transmitter_position).mean
+    assert int(weak.sum()) > 50
+    assert float((mean - truth)[weak].mean()) < 3.5
+    assert float((mean > LIMIT)[weak].double().mean()) < 0.05
+    assert float((ignoring - truth)[weak].mean()) > 1.5 * float((mean - truth)[weak].mean())
+
+
+def test_other_cells_are_as_good_as_without_empty_ones(fitted):
+    data, truth, model = fitted
+    ignoring = RssiModel(not_detected="unknown").fit(data)
+    strong, at = truth > LIMIT + 3, data.transmitter_position
+    error, before = ((m.predict(at).mean - truth)[strong].abs().mean() for m in (model, ignoring))
+    assert float(error) < float(before) + 0.05
+
+
+def test_a_detected_value_is_predicted_above_the_power_of_all_packets(fitted):
+    data, _, model = fitted
+    every, detected = model.predict(data.transmitter_position), model.predict_detected(data)
+    weak = every.mean < LIMIT
+    assert bool((detected.mean >= every.mean - 1e-4).all())
+    assert bool((detected.mean > every.mean + 1)[weak].all())
+    assert bool((detected.std <= every.std + 1e-4).all())
+
+
+def test_the_limit_and_random_misses_are_told_apart():
+    data, _ = survey(n=400, missed=0.2)
+    found = Detection.estimate(data.transmitter_position, data.rssi_dbm)
+    assert found.limit == pytest.approx(LIMIT, abs=2)
+    assert float(found.missed.mean()) == pytest.approx(0.2, abs=0.07)
+    assert Detection.estimate(data.transmitter_position, data.rssi_dbm.nan_to_num(-90.0)) is None
+
+
+def test_a_receiver_that_is_empty_beside_its_place_keeps_its_path_loss():
+    """It was off, so its empty cells are no limits; those of the others are."""
+    data, _ = survey()
+    rssi = data.rssi_dbm.clone()
+    near = log_distance(data.transmitter_position, RECEIVER)[:, 0] < 1.1
+    rssi[near, 0] = torch.nan
+    rssi[(~near).nonzero()[::2, 0], 0] = torch.nan
+    found = fit_path_losses(data.transmitter_position, RECEIVER, rssi)
+    assert found.detection.is_limit.tolist() == [False, True, True, True]
+    assert "at 1 of 4 receivers (a) empty cells say nothing" in found.detection.note(list("abcd"))
+    assert float(found.own.slope[0]) < -25
+    asked = [fit_path_losses(data.transmitter_position, RECEIVER, rssi, kind) for kind in ("weak", "unknown")]
+    assert asked[0].detection.is_limit.all()
+    assert asked[1].detection is None
+
+
+def test_a_receiver_seen_at_one_distance_has_the_slope_of_all():
+    """Least squares of its own rows gives +100 dBm beside it."""
+    data, _ = survey(limit=-200.0)
+    rssi, apart = data.rssi_dbm.clone(), 10 ** log_distance(data.transmitter_position, RECEIVER)[:, 0]
+    rssi[(apart < 12) | (apart > 13), 0] = torch.nan
+    assert 3 < int((~rssi[:, 0].isnan()).sum()) < 20
+    model = RssiModel(not_detected="unknown").fit(replace(data, rssi_dbm=rssi))
+    line = RECEIVER[0] + torch.tensor([[1.0, 0, -1], [4, 0, -1], [12.5, 0, -1]]).double()
+    found, truth = model.predict(line), -42 - 38 * log_distance(line, RECEIVER)[:, 0]
+    assert float((found.mean[:, 0] - truth).abs().max()) < 6
+    assert float(found.std[0, 0]) > float(found.std[2, 0]) + 0.5  # the trend is uncertain far from the rows
+
+
+def test_detections_are_predicted_and_scored(fitted):
+    data, _, model = fitted
+    found = compare(data, split="random")
+    score = found.summary()["detection"]
+    assert float(score["swiftwrf"]) > 0.85
+    assert float(score["swiftwrf"]) > float(score["mean"])
+    probability = model.predict_detection(data.transmitter_position)
+    assert float(probability[data.detected].mean()) > 0.9 > 0.2 > float(probability[~data.detected].mean())
+    full = replace(data, rssi_dbm=data.rssi_dbm.nan_to_num(-90.0))
+    assert bool((RssiModel().fit(full).predict_detection(data.transmitter_position) == 1).all())
+    assert "detection" not in compare(full, split="random").summary()
+
+
+def test_a_saved_and_updated_model_keeps_its_detections(fitted, tmp_path):
+    data, _, model = fitted
+    model.save(tmp_path / "model")
+    loaded = load(tmp_path / "model")
+    more = survey(n=20, seed=1)[0]
+    for one in (model, model.update(more)):
+        again = loaded if one is model else loaded.update(more)
+        at = data.transmitter_position
+        torch.testing.assert_close(again.predict_detection(at), one.predict_detection(at))
+        torch.testing.assert_close(again.predict_detected(data).mean, one.predict_detected(data).mean)
+
+
+@pytest.mark.parametrize("located", [True, False])
+def test_the_attenuation_of_floors_counts_what_they_hide(located):
+    """14 dB a floor; two floors away hardly anything is received."""
+    generator = torch.Generator().manual_seed(0)
+    floor = torch.arange(240) % 3
+    position = torch.rand(240, 3, generator=generator).double() * torch.tensor([30.0, 20.0, 0.0])
+    position[:, 2] = 4.0 * floor
+    receiver = RECEIVER + torch.tensor([0.0, 4.0, 8.0, 4.0])[:, None] * torch.tensor([0.0, 0, 1])
+    crossed = (floor[:, None] - torch.tensor([0, 1, 2, 1])).abs()
+    flat = torch.tensor([1.0, 1.0, 0.0])
+    rssi = -40.0 - 30.0 * log_distance(position * flat, receiver * flat) - 14.0 * crossed
+    rssi = rssi + 3.0 * torch.randn(240, 4, generator=generator)
+    table = Rssi(rssi, position, receiver_position=receiver, receiver_names=list("abcd"), name="s").to_frame()
+    table = table.rename(columns={"x_m": "x", "y_m": "y", "z_m": "z"}).assign(floor=floor.numpy())
+    places = dict(zip("abcd", receiver.tolist(), strict=True)) if located else None
+    table[list("abcd")] = table[list("abcd")].where(table[list("abcd")] > LIMIT)
+    data = Rssi.from_frame(table.reset_index(drop=True), receiver_position=places)
+    assert estimate_floor_attenuation(data).db == pytest.approx(14, abs=3)
+
+
+def test_the_built_in_floor_misses_packets_at_random():
+    model = RssiModel().fit(rssi_room(n=200))
+    assert "of all packets are missed at any power" in model.detection.note(model.receiver_names)
