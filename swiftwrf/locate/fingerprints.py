@@ -12,6 +12,7 @@ from torch import Tensor
 
 from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.rssi import Rssi
+from swiftwrf.data.splits import places
 
 NEIGHBOUR_COUNTS = (1, 2, 3, 4, 5, 7, 9, 12, 16, 20)
 METRICS = ("sorensen", "manhattan", "euclidean")  # the first one unless another has a significantly lower error
@@ -89,8 +90,9 @@ class Fingerprints:
 
     @cached_property
     def _places(self) -> tuple[Tensor, Tensor]:
-        place, row = self.position.unique(dim=0, return_inverse=True)
-        return place, row
+        """Positions of the places (P, 3) [m] in the order of the rows, which decides ties, and the place of each row."""
+        row = places(self.position, 1)
+        return self.position[torch.zeros(int(row.max()) + 1).long().scatter_(0, row, torch.arange(len(row)))], row
 
     @cached_property
     def _known(self) -> tuple[Tensor, Tensor]:
@@ -118,7 +120,8 @@ class Fingerprints:
                 apart = both - 2 * torch.minimum(known[detected], row[detected, None]).sum(dim=0)
                 apart = apart / both.clamp_min(1e-9) if self.metric == "sorensen" else apart
             least = torch.full((len(place),), torch.inf).scatter_reduce(0, number, apart, "amin")
-            found.append(least.topk(k, largest=False))
+            nearest, order = least.sort(stable=True)
+            found.append((nearest[:k], order[:k]))
         distances, numbers = zip(*found, strict=True) if found else ((rssi.new_zeros(0, k),), (number[:0, None],))
         return torch.stack(distances), torch.stack(numbers)
 
