@@ -48,10 +48,11 @@ def main(config: Config) -> None:
 
 
 def read(name: str) -> Rssi:
-    """Return a data set: the built-in floor, a public one or that of a folder."""
+    """Return a data set: the built-in floor, that of a folder or a public one."""
     if name == BUILT_IN:
         return rssi_room()
-    return load_rssi(fetch(name) if name in DATA_SETS else Path(name))
+    is_public = name in DATA_SETS and not Path(name).is_dir()
+    return load_rssi(fetch(name) if is_public else Path(name))
 
 
 def measure(data: Rssi, split: str, config: Config) -> dict[str, Any]:

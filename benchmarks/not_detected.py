@@ -1,7 +1,7 @@
 """Measure maps of RSSI below the limit of detection, where the truth of simulated surveys is known.
 
-A survey has 300 positions on 30 x 20 m and eight receivers. The power is a path loss, a Gaussian process as shadowing and the
-noise of a packet. Packets below -88 dBm are lost.
+A survey has 300 positions on 30 x 20 m and eight receivers. The power is a path loss, a Gaussian process as shadowing and
+the noise of a packet. Packets below -88 dBm are lost.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from statistics import mean
 from typing import Any
 
 from record import load, markdown
@@ -55,6 +56,29 @@ def rssi_heads() -> str:
         change = " / ".join(f"{head[key] - identity[key]:+.3f}" for key in ("median", "mean"))
         rows.append([key, *cells, change])
     return markdown(["data, split", "with the head", "with the identity", "change by the head"], rows)
+
+
+def not_detected() -> str:
+    """Return the errors of maps below the limit of detection, with empty cells as limits and without."""
+    rows = []
+    for kind, what in (("auto", "upper limits where they are those of weak signals"), ("unknown", "ignored")):
+        found = [row for row in load("not_detected")["rows"] if row["not_detected"] == kind]
+        bias, above, error = (
+            [row[key] for row in found] for key in ("weak_bias_db", "weak_above_limit", "strong_error_db")
+        )
+        cells = [
+            f"{mean(bias):+.1f} ({min(bias):+.1f} to {max(bias):+.1f})",
+            f"{mean(above):.0%}",
+            f"{mean(error):.2f}",
+        ]
+        rows.append([what, *cells])
+    columns = [
+        "empty cells",
+        "bias of weak cells [dB], mean (range)",
+        "weak cells above the limit",
+        "error elsewhere [dB]",
+    ]
+    return markdown(columns, rows)
 
 
 def _outcome(difference_db: float) -> str:
