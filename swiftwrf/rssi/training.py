@@ -33,7 +33,7 @@ from swiftwrf.runtime.threads import single_thread
 RELATIVE_NOISE_VARIANCES = (0.3, 1.0, 2.0, 3.0)
 MAX_KERNEL_RECEIVERS = 12  # more do not change the chosen kernel or weights
 DIRECTIVITY_STD_DB = 2.0  # prior of each harmonic of a receiver's antenna and surroundings
-CERTAIN = 0.999  # probability of an empty cell by path loss alone, beyond which the cell is left out
+CERTAIN = 0.99  # probability that the path loss alone explains an empty cell, or a random miss does: it is left out
 NO_SITE = 1e6  # variance of an empty cell without effect [dB^2]
 DAMPING = 0.7  # of expectation propagation
 WEIGHT_TOLERANCE = 3e-3  # each weight is in (0, 1]
@@ -152,14 +152,16 @@ def prepare(
 
 
 def _limits(rssi: Tensor, loss: PathLosses, distance: Tensor, offset: Tensor) -> Tensor:
-    """Return the upper limit (n, R) [dBm] in each empty cell that the path loss does not explain; nan elsewhere."""
+    """Return the upper limit (n, R) [dBm] in each empty cell that neither path loss nor chance explains; nan elsewhere."""
     if loss.detection is None:
         return torch.full_like(rssi, torch.nan)
     limit = loss.detection.limit - offset
     std = (loss.variance + loss.detection.width**2).sqrt()
-    tells = torch.special.ndtr((limit - loss.own(distance)) / std) < CERTAIN
+    z = (limit - loss.own(distance)) / std
+    weak = empty_given(z, loss.detection.missed)[1]
+    unexplained = (torch.special.ndtr(z) < CERTAIN) & (weak > 1 - CERTAIN)
     received = (~rssi.isnan()).any(dim=0)
-    return limit.where(rssi.isnan() & tells & loss.detection.is_limit & received, torch.nan)
+    return limit.where(rssi.isnan() & unexplained & loss.detection.is_limit & received, torch.nan)
 
 
 def binned(train: Rssi, config: RssiConfig) -> Bins:
