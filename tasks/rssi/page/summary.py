@@ -57,6 +57,12 @@ def next_steps(run: RssiRecords) -> list[str]:
     interval = run.metrics["interval"]
     pairs = model_of(run) == "pairs"  # its maps depend on both ends, and the page shows one
     steps = [] if pairs else [f"Explore maps and coverage: `{command('view', run.path)}`."]
+    if unknown := int(np.isnan(run.arrays("maps")["receiver"]).any(axis=1).sum()):
+        steps.insert(
+            0,
+            "Give the positions of the access points in `receivers.csv` (columns receiver, x, y, z) beside the table: "
+            f"{unknown} are unknown, so that the distance from them explains nothing.",
+        )
     steps.append(where_next(run))
     steps.append(
         f"Predict anywhere: `swiftwrf.load({f'{run.path}/model.safetensors'!r}).predict(positions)`, with intervals."
