@@ -420,14 +420,14 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
 
         try:
             *found, factor = solved()
+            trend = feature[used, :2].to(device)
+            open_ = torch.eye(2).double() - (trend.T @ torch.cholesky_solve(trend, factor)).cpu()
+            covariance = std[:, None] * open_ * std  # a slope that is held at 0 is as uncertain as a free one
             slope = float(prior.slope + std[1] * (found[0].cpu() @ feature[used, 1]))
             if slope > 0:
                 middle = prior.level + prior.slope * loss.centre
                 prior, std[1], feature[:, 1] = PathLoss(middle, torch.zeros(1).double()), 0.0, 0.0
                 *found, factor = solved()
-            trend = feature[used, :2].to(device)
-            open_ = torch.eye(2).double() - (trend.T @ torch.cholesky_solve(trend, factor)).cpu()
-            covariance = std[:, None] * open_ * std
             error[used] = fold_errors(factor, found[0], data.fold[used].to(device)).cpu()
         except torch.linalg.LinAlgError as reason:  # type: ignore[attr-defined]
             raise FitError(
