@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.optimize import minimize
+from scipy.special import expit
 from torch import Tensor
 
 from swiftwrf.data.dataset import Numbers
@@ -131,7 +132,7 @@ class DetectionLikelihood:
 
     @classmethod
     def _of(cls, raw: NDArray[np.float64]) -> DetectionLikelihood:
-        return cls(float(raw[0]), float(np.exp(np.clip(raw[1], -1, 4))), float(0.9 / (1 + np.exp(-raw[2]))))
+        return cls(float(raw[0]), float(np.exp(np.clip(raw[1], -1, 4))), float(0.9 * expit(raw[2])))
 
     def probability(self, mean: Tensor) -> Tensor:
         """Return the probability of a detection for each predicted RSSI [dBm], of the same shape."""

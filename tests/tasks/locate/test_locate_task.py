@@ -22,7 +22,6 @@ from swiftwrf.data.writing import write_spectra
 from swiftwrf.locate import MatchedField
 from swiftwrf.locate.baselines import LEVELS, LOCALIZERS, RegressedCoordinates
 from swiftwrf.locate.comparison import LocateSplit, Trial, compare
-from swiftwrf.runtime.registry import Registry
 from tasks.claim import LOCATOR as MODEL
 from tasks.command_line import command_line
 from tasks.labels import LOCALIZERS as LABELS
@@ -310,11 +309,8 @@ def test_the_benchmark_measures_every_localizer(monkeypatch):
     monkeypatch.setattr(locating, "read", lambda source: rssi_room(n=60))
     monkeypatch.setattr(locating, "write_result", lambda name, content, rows: written.update({name: content}))
     monkeypatch.setattr(locating, "kept", lambda name, key: {})
-    cheap = Registry("localizer")
-    cheap._registered = {name: LOCALIZERS[name] for name in ("posterior", "knn")}
-    monkeypatch.setattr(locating, "LOCALIZERS", cheap)
     with mock.patch.object(RssiModel, "config_type", quick.QuickRssiConfig):
-        locating.main(locating.Config(("floor:block",), cells=60))
+        locating.main(locating.Config(("floor:block",), ("posterior", "knn"), cells=60))
     (result,) = written["locating_rssi"]["sets"].values()
     assert set(result["localizers"]) == {"posterior", "knn"}
     assert set(result["coverage"]) == {"0.5", "0.8", "0.95"}

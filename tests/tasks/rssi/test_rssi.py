@@ -318,7 +318,11 @@ def test_an_interval_of_one_width_sends_nobody_to_measure():
     assert "not worth it" in where_next(run)
     maps["width"][:, :, 2, 3] += 4
     assert where_next(run).startswith("Measure around x = 3.0 m, y = 2.0 m")
-    maps["measured_position"] = corners[[0, 1, 2]]  # x = 3, y = 2 is outside now
+    maps |= {
+        "measured_position": corners[:3],
+        "measured": corners[:3, :2],
+        "floor_of_row": np.zeros(3, int),
+    }  # x = 3, y = 2 is outside now
     assert "x = 3.0 m, y = 2.0 m" not in where_next(run)
 
 
