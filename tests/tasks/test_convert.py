@@ -192,7 +192,7 @@ def test_calibration_sees_the_training_part_alone(tmp_path, capsys):
         (("{source}", "{new}", "--columns", "x"), "x=NAME"),
         (("{source}", "{new}", "--columns", "x=a"), "takes no columns"),
         (("{source}", "{new}", "--grid", 1, 1), "--grid"),
-        (("{source}", "{new}", "--every", 0), "--every must be at least 1"),
+        (("{source}", "{new}", "--every", 0), "--every must be a whole number at least 1"),
         (("{source}", "{new}", "--array", 1, 0.06, 2.4e9), "2 to 32 elements a side"),
         (("{source}", "{new}", "--array", 2, 64, 0.06, 2.4e9), "2 to 32 elements a side"),
         (("{source}", "{new}", "--array", 2, 0, 0.06, 2.4e9), "2 to 32 elements a side"),

@@ -305,7 +305,7 @@ def test_deepmimo_folders_are_made_of_ray_paths(paths, tmp_path, capsys):
         (("out.csv", "--cell", "1"), "are for maps of RSSI models"),
         (("out.mat", "--deepmimo"), "give a directory"),
         (("out.mat", "--calibrate"), "writes a directory"),
-        (("out.png", "--cell", "0"), "above 0 m"),
+        (("out.png", "--cell", "0"), "a number above 0"),
         (("nowhere/out.csv",), "no directory"),
     ],
 )
