@@ -14,8 +14,8 @@ import torch
 from record import options, write_result
 
 from swiftwrf import Rssi, RssiModel
+from swiftwrf.choices import NotDetected
 from swiftwrf.gp import Kernel
-from swiftwrf.rssi.detection import NotDetected
 from swiftwrf.rssi.path_loss import log_distance
 
 LIMIT_DBM, PACKET_DB, SHADOWING_DB, RECEIVERS = -88.0, 2.5, 4.5, 8

@@ -12,6 +12,7 @@ from swiftwrf.errors import InputError
 from swiftwrf.runtime.registry import Registry
 
 Moving = Literal["transmitter", "receiver"]
+NotDetected = Literal["auto", "weak", "unknown"]  # meaning of an empty cell of RSSI
 CARRIERS_HZ = (1e6, 1e13)
 MAX_SUGGESTIONS = 500  # positions to measure next
 AUTO = "auto"  # the field model that cross-validation chooses

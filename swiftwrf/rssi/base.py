@@ -16,6 +16,7 @@ import torch
 from annotated_types import Ge
 from torch import Tensor
 
+from swiftwrf.choices import NotDetected
 from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Offsets, Rssi
@@ -26,7 +27,7 @@ from swiftwrf.models.base import FieldConfig, check_checkpoint
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Displayed
 from swiftwrf.positions import check_positions, to_tensor
-from swiftwrf.rssi.detection import Detection, NotDetected
+from swiftwrf.rssi.detection import Detection
 from swiftwrf.rssi.path_loss import FloorAttenuation, estimate_floor_attenuation, receiver_floors
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.session import Record

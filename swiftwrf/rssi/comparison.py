@@ -12,7 +12,7 @@ import torch
 from pandas import DataFrame, concat
 from torch import Tensor
 
-from swiftwrf.choices import RSSI_PREDICTORS
+from swiftwrf.choices import RSSI_PREDICTORS, NotDetected
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.rssi import PLACE
@@ -21,7 +21,6 @@ from swiftwrf.metrics import method_summary
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import distance
 from swiftwrf.rssi.base import Map, RssiPredictor
-from swiftwrf.rssi.detection import NotDetected
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.pairs import PairModel
 from swiftwrf.rssi.paper import RssiPaperModel

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from typing import Self
 
 import torch
 from sklearn.linear_model import LogisticRegression
@@ -23,7 +23,6 @@ from swiftwrf.gp import GaussianProcess, Kernel, leave_folds_out, subsample
 from swiftwrf.positions import Neighbours, to_tensor
 from swiftwrf.runtime.checkpoint import Header
 
-NotDetected = Literal["auto", "weak", "unknown"]
 NEIGHBOURS, FEWEST = 6, 3  # rows beside a cell, and values among them, that determine its level
 MISSED = 1e-3  # share of random misses at least: no value is impossible
 MISSES_WORTH = 30.0  # strong cells of a receiver that count as much as the share of misses of all receivers

@@ -18,12 +18,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from swiftwrf.choices import NotDetected
 from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.rssi import Offsets, Rssi
 from swiftwrf.errors import InputError, listed
 from swiftwrf.gp import Kernel
 from swiftwrf.positions import Neighbours, distance
-from swiftwrf.rssi.detection import Detection, NotDetected, empty_given
+from swiftwrf.rssi.detection import Detection, empty_given
 from swiftwrf.runtime.threads import single_thread
 
 MIN_DISTANCE_M = 0.3  # shorter distances count as this one: the model does not hold in the near field

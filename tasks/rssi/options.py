@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
-from swiftwrf.choices import RSSI_PREDICTORS
+from swiftwrf.choices import RSSI_PREDICTORS, NotDetected
 from swiftwrf.errors import InputError
-from swiftwrf.rssi.detection import NotDetected
 from swiftwrf.runtime.validation import Preset
 from tasks.options import OffsetSource, Options, Output, Seed, options
 
