@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from pandas import DataFrame, concat
@@ -16,6 +16,7 @@ from swiftwrf.choices import RSSI_PREDICTORS, NotDetected
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.rssi import PLACE
+from swiftwrf.data.splits import Validation
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import method_summary
 from swiftwrf.models.prediction import Prediction
@@ -191,6 +192,7 @@ def compare(
     preset: Preset = "quick",
     reference: str | None = None,
     not_detected: NotDetected = "auto",
+    validation: Validation | Literal["auto"] = "auto",
     device: torch.device | str = "cpu",
     parallel: Map | None = None,
     keep: Keep | None = None,
@@ -207,6 +209,7 @@ def compare(
         preset: "quick", or "paper" for published settings.
         reference: Group whose offset is 0. Defaults to the most frequent one.
         not_detected: Meaning of an empty cell; see `RssiConfig`.
+        validation: Folds that choose all settings: "random", "block" or "session". Defaults to those like the test rows.
         device: Device to compute on.
         parallel: Function that maps a picklable fit over receivers as `map` does.
         keep: Memo `keep(name, compute)`, which returns the values that it has under a name, or the second item of
@@ -231,8 +234,8 @@ def compare(
         offsets = estimate_offsets(pool, reference)
         train, pool = offsets.removed(train), offsets.removed(pool)
     offset = 0.0 if train.offsets is None else train.offsets.of(test)[:, None]
-    options: Values = {"validation": train.validation_for(split, test), "seed": seed, "new_places": split == PLACE}
-    options["not_detected"] = not_detected
+    kind = train.validation_for(split, test) if validation == "auto" else validation
+    options: Values = {"validation": kind, "seed": seed, "new_places": split == PLACE, "not_detected": not_detected}
     names, left_out = compared(chosen, also)
     predictors: dict[str, RssiPredictor] = {}
 

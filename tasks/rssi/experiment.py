@@ -74,6 +74,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
                 also=config.also,
                 preset=config.preset,
                 not_detected=config.not_detected,
+                validation=config.validation,
                 reference=config.table.reference,
                 device=device,
                 parallel=cluster.map if cluster else None,

@@ -32,6 +32,8 @@ class RssiTaskConfig(Options):
     not_detected: NotDetected = "auto"
     """what an empty cell says: weak, the signal was below the limit of detection; unknown, nothing; auto decides for each
     receiver by the data"""
+    validation: Literal["auto", "random", "block", "session"] = "auto"
+    """folds of the training rows that choose all settings; auto takes those that are like the test rows"""
     preset: Preset = "quick"
     """of SwiftWRF and NeRF2: quick, or paper for the published head and field"""
     floor_plan: str | None = None

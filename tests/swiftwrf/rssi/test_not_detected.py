@@ -111,7 +111,7 @@ def test_detections_are_predicted_and_scored(fitted):
     assert float(probability[data.detected].mean()) > 0.9 > 0.2 > float(probability[~data.detected].mean())
     full = replace(data, rssi_dbm=data.rssi_dbm.nan_to_num(-90.0))
     assert bool((RssiModel().fit(full).predict_detection(data.transmitter_position) == 1).all())
-    assert "detection" not in compare(full, split="random").summary()
+    assert "detection" not in compare(full, split="random", validation="block").summary()
 
 
 def test_a_saved_and_updated_model_keeps_its_detections(fitted, tmp_path):
