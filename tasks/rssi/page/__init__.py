@@ -50,7 +50,7 @@ def _summary(run: RssiRecords) -> Summary:
     numbers[:0] = [
         Number(
             f"{maps.covered:.0%}",
-            f"of the {maps.titled('measured area')} has {who} above {COVERED_DBM:g} dBm with {CERTAINTY:.0%} certainty",
+            f"of {maps.place} has {who} above {COVERED_DBM:g} dBm with {CERTAINTY:.0%} certainty",
         )
         for maps in floors
     ]

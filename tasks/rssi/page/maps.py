@@ -61,8 +61,12 @@ class Maps:
 
     def titled(self, title: str) -> str:
         """Return a title with the name of the floor, if there are several."""
-        floors = self.arrays["floor_names"]
-        return title if len(floors) == 1 else f"{title}, floor {floors[self.floor]}"
+        return f"{title}, {self.arrays['floor_names'][self.floor]}" if self.suffix else title
+
+    @property
+    def place(self) -> str:
+        """Name of what the maps cover, in sentences."""
+        return f"floor {self.arrays['floor_names'][self.floor]}" if self.suffix else "the measured area"
 
     @property
     def suffix(self) -> str:

@@ -42,11 +42,11 @@ def conclusion(run: RssiRecords) -> str:
     best, n_test, interval = best_baseline(run), run.metrics["n_test"], run.metrics["interval"]
     own, name, floors = model_of(run), title(run), Maps.of_floors(run)
     who = "a receiver" if len(run.metrics["receivers"]) > 1 else "the receiver"
-    covered = [f"{maps.covered:.0%} of the {maps.titled('measured area')}" for maps in floors]
+    covered = [f"{maps.covered:.0%} of {maps.place}" for maps in floors]
     error = run.metrics["overall"][own]["abs_error_db"]["median"]
     compared = comparison_sentence(by_method(run), own, best, name=name, unit="dB", rows="pairs", n_test=n_test)
     return (
-        f"{' and '.join(covered)} {'has' if len(covered) == 1 else 'have'} {who} above {COVERED_DBM:g} dBm with "
+        f"{', '.join(covered)} {'has' if len(covered) == 1 else 'have'} {who} above {COVERED_DBM:g} dBm with "
         f"{CERTAINTY:.0%} certainty. Half of the errors at new positions are below {error:.1f} dB, and "
         f"{interval['coverage']:.0%} of the measurements lie in their {interval['nominal']:.0%} intervals. {compared}"
     )

@@ -33,6 +33,7 @@ from tasks.command_line import command_line
 from tasks.labels import PREDICTORS as LABELS
 from tasks.report.run import merge
 from tasks.rssi import experiment
+from tasks.rssi.page.maps import Maps
 from tasks.rssi.page.summary import where_next
 
 
@@ -324,6 +325,27 @@ def test_an_interval_of_one_width_sends_nobody_to_measure():
         "floor_of_row": np.zeros(3, int),
     }  # x = 3, y = 2 is outside now
     assert "x = 3.0 m, y = 2.0 m" not in where_next(run)
+
+
+def test_each_floor_has_its_maps_its_rows_and_its_coverage():
+    corners = np.array([[0, 0, 0], [4, 0, 0], [0, 3, 0], [4, 3, 0]], dtype=float)
+    position = np.concatenate([corners, corners + np.array([0, 0, 4])])
+    level = np.stack([np.full((1, 4, 5), dbm) for dbm in (-50.0, -90.0)])
+    maps = {
+        "x": np.arange(5.0),
+        "y": np.arange(4.0),
+        "predicted": level,
+        "width": 0 * level,
+        "detection": 0 * level + 1,
+    }
+    maps |= {"measured_position": position, "measured": position[:, 2:], "floor_of_row": np.repeat([0, 1], 4)}
+    maps |= {"floor_names": np.array(["Ground", "First"]), "receiver_names": np.array(["a"]), "receiver": corners[:1]}
+    ground, first = Maps.of_floors(SimpleNamespace(arrays=lambda name: maps, file_name="run"))
+    assert (ground.covered, first.covered) == (1, 0)
+    assert (ground.place, first.titled("a")) == ("floor Ground", "a, First")
+    assert first.arrays["measured"].ravel().tolist() == [4.0] * 4
+    assert first.summary().name == "summary-1"
+    assert len(first.by_receiver()) == 2
 
 
 @pytest.mark.parametrize("seed", [0, 1])
