@@ -58,6 +58,23 @@ def rssi_heads() -> str:
     return markdown(["data, split", "with the head", "with the identity", "change by the head"], rows)
 
 
+def channels() -> str:
+    """Return errors of matched fields on channels, and coherence and errors of channels predicted at unseen positions."""
+    rows = []
+    for scene, fractions in load("channels_1")["scenes"].items():
+        for fraction, found in fractions.items():
+            row = found["median"]
+            error = [f"{row[key]['median']:.2g} / {row[key]['p90']:.2g}" for key in ("angle_deg", "position_m")]
+            predicted = [
+                f"{row['channel'][name]['coherence']:.2f} / {row['channel'][name]['nmse_db']:+.1f}"
+                for name in ("nearest", "gaussian_process", "planes", "furniture")
+                if name in row["channel"]
+            ]
+            rows.append([scene, f"{float(fraction):.0%}", *error, f"{row['coverage_80']:.0%}", *predicted])
+    columns = ["scene", "measured", "angle [deg]", "position [m]", "80 % regions hold"]
+    return markdown([*columns, "nearest", "Gaussian process", "planes", "planes and furniture"], rows)
+
+
 def not_detected() -> str:
     """Return the errors of maps below the limit of detection, with empty cells as limits and without."""
     rows = []
