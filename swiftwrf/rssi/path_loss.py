@@ -274,15 +274,22 @@ def _maximise(
     eye, spread = torch.eye(3, dtype=torch.float64), torch.tensor([SPREAD_DB, SPREAD_DB, 1e-3]).double().square()
     (expected, known), of_floor = SLOPE_PRIOR, FLOOR_STD_DB
     certain = torch.tensor([1e-6, known**-2, of_floor**-2], dtype=torch.float64)
-    value, weight, extra = rssi.nan_to_num(), seen.double(), torch.zeros_like(rssi)
+
+    def sums(value: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return weighted sums over the rows: of products of regressors, of them and the values, of squares, and of 1."""
+        weighted = weight[..., None] * feature
+        gram = torch.einsum("nrk,nrl->rkl", weighted, feature)
+        cross = (weighted * value[..., None]).sum(dim=0)
+        return gram, cross, (weight * value.square()).sum(dim=0), weight.sum(dim=0)
+
+    gram, cross, power, count = sums(rssi.nan_to_num(), seen.double())
     variance = rssi[seen].var(correction=0).clamp_min(1e-6).expand(n_receivers)
     missed = torch.zeros(n_receivers).double() if detection is None else detection.missed
     unexplained, last = missed, None
     limited = torch.zeros_like(seen) if detection is None else ~seen & detection.is_limit
     for _ in range(MAX_ROUNDS):
         scale = variance * repeats
-        normal = torch.einsum("nrk,nr,nrl->rkl", feature, weight, feature) / scale[:, None, None]
-        right = torch.einsum("nrk,nr->rk", feature, weight * value) / scale[:, None]
+        normal, right = gram / scale[:, None, None], cross / scale[:, None]
         shrink = torch.linalg.inv(eye + normal @ spread.diag())
         total = (shrink @ normal).sum(dim=0) + certain.diag()
         pull = (shrink @ right[..., None]).sum(dim=0)[:, 0] + torch.tensor([0.0, expected / known**2, 0.0]).double()
@@ -295,26 +302,24 @@ def _maximise(
         moments = (deviation.square() + posterior.diagonal(dim1=1, dim2=2))[:, :2].sum(dim=0)
         spread[:2] = (moments + SPREAD_WORTH * SPREAD_DB**2) / (n_receivers + SPREAD_WORTH)  # floors are alike
         own = shared + deviation
-        mean = (feature * own).sum(dim=-1)
-        squares = weight * (value - mean).square() + extra
-        pooled = squares.sum() / weight.sum()
-        variance = (squares.sum(dim=0) + ROWS_WORTH * pooled) / (weight.sum(dim=0) + ROWS_WORTH)
+        squares = power - 2 * (own * cross).sum(dim=1) + torch.einsum("rk,rkl,rl->r", own, gram, own)
+        variance = (squares + ROWS_WORTH * squares.sum() / count.sum()) / (count + ROWS_WORTH)
         variance = variance.clamp_min(1e-6)
         if last is not None and float((own - last).abs().max()) < 0.01:
             break
         last = own
         if detection is None or not limited.any():
             continue
-        std = (variance + detection.width**2).sqrt()
+        mean, std = (feature * own).sum(dim=-1), (variance + detection.width**2).sqrt()
         z = (detection.limit - shift - mean) / std
         ratio, weak = empty_given(z, unexplained)
         hazard = (ratio / weak.clamp_min(1e-12)).clamp_max(40)
         value = rssi.where(seen, mean - variance / std * hazard)
-        weight = torch.where(limited, weak, seen.double())
+        gram, cross, power, count = sums(value, torch.where(limited, weak, seen.double()))
         rest = 1 - variance / std.square() * hazard * (z + hazard)
-        extra = torch.where(limited, weak * variance * rest.clamp(0, 1), 0.0)
-        count, other = seen.sum(dim=0), (1 - weak).where(limited, 0.0).sum(dim=0)
-        share = (other + ROWS_WORTH * other.sum() / (count + other).sum()) / (count + other + ROWS_WORTH)
+        power = power + torch.where(limited, weak * variance * rest.clamp(0, 1), 0.0).sum(dim=0)
+        detected, other = seen.sum(dim=0), (1 - weak).where(limited, 0.0).sum(dim=0)
+        share = (other + ROWS_WORTH * other.sum() / (detected + other).sum()) / (detected + other + ROWS_WORTH)
         if bool((distance.std(dim=0) > 0).any()):  # without distances no power is expected anywhere
             unexplained = missed.maximum(share)
     own_level, shared_level = own[:, 0] - own[:, 1] * centre, shared[0] - shared[1] * centre
