@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -70,8 +70,8 @@ class RssiConfig(FieldConfig):
     max_locations: Annotated[int, Ge(10)] = 1500
     """location bins that the rows are averaged in; the time of a fit grows with the cube of their number"""
     not_detected: NotDetected = "auto"
-    """what an empty cell says: "weak", the power was below the limit of detection; "unknown", nothing; "auto" decides for
-    each receiver by whether its empty cells are where its path loss expects no value"""
+    """meaning of an empty cell: "weak", the power was below the limit of detection; "unknown", it is ignored; "auto" decides
+    for each receiver by whether its empty cells are where its path loss expects no value"""
 
 
 class RssiPredictor(Configured, Displayed, ABC):
@@ -183,8 +183,8 @@ class RssiPredictor(Configured, Displayed, ABC):
             shift = shift + of_pool.of(pool.transmitter_position)
             train, pool = self.attenuation.removed(train), of_pool.removed(pool)
         others = {"parallel": parallel, "checkpoint": checkpoint, "on_record": on_record, "progress": progress}
-        curve, names = Detection.estimate(pool.transmitter_position, pool.rssi_dbm + shift), list(pool.receiver_names)
-        self.detection = curve and curve.columns(torch.tensor([names.index(name) for name in self.receiver_names]))
+        curve = Detection.estimate(pool.transmitter_position, pool.rssi_dbm + shift)
+        self.detection = curve and curve.columns(columns_of(self.receiver_names, pool))
         self._fit(train, pool=pool, shift=shift, device=to_device(device), **others)
         return self
 
@@ -377,6 +377,12 @@ def check_training(train: Rssi, pool: Rssi) -> None:
     more = set(train.receiver_names) <= set(pool.receiver_names)
     if not more or not torch.equal(pool.transmitter_position, train.transmitter_position):
         raise InputError("the pool must hold the same rows as the training part, at the same receivers and more")
+
+
+def columns_of(receiver_names: Sequence[str], pool: Rssi) -> Tensor:
+    """Return the columns of a pool that hold these receivers, int64 (R,)."""
+    names = list(pool.receiver_names)
+    return torch.tensor([names.index(name) for name in receiver_names])
 
 
 def fingerprint(config: Any, train: Rssi, pool: Rssi) -> str:

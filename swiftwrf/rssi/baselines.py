@@ -21,7 +21,7 @@ from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.data import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
 from swiftwrf.models.base import CPU, FieldConfig
-from swiftwrf.rssi.base import Map, RssiPredictor
+from swiftwrf.rssi.base import Map, RssiPredictor, columns_of
 from swiftwrf.rssi.comparison import make_predictor
 from swiftwrf.rssi.pairs import PairPredictor
 from swiftwrf.rssi.path_loss import fit_path_losses, fit_shared_path_loss, log_distance
@@ -79,8 +79,7 @@ class ReceiverPathLoss(SharedPathLoss):
     def _fit(self, train: Rssi, *, pool: Rssi, shift: Tensor, **_: Any) -> None:
         self._receiver = train.receiver_position
         found = fit_path_losses(pool.transmitter_position, pool.receiver_position, pool.rssi_dbm, shift=shift)
-        names = list(pool.receiver_names)
-        self._path_loss = found.columns(torch.tensor([names.index(name) for name in train.receiver_names])).own
+        self._path_loss = found.columns(columns_of(train.receiver_names, pool)).own
 
 
 class ReceiverRegressors(RssiPredictor):

@@ -106,7 +106,7 @@ class Detection:
         missed = float(self.missed[self.is_limit].mean()) if weak else 0.0
         said = []
         if weak:
-            said.append(f"an empty cell says that the signal was below about {self.limit:.0f} dBm")
+            said.append(f"an empty cell means that the signal was below about {self.limit:.0f} dBm")
             if missed > 0.03:
                 said.append(f"{missed:.0%} of all packets are missed at any power")
         if others:

@@ -22,7 +22,7 @@ from swiftwrf.models.base import CPU
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Axes
 from swiftwrf.positions import check_positions
-from swiftwrf.rssi.base import Map, RssiConfig, SavedRssiPredictor, map_threads
+from swiftwrf.rssi.base import Map, RssiConfig, SavedRssiPredictor, columns_of, map_threads
 from swiftwrf.rssi.detection import Detection, DetectionField
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
 from swiftwrf.rssi.maps import RssiMap
@@ -92,7 +92,7 @@ class RssiModel(SavedRssiPredictor):
     covariance: Tensor
     """calibrated covariance of level at that distance and slope, float64 (R, 2, 2)"""
     detection_field: DetectionField | None
-    """probability of a detection; None if every cell has a value, or if empty cells tell nothing"""
+    """probability of a detection; None if every cell has a value, or if empty cells are ignored"""
     directivity: Tensor
     """coefficients of the harmonics, (R, 8) [dB]"""
     anchor: Tensor
@@ -111,8 +111,9 @@ class RssiModel(SavedRssiPredictor):
     def _fit(self, train: Rssi, *, pool: Rssi, shift: Tensor, **arguments: Any) -> None:
         training = prepare(train, pool, self.config, shift=shift)
         found = self._receivers(training, **arguments)
-        weight = self._mixing_weights(train, pool, training, found, shift, **arguments)
-        self._assemble(train, training, found, weight[:, None].repeat(1, len(training.receiver_names)))
+        held_out = _held_out_predictors(training, found)
+        weight = self._mixing_weights(train, pool, training, held_out[0], shift, **arguments)
+        self._assemble(train, training, found, held_out, weight[:, None].repeat(1, len(training.receiver_names)))
 
     def _receivers(
         self,
@@ -135,7 +136,7 @@ class RssiModel(SavedRssiPredictor):
         train: Rssi,
         pool: Rssi,
         training: RssiTraining,
-        found: dict[str, Tensor],
+        predictors: Tensor,
         shift: Tensor,
         **arguments: Any,
     ) -> Tensor:
@@ -146,8 +147,7 @@ class RssiModel(SavedRssiPredictor):
         """
         some = representative_receivers(pool)
         if set(some.receiver_names) <= set(train.receiver_names):
-            columns = torch.tensor([train.receiver_names.index(name) for name in some.receiver_names])
-            predictors = _held_out_predictors(training, found)[0][:, :, columns]
+            predictors = predictors[:, :, columns_of(some.receiver_names, train)]
         else:
             others = prepare(some, pool, self.config, training, shift)
             predictors = _held_out_predictors(others, self._receivers(others, **arguments | {"progress": False}))[0]
@@ -157,9 +157,16 @@ class RssiModel(SavedRssiPredictor):
         return mixing_weights(predicted, some.rssi_dbm, 0.05)  # by nested cross-validation
 
     @single_thread()
-    def _assemble(self, train: Rssi, training: RssiTraining, found: dict[str, Tensor], weight: Tensor) -> None:
+    def _assemble(
+        self,
+        train: Rssi,
+        training: RssiTraining,
+        found: dict[str, Tensor],
+        held_out: tuple[Tensor, Tensor],
+        weight: Tensor,
+    ) -> None:
         """Mix the fits of all receivers with the simpler predictors by weights (4, R), and calibrate the deviation."""
-        predictors, std = _held_out_predictors(training, found)
+        predictors, std = held_out
         check_comparable(predictors[:, training.bin_of_row], train.rssi_dbm)
         predicted = (weight[:, None] * predictors).where(weight[:, None] > 0, 0.0).sum(dim=0)
         of_row = training.bin_of_row

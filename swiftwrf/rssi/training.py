@@ -23,7 +23,7 @@ from swiftwrf.data.splits import folds
 from swiftwrf.errors import FitError, InputError
 from swiftwrf.gp import GaussianProcess, Kernel, candidates, held_out_errors, subsample
 from swiftwrf.positions import cells
-from swiftwrf.rssi.base import RssiConfig
+from swiftwrf.rssi.base import RssiConfig, columns_of
 from swiftwrf.rssi.detection import Detection, empty_given
 from swiftwrf.rssi.head import Head, HeadTable, render
 from swiftwrf.rssi.path_loss import N_HARMONICS, PathLoss, PathLosses, fit_path_losses, harmonics, log_distance
@@ -110,8 +110,7 @@ def prepare(
     """
     bins = binned(train, config)
     rssi, fold, every = bins.rssi, bins.fold, bin_locations(pool, config.max_locations)[1]
-    names, receiver = list(pool.receiver_names), pool.receiver_position.double() - bins.centre
-    own = torch.tensor([names.index(name) for name in train.receiver_names])
+    receiver, own = pool.receiver_position.double() - bins.centre, columns_of(train.receiver_names, pool)
     offset = torch.zeros_like(every) if shift is None else _bin_means(shift, bins.bin_of_row, len(fold))
 
     def fit_baselines(rows: Tensor, detection: Detection | None = None) -> tuple[PathLosses, PathLoss]:
@@ -401,12 +400,10 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
     prior, std = loss.shared, loss.std[0].clone()
     distance = log_distance(data.position, receiver)
     used = (~rssi.isnan() | ~limit.isnan()).nonzero()[:, 0]
-    n_used = len(used) if bool((~rssi.isnan()).any()) else 0
-    used = used[:n_used]
     error, dual, tangent, variance = (torch.zeros_like(rssi) for _ in range(4))
     feature = regressors(distance, harmonics(data.position, receiver), loss.centre, std[None])[0]
     linear, covariance = torch.zeros(feature.shape[1]).double(), std.square().diag()
-    if n_used:
+    if len(used):
         at, weak = data.position[used].to(device), limit[used].isnan().logical_not()
         prior_covariance = float(data.field_db[some]) ** 2 * data.kernel(at, at)
         noise_db = (data.noise_db[some] / data.count[used, some][:, 0].clamp_min(1).sqrt()).to(device)
@@ -532,8 +529,11 @@ def solve(
             site = _site(left_mean, left, value, noise, censored)
             moved = DAMPING * (site - torch.stack([precision, pull])).where(weak, 0.0)
             precision, pull = precision + moved[0], pull + moved[1]
-            told = precision > 1 / NO_SITE
-            previous, target = target, (pull / precision.clamp_min(1e-9)).where(told & weak, value.where(~weak, 0.0))
+            informative = precision > 1 / NO_SITE
+            previous, target = (
+                target,
+                (pull / precision.clamp_min(1e-9)).where(informative & weak, value.where(~weak, 0.0)),
+            )
             settled &= float(((target - previous) * precision.sqrt())[weak].abs().mean()) < 0.02
         if settled and (step == 1 or mean_change < 0.1):
             break

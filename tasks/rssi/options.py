@@ -30,8 +30,8 @@ class RssiTaskConfig(Options):
     """predictors that are compared only when named: nerf2 and blend take minutes; pairs and knn_pairs are for data with both
     ends moving, where they are compared anyway"""
     not_detected: NotDetected = "auto"
-    """what an empty cell says: weak, the signal was below the limit of detection; unknown, nothing; auto decides for each
-    receiver by the data"""
+    """meaning of an empty cell: weak, the signal was below the limit of detection; unknown, it is ignored; auto decides for
+    each receiver by the data"""
     validation: Literal["auto", "random", "block", "session"] = "auto"
     """folds of the training rows that choose all settings; auto takes those that are like the test rows"""
     preset: Preset = "quick"
