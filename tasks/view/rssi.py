@@ -150,7 +150,7 @@ class RssiView:
     @property
     def floors(self) -> Floors | None:
         """Floors of the building; None if there is one only."""
-        return self.model.attenuation and self.model.attenuation.floors
+        return None if self.model.attenuation is None else self.model.attenuation.floors
 
     def on_floor(self, height: float) -> NDArray[np.bool_]:
         """Return which measured rows are on the floor of a height [m], (n,)."""

@@ -64,7 +64,7 @@ class RssiPage:
         if (floors := self._view.floors) is not None:
             heights = dict(zip(floors.height_m, floors.names, strict=True))
             first = floors.height_m[int(floors.number(torch.tensor([[0.0, 0.0, middle]])))]
-            self._height = ui.select(heights, value=first, label="floor", on_change=self._update)
+            self._height: ui.select | ui.slider = ui.select(heights, value=first, label="floor", on_change=self._update)
             self._height.props("outlined dense options-dense").classes("w-full")
         else:
             with ui.column().classes("w-full") as column:
