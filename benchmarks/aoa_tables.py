@@ -7,8 +7,7 @@ from typing import Any
 from geometry import SIDES, WALLS, nearest
 from record import RESULTS, interval, load, markdown
 
-from augment.cross_validation import LOCATOR
-from augment.turbo.condition import Condition, conditions_of
+from augment.turbo.condition import FULL_NETWORK, LOCATED, MEASURED_NETWORK, Condition, conditions_of
 from augment.turbo.condition import headline as chosen
 from augment.turbo.results import MixMetrics
 from swiftwrf.metrics import ChangeMetrics
@@ -58,11 +57,11 @@ def aoa() -> str:
                 median["peak"],
                 median["constant"],
                 f"{median[best]} `{best}`",
-                median["measured_only"],
+                median[MEASURED_NETWORK],
                 median[turbo.method],
-                *(change_text(methods[turbo.method]["changes"][other]) for other in ("measured_only", best)),
-                median.get(LOCATOR, ""),
-                median["measured_all"],
+                *(change_text(methods[turbo.method]["changes"][other]) for other in (MEASURED_NETWORK, best)),
+                median.get(LOCATED, ""),
+                median[FULL_NETWORK],
             ]
         )
     columns = ["scene, split, moving end", "measured", "peak", "constant", "best", "measured only", "turbo"]
@@ -77,7 +76,7 @@ def headline() -> str:
         if share != "0.3":
             continue
         metrics, methods = result["metrics"], mix["methods"]
-        shown = ("peak", "constant", "measured_only", turbo_condition(mix).method, LOCATOR, "measured_all")
+        shown = ("peak", "constant", MEASURED_NETWORK, turbo_condition(mix).method, LOCATED, FULL_NETWORK)
         cells = [interval(methods[name]["great_circle_deg"]) if name in methods else "" for name in shown]
         rows.append([f"{metrics['data']}, {metrics['split']}, {metrics['moving']} moves", *cells])
     columns = [

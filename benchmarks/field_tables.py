@@ -8,6 +8,7 @@ from typing import Any
 from pandas import DataFrame
 from record import RESULTS, interval, load, markdown
 
+from augment.turbo.condition import NETWORK
 from tasks.summarise import pareto
 
 Row = dict[str, Any]
@@ -308,11 +309,11 @@ def angles(fractions: dict[str, dict[str, Row]]) -> str:
         return f"{errors['elevation_deg']['median']:.2f} / {errors['azimuth_deg']['median']:.2f}"
 
     paper = [
-        (f"paper: turbo_{name}", _measured(fraction), f"{elevation:.2f} / {azimuth:.2f}")
+        (f"paper: {NETWORK}, measured + synthetic ({name})", _measured(fraction), f"{elevation:.2f} / {azimuth:.2f}")
         for fraction in fractions
         for name, (elevation, azimuth) in PAPER_ANGLES[fraction].items()
     ]
-    return _by_fraction(fractions, "azimuth_deg", cell, lambda name: name.startswith(("measured_", "turbo_")), paper)
+    return _by_fraction(fractions, "azimuth_deg", cell, lambda name: name.startswith(NETWORK), paper)
 
 
 def paper_scale_angles() -> str:
@@ -327,7 +328,7 @@ def paper_scale_aoa() -> str:
         return f"{interval(errors['great_circle_deg'])} / {errors['great_circle_deg']['p90']:.1f}"
 
     def is_shown(method: str) -> bool:
-        return "_turbo_" not in method or method.endswith("_turbo_hybrid")
+        return method.startswith(NETWORK) or "synthetic" not in method or method.endswith("(hybrid)")
 
     return _by_fraction(load("paper_scale")["aoa"], "great_circle_deg", cell, is_shown)
 
