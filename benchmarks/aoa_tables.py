@@ -6,8 +6,7 @@ from typing import Any
 
 from record import RESULTS, load, markdown
 
-from augment.cross_validation import LOCATOR
-from augment.turbo.condition import Condition, conditions_of
+from augment.turbo.condition import FULL_NETWORK, LOCATED, MEASURED_NETWORK, Condition, conditions_of
 from augment.turbo.condition import headline as chosen
 from augment.turbo.results import MixMetrics
 from swiftwrf.metrics import ChangeMetrics
@@ -50,10 +49,13 @@ def aoa() -> str:
         metrics, methods = result["metrics"], mix["methods"]
         turbo, best = turbo_condition(mix).method, mix["reference"]
         median = {name: f"{method['great_circle_deg']['median']:.2f}" for name, method in methods.items()}
-        names = {"measured_only": "network"}
-        cells = [median["peak"], f"{median[best]} ({names.get(best, best).replace('_', ' ')})", median["measured_only"]]
-        cells += [median[turbo], change_text(methods[turbo]["changes"]["measured_only"])]
-        cells += [median.get(LOCATOR, ""), median["measured_all"]]
+        cells = [
+            median["peak"],
+            f"{median[best]} ({best.partition(',')[0].replace('_', ' ')})",
+            median[MEASURED_NETWORK],
+        ]
+        cells += [median[turbo], change_text(methods[turbo]["changes"][MEASURED_NETWORK])]
+        cells += [median.get(LOCATED, ""), median[FULL_NETWORK]]
         rows.append([f"{metrics['data']}, {metrics['split']}, {metrics['moving']}", f"{float(share):.0%}", *cells])
     columns = ["scene, split, moving end", "measured", "strongest peak", "best without synthetic", "network, measured"]
     columns += ["network, measured + synthetic", "change", "matched field", "network, all measured"]

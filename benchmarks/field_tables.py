@@ -8,6 +8,8 @@ from typing import Any
 from pandas import DataFrame
 from record import interval, load, markdown
 
+from augment.turbo.condition import LOCATED, NETWORK
+
 Row = dict[str, Any]
 Scores = dict[str, tuple[float, float]]  # median PSNR [dB] and median SSIM by method, on other spectra
 PAPER_S23: Scores = {
@@ -167,24 +169,13 @@ def _range(values: Sequence[float], digits: int = 0) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-ESTIMATORS = {  # names in the result: names of the table
-    "peak": "strongest peak",
-    "measured_only": "network, measured",
-    "turbo_nerf2": "network, measured + synthetic of `nerf2`",
-    "turbo_wrfgs": "network, measured + synthetic of `wrfgs`",
-    "turbo_swiftwrf": "network, measured + synthetic of `swiftwrf`",
-    "turbo_hybrid": "network, measured + synthetic of `hybrid`",
-    "measured_all": "network, all measured",
-    "matched_field": "matched field, measured",
-}
-
-
 def paper_scale_aoa() -> str:
     """Return the median angular error of each estimator and training set at each measured fraction."""
     cells = [
-        (name, f"{float(fraction):.0%} measured", interval(rows[method]["great_circle_deg"]))
-        for method, name in ESTIMATORS.items()
+        (method, f"{float(fraction):.0%} measured", interval(errors["great_circle_deg"]))
         for fraction, rows in load("paper_scale")["aoa"].items()
+        for method, errors in sorted(rows.items(), key=lambda row: -float(row[1]["great_circle_deg"]["median"]))
+        if method in {"peak", LOCATED} or method.startswith(NETWORK)
     ]
     return pivot("estimator, training set", cells)
 

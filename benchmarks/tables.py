@@ -11,7 +11,7 @@ import rssi_tables
 import speed_tables
 from record import ROOT, load, markdown
 
-from augment.cross_validation import LOCATOR
+from augment.turbo.condition import LOCATED, MEASURED_NETWORK
 
 
 def random_rooms() -> str:
@@ -55,7 +55,7 @@ def headline() -> str:
         errors["synthetic"] = f"{errors[aoa_tables.turbo_condition(mix).method]} with synthetic spectra"
         degree[result["metrics"]["data"], result["metrics"]["split"], share] = errors
     office, tag = degree["newrf-office", "random", "0.3"], degree["s23-200", "block", "0.3"]
-    room = f"{office['synthetic']}, {office[LOCATOR]} by the room"
+    room = f"{office['synthetic']}, {office[LOCATED]} by the room"
     rows = [
         ["RSSI where nobody measured", "tetam-tracks, spatial"],
         ["position from RSSI", "tetam-tracks, spatial"],
@@ -69,8 +69,8 @@ def headline() -> str:
         [f"mean {metre['mean']:.2f} m", f"`{other}` {metre[other]:.2f} m", f"{metre['posterior']:.2f} m"],
         [f"1-NN {mean['nearest']:.2f} m", f"`knn` {mean['knn']:.2f} m", f"{mean['posterior']:.2f} m"],
         [f"nearest {coherence['nearest']}", f"Gaussian process {coherence['gaussian_process']}", channels],
-        [f"strongest peak {office['peak']}", f"network {office['measured_only']}", room],
-        [f"mean {tag['constant']}", f"network {tag['measured_only']}", tag["synthetic"]],
+        [f"strongest peak {office['peak']}", f"network {office[MEASURED_NETWORK]}", room],
+        [f"mean {tag['constant']}", f"network {tag[MEASURED_NETWORK]}", tag["synthetic"]],
     ]
     columns = ["question", "data, split", "simplest method", "best other method", "SwiftWRF"]
     return markdown(columns, [[*row, *three] for row, three in zip(rows, cells, strict=True)])
