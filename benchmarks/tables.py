@@ -12,6 +12,7 @@ import speed_tables
 from record import ROOT, load, markdown
 
 from augment.turbo.condition import LOCATED, MEASURED_NETWORK
+from swiftwrf.datasets import catalogue
 
 
 def random_rooms() -> str:
@@ -74,6 +75,15 @@ def headline() -> str:
     ]
     columns = ["question", "data, split", "simplest method", "best other method", "SwiftWRF"]
     return markdown(columns, [[*row, *three] for row, three in zip(rows, cells, strict=True)])
+
+
+def datasets() -> str:
+    """Return the public data sets that have a name."""
+    rows = [
+        [f"`{row.Index}`", str(row.content), str(row.licence), f"[{str(row.source).rpartition('/')[2]}]({row.source})"]
+        for row in catalogue().itertuples()
+    ]
+    return markdown(["name", "content", "licence", "source"], rows)
 
 
 MODULES = (aoa_tables, field_tables, rssi_tables, speed_tables)
