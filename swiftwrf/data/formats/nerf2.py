@@ -2,7 +2,7 @@
 
 | file | content |
 |---|---|
-| `gateway_info.yml` | one gateway: `position` [m], `orientation` (x, y, z, w); optional `frequency_hz` and `element_position` [m] |
+| `gateway_info.yml` | `position` [m], `orientation` (x, y, z, w); optional `frequency_hz`, `element_position` [m] |
 | `tx_pos.csv` or `rx_pos.csv` | header `x,y,z`: positions of the end that moves |
 | `spectrum/00001.png`, ... | 8-bit grey; row 0 the lowest elevation (90/H degrees), column 0 azimuth 0 |
 | `spectrum.npy` | alternative: floating point (n, elevations, azimuths) in [0, 1], or unsigned integers |

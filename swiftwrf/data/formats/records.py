@@ -2,8 +2,8 @@
 
 The JSON's `antennas` give each array's `location`, `spacingX` (along its rows) and `spacingY` [m], and its orientation:
 `rightvector` and `upvector` as seen from its front, or its `direction` alone for an upright array. The carrier is
-`frequency` [Hz]. Row 0 of an array is taken as its upper one and column 0 as its left one, seen from the front. The data sets
-do not define this, so inspect the frames. For DICHASUS the JSON contains `assignments`, the antenna of each row and column.
+`frequency` [Hz]. Row 0 of an array is taken as its upper one and column 0 as its left one, seen from the front. The data
+sets do not define this, so inspect the frames. For DICHASUS the JSON has `assignments`, the antenna of each row and column.
 
 | data set | `csi` | position |
 |---|---|---|
