@@ -70,24 +70,18 @@ def test_one_display_has_the_fraction_of_all_steps():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "first"),
-    [
-        (("rssi", "--rx", "1"), "model"),
-        (("locate",), "localizer"),
-        (("aoa", "--mix", "0.5", "--synthesizer", "nearest", "--extra", "0"), "condition"),
-    ],
+    ("run", "first", "unit"),
+    [("rssi_run", "model", "dB"), ("locate_run", "localizer", "m"), ("aoa_run", "measured", "deg")],
 )
-def test_a_run_shows_results_and_its_answer(tmp_path, capsys, arguments, first):
-    assert quick.run(*arguments, "--out", tmp_path / "run") == 0
-    out, err = capsys.readouterr()
+def test_a_run_shows_results_and_its_answer(request, run, first, unit):
+    folder = request.getfixturevalue(run)
+    out, err = ((folder.parent / name).read_text() for name in ("out.txt", "err.txt"))
     assert out.startswith(first)
-    assert out.splitlines()[-1] == f"report: {tmp_path / 'run' / 'report.html'}"
+    assert out.splitlines()[-1] == f"report: {folder / 'report.html'}"
     conclusion = next(line for line in out.split("\n\n")[1].splitlines())
-    assert conclusion.replace("'", "&#39;") in (tmp_path / "run" / "report.html").read_text()
-    unit = {"rssi": "dB", "locate": "m", "aoa": "deg"}[arguments[0]]
-    results = [line for line in err.splitlines() if line.endswith(f" {unit}")]
-    assert len(results) >= 4
-    assert not {*json.loads((tmp_path / "run" / "config.json").read_text())["config"]} & {"open", "quiet", "json"}
+    assert conclusion.replace("'", "&#39;") in (folder / "report.html").read_text()
+    assert len([line for line in err.splitlines() if line.endswith(f" {unit}")]) >= 4
+    assert not {*json.loads((folder / "config.json").read_text())["config"]} & {"open", "quiet", "json"}
 
 
 def test_quiet_runs_show_the_answer_alone(tmp_path, capsys):
