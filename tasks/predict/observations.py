@@ -48,7 +48,7 @@ def positions_of_rssi(locator: RssiLocator, config: PredictConfig) -> Columns:
         if data.groups is None:
             console.print(f"{data.name}: rows count as those of {offsets.column} {offsets.reference}")
         data = offsets.removed(data)
-    data = aligned(data.about(origin), locator.receiver_names)
+    data = aligned(data.about(origin), locator.receiver_names, config.ignore_receivers)
     locator.model.check_measurements(data)
     kept = data.detected.any(dim=1)
     if not bool(kept.any()):
@@ -76,10 +76,8 @@ def read_rssi(source: str, options: ReadOptions) -> tuple[Rssi, bool]:
         frame = read_table(file)
         if not has_positions(frame, options.columns or {}):
             somewhere = frame.assign(x=0.0, y=0.0, z=0.0)
-            columns, filler, offset_by = options.columns, options.filler, options.offset_by
-            data = Rssi.from_frame(
-                somewhere, columns=columns, filler=filler, offset_by=offset_by, pool_by=options.pool_by, name=file.stem
-            )
+            names = ("columns", "filler", "offset_by", "pool_by", "window")
+            data = Rssi.from_frame(somewhere, **{name: getattr(options, name) for name in names}, name=file.stem)
             return data, False
     return read(located(source), options, RSSI_FORMATS), True
 
