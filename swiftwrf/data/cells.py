@@ -72,7 +72,7 @@ def unit_of(column: pd.Series) -> str:
 
 
 def _words(name: str) -> str:
-    apart = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name.replace("dBm", "dbm"))
+    apart = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name.replace("dB", "db"))
     return re.sub(r"[^a-z0-9]+", "_", apart.lower()).strip("_")
 
 

@@ -73,7 +73,7 @@ def _fills_the_lower_edge(rssi: Floats, value: Floats, count: NDArray[np.int64])
     """Return True if the least value is frequent, and the least of most receivers."""
     if len(value) <= MIN_VALUES or count[0] < MIN_REPEATS or not _is_frequent(value, count, 0, N_NEIGHBOURS_DB):
         return False
-    weakest = np.where((rssi >= MIN_RSSI_DBM) & (rssi <= MAX_RSSI_DBM), rssi, np.inf).min(axis=0)
+    weakest = np.where(rssi >= value[0], rssi, np.inf).min(axis=0)
     return bool((weakest[np.isfinite(weakest)] == value[0]).mean() > 0.5)  # near receivers detect every row
 
 
@@ -94,6 +94,20 @@ def without_fillers(rssi: Floats, fillers: list[float]) -> tuple[Floats, list[st
     if NOT_DETECTED_DBM not in fillers and (n := int((rssi == NOT_DETECTED_DBM).sum())):
         notes.append(f"{NOT_DETECTED_DBM:g} dBm counts as measured: {n} cells")
     return np.where(filled, np.nan, rssi), notes
+
+
+def end_of_scale(rssi: Floats) -> list[str]:
+    """Return a note on the largest value of RSSI (n, R) [dBm] if it is as frequent as only the end of a scale is, or none.
+
+    Example:
+        >>> end_of_scale(np.array([[-50.0] * 6 + [-51, -52, -53, -58, -60, -62]]).T)
+        ['the scale ends at -50 dBm: 6 of 12 cells (50%) have this largest value, so their power is at least that']
+    """
+    value, count = np.unique(-rssi[~np.isnan(rssi)], return_counts=True)
+    if not _fills_the_lower_edge(-rssi, value, count):
+        return []
+    share = f"{count[0]} of {rssi.size} cells ({count[0] / rssi.size:.0%})"
+    return [f"the scale ends at {-value[0]:g} dBm: {share} have this largest value, so their power is at least that"]
 
 
 def check_powers(label: object, rssi: Floats, receivers: Sequence[str], source: NDArray[np.int64]) -> None:

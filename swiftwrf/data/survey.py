@@ -53,7 +53,7 @@ from swiftwrf.data.coordinates import (
     without_fix,
 )
 from swiftwrf.data.files import read_table
-from swiftwrf.data.powers import MIN_REPEATS, check_powers, find_fillers, without_fillers
+from swiftwrf.data.powers import MIN_REPEATS, check_powers, end_of_scale, find_fillers, without_fillers
 from swiftwrf.errors import InputError, listed
 from swiftwrf.positions import cells, check_positions
 
@@ -136,7 +136,7 @@ def read_survey(
     fillers = find_fillers(rssi) if filler is None else list(filler)
     rssi, filled = without_fillers(rssi, fillers)
     check_powers(label, rssi, names, source)
-    notes += found + filled
+    notes += found + filled + end_of_scale(rssi)
     if pool_by is not None:
         n_radios, pools = len(names), _pools(label, table, roles, names, pool_by)
         names, rssi = pooled(rssi, pools)
@@ -327,7 +327,8 @@ def _times(table: pd.DataFrame, roles: dict[str, str], position: Floats) -> tupl
 def _repeated_scans(coordinate: Floats, rssi: Floats) -> NDArray[np.bool_]:
     """Return which rows repeat the RSSI of the row before at another place. None are, if few do."""
     before = np.isnan(rssi[:-1]) & np.isnan(rssi[1:]) | (rssi[:-1] == rssi[1:])
-    several = (~np.isnan(rssi[1:])).sum(axis=1) >= MIN_REPEATED_RECEIVERS
+    top = np.nanmax(rssi) if end_of_scale(rssi) else np.inf  # which repeats by chance
+    several = (rssi[1:] < top).sum(axis=1) >= MIN_REPEATED_RECEIVERS
     repeated = np.append(False, before.all(axis=1) & several & (coordinate[1:, :2] != coordinate[:-1, :2]).any(axis=1))
     enough = repeated.sum() >= max(MIN_REPEATS, MIN_REPEATED * len(rssi))
     return repeated if enough else np.zeros_like(repeated)

@@ -27,6 +27,7 @@ from tasks.source import aligned, located, observed_spectra, reading
 from tasks.terminal import console
 
 Columns = dict[str, Any]  # of tensors, and arrays of names
+MAX_STEP_S = 1000.0  # between rows of a walk
 MAX_TRACKED = 20_000_000  # candidate positions of a walk that are in memory together
 
 
@@ -150,6 +151,12 @@ def _times(source: str, data: Rssi) -> Tensor:
     if bool(missing.any()):
         raise InputError(
             f"{source} row {int(data.index[missing][0])} (counted from 0) has no time [s] or date, which --track needs"
+        )
+    step = float(data.time.sort().values.diff().median()) if len(data) > 1 else 0.0
+    if step >= MAX_STEP_S:
+        raise InputError(
+            f"{source} has steps of {step:.0f} s, too long for --track; if its times are in milliseconds, call their column "
+            "time_ms"
         )
     return data.time
 
