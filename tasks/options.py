@@ -170,6 +170,8 @@ class SpectraSource:
     """distance of the first and the last of these subcarriers [Hz]"""
     drop_null: bool = False
     """leave out null subcarriers of array snapshots, which are the same at every position and element"""
+    drop_elements: tuple[int, ...] = ()
+    """leave out these elements of the array, counted from 0"""
     round_trip: bool = False
     """phases of array snapshots are those of the way there and back, as of RFID and backscatter"""
 

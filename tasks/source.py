@@ -38,6 +38,7 @@ def reading(spectra: SpectraSource, table: TableSource) -> ReadOptions:
         subcarriers=spectra.subcarriers,
         bandwidth=spectra.bandwidth,
         drop_null=spectra.drop_null,
+        drop_elements=spectra.drop_elements,
         round_trip=spectra.round_trip,
         columns=table.column_names,
         filler=table.fillers,

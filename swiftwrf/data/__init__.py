@@ -29,6 +29,7 @@ def load_spectra(
     subcarriers: PositiveInt | None = None,
     bandwidth: PositiveFloat | None = None,
     drop_null: bool = False,
+    drop_elements: tuple[int, ...] = (),
     round_trip: bool = False,
 ) -> Spectra:
     """Read spectra in any format of docs/formats.md: images or arrays of spectra, ray paths, array snapshots.
@@ -44,6 +45,7 @@ def load_spectra(
         subcarriers: Number of subcarriers at which the channel is computed from ray paths. Defaults to spectra alone.
         bandwidth: Distance of the first and the last of these subcarriers [Hz], at most the carrier.
         drop_null: Leaves out null subcarriers of array snapshots, which are the same at every position and element.
+        drop_elements: Elements of array snapshots to leave out, counted from 0.
         round_trip: Phases of array snapshots are those of the way there and back, as of RFID and backscatter.
 
     Raises:
@@ -64,6 +66,7 @@ def load_spectra(
         subcarriers,
         bandwidth,
         drop_null=drop_null,
+        drop_elements=drop_elements,
         round_trip=round_trip,
     )
     data = read(path, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS)
@@ -77,6 +80,7 @@ def load_snapshots(
     every: PositiveInt | None = None,
     station: PositiveInt | None = None,
     drop_null: bool = False,
+    drop_elements: tuple[int, ...] = (),
     round_trip: bool = False,
 ) -> Snapshots:
     """Read array snapshots, with arguments as in `load_spectra`.
@@ -89,7 +93,9 @@ def load_snapshots(
         Traceback (most recent call last):
         swiftwrf.errors.InputError: nowhere is not a folder or file; ...
     """
-    options = ReadOptions(every=every, station=station, drop_null=drop_null, round_trip=round_trip)
+    options = ReadOptions(
+        every=every, station=station, drop_null=drop_null, drop_elements=drop_elements, round_trip=round_trip
+    )
     data: Snapshots = read(path, options, SNAPSHOT_FORMATS)
     return data
 

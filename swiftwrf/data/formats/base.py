@@ -47,6 +47,7 @@ class ReadOptions:
     subcarriers: PositiveInt | None = None
     bandwidth: PositiveFloat | None = None
     drop_null: bool = False
+    drop_elements: tuple[int, ...] = ()
     round_trip: bool = False
     columns: Mapping[str, str] | None = None
     filler: tuple[float, ...] | None = None

@@ -1,8 +1,14 @@
 """Reader of the NeRF2 layout for RSSI: a table of RSSI, positions with the same rows, and positions of the receivers.
 
-The files are gateway_rssi.csv, tx_pos.csv or rx_pos.csv, gateway_position.yml, and perhaps meta.csv with columns of
-sessions and times, and survey.yml with properties of all measurements; or, as the BLE data of the paper are offered,
-rssi.csv, beacon_pos.csv and gateway_pos.csv.
+| file | content |
+|---|---|
+| `gateway_rssi.csv` | a column per receiver, named in the header [dBm]; -100 stands for not detected |
+| `tx_pos.csv` or `rx_pos.csv` | header `x,y,z`: positions of the end that moves |
+| `gateway_position.yml` | optional: `NAME: [x, y, z]` of receivers with known positions |
+| `meta.csv` | optional: a row per measurement, with its session (`session`, `run` or `walk`) and `time` [s] |
+| `survey.yml` | optional: `origin: [latitude, longitude]`, `floors: {NAME: height}` [m], `receiver_moves: true` |
+
+The BLE data of the NeRF2 paper are read unchanged: `rssi.csv`, `beacon_pos.csv` and `gateway_pos.csv`.
 """
 
 from __future__ import annotations
