@@ -2,7 +2,16 @@
 
 The JSON's `antennas` give each array's `location`, `spacingX` (along its rows) and `spacingY` [m], and its orientation:
 `rightvector` and `upvector` as seen from its front, or its `direction` alone for an upright array. The carrier is
-`frequency` [Hz]. Row 0 of an array is its upper one and column 0 its left one, seen from the front.
+`frequency` [Hz]. Row 0 of an array is taken as its upper one and column 0 as its left one, seen from the front. The data
+sets do not define this, so inspect the frames. For DICHASUS the JSON has `assignments`, the antenna of each row and column.
+
+| data set | `csi` | position |
+|---|---|---|
+| ESPARGOS | complex (arrays, 2, 4, subcarriers) | `pos` (3,) [m] |
+| DICHASUS | float32 (antennas, subcarriers, 2): real and imaginary parts, in the order of the FFT | `pos-tachy` (3,) [m] |
+
+64 evenly spaced subcarriers are kept. Phase and time offsets are applied if `reftx-offsets-NAME.json` lies beside
+`NAME.tfrecords`. Records without a finite position or channel are left out and counted.
 
 TFRecord files are read without TensorFlow: a frame around each record, and four protocol-buffer messages inside.
 
