@@ -163,7 +163,7 @@ def located_errors(fold: Fold, seed: int) -> Errors | None:
 
 
 def choose_estimator(
-    errors: Mapping[str, Sequence[Errors]], located: Mapping[int, Errors | None]
+    errors: Mapping[str, Sequence[Errors]], located: Mapping[int, Errors | None], locator: str = LOCATOR
 ) -> EstimatorChoiceMetrics:
     """Return the estimator with the smallest median error on held-out measured spectra, `better` left empty.
 
@@ -173,6 +173,7 @@ def choose_estimator(
     Args:
         errors: Angular errors [deg] on the held-out spectra of each fold, by name of the method.
         located: `located_errors` by number of the fold. Empty without a field model that has a room.
+        locator: Name of matched-field processing among the methods.
     """
     compared = {name: np.concatenate(parts) for name, parts in errors.items()}
     found = {number: own for number, own in located.items() if own is not None}
@@ -181,7 +182,7 @@ def choose_estimator(
             name: np.concatenate([parts[number][_located_rows(len(parts[number])).numpy()] for number in found])
             for name, parts in errors.items()
         }
-        compared[LOCATOR] = np.concatenate(list(found.values()))
+        compared[locator] = np.concatenate(list(found.values()))
     held_out = {name: float(np.median(values)) for name, values in compared.items()}
     best = min(held_out, key=lambda name: held_out[name])
     return {"name": best, "held_out_deg": held_out, "n_held_out": len(compared[best]), "better": {}}

@@ -68,9 +68,9 @@ class Mixed:
     @property
     def counts(self) -> dict[str, int]:
         """Number of measured spectra, of synthetic spectra at withheld positions, and of those at extra positions."""
-        further = int((self.index == NO_INDEX).sum())
+        extra = int((self.index == NO_INDEX).sum())
         synthetic = int(self.synthetic.sum())
-        return {"measured": len(self) - synthetic, "withheld": synthetic - further, "further": further}
+        return {"measured": len(self) - synthetic, "withheld": synthetic - extra, "extra": extra}
 
     def select(self, rows: Tensor) -> Tensor:
         """Return some spectra, float32 (m, H, W).

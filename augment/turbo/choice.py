@@ -51,7 +51,7 @@ def _first_steps(experiment: Experiment, subset: MeasuredSubset) -> list[Step[Ex
         shared = subset == MeasuredSubset(fractions[0]) and 1.0 not in fractions
         steps.append(RoomSearch(subset, (), experiment.located_by(subset), EVERYTHING if shared else None))
     # independent of the measured fraction, so all fractions share these steps
-    return [*steps, *(reference(estimator, "all") for estimator in experiment.trainable)]
+    return [*steps, *(reference(estimator, "all measured") for estimator in experiment.trainable)]
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,9 @@ class CrossValidation(Step[Experiment]):
         folds = choice.folds[trained[0]]
         for name in experiment.evaluated:
             if name not in (*NETWORKS.values(), STAND_IN, *experiment.lacking):
-                errors[name] = [measured_errors(fold, experiment.make_estimator(name, self.subset)) for fold in folds]
+                errors[Condition(name, "measured").method] = [
+                    measured_errors(fold, experiment.make_estimator(name, self.subset)) for fold in folds
+                ]
         with_room = self._with_room(experiment, measured, choice)
         return {
             "choice": {
@@ -127,7 +129,9 @@ class CrossValidation(Step[Experiment]):
     def _turbo(self, experiment: Experiment, synthesizer: str, validation: CrossValidationMetrics) -> Condition:
         """Return the condition of the stand-in with all spectra of a field model."""
         number = experiment.n_extra(validation)
-        return Condition(STAND_IN, "turbo_extra" if number else "turbo", synthesizer, number)
+        return Condition(
+            STAND_IN, "measured + synthetic + extra" if number else "measured + synthetic", synthesizer, number
+        )
 
     def then(self, experiment: Experiment, value: Row) -> Sequence[Step[Experiment]]:
         named = [name for name in experiment.models if name != AUTO]

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from augment.cross_validation import LOCATOR, STAND_IN
+from augment.estimators import ESTIMATORS
 from swiftwrf.choices import AUTO, fraction_key
 from swiftwrf.runtime.validation import Preset
 
 Row = dict[str, Any]
-Training = Literal["measured", "turbo", "turbo_extra", "all"]
-NETWORKS: dict[Preset, str] = {"quick": "aann_kernel", "paper": "aann"}
-"""network that a run of each preset trains; names of its conditions omit it"""
-MEASURED_STAND_IN = f"{STAND_IN}_measured_only"  # file of it without synthetic spectra
+Training = Literal["measured", "measured + synthetic", "measured + synthetic + extra", "all measured"]
+NETWORK = "network"  # name of a run's network in its results
+NETWORKS: dict[Preset, str] = {"quick": "aann_kernel", "paper": "aann"}  # which one it is
+MEASURED_NETWORK, FULL_NETWORK = f"{NETWORK}, measured", f"{NETWORK}, all measured"  # lower and upper reference
+LOCATED = f"{LOCATOR}, measured"
+MEASURED_STAND_IN = f"{STAND_IN}-measured"  # file of it without synthetic spectra
 Value = TypeVar("Value")
 
 
@@ -54,16 +58,16 @@ class Condition:
 
     Args:
         estimator: Name of the estimator.
-        training: Training set. "measured": the measured spectra. "turbo": these and synthetic spectra at the withheld
-            positions. "turbo_extra": these and synthetic spectra at extra positions. "all": all spectra, measured.
+        training: Training set: the measured spectra, these and synthetic ones at the withheld positions, these and synthetic
+            ones at extra positions, or all training spectra as measured.
         synthesizer: Name of the field model of the synthetic spectra, empty without any.
         n_synthetic: Number of extra synthetic positions.
         measured_fraction: Fraction of the training spectra that is measured.
         repeat: Number of the repeat.
 
     Example:
-        >>> Condition("kernel_regression", "turbo_extra", "hybrid", 3000).method
-        'kernel_regression_turbo_hybrid_extra'
+        >>> Condition("kernel_regression", "measured + synthetic", "hybrid").method
+        'kernel_regression, measured + synthetic (hybrid)'
     """
 
     estimator: str
@@ -74,37 +78,20 @@ class Condition:
     repeat: int = 0
 
     @property
+    def name(self) -> str:
+        """Name of the estimator. A run has one network, whose name does not depend on the preset."""
+        return NETWORK if self.is_network else self.estimator
+
+    @property
     def training_set(self) -> str:
-        """Name of the training set in metrics.json and in reports."""
-        match self.training:
-            case "measured":
-                return "measured_only"
-            case "all":
-                return "measured_all"
-            case "turbo":
-                return f"turbo_{self.synthesizer}"
-            case "turbo_extra":
-                return f"turbo_{self.synthesizer}_extra"
+        """Name of the training set, with the field model of its synthetic spectra."""
+        return f"{self.training} ({self.synthesizer})" if self.synthesizer else self.training
 
     @property
     def method(self) -> str:
-        """Name of the condition in metrics.json and in reports, the same for all fractions and repeats."""
-        if self.is_network:
-            return self.training_set
-        return self.estimator if self.training == "measured" else f"{self.estimator}_{self.training_set}"
-
-    @property
-    def meaning(self) -> str:
-        """Training set in words."""
-        match self.training:
-            case "measured":
-                return "measured only"
-            case "all":
-                return "all measured"
-            case "turbo":
-                return f"with synthetic spectra ({self.synthesizer})"
-            case "turbo_extra":
-                return f"with {self.n_synthetic:,} extra synthetic spectra ({self.synthesizer})"
+        """Name of the condition in all results: estimator and training set, of which untrained estimators have none."""
+        trained = self.estimator not in ESTIMATORS or ESTIMATORS[self.estimator].trainable
+        return f"{self.name}, {self.training_set}" if trained else self.name
 
     @property
     def subset(self) -> MeasuredSubset:
@@ -114,7 +101,8 @@ class Condition:
     @property
     def result_name(self) -> str:
         """Name of the kept result. Measured fractions share the result of a condition that is trained on all spectra."""
-        return f"{self.method}-{f'r{self.repeat}' if self.training == 'all' else self.subset}"
+        part = f"r{self.repeat}" if self.training == "all measured" else self.subset
+        return f"{re.sub(r'[^0-9A-Za-z_]+', '_', self.method).strip('_')}-{part}"
 
     @property
     def measured_only(self) -> Condition:
@@ -160,7 +148,8 @@ def chosen_file(folder: Path, measured_fraction: str, condition: Condition | Non
     """
     if condition is None:
         return None
-    name = MEASURED_STAND_IN if condition.method == STAND_IN else condition.estimator
+    alone = condition.estimator == STAND_IN and condition.training == "measured"
+    name = MEASURED_STAND_IN if alone else condition.name
     file = folder / f"{name}-mix{measured_fraction}.safetensors"
     return file if file.is_file() else None
 
@@ -175,7 +164,7 @@ def headline(conditions: Iterable[Condition]) -> Condition:
         ValueError: Neither was trained with synthetic spectra.
     """
     turbo = [c for c in conditions if c.is_turbo and (c.is_network or c.estimator == STAND_IN)]
-    return max(turbo, key=lambda c: (c.is_network, c.training == "turbo_extra"))
+    return max(turbo, key=lambda c: (c.is_network, c.training == "measured + synthetic + extra"))
 
 
 def reference_of(conditions: Mapping[str, Condition], error: Mapping[str, float]) -> str:
@@ -189,9 +178,9 @@ def reference_of(conditions: Mapping[str, Condition], error: Mapping[str, float]
         error: Error of each method.
 
     Example:
-        >>> conditions = {name: Condition(name, "measured") for name in ("peak", "kernel_regression")}
-        >>> reference_of(conditions, {"peak": 9.0, "kernel_regression": 2.0})
-        'kernel_regression'
+        >>> conditions = {c.method: c for c in (Condition("peak", "measured"), Condition("kernel_regression", "measured"))}
+        >>> reference_of(conditions, {"peak": 9.0, "kernel_regression, measured": 2.0})
+        'kernel_regression, measured'
     """
     alone = [name for name, c in conditions.items() if c.training == "measured" and c.estimator != LOCATOR]
     return min(alone, key=lambda name: error[name])
@@ -206,8 +195,9 @@ def pooled(results: list[tuple[Condition, Value]], auto: bool) -> list[tuple[Con
 
     Args:
         results: Results by condition.
-        auto: Whether the repeats choose their field model. Their choices then become the condition `turbo_auto`. Otherwise
-            `turbo_NAME_extra` contains the result without extra positions of those repeats that were advised against them.
+        auto: Whether the repeats choose their field model. Their choices then become one condition, "measured + synthetic
+            (auto)". Otherwise a condition with extra positions contains the result without them of those repeats that were
+            advised against them.
     """
     trainings: dict[tuple[float, str], dict[int, set[tuple[str, str]]]] = {}
     for condition, _ in results:
@@ -220,14 +210,15 @@ def pooled(results: list[tuple[Condition, Value]], auto: bool) -> list[tuple[Con
         if not condition.is_turbo or len({frozenset(names) for names in repeats.values()}) == 1:
             found.append((condition, value))
             continue
-        own, extra = repeats[condition.repeat], (condition.synthesizer, "turbo_extra")
+        most: Training = "measured + synthetic + extra"
+        own, extra = repeats[condition.repeat], (condition.synthesizer, most)
         if auto:
-            if condition.training == "turbo_extra" or not any(training == "turbo_extra" for _, training in own):
-                found.append((replace(condition, training="turbo", synthesizer=AUTO), value))
+            if condition.training == most or not any(training == most for _, training in own):
+                found.append((replace(condition, training="measured + synthetic", synthesizer=AUTO), value))
             continue
         own_way = (condition.synthesizer, condition.training)
         if own_way == extra or all(own_way in others for others in repeats.values()):
             found.append((condition, value))
         if extra not in own and any(extra in others for others in repeats.values()):
-            found.append((replace(condition, training="turbo_extra"), value))
+            found.append((replace(condition, training=most), value))
     return found

@@ -175,7 +175,7 @@ class Experiment:
             )
         if subset == EVERYTHING:
             found += [
-                Condition(LOCATOR, "all", measured_fraction=fraction, repeat=repeat)
+                Condition(LOCATOR, "all measured", measured_fraction=fraction, repeat=repeat)
                 for repeat in range(self.repeats)
                 for fraction in self.fractions
             ]

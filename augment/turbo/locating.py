@@ -48,11 +48,11 @@ class Locating(Step[Experiment]):
 
     @property
     def title(self) -> str:
-        return f"locating by the room, {self.condition.meaning}"
+        return f"{self.condition.method}"
 
     def compute(self, experiment: Experiment, folder: Path) -> Row:
         condition, test = self.condition, experiment.test
-        of_all = condition.training == "all"
+        of_all = condition.training == "all measured"
         measured = experiment.train if of_all else experiment.withhold(condition.subset)[0]
         room = load(folder / self.room_file)
         assert isinstance(room, FieldModel)

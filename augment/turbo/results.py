@@ -20,7 +20,7 @@ from augment.cross_validation import (
     choose_estimator,
 )
 from augment.turbo.choice import CrossValidation, FoldLocating
-from augment.turbo.condition import EVERYTHING, Condition, MeasuredSubset, Row, pooled, reference_of
+from augment.turbo.condition import EVERYTHING, LOCATED, Condition, MeasuredSubset, Row, pooled, reference_of
 from augment.turbo.experiment import ROOM_MODEL, Experiment
 from augment.turbo.locating import LEVEL, NO_PLANE, Locating
 from augment.turbo.synthesis import Evaluation, RoomSearch, Synthesis
@@ -208,8 +208,8 @@ class Results:
     def _leave_out(self, conditions: Iterable[Condition], reason: str) -> None:
         """Record why conditions are not in the results."""
         for condition in conditions:
-            share = "everything" if condition.training == "all" else f"{condition.measured_fraction:.0%}"
-            self._note(f"{condition.method} is left out with {share} measured: {reason}")
+            share = "everything" if condition.training == "all measured" else f"{condition.measured_fraction:.0%}"
+            self._note(f"{condition.name} is left out with {share} measured: {reason}")
             self.left_out[condition] = reason
 
     def _note(self, sentence: str) -> None:
@@ -265,7 +265,11 @@ class Results:
         located = self.located_folds.get(key, {})
         if not any(c.estimator == LOCATOR and c.measured_fraction == fraction for c, _ in self.pooled):
             located = {}  # its fit to all measured spectra was refused
-        choice = choose_estimator(errors, {n: None if own is None else np.array(own) for n, own in located.items()})
+        choice = choose_estimator(
+            errors,
+            {n: None if own is None else np.array(own) for n, own in located.items()},
+            LOCATED,
+        )
         return {**choice, "better": self._better(fraction, choice)}
 
     def _better(self, fraction: float, choice: EstimatorChoiceMetrics) -> dict[str, str]:
@@ -274,7 +278,7 @@ class Results:
         error = {method: by_repeat(part, "great_circle_deg") for method, part in errors.groupby("method")}
         reasons = {}
         for condition, _ in self.pooled:
-            if condition.measured_fraction != fraction or condition.training == "all":
+            if condition.measured_fraction != fraction or condition.training == "all measured":
                 continue
             if condition.method in choice["held_out_deg"]:
                 reason = "its error on held-out measured spectra is larger"

@@ -209,9 +209,9 @@ class Synthesis(Step[Experiment]):
         )
 
     def then(self, experiment: Experiment, value: Row) -> Sequence[Step[Experiment]]:
-        trainings: list[tuple[Training, int]] = [("turbo", 0)] if self.trains else []
+        trainings: list[tuple[Training, int]] = [("measured + synthetic", 0)] if self.trains else []
         if self.n_synthetic:
-            trainings.append(("turbo_extra", self.n_synthetic))
+            trainings.append(("measured + synthetic + extra", self.n_synthetic))
         fraction, repeat = self.subset.measured_fraction, self.subset.repeat
         return [
             Evaluation(Condition(estimator, training, self.synthesizer, number, fraction, repeat), self)
@@ -245,7 +245,7 @@ class Evaluation(Step[Experiment]):
 
     @property
     def title(self) -> str:
-        return f"training {self.condition.estimator}, {self.condition.meaning}"
+        return self.condition.method
 
     @property
     def priority(self) -> int:
@@ -271,20 +271,21 @@ class Evaluation(Step[Experiment]):
         if self.subset.repeat:
             return ""
         if self.synthesis is None:
-            return MEASURED_STAND_IN if self.condition.method == STAND_IN else ""
+            alone = self.condition.estimator == STAND_IN and self.condition.training == "measured"
+            return MEASURED_STAND_IN if alone else ""
         first = experiment.models[0] in (AUTO, self.synthesis.synthesizer)
         is_complete = self.condition.n_synthetic == self.synthesis.n_synthetic
-        return self.condition.estimator if first and is_complete else ""
+        return self.condition.name if first and is_complete else ""
 
     def training_set(self, experiment: Experiment, folder: Path) -> Mixed:
         """Return the spectra that train the estimator."""
-        if self.condition.training == "all":
+        if self.condition.training == "all measured":
             return Mixed.measured(experiment.train)
         measured, _ = experiment.withhold(self.subset)
         if self.synthesis is None:
             return Mixed.measured(measured)
         train = mix(measured, *self.synthesis.training_spectra(folder, "withheld"))
-        if self.condition.training == "turbo_extra":
+        if self.condition.training == "measured + synthetic + extra":
             train = train.add(*self.synthesis.training_spectra(folder, "extra"))
         return train
 

@@ -120,8 +120,8 @@ def _show(experiment: Experiment, step: Step[Experiment], value: Row) -> None:
         return
     condition = step.condition
     error = angle_errors(torch.tensor(value["estimate"], dtype=torch.float64), experiment.test.label)["great_circle"]
-    name = f"{condition.estimator}, {condition.meaning}"
-    if condition.training != "all" and len(experiment.fractions) > 1:
+    name = condition.method
+    if condition.training != "all measured" and len(experiment.fractions) > 1:
         name = f"{condition.measured_fraction:.0%}: {name}"
     terminal.result(name, f"{float(error.nanquantile(0.5).rad2deg()):.2f} deg")
 

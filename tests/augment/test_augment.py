@@ -157,7 +157,7 @@ def test_counts_say_where_spectra_come_from():
     measured, withheld = withhold(TRAIN, 0.5, 0)
     further = synthetic_positions(measured, 7, seed=0)
     mixed = mix(measured, withheld, torch.zeros(len(withheld), 15, 60)).add(further, torch.zeros(7, 15, 60))
-    assert mixed.counts == {"measured": len(measured), "withheld": len(withheld), "further": 7}
+    assert mixed.counts == {"measured": len(measured), "withheld": len(withheld), "extra": 7}
 
 
 def test_choice_takes_the_best_on_held_out_spectra():

@@ -37,18 +37,18 @@ def test_models_and_estimators_of_ones_own(data):
     result = turbo_learning(data, measured=0.5, models=[Renamed(), "idw"], estimators=["peak", Zenith()], extra=0)
     methods = {
         "peak",
-        "Zenith",
-        "Zenith_turbo_renamed",
-        "kernel_regression_turbo_renamed",
-        "kernel_regression_turbo_idw",
+        "Zenith, measured",
+        "Zenith, measured + synthetic (renamed)",
+        "kernel_regression, measured + synthetic (renamed)",
+        "kernel_regression, measured + synthetic (idw)",
     }
     assert methods <= set(result.summary().index)
-    assert not {"measured_only", "matched_field"} & set(
+    assert not {"network, measured", "matched_field, measured"} & set(
         result.summary().index
     )  # neither network nor room was asked for
     assert result.summary()["median"].is_monotonic_increasing
     assert set(result.metrics["synthesis"]) == {"renamed", "idw"}
-    change = result.summary().loc["Zenith_turbo_renamed"]
+    change = result.summary().loc["Zenith, measured + synthetic (renamed)"]
     assert change["change_low"] <= change["change"] <= change["change_high"]
     own = result.errors[result.errors.method == result.choice["name"]]
     test = data.subset(torch.tensor(own["index"].tolist()))

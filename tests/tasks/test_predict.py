@@ -95,11 +95,11 @@ def test_a_damaged_network_is_refused(network, tmp_path, change):
 def test_a_run_keeps_the_estimator_that_saw_most(finished):
     files = sorted(file.name for file in finished.glob("*.safetensors"))
     # the network of these runs is a stand-in that cannot be saved
-    assert files == ["kernel_regression-mix0.5.safetensors", "kernel_regression_measured_only-mix0.5.safetensors"]
+    assert files == ["kernel_regression-measured-mix0.5.safetensors", "kernel_regression-mix0.5.safetensors"]
     assert "kernel_regression-mix0.5.safetensors" in (finished / "report.html").read_text()
     estimator = load(finished / "kernel_regression-mix0.5.safetensors")
     errors = pd.read_csv(finished / "errors.csv")
-    own = errors[errors.method == "kernel_regression_turbo_nearest_extra"]
+    own = errors[errors.method == "kernel_regression, measured + synthetic + extra (nearest)"]
     test = simulated_room(n=30, grid=GRID).subset(torch.tensor(own["index"].tolist()))
     estimate = estimator.predict(test.spectrum).rad2deg().numpy()
     np.testing.assert_allclose(estimate, own[["estimate_azimuth_deg", "estimate_elevation_deg"]], atol=1e-3)
@@ -108,7 +108,7 @@ def test_a_run_keeps_the_estimator_that_saw_most(finished):
 def test_the_estimator_that_a_run_recommends_is_the_one_that_cross_validation_chose(finished):
     fraction = FractionRecords.of(Records(finished))[0]
     recommended = {}
-    for name in ("kernel_regression", "kernel_regression_turbo_nearest_extra"):
+    for name in ("kernel_regression, measured", "kernel_regression, measured + synthetic + extra (nearest)"):
         fraction.mix["estimator_choice"] = {"name": name, "held_out_deg": {name: 1.0}, "n_held_out": 9, "better": {}}
         (step,) = (text for text in next_steps(fraction) if text.startswith("Take"))
         assert f"`python -m tasks.predict {finished} SOURCE`" in step

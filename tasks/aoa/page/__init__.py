@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from augment.cross_validation import LOCATOR
 from augment.estimators import ESTIMATORS
-from augment.turbo.condition import NETWORKS
+from augment.turbo.condition import NETWORK, NETWORKS
 from tasks import labels
 from tasks.aoa.page.cost import sizes, speed_section, time_section, trainings
 from tasks.aoa.page.field import field_section
@@ -108,13 +108,13 @@ def _limits(run: AoaRecords) -> Section:
 def terms() -> dict[str, str]:
     """Return what the parts of the names of methods mean."""
     return {
-        "measured_only": "lower reference: trained on the measured spectra alone",
-        "measured_all": "upper reference: trained on all training spectra, measured",
-        "turbo_NAME": "trained on the measured spectra and on spectra that NAME predicts at the withheld positions",
-        "turbo_NAME_extra": "turbo_NAME with synthetic spectra at extra positions, their number by --extra",
-        "turbo_auto": "the choice of each repeat by cross-validation, where repeats chose differently",
+        "measured": "trained on the measured spectra alone",
+        "all measured": "trained on all training spectra as if they were measured",
+        "measured + synthetic (NAME)": "trained on the measured spectra, and on those that NAME predicts at the withheld "
+        "positions; NAME is auto where repeats chose different field models",
+        "measured + synthetic + extra (NAME)": "the same, and spectra that NAME predicts at extra positions, as many as "
+        "--extra",
+        NETWORK: f"{' or, with --preset paper, '.join(NETWORKS.values())}",
         **{name: label.meaning for name, label in labels.labels(ESTIMATORS, labels.ESTIMATORS).items()},
         LOCATOR: labels.ESTIMATORS[LOCATOR].meaning,
-        "no estimator's name": f"the network ({' or '.join(NETWORKS.values())}); the name of another estimator alone: "
-        "trained on measured spectra",
     }

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from augment.cross_validation import LOCATOR
+from augment.turbo.condition import FULL_NETWORK, LOCATED, MEASURED_NETWORK
 from tasks.aoa.page.records import FractionRecords, palette
 from tasks.aoa.page.room import FIXED, draw_in_plan, extent
 from tasks.aoa.page.synthesis import examples, spectra
@@ -22,8 +22,8 @@ SHOWN_SPECTRUM = 3  # of the examples, quantile 0.4 of the quality
 def essential(fraction: FractionRecords) -> list[str]:
     """Return the methods of overviews, in their order: baselines, without synthetic spectra, with them, references."""
     choice = fraction.mix["estimator_choice"]
-    names = [*BASELINES, fraction.mix["reference"], "measured_only", fraction.turbo_method, LOCATOR]
-    names += [*([choice["name"]] if choice else []), "measured_all"]
+    names = [*BASELINES, fraction.mix["reference"], MEASURED_NETWORK, fraction.turbo_method, LOCATED]
+    names += [*([choice["name"]] if choice else []), FULL_NETWORK]
     return [name for name in dict.fromkeys(names) if name in fraction.mix["methods"]]
 
 
@@ -52,7 +52,7 @@ def overview(fraction: FractionRecords) -> Plot:
 def located_plan(fraction: FractionRecords) -> Figure:
     """Return the plan of the room with a line from each test position to its estimate."""
     table = fraction.table("positions")
-    own = table[(table["method"] == LOCATOR) & (table["repeat"] == 0)]
+    own = table[(table["method"] == LOCATED) & (table["repeat"] == 0)]
     truth, estimate = own[["truth_x_m", "truth_y_m"]].to_numpy(), own[["estimate_x_m", "estimate_y_m"]].to_numpy()
     figure, plan = figures.panel(4.8, 3.8)
     draw_room(plan, fraction.arrays("located"))
@@ -90,8 +90,8 @@ def compared(fractions: list[FractionRecords]) -> tuple[Table, Plot]:
         *BASELINES,
         *(fraction.mix["reference"] for fraction in fractions),
         *(fraction.turbo_method for fraction in fractions),
-        LOCATOR,
-        "measured_all",
+        LOCATED,
+        FULL_NETWORK,
     ]
     conditions = [condition for fraction in fractions for condition in fraction.conditions.values()]
     names = [name for name in dict.fromkeys(shown) if any(name in one.errors for one in every)]

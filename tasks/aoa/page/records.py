@@ -134,7 +134,7 @@ def palette(conditions: Iterable[Condition]) -> Palette:
                 colour = LOWER_REFERENCE
             case "measured":
                 colour = estimators.colour(condition.estimator)
-            case "all":
+            case "all measured":
                 colour = UPPER_REFERENCE
             case _:
                 colour = CHOSEN if condition.synthesizer == AUTO else models.colour(condition.synthesizer)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from augment.cross_validation import LOCATOR
+from augment.turbo.condition import FULL_NETWORK, LOCATED, MEASURED_NETWORK
 from augment.turbo.results import Angle
 from swiftwrf.metrics import ChangeMetrics
 from tasks.aoa.page.overview import BASELINES
@@ -30,7 +30,7 @@ def results_section(fraction: FractionRecords) -> Section:
             name,
             *(with_interval(method[column]) for column in ERRORS),
             number(method["great_circle_deg"]["p90"]),
-            fraction.conditions[name].meaning if name in fraction.conditions else "",
+            fraction.conditions[name].training if name in fraction.conditions else "",
         ]
         for name, method in methods
     ]
@@ -84,15 +84,15 @@ def choice_sentence(fraction: FractionRecords) -> str:
         f"Cross-validation inside the measured fraction chooses {choice['name']} (median error in degrees on "
         f"{choice['n_held_out']} held-out spectra: {errors})."
     )
-    if LOCATOR not in choice["held_out_deg"]:
-        text += f" {LOCATOR} is not a candidate: no planes were found without the held-out spectra."
+    if LOCATED not in choice["held_out_deg"]:
+        text += f" {LOCATED} is not a candidate: no planes were found without the held-out spectra."
     return text
 
 
 def _cdf(fraction: FractionRecords) -> Plot:
     """Return the distributions of the errors of the baseline, the best one on measured spectra, and the networks."""
     table = fraction.table("errors")
-    wanted = ("peak", fraction.mix["reference"], fraction.turbo_method, LOCATOR, "measured_all")
+    wanted = ("peak", fraction.mix["reference"], fraction.turbo_method, LOCATED, FULL_NETWORK)
     names = [name for name in dict.fromkeys(wanted) if name in fraction.mix["methods"]][:MAX_CURVES]
     panels = []
     for column, name in ERRORS.items():
@@ -115,7 +115,7 @@ def turbo_distribution(fraction: FractionRecords) -> list[Plot]:
     own = own[own["method"].isin(shown)]
     panels = []
     for start in range(0, len(turbo), MAX_CURVES - 2):
-        names = ["measured_only", *turbo[start : start + MAX_CURVES - 2], "measured_all"]
+        names = [MEASURED_NETWORK, *turbo[start : start + MAX_CURVES - 2], FULL_NETWORK]
         groups = {name: own[own["method"] == name]["great_circle_deg"] for name in names if name in shown}
         figure, ax = figures.panel(5, 3.4)
         limit = max(*(float(part.quantile(0.95)) for part in groups.values()), 1e-3)

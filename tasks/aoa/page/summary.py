@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from augment.cross_validation import LOCATOR
 from augment.estimators import ESTIMATORS
-from augment.turbo.condition import MEASURED_STAND_IN
+from augment.turbo.condition import LOCATED, MEASURED_STAND_IN
 from tasks.aoa.page.overview import overview
 from tasks.aoa.page.records import AoaRecords, FractionRecords
 from tasks.aoa.page.results import change_text, choice_sentence, gain_sentence, judgement
@@ -53,7 +53,7 @@ def answer(run: AoaRecords) -> Answer:
     for fraction in fractions:
         share = {"measured": fraction.percent} if len(fractions) > 1 else {}
         for method, condition in fraction.conditions.items():
-            names = {"condition": condition.meaning, "estimator": condition.estimator}
+            names = {"estimator": condition.name, "training spectra": condition.training_set}
             rows.append((share | names, fraction.mix["methods"][method]["great_circle_deg"]))
     return Answer("deg", rows, conclusion(fractions[0]), next_steps(fractions[0]))
 
@@ -67,7 +67,7 @@ def conclusion(fraction: FractionRecords) -> str:
             sentences.append(f"{name} has {medians[name]:.2f} degrees, but is not recommended: {reason}.")
     best = fraction.mix["reference"]
     change = fraction.mix["methods"][fraction.turbo_method]["changes"][best]
-    without = "that uses neither them nor the room" if LOCATOR in medians else "without them"
+    without = "that uses neither them nor the room" if LOCATED in medians else "without them"
     sentences.append(
         f"With synthetic spectra {fraction.learner} changes the median error by {change_text(change)} against {best}, "
         f"the best estimator {without}: {judgement(change)}."

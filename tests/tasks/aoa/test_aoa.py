@@ -156,27 +156,36 @@ def test_the_headline_is_of_the_network_that_is_kept():
     """Named by its training set, not by its error on test spectra."""
     conditions = [
         Condition("aann_kernel", "measured"),
-        Condition("aann_kernel", "turbo", "gp"),
-        Condition("kernel_regression", "turbo_extra", "gp"),
-        Condition("aann_kernel", "turbo_extra", "gp"),
-        Condition("aann_kernel", "turbo_extra", "idw"),
-        Condition("aann_kernel", "all"),
+        Condition("aann_kernel", "measured + synthetic", "gp"),
+        Condition("kernel_regression", "measured + synthetic + extra", "gp"),
+        Condition("aann_kernel", "measured + synthetic + extra", "gp"),
+        Condition("aann_kernel", "measured + synthetic + extra", "idw"),
+        Condition("aann_kernel", "all measured"),
     ]
-    assert headline(conditions).method == "turbo_gp_extra"
-    assert headline([conditions[1], Condition("aann_kernel", "turbo", "idw"), conditions[2]]).method == "turbo_gp"
+    assert headline(conditions).method == "network, measured + synthetic + extra (gp)"
+    assert (
+        headline([conditions[1], Condition("aann_kernel", "measured + synthetic", "idw"), conditions[2]]).method
+        == "network, measured + synthetic (gp)"
+    )
 
 
 @pytest.mark.parametrize(
     ("condition", "method"),
     [
-        (Condition("aann_kernel", "measured"), "measured_only"),
-        (Condition("aann_kernel", "all"), "measured_all"),
-        (Condition("aann_kernel", "turbo", "hybrid"), "turbo_hybrid"),
-        (Condition("aann_kernel", "turbo_extra", "hybrid"), "turbo_hybrid_extra"),
+        (Condition("aann_kernel", "measured"), "network, measured"),
+        (Condition("aann_kernel", "all measured"), "network, all measured"),
+        (Condition("aann_kernel", "measured + synthetic", "hybrid"), "network, measured + synthetic (hybrid)"),
+        (
+            Condition("aann_kernel", "measured + synthetic + extra", "hybrid"),
+            "network, measured + synthetic + extra (hybrid)",
+        ),
         (Condition("peak", "measured"), "peak"),
-        (Condition("kernel_regression", "all"), "kernel_regression_measured_all"),
-        (Condition("kernel_regression", "turbo_extra", "gp"), "kernel_regression_turbo_gp_extra"),
-        (Condition("aann_kernel", "turbo", "auto"), "turbo_auto"),
+        (Condition("kernel_regression", "all measured"), "kernel_regression, all measured"),
+        (
+            Condition("kernel_regression", "measured + synthetic + extra", "gp"),
+            "kernel_regression, measured + synthetic + extra (gp)",
+        ),
+        (Condition("aann_kernel", "measured + synthetic", "auto"), "network, measured + synthetic (auto)"),
     ],
 )
 def test_names_of_conditions_are_those_of_metrics_json(condition, method):
@@ -385,15 +394,18 @@ def test_whole_run(small, tmp_path):
         0,
     )
     methods = metrics["mixes"]["0.5"]["methods"]
-    trainings = ["measured_all", *(f"turbo_{name}{more}" for name in ("swiftwrf", "idw") for more in ("", "_extra"))]
-    others = ("nearest_spectrum", "kernel_regression")
-    networks = {name for name in trainings if name == "measured_all" or name.endswith("_extra")}
-    expected = {"measured_only", "constant", "peak", *others, *networks}
-    expected |= {f"{estimator}_{training}" for estimator in others for training in trainings}
+    synthetic = {f"measured + synthetic{more} ({name})" for name in ("swiftwrf", "idw") for more in ("", " + extra")}
+    every = {"measured", "all measured", *synthetic}
+    expected = {"constant", "peak", *(f"network, {training}" for training in every if "synthetic (" not in training)}
+    expected |= {f"{name}, {training}" for name in ("nearest_spectrum", "kernel_regression") for training in every}
     assert set(methods) == expected
     drawn = {"swiftwrf", "idw", "gp", "coarray"}
     assert set(metrics["mixes"]["0.5"]["synthesis"]) == drawn
-    assert metrics["mixes"]["0.5"]["counts"]["turbo_idw_extra"] == {"measured": 20, "withheld": 20, "further": 20}
+    assert metrics["mixes"]["0.5"]["counts"]["measured + synthetic + extra (idw)"] == {
+        "measured": 20,
+        "withheld": 20,
+        "extra": 20,
+    }
     assert (
         metrics["mixes"]["0.5"]["cross_validation"]["swiftwrf"]["n_held_out"] == 16
     )  # of 20: one fold is never scored
@@ -401,13 +413,17 @@ def test_whole_run(small, tmp_path):
 
     errors = pd.read_csv(out / "errors.csv")
     assert len(errors) == 2 * 18 * 10  # fractions, methods, test spectra
-    own = errors[(errors.measured_fraction == 0.5) & (errors.method == "turbo_swiftwrf_extra")]
+    own = errors[
+        (errors.measured_fraction == 0.5) & (errors.method == "network, measured + synthetic + extra (swiftwrf)")
+    ]
     assert set(own.estimator) == {"aann_kernel"}
-    assert set(own.training) == {"turbo_extra"}
+    assert set(own.training) == {"measured + synthetic + extra"}
     assert set(own.synthesizer) == {"swiftwrf"}
     median = own.great_circle_deg.median()
-    assert methods["turbo_swiftwrf_extra"]["great_circle_deg"]["median"] == pytest.approx(median)
-    assert methods["turbo_swiftwrf_extra"]["great_circle_deg"]["low"] <= median
+    assert methods["network, measured + synthetic + extra (swiftwrf)"]["great_circle_deg"]["median"] == pytest.approx(
+        median
+    )
+    assert methods["network, measured + synthetic + extra (swiftwrf)"]["great_circle_deg"]["low"] <= median
     truth = np.degrees(small.label[own["index"].tolist()].numpy())
     np.testing.assert_allclose(own[["truth_azimuth_deg", "truth_elevation_deg"]], truth, rtol=1e-9)
 
@@ -485,8 +501,8 @@ def test_a_new_field_model_is_in_help_and_colours(monkeypatch, capsys):
     with pytest.raises(SystemExit):
         run("--help")
     assert "dark: No power anywhere" in " ".join(capsys.readouterr().out.replace("│", " ").split())
-    colours = palette([Condition("aann_kernel", "turbo", "dark")])
-    assert colours.colour("dark") == colours.colour("turbo_dark") == Palette().colour("dark")
+    colours = palette([Condition("aann_kernel", "measured + synthetic", "dark")])
+    assert colours.colour("dark") == colours.colour("network, measured + synthetic (dark)") == Palette().colour("dark")
 
 
 def test_a_name_without_colour_has_one_that_depends_on_the_name_alone():
@@ -516,8 +532,8 @@ def test_fractions_of_many_digits_have_results_of_their_own(small, tmp_path, mon
     mixes = json.loads((tmp_path / "run" / "metrics.json").read_text())["mixes"]
     assert [float(key) for key in mixes] == list(fractions)
     for key in mixes:
-        assert mixes[key]["methods"]["turbo_nearest"]["great_circle_deg"]["n"] == 10
-        for name in (f"suggested-mix{key}.csv", f"aann_kernel-mix{key}.safetensors"):
+        assert mixes[key]["methods"]["network, measured + synthetic (nearest)"]["great_circle_deg"]["n"] == 10
+        for name in (f"suggested-mix{key}.csv", f"network-mix{key}.safetensors"):
             assert (tmp_path / "run" / name).is_file()
         assert list((tmp_path / "run" / "figures").glob(f"cdf-mix{key}-*.svg"))
 
@@ -532,7 +548,7 @@ def test_labels_of_synthetic_spectra_are_those_of_their_positions(small, tmp_pat
     position = sample_positions(measured.position, 20, 0)
     for place in ("augment.positions.sample_positions", "augment.turbo.synthesis.synthetic_positions"):
         monkeypatch.setattr(place, lambda *_: pytest.fail("positions were computed again"))
-    condition = Condition("kernel_regression", "turbo_extra", "idw", 20, 0.5)
+    condition = Condition("kernel_regression", "measured + synthetic + extra", "idw", 20, 0.5)
     mixed = Evaluation(condition, synthesis).training_set(data, tmp_path)
     torch.testing.assert_close(mixed.label[-20:], small.direction_at(position))
     expected = make_model("idw").fit(measured).synthesize(position)
@@ -628,7 +644,7 @@ def test_whole_run_on_a_gpu(small, small_published, tmp_path):
     options = ("--mix", 0.5, "--extra", 10, "--device", "cuda", "--out", tmp_path / "run")
     assert run(*options, "--synthesizer", *trained) == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())["mixes"]["0.5"]
-    assert {f"turbo_{name}_extra" for name in trained} <= set(metrics["methods"])
+    assert {f"network, measured + synthetic + extra ({name})" for name in trained} <= set(metrics["methods"])
     assert set(trained) <= set(metrics["synthesis"])
     assert load(tmp_path / "run" / "model-mix0.5.safetensors").device.type == "cpu"
 

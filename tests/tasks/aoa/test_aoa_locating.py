@@ -20,7 +20,7 @@ from small import known_planes, with_defaults
 from augment import Fold, cross_validation
 from augment.cross_validation import LOCATOR
 from augment.estimators import ESTIMATORS
-from augment.turbo.condition import NETWORKS
+from augment.turbo.condition import LOCATED, NETWORKS
 from augment.turbo.experiment import Experiment
 from augment.turbo.locating import Locating, containing_level
 from swiftwrf import MatchedField, load, make_model
@@ -40,7 +40,7 @@ from tasks.resume.run import run as resume
 PLANES = {(0.0, 0.0, -1.0): 0.0, (1.0, 0.0, 0.0): 5.0, (0.0, 1.0, 0.0): 4.0}  # outward normal to offset [m]
 FEW_CELLS = MatchedFieldConfig(max_cells=3000, n_best=60, n_background=20, n_rounds=1, n_calibration=16)
 FIT = MatchedField.fit
-LEFT_OUT = {LOCATOR, f"{LOCATOR}_measured_all"}
+LEFT_OUT = {LOCATED, f"{LOCATOR}, all measured"}
 ON_SNAPSHOTS = {"music", "esprit", "maximum_likelihood"}  # left out too, because the data contain spectra alone
 
 
@@ -135,11 +135,11 @@ def test_a_known_room_without_noise_is_located(finished):
     """Far below the error of every estimator that does not use the room."""
     mix = mix_of(finished)
     error = {name: method["great_circle_deg"]["median"] for name, method in mix["methods"].items()}
-    assert error[LOCATOR] < 0.3 * error["kernel_regression"]
-    assert mix["locating"][LOCATOR]["position_error_m"]["median"] < 0.1
-    assert mix["estimator_choice"]["name"] == LOCATOR
+    assert error[LOCATED] < 0.3 * error["kernel_regression, measured"]
+    assert mix["locating"][LOCATED]["position_error_m"]["median"] < 0.1
+    assert mix["estimator_choice"]["name"] == LOCATED
     alone = {name for name, method in mix["methods"].items() if method["training"] == "measured"}
-    assert set(mix["estimator_choice"]["held_out_deg"]) == alone - {"measured_only"}
+    assert set(mix["estimator_choice"]["held_out_deg"]) == alone - {"network, measured"}
 
 
 def test_the_recommendation_does_not_depend_on_the_field_models_asked_for(closed_form, tmp_path):
@@ -148,12 +148,14 @@ def test_the_recommendation_does_not_depend_on_the_field_models_asked_for(closed
         assert run("--mix", 0.6, "--extra", 0, "--synthesizer", "nearest", "--out", tmp_path / "run") == 0
     mix = mix_of(tmp_path / "run")
     choice, methods = mix["estimator_choice"], mix["methods"]
-    assert choice["name"] == LOCATOR
+    assert choice["name"] == LOCATED
     assert choice["better"] == {}
-    possible = [m["great_circle_deg"]["median"] for m in methods.values() if m["training"] != "all"]
-    assert methods[LOCATOR]["great_circle_deg"]["median"] < 10 * min(possible)
+    possible = [m["great_circle_deg"]["median"] for m in methods.values() if m["training"] != "all measured"]
+    assert methods[LOCATED]["great_circle_deg"]["median"] < 10 * min(possible)
     evaluated = {name for name, method in methods.items() if method["training"] == "measured"}
-    assert set(choice["held_out_deg"]) == evaluated - {"measured_only"}  # kernel regression stands in for the network
+    assert set(choice["held_out_deg"]) == evaluated - {
+        "network, measured"
+    }  # kernel regression stands in for the network
 
 
 def test_a_better_method_that_is_not_recommended_has_a_reason(closed_form, tmp_path):
@@ -161,9 +163,9 @@ def test_a_better_method_that_is_not_recommended_has_a_reason(closed_form, tmp_p
     with quickly(closed_form), mock.patch("augment.turbo.choice.located_errors", return_value=None):
         assert run("--mix", 0.6, "--extra", 0, "--synthesizer", "idw", "--out", tmp_path / "run") == 0
     choice = mix_of(tmp_path / "run")["estimator_choice"]
-    assert LOCATOR not in choice["held_out_deg"]
-    assert choice["better"][LOCATOR] == "no planes were found without the held-out spectra"
-    assert f"{LOCATOR} has 0." in (tmp_path / "run" / "report.html").read_text()
+    assert LOCATED not in choice["held_out_deg"]
+    assert choice["better"][LOCATED] == "no planes were found without the held-out spectra"
+    assert f"{LOCATED} has 0." in (tmp_path / "run" / "report.html").read_text()
 
 
 def test_the_report_shows_where_it_was(finished):
@@ -186,7 +188,7 @@ def test_the_trained_locator_is_kept_and_estimates_directions(closed_form, finis
     with quickly(closed_form):  # a locator that is loaded estimates its likelihoods
         assert command_line("tasks.predict", PredictConfig, predict, arguments) == 0
     errors = pd.read_csv(finished / "errors.csv")
-    own = errors[errors.method == LOCATOR]
+    own = errors[errors.method == LOCATED]
     found = pd.read_csv(out)
     np.testing.assert_allclose(found["elevation_deg"], own["estimate_elevation_deg"], atol=1e-3)
     np.save(tmp_path / "other.npy", np.zeros((1, 5, 5), dtype=np.float32))
@@ -199,7 +201,7 @@ def test_a_resumed_run_has_equal_numbers(closed_form, finished, tmp_path, monkey
         honest = Locating.compute
 
         def interrupt(self, *given):
-            if self.condition.training == "all":
+            if self.condition.training == "all measured":
                 raise KeyboardInterrupt
             return honest(self, *given)
 
@@ -234,7 +236,7 @@ def test_without_array_or_planes_it_is_left_out_with_one_sentence(closed_form, t
     else:
         assert f"{LOCATOR} is left out with 60% measured: {reason}" in console
         assert reason == "no plane explains the spectra"
-    assert LOCATOR not in mix["estimator_choice"]["held_out_deg"]
+    assert LOCATED not in mix["estimator_choice"]["held_out_deg"]
     assert not (tmp_path / "run" / "positions.csv").exists()
     assert "Where was it?" in (tmp_path / "run" / "report.html").read_text()
 
@@ -244,26 +246,32 @@ def test_fractions_and_repeats_share_the_search_in_all_spectra(closed_form, tmp_
         data = Experiment(*closed_form.split(), (0.5, 1.0), extra=0, repeats=2)
         subsets = data.subsets
         own = {subset: [condition.result_name for condition in data.located_by(subset)] for subset in subsets}
-    everything = [f"{LOCATOR}_measured_all-r{repeat}" for repeat in (0, 0, 1, 1)]
-    assert own[subsets[0]] == [f"{LOCATOR}-mix0.5-r0"]
-    assert own[subsets[1]] == [f"{LOCATOR}-mix1-r0", *everything]
-    assert own[subsets[3]] == [f"{LOCATOR}-mix1-r1"]
+    everything = [f"{LOCATOR}_all_measured-r{repeat}" for repeat in (0, 0, 1, 1)]
+    assert own[subsets[0]] == [f"{LOCATOR}_measured-mix0.5-r0"]
+    assert own[subsets[1]] == [f"{LOCATOR}_measured-mix1-r0", *everything]
+    assert own[subsets[3]] == [f"{LOCATOR}_measured-mix1-r1"]
 
 
 def test_the_estimator_is_chosen_by_held_out_errors_alone(closed_form):
     """Without a model that has a room, or with planes in one of two searches, it is not matched-field processing."""
     model = make_model("idw").fit(closed_form)
     folds = [Fold(model, closed_form, closed_form.subset(torch.arange(4))) for _ in range(4)]
-    errors = {"kernel_regression": [np.full(4, 2.0)] * 4, "kernel_regression_turbo_idw": [np.full(4, 1.0)] * 4}
+    errors = {
+        "kernel_regression": [np.full(4, 2.0)] * 4,
+        "kernel_regression, measured + synthetic (idw)": [np.full(4, 1.0)] * 4,
+    }
     compared = cross_validation.located_folds(folds)
     assert list(compared) == [0, 2]
     without = {number: cross_validation.located_errors(fold, seed=0) for number, fold in compared.items()}
     for located in ({}, without, {0: np.full(4, 0.1), 2: None}):
         choice = cross_validation.choose_estimator(errors, located)
-        assert choice["name"] == "kernel_regression_turbo_idw"
-        assert choice["held_out_deg"] == {"kernel_regression": 2.0, "kernel_regression_turbo_idw": 1.0}
+        assert choice["name"] == "kernel_regression, measured + synthetic (idw)"
+        assert choice["held_out_deg"] == {
+            "kernel_regression": 2.0,
+            "kernel_regression, measured + synthetic (idw)": 1.0,
+        }
         assert choice["n_held_out"] == 16
-    for error, chosen in ((0.1, LOCATOR), (1.5, "kernel_regression_turbo_idw")):
+    for error, chosen in ((0.1, LOCATOR), (1.5, "kernel_regression, measured + synthetic (idw)")):
         choice = cross_validation.choose_estimator(errors, dict.fromkeys(compared, np.full(4, error)))
         assert (choice["name"], choice["n_held_out"]) == (chosen, 8)
 

@@ -16,8 +16,10 @@ from augment.turbo.synthesis import Evaluation
 from swiftwrf import simulated_room
 
 MEASURED = Condition("aann_kernel", "measured", measured_fraction=0.3)
-GP, IDW = (Condition("aann_kernel", "turbo", name, measured_fraction=0.3) for name in ("gp", "idw"))
-GP_EXTRA, IDW_EXTRA = (replace(condition, training="turbo_extra", n_synthetic=9) for condition in (GP, IDW))
+GP, IDW = (Condition("aann_kernel", "measured + synthetic", name, measured_fraction=0.3) for name in ("gp", "idw"))
+GP_EXTRA, IDW_EXTRA = (
+    replace(condition, training="measured + synthetic + extra", n_synthetic=9) for condition in (GP, IDW)
+)
 
 
 def regression(condition):
@@ -47,26 +49,30 @@ def test_the_choices_of_all_repeats_are_one_condition():
     given = results((GP, regression(GP)), (IDW, IDW_EXTRA, regression(IDW_EXTRA)))
     found = pooled(given, auto=True)
     methods = {condition.method for condition, _ in found}
-    assert methods == {"measured_only", "turbo_auto", "kernel_regression_turbo_auto"}
-    assert values(found, "turbo_auto") == [1, 12]  # with extra positions if there are some
-    assert values(found, "kernel_regression_turbo_auto") == [2, 13]
-    assert values(found, "measured_only") == [0, 10]
+    assert methods == {
+        "network, measured",
+        "network, measured + synthetic (auto)",
+        "kernel_regression, measured + synthetic (auto)",
+    }
+    assert values(found, "network, measured + synthetic (auto)") == [1, 12]  # with extra positions if there are some
+    assert values(found, "kernel_regression, measured + synthetic (auto)") == [2, 13]
+    assert values(found, "network, measured") == [0, 10]
 
 
 def test_field_models_asked_for_by_name_add_no_positions_against_cross_validation():
     found = pooled(results((GP,), (GP, GP_EXTRA)), auto=False)
-    assert values(found, "turbo_gp") == [1, 11]
-    assert values(found, "turbo_gp_extra") == [1, 12]
+    assert values(found, "network, measured + synthetic (gp)") == [1, 11]
+    assert values(found, "network, measured + synthetic + extra (gp)") == [1, 12]
 
 
 def test_a_network_with_further_positions_alone_is_pooled_with_those_without_any():
     """The network is trained one way in each repeat, other estimators both ways."""
     given = results((GP, regression(GP)), (GP_EXTRA, regression(GP), regression(GP_EXTRA)))
     found = pooled(given, auto=False)
-    assert values(found, "turbo_gp") == []
-    assert values(found, "turbo_gp_extra") == [1, 11]
-    assert values(found, "kernel_regression_turbo_gp") == [2, 12]
-    assert values(found, "kernel_regression_turbo_gp_extra") == [2, 13]
+    assert values(found, "network, measured + synthetic (gp)") == []
+    assert values(found, "network, measured + synthetic + extra (gp)") == [1, 11]
+    assert values(found, "kernel_regression, measured + synthetic (gp)") == [2, 12]
+    assert values(found, "kernel_regression, measured + synthetic + extra (gp)") == [2, 13]
 
 
 def test_fractions_are_pooled_apart():
@@ -115,8 +121,10 @@ def test_a_run_whose_repeats_choose_differently(tmp_path):
     ):
         assert run("aoa", "--mix", 0.7, "--repeats", 2, "--extra", 0, "--out", tmp_path / "run") == 0
     methods = json.loads((tmp_path / "run" / "metrics.json").read_text())["mixes"]["0.7"]["methods"]
-    assert [name for name in methods if name.startswith("turbo_")] == ["turbo_auto"]
+    assert [name for name in methods if name.startswith("network, measured +")] == [
+        "network, measured + synthetic (auto)"
+    ]
     errors = pd.read_csv(tmp_path / "run" / "errors.csv")
     by_method = errors.groupby("method").size()
-    assert by_method["turbo_auto"] == by_method["measured_only"]
-    assert "turbo_auto" in (tmp_path / "run" / "report.html").read_text()
+    assert by_method["network, measured + synthetic (auto)"] == by_method["network, measured"]
+    assert "network, measured + synthetic (auto)" in (tmp_path / "run" / "report.html").read_text()
