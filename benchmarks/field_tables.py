@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from pandas import DataFrame
+from pareto import pareto
 from record import RESULTS, interval, load, markdown
 
 from augment.turbo.condition import NETWORK
-from tasks.summarise import pareto
 
 Row = dict[str, Any]
 Scores = dict[str, tuple[float, float, float]]  # median PSNR [dB], median SSIM and mean L1 by method, on other spectra

@@ -29,6 +29,7 @@ from typing import Any, Literal, get_args
 
 import torch
 import tyro
+from pareto import speed
 from record import CPU, ROOT, kept, load, options, provenance, write_result
 from scipy.cluster.hierarchy import fclusterdata
 from sklearn.model_selection import GroupKFold
@@ -546,7 +547,7 @@ def draw(rows: Sequence[Row]) -> None:
             for row in own
             if row["n_train"] == most
         }
-        figures.speed(ax, palette, points, f"milliseconds a spectrum, {scene}", "RMS error", list(points))
+        speed(ax, palette, points, f"milliseconds a spectrum, {scene}", "RMS error", list(points))
     for ax in axes[len(by_scene) :]:
         ax.set_axis_off()
     (folder / "comparison_speed.svg").write_text(figures.as_svg(panels))

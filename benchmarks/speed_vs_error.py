@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 from fields import load_scene
+from pareto import speed
 from record import options, write_result
 from torch import Tensor
 
@@ -225,9 +226,9 @@ def draw(content: dict[str, Any], file: Path) -> None:
     short = {p["setting"]: p["setting"].rsplit(", ", 1)[0] for p in own}
     numerical = {short[p["setting"]]: (p["seconds"]["median"], max(p["numerical"], 1e-9)) for p in own}
     held_out = {p["setting"]: (p["seconds"]["median"], p["held_out"]) for p in content["models"]}
-    figures.speed(axes[0], palette, numerical, "seconds a spectrum", "RMS error against the exact drawing")
+    speed(axes[0], palette, numerical, "seconds a spectrum", "RMS error against the exact drawing")
     default = [name for name in held_out if name.startswith("swiftwrf, default (") or name == "coarray"]
-    figures.speed(axes[1], palette, held_out, "seconds a spectrum", "RMS error against held-out spectra", default)
+    speed(axes[1], palette, held_out, "seconds a spectrum", "RMS error against held-out spectra", default)
     file.write_text(figures.as_svg(figure))
     print(f"drew {file}")
 
