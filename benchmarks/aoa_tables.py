@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from geometry import SIDES, WALLS, nearest
-from record import RESULTS, interval, load, markdown
+from record import RESULTS, load, markdown
 
 from augment.turbo.condition import FULL_NETWORK, LOCATED, MEASURED_NETWORK, Condition, conditions_of
 from augment.turbo.condition import headline as chosen
@@ -44,66 +43,51 @@ def change_text(found: ChangeMetrics) -> str:
 
 
 def aoa() -> str:
-    """Return median angular errors of each run, and what synthetic spectra change, with paired intervals."""
+    """Return median angular errors of each run, and the change by synthetic spectra with its paired interval."""
     rows = []
     for share, mix, result in aoa_shares():
         metrics, methods = result["metrics"], mix["methods"]
-        turbo, best = turbo_condition(mix), mix["reference"]
+        turbo, best = turbo_condition(mix).method, mix["reference"]
         median = {name: f"{method['great_circle_deg']['median']:.2f}" for name, method in methods.items()}
-        rows.append(
-            [
-                f"{metrics['data']}, {metrics['split']}, {metrics['moving']}",
-                f"{float(share):.0%}",
-                median["peak"],
-                median["constant"],
-                f"{median[best]} `{best}`",
-                median[MEASURED_NETWORK],
-                median[turbo.method],
-                *(change_text(methods[turbo.method]["changes"][other]) for other in (MEASURED_NETWORK, best)),
-                median.get(LOCATED, ""),
-                median[FULL_NETWORK],
-            ]
-        )
-    columns = ["scene, split, moving end", "measured", "peak", "constant", "best", "measured only", "turbo"]
-    columns += ["against measured only", "against the best", "matched field", "all measured"]
+        cells = [
+            median["peak"],
+            f"{median[best]} ({best.partition(',')[0].replace('_', ' ')})",
+            median[MEASURED_NETWORK],
+        ]
+        cells += [median[turbo], change_text(methods[turbo]["changes"][MEASURED_NETWORK])]
+        cells += [median.get(LOCATED, ""), median[FULL_NETWORK]]
+        rows.append([f"{metrics['data']}, {metrics['split']}, {metrics['moving']}", f"{float(share):.0%}", *cells])
+    columns = ["scene, split, moving end", "measured", "strongest peak", "best without synthetic", "network, measured"]
+    columns += ["network, measured + synthetic", "change", "matched field", "network, all measured"]
     return markdown(columns, rows)
 
 
-def headline() -> str:
-    """Return the errors in each scene with 30 % of the positions measured."""
-    rows = []
-    for share, mix, result in aoa_shares():
-        if share != "0.3":
-            continue
-        metrics, methods = result["metrics"], mix["methods"]
-        shown = ("peak", "constant", MEASURED_NETWORK, turbo_condition(mix).method, LOCATED, FULL_NETWORK)
-        cells = [interval(methods[name]["great_circle_deg"]) if name in methods else "" for name in shown]
-        rows.append([f"{metrics['data']}, {metrics['split']}, {metrics['moving']} moves", *cells])
-    columns = [
-        "strongest peak",
-        "mean direction",
-        "measured spectra only",
-        "with synthetic spectra",
-        "matched field",
-        "all spectra measured",
-    ]
-    return markdown(["scene, split", *columns], rows)
+WALLS = {  # offset of each wall [m] along -x, +x, -y, +y, -z, +z
+    "newrf-bedroom": (-2.28, 2.28, -2.28, 2.28, 0.0, 3.0),
+    "newrf-office": (0.010, 5.010, 0.016, 8.016, 0.0, 3.2),
+    "simulated-room": (0.0, 6.0, 0.0, 5.0, 0.0, 3.0),
+}
+PARALLEL = 0.9  # cosine between a wall's normal and a plane's, above which it may be that wall
 
 
 def room() -> str:
     """Return the largest error of the planes that each run found, where the true ones are known."""
-    methods, rows = ("geometry", "hybrid", "coarray"), []
+    rows = []
     for share, mix, result in aoa_shares():
         found, walls = result.get("geometry", {}).get(share), WALLS.get(result["metrics"]["data"])
         if found is None or walls is None:
             continue
-        near = [nearest(found["planes"], *wall) for wall in zip(SIDES, walls, strict=True)]
-        errors = [plane["error_mm"] for plane in near if plane]
-        n = len(found["planes"])
+        errors = [_error_mm(found["planes"], *wall) for wall in enumerate(walls)]
+        near = [error for error in errors if error is not None]
         certain = sum(plane["certain"] for plane in found["planes"])
         scene = f"{result['metrics']['data']}, {result['metrics']['moving']}"
-        quality = [f"{mix['synthesis'][s]['psnr_db']['median']:.1f}" for s in methods]
-        cells = [f"{len(errors)} of {len(walls)}", f"{max(errors):.1f}", f"{certain} of {n}"]
-        rows.append([scene, str(mix["n_measured"]), *cells, *quality])
-    columns = ["scene, moving end", "spectra", "walls found", "largest error [mm]", "identifiable", *methods]
-    return markdown(columns, rows)
+        cells = [f"{len(near)} of {len(walls)}", f"{max(near):.1f}", f"{certain} of {len(found['planes'])}"]
+        rows.append([scene, str(mix["n_measured"]), *cells])
+    return markdown(["scene, moving end", "spectra", "walls found", "largest error [mm]", "identifiable"], rows)
+
+
+def _error_mm(planes: list[dict[str, Any]], side: int, offset: float) -> float | None:
+    """Return the error of the plane nearest to a true wall on that side of the room, None without a plane."""
+    outward = 1 if side % 2 else -1
+    own = [outward * plane["offset_m"] for plane in planes if outward * plane["normal"][side // 2] > PARALLEL]
+    return min((1000 * abs(found - offset) for found in own), default=None)

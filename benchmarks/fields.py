@@ -1,11 +1,8 @@
-"""Fit field models, and estimators of directions, and score them at unseen positions.
+"""Fit field models and score them at unseen positions.
 
 python benchmarks/fields.py STUDY --data DATA
 
-synthesis: field models on measured scenes and in the built-in room, all training spectra measured.
-model_size: fits with fixed numbers of primitives beside the number that the fit chooses.
-ablation: primitives, training spectra and resolution, as in the paper. ablation_large: one scene, the folder `--data`.
-measured_spectra: field models and estimators on every measured set, places held out in turn.
+coverage: intervals of `swiftwrf` on measured scenes and in the built-in room, all training spectra measured.
 raytracing: `raytrace` beside other field models in the furnished rooms (extra: raytrace).
 comparison: the paper's methods on measured and built-in scenes, with few training spectra, and turbo learning.
 paper_scale: every method on six scenes of 6,000 positions at one height (extra: raytrace), and angle of arrival.
@@ -29,15 +26,9 @@ from typing import Any, Literal, get_args
 
 import torch
 import tyro
-from pareto import speed
 from record import CPU, ROOT, kept, load, options, provenance, write_result
-from scipy.cluster.hierarchy import fclusterdata
-from sklearn.model_selection import GroupKFold
 from torch import Tensor
 
-from augment import Mixed
-from augment.estimators import ESTIMATORS, make_estimator
-from augment.turbo.condition import NETWORKS
 from swiftwrf import AngularGrid, FieldModel, FitError, InputError, Spectra, SwiftWRF, make_model, simulated_room
 from swiftwrf import load_spectra as read
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
@@ -45,9 +36,8 @@ from swiftwrf.choices import Moving
 from swiftwrf.data.raytraced import ROOMS
 from swiftwrf.data.splits import validation_for
 from swiftwrf.gp import subsample
-from swiftwrf.metrics import angle_errors, covered, l1, psnr, ssim, summary
+from swiftwrf.metrics import covered, l1, psnr, ssim, summary
 from swiftwrf.models import FIELD_MODELS
-from swiftwrf.models.coarray import project
 from swiftwrf.models.neighbours import MemoryModel
 from swiftwrf.positions import Neighbours
 from swiftwrf.runtime.durable import write_text
@@ -61,23 +51,10 @@ from tasks.scenes.options import ScenesConfig
 from tasks.scenes.run import run as trace
 from tasks.workers import connected
 
-Study = Literal[
-    "synthesis",
-    "model_size",
-    "ablation",
-    "ablation_large",
-    "measured_spectra",
-    "raytracing",
-    "comparison",
-    "paper_scale",
-]
+Study = Literal["coverage", "raytracing", "comparison", "paper_scale"]
 S23_ARRAY = PlanarArray.square(4, 915e6, spacing=0.16)  # the files of s23-200 do not describe it
 MEASURED = (("s23-200", "random"), ("s23-200", "block"), ("newrf-bedroom", "random"), ("newrf-office", "random"))
-WSR = tuple(f"wsr-{sight}-a-tx{number}" for sight in ("los", "nlos") for number in (2, 3, 4))
-SETS = {"s23-200": ("random", "block")} | dict.fromkeys(WSR, ("places",))  # measured sets and their splits
-ESTIMATED = ("peak", "constant", "nearest_spectrum", "kernel_regression", NETWORKS["quick"])
-PLACE_M, FOLDS = 0.1, 5  # measurements closer than this are one place [m]; folds of the places
-MEAN, PROJECTED = "mean", "swiftwrf, projected"  # the mean training spectrum; onto what the array can produce
+MEAN = "mean"  # the mean training spectrum
 BY_GRADIENT = ("nerf2", "wrfgs", "vae", "dcgan", "swiftwrf_paper")
 COMPARED = (MEAN, "nearest", "gp", "coarray", "swiftwrf", *BY_GRADIENT[:4])
 AT_PAPER_SCALE = (MEAN, "nearest", "idw", "gp", "coarray", "geometry", "hybrid", "swiftwrf", *BY_GRADIENT)
@@ -140,15 +117,13 @@ class Fit:
     """A method to fit.
 
     Args:
-        name: Name of the row.
-        method: Name of the field model or of the estimator, or `MEAN`.
+        method: Name of the field model, or `MEAN`.
         options: Options of the method.
         n: Number of training spectra, chosen at random. None: all.
         preset: Preset of the method.
         device: Device of the fit.
     """
 
-    name: str
     method: str
     options: Row = field(default_factory=dict)
     n: int | None = None
@@ -158,19 +133,19 @@ class Fit:
 
 @dataclass(frozen=True)
 class Scene:
-    """Spectra and the fits to them. Scores are over the test spectra of all parts.
+    """Spectra and the fits to them.
 
     Args:
         name: Name of the scene.
         split: Name of the split.
-        parts: Training and test spectra.
+        part: Training and test spectra.
         fits: Methods.
         described: What is known of the scene.
     """
 
     name: str
     split: str
-    parts: Sequence[Part]
+    part: Part
     fits: Sequence[Fit]
     described: Row = field(default_factory=dict)
 
@@ -185,19 +160,19 @@ def main(config: Config) -> None:
     with connected(config.scheduler, CPU) as cluster:
         for scene in STUDIES[config.study](config):
             described |= {scene.name: scene.described} if scene.described else {}
-            files = [work / f"{scene.name} {scene.split} {fit.n or 'all'} {fit.name}" for fit in scene.fits]
+            files = [work / f"{scene.name} {scene.split} {fit.n or 'all'} {fit.method}" for fit in scene.fits]
             missing = [n for n, file in enumerate(files) if not Path(f"{file}.json").exists()]
             fits = [scene.fits[n] for n in missing]
             found: Iterator[Row] = (
-                cluster.map(partial(measure_away, scene.parts), fits)
+                cluster.map(partial(measure_away, scene.part), fits)
                 if cluster
-                else (measure(scene.parts, scene.fits[n], Path(f"{files[n]}.state")) for n in missing)
+                else (measure(scene.part, scene.fits[n], Path(f"{files[n]}.state")) for n in missing)
             )
             for n, fit, row in zip(missing, fits, found, strict=True):
                 write_text(Path(f"{files[n]}.json"), json.dumps(row))
-                print(scene.name, scene.split, fit.n or "", fit.name, in_words(row), flush=True)
+                print(scene.name, scene.split, fit.n or "", fit.method, in_words(row), flush=True)
             for fit, file in zip(scene.fits, files, strict=True):
-                row = {"scene": scene.name, "split": scene.split, "method": fit.name}
+                row = {"scene": scene.name, "split": scene.split, "method": fit.method}
                 row |= json.loads(Path(f"{file}.json").read_text())
                 rows[_key(row)] = row
     content = {"seed": config.seed, "rows": list(rows.values())} | ({"described": described} if described else {})
@@ -216,34 +191,30 @@ def in_words(row: Row) -> str:
     """Return a row in one line."""
     if "refusal" in row:
         return str(row["refusal"])
-    name = "psnr_db" if "psnr_db" in row else "angle_deg"
-    return f"{name} {row[name]['median']:.2f}, {row['fit_seconds']:.0f} s"
+    return f"{row['psnr_db']['median']:.2f} dB, {row['fit_seconds']:.0f} s"
 
 
 # -------------------------------------------------------------------------------------------------------------- one row
 
 
-def measure_away(parts: Sequence[Part], fit: Fit) -> Row:
+def measure_away(part: Part, fit: Fit) -> Row:
     """Measure a row on a worker, where an interrupted fit starts from the beginning."""
     with TemporaryDirectory(prefix="swiftwrf-") as folder:
-        return measure(parts, fit, Path(folder) / "fit.state")
+        return measure(part, fit, Path(folder) / "fit.state")
 
 
-def measure(parts: Sequence[Part], fit: Fit, state: Path) -> Row:
-    """Return scores over the test spectra of all parts, seconds and size of a method, or the reason of its refusal."""
-    scores: dict[str, list[Tensor]] = {}
-    row: Row = {"n_train": fit.n or len(parts[0][0]), "n_test": sum(len(test) for _, test in parts), "fit_seconds": 0.0}
+def measure(part: Part, fit: Fit, state: Path) -> Row:
+    """Return scores over the test spectra, seconds and size of a method, or the reason of its refusal."""
+    train, test = part
+    row: Row = {"n_train": fit.n or len(train), "n_test": len(test), "fit_seconds": 0.0}
     try:
-        for train, test in parts:
-            found, numbers = scored(train, test, fit, state)
-            row |= numbers | {"fit_seconds": row["fit_seconds"] + numbers["fit_seconds"]}
-            for name, score in found.items():
-                scores.setdefault(name, []).append(score)
+        scores, numbers = scored(train, test, fit, state)
     except (InputError, FitError) as error:
-        row["refusal"] = str(error)
+        return row | {"refusal": str(error), "provenance": provenance(torch.device(fit.device))}
+    row |= numbers
     if "covered_by_80" in scores:
-        row["covered_by_80"] = float(torch.cat(scores.pop("covered_by_80")).mean())
-    row |= {name: summary(torch.cat(score)) for name, score in scores.items()}
+        row["covered_by_80"] = float(scores.pop("covered_by_80").mean())
+    row |= {name: summary(score) for name, score in scores.items()}
     return row | {"provenance": provenance(torch.device(fit.device))}
 
 
@@ -256,10 +227,6 @@ def scored(train: Spectra, test: Spectra, fit: Fit, state: Path) -> tuple[dict[s
     clock = time.process_time if device == CPU else time.perf_counter
     earlier = json.loads(file.read_text()) if file.exists() else 0.0
     began = clock()
-    if fit.method in ESTIMATORS:
-        estimator = make_estimator(fit.method, len(train), **fit.options).fit(Mixed.measured(train))
-        error = angle_errors(estimator.estimate(test), test.label)["great_circle"].rad2deg()
-        return {"angle_deg": error}, {"fit_seconds": clock() - began}
 
     def on_record(_: Row) -> None:
         """Keep the seconds of an unfinished fit beside its state."""
@@ -280,15 +247,10 @@ def scored(train: Spectra, test: Spectra, fit: Fit, state: Path) -> tuple[dict[s
         row = {"fit_seconds": earlier + clock() - began} | weight(model, train, state.with_suffix(".model"))
 
         def synthesize(position: Tensor) -> Tensor:
-            drawn = model.synthesize(position).cpu()
-            if fit.name == PROJECTED and train.array is not None:
-                stretched = train.name.startswith("s23")
-                return project(drawn, train.array, train.grid, stretched=stretched)
-            return drawn
+            return model.synthesize(position).cpu()
 
         prediction = model.predict(test.position)
-        predicted = synthesize(test.position) if fit.name == PROJECTED else prediction.mean.cpu()
-        std = None if fit.name == PROJECTED else prediction.std
+        predicted, std = prediction.mean.cpu(), prediction.std
     scores = {name: score(predicted, test.spectrum) for name, score in (("psnr_db", psnr), ("ssim", ssim), ("l1", l1))}
     if std is not None:
         scores["covered_by_80"] = covered(predicted, std.cpu(), test.spectrum)
@@ -342,100 +304,45 @@ def scenes(config: Config) -> Iterator[tuple[str, Spectra, str]]:
             yield name, spectra(), split
 
 
-def load_scene(folder: Path, grid: AngularGrid | None = None) -> Spectra:
+def load_scene(folder: Path) -> Spectra:
     """Load spectra with the array that measured them."""
-    data = read(folder, grid=grid)
+    data = read(folder)
     return replace(data, array=S23_ARRAY) if data.name.startswith("s23") else data
 
 
 def fits(config: Config, methods: Sequence[str], data: Spectra, split: str, n: int | None = None) -> list[Fit]:
     """Return the fits of those methods that the data suffice for."""
-    validation = "random" if split == "places" else validation_for(split)
-    found = []
-    for name in config.methods or methods:
-        method = name.partition(",")[0]
+    validation, found = validation_for(split), []
+    for method in config.methods or methods:
         given: Row = {"seed": config.seed}
-        if method in ESTIMATORS:
-            found.append(Fit(name, method, given, n))
-        elif method == MEAN or not FIELD_MODELS[method].lacking(data):
+        if method == MEAN or not FIELD_MODELS[method].lacking(data):
             on_gpu = config.device == "cuda" and method in BY_GRADIENT
             given |= {"validation": validation} | (ON_GPU[method] if on_gpu else {})
             steps = 0 if method == MEAN else getattr(make_model(method).config, "steps", 0)
             if steps and (config.steps or config.quick):
                 given["steps"] = config.steps or steps // QUICK_DIVISOR.get(config.study, 1)
             preset: Preset = "paper" if on_gpu else "quick"
-            found.append(Fit(name, method, given, n, preset, config.device if on_gpu else "cpu"))
+            found.append(Fit(method, given, n, preset, config.device if on_gpu else "cpu"))
     return found
 
 
-def synthesis(config: Config) -> Iterator[Scene]:
-    """Every field model on every scene."""
+def coverage(config: Config) -> Iterator[Scene]:
+    """The model with intervals on every scene."""
     for name, data, split in scenes(config):
-        methods = (MEAN, "nearest", "idw", "gp", "coarray", "swiftwrf", *([PROJECTED] if data.array else []))
-        yield Scene(name, split, [data.split(split, config.seed)], fits(config, methods, data, split))
-
-
-def model_size(config: Config) -> Iterator[Scene]:
-    """Fits of every number of primitives, and of the number that the fit chooses."""
-    for name, data, split in scenes(config):
-        default = {"validation": validation_for(split), "seed": config.seed}
-        sizes = {str(n): default | {"n_primitives": n} for n in (16, 32, 64, 128, 256, 512, 1024)} | {"auto": default}
-        chosen = [Fit(size, "swiftwrf", options) for size, options in sizes.items()]
-        yield Scene(name, split, [data.split(split, config.seed)], chosen)
-
-
-def ablation(config: Config) -> Iterator[Scene]:
-    """One option or part of the data changed at a time. Ray paths are rendered at another resolution, too."""
-    measured: list[tuple[str, Path | None, str]] = [("simulated-room", None, "random")]
-    if config.data is not None and config.study == "ablation_large":
-        measured = [(config.data.name, config.data, "random")]
-    elif config.data is not None:
-        measured = [(name, config.data / name, split) for name, split in MEASURED[1:]]
-    for name, folder, split in measured:
-        data = read(folder) if folder else simulated_room()
-        train, test = data.split(split)
-        default = {"validation": validation_for(split)}
-        some = [
-            Fit("default", "swiftwrf", default),
-            *(Fit(f"{n} primitives", "swiftwrf", default | {"n_primitives": n}) for n in (16, 64, 256)),
-            Fit("fitted on all pixels", "swiftwrf", default | {"max_azimuths": 0}),
-            *(Fit(f"{f:.0%} of the training spectra", "swiftwrf", default, round(f * len(train))) for f in FRACTIONS),
-        ]
-        yield Scene(name, split, [(train, test)], some)
-        if data.array is not None and folder:
-            fine = read(folder, grid=AngularGrid.hemisphere(180, 720))
-            yield Scene(name, split, [fine.split(split)], [Fit("seen at 0.5 degrees", "swiftwrf", default)])
-
-
-def measured_spectra(config: Config) -> Iterator[Scene]:
-    """Every measured set. Each place is held out once, with all repeats of its measurement, unless a split is published."""
-    assert config.data is not None
-    methods = (MEAN, "nearest", "idw", "gp", "coarray", "swiftwrf", *ESTIMATED)
-    for name, splits in SETS.items():
-        data = load_scene(config.data / name)
-        for split in splits:
-            parts = [data.split(split, config.seed)] if split != "places" else list(by_place(data))
-            yield Scene(name, split, parts, fits(config, methods, data, split), {"n": len(data), "moving": data.moving})
-
-
-def by_place(data: Spectra) -> Iterator[Part]:
-    """Yield training and test spectra of each fold of the places."""
-    place = fclusterdata(data.position.double().numpy(), PLACE_M, "distance")
-    for train, test in GroupKFold(FOLDS).split(place, groups=place):
-        yield data.subset(torch.from_numpy(train)), data.subset(torch.from_numpy(test))
+        yield Scene(name, split, data.split(split, config.seed), fits(config, ("swiftwrf",), data, split))
 
 
 def raytracing(config: Config) -> Iterator[Scene]:
     """The furnished rooms, either end moving. No model receives the geometry of the room, which is traced again."""
-    methods = (MEAN, "nearest", "gp", "coarray", "swiftwrf", "geometry", "hybrid", "raytrace")
+    methods = (MEAN, "swiftwrf", "geometry", "hybrid", "raytrace")
     for room in ROOMS:
         for moving in get_args(Moving):
             folder = (config.data or config.work) / str(RAYTRACED_POSITIONS) / f"{room}-{moving}"
             traced(folder, room, moving, RAYTRACED_POSITIONS, None, config.seed)
             data = read(folder, grid=AngularGrid.hemisphere(30, 120))
             known = described(room, data, folder)
-            parts = [data.split("random")]
-            yield Scene(f"{room}, {moving}", "random", parts, fits(config, methods, data, "random"), known)
+            part = data.split("random")
+            yield Scene(f"{room}, {moving}", "random", part, fits(config, methods, data, "random"), known)
 
 
 def comparison(config: Config) -> Iterator[Scene]:
@@ -449,7 +356,7 @@ def comparison(config: Config) -> Iterator[Scene]:
         if number == 0 and "counts" in config.parts:
             for n in QUICK_COMPARED_COUNTS if config.quick else COMPARED_COUNTS:
                 chosen += fits(config, COMPARED, data, split, n) if n < len(train) else []
-        yield Scene(name, split, [(train, test)], chosen)
+        yield Scene(name, split, (train, test), chosen)
     if "aoa" in config.parts and not config.quick and config.data is not None:
         estimate_angles(config, config.data / MEASURED[0][0])
 
@@ -473,7 +380,7 @@ def paper_scale(config: Config) -> Iterator[Scene]:
             if number == 0 and split == "random" and "counts" in config.parts:
                 for n in QUICK_PAPER_COUNTS if config.quick else PAPER_COUNTS:
                     chosen += fits(config, ("swiftwrf",), data, split, n)
-            yield Scene(name, split, [(train, test)], chosen, described(room, data, folder))
+            yield Scene(name, split, (train, test), chosen, described(room, data, folder))
         if number == 0 and "aoa" in config.parts and not config.quick:
             estimate_angles(config, folder)
 
@@ -534,26 +441,12 @@ def angles(work: Path) -> Row:
 
 
 def draw(rows: Sequence[Row]) -> None:
-    """Draw speed against error on each scene, and SSIM against the number of training spectra."""
-    folder, palette = ROOT / "docs" / "figures", figures.Palette.of(labels.FIELD_MODELS)
-    by_scene: dict[str, list[Row]] = {}
-    for row in rows:
-        by_scene.setdefault(f"{row['scene']} {row['split']}", []).append(row)
-    panels, axes = figures.new_figure(-(-len(by_scene) // 2), min(2, len(by_scene)), 10, 3.4 * -(-len(by_scene) // 2))
-    for ax, (scene, own) in zip(axes, by_scene.items(), strict=False):
-        most = max(row["n_train"] for row in own)
-        points = {
-            row["method"]: (row["ms"]["median"], 10 ** (-row["psnr_db"]["median"] / 20))
-            for row in own
-            if row["n_train"] == most
-        }
-        speed(ax, palette, points, f"milliseconds a spectrum, {scene}", "RMS error", list(points))
-    for ax in axes[len(by_scene) :]:
-        ax.set_axis_off()
-    (folder / "comparison_speed.svg").write_text(figures.as_svg(panels))
+    """Draw SSIM against the number of training spectra."""
+    palette = figures.Palette.of(labels.FIELD_MODELS)
     curves: dict[str, dict[int, float]] = {}
-    for row in by_scene.get("s23-200 random", []):
-        curves.setdefault(row["method"], {})[row["n_train"]] = row["ssim"]["median"]
+    for row in rows:
+        if (row["scene"], row["split"]) == MEASURED[0]:
+            curves.setdefault(row["method"], {})[row["n_train"]] = row["ssim"]["median"]
     panel, (ax,) = figures.new_figure(1, 1, 6, 3.4)
     for name, curve in curves.items():
         ax.plot(*zip(*sorted(curve.items()), strict=True), "o-", markersize=3, label=name, color=palette.colour(name))
@@ -562,15 +455,11 @@ def draw(rows: Sequence[Row]) -> None:
     ax.set_xticks(numbers, [str(n) for n in numbers])
     ax.minorticks_off()
     figures.legend_below(panel, ax)
-    (folder / "comparison_counts.svg").write_text(figures.as_svg(panel))
+    (ROOT / "docs" / "figures" / "comparison_counts.svg").write_text(figures.as_svg(panel))
 
 
 STUDIES: dict[str, Callable[[Config], Iterator[Scene]]] = {
-    "synthesis": synthesis,
-    "model_size": model_size,
-    "ablation": ablation,
-    "ablation_large": ablation,
-    "measured_spectra": measured_spectra,
+    "coverage": coverage,
     "raytracing": raytracing,
     "comparison": comparison,
     "paper_scale": paper_scale,

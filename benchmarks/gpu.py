@@ -38,18 +38,11 @@ from augment import Mixed
 from augment.estimators.aann import AANN, AANNConfig
 from swiftwrf import (
     AngularGrid,
-    CoarrayModel,
-    GeometryModel,
-    MatchedField,
     Spectra,
     fit,
-    make_model,
     simulated_room,
 )
-from swiftwrf.data.simulated import ShoeboxRoom
-from swiftwrf.models.geometry.planes import Plane
 from swiftwrf.models.swiftwrf_paper import SwiftWRFPaper
-from swiftwrf.online import prequential
 from swiftwrf.rasterize import rasterize_magnitude
 from tasks.environment import choose_device
 
@@ -67,7 +60,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Config:
-    part: tyro.conf.Positional[Literal["rates", "training", "coarray", "update", "locating", "profile", "draw"]]
+    part: tyro.conf.Positional[Literal["rates", "training", "profile", "draw"]]
     """what to measure; draw measures nothing and is what a profiler looks at"""
     out: Path = RESULTS
     """folder of the result"""
@@ -158,51 +151,6 @@ def training(config: Config, device: torch.device) -> Row:
     return {"grid": grid.shape, "n_train": len(train), "seconds": seconds}
 
 
-def coarray(config: Config, device: torch.device) -> Row:
-    """Spectra a second of the co-array's model, which draws on the CPU of the machine."""
-    grid, _, batches = sizes(config)
-    model = CoarrayModel().fit(simulated_room(n=40, grid=grid))
-    cpu = torch.device("cpu")
-    found = {str(n): rate(partial(model.synthesize, positions(n)), n, cpu, config.seconds) for n in batches}
-    print(found, flush=True)
-    return {"grid": grid.shape, "threads": torch.get_num_threads(), "synthesize_per_s": found}
-
-
-def update(config: Config, device: torch.device) -> Row:
-    """Return the milliseconds in which fitted models predict, score and learn a spectrum, one at a time."""
-    n, new = (30, 5) if config.quick else (1000, 50)
-    data, cpu, rows = scene_of(n + new, config), torch.device("cpu"), []
-    train, further = data.subset(torch.arange(n)), data.subset(torch.arange(n, n + new))
-    for name, where in dict.fromkeys([("swiftwrf", cpu), ("swiftwrf", device), ("coarray", cpu)]):
-        model = make_model(name).fit(train, device=where)
-        prequential(model, further)  # compiles
-        seconds = timed(partial(prequential, model, further), where)
-        rows.append({"model": name, "device": where.type, "n": n, "ms_per_spectrum": 1e3 * seconds / new})
-        print(rows[-1], flush=True)
-    return {"grid": data.grid.shape, "threads": torch.get_num_threads(), "rows": rows}
-
-
-def locating(config: Config, device: torch.device) -> Row:
-    """Return the seconds of matched-field processing in a known room, on the CPU of the machine."""
-    n, new = (20, 4) if config.quick else (120, 64)
-    data, room = scene_of(n + new, config), ShoeboxRoom()
-    train, test = data.subset(torch.arange(n)), data.subset(torch.arange(n, n + new))
-    ends = zip(torch.eye(3).tolist(), room.size, strict=True)
-    walls = [
-        Plane(tuple(sign * x for x in axis), offset_m=max(0.0, sign * size), gain=room.reflection)
-        for axis, size in ends
-        for sign in (-1, 1)
-    ]
-    known = GeometryModel.of_planes(train, walls)
-    locator = MatchedField(spacing=0.5 if config.quick else 0.1)
-    seconds = {"fit": timed(lambda: locator.fit(train, room=known), device)}
-    found = []
-    seconds["spectrum"] = timed(lambda: found.append(locator.locate(test.spectrum)), device) / new
-    error = (found[0].median - test.position).norm(dim=1).median()
-    print(seconds, f"{float(error):.3f} m", flush=True)
-    return {"n_train": n, "threads": torch.get_num_threads(), "seconds": seconds, "median_error_m": float(error)}
-
-
 def scene_of(n: int, config: Config) -> Spectra:
     """Spectra of the built-in room."""
     grid, _, _ = sizes(config)
@@ -288,9 +236,6 @@ def draw(config: Config, device: torch.device) -> None:
 PARTS = {
     "rates": rates,
     "training": training,
-    "coarray": coarray,
-    "update": update,
-    "locating": locating,
     "profile": profiled,
     "draw": draw,
 }

@@ -55,9 +55,6 @@ part rasterize 150 "$python" benchmarks/rasterize.py "${size[@]}" --seconds 0.1 
 part rates 90 "$python" benchmarks/gpu.py rates "${size[@]}" --out "$folder"
 part profile 90 "$python" benchmarks/gpu.py profile "${size[@]}" --out "$folder"
 part training 120 "$python" benchmarks/gpu.py training "${size[@]}" --out "$folder"
-for name in coarray update locating; do
-  part "$name" 60 "$python" benchmarks/gpu.py "$name" "${size[@]}" --out "$folder"
-done
 if command -v compute-sanitizer >/dev/null; then
   for tool in racecheck initcheck synccheck; do # memcheck is one of the tests
     part "$tool" 60 compute-sanitizer --tool "$tool" --error-exitcode 1 \

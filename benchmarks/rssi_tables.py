@@ -35,29 +35,6 @@ def rssi_glance() -> str:
     return markdown([*columns, "mean difference [95 %]", "80 % interval covers"], rows)
 
 
-def rssi_methods() -> str:
-    """Return the median and mean absolute error of every predictor on each split."""
-    sets = load("rssi")["sets"]
-    names = list(dict.fromkeys(name for found in sets.values() for name in found["methods"]))
-    rows = []
-    for key, found in sets.items():
-        errors = {name: entry["abs_error_db"] for name, entry in found["methods"].items()}
-        cells = [f"{errors[n]['median']:.2f} / {errors[n]['mean']:.2f}" if n in errors else "" for n in names]
-        rows.append([key, *cells])
-    return markdown(["data, split", *(f"`{name}`" for name in names)], rows)
-
-
-def rssi_heads() -> str:
-    """Return the errors of the model with the head and with the identity in its place, and the change by the head."""
-    rows = []
-    for key, found in load("rssi")["sets"].items():
-        head, identity = (found["methods"][name]["abs_error_db"] for name in ("swiftwrf", "identity"))
-        cells = [f"{error['median']:.2f} / {error['mean']:.2f}" for error in (head, identity)]
-        change = " / ".join(f"{head[key] - identity[key]:+.3f}" for key in ("median", "mean"))
-        rows.append([key, *cells, change])
-    return markdown(["data, split", "with the head", "with the identity", "change by the head"], rows)
-
-
 def channels() -> str:
     """Return errors of matched fields on channels, and coherence and errors of channels predicted at unseen positions."""
     rows = []
@@ -108,63 +85,16 @@ def _interval(difference: dict[str, Any]) -> str:
     return f"{difference['mean']:+.2f} [{difference['low']:+.2f}, {difference['high']:+.2f}]"
 
 
-def headline_rssi() -> str:
-    """Return errors of RSSI and of positions on the measured sets of which both are known."""
-    located, rows = load("locating_rssi")["sets"], []
-    for name, found in load("rssi")["sets"].items():
-        if name not in located:
-            continue
-        methods, best = found["methods"], found["best_baseline"]
-        own = methods["swiftwrf"]
-        errors = (methods["mri_receiver"], methods[best], own)
-        cells = [f"{entry['abs_error_db']['median']:.2f} / {entry['abs_error_db']['p90']:.1f}" for entry in errors]
-        cells[1] += f" (`{best}`)"
-        position = {method: entry["position_error_m"] for method, entry in located[name]["localizers"].items()}
-        cells.append(f"{own['coverage']:.0%}")
-        cells += [
-            f"{position[method]['median']:.2f} / {position[method]['p90']:.2f}" for method in ("knn", "posterior")
-        ]
-        rows.append([name, *cells, f"{located[name]['coverage']['0.8']:.0%}"])
-    columns = ["RSSI [dB]: path-loss model", "best baseline", "SwiftWRF", "80 % intervals cover"]
-    columns += ["position [m]: nearest fingerprints", "posterior", "80 % regions cover"]
-    return markdown(["data, split", *columns], rows)
-
-
 def locating_spectra() -> str:
-    """Return errors of directions and positions by matched-field processing, medians over the draws."""
+    """Return position errors of matched-field processing, medians over the draws."""
     rows = []
     for name in SPECTRA:
         for scene, fractions in load(name).get("scenes", {}).items():
             for fraction, entry in fractions.items():
-                rows.append([scene, f"{float(fraction):.0%}", str(len(entry["draws"])), *_cells(entry["median"])])
-    columns = [
-        "scene",
-        "measured",
-        "random choices",
-        "kernel regression [deg]",
-        "matched field [deg]",
-        "position [m]",
-        "80 % regions hold",
-        "fit",
-        "200 spectra",
-    ]
-    return markdown(columns, rows)
-
-
-def _cells(median: dict[str, Any]) -> list[str]:
-    def both(name: str, digits: int) -> str:
-        value = median.get(name)
-        return f"{value['median']:.{digits}f} / {value['p90']:.{digits}f}" if value else ""
-
-    seconds = median.get("seconds")
-    return [
-        both("kernel_regression_angle_deg", 2),
-        both("angle_deg", 2),
-        both("position_m", 3),
-        f"{median['coverage_80']:.0%}" if "coverage_80" in median else "",
-        f"{seconds['fit']:.0f} s" if seconds else "",
-        f"{seconds['locate']:.0f} s" if seconds else "",
-    ]
+                found, n = entry["median"], str(len(entry["draws"]))
+                error = f"{found['position_m']['median']:.3f} / {found['position_m']['p90']:.3f}"
+                rows.append([scene, f"{float(fraction):.0%}", n, error, f"{found['coverage_80']:.0%}"])
+    return markdown(["scene", "measured", "random choices", "position [m]", "80 % regions hold"], rows)
 
 
 # mean 3D error [m] and right floors of published methods on the same rows, best first: 1-NN of the comparisons by

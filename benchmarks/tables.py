@@ -4,64 +4,15 @@ from __future__ import annotations
 
 import re
 import statistics
-from typing import Any
 
 import aoa_tables
 import field_tables
 import rssi_tables
 import speed_tables
-import targets
-from geometry import SIDES
 from record import ROOT, load, markdown
 
-
-def reliability() -> str:
-    """Return how each kind of attack ended."""
-    done = load("reliability")
-    ends = done["mutations"].values()
-    read, refused, wrong = (sum(end.get(key, 0) for end in ends) for key in ("read", "refused", "wrong"))
-    lines, right, kills, disks, races = (done[part] for part in ("commands", "right", "kills", "disks", "races"))
-    rows = [
-        [f"{read + refused:,} mutations of {len(ends)} kinds of files", f"{read} read, {refused:,} refused", wrong],
-        [
-            f"{sum(lines.values()) - lines['wrong']} mistyped command lines",
-            f"{lines['exit 2']} refused",
-            lines["wrong"],
-        ],
-        [f"{sum(right.values()) - right['wrong']} right command lines", f"{right['exit 0']} done", right["wrong"]],
-        [f"{kills['kills']} kills", f"{kills['runs']} runs resumed to the same tables", kills["wrong"]],
-        [f"{disks['full disks']} full disks", "each a sentence, nothing half-written", disks["wrong"]],
-        [f"{races['races']} races for one directory", "one run each", races["wrong"]],
-    ]
-    for kind, end in done.get("attempts", {}).items():
-        read, refused = (end.get(key, 0) for key in ("read", "refused"))
-        rows.append([f"{read + refused:,} times: {kind}", f"{read} plausible, {refused:,} refused", end["wrong"]])
-    return markdown(["attack", "end", "wrong"], [[str(cell) for cell in row] for row in rows])
-
-
-def walls() -> str:
-    """Return the errors of the planes that geometry found in several draws of the measured fraction."""
-    rows = []
-    for case, found in load("geometry")["cases"].items():
-        scene, moving, _, draw = case.split(", ")
-        planes = [plane for plane in found["walls"].values() if plane]
-        cells = [_millimetres(plane) for plane in found["walls"].values()]
-        covered = sum(plane["error_mm"] <= 3 * plane["std_mm"] for plane in planes if plane["certain"])
-        certain = f"{covered} of {sum(plane['certain'] for plane in planes)}"
-        quality = [f"{found['psnr_db'][name]['median']:.1f}" for name in ("geometry", "hybrid")]
-        what = f"{scene}, {moving.removeprefix('moving ')}, {draw}"
-        rows.append([what, str(found["positions"]), *cells, certain, *quality, f"{found['cpu_seconds']:.0f} s"])
-    columns = [
-        "scene, moving end",
-        "spectra",
-        *(f"{side} [mm]" for side in SIDES),
-        "identifiable ones within 3 deviations",
-    ]
-    return markdown([*columns, "geometry", "hybrid", "processor time"], rows)
-
-
-def _millimetres(plane: dict[str, Any] | None) -> str:
-    return "not found" if plane is None else f"{plane['error_mm']:.1f}"
+from augment.turbo.condition import LOCATED, MEASURED_NETWORK
+from swiftwrf.datasets import catalogue
 
 
 def random_rooms() -> str:
@@ -85,41 +36,57 @@ def random_rooms() -> str:
     )
 
 
-def hard_cases() -> str:
-    """Return the largest errors over cutoffs of each backend in each case."""
-    found: dict[str, dict[str, list[dict[str, Any]]]] = {}
-    for row in load("stability_cpu")["backends"]:
-        found.setdefault(row["case"], {}).setdefault(row["backend"], []).append(row)
-    rows = []
-    for case, backends in found.items():
-        cells = []
-        for entries in backends.values():
-            value = {entry["cutoff"]: entry["value"] for entry in entries}
-            gradient = max(max(entry["gradient"], entry["magnitude_gradient"]) for entry in entries)
-            cells.append(f"{value[None]:.0e}, {value[1e-4]:.0e}; {gradient:.0e}")
-        rows.append([case, next(iter(backends.values()))[0]["rule"].replace("|", "\\|"), *cells])
-    return markdown(["case", "rule", *(f"`{backend}` (float32)" for backend in found[rows[0][0]])], rows)
+def headline() -> str:
+    """Return one row for each question: the simplest method, the best other method, and this project."""
+    located = {name: one["localizers"] for name, one in load("locating_rssi")["sets"].items()}
+    rssi = load("rssi")["sets"]["tetam-tracks spatial"]
+    decibel = {name: f"{found['abs_error_db']['median']:.2f} dB" for name, found in rssi["methods"].items()}
+    baseline = rssi["best_baseline"]
+    metre = {name: found["position_error_m"]["median"] for name, found in located["tetam-tracks spatial"].items()}
+    other = min(metre.keys() - {"posterior"}, key=lambda name: float(metre[name]))
+    mean = {name: found["position_error_m"]["mean"] for name, found in located["ts-tut5 published"].items()}
+    csi = load("channels_1")["scenes"]["newrf-conference"]["0.3"]["median"]
+    coherence = {name: f"{found['coherence']:.2f}" for name, found in csi["channel"].items()}
+    channels = (
+        f"{coherence['furniture']} ({100 * csi['position_m']['median']:.1f} cm, {csi['angle_deg']['median']:.2f}° off)"
+    )
+    degree = {}
+    for share, mix, result in aoa_tables.aoa_shares():
+        errors = {name: f"{m['great_circle_deg']['median']:.2f}°" for name, m in mix["methods"].items()}
+        errors["synthetic"] = f"{errors[aoa_tables.turbo_condition(mix).method]} with synthetic spectra"
+        degree[result["metrics"]["data"], result["metrics"]["split"], share] = errors
+    office, tag = degree["newrf-office", "random", "0.3"], degree["s23-200", "block", "0.3"]
+    room = f"{office['synthetic']}, {office[LOCATED]} by the room"
+    rows = [
+        ["RSSI where nobody measured", "tetam-tracks, spatial"],
+        ["position from RSSI", "tetam-tracks, spatial"],
+        ["position from Wi-Fi RSSI, public benchmark, mean 3D error", "ts-tut5, published"],
+        ["CSI where nobody measured, coherence", "newrf-conference"],
+        ["direction, ray-traced furnished room", "newrf-office, random"],
+        ["direction, measured spectra of an RFID tag", "s23-200, block"],
+    ]
+    cells = [
+        [f"path loss {decibel['mri_receiver']}", f"`{baseline}` {decibel[baseline]}", decibel["swiftwrf"]],
+        [f"mean {metre['mean']:.2f} m", f"`{other}` {metre[other]:.2f} m", f"{metre['posterior']:.2f} m"],
+        [f"1-NN {mean['nearest']:.2f} m", f"`knn` {mean['knn']:.2f} m", f"{mean['posterior']:.2f} m"],
+        [f"nearest {coherence['nearest']}", f"Gaussian process {coherence['gaussian_process']}", channels],
+        [f"strongest peak {office['peak']}", f"network {office[MEASURED_NETWORK]}", room],
+        [f"mean {tag['constant']}", f"network {tag[MEASURED_NETWORK]}", tag["synthetic"]],
+    ]
+    columns = ["question", "data, split", "simplest method", "best other method", "SwiftWRF"]
+    return markdown(columns, [[*row, *three] for row, three in zip(rows, cells, strict=True)])
 
 
-def precision() -> str:
-    """Return the errors of rounded numbers."""
-    rows = [[row["what"], f"{row['error']:.0e}", f"{row['psnr_db']:.0f}"] for row in load("stability_cpu")["precision"]]
-    return markdown(["what is rounded", "largest error of \\|A\\| over the largest", "PSNR [dB]"], rows)
+def datasets() -> str:
+    """Return the public data sets that have a name."""
+    rows = [
+        [f"`{row.Index}`", str(row.content), str(row.licence), f"[{str(row.source).rpartition('/')[2]}]({row.source})"]
+        for row in catalogue().itertuples()
+    ]
+    return markdown(["name", "content", "licence", "source"], rows)
 
 
-def hard_fits() -> str:
-    """Return how each hard fit ended."""
-    rows = []
-    for row in load("stability_cpu")["fits"]:
-        if row["refusal"]:
-            ended = f"refused: {row['refusal']}"
-        else:
-            ended = f"{row['psnr_db']:.1f} dB on its own spectra (their mean: {row['mean_psnr_db']:.1f})"
-        rows.append([row["case"], str(row["n"]), ended, f"{row['seconds']:.0f} s"])
-    return markdown(["case", "spectra", "how the fit ended", "time"], rows)
-
-
-MODULES = (aoa_tables, field_tables, rssi_tables, speed_tables, targets)
+MODULES = (aoa_tables, field_tables, rssi_tables, speed_tables)
 FILES = ("README.md", *sorted(file.relative_to(ROOT).as_posix() for file in (ROOT / "docs").rglob("*.md")))
 
 

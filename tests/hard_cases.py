@@ -1,6 +1,6 @@
 """Hard cases of the rasterizer with the rule that each follows, and how far a backend is from the definition in float64.
 
-The benchmark `stability.py` tabulates them; the tests hold every backend to `tolerances.py`.
+The tests hold every backend to `tolerances.py`.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Each uses the covariance R = mean of h h^H over the snapshots (subcarriers or packets) of one position, and scales every
 spectrum S into [0, 1]. With steering vector a(k) and K elements:
 
-    phase:    S(k)^2 = a^H R a / K^2, R from the phases of h only (the paper's spectrum for one snapshot)
+    phase:    S(k)^2 = a^H R a / (K tr R), R from the phases of h only (the paper's spectrum for one snapshot)
     bartlett: S(k)^2 = a^H R a / (K tr R), the fraction of the power that a beam towards k collects
     capon:    S(k)^2 ~ 1 / (a^H R^-1 a), scaled to a maximum of 1
               (J. Capon, "High-resolution frequency-wavenumber spectrum analysis", Proc. IEEE 57, 1969)
@@ -35,15 +35,20 @@ def covariance(channel: Tensor) -> Tensor:
     return channel.mT @ channel.conj() / channel.shape[1]
 
 
+def unit(channel: Tensor) -> Tensor:
+    """Return a channel of any shape with all magnitudes 1, complex128. A missing value, 0, has no phase and stays 0."""
+    channel = channel.to(torch.complex128)
+    return channel / channel.abs().clamp_min(1e-300)
+
+
 def phase(channel: Tensor, responses: Responses) -> Tensor:
     """Return squared spectra (n, ...) of the phases of channels (n, S, K)."""
-    unit = torch.polar(torch.ones((), dtype=torch.float64), channel.angle().double())
-    return responses(covariance(unit) / channel.shape[2] ** 2)
+    return responses(of_unit_power(unit(channel)) / channel.shape[2] ** 2)
 
 
 def bartlett(channel: Tensor, responses: Responses) -> Tensor:
     """Return squared spectra (n, ...) of channels (n, S, K)."""
-    return responses(_of_unit_power(channel) / channel.shape[2] ** 2)
+    return responses(of_unit_power(channel) / channel.shape[2] ** 2)
 
 
 def capon(channel: Tensor, responses: Responses) -> Tensor:
@@ -57,12 +62,12 @@ def capon(channel: Tensor, responses: Responses) -> Tensor:
             f"the capon beamformer needs at least as many snapshots (subcarriers or packets) as elements, got "
             f"{channel.shape[1]} of {channel.shape[2]} elements; use phase or bartlett"
         )
-    power = 1 / responses(torch.linalg.inv(_of_unit_power(channel) + DIAGONAL_LOADING * torch.eye(channel.shape[2])))
+    power = 1 / responses(torch.linalg.inv(of_unit_power(channel) + DIAGONAL_LOADING * torch.eye(channel.shape[2])))
     return power / power.amax(dim=(1, 2), keepdim=True)
 
 
-def _of_unit_power(channel: Tensor) -> Tensor:
-    """Return the covariance (n, K, K), scaled to a mean diagonal of 1."""
+def of_unit_power(channel: Tensor) -> Tensor:
+    """Return the covariance (n, K, K) of channels (n, S, K), scaled to a mean diagonal of 1."""
     found = covariance(channel)
     power = found.diagonal(dim1=1, dim2=2).real.mean(dim=1).clamp_min(1e-300)
     return found / power[:, None, None]

@@ -102,6 +102,10 @@ class PlanarArray:
         y, x = (spacing * (torch.arange(n, dtype=torch.float64) - (n - 1) / 2) for n in (rows, columns))
         return cls(torch.cartesian_prod(y, x).flip(1), LIGHT_SPEED / frequency_hz)
 
+    def subset(self, elements: Tensor) -> PlanarArray:
+        """Return the array of some of the elements, by their indices."""
+        return PlanarArray(self.element[elements], self.wavelength)
+
     @property
     def spacing_wavelengths(self) -> float:
         """Median distance of an element from the nearest other one [wavelengths]."""

@@ -43,7 +43,7 @@ BATCH_POSITIONS = 4096  # whose paths take half a gigabyte
 CHANNELS_HZ = (2.402e9, 2.426e9, 2.480e9)  # of BLE advertisements; a receiver does not report the channel
 TRANSMIT_DBM = -8.0
 PACKET_NOISE_DB = 2.0
-SENSITIVITY_DBM = -97.0
+SENSITIVITY_DBM = -85.0  # of a simple receiver: weaker packets leave their cells empty
 
 
 class Rays(NamedTuple):

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -169,26 +170,78 @@ def check_spacing(file: Path, array: PlanarArray) -> None:
         )
 
 
-def kept_subcarriers(channel: Tensor, drop: bool) -> tuple[Tensor, tuple[str, ...]]:
-    """Return which subcarriers of a channel (n, S, K) to use, (S,), all but the null ones on request, and a note on these.
+class Measured(NamedTuple):
+    """Channel (n, S, K) without what is missing, its snapshots and elements among those of the source, and notes."""
 
-    Null, guard and DC subcarriers hold a constant or nothing: they are the same at every position and element.
+    channel: Tensor
+    snapshot: Tensor
+    element: Tensor
+    notes: tuple[str, ...]
+
+
+def measured(source: Path, channel: Tensor, drop_null: bool = False, drop: Sequence[int] = ()) -> Measured:
+    """Return a channel (n, S, K) with missing values as 0: those that are 0 or NaN. Beamformers do not use them.
+
+    Elements without any value are left out, so are snapshots if other rows have fewer of them. Null, guard and DC
+    subcarriers hold a constant or nothing: they are the same at every position and element.
+
+    Args:
+        source: File or folder, for messages.
+        channel: Complex channels.
+        drop_null: Leave out null subcarriers, too.
+        drop: Elements to leave out, counted from 0.
+
+    Raises:
+        InputError: A position without any value, fewer than 2 elements, or one to leave out that does not exist.
 
     Example:
         >>> channel = torch.randn(5, 4, 3, dtype=torch.complex64)
         >>> channel[:, 2] = 12 + 3j
-        >>> kept_subcarriers(channel, drop=True)
-        (tensor([ True,  True, False,  True]), (...are left out (1 of 4, counted from 0): 2',))
+        >>> measured(Path("a"), channel, drop_null=True)[1:]
+        (tensor([0, 1, 3]), tensor([0, 1, 2]), (...are left out (1 of 4, counted from 0): 2',))
     """
-    first = channel[:1, :, :1]
-    null = ((channel - first).abs() <= 1e-3 * first.abs()).all(dim=2).all(dim=0)
-    if not bool(null.any()) or bool(null.all()) or len(channel) < 2:
-        return torch.ones_like(null), ()
-    which = f"({int(null.sum())} of {len(null)}, counted from 0): {ranges(null.nonzero()[:, 0].tolist())}"
-    name = "null subcarriers, the same at every position and element, are"
-    if drop:
-        return ~null, (f"{name} left out {which}",)
-    return torch.ones_like(null), (f"{name} used like the others {which}; --drop-null leaves them out",)
+    count, elements = channel.shape[1:]
+    missing, notes = (channel == 0) | channel.isnan(), []
+    channel = channel.masked_fill(missing, 0)
+    if lost := missing.all(dim=2).all(dim=1).nonzero()[:, 0].tolist():
+        raise InputError(f"{source}: csi of row {lost[0]} has no power; leave it out")
+    if beyond := [number for number in drop if not 0 <= number < elements]:
+        raise InputError(f"{source} has elements 0 to {elements - 1}, so element {beyond[0]} cannot be left out")
+    silent = missing.all(dim=1).all(dim=0)
+    used = ~silent
+    used[list(drop)] = False
+    if int(used.sum()) < 2:
+        raise InputError(
+            f"{source}: csi has values at {int(used.sum())} elements; expected at least 2 to resolve directions"
+        )
+    for which, reason in (
+        (silent.nonzero()[:, 0].tolist(), "silent (0 or NaN everywhere)"),
+        (list(drop), "to be ignored"),
+    ):
+        if which:
+            named = f"element {which[0]} is" if len(which) == 1 else f"elements {ranges(sorted(which))} are"
+            notes.append(f"{named} {reason} and left out (counted from 0)")
+    channel, missing = channel[..., used], missing[..., used]
+    empty = missing.all(dim=2)
+    kept = torch.ones(count, dtype=torch.bool)
+    if bool((empty.any(dim=0) & ~empty.all(dim=0)).any()):  # rows differ in their number of packets
+        kept = ~empty.all(dim=0)
+        notes.append(f"{int(empty.sum())} of {empty.numel()} snapshots are 0 or NaN at all elements and left out")
+    elif len(channel) > 1:
+        first = channel[:1, :, :1]
+        null = ((channel - first).abs() <= 1e-3 * first.abs()).all(dim=2).all(dim=0)
+        if bool(null.any()) and not bool(null.all()):
+            which_null = f"({int(null.sum())} of {count}, counted from 0): {ranges(null.nonzero()[:, 0].tolist())}"
+            name = "null subcarriers, the same at every position and element, are"
+            kept = ~null if drop_null else kept
+            notes.append(
+                f"{name} left out {which_null}"
+                if drop_null
+                else f"{name} used like the others {which_null}; --drop-null leaves them out"
+            )
+    if some := int((missing & ~empty[..., None]).sum()):
+        notes.append(f"{some} of {missing.numel()} values of single elements are 0 or NaN and not used")
+    return Measured(channel[:, kept], kept.nonzero()[:, 0], used.nonzero()[:, 0], tuple(notes))
 
 
 def round_trip_array(array: PlanarArray) -> tuple[PlanarArray, tuple[str, ...]]:

@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from swiftwrf.array.angles import angular_distance, wrap
-from swiftwrf.array.beamforming import covariance
+from swiftwrf.array.beamforming import of_unit_power, unit
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.splits import FOLDS, MIN_TRAINING, slabs
@@ -178,7 +178,7 @@ class _Problem:
 
     @classmethod
     def of(cls, data: Snapshots) -> _Problem:
-        received = covariance(unit_phasor(data.channel.angle().double()))
+        received = of_unit_power(unit(data.channel))
         return cls(
             data.array, data.position, data.direction, received, torch.linalg.eigh(received).eigenvectors[..., -1]
         )

@@ -12,6 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from swiftwrf.array.beamforming import unit
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.snapshots import Snapshots
 
@@ -124,7 +125,7 @@ def phases_are_constant(data: Snapshots) -> bool:
 def _unit_channel(data: Snapshots) -> Tensor:
     """Return the phases of some snapshots of each position, complex128 (n, S, K)."""
     few = data.channel[:, :: max(1, data.channel.shape[1] // 8)]
-    return unit_phasor(few.angle().double())
+    return unit(few)
 
 
 def unit_phasor(phase: Tensor) -> Tensor:

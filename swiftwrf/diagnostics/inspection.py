@@ -12,7 +12,7 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.data import Rssi, Snapshots, Spectra
-from swiftwrf.data.columns import has_frequent_edge
+from swiftwrf.data.powers import has_frequent_edge
 from swiftwrf.data.splits import MAX_REPEATED, MIN_TRAINING, repeated_fraction
 from swiftwrf.diagnostics.calibration import calibrate
 from swiftwrf.diagnostics.elements import flipping_elements, phases_are_constant

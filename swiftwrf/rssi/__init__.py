@@ -2,19 +2,12 @@
 
 from swiftwrf.rssi.base import Map, RssiConfig, RssiPredictor
 from swiftwrf.rssi.comparison import RssiComparison, compare
+from swiftwrf.rssi.mixing import LEVEL
 from swiftwrf.rssi.model import RssiModel, fit_rssi
+from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation, estimate_offsets
 from swiftwrf.rssi.pairs import PairConfig, PairModel, PairPredictor
 from swiftwrf.rssi.paper import RssiPaperConfig, RssiPaperModel
-from swiftwrf.rssi.path_loss import (
-    FloorAttenuation,
-    PathLoss,
-    estimate_floor_attenuation,
-    estimate_offsets,
-    fit_path_loss,
-    fit_shared_path_loss,
-    log_distance,
-)
-from swiftwrf.rssi.training import LEVEL
+from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, fit_shared_path_loss, log_distance
 
 __all__ = [
     "LEVEL",

@@ -28,7 +28,7 @@ from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Displayed
 from swiftwrf.positions import check_positions, to_tensor
 from swiftwrf.rssi.detection import Detection
-from swiftwrf.rssi.path_loss import FloorAttenuation, estimate_floor_attenuation, receiver_floors
+from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation, receiver_floors
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.session import Record
 from swiftwrf.runtime.threads import parallel_map, to_device
@@ -185,7 +185,7 @@ class RssiPredictor(Configured, Displayed, ABC):
         others = {"parallel": parallel, "checkpoint": checkpoint, "on_record": on_record, "progress": progress}
         curve = Detection.estimate(pool.transmitter_position, pool.rssi_dbm + shift)
         self.detection = curve and curve.columns(columns_of(self.receiver_names, pool))
-        self._fit(train, pool=pool, shift=shift, device=to_device(device), **others)
+        self._fit(train, pool=pool, shift=shift, curve=curve, device=to_device(device), **others)
         return self
 
     @checked
@@ -245,13 +245,14 @@ class RssiPredictor(Configured, Displayed, ABC):
         raise NotImplementedError
 
     @abstractmethod
-    def _fit(self, train: Rssi, *, pool: Rssi, shift: Tensor, **arguments: Any) -> None:
+    def _fit(self, train: Rssi, *, pool: Rssi, shift: Tensor, curve: Detection | None, **arguments: Any) -> None:
         """Fit to checked data.
 
         Args:
             train: Training rows.
             pool: The same rows at all receivers.
             shift: Received power less the RSSI of the pool, by floors and offsets that were removed, (n, P) [dB].
+            curve: Curve of detection of the pool; None if every cell has a value.
             arguments: The other arguments of `fit`. A predictor declares those that it uses, and ignores the rest by `**_`.
         """
 

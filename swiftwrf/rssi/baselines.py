@@ -23,9 +23,10 @@ from swiftwrf.data.splits import MIN_TRAINING, folds
 from swiftwrf.models.base import CPU, FieldConfig
 from swiftwrf.rssi.base import Map, RssiPredictor, columns_of
 from swiftwrf.rssi.comparison import make_predictor
+from swiftwrf.rssi.detection import Detection
+from swiftwrf.rssi.mixing import mixing_weights
 from swiftwrf.rssi.pairs import PairPredictor
 from swiftwrf.rssi.path_loss import fit_path_losses, fit_shared_path_loss, log_distance
-from swiftwrf.rssi.training import mixing_weights
 from swiftwrf.runtime.threads import parallel_map
 from swiftwrf.runtime.validation import Preset, configuration
 
@@ -61,7 +62,7 @@ class SharedPathLoss(RssiPredictor):
     name = "mri_pooled"
     requires_receiver_position = True
 
-    def _fit(self, train: Rssi, *, pool: Rssi, shift: Tensor, **_: Any) -> None:
+    def _fit(self, train: Rssi, *, pool: Rssi, shift: Tensor, curve: Detection | None, **_: Any) -> None:
         self._receiver = train.receiver_position
         distance = log_distance(pool.transmitter_position, pool.receiver_position)
         known = pool.receiver_located, train.receiver_located
@@ -76,9 +77,9 @@ class ReceiverPathLoss(SharedPathLoss):
 
     name = "mri_receiver"
 
-    def _fit(self, train: Rssi, *, pool: Rssi, shift: Tensor, **_: Any) -> None:
-        self._receiver = train.receiver_position
-        found = fit_path_losses(pool.transmitter_position, pool.receiver_position, pool.rssi_dbm, shift=shift)
+    def _fit(self, train: Rssi, *, pool: Rssi, shift: Tensor, curve: Detection | None, **_: Any) -> None:
+        self._receiver, at = train.receiver_position, pool.transmitter_position
+        found = fit_path_losses(at, pool.receiver_position, pool.rssi_dbm, "auto", shift, curve)
         self._path_loss = found.columns(columns_of(train.receiver_names, pool)).own
 
 

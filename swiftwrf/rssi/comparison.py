@@ -22,11 +22,11 @@ from swiftwrf.metrics import method_summary
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import distance
 from swiftwrf.rssi.base import Map, RssiPredictor
+from swiftwrf.rssi.mixing import LEVEL
 from swiftwrf.rssi.model import RssiModel
+from swiftwrf.rssi.offsets import estimate_offsets
 from swiftwrf.rssi.pairs import PairModel
 from swiftwrf.rssi.paper import RssiPaperModel
-from swiftwrf.rssi.path_loss import estimate_offsets
-from swiftwrf.rssi.training import LEVEL
 from swiftwrf.runtime.validation import Preset, checked
 
 Values = dict[str, Any]

@@ -26,21 +26,11 @@ from swiftwrf.rssi.base import Map, RssiConfig, SavedRssiPredictor, columns_of, 
 from swiftwrf.rssi.detection import Detection, DetectionField
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
 from swiftwrf.rssi.maps import RssiMap
+from swiftwrf.rssi.mixing import check_comparable, comparable, interval_scale, mixing_weights, rounding_std
 from swiftwrf.rssi.path_loss import N_HARMONICS, harmonics, log_distance
 from swiftwrf.rssi.posterior import FitState, RssiPosterior
-from swiftwrf.rssi.training import (
-    RssiTraining,
-    Uncertainty,
-    check_comparable,
-    comparable,
-    fit_receiver,
-    held_out_std,
-    interval_scale,
-    mixing_weights,
-    prepare,
-    representative_receivers,
-    rounding_std,
-)
+from swiftwrf.rssi.regression import Uncertainty, fit_receiver, held_out_std
+from swiftwrf.rssi.training import RssiTraining, prepare, representative_receivers
 from swiftwrf.runtime import checkpoint as files
 from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.progress import progress_bar
@@ -108,11 +98,11 @@ class RssiModel(SavedRssiPredictor):
     _posterior: RssiPosterior | None
     """least squares of the fit, which `update` continues; None for `RssiPaperModel`"""
 
-    def _fit(self, train: Rssi, *, pool: Rssi, shift: Tensor, **arguments: Any) -> None:
-        training = prepare(train, pool, self.config, shift=shift)
+    def _fit(self, train: Rssi, *, pool: Rssi, shift: Tensor, curve: Detection | None, **arguments: Any) -> None:
+        training = prepare(train, pool, self.config, shift, curve)
         found = self._receivers(training, **arguments)
         held_out = _held_out_predictors(training, found)
-        weight = self._mixing_weights(train, pool, training, held_out[0], shift, **arguments)
+        weight = self._mixing_weights(train, pool, training, held_out[0], (shift, curve), **arguments)
         self._assemble(train, training, found, held_out, weight[:, None].repeat(1, len(training.receiver_names)))
 
     def _receivers(
@@ -137,7 +127,7 @@ class RssiModel(SavedRssiPredictor):
         pool: Rssi,
         training: RssiTraining,
         predictors: Tensor,
-        shift: Tensor,
+        removed: tuple[Tensor, Detection | None],
         **arguments: Any,
     ) -> Tensor:
         """Return the weights (4,) of the field and the simpler predictors with the lowest error on held-out rows.
@@ -149,7 +139,7 @@ class RssiModel(SavedRssiPredictor):
         if set(some.receiver_names) <= set(train.receiver_names):
             predictors = predictors[:, :, columns_of(some.receiver_names, train)]
         else:
-            others = prepare(some, pool, self.config, training, shift)
+            others = prepare(some, pool, self.config, *removed, training)
             predictors = _held_out_predictors(others, self._receivers(others, **arguments | {"progress": False}))[0]
         predicted = predictors[:, training.bin_of_row]
         if not comparable(predicted, some.rssi_dbm).any():

@@ -10,6 +10,8 @@ known places are predicted, they depend on the place, by a ridge regression.
 from __future__ import annotations
 
 from abc import abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import groupby
 from statistics import NormalDist
 from typing import Any, ClassVar, NamedTuple, Self
@@ -26,8 +28,8 @@ from swiftwrf.models.base import FieldConfig
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import Neighbours, check_positions, distance
 from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiPredictor, SavedRssiPredictor
-from swiftwrf.rssi.path_loss import PairPathLoss
-from swiftwrf.rssi.training import LEVEL, rounding_std
+from swiftwrf.rssi.mixing import LEVEL, rounding_std
+from swiftwrf.rssi.path_loss import MIN_DISTANCE_M, fit_path_loss
 from swiftwrf.runtime import checkpoint as files
 from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.threads import single_thread
@@ -49,6 +51,68 @@ class PairConfig(FieldConfig):
     new_places: bool = True
     """fit for receivers at positions without a measurement, with one path-loss model; otherwise for new positions of the
     transmitter, as `validation` states, with a path-loss model for each receiver"""
+
+
+@dataclass(frozen=True, eq=False)
+class PairPathLoss:
+    """The log-distance path-loss model over pairs of positions: one for all receivers, and corrections at some places.
+
+    Args:
+        shared: RSSI at 1 m [dBm] and slope [dB a decade] of all receivers, float64 (2,).
+        place: Positions of the receivers with a correction, float64 (P, 3) [m].
+        correction: What is added to RSSI at 1 m and slope at these places, float64 (P, 2).
+
+    Example:
+        >>> pair = torch.tensor([[0.0, 0, 1, 0, 0, 0], [0.0, 0, 10, 0, 0, 0]])
+        >>> PairPathLoss.fit(pair, torch.tensor([-40.0, -60.0]), by_place=False)(pair)
+        tensor([-40., -60.], dtype=torch.float64)
+    """
+
+    shared: Tensor
+    place: Tensor
+    correction: Tensor
+
+    @classmethod
+    def fit(cls, pair: Tensor, rssi: Tensor, by_place: bool) -> Self:
+        """Fit the model by least squares, the corrections with a ridge penalty.
+
+        Args:
+            pair: Positions of transmitter and receiver, (m, 6) [m].
+            rssi: Measurements (m,) [dBm].
+            by_place: Whether each position of a receiver has a correction.
+        """
+        apart = _pair_log_distance(pair)
+        shared = torch.cat(fit_path_loss(apart[:, None], rssi[:, None].double()))
+        place, row = pair[: len(pair) if by_place else 0, 3:].double().unique(dim=0, return_inverse=True)
+        if not len(place):
+            return cls(shared, place.reshape(0, 3), torch.zeros(0, 2, dtype=torch.float64))
+        centre = apart.mean()
+        own = torch.stack([torch.ones_like(apart), apart - centre], dim=1)
+        normal = 10.0 * torch.eye(2).double().repeat(len(place), 1, 1)  # half after 10 measurements
+        normal = normal.index_add(0, row, own[:, :, None] * own[:, None])
+        residual = rssi - shared[0] - shared[1] * apart
+        right = torch.zeros(len(place), 2, dtype=torch.float64).index_add(0, row, own * residual[:, None])
+        slope = torch.linalg.solve(normal, right)[:, 1].clamp_max(-shared[1])  # the sum of both slopes is at most 0
+        level = (right[:, 0] - normal[:, 0, 1] * slope) / normal[:, 0, 0]
+        return cls(shared, place, torch.stack([level - slope * centre, slope], dim=1))
+
+    @cached_property
+    def _places(self) -> Neighbours:
+        return Neighbours(self.place)
+
+    def __call__(self, pair: Tensor) -> Tensor:
+        """Return the RSSI (m,) [dBm] at pairs (m, 6) [m]; at places without a correction by the shared model."""
+        values = self.shared.expand(len(pair), 2)
+        if len(self.place) and len(pair):
+            away, nearest = (found[:, 0] for found in self._places(pair[:, 3:], 1))
+            values = values + self.correction[nearest].where(away[:, None] < 1e-3, 0.0)
+        return values[:, 0] + values[:, 1] * _pair_log_distance(pair)
+
+
+def _pair_log_distance(pair: Tensor) -> Tensor:
+    """Return the log10 of the distances [m] between the ends of pairs (m, 6), float64 (m,)."""
+    squared = (pair[:, :3].double() - pair[:, 3:].double()).square().sum(dim=1)
+    return squared.clamp_min(MIN_DISTANCE_M**2).log10() / 2
 
 
 class PairPredictor(RssiPredictor):

@@ -3,7 +3,7 @@
     rssi_r(s) = -100 + m_r(c_r(s))       [dBm]
 
 m_r is the mean magnitude of the receiver's primitives (`swiftwrf.rssi.head`), and c_r a Gaussian process of the position.
-There is no path-loss model. The loss is that of `swiftwrf.rssi.training`.
+There is no path-loss model. The loss is that of `swiftwrf.rssi.regression`.
 """
 
 from __future__ import annotations
@@ -21,19 +21,11 @@ from swiftwrf.errors import FitError
 from swiftwrf.models.base import CPU
 from swiftwrf.rssi.base import Map, RssiConfig
 from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
+from swiftwrf.rssi.mixing import check_comparable, interval_scale, rounding_std
 from swiftwrf.rssi.model import FIELD_ALONE, RssiModel
 from swiftwrf.rssi.path_loss import N_HARMONICS
-from swiftwrf.rssi.training import (
-    Bins,
-    bin_locations,
-    binned,
-    check_comparable,
-    choose_residual_kernel,
-    held_out_std,
-    interval_scale,
-    prior_std,
-    rounding_std,
-)
+from swiftwrf.rssi.regression import held_out_std
+from swiftwrf.rssi.training import Bins, bin_locations, binned, choose_residual_kernel, prior_std
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, configuration

@@ -1,29 +1,20 @@
-"""Received power without a field: path loss, directivity of a receiver, floors, and offsets between groups of rows.
+"""Received power without a field: the log-distance path loss of each receiver, learnt together, and its directivity.
 
-    rssi = T - 10 gamma log10 d - F |floor(s) - floor(receiver)| + offset of the group       [dBm]
-
-F is the floor attenuation factor (S. Y. Seidel and T. S. Rappaport, IEEE Transactions on Antennas and Propagation 40, 1992),
-linear in the number of floors. Groups are devices, channels or any other between which RSSI has constant offsets.
+rssi = T - 10 gamma log10 d       [dBm]
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, NamedTuple, Self
+from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from swiftwrf.choices import NotDetected
-from swiftwrf.data.coordinates import Floors
-from swiftwrf.data.rssi import Offsets, Rssi
-from swiftwrf.errors import InputError, listed
-from swiftwrf.gp import Kernel
-from swiftwrf.positions import Neighbours, distance
+from swiftwrf.positions import distance
 from swiftwrf.rssi.detection import Detection, empty_given
 from swiftwrf.runtime.threads import single_thread
 
@@ -35,7 +26,6 @@ SPREAD_DB, SPREAD_WORTH = 6.0, 4.0  # prior of the spread over receivers, and th
 FLOOR_STD_DB = 20.0  # prior standard deviation of the attenuation of a floor about 0
 ROWS_WORTH = 10.0  # rows of a receiver that count as much as the variance of all receivers
 MAX_UNEXPLAINED = 0.4  # share of empty cells where a value was expected, beyond which those of a receiver are ignored
-MAX_ROWS = 300  # of a receiver, from which offsets are estimated; the cost grows with their cube
 
 
 def log_distance(position: Tensor, receiver: Tensor) -> Tensor:
@@ -335,221 +325,3 @@ def _maximise(
         "variance": variance,
         "unexplained": unexplained,
     }
-
-
-@dataclass(frozen=True, eq=False)
-class PairPathLoss:
-    """The log-distance path-loss model over pairs of positions: one for all receivers, and corrections at some places.
-
-    Args:
-        shared: RSSI at 1 m [dBm] and slope [dB a decade] of all receivers, float64 (2,).
-        place: Positions of the receivers with a correction, float64 (P, 3) [m].
-        correction: What is added to RSSI at 1 m and slope at these places, float64 (P, 2).
-
-    Example:
-        >>> pair = torch.tensor([[0.0, 0, 1, 0, 0, 0], [0.0, 0, 10, 0, 0, 0]])
-        >>> PairPathLoss.fit(pair, torch.tensor([-40.0, -60.0]), by_place=False)(pair)
-        tensor([-40., -60.], dtype=torch.float64)
-    """
-
-    shared: Tensor
-    place: Tensor
-    correction: Tensor
-
-    @classmethod
-    def fit(cls, pair: Tensor, rssi: Tensor, by_place: bool) -> Self:
-        """Fit the model by least squares, the corrections with a ridge penalty.
-
-        Args:
-            pair: Positions of transmitter and receiver, (m, 6) [m].
-            rssi: Measurements (m,) [dBm].
-            by_place: Whether each position of a receiver has a correction.
-        """
-        apart = _pair_log_distance(pair)
-        shared = torch.cat(fit_path_loss(apart[:, None], rssi[:, None].double()))
-        place, row = pair[: len(pair) if by_place else 0, 3:].double().unique(dim=0, return_inverse=True)
-        if not len(place):
-            return cls(shared, place.reshape(0, 3), torch.zeros(0, 2, dtype=torch.float64))
-        centre = apart.mean()
-        own = torch.stack([torch.ones_like(apart), apart - centre], dim=1)
-        normal = 10.0 * torch.eye(2).double().repeat(len(place), 1, 1)  # half after 10 measurements
-        normal = normal.index_add(0, row, own[:, :, None] * own[:, None])
-        residual = rssi - shared[0] - shared[1] * apart
-        right = torch.zeros(len(place), 2, dtype=torch.float64).index_add(0, row, own * residual[:, None])
-        slope = torch.linalg.solve(normal, right)[:, 1].clamp_max(-shared[1])  # the sum of both slopes is at most 0
-        level = (right[:, 0] - normal[:, 0, 1] * slope) / normal[:, 0, 0]
-        return cls(shared, place, torch.stack([level - slope * centre, slope], dim=1))
-
-    @cached_property
-    def _places(self) -> Neighbours:
-        return Neighbours(self.place)
-
-    def __call__(self, pair: Tensor) -> Tensor:
-        """Return the RSSI (m,) [dBm] at pairs (m, 6) [m]; at places without a correction by the shared model."""
-        values = self.shared.expand(len(pair), 2)
-        if len(self.place) and len(pair):
-            away, nearest = (found[:, 0] for found in self._places(pair[:, 3:], 1))
-            values = values + self.correction[nearest].where(away[:, None] < 1e-3, 0.0)
-        return values[:, 0] + values[:, 1] * _pair_log_distance(pair)
-
-
-def _pair_log_distance(pair: Tensor) -> Tensor:
-    """Return the log10 of the distances [m] between the ends of pairs (m, 6), float64 (m,)."""
-    squared = (pair[:, :3].double() - pair[:, 3:].double()).square().sum(dim=1)
-    return squared.clamp_min(MIN_DISTANCE_M**2).log10() / 2
-
-
-@dataclass(frozen=True)
-class FloorAttenuation:
-    """Attenuation of each floor between transmitter and receiver.
-
-    Args:
-        floors: Floors of the building.
-        receiver_floor: Number of each receiver's floor.
-        db: Attenuation of a floor [dB].
-
-    Example:
-        >>> floors = Floors(("ground", "first"), (0.0, 3.0))
-        >>> FloorAttenuation(floors, receiver_floor=(0,), db=15.0).of(torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 3.0]]))
-        tensor([[ -0.],
-                [-15.]], dtype=torch.float64)
-    """
-
-    floors: Floors
-    receiver_floor: tuple[int, ...]
-    db: float
-
-    @classmethod
-    def from_plain(cls, values: Mapping[str, Any] | None) -> Self | None:
-        """Return the attenuation of plain values, None without any."""
-        if not values:
-            return None
-        names, heights = (tuple(values["floors"][field]) for field in ("names", "height_m"))
-        floors = Floors(tuple(map(str, names)), tuple(map(float, heights)))
-        return cls(floors, tuple(map(int, values["receiver_floor"])), float(values["db"]))
-
-    def of(self, position: Tensor) -> Tensor:
-        """Return the RSSI that the floors take from transmitters (n, 3) at each receiver, float64 (n, R) [dB]."""
-        receiver = torch.tensor(self.receiver_floor)
-        return -self.db * (self.floors.number(position.detach())[:, None] - receiver).abs().double()
-
-    def between(self, a: Tensor, b: Tensor) -> Tensor:
-        """Return the RSSI that the floors between positions a and b (m, 3) take, float64 (m,) [dB]."""
-        return -self.db * (self.floors.number(a.detach()) - self.floors.number(b.detach())).abs().double()
-
-    def removed(self, data: Rssi) -> Rssi:
-        """Return the data as if all links were within a floor."""
-        return data.derived(rssi_dbm=data.rssi_dbm - self.of(data.transmitter_position))
-
-
-def estimate_floor_attenuation(train: Rssi, pool: Rssi | None = None) -> FloorAttenuation:
-    """Estimate the attenuation of a floor jointly with the path-loss models of the receivers; see `fit_path_losses`.
-
-    A receiver of unknown position counts as on the floor of its strongest mean RSSI, amid its three strongest rows.
-
-    Args:
-        train: Training rows with floors.
-        pool: The same rows at more receivers, which determine the attenuation. Defaults to `train`.
-
-    Example:
-        >>> import pandas as pd
-        >>> table = pd.DataFrame({"x": [0.0, 5, 9] * 4, "y": 0.0, "floor": [0] * 6 + [1] * 6})
-        >>> table["hall"] = [-50.0, -60, -64] * 2 + [-65.0, -75, -79] * 2
-        >>> round(estimate_floor_attenuation(Rssi.from_frame(table)).db)
-        15
-    """
-    pool = pool or train
-    assert train.floors is not None
-    where = receiver_floors(pool)
-    crossed = (train.floors.number(train.transmitter_position)[:, None] - where).abs().double()
-    strongest = pool.rssi_dbm.nan_to_num(-torch.inf).topk(min(3, len(pool)), dim=0).indices
-    nearby = pool.transmitter_position[strongest].mean(dim=0)
-    receiver = pool.receiver_position.where(pool.receiver_located[:, None], nearby)
-    found = fit_path_losses(pool.transmitter_position, receiver, pool.rssi_dbm, crossed=crossed)
-    measured = pool.detected.sum(dim=0).double()
-    db = float(found.floor_db @ measured / measured.sum())
-    number = dict(zip(pool.receiver_names, where.tolist(), strict=True))
-    return FloorAttenuation(train.floors, tuple(number[name] for name in train.receiver_names), db)
-
-
-def receiver_floors(data: Rssi) -> Tensor:
-    """Return the floor of each receiver by its position, or by where its mean RSSI is strongest, int64 (R,)."""
-    assert data.floors is not None
-    floor, mean = data.floors.number(data.transmitter_position), []
-    rssi = data.rssi_dbm.nan_to_num(float(data.rssi_dbm[data.detected].min()))  # what was not received was weak
-    for number in range(len(data.floors.names)):
-        enough = data.detected[floor == number].sum(dim=0) >= 3
-        mean.append(rssi[floor == number].mean(dim=0).where(enough, -torch.inf))
-    strongest = torch.stack(mean).argmax(dim=0)
-    return data.floors.number(data.receiver_position.nan_to_num(0.0)).where(data.receiver_located, strongest)
-
-
-@single_thread()
-def estimate_offsets(train: Rssi, reference: str | None = None) -> Offsets:
-    """Estimate the offset of each group of rows by generalised least squares.
-
-    RSSI at a receiver is its path-loss model, plus a Gaussian process of the position, plus the offset of the row's group,
-    plus noise. An offset is the same at all receivers.
-
-    Args:
-        train: Training rows with groups.
-        reference: Group with offset 0. Defaults to the most frequent one.
-
-    Raises:
-        InputError: Rows without groups, one group only, or an unknown reference.
-
-    Example:
-        >>> import swiftwrf
-        >>> room = swiftwrf.rssi_room(n=100)
-        >>> table = room.to_frame().rename(columns={"x_m": "x", "y_m": "y", "z_m": "z"}).reset_index(drop=True)
-        >>> table.iloc[::2, 3:] -= 8.0
-        >>> table["phone"] = ["old", "new"] * 50
-        >>> offsets = estimate_offsets(swiftwrf.Rssi.from_frame(table, offset_by="phone"), "new")
-        >>> -9 < offsets.offset_db["old"] < -7
-        True
-    """
-    groups = train.groups
-    if groups is None:
-        raise InputError(f"{train.name} has no groups; read it with offset_by")
-    frequency = groups.code.bincount(minlength=len(groups.names))
-    if int((frequency > 0).sum()) < 2:
-        raise InputError(
-            f"column {groups.column} has one value in the training rows, so there are no offsets to estimate"
-        )
-    chosen = groups.names[int(frequency.argmax())] if reference is None else reference
-    if chosen not in groups.names:
-        raise InputError(f"column {groups.column} has no value {chosen!r}; there are {listed(groups.names)}")
-    position = train.transmitter_position
-    extent = float((position.amax(dim=0) - position.amin(dim=0)).max()) or 1.0
-    kernel = Kernel(0.25 * extent, matern12_weight=1.0, noise=1.0)  # fading is as large as shadowing
-    apart = log_distance(position, train.receiver_position)
-    member = torch.nn.functional.one_hot(groups.code, len(groups.names)).double()
-    normal = torch.zeros(len(groups.names), len(groups.names), dtype=torch.float64)
-    right, total = torch.zeros(len(groups.names), dtype=torch.float64), 0.0
-    generator = torch.Generator().manual_seed(0)
-    for r, rssi in enumerate(train.rssi_dbm.T):
-        rows = (~rssi.isnan()).nonzero()[:, 0]
-        rows = rows[torch.randperm(len(rows), generator=generator)[:MAX_ROWS]]  # evenly spaced rows may be of one group
-        if not len(rows):
-            continue
-        weight = _residual_precision(kernel.covariance(position[rows]), apart[rows, r])
-        normal += member[rows].T @ weight @ member[rows]
-        right += member[rows].T @ weight @ rssi[rows]
-        total += float(rssi[rows] @ weight @ rssi[rows])
-    free = torch.tensor([name != chosen for name in groups.names])
-    precision = normal[free][:, free] + 0.05 * torch.eye(int(free.sum())).double()  # a standard deviation of 10 dB
-    offset = torch.zeros(len(groups.names), dtype=torch.float64)
-    offset[free] = torch.linalg.solve(precision, right[free])
-    explained = float(right @ offset) / total if total > 0 else 0.0
-    estimates = dict(zip(groups.names, offset.tolist(), strict=True))
-    known = {name: db for name, db in estimates.items() if frequency[groups.names.index(name)] > 0 or name == chosen}
-    return Offsets(groups.column, chosen, known, explained)
-
-
-def _residual_precision(covariance: Tensor, apart: Tensor) -> Tensor:
-    """Return the precision of noisy values with covariance (m, m) after a fit of level and slope over log10 distance."""
-    precision = torch.linalg.inv(covariance)
-    free = torch.stack([torch.ones_like(apart), apart], dim=1)
-    weighted = precision @ free
-    projected: Tensor = precision - weighted @ torch.linalg.pinv(free.T @ weighted, hermitian=True) @ weighted.T
-    return projected

@@ -1,6 +1,6 @@
 """Update of an RSSI fit with more rows: the weighted least squares that the fit ended in, bordered by the new rows.
 
-At the end of `swiftwrf.rssi.training.solve` the rows of one receiver have the covariance C + F F^T with
+At the end of `swiftwrf.rssi.regression.solve` the rows of one receiver have the covariance C + F F^T with
 
     C = (slope slope^T) * covariance of the latent field + diag(noise / weight),    F = scaled regressors of the path loss.
 
@@ -25,7 +25,7 @@ from torch.nn import functional
 from swiftwrf.gp import Kernel
 from swiftwrf.rssi.head import HeadTable
 from swiftwrf.rssi.path_loss import N_HARMONICS, harmonics, log_distance
-from swiftwrf.rssi.training import WEIGHT_TOLERANCE, coefficient_scale, regressors
+from swiftwrf.rssi.regression import WEIGHT_TOLERANCE, coefficient_scale, regressors
 
 MAX_NEW_ROWS = 256  # beyond, the weights of new rows are fixed and the inverses are computed again
 TOLERANCE = WEIGHT_TOLERANCE / 100  # of these weights, so that the order of the rows does not matter

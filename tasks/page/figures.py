@@ -208,10 +208,10 @@ def dots(
     axes.set_ylim(len(rows) - 0.4, -0.6)
     if log and any(value > 0 for of_rows in values.values() for value, *_ in of_rows):
         axes.set_xscale("log")
-        low, high = axes.get_xlim()
+        left, right = axes.get_xlim()
         axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_formatter("{x:g}" if high < 10 * low else "")
-        if high >= 10 * low:  # a label a decade would be few
+        axes.xaxis.set_minor_formatter("{x:g}" if right < 10 * left else "")
+        if right >= 10 * left:  # a label a decade would be few
             axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.grid(axis="y", visible=False)
     if len(values) > 1:

@@ -30,6 +30,8 @@ class PredictConfig(Options):
     latitude, longitude, altitude"""
     track: float | None = None
     """rows of SOURCE are a walk: smooths its positions by this typical speed [m/s]. Rows without times are 1 s apart"""
+    ignore_receivers: bool = False
+    """leave out receivers in SOURCE that the locator does not have (default: refuse them)"""
     out: str | None = None
     """table to write; of a field or RSSI model also .mat; must not exist (default: a new predicted-TIME.csv)"""
     output: Answered = Answered()

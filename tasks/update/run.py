@@ -162,6 +162,6 @@ def _read(source: str, options: ReadOptions, model: FieldModel | RssiModel) -> S
     source = located(source)
     if isinstance(model, RssiModel):
         rssi: Any = read(source, options, RSSI_FORMATS)
-        return aligned(rssi.about(model.origin), model.receiver_names)
+        return aligned(rssi.about(model.origin), model.receiver_names, ignore_others=True)
     data: Any = read(source, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS)
     return data.spectra(model.grid, options.beamformer or "phase") if isinstance(data, Snapshots) else data

@@ -59,6 +59,18 @@ def picture(image: Image.Image, corners: Corners, opacity: float = 1.0) -> Data:
     return [[*corners, image.width, image.height, opacity, content]]
 
 
+def stripes(where: NDArray[np.bool_]) -> Values:
+    """Return pixels of diagonal stripes, six by six for each cell of a map (rows, columns): 1 on a stripe, else nan.
+
+    Example:
+        >>> stripes(np.array([[True, False]])).shape
+        (6, 12)
+    """
+    inside = np.kron(where, np.ones((6, 6))) > 0
+    row, column = np.indices(inside.shape)
+    return np.where(inside & ((row + column) % 18 < 3), 1.0, np.nan)
+
+
 def dots(name: str, colour: str, size: float, system: str = "cartesian2d", **style: Any) -> Option:
     """Return a layer of dots, for data of `points`."""
     look = {"opacity": 1, "color": colour} | style

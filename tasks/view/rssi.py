@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from swiftwrf import Prediction, Rssi, RssiModel
+from swiftwrf.data.coordinates import Floors
 from swiftwrf.locate.posterior import PlanMap
 from swiftwrf.rssi import LEVEL
 from swiftwrf.rssi.maps import RssiMap
@@ -146,6 +147,18 @@ class RssiView:
         low, middle, high = np.quantile(self.position[:, 2], (0, 0.5, 1)).tolist()
         return low, middle, high
 
+    @property
+    def floors(self) -> Floors | None:
+        """Floors of the building; None if there is one only."""
+        return None if self.model.attenuation is None else self.model.attenuation.floors
+
+    def on_floor(self, height: float) -> NDArray[np.bool_]:
+        """Return which measured rows are on the floor of a height [m], (n,)."""
+        if self.floors is None:
+            return np.ones(len(self.position), dtype=bool)
+        at = torch.tensor([[0.0, 0.0, height]], dtype=torch.float64)
+        return (self.floors.number(self.rows.transmitter_position) == self.floors.number(at)).numpy()
+
     def __post_init__(self) -> None:
         if self.folder is not None and (stored := FloorPlan.load(self.folder)) is not None:
             self.plan = stored
@@ -174,6 +187,12 @@ class RssiView:
         if self._last is None or self._last.height != height:
             self._last = RssiMap.predict(self.model, height=height, region=self.region)
         return self._last
+
+    def silent(self, selection: MapSelection) -> NDArray[np.bool_]:
+        """Return where a packet is more likely lost than received, at the selected receiver or at all of them."""
+        detection = self.map(selection.height).detection
+        shown = detection.max(axis=0) if selection.kind == "best receiver" else detection[selection.receiver]
+        return np.asarray(shown < 0.5)
 
     def coloured(self, selection: MapSelection) -> ColouredMap:
         """Return values and colours of the selected map."""
@@ -234,9 +253,10 @@ class RssiView:
         match selection.kind:
             case "RSSI":
                 dots = bool(self.rows.detected[:, selection.receiver].any())
-                return f"Predicted RSSI of {name}{'; dots: measured, in the same colours' if dots else ''}."
+                measured = "; dots: measured, in the same colours, hollow where nothing was received" if dots else ""
+                return f"Predicted RSSI of {name}{measured}.{self._hatching(selection)}"
             case "interval":
-                return f"Width of the {LEVEL:.0%} interval of a measurement at {name}."
+                return f"Width of the {LEVEL:.0%} interval of a measurement at {name}.{self._hatching(selection)}"
             case "coverage":
                 number = selection.at_least
                 who = {0: name, 1: "at least one receiver"}.get(number, f"at least {number} receivers")
@@ -248,8 +268,12 @@ class RssiView:
                 )
             case "best receiver":
                 first, fraction = next(iter(self.best(selection.height).items()))
-                return f"Receiver with the highest prediction: {self.receivers[first]} on {fraction:.0%} of the map."
+                best = f"Receiver with the highest prediction: {self.receivers[first]} on {fraction:.0%} of the map."
+                return best + self._hatching(selection)
         raise AssertionError(selection.kind)
+
+    def _hatching(self, selection: MapSelection) -> str:
+        return " Hatched: a packet is more likely lost than received." if self.silent(selection).any() else ""
 
     def at(self, selection: MapSelection, x: float, y: float) -> Prediction:
         """Return the predictions of all receivers (R,) at a position [m], at the height of the selected map."""

@@ -6,6 +6,7 @@ import io
 from urllib.parse import unquote
 
 import numpy as np
+import torch
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 from nicegui import events, run, ui
@@ -13,7 +14,7 @@ from PIL import Image
 
 from swiftwrf import InputError
 from tasks.page.maps import FloorPlan, colour_image, read_pixels
-from tasks.view.charts import BAR, Data, around, colour_bar, crosses, dots, named, picture, pictures, points
+from tasks.view.charts import BAR, Data, around, colour_bar, crosses, dots, named, picture, pictures, points, stripes
 from tasks.view.page import (
     MAX_UPLOAD_BYTES,
     NewestOnly,
@@ -43,7 +44,8 @@ class RssiPage:
         with header(view.title, view.notes):
             kinds = {kind: KIND_LABELS.get(kind, kind) for kind in view.kinds}
             self._kind = ui.toggle(kinds, value="RSSI", on_change=self._update).props("no-caps padding='2px 12px'")
-        layers = [pictures("floor"), pictures("map"), pictures("outside"), dots("rows", ROW, 3)]
+        layers = [pictures(name) for name in ("floor", "map", "silent", "outside")] + [dots("rows", ROW, 3)]
+        layers += [dots("nothing", "transparent", 6, borderColor="white", borderWidth=1)]
         layers += [dots("measured", ROW, 8, borderColor="white", borderWidth=0.7), *located_layers()]
         layers += [crosses("receivers", RECEIVER_MARK)]
         with ui.row().classes("w-full items-start gap-8 lg:flex-nowrap"):
@@ -59,9 +61,15 @@ class RssiPage:
         self._receiver = ui.select(names, value=0, label="receiver", with_input=len(names) > 20, on_change=self._update)
         self._receiver.props("outlined dense options-dense").classes("w-full")
         low, middle, high = self._view.heights
-        with ui.column().classes("w-full") as column:
-            self._height = slider("height", low, high, round(middle, 2), "m", self._update, step=0.01)
-        column.set_visibility(high > low)
+        if (floors := self._view.floors) is not None:
+            heights = dict(zip(floors.height_m, floors.names, strict=True))
+            first = floors.height_m[int(floors.number(torch.tensor([[0.0, 0.0, middle]])))]
+            self._height: ui.select | ui.slider = ui.select(heights, value=first, label="floor", on_change=self._update)
+            self._height.props("outlined dense options-dense").classes("w-full")
+        else:
+            with ui.column().classes("w-full") as column:
+                self._height = slider("height", low, high, round(middle, 2), "m", self._update, step=0.01)
+            column.set_visibility(high > low)
         with ui.column().classes("w-full gap-0") as self._limits:
             self._threshold = slider("above", -110, -30, -75, "dBm", self._update)
             self._certainty = slider("certainty", 50, 99, 90, "%", self._update)
@@ -139,16 +147,20 @@ class RssiPage:
         """Return the data of all layers of the plan."""
         view, rows, corners = self._view, self._view.rows, self._view.chart.corners
         image = colour_image(coloured.values[::-1], coloured.colours, coloured.low, coloured.high)
-        data: dict[str, Data] = {"floor": [], "outside": [], "rows": [], "measured": [], "receivers": []}
+        hidden = ("floor", "silent", "outside", "rows", "nothing", "measured", "receivers")
+        data: dict[str, Data] = {name: [] for name in hidden}
         data["map"] = picture(image, coloured.corners or corners, 0.7 if view.plan else 1.0)
         if view.plan:
             data["floor"] = picture(Image.fromarray(view.plan.pixels), view.plan.corners)
         if selection.kind not in LOCATING:  # grey where the map is extrapolated
             data["outside"] = picture(colour_image(np.where(view.inside, np.nan, 0.5)[::-1], "gray"), corners, 0.55)
+            data["silent"] = picture(colour_image(stripes(view.silent(selection))[::-1], "gray"), corners, 0.6)
         if selection.kind == "RSSI":
-            detected = rows.detected[:, selection.receiver]
-            values = rows.rssi_dbm[detected, selection.receiver].numpy()
-            data["measured"] = points(view.position[detected.numpy()], values)
+            detected, here = rows.detected[:, selection.receiver].numpy(), view.on_floor(selection.height)
+            values = rows.rssi_dbm[detected & here, selection.receiver].numpy()
+            data["measured"] = points(view.position[detected & here], values)
+            if detected.any():  # a saved model does not hold what was received
+                data["nothing"] = points(view.position[~detected & here])
         found = None
         if selection.kind == "posterior" and view.locating is not None:
             data["rows"], found = points(view.position), view.locating.located(selection.row)

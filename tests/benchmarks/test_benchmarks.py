@@ -1,4 +1,4 @@
-"""Studies can be stopped at any time and state what measured their rows; networks are compared on held-out spectra."""
+"""Studies can be stopped at any time and state what measured their rows."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from argparse import Namespace
 from contextlib import nullcontext
 
 import fields
-import networks
 import pytest
 import record
 
@@ -33,11 +32,11 @@ def test_a_study_goes_on_after_the_rows_that_are_there(study, tmp_path, monkeypa
     config = fields.Config("comparison", quick=True, parts=("scenes",), work=tmp_path)
     honest, measured = fields.measure, []
 
-    def measure(parts, fit, state):
+    def measure(part, fit, state):
         if len(measured) == 2:
             raise KeyboardInterrupt
-        measured.append(fit.name)
-        return honest(parts, fit, state)
+        measured.append(fit.method)
+        return honest(part, fit, state)
 
     monkeypatch.setattr(fields, "measure", measure)
     with pytest.raises(KeyboardInterrupt):
@@ -59,17 +58,6 @@ def test_a_study_goes_on_after_the_rows_that_are_there(study, tmp_path, monkeypa
     assert not list(tmp_path.rglob("*.state"))
 
 
-@pytest.mark.parametrize("name", ["synthesis", "model_size", "ablation"])
-def test_every_study_of_the_room_has_its_rows_and_its_table(name, study, tmp_path, monkeypatch):
-    monkeypatch.setattr(fields, "simulated_room", lambda: simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32)))
-    monkeypatch.setattr(fields, "measure", lambda parts, fit, state: measured | {"n_train": fit.n or 24})
-    measured = {"n_test": 6, "fit_seconds": 1.0, "psnr_db": {"median": 20.0}}
-    fields.main(fields.Config(name, work=tmp_path))
-    ((result, content),) = study
-    assert result == name
-    assert len(content["rows"]) == {"synthesis": 7, "model_size": 8, "ablation": 9}[name]
-
-
 def test_rows_measured_at_different_times_have_a_provenance_each(tmp_path, monkeypatch):
     monkeypatch.setattr(record, "RESULTS", tmp_path)
     for number, command in enumerate(("first.py", "folder/second.py --n 2")):
@@ -87,19 +75,3 @@ def test_uncommitted_code_is_not_measured(monkeypatch):
         monkeypatch.setattr(record.subprocess, "run", lambda *_, changed=changed, **options: Namespace(stdout=changed))
         with pytest.raises(SystemExit, match=r"commit them:\n M swiftwrf/gp") if changed else nullcontext():
             assert record.options(dict) == {}
-
-
-def test_networks_are_compared_on_training_spectra_that_are_held_out(monkeypatch):
-    room, written = simulated_room(n=60, grid=AngularGrid.hemisphere(8, 32)), []
-    held_out = room.split("random")[0].split("random", seed=1)[1]
-    monkeypatch.setattr(networks, "simulated_room", lambda: room)
-    monkeypatch.setattr(networks, "has_room", lambda data: False)
-    monkeypatch.setattr(networks, "write_result", lambda name, content, rows: written.append(content))
-    networks.main(networks.Config(trainings=("measured", "turbo"), steps=(1,), name="none"))
-    rows = written[-1]["scenes"]["room"]
-    assert [entry["n_train"] for entry in rows.values()] == [11, 38]
-    for entry in rows.values():
-        heads = {f"{name}, quick, 1 steps" for name in ("aann", "aann_kernel")}
-        assert set(entry["methods"]) == {"kernel_regression", "nearest_spectrum", *heads}
-        assert entry["methods"]["kernel_regression"]["change"]["change"] == 0
-        assert all(len(method["errors_deg"]) == len(held_out) == 10 for method in entry["methods"].values())

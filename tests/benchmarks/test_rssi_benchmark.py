@@ -34,8 +34,7 @@ def test_every_predictor_has_the_same_pairs_and_a_difference_to_the_best_baselin
     assert methods[best]["difference_db"]["median"] == methods[best]["difference_db"]["mean"] == 0
     assert 0.5 < methods["swiftwrf"]["coverage"] <= 1
     monkeypatch.setattr(rssi_tables, "load", lambda name: {"sets": results[-1]})
-    for table in (rssi_tables.rssi_glance, rssi_tables.rssi_heads, rssi_tables.rssi_methods):
-        assert "| b random |" in table()
+    assert "| b random |" in rssi_tables.rssi_glance()
 
 
 def test_measured_splits_are_skipped_on_resume(results, monkeypatch):

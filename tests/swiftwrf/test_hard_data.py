@@ -25,8 +25,8 @@ from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import search, uncertainty
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.swiftwrf import smallest
-from swiftwrf.rssi.path_loss import PairPathLoss
-from swiftwrf.rssi.training import rounding_std
+from swiftwrf.rssi.mixing import rounding_std
+from swiftwrf.rssi.pairs import PairPathLoss
 
 SHORT = {
     "search_distance_m": 0.5,

@@ -1,7 +1,4 @@
-"""Runs that are killed, run into a full disk or into each other: nothing finished is lost, and the numbers are the same.
-
-`benchmarks/reliability.py` does the same many times.
-"""
+"""Runs that are killed, run into a full disk or into each other: nothing finished is lost, and the numbers are the same."""
 
 from __future__ import annotations
 

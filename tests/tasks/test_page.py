@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from pandas import DataFrame
-from pareto import speed
 
 from swiftwrf import AngularGrid, Rssi, Spectra, plotting
 from swiftwrf.diagnostics.inspection import Findings
@@ -155,7 +154,6 @@ def test_figures_of_constant_empty_and_single_values(values):
     for draw in (
         lambda axes: figures.cdf(axes, Palette(), {"a": values}, "error"),
         lambda axes: figures.curves(axes, Palette(), {"a": (values, values)}, "x", "y"),
-        lambda axes: speed(axes, Palette(), {str(i): (x, x) for i, x in enumerate(values)}, "x", "y"),
         lambda axes: plotting.plan(position, torch.tensor(values), "value", axes),
         lambda axes: plotting.plan_map((0, 1, 0, 1), values[None] if n else np.zeros((1, 1)), "v", axes),
     ):

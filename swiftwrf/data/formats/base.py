@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data.coordinates import Coordinates
+from swiftwrf.data.coordinates import Coordinates, Up
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.spectra import Spectra
@@ -47,6 +47,7 @@ class ReadOptions:
     subcarriers: PositiveInt | None = None
     bandwidth: PositiveFloat | None = None
     drop_null: bool = False
+    drop_elements: tuple[int, ...] = ()
     round_trip: bool = False
     columns: Mapping[str, str] | None = None
     filler: tuple[float, ...] | None = None
@@ -54,6 +55,10 @@ class ReadOptions:
     offset_by: str | None = None
     transmitter: tuple[str, ...] = ()
     pool_by: str | None = None
+    scale: PositiveFloat | None = None
+    y_down: bool = False
+    up: Up = "z"
+    window: PositiveFloat | None = None
 
     @property
     def given(self) -> dict[str, Any]:

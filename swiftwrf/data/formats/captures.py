@@ -1,6 +1,17 @@
 """Reader of captures of CSI tools: a folder with one capture per position, their positions, and a description of the array.
 
-The files are NAME.dat (Linux 802.11n CSI Tool) or NAME.pcap (nexmon_csi), positions.csv and array.yml.
+| file | content |
+|---|---|
+| `NAME.dat` | Linux 802.11n CSI Tool (Intel 5300). Elements are the ports A, B, C, in any order of the receiver's chains |
+| `NAME.pcap` | nexmon_csi of a 4358 or 4366c0 (Nexus 6P, RT-AC86U), 20 to 80 MHz. Elements are the cores 0, 1, ... |
+| `positions.csv` | columns `file`, `x`, `y`, `z` [m], optionally `time` [s]: a row per capture |
+| `array.yml` | `frequency_hz`, `array_position`, `array_orientation`; `rows`, `columns`, `spacing_m` or `element_position` |
+
+Snapshots of a position are the subcarriers of at most 32 packets, evenly spaced in the capture. Null, guard and DC
+subcarriers are left out. The first transmitted stream is used. Packets of other numbers of antennas are left out and
+counted. Nexmon scales each core separately, so use the beamformer `phase`. Correct constant phase offsets of the chains,
+e.g. by a capture over equal cables: a calibration from positions needs a planar array. Captures with one antenna (ESP32,
+Raspberry Pi) are refused. PicoScenes is not read: write its channels as array snapshots.
 """
 
 from __future__ import annotations
@@ -14,7 +25,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from swiftwrf.data.archives import MAX_UNPACKED_BYTES, Arrays, refusing_broken
-from swiftwrf.data.columns import column_of, column_of_numbers, text_of
+from swiftwrf.data.cells import column_of_numbers, text_of
+from swiftwrf.data.columns import column_of
 from swiftwrf.data.files import read_bytes, read_table, read_yaml
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
 from swiftwrf.data.formats.snapshots import array_of, snapshots_of

@@ -1,7 +1,12 @@
-"""Reader of the NeRF2 layout for spectra: gateway_info.yml, tx_pos.csv or rx_pos.csv, and spectrum/*.png or an array.
+"""Reader of the NeRF2 layout for spectra, which `swiftwrf.data.writing` writes.
 
-An array in spectrum.npy or spectrum.npz keeps more than eight bits. spectrum.npz may hold line_of_sight, and the gateway
-frequency_hz and element_position. `swiftwrf.data.writing` writes this layout.
+| file | content |
+|---|---|
+| `gateway_info.yml` | `position` [m], `orientation` (x, y, z, w); optional `frequency_hz`, `element_position` [m] |
+| `tx_pos.csv` or `rx_pos.csv` | header `x,y,z`: positions of the end that moves |
+| `spectrum/00001.png`, ... | 8-bit grey; row 0 the lowest elevation (90/H degrees), column 0 azimuth 0 |
+| `spectrum.npy` | alternative: floating point (n, elevations, azimuths) in [0, 1], or unsigned integers |
+| `spectrum.npz` | alternative: `spectrum` as above and optional `line_of_sight` (n,) bool |
 """
 
 from __future__ import annotations

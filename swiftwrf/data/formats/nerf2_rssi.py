@@ -1,8 +1,14 @@
 """Reader of the NeRF2 layout for RSSI: a table of RSSI, positions with the same rows, and positions of the receivers.
 
-The files are gateway_rssi.csv, tx_pos.csv or rx_pos.csv, gateway_position.yml, and perhaps meta.csv with columns of
-sessions and times, and survey.yml with properties of all measurements; or, as the BLE data of the paper are offered,
-rssi.csv, beacon_pos.csv and gateway_pos.csv.
+| file | content |
+|---|---|
+| `gateway_rssi.csv` | a column per receiver, named in the header [dBm]; -100 stands for not detected |
+| `tx_pos.csv` or `rx_pos.csv` | header `x,y,z`: positions of the end that moves |
+| `gateway_position.yml` | optional: `NAME: [x, y, z]` of receivers with known positions |
+| `meta.csv` | optional: a row per measurement, with its session (`session`, `run` or `walk`) and `time` [s] |
+| `survey.yml` | optional: `origin: [latitude, longitude]`, `floors: {NAME: height}` [m], `receiver_moves: true` |
+
+The BLE data of the NeRF2 paper are read unchanged: `rssi.csv`, `beacon_pos.csv` and `gateway_pos.csv`.
 """
 
 from __future__ import annotations
@@ -14,19 +20,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from swiftwrf.data.columns import (
-    NOT_DETECTED_DBM,
-    column_of,
-    column_of_numbers,
-    find_fillers,
-    numbered,
-    seconds,
-    text_of,
-    without_fillers,
-)
+from swiftwrf.data.cells import column_of_numbers, seconds, text_of
+from swiftwrf.data.columns import column_of, numbered
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin, without_fix
 from swiftwrf.data.files import digests, numbers, read_table, read_xyz, read_yaml
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
+from swiftwrf.data.powers import NOT_DETECTED_DBM, find_fillers, without_fillers
 from swiftwrf.data.rssi import META, SURVEY, Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
 from swiftwrf.data.survey import read_receivers, unknown_positions

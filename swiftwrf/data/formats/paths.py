@@ -1,4 +1,14 @@
-"""Reader of ray paths (`paths.npz`): spectra computed from traced paths by the array equations."""
+"""Reader of ray paths (`paths.npz`): spectra computed from traced paths by the array equations.
+
+For N pairs of positions the archive has `transmitter_position` and `receiver_position` (N, 3) [m], `path_count` (N,),
+`line_of_sight` (N,) and `frequency_hz`. For the paths of all pairs in order it has
+
+- `last_point` (sum, 3): point from which the path reaches the receiver [m],
+- `gain` (sum,): complex gain with the phase of the whole length,
+- `length` (sum,): optional [m]. Several subcarriers need it, unless the amplitudes are those of free space.
+
+The array lies level at each receiver. `swiftwrf scenes` writes such folders.
+"""
 
 from __future__ import annotations
 

@@ -2,7 +2,16 @@
 
 The JSON's `antennas` give each array's `location`, `spacingX` (along its rows) and `spacingY` [m], and its orientation:
 `rightvector` and `upvector` as seen from its front, or its `direction` alone for an upright array. The carrier is
-`frequency` [Hz]. Row 0 of an array is its upper one and column 0 its left one, seen from the front.
+`frequency` [Hz]. Row 0 of an array is taken as its upper one and column 0 as its left one, seen from the front. The data
+sets do not define this, so inspect the frames. For DICHASUS the JSON has `assignments`, the antenna of each row and column.
+
+| data set | `csi` | position |
+|---|---|---|
+| ESPARGOS | complex (arrays, 2, 4, subcarriers) | `pos` (3,) [m] |
+| DICHASUS | float32 (antennas, subcarriers, 2): real and imaginary parts, in the order of the FFT | `pos-tachy` (3,) [m] |
+
+64 evenly spaced subcarriers are kept. Phase and time offsets are applied if `reftx-offsets-NAME.json` lies beside
+`NAME.tfrecords`. Records without a finite position or channel are left out and counted.
 
 TFRecord files are read without TensorFlow: a frame around each record, and four protocol-buffer messages inside.
 
@@ -36,7 +45,7 @@ from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.archives import MAX_UNPACKED_BYTES
 from swiftwrf.data.files import check_carrier, digests, read_text
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
-from swiftwrf.data.snapshots import Snapshots, check_spacing, kept_subcarriers, round_trip_array
+from swiftwrf.data.snapshots import Snapshots, check_spacing, measured, round_trip_array
 from swiftwrf.errors import InputError
 from swiftwrf.positions import MAX_COORDINATE_M, check_positions
 from swiftwrf.runtime.validation import PositiveFloat, check_value
@@ -56,7 +65,7 @@ Assignments = list[
 class RecordFormat(Format[Snapshots]):
     """Reader of TFRecord files with channel and position, one record a measurement."""
 
-    takes = frozenset({"beamformer", "grid", "every", "station", "drop_null", "round_trip"})
+    takes = frozenset({"beamformer", "grid", "every", "station", "drop_null", "drop_elements", "round_trip"})
     assigned: ClassVar[bool]
     """whether the description assigns antennas to rows and columns"""
     position: ClassVar[str]
@@ -116,19 +125,20 @@ class RecordFormat(Format[Snapshots]):
         if without:
             notes = (*notes, f"records without a finite position or channel are left out: {without}")
         csi = torch.from_numpy(np.stack(channels))
-        kept, null = kept_subcarriers(csi, options.drop_null)
+        csi, _, elements, missing = measured(path, csi, options.drop_null, options.drop_elements)
+        link["array"] = link["array"].subset(elements)
         turned: tuple[str, ...] = ()
         if options.round_trip:
             link["array"], turned = round_trip_array(link["array"])
         name = path.resolve().name if path.is_dir() else path.stem
         return Snapshots(
-            csi[:, kept],
+            csi,
             np.stack(positions),
             **link,
             name=f"{name}-{station}" if station else name,
             index=index,
             source=digests([*files, described[0], *beside]),
-            notes=(*notes, *null, *turned),
+            notes=(*notes, *missing, *turned),
         )
 
 

@@ -14,7 +14,7 @@ from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.archives import ARCHIVES, Arrays, array_names, read_arrays
 from swiftwrf.data.files import check_carrier, digests
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
-from swiftwrf.data.snapshots import Snapshots, check_spacing, kept_subcarriers, round_trip_array
+from swiftwrf.data.snapshots import Snapshots, check_spacing, measured, round_trip_array
 from swiftwrf.data.splits import read_splits
 from swiftwrf.errors import InputError
 from swiftwrf.positions import check_positions, to_tensor
@@ -29,7 +29,7 @@ VECTORS = ("array_position", "array_orientation", "line_of_sight", "time", "freq
 class SnapshotArrays(Format[Snapshots]):
     """Arrays by name, one row a position of the transmitter."""
 
-    takes = frozenset({"beamformer", "grid", "every", "drop_null", "round_trip"})
+    takes = frozenset({"beamformer", "grid", "every", "drop_null", "drop_elements", "round_trip"})
 
     def recognises(self, path: Path) -> bool:
         return _file(path) is not None
@@ -62,16 +62,17 @@ def snapshots_of(
     arrays = arrays | {name: values.reshape(-1) for name, values in vectors.items() if 1 in values.shape}
     arrays |= {name: arrays[name].reshape(()) for name in SCALARS if name in arrays and arrays[name].size == 1}
     arrays, reversed_axes = _turned_round(arrays)
+    arrays, polarisations = _polarisations(source, arrays)
     given, frequency = arrays["frequency_hz"], None
     if given.ndim == 1 and arrays["csi"].ndim == 3:
         arrays |= {"frequency_hz": given.mean()}
     position, array = check_positions(arrays["position"], f"{source}: position"), array_of(source, arrays)
     n, folder, pose = len(position), files[0].parent, _pose(source, arrays)
     raw = _channel(source, arrays["csi"], n, len(array.element))
-    kept, null = kept_subcarriers(raw, options.drop_null)
-    channel = _scaled(source, raw[:, kept])
+    channel, kept, elements, missing = measured(source, raw, options.drop_null, options.drop_elements)
+    channel, array = _scaled(source, channel), array.subset(elements)
     if given.ndim == 1:
-        frequency = to_tensor(f"{source}: frequency_hz", given, torch.float64, (len(kept),))[kept]
+        frequency = to_tensor(f"{source}: frequency_hz", given, torch.float64, (raw.shape[1],))[kept]
         frequency = 2 * frequency if options.round_trip else frequency
     array, turned = round_trip_array(array) if options.round_trip else (array, ())
     if bool((position == torch.tensor(pose.position, dtype=torch.float64)).all(dim=1).any()):
@@ -87,7 +88,7 @@ def snapshots_of(
         line_of_sight=arrays.get("line_of_sight"),
         time=arrays.get("time"),
         frequency_hz=frequency,
-        notes=(*notes, *reversed_axes, *null, *turned),
+        notes=(*notes, *reversed_axes, *polarisations, *missing, *turned),
     )
     return data if options.every in (None, 1) else data.subset(torch.arange(0, n, options.every))
 
@@ -115,6 +116,32 @@ def _turned_round(arrays: Arrays) -> tuple[Arrays, tuple[str, ...]]:
     return arrays | turned, ("axes are in reverse order, as MATLAB and Octave write HDF5; they are turned round",)
 
 
+def _polarisations(source: Path, arrays: Arrays) -> tuple[Arrays, tuple[str, ...]]:
+    """Return the arrays with elements at one place, which have different polarisations, as snapshots of one element."""
+    element, csi, carrier = arrays.get("element_position"), arrays["csi"], arrays["frequency_hz"]
+    if element is None or element.ndim != 2 or csi.ndim < 2 or csi.shape[-1] != len(element):
+        return arrays, ()  # refused with its shape
+    # 1 micrometre is far below any distance of elements
+    place, count = np.unique(np.round(element / 1e-6), axis=0, return_inverse=True, return_counts=True)[1:]
+    ports = int(count.max(initial=1))
+    if ports == 1:
+        return arrays, ()
+    if bool((count != ports).any()) or len(count) < 2:
+        raise InputError(
+            f"{source}: element_position has {int(count.min())} to {ports} elements at one place; expected as many "
+            "polarisations at each place, so leave out the other elements"
+        )
+    order = np.argsort(place.reshape(-1), kind="stable").reshape(-1, ports).T  # elements of each polarisation
+    order = order[:, np.argsort(order[0])]
+    split = np.concatenate([csi.reshape(len(csi), -1, len(element))[..., some] for some in order], axis=1)
+    arrays |= {"csi": split, "element_position": element[order[0]]}
+    if carrier.ndim == 1 and csi.ndim == 3:
+        arrays |= {"frequency_hz": np.tile(carrier, ports)}
+    return arrays, (
+        f"{ports} elements lie at each place, as of {ports} polarisations: each polarisation is a snapshot",
+    )
+
+
 def _channel(file: Path, csi: NDArray[np.generic], n: int, elements: int) -> Tensor:
     """Return channels, complex128 (n, S, K)."""
     if csi.dtype.kind != "c":
@@ -135,15 +162,22 @@ def _channel(file: Path, csi: NDArray[np.generic], n: int, elements: int) -> Ten
 
 def _scaled(file: Path, channel: Tensor) -> Tensor:
     """Return channels, complex64 (n, S, K), each row scaled to unit mean power, because their unit is arbitrary."""
-    power = torch.view_as_real(channel).square().sum(-1).mean(dim=(1, 2), keepdim=True)
-    silent = (~((power > 0) & power.isfinite())).flatten().nonzero()
-    if len(silent):
-        raise InputError(f"{file}: csi of row {int(silent[0])} has no power, or more than numbers hold; leave it out")
+    total = torch.view_as_real(channel).square().sum(-1).sum(dim=(1, 2), keepdim=True)
+    power = total / (channel != 0).sum(dim=(1, 2), keepdim=True)
+    beyond = (~((power > 0) & power.isfinite())).flatten().nonzero()
+    if len(beyond):
+        raise InputError(f"{file}: csi of row {int(beyond[0])} has no power, or more than numbers hold; leave it out")
     return (channel / power.sqrt()).to(torch.complex64)
 
 
 def _pose(file: Path, arrays: Arrays) -> ArrayPose:
     position, orientation = arrays["array_position"], arrays["array_orientation"]
+    if position.ndim == 2 or orientation.ndim == 2:
+        raise InputError(
+            f"{file}: array_position and array_orientation have shapes {position.shape} and {orientation.shape}, as of an "
+            "array that moves; the array must rest while the transmitter moves, so give its one position (3) and "
+            "quaternion (4)"
+        )
     if orientation.shape == (3,):
         raise InputError(
             f"{file}: array_orientation has 3 numbers; Euler angles leave their order open, so give the unit quaternion "

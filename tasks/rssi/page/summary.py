@@ -12,6 +12,9 @@ from tasks.rssi.page.maps import CERTAINTY, COVERED_DBM, MIN_RATIO, Maps, RssiRe
 from tasks.summarise import comparison_sentence, coverage_warning
 
 REFERENCES = ("mean", "mri_pooled")  # which explain no place
+WIDTH_OF_80_PERCENT = 2.563  # of an interval, in standard deviations of a normal distribution
+MIN_REPEATS = 10  # of measurements at one place
+MAX_RATIO_TO_SCATTER = 1.3  # of an interval to the one of repeated measurements, which then explain it
 
 
 def answer(run: RssiRecords) -> Answer:
@@ -92,14 +95,28 @@ def where_next(run: RssiRecords) -> str:
     typical = float(np.median(width[known]))
     row, column = np.unravel_index(np.argmax(np.where(known, width, -np.inf)), width.shape)
     if width[row, column] < MIN_RATIO * typical:
+        scatter = scatter_of_repeats(run)
+        reason = "and the model explains no more"
+        if scatter is not None and typical < MAX_RATIO_TO_SCATTER * scatter:
+            reason = "which is the scatter of repeated measurements at one place"
+        elif scatter is not None:
+            reason += f", though repeated measurements at one place lie within {scatter:.0f} dB"
         return (
             f"More positions inside the measured area are not worth it: the 80 % interval is about {typical:.0f} dB wide "
-            "everywhere in it, by the scatter of measurements a few decimetres apart."
+            f"everywhere in it, {reason}."
         )
     return (
         f"Measure around x = {maps['x'][column]:.1f} m, y = {maps['y'][row]:.1f} m: inside the measured area the 80 % "
         f"interval is widest there, {width[row, column]:.0f} dB instead of {typical:.0f} dB."
     )
+
+
+def scatter_of_repeats(run: RssiRecords) -> float | None:
+    """Return the width of the 80 % interval of repeated measurements at one place [dB], None if there are too few."""
+    same = run.table("predictions").groupby(["x", "y", "z", "receiver"])["measured"]
+    repeats = same.count() - 1
+    n = int(repeats.clip(lower=0).sum())
+    return float(WIDTH_OF_80_PERCENT * np.sqrt((same.var() * repeats).sum() / n)) if n >= MIN_REPEATS else None
 
 
 def by_method(run: RssiRecords) -> DataFrame:

@@ -84,7 +84,14 @@ REFUSED = {
     "other elements": (_csi(lambda c: c[..., :9]), "16 elements"),
     "other rows": (_csi(lambda c: c[:50]), "for 120 positions"),
     "silent": (_csi(lambda c: c * (np.arange(120) != 7)[:, None, None]), "row 7 has no power"),
-    "not finite": (_csi(lambda c: c + np.nan), "no power, or more than numbers hold"),
+    "without a number": (_csi(lambda c: c + np.nan), "row 0 has no power"),
+    "not finite": (_csi(lambda c: c + np.inf), "no power, or more than numbers hold"),
+    "one element alone": (_csi(lambda c: c * (np.arange(16) == 3)), "values at 1 elements"),
+    "an array that moves": ({"array_position": np.zeros((120, 3))}, "the array must rest"),
+    "unequal polarisations": (
+        {"element_position": snapshot_arrays(snapshots())["element_position"][[0, *range(15)]]},
+        "1 to 2 elements at one place",
+    ),
     "no csi": ({"csi": None}, "lacks csi"),
     "no pose": ({"array_orientation": None}, "lacks array_orientation"),
     "Euler angles": ({"array_orientation": np.zeros(3)}, "Euler angles"),
@@ -264,6 +271,51 @@ def test_null_subcarriers_are_named_and_left_out_on_request(tmp_path):
     torch.testing.assert_close(data.channel, kept.channel)
     assert kept.notes == ()
     assert "left out" in data.notes[0]
+
+
+@pytest.mark.parametrize("filler", [0, np.nan])
+@pytest.mark.parametrize("beamformer", ["phase", "bartlett"])
+def test_missing_packets_and_elements_are_counted_and_not_used(tmp_path, filler, beamformer):
+    """Values that are 0 or NaN have no phase."""
+    made = snapshots(count=6)
+    csi = made.channel.numpy().copy()
+    packets = 3 + np.arange(120) % 2
+    csi[:, :, [5, 9]] = filler
+    csi[np.arange(6) >= packets[:, None]] = filler
+    data = load_snapshots(write_snapshots(tmp_path / "b", csi=csi))
+    assert data.notes == (
+        "elements 5, 9 are silent (0 or NaN everywhere) and left out (counted from 0)",
+        "300 of 720 snapshots are 0 or NaN at all elements and left out",
+    )
+    assert data.channel.shape == (120, 4, 14)
+    kept = [number for number in range(16) if number not in (5, 9)]
+    array = made.array.subset(torch.tensor(kept))
+    row = replace(made.subset(torch.tensor([0])), array=array, channel=made.channel[:1, :3, kept])
+    torch.testing.assert_close(data.spectra(GRID, beamformer).spectrum[:1], row.spectra(GRID, beamformer).spectrum)
+
+
+def test_elements_are_left_out_on_request(tmp_path):
+    folder = write_snapshots(tmp_path / "a")
+    data = load_snapshots(folder, drop_elements=(2, 7))
+    assert torch.equal(data.array.element, snapshots().array.element[[0, 1, 3, 4, 5, 6, *range(8, 16)]])
+    assert "elements 2, 7 are to be ignored and left out" in data.notes[0]
+    with pytest.raises(InputError, match="elements 0 to 15, so element 16"):
+        load_snapshots(folder, drop_elements=(16,))
+
+
+@pytest.mark.parametrize("order", [[*range(16), *range(16)], [n // 2 for n in range(32)]])
+def test_two_polarisations_at_each_place_are_snapshots(tmp_path, order):
+    made = snapshots(count=2)
+    other = snapshots(count=4).channel[:, 2:]
+    first = [order.index(number) for number in range(16)]
+    port = torch.tensor([0 if place in first else 1 for place in range(32)])
+    both = torch.stack([made.channel, other])[port, :, :, torch.tensor(order)].permute(1, 2, 0)
+    element = snapshot_arrays(made)["element_position"][order]
+    data = load_snapshots(write_snapshots(tmp_path / "a", csi=both.numpy(), element_position=element))
+    assert "2 polarisations" in data.notes[0]
+    torch.testing.assert_close(data.array.element, made.array.element)
+    expected = replace(made, channel=torch.cat([made.channel, other], dim=1)).spectra(GRID)
+    torch.testing.assert_close(data.spectra(GRID).spectrum, expected.spectrum)
 
 
 def test_phases_of_the_way_there_and_back(tmp_path):

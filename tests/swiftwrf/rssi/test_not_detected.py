@@ -10,7 +10,8 @@ import torch
 from swiftwrf import Rssi, RssiModel, load, rssi_room
 from swiftwrf.rssi import compare
 from swiftwrf.rssi.detection import Detection
-from swiftwrf.rssi.path_loss import estimate_floor_attenuation, fit_path_losses, log_distance
+from swiftwrf.rssi.offsets import estimate_floor_attenuation
+from swiftwrf.rssi.path_loss import fit_path_losses, log_distance
 
 LIMIT = -88.0
 RECEIVER = torch.tensor([[3.0, 3, 2], [27, 4, 2], [15, 18, 2], [5, 15, 2]], dtype=torch.float64)

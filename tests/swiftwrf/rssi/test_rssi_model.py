@@ -13,14 +13,10 @@ from swiftwrf import InputError, Rssi, RssiModel, fit_rssi, load, rssi_room
 from swiftwrf.gp import Kernel
 from swiftwrf.rssi import RssiConfig, RssiPaperModel
 from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
+from swiftwrf.rssi.mixing import mixing_weights
 from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, harmonics, log_distance
-from swiftwrf.rssi.training import (
-    DIRECTIVITY_STD_DB,
-    RssiTraining,
-    bin_locations,
-    fit_receiver,
-    mixing_weights,
-)
+from swiftwrf.rssi.regression import DIRECTIVITY_STD_DB, fit_receiver
+from swiftwrf.rssi.training import RssiTraining, bin_locations
 from swiftwrf.runtime import checkpoint
 from swiftwrf.runtime.threads import threads_kept
 

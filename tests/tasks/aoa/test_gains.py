@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import targets
 import torch
 from pandas import DataFrame
 
@@ -129,24 +128,6 @@ def test_repeats_do_not_narrow_the_interval_of_a_gain():
     )
     assert often["low"] == pytest.approx(once["low"], abs=1e-6)
     assert often["high"] == pytest.approx(once["high"], abs=1e-6)
-
-
-@pytest.mark.parametrize(("change", "low", "state"), [(0.2, -0.1, "met"), (0.2, 0.1, "missed by 10%")])
-def test_never_worse_is_decided_by_the_interval(monkeypatch, change, low, state):
-    angle = {"median": 1.0, "low": 0.9, "high": 1.1}
-    methods = {
-        condition.method: condition.description | {"great_circle_deg": dict(angle)}
-        for condition in (MEASURED, TURBO, replace(MEASURED, training="all measured"))
-    }
-    methods["network, measured + synthetic (gp)"]["great_circle_deg"]["median"] = 1 + change
-    found = {"median_deg": 1 + change, "change": change, "low": low, "high": 0.5}
-    methods["network, measured + synthetic (gp)"]["changes"] = {"network, measured": found}
-    metrics = {"data": "s23-200", "split": "block", "moving": "transmitter"}
-    mix = {"methods": methods, "reference": "network, measured"}
-    monkeypatch.setattr(targets, "aoa_shares", lambda: [("0.3", mix, {"metrics": metrics})])
-    row = targets.aoa_targets().splitlines()[-1]
-    assert "| never worse |" in row
-    assert row.endswith(f"| {state} |")
 
 
 def test_the_report_states_gain_interval_and_judgement(aoa_run):

@@ -316,8 +316,15 @@ def test_an_interval_of_one_width_sends_nobody_to_measure():
     width = np.tile([[[[7.0]], [[8.0]]]], (1, 1, 4, 5))
     maps = {"x": x, "y": y, "measured_position": corners, "measured": corners[:, :2], "width": width}
     maps |= {"predicted": width, "detection": width, "floor_of_row": np.zeros(4, int)}
-    run = SimpleNamespace(arrays=lambda name: maps)
+    tested = pd.DataFrame({"x": x, "y": 0.0, "z": 1.0, "receiver": "a", "measured": -60.0})
+    run = SimpleNamespace(arrays=lambda name: maps, table=lambda name: tested)
     assert "not worth it" in where_next(run)
+    assert "the model explains no more" in where_next(run)
+    for spread, reason in ((2.7, "which is the scatter of repeated"), (0.5, "lie within 1 dB")):
+        tested = pd.DataFrame(
+            {"x": 1.0, "y": 0.0, "z": 1.0, "receiver": "a", "measured": [-60.0 - spread, -60 + spread] * 20}
+        )
+        assert reason in where_next(run)
     maps["width"][:, :, 2, 3] += 4
     assert where_next(run).startswith("Measure around x = 3.0 m, y = 2.0 m")
     maps |= {

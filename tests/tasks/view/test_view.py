@@ -23,7 +23,7 @@ import torch
 from fuzz import kinds
 from PIL import Image
 
-from swiftwrf import AngularGrid, GeometryModel, InputError, PairModel, RssiModel, load, load_rssi, rssi_room
+from swiftwrf import AngularGrid, GeometryModel, InputError, PairModel, Rssi, RssiModel, load, load_rssi, rssi_room
 from swiftwrf.locate import MatchedField, RssiLocator
 from swiftwrf.models.geometry import HybridModel, Plane
 from swiftwrf.online import Follower
@@ -36,7 +36,7 @@ from tasks.update.record import Record
 from tasks.view import charts, spectra
 from tasks.view.locating import N_POSITIONS, RssiLocating
 from tasks.view.options import ViewConfig
-from tasks.view.rssi import MapSelection, at_least, probability_above
+from tasks.view.rssi import MapSelection, RssiView, at_least, probability_above
 from tasks.view.run import run
 from tasks.view.sources import open_source
 from tasks.view.spectra import angle_between
@@ -276,6 +276,25 @@ def test_one_receiver_has_no_best(rssi_run):
     assert "best receiver" in view.kinds
     view.model.receiver_names = view.receivers[:1]
     assert "best receiver" not in view.kinds
+
+
+def test_floors_and_what_was_not_received_are_shown_apart():
+    """Two floors, 40 dB of attenuation between them: nothing from above is detected."""
+    room = rssi_room(n=120)
+    position = room.transmitter_position.clone()
+    upper = torch.arange(120) % 2 == 0
+    position[upper, 2] += 3.5
+    power = torch.where(upper, -95.0, room.rssi_dbm[:, 5].nan_to_num(-70.0))[:, None]
+    table = pd.DataFrame(position.numpy(), columns=["x", "y", "z"])
+    table["floor"], table["6"] = np.where(upper, "upper", "lower"), power.where(power > -85, torch.nan)[:, 0]
+    data = Rssi.from_frame(table, receiver_position={"6": room.receiver_position[5].tolist()})
+    view = RssiView("two floors", RssiModel().fit(data), data)
+    lower, above = (MapSelection("RSSI", 0, height) for height in view.floors.height_m)
+    assert view.floors.names == ("lower", "upper")
+    assert view.on_floor(above.height).tolist() == upper.tolist()
+    assert view.silent(above).mean() > 0.9 > 0.1 > view.silent(lower).mean()
+    assert ("Hatched" in view.sentence(above), "Hatched" in view.sentence(lower)) == (True, False)
+    assert np.nanmean(charts.stripes(view.silent(above))) == 1
 
 
 def test_an_rssi_model_by_itself(rssi_run):

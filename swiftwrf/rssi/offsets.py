@@ -1,0 +1,181 @@
+"""Attenuation of floors and offsets between groups of rows, which are removed from RSSI before a fit.
+
+    rssi = rssi within a floor and group - F |floor(s) - floor(receiver)| + offset of the group       [dBm]
+
+F is the floor attenuation factor (S. Y. Seidel and T. S. Rappaport, IEEE Transactions on Antennas and Propagation 40, 1992),
+linear in the number of floors. Groups are devices, channels or any other between which RSSI has constant offsets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from swiftwrf.data.coordinates import Floors
+from swiftwrf.data.rssi import Offsets, Rssi
+from swiftwrf.errors import InputError, listed
+from swiftwrf.gp import Kernel
+from swiftwrf.rssi.path_loss import fit_path_losses, log_distance
+from swiftwrf.runtime.threads import single_thread
+
+MAX_ROWS = 300  # of a receiver, from which offsets are estimated; the cost grows with their cube
+
+
+@dataclass(frozen=True)
+class FloorAttenuation:
+    """Attenuation of each floor between transmitter and receiver.
+
+    Args:
+        floors: Floors of the building.
+        receiver_floor: Number of each receiver's floor.
+        db: Attenuation of a floor [dB].
+
+    Example:
+        >>> floors = Floors(("ground", "first"), (0.0, 3.0))
+        >>> FloorAttenuation(floors, receiver_floor=(0,), db=15.0).of(torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 3.0]]))
+        tensor([[ -0.],
+                [-15.]], dtype=torch.float64)
+    """
+
+    floors: Floors
+    receiver_floor: tuple[int, ...]
+    db: float
+
+    @classmethod
+    def from_plain(cls, values: Mapping[str, Any] | None) -> Self | None:
+        """Return the attenuation of plain values, None without any."""
+        if not values:
+            return None
+        names, heights = (tuple(values["floors"][field]) for field in ("names", "height_m"))
+        floors = Floors(tuple(map(str, names)), tuple(map(float, heights)))
+        return cls(floors, tuple(map(int, values["receiver_floor"])), float(values["db"]))
+
+    def of(self, position: Tensor) -> Tensor:
+        """Return the RSSI that the floors take from transmitters (n, 3) at each receiver, float64 (n, R) [dB]."""
+        receiver = torch.tensor(self.receiver_floor)
+        return -self.db * (self.floors.number(position.detach())[:, None] - receiver).abs().double()
+
+    def between(self, a: Tensor, b: Tensor) -> Tensor:
+        """Return the RSSI that the floors between positions a and b (m, 3) take, float64 (m,) [dB]."""
+        return -self.db * (self.floors.number(a.detach()) - self.floors.number(b.detach())).abs().double()
+
+    def removed(self, data: Rssi) -> Rssi:
+        """Return the data as if all links were within a floor."""
+        return data.derived(rssi_dbm=data.rssi_dbm - self.of(data.transmitter_position))
+
+
+def estimate_floor_attenuation(train: Rssi, pool: Rssi | None = None) -> FloorAttenuation:
+    """Estimate the attenuation of a floor jointly with the path-loss models of the receivers; see `fit_path_losses`.
+
+    A receiver of unknown position counts as on the floor of its strongest mean RSSI, amid its three strongest rows.
+
+    Args:
+        train: Training rows with floors.
+        pool: The same rows at more receivers, which determine the attenuation. Defaults to `train`.
+
+    Example:
+        >>> import pandas as pd
+        >>> table = pd.DataFrame({"x": [0.0, 5, 9] * 4, "y": 0.0, "floor": [0] * 6 + [1] * 6})
+        >>> table["hall"] = [-50.0, -60, -64] * 2 + [-65.0, -75, -79] * 2
+        >>> round(estimate_floor_attenuation(Rssi.from_frame(table)).db)
+        15
+    """
+    pool = pool or train
+    assert train.floors is not None
+    where = receiver_floors(pool)
+    crossed = (train.floors.number(train.transmitter_position)[:, None] - where).abs().double()
+    strongest = pool.rssi_dbm.nan_to_num(-torch.inf).topk(min(3, len(pool)), dim=0).indices
+    nearby = pool.transmitter_position[strongest].mean(dim=0)
+    receiver = pool.receiver_position.where(pool.receiver_located[:, None], nearby)
+    found = fit_path_losses(pool.transmitter_position, receiver, pool.rssi_dbm, crossed=crossed)
+    measured = pool.detected.sum(dim=0).double()
+    db = float(found.floor_db @ measured / measured.sum())
+    number = dict(zip(pool.receiver_names, where.tolist(), strict=True))
+    return FloorAttenuation(train.floors, tuple(number[name] for name in train.receiver_names), db)
+
+
+def receiver_floors(data: Rssi) -> Tensor:
+    """Return the floor of each receiver by its position, or by where its mean RSSI is strongest, int64 (R,)."""
+    assert data.floors is not None
+    floor, mean = data.floors.number(data.transmitter_position), []
+    rssi = data.rssi_dbm.nan_to_num(float(data.rssi_dbm[data.detected].min()))  # what was not received was weak
+    for number in range(len(data.floors.names)):
+        enough = data.detected[floor == number].sum(dim=0) >= 3
+        mean.append(rssi[floor == number].mean(dim=0).where(enough, -torch.inf))
+    strongest = torch.stack(mean).argmax(dim=0)
+    return data.floors.number(data.receiver_position.nan_to_num(0.0)).where(data.receiver_located, strongest)
+
+
+@single_thread()
+def estimate_offsets(train: Rssi, reference: str | None = None) -> Offsets:
+    """Estimate the offset of each group of rows by generalised least squares.
+
+    RSSI at a receiver is its path-loss model, plus a Gaussian process of the position, plus the offset of the row's group,
+    plus noise. An offset is the same at all receivers.
+
+    Args:
+        train: Training rows with groups.
+        reference: Group with offset 0. Defaults to the most frequent one.
+
+    Raises:
+        InputError: Rows without groups, one group only, or an unknown reference.
+
+    Example:
+        >>> import swiftwrf
+        >>> room = swiftwrf.rssi_room(n=100)
+        >>> table = room.to_frame().rename(columns={"x_m": "x", "y_m": "y", "z_m": "z"}).reset_index(drop=True)
+        >>> table.iloc[::2, 3:] -= 8.0
+        >>> table["phone"] = ["old", "new"] * 50
+        >>> offsets = estimate_offsets(swiftwrf.Rssi.from_frame(table, offset_by="phone"), "new")
+        >>> -9 < offsets.offset_db["old"] < -7
+        True
+    """
+    groups = train.groups
+    if groups is None:
+        raise InputError(f"{train.name} has no groups; read it with offset_by")
+    frequency = groups.code.bincount(minlength=len(groups.names))
+    if int((frequency > 0).sum()) < 2:
+        raise InputError(
+            f"column {groups.column} has one value in the training rows, so there are no offsets to estimate"
+        )
+    chosen = groups.names[int(frequency.argmax())] if reference is None else reference
+    if chosen not in groups.names:
+        raise InputError(f"column {groups.column} has no value {chosen!r}; there are {listed(groups.names)}")
+    position = train.transmitter_position
+    extent = float((position.amax(dim=0) - position.amin(dim=0)).max()) or 1.0
+    kernel = Kernel(0.25 * extent, matern12_weight=1.0, noise=1.0)  # fading is as large as shadowing
+    apart = log_distance(position, train.receiver_position)
+    member = torch.nn.functional.one_hot(groups.code, len(groups.names)).double()
+    normal = torch.zeros(len(groups.names), len(groups.names), dtype=torch.float64)
+    right, total = torch.zeros(len(groups.names), dtype=torch.float64), 0.0
+    generator = torch.Generator().manual_seed(0)
+    for r, rssi in enumerate(train.rssi_dbm.T):
+        rows = (~rssi.isnan()).nonzero()[:, 0]
+        rows = rows[torch.randperm(len(rows), generator=generator)[:MAX_ROWS]]  # evenly spaced rows may be of one group
+        if not len(rows):
+            continue
+        weight = _residual_precision(kernel.covariance(position[rows]), apart[rows, r])
+        normal += member[rows].T @ weight @ member[rows]
+        right += member[rows].T @ weight @ rssi[rows]
+        total += float(rssi[rows] @ weight @ rssi[rows])
+    free = torch.tensor([name != chosen for name in groups.names])
+    precision = normal[free][:, free] + 0.05 * torch.eye(int(free.sum())).double()  # a standard deviation of 10 dB
+    offset = torch.zeros(len(groups.names), dtype=torch.float64)
+    offset[free] = torch.linalg.solve(precision, right[free])
+    explained = float(right @ offset) / total if total > 0 else 0.0
+    estimates = dict(zip(groups.names, offset.tolist(), strict=True))
+    known = {name: db for name, db in estimates.items() if frequency[groups.names.index(name)] > 0 or name == chosen}
+    return Offsets(groups.column, chosen, known, explained)
+
+
+def _residual_precision(covariance: Tensor, apart: Tensor) -> Tensor:
+    """Return the precision of noisy values with covariance (m, m) after a fit of level and slope over log10 distance."""
+    precision = torch.linalg.inv(covariance)
+    free = torch.stack([torch.ones_like(apart), apart], dim=1)
+    weighted = precision @ free
+    projected: Tensor = precision - weighted @ torch.linalg.pinv(free.T @ weighted, hermitian=True) @ weighted.T
+    return projected
