@@ -42,19 +42,8 @@ def page(record: Record, name: str, folder: Path) -> Page:
         for i in order
     ]
     columns = ["measurement", "x [m]", "y [m]", "z [m]", f"error{record.unit}", "innovation"]
-    changes = [[str(number), text] for number, text in sorted(record.alarms + record.notices)]
-    tables = [Table(columns, cells, "Measurements with the largest innovations.")]
-    if changes:
-        tables.append(
-            Table(
-                ["measurement", "change"],
-                changes,
-                "Detected changes, and changes of the model beside its data.",
-                long=True,
-            )
-        )
-    sections = [Section("Surprising measurements", tables=tables), Section("Changes", plots=[map_plot(record)])]
-    return Page(f"Update: {name}", summary, sections)
+    table = Table(columns, cells, "Measurements with the largest innovations.")
+    return Page(f"Update: {name}", summary, [Section("Surprising measurements", [], [table], [map_plot(record)])])
 
 
 def error_plot(record: Record) -> Plot:

@@ -81,7 +81,7 @@ def _comparison(fractions: list[FractionRecords]) -> Summary:
 
 def _errors(fraction: FractionRecords) -> Section:
     caption = (
-        "The angle is the angular error. Near the zenith azimuth errors are large without meaning. Held out: on measured "
+        "Near the zenith azimuth errors are large without meaning. Held out: on measured "
         "spectra, which decide the choice. By synthetic spectra: change of the median of the same estimator on measured "
         "spectra, a paired bootstrap over the test positions."
     )

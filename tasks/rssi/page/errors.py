@@ -35,7 +35,7 @@ def differences(run: RssiRecords) -> Plot:
     figure = figures.dots(shown, {own: values[own][: len(shown)]}, palette(), label, zero=True)
     caption = (
         f"Difference of the mean absolute error of {own} from that of {best}, the best baseline, at each receiver on "
-        f"the same pairs; whiskers: 95 % intervals. Left of zero {own} is better."
+        f"the same pairs; whiskers: 95 % intervals. Below zero {own} is better."
     )
     return Plot(f"difference-{run.file_name}", [figure], caption, figures.dots_data("receiver", names, values, "db"))
 
