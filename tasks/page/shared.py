@@ -1,4 +1,4 @@
-"""Parts that reports of several tasks share: errors of methods, next steps, comparison of runs, positions to measure next."""
+"""Parts of several reports: errors of methods, next steps, comparison of runs, positions to measure next."""
 
 from __future__ import annotations
 
