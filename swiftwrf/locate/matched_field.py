@@ -121,7 +121,7 @@ class _Likelihoods:
             waves, target = PathWaves.at(self.room, at[rows], self.frequency), observed.subset(owner[rows])
             return torch.stack([part(waves, target) for part in self.parts])
 
-        batches = torch.arange(n * m).split(BATCH_CANDIDATES)
+        batches = torch.arange(n * m).split(BATCH_CANDIDATES // len(self.frequency))
         return torch.cat(parallel_map(of_batch, batches), dim=1).reshape(len(self.parts), n, m)
 
 
