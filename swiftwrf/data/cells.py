@@ -7,6 +7,7 @@ as "n/a", "--" or "not detected".
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 
 import numpy as np
 import pandas as pd
@@ -90,6 +91,9 @@ def parsed(column: pd.Series) -> tuple[Floats, NDArray[np.bool_]]:
     """
     if column.dtype.kind in "biuf":
         return column.to_numpy(np.float64), np.zeros(len(column), dtype=bool)
+    with suppress(ValueError, TypeError):  # numbers alone, the usual case, are parsed fast
+        if "_" not in (whole := "".join(column)) and whole.isascii():
+            return np.fromiter(map(float, column), np.float64, len(column)), np.zeros(len(column), dtype=bool)
     cells = column.astype(str).str.strip()
     values = pd.to_numeric(cells, errors="coerce").to_numpy(np.float64, copy=True)
     rest = np.isnan(values) & column.notna().to_numpy()
