@@ -182,8 +182,11 @@ def read_survey(
         notes += found
     groups = Groups.of(offset_by, group.to_numpy()[origins].tolist()) if offset_by else None
     sessions = None if session is None else session.to_numpy()[origins].tolist()
-    # columns with few different values, each of them in several rows
+    # columns with few different values, each of them in several rows, that are no other names of the receivers
     times = {name: text_of(table[name]).value_counts() for name in (*unused, roles.get("session")) if name}
+    if "receiver" in roles:
+        several = table.groupby(roles["receiver"])[list(times)].nunique().max() > 1
+        times = {name: count for name, count in times.items() if several[name]}
     labels = tuple(name for name, count in times.items() if 2 <= len(count) <= 30 and int(count.min()) >= 10)
     if labels and not offset_by:
         notes.append(f"rows differ in {listed(labels)}; tasks.inspect tests whether its values have constant offsets")
