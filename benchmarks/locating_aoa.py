@@ -39,7 +39,7 @@ from swiftwrf.choices import fraction_key
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import GaussianProcess, choose_kernel
 from swiftwrf.metrics import angle_errors, summary
-from swiftwrf.models.geometry.furniture import coherence, field, waves
+from swiftwrf.models.geometry.channels import coherence, field, waves
 
 N_LOCATED = 200  # spectra whose time is measured
 KERNEL = "kernel_regression"
@@ -151,7 +151,7 @@ def channel_scores(room: GeometryModel, measured: Spectra, test: Spectra, seed: 
     walls.furniture = None
     for name, model in {"planes": walls, "furniture": room}.items():
         at_known, at_test = (
-            field(model.gains(part.scene), waves(model.tensors(), part.scene, part.frequency))
+            field(model.gains(part.scene), waves(model.reflectors, part.scene, part.frequency))
             for part in (known, truth)
         )
         factor = (at_known.conj() * known.value).sum() / at_known.abs().square().sum()

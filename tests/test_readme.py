@@ -45,6 +45,9 @@ def test_links_of_a_page_lead_to_files_and_headings(name):
             assert anchor in anchors(linked), f"{target}#{anchor}"
 
 
+NUMBER = r"\d+\.\d+"
+
+
 def run_blocks(name: str) -> dict[str, object]:
     """Run the Python blocks of a page in the working directory and return their names."""
     names: dict[str, object] = {"__name__": "documented"}
@@ -53,10 +56,16 @@ def run_blocks(name: str) -> dict[str, object]:
     return names
 
 
-def test_readme_runs(tmp_path, monkeypatch):
+def test_readme_prints_what_it_shows(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    names = run_blocks("README.md")
-    assert names["prediction"].std.shape == names["prediction"].mean.shape == (len(names["test"]), 30, 120)
+    run_blocks("README.md")
+    (shown,) = re.findall(r"```text\n(.*?)```", (ROOT / "README.md").read_text(), flags=re.DOTALL)
+    printed = capsys.readouterr().out
+    assert re.sub(NUMBER, "", printed) == re.sub(NUMBER, "", shown)
+    # other processors find a slightly different room
+    assert [float(x) for x in re.findall(NUMBER, printed)] == pytest.approx(
+        [float(x) for x in re.findall(NUMBER, shown)], abs=0.1
+    )
 
 
 def test_documented_extensions_work(tmp_path, monkeypatch):

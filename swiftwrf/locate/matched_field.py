@@ -34,8 +34,8 @@ from swiftwrf.locate.spectrum_likelihood import (
 from swiftwrf.locate.student import Student
 from swiftwrf.models.base import FieldModel
 from swiftwrf.models.geometry import GeometryModel
+from swiftwrf.models.geometry.channels import coherence
 from swiftwrf.models.geometry.fit import GeometryConfig, observe
-from swiftwrf.models.geometry.furniture import coherence
 from swiftwrf.models.geometry.model import kept_snapshots
 from swiftwrf.models.geometry.path_gains import PRIORS, PathGains, choose_prior, fit_path_gains, kernel_of
 from swiftwrf.positions import to_tensor
@@ -447,7 +447,7 @@ class MatchedField(Configured, Saved):
         features, is_channel = 2 * len(differences(room.array)), bool(header["n_snapshots"])
         n, known = tensors["residual"].shape[1], len(tensors["region"])
         shapes = {
-            "statistics": (4 + len(room.planes),),
+            "statistics": (4 + room.reflectors.gain.shape[1],),
             "residual": (0 if is_channel else 2, n, features),
             "region": (known, 3),
             "weight": (2 if is_channel else 3,),

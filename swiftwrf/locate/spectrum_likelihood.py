@@ -24,9 +24,9 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.locate.student import Student, covariance
+from swiftwrf.models.geometry.channels import coherence, field
+from swiftwrf.models.geometry.channels import waves as path_waves
 from swiftwrf.models.geometry.fit import carrier_phases
-from swiftwrf.models.geometry.furniture import coherence, field
-from swiftwrf.models.geometry.furniture import waves as path_waves
 from swiftwrf.models.geometry.model import GeometryModel, kept_snapshots
 from swiftwrf.models.geometry.path_gains import PathGains, paths
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation, coarray_numbers, retrieve_phases
@@ -147,7 +147,7 @@ class PhaseLikelihood:
     The phase of the whole channel is unknown and integrated over.
 
     Args:
-        room: Room with P planes, and its paths.
+        room: Room with P planes and further surfaces, and its paths.
         log_variance: Logarithms of variances, (4 + P,), relative to the power of the direct path's mean gain. The first is
             that of the direct path's gain, the next P are those of a first-order gain in each plane. The next one is that
             of higher orders, relative to the product of their planes' variances and squared gains. The last two are those of
@@ -157,7 +157,7 @@ class PhaseLikelihood:
 
     def __init__(self, room: GeometryModel, log_variance: Tensor) -> None:
         self.log_variance = log_variance
-        found, value = room.tensors(), log_variance.exp()
+        found, value = room.reflectors, log_variance.exp()
         direct, plane, (order, self._diffuse, self._floor) = value[0], value[1:-3], value[-3:].unbind()
         second = found.gain[0].square() + plane
         images = [
@@ -170,7 +170,7 @@ class PhaseLikelihood:
     @classmethod
     def fit(cls, room: GeometryModel, position: Tensor, observed: SpectrumFeatures) -> Self:
         """Fit the variances by the marginal likelihood of n observations at known positions (n, 3)."""
-        start = np.array([-3.0, *[-2.0] * len(room.planes), 0.0, -2.0, -2.0])
+        start = np.array([-3.0, *[-2.0] * room.reflectors.gain.shape[1], 0.0, -2.0, -2.0])
         waves = PathWaves.at(room, position)
 
         @torch.enable_grad()
@@ -228,7 +228,7 @@ class ChannelLikelihood:
         """Return the channels at candidates, complex64 (m, F, K)."""
         if bool((self.frequency == 1).all()):
             return waves.channel[:, None].expand(-1, len(self.frequency), -1)
-        return field(waves.gain, path_waves(self.room.tensors(), self.room.scene(waves.position), self.frequency))
+        return field(waves.gain, path_waves(self.room.reflectors, self.room.scene(waves.position), self.frequency))
 
     def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
         """Return log-likelihoods (m,) of m observations at m candidates, up to a constant of each observation."""
