@@ -430,7 +430,7 @@ def earlier(position: Tensor, late: int) -> Tensor:
 
 def delay(late: int, time: Tensor | None) -> str:
     """Return in words that positions are some rows late, and how many seconds if times are known."""
-    step = None if time is None else abs(late) * float(time.diff().median())
+    step = None if time is None else abs(late) * float(time.diff().nanmedian())
     rows = f"{abs(late)} row{'s' if abs(late) > 1 else ''}"
     by = rows if not step or not step > 0 else f"{step:.2g} s ({rows})"
     return f"positions and radio differ in time: the positions are {by} {'late' if late > 0 else 'early'}"
