@@ -79,7 +79,8 @@ def _errors(run: RssiRecords) -> Section:
         quantity="absolute error",
         caption=caption,
         paragraphs=[f"Left out: {reason}." for reason in run.metrics["left_out"].values()],
-        plots=errors.differences(run) + errors.by_rows(run),
+        panels=errors.by_rows(run),
+        plots=errors.differences(run),
     )
 
 
