@@ -35,7 +35,6 @@ def errors_section(
     quantity: str,
     caption: str,
     paragraphs: Sequence[str] = (),
-    plots: Sequence[Plot] = (),
 ) -> Section:
     """Return the table of all methods, and figures of those of the short table.
 
@@ -47,7 +46,6 @@ def errors_section(
         quantity: Name of the errors.
         caption: What the cells beside the errors mean.
         paragraphs: Sentences before the table.
-        plots: Further figures.
     """
     unit, short = answer.unit, [one for block in answer.short() for one in block]
     further = list(dict.fromkeys(column for one in answer.methods for column in one.cells))
@@ -56,12 +54,11 @@ def errors_section(
             one.name,
             with_interval(one.error),
             number(one.error["p90"]),
-            number(one.error["mean"]),
             *(one.cells.get(column, "") for column in further),
         ]
         for one in answer.methods
     ]
-    columns = ["method", f"median [{unit}]", f"90 % below [{unit}]", f"mean [{unit}]", *further]
+    columns = ["method", f"median [{unit}]", f"90 % below [{unit}]", *further]
     caption = f"{quantity.capitalize()} on the test rows; medians with their 95 % intervals. {caption}".strip()
     values = {"error": [interval(one.error) for one in short]}
     medians = [one.error["median"] for one in short if one.error["n"]]
@@ -75,7 +72,7 @@ def errors_section(
     figures.cdf(axes, palette, shown, f"{quantity} [{unit}]", max(limit, 1e-3))
     text = "Medians with 95 % intervals, and the distribution of the errors; the thin line is at the median."
     plot = Plot(f"errors-{name}", [dots, figure], text, errors)
-    return Section("", list(paragraphs), [Table(columns, rows, caption, frozenset([answer.chosen]))], [plot, *plots])
+    return Section("", list(paragraphs), [Table(columns, rows, caption, frozenset([answer.chosen]))], [plot])
 
 
 def difference(errors: DataFrame, own: str, other: str) -> str:
