@@ -115,7 +115,7 @@ def read_survey(
     table = table.set_axis([str(name).strip() for name in table.columns], axis=1).reset_index(drop=True)
     if not len(table) or not table.columns.is_unique:
         raise InputError(f"{label} must have rows, and a name of its own for each column")
-    roles, names, end, found = _roles(label, table, dict(columns or {}), transmitter, offset_by, pool_by)
+    table, roles, names, end, found = _roles(label, table, dict(columns or {}), transmitter, offset_by, pool_by)
     notes += found
     unused = [name for name in table.columns if name not in (*roles.values(), *names, offset_by, pool_by)]
 
@@ -182,8 +182,11 @@ def read_survey(
         notes += found
     groups = Groups.of(offset_by, group.to_numpy()[origins].tolist()) if offset_by else None
     sessions = None if session is None else session.to_numpy()[origins].tolist()
-    # columns with few different values, each of them in several rows
+    # columns with few different values, each of them in several rows, that are no other names of the receivers
     times = {name: text_of(table[name]).value_counts() for name in (*unused, roles.get("session")) if name}
+    if "receiver" in roles:
+        several = table.groupby(roles["receiver"])[list(times)].nunique().max() > 1
+        times = {name: count for name, count in times.items() if several[name]}
     labels = tuple(name for name, count in times.items() if 2 <= len(count) <= 30 and int(count.min()) >= 10)
     if labels and not offset_by:
         notes.append(f"rows differ in {listed(labels)}; tasks.inspect tests whether its values have constant offsets")
@@ -218,8 +221,8 @@ def _roles(
     transmitter: Sequence[str],
     offset_by: str | None,
     pool_by: str | None,
-) -> tuple[dict[str, str], list[str], dict[str, str], list[str]]:
-    """Return the columns by role, those of receivers of a wide table, those of the second end, and notes on all."""
+) -> tuple[pd.DataFrame, dict[str, str], list[str], dict[str, str], list[str]]:
+    """Return the table, its columns by role, those of receivers if it is wide, those of the second end, and notes."""
     end = dict[str, str]()
     if len(transmitter) == 1:
         asked["receiver"] = transmitter[0]
@@ -233,6 +236,8 @@ def _roles(
     if "receiver" not in roles:
         power = roles.pop("rssi", None)
         others = [name for name in table.columns if name not in (*roles.values(), *end.values(), offset_by, pool_by)]
+        numbers = {name: values for name in others for values, text in [parsed(table[name])] if not text.any()}
+        table = table.assign(**numbers)  # each cell is parsed once
         if "rssi" in asked:
             names = [power] if power else fnmatch.filter(others, asked["rssi"])
         else:
@@ -253,7 +258,7 @@ def _roles(
     unused = {*table.columns} - {*roles.values(), *end.values(), *names, *left_out, offset_by, pool_by}
     if unused:
         notes.append(f"columns that are not used: {listed(name for name in table.columns if name in unused)}")
-    return roles, names, end, notes
+    return table, roles, names, end, notes
 
 
 def _power_of(label: object, table: pd.DataFrame, names: Sequence[str]) -> tuple[Floats, list[str]]:
@@ -266,7 +271,7 @@ def _power_of(label: object, table: pd.DataFrame, names: Sequence[str]) -> tuple
     words = pd.Series(table[list(names)].to_numpy(dtype=object)[text], dtype=object).astype(str).str.strip()
     if len(words) >= MIN_REPEATS and words.nunique() == 1:
         return values, [f"{words[0]!r} counts as not detected: {len(words)} of {text.size} cells ({text.mean():.0%})"]
-    for name in names:
+    for name in np.array(names)[text.any(axis=0)]:
         column_of_numbers(label, table, name)
     return values, []
 
