@@ -37,7 +37,6 @@ def errors_section(
     caption: str,
     paragraphs: Sequence[str] = (),
     panels: Sequence[Figure] = (),
-    plots: Sequence[Plot] = (),
 ) -> Section:
     """Return the table of all methods, and figures of those of the short table.
 
@@ -50,7 +49,6 @@ def errors_section(
         caption: What the cells beside the errors mean.
         paragraphs: Sentences before the table.
         panels: Errors against the number of measured positions, if they are known.
-        plots: Further figures.
     """
     unit, short = answer.unit, [one for block in answer.short() for one in block]
     further = list(dict.fromkeys(column for one in answer.methods for column in one.cells))
@@ -59,13 +57,12 @@ def errors_section(
             one.name,
             with_interval(one.error),
             number(one.error["p90"]),
-            number(one.error["mean"]),
             *(one.cells.get(column, "") for column in further),
             " + ".join(number(seconds) for seconds in one.seconds),
         ]
         for one in answer.methods
     ]
-    columns = ["method", f"median [{unit}]", f"90 % below [{unit}]", f"mean [{unit}]", *further, "fit + apply [s]"]
+    columns = ["method", f"median [{unit}]", f"90 % below [{unit}]", *further, "fit + apply [s]"]
     caption = f"{quantity.capitalize()} on the test rows; medians with their 95 % intervals. {caption}".strip()
     values = {"error": [interval(one.error) for one in short]}
     medians = [one.error["median"] for one in short if one.error["n"]]
@@ -85,7 +82,7 @@ def errors_section(
         f"the time that it takes{'; and the error against the number of measured positions' if panels else ''}."
     )
     plot = Plot(f"errors-{name}", [dots, figure, cost, *panels], text, errors)
-    return Section("", list(paragraphs), [Table(columns, rows, caption, frozenset([answer.chosen]))], [plot, *plots])
+    return Section("", list(paragraphs), [Table(columns, rows, caption, frozenset([answer.chosen]))], [plot])
 
 
 def difference(errors: DataFrame, own: str, other: str) -> str:
