@@ -12,15 +12,16 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from swiftwrf.data.columns import Groups, check_powers, numbered
-from swiftwrf.data.coordinates import Coordinates, Floors, GeodeticOrigin
+from swiftwrf.data.columns import Groups, numbered
+from swiftwrf.data.coordinates import Coordinates, Floors, GeodeticOrigin, Up
 from swiftwrf.data.dataset import Arrays, Numbers, PositionedData, position_coordinates, to_positions
+from swiftwrf.data.powers import check_powers
 from swiftwrf.data.splits import MIN_TRAINING, Validation, random_split, validation_for
 from swiftwrf.data.survey import read_survey
 from swiftwrf.errors import InputError, listed
 from swiftwrf.plotting import MARK, Axes, plan
 from swiftwrf.positions import to_tensor
-from swiftwrf.runtime.validation import NonNegativeInt, checked
+from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, checked
 
 META = "meta.csv"  # file of the NeRF2 layout with a row for each measurement
 SURVEY = "survey.yml"  # file of the toolkit's own layout with properties of all measurements
@@ -139,6 +140,10 @@ class Rssi(PositionedData):
         offset_by: str | None = None,
         transmitter: Sequence[str] = (),
         pool_by: str | None = None,
+        scale: PositiveFloat | None = None,
+        y_down: bool = False,
+        up: Up = "z",
+        window: PositiveFloat | None = None,
         receiver_position: Mapping[str, Sequence[float]] | None = None,
         name: str = "rssi",
     ) -> Rssi:
@@ -152,6 +157,10 @@ class Rssi(PositionedData):
             offset_by: Column with the groups of rows between which RSSI has constant offsets.
             transmitter: Columns with the position of the second end of the link where both ends move, as in `load_rssi`.
             pool_by: Radios of one access point to pool, as in `load_rssi`.
+            scale: Units of x and y in a metre, as in `load_rssi`.
+            y_down: y points down, as in images.
+            up: Axis that points up.
+            window: Length [s] of the windows in which packets are joined, as in `load_rssi`.
             receiver_position: Positions [m] by name of the receiver; those of others are unknown.
             name: Name of the data set.
 
@@ -172,6 +181,10 @@ class Rssi(PositionedData):
             offset_by=offset_by,
             transmitter=tuple(transmitter),
             pool_by=pool_by,
+            scale=scale,
+            y_down=y_down,
+            up=up,
+            window=window,
         )
         if receiver_position:
             places = [list(receiver_position.get(receiver, UNKNOWN)) for receiver in found["receiver_names"]]

@@ -16,7 +16,7 @@ from swiftwrf.choices import RSSI_PREDICTORS, NotDetected
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.rssi import PLACE
-from swiftwrf.data.splits import Validation
+from swiftwrf.data.splits import MIN_TRAINING, Validation
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import method_summary
 from swiftwrf.models.prediction import Prediction
@@ -84,6 +84,7 @@ class RssiComparison:
             `detection` are the shares of detected and of empty test cells that are predicted as such, or None.
         left_out: Reason for each predictor that the data do not suffice for.
         predictors: Fitted predictors by name, without those whose values `keep` had.
+        fewer: Values of the model and of nearest neighbours that were fitted to fewer rows, by the number of rows.
 
     Example:
         >>> import swiftwrf
@@ -97,6 +98,7 @@ class RssiComparison:
     values: Mapping[str, Values]
     left_out: dict[str, str]
     predictors: dict[str, RssiPredictor] = field(default_factory=dict)
+    fewer: Mapping[int, Mapping[str, Values]] = field(default_factory=dict)
 
     @property
     def model(self) -> str:
@@ -157,6 +159,18 @@ class RssiComparison:
         return found.assign(detection=found.index.map(right)) if right else found
 
     @property
+    def by_rows(self) -> DataFrame:
+        """Mean absolute error [dB] by the number of training rows, a column for each method that had fewer of them."""
+        names = {name for values in self.fewer.values() for name in values}
+        every = {**self.fewer, len(self.train): {name: value for name, value in self.values.items() if name in names}}
+        measured = self.test.rssi_dbm[self._pairs]
+        found = {
+            n: {name: float((self._at_pairs(value).mean - measured).abs().mean()) for name, value in values.items()}
+            for n, values in every.items()
+        }
+        return DataFrame.from_dict(found, orient="index").rename_axis("n_train")
+
+    @property
     def _pairs(self) -> tuple[Tensor, Tensor]:
         """Rows and receivers of the detected test pairs."""
         row, column = self.test.detected.nonzero(as_tuple=True)
@@ -167,8 +181,11 @@ class RssiComparison:
         return [self.test.receiver_names[number] for number in self._pairs[1].tolist()]
 
     def _prediction(self, name: str) -> Prediction:
+        return self._at_pairs(self.values[name])
+
+    def _at_pairs(self, values: Values) -> Prediction:
         """Return the prediction of the detected test pairs (n,), with the offsets of their groups."""
-        values, offsets = self.values[name], self.train.offsets
+        offsets = self.train.offsets
         mean = torch.as_tensor(values["predicted"], dtype=torch.float64)
         if offsets is not None:
             mean = mean + offsets.of(self.test)[self._pairs[0]]
@@ -193,6 +210,7 @@ def compare(
     reference: str | None = None,
     not_detected: NotDetected = "auto",
     validation: Validation | Literal["auto"] = "auto",
+    fewer: Sequence[float] = (),
     device: torch.device | str = "cpu",
     parallel: Map | None = None,
     keep: Keep | None = None,
@@ -210,6 +228,7 @@ def compare(
         reference: Group whose offset is 0. Defaults to the most frequent one.
         not_detected: Meaning of an empty cell; see `RssiConfig`.
         validation: Folds that choose all settings: "random", "block" or "session". Defaults to those like the test rows.
+        fewer: Fractions of the training rows that the model and "knn" are fitted to, too, e.g. (0.25, 0.5).
         device: Device to compute on.
         parallel: Function that maps a picklable fit over receivers as `map` does.
         keep: Memo `keep(name, compute)`, which returns the values that it has under a name, or the second item of
@@ -239,14 +258,16 @@ def compare(
     names, left_out = compared(chosen, also)
     predictors: dict[str, RssiPredictor] = {}
 
-    def compute(name: str) -> tuple[RssiPredictor, Values]:
+    def compute(name: str, rows: Tensor | None = None) -> tuple[RssiPredictor, Values]:
         predictor = make_predictor(name, preset, **options)
+        part, every = (train, pool) if rows is None else (train.subset(rows), pool.subset(rows))
         began = time.perf_counter()
-        predictor.fit(train, pool=pool, device=device, parallel=parallel, progress=progress)
+        predictor.fit(part, pool=every, device=device, parallel=parallel, progress=progress)
         fitted = time.perf_counter()
         prediction = predictor.predict_detected(test)
         seconds = {"fit": fitted - began, "predict": time.perf_counter() - fitted}
-        predictors[name] = predictor
+        if rows is None:
+            predictors[name] = predictor
         std = None if prediction.std is None else prediction.std[test.detected]
         error = (prediction.mean + offset - test.rssi_dbm)[test.detected].abs()
         values = {"predicted": prediction.mean[test.detected], "std": std, "median_db": float(error.quantile(0.5))}
@@ -254,7 +275,18 @@ def compare(
 
     keep = keep or (lambda name, compute: compute()[1])
     values = {name: keep(name, partial(compute, name)) for name in names}
-    return RssiComparison(train, test, values, left_out, predictors)
+    order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))
+    parts = [order[: round(fraction * len(train))].sort().values for fraction in fewer]
+    less = {
+        len(rows): {
+            name: keep(f"{name}, {len(rows)} rows", partial(compute, name, rows))
+            for name in (model_of(train), "knn")
+            if name in names
+        }
+        for rows in parts
+        if int(train.detected[rows].sum(dim=0).min()) >= MIN_TRAINING
+    }
+    return RssiComparison(train, test, values, left_out, predictors, less)
 
 
 def _detection(predictor: RssiPredictor, test: Rssi) -> tuple[float, float] | None:

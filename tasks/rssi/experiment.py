@@ -60,12 +60,10 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
                     predictor.save(directory.path(MODEL))
                 return value | {"n_primitives": getattr(predictor, "n_primitives", 0)}
 
-            value = directory.step(name, f"fitting {name}", saved)
-            terminal.result(name, f"{value['median_db']:.2f} dB")
-            return value
+            return directory.step(name, name, saved, lambda value: f"{value['median_db']:.2f} dB")
 
-        terminal.expect(sum(not directory.holds(name) for name in names))
         with terminal.progress():
+            terminal.expect(sum(not directory.holds(name) for name in names))
             result = compare(
                 whole,
                 receivers=config.rx,

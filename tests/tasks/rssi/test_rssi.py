@@ -198,11 +198,12 @@ def test_a_lone_receiver_has_one_map_and_no_average(tmp_path, capsys):
     out = tmp_path / "her 'own' run"
     assert run("--rx", "1", "--out", out) == 0
     drawn = {file.stem.partition("-")[0] for file in (out / "figures").glob("*.svg")}
-    assert drawn == {"summary", "cdf", "where", "speed"}
+    assert drawn == {"summary", "errors", "where"}
     assert list((out / "figures").glob("summary*.csv"))
     for text in (capsys.readouterr().out, unescape(re.sub("<[^>]*>", "", (out / "report.html").read_text()))):
-        assert f"python -m tasks.view {shlex.quote(str(out))}" in text
-        assert f"swiftwrf.load({str(out / 'model.safetensors')!r})" in text
+        assert f"swiftwrf view {shlex.quote(str(out))}" in text
+        assert f"swiftwrf predict {shlex.quote(str(out))} positions.csv" in text
+        assert "--split block" in text
 
 
 @pytest.mark.parametrize(
@@ -315,8 +316,15 @@ def test_an_interval_of_one_width_sends_nobody_to_measure():
     width = np.tile([[[[7.0]], [[8.0]]]], (1, 1, 4, 5))
     maps = {"x": x, "y": y, "measured_position": corners, "measured": corners[:, :2], "width": width}
     maps |= {"predicted": width, "detection": width, "floor_of_row": np.zeros(4, int)}
-    run = SimpleNamespace(arrays=lambda name: maps)
+    tested = pd.DataFrame({"x": x, "y": 0.0, "z": 1.0, "receiver": "a", "measured": -60.0})
+    run = SimpleNamespace(arrays=lambda name: maps, table=lambda name: tested)
     assert "not worth it" in where_next(run)
+    assert "the model explains no more" in where_next(run)
+    for spread, reason in ((2.7, "which is the scatter of repeated"), (0.5, "lie within 1 dB")):
+        tested = pd.DataFrame(
+            {"x": 1.0, "y": 0.0, "z": 1.0, "receiver": "a", "measured": [-60.0 - spread, -60 + spread] * 20}
+        )
+        assert reason in where_next(run)
     maps["width"][:, :, 2, 3] += 4
     assert where_next(run).startswith("Measure around x = 3.0 m, y = 2.0 m")
     maps |= {
