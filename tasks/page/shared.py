@@ -58,10 +58,11 @@ def errors_section(
             number(one.error["p90"]),
             number(one.error["mean"]),
             *(one.cells.get(column, "") for column in further),
+            " + ".join(number(seconds) for seconds in one.seconds),
         ]
         for one in answer.methods
     ]
-    columns = ["method", f"median [{unit}]", f"90 % below [{unit}]", f"mean [{unit}]", *further]
+    columns = ["method", f"median [{unit}]", f"90 % below [{unit}]", f"mean [{unit}]", *further, "fit + apply [s]"]
     caption = f"{quantity.capitalize()} on the test rows; medians with their 95 % intervals. {caption}".strip()
     values = {"error": [interval(one.error) for one in short]}
     medians = [one.error["median"] for one in short if one.error["n"]]
@@ -73,8 +74,14 @@ def errors_section(
     limit = max((float(part.quantile(0.9)) for part in groups.values() if len(part)), default=1.0)
     shown = dict(list(groups.items())[:MAX_CURVES])
     figures.cdf(axes, palette, shown, f"{quantity} [{unit}]", max(limit, 1e-3))
-    text = "Medians with 95 % intervals, and the distribution of the errors; the thin line is at the median."
-    plot = Plot(f"errors-{name}", [dots, figure], text, errors)
+    cost, axes = figures.panel(4.6, 3.2)
+    points = {one.name: (sum(one.seconds), one.error["median"]) for one in short if one.error["n"]}
+    figures.speed(axes, palette, points, "seconds to fit and apply", f"median {quantity} [{unit}]")
+    text = (
+        "Medians with 95 % intervals; the distribution of the errors, with a thin line at the median; and the median "
+        "against the time that it takes."
+    )
+    plot = Plot(f"errors-{name}", [dots, figure, cost], text, errors)
     return Section("", list(paragraphs), [Table(columns, rows, caption, frozenset([answer.chosen]))], [plot, *plots])
 
 

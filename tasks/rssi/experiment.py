@@ -30,6 +30,8 @@ from tasks.source import measured_rssi, offset_notes, split_notes
 from tasks.terminal import console, terminal
 from tasks.workers import connected
 
+FEWER = (0.125, 0.25, 0.5)  # of the training rows, for the figure of the error against their number
+
 
 def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     """Run the experiment and write its directory, or continue an interrupted one.
@@ -53,7 +55,10 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         Run("rssi", config.out, label, config, device, source, resume) as directory,
     ):
 
-        def keep(name: str, compute: Callable[[], tuple[RssiPredictor, Row]]) -> Row:
+        def keep(name: str, compute: Callable[[], tuple[RssiPredictor | None, Row]]) -> Row:
+            if name == "fewer rows":
+                return directory.step(name, name, lambda: compute()[1], lambda value: "")
+
             def saved() -> Row:
                 predictor, value = compute()
                 if isinstance(predictor, RssiModel | PairModel) and name == model_of(data):
@@ -63,7 +68,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
             return directory.step(name, name, saved, lambda value: f"{value['median_db']:.2f} dB")
 
         with terminal.progress():
-            terminal.expect(sum(not directory.holds(name) for name in names))
+            terminal.expect(sum(not directory.holds(name) for name in (*names, "fewer rows")))
             result = compare(
                 whole,
                 receivers=config.rx,
@@ -74,6 +79,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
                 not_detected=config.not_detected,
                 validation=config.validation,
                 reference=config.table.reference,
+                fewer=FEWER,
                 device=device,
                 parallel=cluster.map if cluster else None,
                 keep=keep,
@@ -143,6 +149,7 @@ def _metrics(config: RssiTaskConfig, data: Rssi, result: RssiComparison, model: 
         "model": result.model,
         "seconds": seconds[result.model],
         "interval": {"nominal": LEVEL, "coverage": result.coverage},
+        "by_rows": {str(n): {str(name): mean for name, mean in row.items()} for n, row in result.by_rows.iterrows()},
         "chosen": {
             "n_primitives": max(value["n_primitives"] for value in result.values.values()),
             "floor_attenuation_db": attenuation_db,

@@ -79,7 +79,7 @@ def _errors(run: RssiRecords) -> Section:
         quantity="absolute error",
         caption=caption,
         paragraphs=[f"Left out: {reason}." for reason in run.metrics["left_out"].values()],
-        plots=[errors.differences(run)] if len(run.metrics["receivers"]) > 1 else [],
+        plots=errors.differences(run) + errors.by_rows(run),
     )
 
 
