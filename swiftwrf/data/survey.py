@@ -207,6 +207,7 @@ def read_survey(
         "labels": labels,
         "floors": floors,
         "receiver_moves": moves,
+        "plan_scale": frame.scale if frame.y_down else None,
         "session": sessions,
         "time": time,
         "index": row,
