@@ -132,22 +132,23 @@ def std_factor(score: Tensor) -> float:
     return float(np.quantile(score.numpy(), 0.8)) / NORMAL_80
 
 
-def angle_errors(estimate: Tensor, truth: Tensor) -> dict[str, Tensor]:
+def angle_errors(estimate: Tensor | NDArray[np.floating], truth: Tensor | NDArray[np.floating]) -> dict[str, Tensor]:
     """Return absolute errors (n,) [rad] of azimuth (modulo 2 pi) and elevation, and the angular error (great-circle).
 
     Args:
-        estimate: Estimated azimuth and elevation [rad], (n, 2).
-        truth: True azimuth and elevation [rad], (n, 2).
+        estimate: Estimated azimuth and elevation [rad], tensor or array (n, 2).
+        truth: True azimuth and elevation [rad], tensor or array (n, 2).
 
     Example:
         >>> errors = angle_errors(torch.tensor([[0.1, 0.0]]), torch.tensor([[6.2, 0.0]]))
         >>> round(float(errors["azimuth"]), 2), round(float(errors["great_circle"]), 2)
         (0.18, 0.18)
     """
+    found, true = (torch.as_tensor(given, dtype=torch.float64) for given in (estimate, truth))
     return {
-        "azimuth": wrap(estimate[:, 0] - truth[:, 0]).abs(),
-        "elevation": (estimate[:, 1] - truth[:, 1]).abs(),
-        "great_circle": angular_distance(to_direction(*estimate.unbind(-1)), to_direction(*truth.unbind(-1))),
+        "azimuth": wrap(found[:, 0] - true[:, 0]).abs(),
+        "elevation": (found[:, 1] - true[:, 1]).abs(),
+        "great_circle": angular_distance(to_direction(*found.unbind(-1)), to_direction(*true.unbind(-1))),
     }
 
 

@@ -216,6 +216,15 @@ class TableSource:
     pool_by: str | None = None
     """pool radios of one access point into one receiver, by the mean of their powers: mac (the first five bytes of their
     addresses), a regular expression whose group is the access point, or the column of a long table that contains it"""
+    scale: PositiveFloat | None = None
+    """pixels of a floor plan, or other units of x and y in a survey table, in a metre (default: as lines above the header or
+    names of columns state)"""
+    y_down: bool = False
+    """y of a survey table points down, as in images of floor plans"""
+    up: Literal["y", "z"] = "z"
+    """axis of a survey table that points up: y as in ARCore, ARKit and Unity"""
+    window: PositiveFloat | None = None
+    """join packets of several receivers in windows of this length [s] to one row each, by their means"""
 
     @property
     def column_names(self) -> dict[str, str] | None:

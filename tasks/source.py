@@ -17,6 +17,7 @@ from swiftwrf.data import ReadOptions, load_rssi, load_spectra
 from swiftwrf.data.archives import array_header, read_rows
 from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
 from swiftwrf.data.store import Store
+from swiftwrf.data.survey import spelled_as
 from swiftwrf.datasets import DATA_SETS, fetch
 from swiftwrf.errors import listed
 from tasks.options import OffsetSource, SpectraSource, TableSource
@@ -44,6 +45,10 @@ def reading(spectra: SpectraSource, table: TableSource) -> ReadOptions:
         coordinates=table.coordinates,
         transmitter=table.transmitter,
         pool_by=table.pool_by,
+        scale=table.scale,
+        y_down=table.y_down,
+        up=table.up,
+        window=table.window,
         offset_by=offset_by and offset_by.partition("=")[0],
     )
 
@@ -136,13 +141,18 @@ def observed_spectra(source: str, options: ReadOptions, grid: AngularGrid, model
     return store, known
 
 
-def aligned(data: Rssi, names: tuple[str, ...]) -> Rssi:
+def aligned(data: Rssi, names: tuple[str, ...], ignore_others: bool) -> Rssi:
     """Return the data at the receivers of a locator, in its order; those that the data lack count as not detecting.
 
+    Names may differ in case, separators or zeros.
+
     Raises:
-        InputError: The data have none of the receivers.
+        InputError: The data have none of the receivers, or others that are not ignored.
     """
-    place = {name: column for column, name in enumerate(data.receiver_names)}
+    own, notes = spelled_as(data.receiver_names, names)
+    for note in notes:
+        console.print(f"{data.name}: {note}")
+    place = {name: column for column, name in enumerate(own)}
     if not place.keys() & set(names):
         raise InputError(
             f"{data.name} has other receivers ({listed(data.receiver_names)}) than the model ({listed(names)}); their names "
@@ -151,7 +161,12 @@ def aligned(data: Rssi, names: tuple[str, ...]) -> Rssi:
     missing = [name for name in names if name not in place]
     if missing:
         console.print(f"{data.name}: receivers of the model that are missing count as not detecting: {listed(missing)}")
-    others = [name for name in data.receiver_names if name not in names]
+    others = [name for name in own if name not in names]
+    if others and not ignore_others:
+        raise InputError(
+            f"{data.name} has receivers that the model does not have ({listed(others)}); leave them out by "
+            "--ignore-receivers"
+        )
     if others:
         console.print(f"{data.name}: receivers that the model does not have are not used: {listed(others)}")
     rssi = torch.full((len(data), len(names)), torch.nan, dtype=torch.float64)

@@ -213,8 +213,8 @@ def test_report_leaves_the_interrupted_work_of_others(finished, tmp_path):
     assert {file.name for file in tmp_path.iterdir()} == {"one", "long", "long.partial"}
 
 
-@pytest.mark.parametrize(("task", "figures"), [("rssi", 6), ("aoa", 4)])
-def test_merged_reports_show_every_run(request, tmp_path, task, figures):
+@pytest.mark.parametrize("task", ["rssi", "aoa"])
+def test_merged_reports_show_every_run(request, tmp_path, task):
     if task == "rssi":
         other = request.getfixturevalue("finished")
     else:
@@ -225,8 +225,8 @@ def test_merged_reports_show_every_run(request, tmp_path, task, figures):
         merge([request.getfixturevalue(f"{task}_run"), other], tmp_path / "both")
     drawn = _files(tmp_path / "both" / "figures")
     first, second = ({name for name in drawn if run in name} for run in ("run1", "run2"))
-    assert min(len(first), len(second)) >= figures
-    same = [name for name in first if name.endswith(".csv") and name.startswith("cdf")]
+    assert min(len(first), len(second)) >= 3
+    same = [name for name in first if name.endswith(".csv") and name.startswith("errors")]
     pairs = [(name, name.replace("run1", "run2")) for name in same if name.replace("run1", "run2") in drawn]
     assert pairs
     assert all(drawn[one] != drawn[other] for one, other in pairs)

@@ -8,7 +8,7 @@ from pathlib import Path
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data.coordinates import Coordinates
+from swiftwrf.data.coordinates import Coordinates, Up
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, ReadOptions, read
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.rssi import Rssi
@@ -110,6 +110,10 @@ def load_rssi(
     offset_by: str | None = None,
     transmitter: Sequence[str] = (),
     pool_by: str | None = None,
+    scale: PositiveFloat | None = None,
+    y_down: bool = False,
+    up: Up = "z",
+    window: PositiveFloat | None = None,
 ) -> Rssi:
     """Read RSSI in any format of docs/formats.md: the NeRF2 layout, or a survey table (CSV, Parquet).
 
@@ -124,6 +128,11 @@ def load_rssi(
             the one column with names of its positions, which receivers.csv contains. Defaults to those recognised.
         pool_by: Radios of one access point to pool by the mean of their powers: "mac" for the first five bytes of MAC
             addresses, a regular expression whose group is the access point, or the column of a long table that contains it.
+        scale: Units of x and y in a metre, e.g. pixels of a floor plan. Defaults to the scale that lines above the
+            header or names of columns state.
+        y_down: y points down, as in images of floor plans.
+        up: Axis that points up, "y" as in ARCore, ARKit and Unity.
+        window: Length [s] of the windows in which packets of several receivers are joined to a row by their means.
 
     Raises:
         InputError: A part that is missing or invalid, parts that do not match, or an argument that does not apply.
@@ -146,6 +155,10 @@ def load_rssi(
         offset_by=offset_by,
         transmitter=tuple(transmitter),
         pool_by=pool_by,
+        scale=scale,
+        y_down=y_down,
+        up=up,
+        window=window,
     )
     data: Rssi = read(path, options, RSSI_FORMATS)
     return data

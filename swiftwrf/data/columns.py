@@ -1,8 +1,4 @@
-"""Columns of tables: what they hold, recognised by their names, and their cells as numbers, text and groups of rows.
-
-A filler is a constant where a receiver detected nothing: 0, 100, 127 (Bluetooth: not available), -100, or a value just below
-the weakest measurement. It is recognised by its place at the edge of all values and by its frequency.
-"""
+"""Columns of tables and what they hold: roles by names first, by kinship of names second, by values last."""
 
 from __future__ import annotations
 
@@ -17,36 +13,68 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from swiftwrf.data.cells import parsed, plain_name, text_of
+from swiftwrf.data.powers import KNOWN_FILLERS, MIN_RSSI_DBM
 from swiftwrf.errors import InputError, listed
 
 Floats = NDArray[np.float64]
-END = "pos|position|coord|tx|rx|transmitter|receiver"
-AXIS = f"(?:(?:{END})_)?{{0}}(?:_(?:{END}))?(?:_m)?"
-ROLES = {  # names of columns, in lower case with underscores
-    "x": re.compile(AXIS.format("x") + "|east(?:ing)?|e_?coord"),
-    "y": re.compile(AXIS.format("y") + "|north(?:ing)?|n_?coord"),
-    "z": re.compile(AXIS.format("z") + "|(?:height|alt|altitude|elevation)_?(?:m|meters|metres)?"),
-    "longitude": re.compile("(?:gps_?|current_?)?(?:lon|lng|long|longitude)(?:_deg(?:rees)?)?"),
-    "latitude": re.compile("(?:gps_?|current_?)?(?:lat|latitude)(?:_deg(?:rees)?)?"),
-    "floor": re.compile("floor(?:_?id)?"),
-    "time": re.compile("time(?:_s)?|timestamp|t|date(?:_?time)?|first_?seen"),
-    "session": re.compile("(?:session|run|walk)(?:_?id)?"),
-    "receiver": re.compile("receiver(?:_(?:name|id))?|rx|gateway|ap(?:_(?:name|id))?|bssid|mac|sensor|anchor"),
-    "rssi": re.compile("(?:rssi?|rsrp|signal|power)(?:_dbm)?|rss_dbm|dbm"),
-}
-EPOCH_UNITS = (  # of times since 1970 by their size, from the year 1973 on
-    ("milliseconds", 1e3, 1e11, 1e14),
-    ("microseconds", 1e6, 1e14, 1e17),
-    ("nanoseconds", 1e9, 1e17, 1e20),
+PLACE = (
+    "pos|position|coord|coordinate|loc|location|tx|rx|transmitter|receiver|map|plan|floorplan|image|point|pixels?|px|local|robot|ue|"
+    "true|truth|gt"
 )
+MEAN = "(?:(?:mean|avg|average|median|max|raw|filtered|wifi|wlan|ble|bt|lora|lte|nr|ss|serving|measured)_?)*"
+GPS, GPS_END = "(?:(?:gps|gnss|current|location|device|phone|best|tri)_?)?", "(?:_?(?:1?e7|dd|wgs_?84|nmea))?"
+CELL_ID = "(?:global_?)?cell_?id|cid|eci|cgi|pci"
+ROLES = {  # patterns of names in lower case with underscores and without units, the first ones preferred
+    "x": [f"(?:(?:{PLACE})_?)*x(?:_?(?:{PLACE}))*|east(?:ing)?s?|e_?coord"],
+    "y": [f"(?:(?:{PLACE})_?)*y(?:_?(?:{PLACE}))*|north(?:ing)?s?|n_?coord"],
+    "z": [f"(?:(?:{PLACE})_?)*z(?:_?(?:{PLACE}))*", "height", f"{GPS}(?:alt|altitude|elevation)"],
+    "longitude": [f"{GPS}(?:lon|lng|long|longitude){GPS_END}"],
+    "latitude": [f"{GPS}(?:lat|latitude){GPS_END}"],
+    "floor": ["floor(?:_?(?:id|name|number|no|level))?|storey|etage|stockwerk"],
+    "time": [
+        "time_?stamp|date_?time|unix(?:_?time)?|epoch(?:_?time)?|(?:gps|utc|local|phone|system|event|measured|received)_?time",
+        "time|t|ts|elapsed(?:_?time)?|uptime",
+        "date",
+        "(?:first|last)_?seen|(?:received|measured|recorded|created|logged|reported)_?at",
+    ],
+    "session": ["(?:session|run|walk)(?:_?id)?"],
+    "receiver": [
+        "receiver(?:_?(?:name|id))?|rx(?:_?(?:name|id))?",
+        "(?:gateway|gw|gtw)(?:_?(?:name|id|eui))?",
+        "(?:(?:ap|wifi|wlan|ble|bt|beacon|router|station)_?)?(?:bssid|mac(?:_?addr(?:ess)?)?)(?:_of_ap)?",
+        "(?:ap|access_?point)(?:_?(?:id|name|mac|address))?",
+        "(?:anchor|sensor|node|station|beacon|tag_?reader|reader)(?:_?(?:id|name|mac|address))?|eui|(?:ble_?)?address",
+        CELL_ID,
+        "(?:wifi_?)?e?ssid",
+    ],
+    "rssi": [
+        f"{MEAN}rsrp",
+        f"{MEAN}rssi?(?:_?(?:value|mean|avg|average|median|raw))*",
+        f"{MEAN}(?:rscp|rxlev|rx_?lev(?:el)?|rx_?power|received_?power|dbm)",
+        f"{MEAN}(?:received_)?signal(?:_?(?:strength|level|power|dbm))?",
+        f"{MEAN}(?:power|strength|level)(?:_?dbm)?",
+    ],
+}
+NO_POWER = re.compile(  # quantities beside received power that may be negative, as the last words of a name
+    r"(?:.*_)?(?:"
+    r"rsrq|rsr_q|r?ss?nr|sinr|l?snr|esnr|ec_?[in]?o|cqi|qual|quality|noise(?:_?(?:floor|level|power))?|nf|offset|path_?loss|error|gain"
+    r"|tx_?p\w*|transmit\w*_power|power_?tx|eirp|erp|measured_power|ref\w*_power"
+    r"|(?:mag|magnet\w*|geomag\w*|acc|accel\w*|gyro\w*|grav\w*|ori|orient\w*|rot|rotation\w*|imu|odom\w*)_?[xyzw]?\d?"
+    r"|(?:b|m|q|v|vel|velocity|speed|est|estimated?|pred|predicted|hat|slam|vio|ekf|euler|angle)_?[xyzw]"
+    r"|(?:x|y|z|lat|lon|lng|latitude|longitude|alt)_?(?:est|estimated?|pred|predicted|hat|odom|imu|slam|vio|ekf|mag|acc|gyro)"
+    r"|roll|pitch|yaw|heading|azimuth|bearing|course|tilt|speed|velocity|temp|temperature\w*"
+    r")(?:_(?:mean|avg|std|serving|\d+))*"
+)
+GROUPS_OF_ROWS = re.compile(  # columns that distinguish rows, but not the receivers
+    r"(?:.*_)?(device|phone|user|model|brand|person|operator|mode|weather|channel|ch|freq\w*|band|sf|data_?rate|modulation|bw"
+    r"|bandwidth|codr|building\w*|room|zone|area|space\w*|site|place|location|point|snapshot|direction|orientation|date|day"
+    r"|time\w*|type|security|auth_?mode|capabilities|vendor|manufacturer|provider|experiment\w*|trial|comment|notes?|version|os"
+    r"|app\w*|sample\w*|index|idx|row|count\w*|seq\w*|packet\w*|frame\w*|node_?addr\w*|dev_?(?:eui|addr))"
+    r"(?:_?(?:id|name|no|number))?"
+)
+MIN_REFERENCE_DBM = -25.0  # median of a column that is a received power by its values alone
 GEODETIC = {"x": "longitude", "y": "latitude"}  # that take the place of x and y
-NOT_DETECTED_DBM = -100.0  # the usual filler
-KNOWN_FILLERS = (NOT_DETECTED_DBM, -200.0, 0.0, 100.0, 127.0)
-MIN_RSSI_DBM, MAX_RSSI_DBM = -150.0, 30.0
-# a frequent value from -1 dBm on is a filler, unless values within 10 dB are as frequent
-N_NEIGHBOURS_DB = 5  # of the next stronger values that a filler at the lower edge is compared with
-MIN_REPEATS = 5  # cells with a filler that is not known
-MIN_VALUES = 5  # different values that are left
 
 
 def column_of(table: pd.DataFrame, role: str, columns: Mapping[str, str]) -> str | None:
@@ -55,28 +83,25 @@ def column_of(table: pd.DataFrame, role: str, columns: Mapping[str, str]) -> str
 
 
 def candidates(table: pd.DataFrame, role: str) -> list[str]:
-    """Return the columns whose names are of a role. A column of powers does not hold names of receivers."""
-    found = [name for name in map(str, table.columns) if ROLES[role].fullmatch(plain_name(name))]
-    return [name for name in found if role != "receiver" or not is_rssi(table[name])]
+    """Return the columns whose names are of a role, the most specific name first.
 
-
-def column_of_numbers(label: object, table: pd.DataFrame, name: str) -> Floats:
-    """Return a column as numbers, nan where a cell is empty.
-
-    Raises:
-        InputError: A cell holds text.
+    A column of powers does not hold names of receivers.
     """
-    values, text = parsed(table[name])
-    if text.any():
-        row = int(text.argmax())
-        raise InputError(f"{label} row {row + 1}, column {name}: {table[name].iloc[row]!r} is not a number")
-    return values
+    plain = {name: plain_name(name) for name in map(str, table.columns)}
+    found = [name for pattern in ROLES[role] for name in plain if re.fullmatch(pattern, plain[name])]
+    if role == "receiver":
+        return [name for name in found if not is_rssi(table[name])]
+    return [name for name in found if not NO_POWER.fullmatch(plain[name])]
 
 
 def find_roles(
     label: object, table: pd.DataFrame, asked: Mapping[str, str], taken: Collection[str] = ()
 ) -> dict[str, str]:
-    """Return the column of each role: the one asked for, or else the one with a known name that is not taken."""
+    """Return the column of each role: the one asked for, or else the first one with a known name that is not taken.
+
+    Raises:
+        InputError: A column that is missing, no or several columns for x or y, or receivers without RSSI.
+    """
     for role in asked:
         if role not in ROLES:
             raise InputError(f"columns takes {', '.join(ROLES)}, got {role!r}")
@@ -89,7 +114,7 @@ def find_roles(
         found = [name for name in candidates(table, role) if name not in (*roles.values(), *taken)]
         if role in asked or not found:
             continue
-        if len(found) > 1:
+        if len(found) > 1 and role in (*GEODETIC, *GEODETIC.values()):
             raise InputError(
                 f"{label} has {len(found)} columns that may be {role} ({listed(found)}); choose one with columns {role}=NAME"
             )
@@ -101,62 +126,125 @@ def find_roles(
             raise InputError(
                 f"{label} has no column for {role}; there are {listed(table.columns)}; choose one with columns {role}=NAME"
             )
+    name = roles.get("receiver", "")
+    if "receiver" not in asked and re.fullmatch(CELL_ID, plain_name(name)) and table[name].nunique() == 1:
+        del roles["receiver"]  # the log of one cell
+    others = [name for name in table.columns if name not in roles.values()]
     if "receiver" in roles and "rssi" not in roles:
-        raise InputError(
-            f"{label} has receivers in column {roles['receiver']!r}, but no RSSI beside; name it with columns rssi=NAME"
-        )
+        if "receiver" in asked or len(receiver_columns(table, others)[0]) < 2:
+            raise InputError(
+                f"{label} has receivers in column {roles['receiver']!r}, but no RSSI beside; name it with columns rssi=NAME"
+            )
+        del roles["receiver"]  # a label of the rows of a wide table
     return roles
 
 
-def plain_name(name: str) -> str:
-    """Return the name in lower case with underscores: `Position X [m]` becomes position_x_m."""
-    return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+def receiver_columns(table: pd.DataFrame, names: Sequence[str]) -> tuple[list[str], list[str], list[str]]:
+    """Return the columns of a wide table that hold the RSSI of receivers, others that look like it, and notes on these.
 
+    Names of other quantities are left out. Of several columns whose names are nothing but received power, the most specific
+    one counts. Other columns must be akin to columns of received power, by their names or by their values.
 
-def text_of(column: pd.Series) -> pd.Series:
-    """Return the cells as text, empty for missing ones."""
-    return column.astype(object).where(column.notna(), "").astype(str).str.strip()
-
-
-def parsed(column: pd.Series) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return numbers, nan elsewhere, and a mask of cells that hold text."""
-    if column.dtype.kind in "biuf":
-        return column.to_numpy(np.float64), np.zeros(len(column), dtype=bool)
-    cells = column.astype(str).str.strip()
-    values = pd.to_numeric(cells, errors="coerce").to_numpy(np.float64)
-    empty = column.isna().to_numpy() | cells.str.lower().isin({"", "nan", "na", "n/a", "null", "none", "-"}).to_numpy()
-    return np.where(empty, np.nan, values), np.isnan(values) & ~empty
-
-
-def seconds(column: pd.Series) -> tuple[Floats, list[str]]:
-    """Return times [s] since the first cell, nan where a cell is no time, and a note on their unit.
-
-    Cells are dates or numbers [s]. Numbers as large as milliseconds, microseconds or nanoseconds since 1970 are these.
+    Args:
+        table: Columns.
+        names: Those without another role.
 
     Example:
-        >>> seconds(pd.Series(["2024-01-01 10:00:00", "2024-01-01 10:01:00", "noon"]))
-        (array([ 0., 60., nan]), [])
-        >>> seconds(pd.Series([1_700_000_000_000, 1_700_000_000_500], name="time"))
-        (array([0. , 0.5]), ['column time counts milliseconds since 1970, which are converted to seconds'])
+        >>> table = pd.DataFrame({"AP1": [-60, -61], "AP2": [-70, -71], "SNR": [-3, -4], "drift": [-20.5, 3.5]})
+        >>> receiver_columns(table, list(table))[0]
+        ['AP1', 'AP2']
     """
+    found = [name for name in names if is_rssi(table[name]) and not is_coordinate(name)]
+    plain = {name: plain_name(name) for name in found}
+    others = [name for name in found if NO_POWER.fullmatch(plain[name])]
+    bare = [name for name in candidates(table, "rssi") if name in found]
+    weaker = bare[1:]
+    found = [name for name in found if name not in (*others, *weaker)]
+    powers = {name: _powers(table[name]) for name in found}
+    plausible = [name for name in found if _is_plausible(powers[name])] or found
+    whole = [name for name in plausible if (powers[name] % 1 == 0).all()]
+    reference = whole if len(whole) > 1 or set(whole) & set(bare) else plausible
+    kin = {_kinship(plain[name]) for name in reference}
+    doubtful = [name for name in found if name not in reference and _kinship(plain[name]) not in kin]
     notes = []
-    values = np.full(len(column), np.nan) if column.dtype.kind == "M" else parsed(column)[0]
-    if np.isnan(values).all():
-        date = pd.to_datetime(column, errors="coerce", utc=True, format="mixed")
-        values = (date - date.min()).dt.total_seconds().to_numpy(np.float64)
-    size = np.nanmedian(values) if np.isfinite(values).any() else 0.0
-    for unit, factor, low, high in EPOCH_UNITS:
-        if low <= size < high:
-            values = values / factor
-            notes.append(f"column {column.name} counts {unit} since 1970, which are converted to seconds")
-    return values - values[0] if len(values) and np.isfinite(values[0]) else values, notes
+    if others or weaker:
+        notes.append(f"columns of other quantities than the received power are left out: {listed([*others, *weaker])}")
+    if doubtful:
+        notes.append(
+            f"columns are left out whose values are unlike those of {listed(reference[:3])}: {listed(doubtful)}; if "
+            "they are receivers, give --columns rssi=PATTERN"
+        )
+    found = [name for name in found if name not in doubtful]
+    families = pd.Series([_kinship(plain[name]) for name in found], dtype=object)
+    usual = families.value_counts()
+    if len(usual) > 1 and usual.iloc[0] >= max(3, 0.6 * len(found)):
+        odd = [name for name, family in zip(found, families, strict=True) if family != usual.index[0]]
+        notes.append(f"columns count as receivers though they are named unlike the others: {listed(odd)}")
+    return found, [*others, *weaker, *doubtful], notes
+
+
+def _powers(column: pd.Series) -> Floats:
+    """Return the values of a column that may be received powers."""
+    values = parsed(column)[0]
+    return values[np.isfinite(values) & ~np.isin(values, KNOWN_FILLERS)]
+
+
+def _is_plausible(power: Floats) -> bool:
+    """Return True if values are received powers without a name that states it."""
+    return len(power) == 0 or bool(np.median(power) <= MIN_REFERENCE_DBM and (power > 0).mean() < 0.02)
+
+
+def _kinship(name: str) -> str:
+    """Return what related names share: that of MAC addresses, or the first word without digits."""
+    if re.fullmatch(r"(?:[0-9a-f]{2}_?){5}[0-9a-f]{2}", name):
+        return "address"
+    return re.split(r"[_\d]", name, maxsplit=1)[0] or "number"
+
+
+def check_receiver_known(
+    label: object, table: pd.DataFrame, rssi: str, others: Sequence[str], place: Sequence[str]
+) -> None:
+    """Refuse a table with one column of RSSI beside names that may be those of its receivers.
+
+    Such names repeat. Several of them occur at one place and time, or they alternate from row to row.
+
+    Args:
+        label: Name of the table, for messages.
+        table: Its columns.
+        rssi: Column of RSSI.
+        others: Columns without a role.
+        place: Columns of position and time.
+
+    Raises:
+        InputError: The question whether the column contains the receivers.
+    """
+    timed = len(place) > 2
+    together = table.groupby([text_of(table[name]) for name in place], sort=False).ngroup()
+    several = together.groupby(together).transform("size") > 1
+    for name in others:
+        cell = text_of(table[name])
+        values, is_text = parsed(table[name])
+        count = cell.value_counts()
+        if not 2 <= len(count) <= len(cell) / 3 or "" in count.index:
+            continue
+        is_name = is_text.mean() > 0.9 or bool((values % 1 == 0).all())
+        apart = ~pd.DataFrame({"row": together, "cell": cell}).duplicated(keep=False)
+        is_packet = several.mean() > 0.3 and apart[several].mean() > 0.8
+        alternates = is_text.all() and not several.any() and (cell != cell.shift()).mean() > 0.5
+        if (group := GROUPS_OF_ROWS.fullmatch(plain_name(name))) and not (timed and is_packet and group[1] == "device"):
+            continue
+        if is_name and (is_packet or alternates):
+            raise InputError(
+                f"{label}: is {name!r} the receiver of each row? Then give --columns receiver={name}, or --columns "
+                f"rssi={rssi} if all rows are of one receiver"
+            )
 
 
 def is_rssi(column: pd.Series) -> bool:
     """Return True if most cells are received powers or fillers, whatever the number of these."""
     values, text = parsed(column)
     known = np.unique(values[~np.isnan(values)])
-    if not len(known) or text.sum() > np.isfinite(values).sum():
+    if not len(known) or (text.sum() > np.isfinite(values).sum() and column[text].nunique() > 1):
         return False
     power = known[~np.isin(known, KNOWN_FILLERS) & np.isfinite(known)]
     if not len(power):
@@ -168,103 +256,10 @@ def is_rssi(column: pd.Series) -> bool:
 
 def is_coordinate(name: str) -> bool:
     """Return True for the name of a column with a coordinate."""
-    return any(ROLES[role].fullmatch(plain_name(name)) for role in ("x", "y", "z", "longitude", "latitude"))
-
-
-def find_fillers(rssi: Floats) -> list[float]:
-    """Return the values in a table of RSSI (n, R) [dBm] that stand for "not detected", apart from nan and -inf.
-
-    Example:
-        >>> find_fillers(np.array([[-60.0, 127.0], [-70.0, -65.0], [0.0, -80.0]]))
-        [127.0, 0.0]
-    """
-    value, count = np.unique(rssi[rssi > -np.inf], return_counts=True)
-    impossible = (value < MIN_RSSI_DBM) | (value > MAX_RSSI_DBM)
-    is_filler = impossible & np.isin(value, KNOWN_FILLERS)
-    if (others := impossible & ~is_filler).sum() == 1:
-        is_filler |= others & (count >= MIN_REPEATS)
-    found: list[float] = value[is_filler].tolist()
-    value, count = value[~impossible], count[~impossible]
-    while len(value) and value[-1] >= -1.0 and _is_frequent(value, count, len(value) - 1, 10.0):
-        found.append(float(value[-1]))
-        value, count = value[:-1], count[:-1]
-    usual = np.flatnonzero(value == NOT_DETECTED_DBM)
-    if len(usual) and (usual[0] == 0 or _is_frequent(value, count, int(usual[0]), N_NEIGHBOURS_DB)):
-        found.append(NOT_DETECTED_DBM)
-    elif _fills_the_lower_edge(rssi, value, count):
-        found.append(float(value[0]))
-    return found
-
-
-def has_frequent_edge(rssi: Floats) -> bool:
-    """Return True if the least of the values of a receiver (n,) [dBm] is far more frequent than those above it.
-
-    Example:
-        >>> has_frequent_edge(np.array([-90.0] * 9 + [-89, -88, -87, -80, -75, -70, -60]))
-        True
-    """
-    value, count = np.unique(rssi, return_counts=True)
-    if len(value) <= MIN_VALUES or int(count[0]) < 0.2 * len(rssi):
-        return False
-    return _is_frequent(value, count, 0, N_NEIGHBOURS_DB)
-
-
-def _is_frequent(value: Floats, count: NDArray[np.int64], index: int, within_db: float) -> bool:
-    """Return True if a value is much more frequent than every other one within a distance, in bins of 1 dB."""
-    near = np.abs(value - value[index]) <= within_db
-    near[index] = False
-    bins = np.bincount((value[near] - value[index] + within_db).round().astype(int), count[near], minlength=1)
-    return bool(count[index] > 3.0 * bins.max())
-
-
-def _fills_the_lower_edge(rssi: Floats, value: Floats, count: NDArray[np.int64]) -> bool:
-    """Return True if the least value is frequent, and the least of most receivers."""
-    if len(value) <= MIN_VALUES or count[0] < MIN_REPEATS or not _is_frequent(value, count, 0, N_NEIGHBOURS_DB):
-        return False
-    weakest = np.where((rssi >= MIN_RSSI_DBM) & (rssi <= MAX_RSSI_DBM), rssi, np.inf).min(axis=0)
-    return bool((weakest[np.isfinite(weakest)] == value[0]).mean() > 0.5)  # near receivers detect every row
-
-
-def without_fillers(rssi: Floats, fillers: list[float]) -> tuple[Floats, list[str]]:
-    """Return RSSI (n, R) with nan in place of fillers and of -inf, and a note on each of them.
-
-    Example:
-        >>> without_fillers(np.array([[-60.0, 127.0]]), [127.0])
-        (array([[-60.,  nan]]), ['127 counts as not detected: 1 of 2 cells (50%)'])
-    """
-    notes = []
-    filled = np.zeros(rssi.shape, dtype=bool)
-    for filler in [-np.inf, *fillers]:
-        cells = rssi == filler
-        if n := int(cells.sum()):
-            notes.append(f"{filler:g} counts as not detected: {n} of {rssi.size} cells ({n / rssi.size:.0%})")
-        filled |= cells
-    if NOT_DETECTED_DBM not in fillers and (n := int((rssi == NOT_DETECTED_DBM).sum())):
-        notes.append(f"{NOT_DETECTED_DBM:g} dBm counts as measured: {n} cells")
-    return np.where(filled, np.nan, rssi), notes
-
-
-def check_powers(label: object, rssi: Floats, receivers: Sequence[str], source: NDArray[np.int64]) -> None:
-    """Refuse RSSI (n, R) that is no received power.
-
-    Args:
-        label: Name of the table, for messages.
-        rssi: Values, (n, R) [dBm], nan where not detected.
-        receivers: R names.
-        source: Row of each value in the table, counted from 0, (n, R) or (n, 1).
-
-    Raises:
-        InputError: The first such value, with its row and receiver.
-    """
-    bad = (rssi < MIN_RSSI_DBM) | (rssi > MAX_RSSI_DBM)
-    if not bad.any():
-        return
-    rows = np.broadcast_to(source, rssi.shape)
-    row, column = min(np.argwhere(bad), key=lambda cell: rows[tuple(cell)])
-    value = rssi[row, column]
-    raise InputError(
-        f"{label} row {rows[row, column] + 1}, receiver {receivers[column]}: {value:g} dBm is no received power; expected "
-        f"{MIN_RSSI_DBM:g} to {MAX_RSSI_DBM:g}; if it stands for not detected, give nan or --filler {value:g}"
+    return any(
+        re.fullmatch(pattern, plain_name(name))
+        for role in (*GEODETIC, "z", *GEODETIC.values())
+        for pattern in ROLES[role]
     )
 
 

@@ -18,19 +18,73 @@ from swiftwrf.errors import InputError
 
 Floats = NDArray[np.float64]
 Coordinates = Literal["degrees", "metres"]
+Up = Literal["y", "z"]
 FAR_RATIO = 10.0  # distance of the origin relative to the distance between positions, or to their extent
 MAX_EXTENT_DEG = 2.0  # of positions that are recognised as degrees
 # x and y that receivers of satellites write without a position
 NO_FIX = (0.0, -1.0, 999.0, -999.0, 9999.0, -9999.0)
+MIN_EXTENT_M, MAX_EXTENT_MINUTES = 2.0, 30.0  # of walks in metres, and in ddmm.mmmm
 STOREY_M = 4.0  # height of a floor where heights are missing or count from the floor
 MIN_STOREY_M = 1.5  # difference of the heights of two floors
 BELOW_GROUND = re.compile(r"(?:b|ug|u\.g\.?|basement|cellar|keller|sub|lower)[ ._-]*(?:level|floor)?[ ._-]*(\d*)")
+VALUE, PX, METRE = r"(\d+(?:[.,]\d+)?)", "(?:px|pixels?)", "m(?:et(?:er|re)s?)?"
+PIXELS_PER_METRE = [
+    re.compile(pattern, re.IGNORECASE)
+    for pattern in (
+        rf"\b1 *{METRE} *[=:] *{VALUE} *{PX}\b",
+        rf"{VALUE} *{PX} *(?:/|per|=) *(?:1 *)?{METRE}\b",
+        rf"{PX}[ _]*(?:/|per)[ _]*{METRE}\W+{VALUE}",
+    )
+]
+METRES_PER_PIXEL = re.compile(
+    rf"\b1 *{PX} *[=:] *{VALUE} *{METRE}\b|{VALUE} *{METRE} *(?:/|per|=) *(?:1 *)?{PX}\b", re.IGNORECASE
+)
 FLOOR_NAMES = {  # numbers of floors without a digit in their name
     **dict.fromkeys(("ground", "g", "gf", "eg", "erdgeschoss", "parterre", "rdc", "lobby", "pb"), 0.0),
     **dict.fromkeys(("mezzanine", "zg"), 0.5),
     **dict.fromkeys(("og", "obergeschoss", "upper"), 1.0),
     **{name: n + 1.0 for n, name in enumerate(["first", "second", "third", "fourth", "fifth", "sixth", "seventh"])},
 }
+
+
+def stated_scale(text: str) -> float | None:
+    """Return the number of pixels in a metre that lines above a table state, None if they do not.
+
+    Example:
+        >>> stated_scale("Scale: 1 m = 20.7 px"), stated_scale("0.05 m/px"), stated_scale("Project: office")
+        (20.7, 20.0, None)
+    """
+    for pattern in PIXELS_PER_METRE:
+        if (found := pattern.search(text)) and (value := float(found[1].replace(",", "."))) > 0:
+            return value
+    found = METRES_PER_PIXEL.search(text)
+    value = float((found[1] or found[2]).replace(",", ".")) if found else 0.0
+    return 1 / value if value > 0 else None
+
+
+class PlanFrame(NamedTuple):
+    """Axes of the coordinates in a table, e.g. of a floor plan or of a phone.
+
+    Args:
+        scale: Units of x and y in a metre, e.g. pixels of a floor plan. Defaults to what columns state.
+        y_down: y points down in the plan, as in images.
+        up: Axis that points up, "y" as in ARCore, ARKit and Unity.
+
+    Example:
+        >>> PlanFrame(scale=20.0, y_down=True).to_world(np.array([[10.0, 40.0, 3.0]]))
+        array([[ 0.5, -2. ,  3. ]])
+    """
+
+    scale: float | None = None
+    y_down: bool = False
+    up: Up = "z"
+
+    def to_world(self, xyz: Floats) -> Floats:
+        """Return positions (n, 3) [m] with x and y in the horizontal plane, z up and right-handed axes."""
+        x, y, z = (xyz / (self.scale or 1.0, self.scale or 1.0, 1.0)).T
+        if self.y_down:
+            y = -y
+        return np.stack([x, -z, y] if self.up == "y" else [x, y, z], axis=1)
 
 
 class GeodeticOrigin(NamedTuple):
@@ -127,6 +181,40 @@ def _is_apart(others: Floats, same: Floats) -> bool:
     of_no_height = not bool(same.any()) and bool((others[:, 2] != 0).all())
     more_often = len(same) > int(times.max())
     return of_no_height or distance > FAR_RATIO * spacing or (more_often and distance > spacing)
+
+
+def plain_degrees(label: object, names: tuple[str, str], xy: Floats) -> tuple[Floats, list[str]]:
+    """Return longitudes and latitudes (n, 2) [deg] that may be in units of 1e-7 degrees or ddmm.mmmm, and a note on these.
+
+    Args:
+        label: Name of the table, for messages.
+        names: Names of both columns.
+        xy: Values of the columns of longitude and latitude, (n, 2).
+
+    Raises:
+        InputError: Values that may be ddmm.mmmm or metres.
+
+    Example:
+        >>> plain_degrees("walk.csv", ("lon", "lat"), np.array([[850.5, 4730.0]]))[0].round(4)
+        array([[ 8.8417, 47.5   ]])
+    """
+    columns = f"columns {names[0]} and {names[1]}"
+    size = np.abs(xy)
+    if (size <= 180).all():
+        return xy, []
+    if bool((xy % 1 == 0).all()) and (size <= (180e7, 90e7)).all() and size.min(axis=0).max() >= 1e7:
+        return xy / 1e7, [f"{columns} count 1e-7 degrees, which are converted to degrees"]
+    whole, minutes = np.divmod(size, 100)
+    extent = float(np.ptp(xy, axis=0).max())
+    if (minutes >= 60).any() or (whole > (180, 90)).any() or extent > MAX_EXTENT_MINUTES:
+        return xy, []
+    if extent > MIN_EXTENT_M:
+        raise InputError(
+            f"{label}: {columns} may be degrees and minutes (ddmm.mmmm) or metres; convert them to degrees, or give "
+            "--coordinates metres"
+        )
+    degrees = np.sign(xy) * (whole + minutes / 60)
+    return degrees, [f"{columns} count degrees and minutes (ddmm.mmmm), which are converted to degrees"]
 
 
 def degrees_in(

@@ -20,13 +20,14 @@ from numpy.typing import NDArray
 
 from swiftwrf.choices import CARRIERS_HZ
 from swiftwrf.data.archives import MAX_UNPACKED_BYTES, refusing_broken
-from swiftwrf.data.columns import column_of_numbers
+from swiftwrf.data.cells import NO_VALUE, column_of_numbers
 from swiftwrf.errors import InputError, optional_module
 
 SUFFIXES = (".csv", ".parquet")  # of tables
 SEPARATORS = ",;\t"
 MAX_TEXT_BYTES = 2**28  # a million rows of positions take a tenth of it
 MAX_PREAMBLE_LINES = 20  # before the header of a table
+MAX_MISSING_CELLS = 3  # at the end of all rows
 DECIMAL_COMMA = re.compile(r"^(\s*[+-]?\d+),(\d+\s*)$")
 PLAIN_TAGS = {
     f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "timestamp", "seq", "map")
@@ -146,7 +147,7 @@ def numbers(value: Any, count: int) -> tuple[float, ...] | None:
 def lines_before_header(file: Path) -> int:
     """Return the number of lines before the header of a table, e.g. 1 for a first line of metadata.
 
-    The header is the first line of names that has as many cells as the line below.
+    The header is the first line of names that has as many cells as the line below, or that is followed by numbers.
 
     Raises:
         InputError: The file cannot be read.
@@ -158,35 +159,61 @@ def lines_before_header(file: Path) -> int:
             header, row = (next(csv.reader([text], delimiter=separator), []) for text in (line, below))
         except csv.Error:  # read_table refuses it
             return 0
-        is_header = all(cell.strip() and math.isnan(number(cell)) for cell in header)
+        names = [cell for cell in header if cell.strip()]
+        is_header = len(names) > 1 and all(math.isnan(number(cell)) for cell in names)
         if len(header) == len(row) > 1 and (is_header or not skipped):
+            return skipped
+        has_numbers = sum(not math.isnan(number(cell)) for cell in row) > 1
+        if is_header and has_numbers and abs(len(header) - len(row)) <= MAX_MISSING_CELLS:
             return skipped
     return 0
 
 
-def read_table(file: Path) -> pd.DataFrame:
+def read_table(file: Path, header: bool = True) -> pd.DataFrame:
     """Return the table in a CSV or Parquet file. Cells of CSV are text.
 
     Args:
         file: Parquet, or one row a line with commas, semicolons or tabs between values; the most frequent one in the header
             counts. Numbers may have a decimal comma if it is not the comma. Lines before the header are skipped.
+        header: The first line contains the names of the columns. Otherwise, they are named 1, 2, ...
+
+    Returns:
+        A table. Its attrs may contain `notes` on lines, rows and columns that are left out, and the `preamble`.
 
     Raises:
         InputError: No such file, one that is broken, a column without name or a name twice, rows of unequal length, no rows.
     """
     if file.suffix.lower() != ".parquet":
-        return table_of(file, read_text(file).split("\n", lines_before_header(file))[-1])
+        text = read_text(file)
+        skipped = lines_before_header(file) if header else 0
+        *before, rest = text.split("\n", skipped)
+        table = table_of(file, rest, header)
+        if skipped:
+            table.attrs["preamble"] = "\n".join(before)
+            table.attrs["notes"] = [f"lines before the header are skipped: {skipped}", *table.attrs["notes"]]
+        return table
     parquet = optional_module("pyarrow.parquet", f"{file} is Parquet, which pyarrow reads", "formats")
     with refusing_broken(file, "a Parquet file"):
         content = parquet.ParquetFile(file)
         groups = range(content.metadata.num_row_groups)
         if (total := sum(content.metadata.row_group(i).total_byte_size for i in groups)) > MAX_UNPACKED_BYTES:
             raise InputError(f"it unpacks to {total} bytes; at most {MAX_UNPACKED_BYTES} are read, so split the data")
-        table: pd.DataFrame = content.read().to_pandas()
+        table = content.read().to_pandas()
         return table
 
 
-def table_of(label: object, text: str) -> pd.DataFrame:
+def has_header(file: Path) -> bool:
+    """Return False if the first line of a CSV file holds values: numbers alone, with signs, fractions or twice the same."""
+    line = read_text(file).split("\n", 1)[0]
+    return not _holds_values(next(csv.reader([line], delimiter=max(SEPARATORS, key=line.count)), []))
+
+
+def _holds_values(cells: list[str]) -> bool:
+    is_number = bool(cells) and not any(math.isnan(number(cell)) for cell in cells)
+    return is_number and (len(set(cells)) < len(cells) or any(set("-.") & set(cell) for cell in cells))
+
+
+def table_of(label: object, text: str, header: bool = True) -> pd.DataFrame:
     """Return the table in the text of a CSV file, as `read_table`; the label stands for it in messages."""
     first = text.split("\n", 1)[0]
     separator = max(SEPARATORS, key=first.count)
@@ -197,20 +224,70 @@ def table_of(label: object, text: str) -> pd.DataFrame:
         raise InputError(f"{label} is not a comma-separated table ({error})") from None
     if not lines:
         raise InputError(f"{label} is empty; expected a header and one row a measurement")
-    header, rows = [name.strip() for name in lines[0]], lines[1:]
-    if "" in header:
-        raise InputError(f"{label} has no name for column {header.index('') + 1}; give it one in the header")
-    if len(set(header)) < len(header):
-        twice = next(name for name in header if header.count(name) > 1)
-        raise InputError(f"{label} names column {twice!r} twice; each needs a name of its own")
-    if not rows:
-        raise InputError(f"{label} has a header but no rows")
-    for row, line in enumerate(rows, start=1):
-        if len(line) != len(header):
-            raise InputError(f"{label} row {row} has {len(line)} values, but the header has {len(header)}")
+    if header and _holds_values(lines[0]):
+        raise InputError(
+            f"{label} has no header, its first line holds numbers; write the names of the columns above it"
+        )
+    if not header:
+        lines = [[str(column) for column in range(1, len(lines[0]) + 1)], *lines]
+    names, rows, notes = _regular(label, lines)
     if separator != ",":
         rows = [[DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in line] for line in rows]
-    return pd.DataFrame(rows, columns=header, dtype=object)
+    table = pd.DataFrame(rows, columns=names, dtype=object)
+    table.attrs["notes"] = notes
+    return table
+
+
+def _regular(label: object, lines: list[list[str]]) -> tuple[list[str], list[list[str]], list[str]]:
+    """Return names of columns, rows of equal length, and notes on lines, rows and columns without content."""
+    names = _names_in(lines[0])
+    repeated = [line for line in lines[1:] if line[0].strip(" #") == names[0] and _names_in(line) == names]
+    rows = [line for line in lines[1:] if line not in repeated and any(map(str.strip, line))]
+    notes = []
+    if repeated:
+        notes.append(f"lines that repeat the header are left out: {len(repeated)}")
+    if not rows:
+        raise InputError(f"{label} has a header but no rows")
+    widths = {len(line) for line in rows}
+    width, missing = len(rows[0]), len(names) - len(rows[0])
+    if len(widths) == 1 < len(rows):
+        if 0 < missing <= MAX_MISSING_CELLS:
+            notes.append(f"rows lack the last columns, which count as empty: {', '.join(names[width:])}")
+            rows = [line + [""] * missing for line in rows]
+        elif missing < 0 and not any(cell.strip() for line in rows for cell in line[len(names) :]):
+            rows = [line[: len(names)] for line in rows]
+    for row, line in enumerate(rows, start=1):
+        if len(line) != len(names):
+            raise InputError(f"{label} row {row} has {len(line)} values, but the header has {len(names)}")
+    if len(rows) > 1 and _is_second_header(rows[0], rows[1]):
+        notes.append(f"row 1 is a second header and left out: {', '.join(filter(None, rows[0]))}")
+        rows = rows[1:]
+    nameless = [column for column, name in enumerate(names) if not name]
+    empty = [c for c in nameless if not any(line[c].strip() for line in rows)]
+    if 0 in nameless and all(line[0].strip() == str(row) for row, line in enumerate(rows)):
+        empty.append(0)  # the index of a data frame
+    if set(nameless) - set(empty):
+        raise InputError(
+            f"{label} has no name for column {min(set(nameless) - set(empty)) + 1}; give it one in the header"
+        )
+    if empty:
+        rows = [[cell for column, cell in enumerate(line) if column not in empty] for line in rows]
+        names = list(filter(None, names))
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"{label} names column {twice!r} twice; each needs a name of its own")
+    return names, rows, notes
+
+
+def _names_in(line: list[str]) -> list[str]:
+    return [name.strip().removeprefix("#").strip() for name in line]
+
+
+def _is_second_header(row: list[str], below: list[str]) -> bool:
+    """Return True for a row of text alone above numbers, e.g. of units or names of networks."""
+    filled = [column for column, cell in enumerate(row) if cell.strip()]
+    is_text = all(math.isnan(number(row[column])) and not NO_VALUE.fullmatch(row[column]) for column in filled)
+    return is_text and sum(not math.isnan(number(below[column])) for column in filled) > 1
 
 
 def read_xyz(file: Path) -> NDArray[np.float64]:

@@ -12,15 +12,16 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from swiftwrf.data.columns import Groups, check_powers, numbered
-from swiftwrf.data.coordinates import Coordinates, Floors, GeodeticOrigin
+from swiftwrf.data.columns import Groups, numbered
+from swiftwrf.data.coordinates import Coordinates, Floors, GeodeticOrigin, Up
 from swiftwrf.data.dataset import Arrays, Numbers, PositionedData, position_coordinates, to_positions
+from swiftwrf.data.powers import check_powers
 from swiftwrf.data.splits import MIN_TRAINING, Validation, random_split, validation_for
 from swiftwrf.data.survey import read_survey
 from swiftwrf.errors import InputError, listed
 from swiftwrf.plotting import MARK, Axes, plan
 from swiftwrf.positions import to_tensor
-from swiftwrf.runtime.validation import NonNegativeInt, checked
+from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, checked
 
 META = "meta.csv"  # file of the NeRF2 layout with a row for each measurement
 SURVEY = "survey.yml"  # file of the toolkit's own layout with properties of all measurements
@@ -45,6 +46,7 @@ class Rssi(PositionedData):
         labels: Names of columns of the table that distinguish groups of rows.
         floors: Floors of the building, by height.
         receiver_moves: Whether the receivers are positions of one receiver that moves, too.
+        plan_scale: Pixels in a metre if positions were pixels of a floor plan, whose upper left corner is x = y = 0.
         session: Session of measurements that each row is of, e.g. a walk or a day: n names, or their numbers, int64 (n,).
         time: Time of each measurement [s], (n,), nan where unknown.
         name: Name of the data set.
@@ -70,6 +72,7 @@ class Rssi(PositionedData):
     labels: tuple[str, ...]
     floors: Floors | None
     receiver_moves: bool
+    plan_scale: float | None
     session: Tensor | None
     time: Tensor | None
 
@@ -89,6 +92,7 @@ class Rssi(PositionedData):
         labels: tuple[str, ...] = (),
         floors: Floors | None = None,
         receiver_moves: bool = False,
+        plan_scale: float | None = None,
         session: Tensor | Sequence[str | int] | None = None,
         time: Numbers | None = None,
         name: str = "rssi",
@@ -122,6 +126,7 @@ class Rssi(PositionedData):
             labels=labels,
             floors=floors,
             receiver_moves=receiver_moves,
+            plan_scale=plan_scale,
             session=None if session is None else numbered(session),
             time=None if time is None else to_tensor("time", time, torch.float64, (None,), missing=True),
         )
@@ -139,6 +144,10 @@ class Rssi(PositionedData):
         offset_by: str | None = None,
         transmitter: Sequence[str] = (),
         pool_by: str | None = None,
+        scale: PositiveFloat | None = None,
+        y_down: bool = False,
+        up: Up = "z",
+        window: PositiveFloat | None = None,
         receiver_position: Mapping[str, Sequence[float]] | None = None,
         name: str = "rssi",
     ) -> Rssi:
@@ -152,6 +161,10 @@ class Rssi(PositionedData):
             offset_by: Column with the groups of rows between which RSSI has constant offsets.
             transmitter: Columns with the position of the second end of the link where both ends move, as in `load_rssi`.
             pool_by: Radios of one access point to pool, as in `load_rssi`.
+            scale: Units of x and y in a metre, as in `load_rssi`.
+            y_down: y points down, as in images.
+            up: Axis that points up.
+            window: Length [s] of the windows in which packets are joined, as in `load_rssi`.
             receiver_position: Positions [m] by name of the receiver; those of others are unknown.
             name: Name of the data set.
 
@@ -172,6 +185,10 @@ class Rssi(PositionedData):
             offset_by=offset_by,
             transmitter=tuple(transmitter),
             pool_by=pool_by,
+            scale=scale,
+            y_down=y_down,
+            up=up,
+            window=window,
         )
         if receiver_position:
             places = [list(receiver_position.get(receiver, UNKNOWN)) for receiver in found["receiver_names"]]

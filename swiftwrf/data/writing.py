@@ -17,9 +17,9 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid, to_angles
 from swiftwrf.array.planar import LIGHT_SPEED
-from swiftwrf.data.columns import NOT_DETECTED_DBM
 from swiftwrf.data.dataset import Labelled
 from swiftwrf.data.paths import PropagationPaths
+from swiftwrf.data.powers import NOT_DETECTED_DBM
 from swiftwrf.data.rssi import META, SURVEY, Rssi
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.store import write_npy

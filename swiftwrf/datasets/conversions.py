@@ -14,8 +14,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.io import loadmat
 
-from swiftwrf.data.columns import NOT_DETECTED_DBM
 from swiftwrf.data.paths import PropagationPaths
+from swiftwrf.data.powers import NOT_DETECTED_DBM
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.writing import write_paths, write_rssi
 from swiftwrf.errors import InputError

@@ -11,8 +11,8 @@ import torch
 from annotated_types import Ge, Le
 from torch import Tensor
 
-from swiftwrf.data.columns import MAX_RSSI_DBM, MIN_RSSI_DBM, check_powers
 from swiftwrf.data.dataset import Numbers
+from swiftwrf.data.powers import MAX_RSSI_DBM, MIN_RSSI_DBM, check_powers
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import FOLDS, Validation, folds
 from swiftwrf.errors import InputError, listed

@@ -1,4 +1,4 @@
-"""What is removed from RSSI before a fit: the attenuation of floors, and offsets between groups of rows.
+"""Attenuation of floors and offsets between groups of rows, which are removed from RSSI before a fit.
 
     rssi = rssi within a floor and group - F |floor(s) - floor(receiver)| + offset of the group       [dBm]
 

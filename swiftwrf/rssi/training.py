@@ -1,4 +1,4 @@
-"""What is known before a receiver is fitted: rows by location bin, path-loss models, limits of empty cells, and kernel."""
+"""Preparation of a fit: rows by location bin, path-loss models, limits of empty cells, and the kernel."""
 
 from __future__ import annotations
 

@@ -27,6 +27,7 @@ from tasks.source import aligned, located, observed_spectra, reading
 from tasks.terminal import console
 
 Columns = dict[str, Any]  # of tensors, and arrays of names
+MAX_STEP_S = 1000.0  # between rows of a walk
 MAX_TRACKED = 20_000_000  # candidate positions of a walk that are in memory together
 
 
@@ -48,7 +49,7 @@ def positions_of_rssi(locator: RssiLocator, config: PredictConfig) -> Columns:
         if data.groups is None:
             console.print(f"{data.name}: rows count as those of {offsets.column} {offsets.reference}")
         data = offsets.removed(data)
-    data = aligned(data.about(origin), locator.receiver_names)
+    data = aligned(data.about(origin), locator.receiver_names, config.ignore_receivers)
     locator.model.check_measurements(data)
     kept = data.detected.any(dim=1)
     if not bool(kept.any()):
@@ -76,10 +77,8 @@ def read_rssi(source: str, options: ReadOptions) -> tuple[Rssi, bool]:
         frame = read_table(file)
         if not has_positions(frame, options.columns or {}):
             somewhere = frame.assign(x=0.0, y=0.0, z=0.0)
-            columns, filler, offset_by = options.columns, options.filler, options.offset_by
-            data = Rssi.from_frame(
-                somewhere, columns=columns, filler=filler, offset_by=offset_by, pool_by=options.pool_by, name=file.stem
-            )
+            names = ("columns", "filler", "offset_by", "pool_by", "window")
+            data = Rssi.from_frame(somewhere, **{name: getattr(options, name) for name in names}, name=file.stem)
             return data, False
     return read(located(source), options, RSSI_FORMATS), True
 
@@ -152,6 +151,12 @@ def _times(source: str, data: Rssi) -> Tensor:
     if bool(missing.any()):
         raise InputError(
             f"{source} row {int(data.index[missing][0])} (counted from 0) has no time [s] or date, which --track needs"
+        )
+    step = float(data.time.sort().values.diff().median()) if len(data) > 1 else 0.0
+    if step >= MAX_STEP_S:
+        raise InputError(
+            f"{source} has steps of {step:.0f} s, too long for --track; if its times are in milliseconds, call their column "
+            "time_ms"
         )
     return data.time
 

@@ -16,9 +16,9 @@ class PredictConfig(Options):
     An estimator gives the directions of spectra, and a locator the positions of transmitters. A field model gives spectra,
     and an RSSI model powers, at the positions of a table.
 
-    Example: python -m tasks.predict runs/aoa/first DIR
+    Example: swiftwrf predict runs/aoa/first DIR
 
-    Example: python -m tasks.predict runs/rssi/first/model.safetensors positions.csv --out predicted.csv
+    Example: swiftwrf predict runs/rssi/first/model.safetensors positions.csv --out predicted.csv
     """
 
     model: Annotated[str, tyro.conf.Positional]
@@ -30,6 +30,8 @@ class PredictConfig(Options):
     latitude, longitude, altitude"""
     track: float | None = None
     """rows of SOURCE are a walk: smooths its positions by this typical speed [m/s]. Rows without times are 1 s apart"""
+    ignore_receivers: bool = False
+    """leave out receivers in SOURCE that the locator does not have (default: refuse them)"""
     out: str | None = None
     """table to write; of a field or RSSI model also .mat; must not exist (default: a new predicted-TIME.csv)"""
     output: Answered = Answered()

@@ -54,7 +54,7 @@ def run(config: UpdateConfig) -> None:
         _save(follower, folder / MODEL)
         record.write(folder)
         _write_config(config, folder)
-        write_page(folder, page(record, new.name))
+        write_page(folder, page(record, new.name, Path(config.out)))
     sentences = record.sentences()
     if follower.waiting is not None:
         sentences.append(
@@ -162,6 +162,6 @@ def _read(source: str, options: ReadOptions, model: FieldModel | RssiModel) -> S
     source = located(source)
     if isinstance(model, RssiModel):
         rssi: Any = read(source, options, RSSI_FORMATS)
-        return aligned(rssi.about(model.origin), model.receiver_names)
+        return aligned(rssi.about(model.origin), model.receiver_names, ignore_others=True)
     data: Any = read(source, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS)
     return data.spectra(model.grid, options.beamformer or "phase") if isinstance(data, Snapshots) else data

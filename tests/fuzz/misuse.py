@@ -140,6 +140,10 @@ DATA: dict[str, Call] = {
             "offset_by",
             "transmitter",
             "pool_by",
+            "scale",
+            "y_down",
+            "up",
+            "window",
             "receiver_position",
             "name",
         )

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data.coordinates import Coordinates
+from swiftwrf.data.coordinates import Coordinates, Up
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.spectra import Spectra
@@ -55,6 +55,10 @@ class ReadOptions:
     offset_by: str | None = None
     transmitter: tuple[str, ...] = ()
     pool_by: str | None = None
+    scale: PositiveFloat | None = None
+    y_down: bool = False
+    up: Up = "z"
+    window: PositiveFloat | None = None
 
     @property
     def given(self) -> dict[str, Any]:

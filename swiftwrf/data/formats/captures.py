@@ -25,7 +25,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from swiftwrf.data.archives import MAX_UNPACKED_BYTES, Arrays, refusing_broken
-from swiftwrf.data.columns import column_of, column_of_numbers, text_of
+from swiftwrf.data.cells import column_of_numbers, text_of
+from swiftwrf.data.columns import column_of
 from swiftwrf.data.files import read_bytes, read_table, read_yaml
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
 from swiftwrf.data.formats.snapshots import array_of, snapshots_of

@@ -20,19 +20,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from swiftwrf.data.columns import (
-    NOT_DETECTED_DBM,
-    column_of,
-    column_of_numbers,
-    find_fillers,
-    numbered,
-    seconds,
-    text_of,
-    without_fillers,
-)
+from swiftwrf.data.cells import column_of_numbers, seconds, text_of
+from swiftwrf.data.columns import column_of, numbered
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin, without_fix
 from swiftwrf.data.files import digests, numbers, read_table, read_xyz, read_yaml
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
+from swiftwrf.data.powers import NOT_DETECTED_DBM, find_fillers, without_fillers
 from swiftwrf.data.rssi import META, SURVEY, Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
 from swiftwrf.data.survey import read_receivers, unknown_positions

@@ -2,56 +2,53 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
-from swiftwrf.data.files import SUFFIXES, digests, lines_before_header, read_table
+import pandas as pd
+
+from swiftwrf.data.columns import is_rssi
+from swiftwrf.data.files import SUFFIXES, digests, has_header, read_table
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
 from swiftwrf.data.formats.captures import holds_captures
 from swiftwrf.data.formats.nerf2_rssi import FILES as NERF2_FILES
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
-from swiftwrf.data.survey import read_receivers, read_survey
-from swiftwrf.errors import InputError
+from swiftwrf.data.survey import has_positions, read_survey
+from swiftwrf.errors import InputError, listed
 
 RECEIVERS = "receivers.csv"  # beside the table: receiver,x,y,z
+HALF = re.compile(r"[ _-]*(?:rssi?|crd|coord(?:inate)?s?|pos(?:ition)?s?|loc(?:ation)?s?|places?)(?![a-z])[ _-]*")
+MAX_COORDINATES = 6  # columns of a table of positions: x, y, z, floor, building, ...
 
 
 @RSSI_FORMATS.register("survey")
 class SurveyTable(Format[Rssi]):
     """Table of a walk test; positions of receivers are unknown unless receivers.csv beside it contains them."""
 
-    takes = frozenset({"columns", "filler", "coordinates", "offset_by", "transmitter", "pool_by"})
+    takes = frozenset(
+        {"columns", "filler", "coordinates", "offset_by", "transmitter", "pool_by", "scale", "y_down", "up", "window"}
+    )
 
     def recognises(self, path: Path) -> bool:
         return bool(_tables(path))
 
     def read(self, path: Path, options: ReadOptions) -> Rssi:
-        tables = _tables(path)
-        if len(tables) > 1:
-            raise InputError(
-                f"{path} holds {len(tables)} tables ({', '.join(file.name for file in tables)}); name the one to read"
-            )
-        file, receivers = tables[0], tables[0].with_name(RECEIVERS)
-        table = read_table(file)
-        data = Rssi(**read_survey(file, table, **options.given), name=file.stem)
-        known, unknown = data.receiver_position, list[str]()
-        if receivers.is_file() and not data.located:
-            known, unknown = read_receivers(receivers, data.receiver_names, data.origin)
-        if data.receiver_moves and (bool(known.isnan().all()) or unknown):
+        file, others, table = _table(path)
+        receivers = file.with_name(RECEIVERS)
+        stated = receivers if receivers.is_file() else None
+        data = Rssi(**read_survey(file, table, **options.given, receivers=stated), name=file.stem)
+        if data.receiver_moves and bool(data.receiver_position.isnan().any()):
             raise InputError(
                 f"{file}: column {options.transmitter[0]} has names of positions, so {RECEIVERS} beside it must contain "
                 "each of them"
             )
-        skipped = file.suffix.lower() == ".csv" and lines_before_header(file)
-        notes = [f"lines before the header are skipped: {skipped}"] * bool(skipped)
         splits = read_splits(file.parent, len(table), first=0)
         return replace(
             data,
-            receiver_position=known,
             named_splits=kept_splits(splits, data.index, len(table)),
-            source=digests([file, *([receivers] if receivers.is_file() else [])], file.parent),
-            notes=(*notes, *data.notes, *unknown),
+            source=digests([file, *others, *([stated] if stated else [])], file.parent),
         )
 
 
@@ -63,3 +60,47 @@ def _tables(path: Path) -> list[Path]:
     if any((path / name).is_file() for name in NERF2_FILES):
         return []
     return sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.name != RECEIVERS)
+
+
+def _table(path: Path) -> tuple[Path, list[Path], pd.DataFrame]:
+    """Return the file of RSSI, other files that its table is of, and the table, which may be in two halves."""
+    files = _tables(path)
+    if path.is_file() and not _is_whole(path):
+        related = [file for file in _tables(path.parent) if _set_of(file) == _set_of(path)]
+        files = related if len(related) == 2 else files
+    if len(files) == 1:
+        return files[0], [], read_table(files[0])
+    tables = {file: read_table(file, header=_is_whole(file)) for file in files} if len(files) == 2 else {}
+    halves = {_holds_places(table): file for file, table in tables.items()}
+    if halves.keys() != {False, True} or len({len(table) for table in tables.values()}) > 1:
+        raise InputError(
+            f"{path} holds {len(files)} tables ({listed(file.name for file in files)}); name the one to read"
+        )
+    file, other = halves[False], halves[True]
+    rssi, place = tables[file], tables[other]
+    if not _is_whole(other):
+        place = place.iloc[:, :3].set_axis(["x", "y", "z"][: place.shape[1]], axis=1)
+    if not _is_whole(file):
+        rssi = rssi.add_prefix("receiver")
+    table = pd.concat([place, rssi], axis=1)
+    table.attrs["notes"] = [f"{file.name} holds the RSSI and {other.name} the positions of the same {len(table)} rows"]
+    return file, [other], table
+
+
+def _is_whole(file: Path) -> bool:
+    return file.suffix.lower() != ".csv" or has_header(file)
+
+
+def _set_of(file: Path) -> str:
+    """Return the name of the set of measurements that a file is a half of."""
+    return HALF.sub("", file.stem.lower())
+
+
+def _holds_places(table: pd.DataFrame) -> bool | None:
+    """Return True for a table of positions alone, False for one of RSSI alone, None for another one."""
+    powers = [is_rssi(table[name]) for name in table]
+    if has_positions(table, {}):
+        return True if not any(powers[2:]) and len(powers) <= MAX_COORDINATES else None
+    if all(powers):
+        return False
+    return True if 2 <= len(powers) <= MAX_COORDINATES and "1" in table else None

@@ -33,6 +33,7 @@ def test_wide_table(tmp_path):
     assert not data.located
     assert data.name == "walk"
     assert data.notes == (
+        f"taken as: x = x, y = y, z = z, RSSI of 3 receivers = {', '.join(NAMES[3:])}",
         f"-100 counts as not detected: {NOT_HEARD.sum().sum()} of 120 cells ({NOT_HEARD.to_numpy().mean():.0%})",
     )
 
@@ -72,7 +73,7 @@ def test_packets_of_one_place_have_a_row_each(tmp_path):
     data = load_rssi(write_survey(tmp_path, header=header, rows=rows))
     assert data.rssi_dbm.nan_to_num(0).tolist() == [[-50, -60], [-52, 0], [0, -70]]
     assert data.transmitter_position[:, 0].tolist() == [1, 1, 2]
-    assert "no height" in data.notes[0]
+    assert "no height" in data.notes[1]
 
 
 def test_semicolons_and_decimal_commas(tmp_path):
@@ -134,7 +135,7 @@ def test_weak_values_make_100_a_measured_one(tmp_path):
     rows = [[i, i, 1, -95.0 - i] for i in range(12)]
     data = load_rssi(write_survey(tmp_path, header=["x", "y", "z", "rsrp"], rows=rows))
     assert not data.rssi_dbm.isnan().any()
-    assert "counts as measured" in data.notes[0]
+    assert "counts as measured" in data.notes[1]
 
 
 def test_positions_of_receivers_beside_the_table(tmp_path):

@@ -146,6 +146,13 @@ def run(*arguments):
     return command_line("tasks.rssi", experiment.RssiTaskConfig, experiment.run, [str(a) for a in arguments])
 
 
+def test_a_floor_plan_whose_pixels_are_the_positions_needs_no_extent(tmp_path):
+    Image.new("RGB", (400, 300), "white").save(tmp_path / "plan.png")
+    config = SimpleNamespace(floor_plan=str(tmp_path / "plan.png"), floor_extent=None)
+    data = replace(rssi_room(n=12), plan_scale=20.0)
+    assert experiment._read_floor_plan(config, data)["plan_extent"].tolist() == [0, 20, -15, 0]
+
+
 def test_whole_run(small, tmp_path, monkeypatch):
     monkeypatch.setattr(Blend, "config_type", with_defaults(BlendConfig(members=("knn", "mri_residual"))))
     plan = tmp_path / "plan.png"
@@ -188,11 +195,12 @@ def test_a_lone_receiver_has_one_map_and_no_average(tmp_path, capsys):
     out = tmp_path / "her 'own' run"
     assert quick.run("rssi", "--rx", "1", "--out", out, drawn=True) == 0
     drawn = {file.stem.partition("-")[0] for file in (out / "figures").glob("*.svg")}
-    assert drawn == {"summary", "cdf", "where", "speed"}
+    assert drawn == {"summary", "errors", "where"}
     assert list((out / "figures").glob("summary*.csv"))
     for text in (capsys.readouterr().out, unescape(re.sub("<[^>]*>", "", (out / "report.html").read_text()))):
-        assert f"python -m tasks.view {shlex.quote(str(out))}" in text
-        assert f"swiftwrf.load({str(out / 'model.safetensors')!r})" in text
+        assert f"swiftwrf view {shlex.quote(str(out))}" in text
+        assert f"swiftwrf predict {shlex.quote(str(out))} positions.csv" in text
+        assert "--split block" in text
 
 
 def unlocated(n=60):
@@ -285,8 +293,15 @@ def test_an_interval_of_one_width_sends_nobody_to_measure():
     width = np.tile([[[[7.0]], [[8.0]]]], (1, 1, 4, 5))
     maps = {"x": x, "y": y, "measured_position": corners, "measured": corners[:, :2], "width": width}
     maps |= {"predicted": width, "detection": width, "floor_of_row": np.zeros(4, int)}
-    run = SimpleNamespace(arrays=lambda name: maps)
+    tested = pd.DataFrame({"x": x, "y": 0.0, "z": 1.0, "receiver": "a", "measured": -60.0})
+    run = SimpleNamespace(arrays=lambda name: maps, table=lambda name: tested)
     assert "not worth it" in where_next(run)
+    assert "the model explains no more" in where_next(run)
+    for spread, reason in ((2.7, "which is the scatter of repeated"), (0.5, "lie within 1 dB")):
+        tested = pd.DataFrame(
+            {"x": 1.0, "y": 0.0, "z": 1.0, "receiver": "a", "measured": [-60.0 - spread, -60 + spread] * 20}
+        )
+        assert reason in where_next(run)
     maps["width"][:, :, 2, 3] += 4
     assert where_next(run).startswith("Measure around x = 3.0 m, y = 2.0 m")
     maps |= {

@@ -273,7 +273,7 @@ def test_one_receiver_has_no_best(rssi_run):
 
 
 def test_floors_and_what_was_not_received_are_shown_apart():
-    """Two floors, 40 dB of attenuation between them: above, the receiver below hears nothing."""
+    """Two floors, 40 dB of attenuation between them: nothing from above is detected."""
     room = rssi_room(n=120)
     position = room.transmitter_position.clone()
     upper = torch.arange(120) % 2 == 0
