@@ -20,12 +20,14 @@ class Method:
         name: Name of the method in all results.
         error: Summary of its errors.
         is_reference: Whether others are measured by it, rather than that a user would take it.
+        seconds: Seconds to fit it, and to apply it to the test rows.
         cells: Further cells of its row in the report, by column.
     """
 
     name: str
     error: ErrorSummary
     is_reference: bool = False
+    seconds: tuple[float, ...] = ()
     cells: Mapping[str, str] = field(default_factory=dict)
 
 

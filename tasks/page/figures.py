@@ -162,6 +162,14 @@ def curves(axes: Axes, palette: Palette, lines: Mapping[str, tuple[ArrayLike, Ar
     _named_below(axes)
 
 
+def speed(axes: Axes, palette: Palette, points: Mapping[str, tuple[float, float]], x: str, y: str) -> None:
+    """Draw the cost and the error of each method, costs on a logarithmic scale."""
+    for marker, (name, (cost, error)) in zip("osD^vP", points.items(), strict=False):
+        axes.plot(max(cost, 1e-4), error, marker, color=palette.colour(name), label=name)
+    axes.set(xscale="log", xlabel=x, ylabel=y, ylim=(0, None))
+    _named_below(axes)
+
+
 def _named_below(axes: Axes) -> None:
     figure = axes.get_figure(root=True)
     assert figure is not None  # axes outside of a figure have no legend

@@ -31,10 +31,10 @@ def answer(fraction: FractionRecords) -> Answer:
             "elevation [deg]": number(found["elevation_deg"]["median"]),
             "held out [deg]": number(held_out[name]) if name in held_out else "",
             "by synthetic spectra": change_text(change) if change else "",
-            "train + estimate [s]": " + ".join(number(found["seconds"][stage], 1) for stage in ("train", "estimate")),
         }
+        seconds = found["seconds"]["train"], found["seconds"]["estimate"]
         is_reference = condition.training == "all measured" or name in BASELINES
-        methods.append(Method(name, found["great_circle_deg"], is_reference and name != chosen, cells))
+        methods.append(Method(name, found["great_circle_deg"], is_reference and name != chosen, seconds, cells))
     shown = (fraction.turbo_method, mix["reference"], MEASURED_NETWORK, LOCATED, FULL_NETWORK, "peak")
     return Answer("deg", methods, chosen, conclusion(fraction), steps(fraction), shown)
 

@@ -24,8 +24,8 @@ def answer(run: LocateRecords) -> Answer:
         cells = {"median in plan [m]": number(entry["horizontal_error_m"]["median"])}
         cells |= {"floors right": f"{entry['floor_hit_rate']:.1%}"} if "floor_hit_rate" in entry else {}
         cells |= {f"{OWN} minus it [m]": difference(errors, OWN, name)}
-        cells["fit + locate [s]"] = " + ".join(number(entry["seconds"][stage]) for stage in ("fit", "predict"))
-        methods.append(Method(name, entry["position_error_m"], name == "mean", cells))
+        seconds = entry["seconds"]["fit"], entry["seconds"]["predict"]
+        methods.append(Method(name, entry["position_error_m"], name == "mean", seconds, cells))
     return Answer("m", methods, OWN, conclusion(run), _steps(run), NEIGHBOURS)
 
 

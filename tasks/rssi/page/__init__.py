@@ -26,7 +26,7 @@ def page(runs: list[RssiRecords]) -> Page:
     details = [provenance(runs)]
     if len(runs) > 1 or any(len(Maps(run).names) > 1 for run in runs):
         sections.insert(0, sections_of("Maps", runs, partial(_maps, kind="predicted")))
-        by_receiver = sections_of("Errors by receiver", runs, lambda run: Section("", plots=[errors.differences(run)]))
+        by_receiver = sections_of("Errors by receiver", runs, lambda run: Section("", plots=errors.differences(run)))
         details[:0] = [by_receiver, sections_of("Widths of the intervals", runs, partial(_maps, kind="width"))]
     names = ", ".join(dict.fromkeys(run.place for run in runs))
     if len(runs) == 1:
@@ -70,6 +70,7 @@ def _errors(run: RssiRecords) -> Section:
         quantity="absolute error",
         caption=caption,
         paragraphs=[f"Left out: {reason}." for reason in run.metrics["left_out"].values()],
+        panels=errors.by_rows(run),
     )
 
 

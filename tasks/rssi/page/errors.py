@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from matplotlib.figure import Figure
+
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.metrics import paired_difference
 from tasks.labels import PREDICTORS as LABELS
@@ -21,8 +23,23 @@ def palette() -> Palette:
     return Palette.of(labels(RSSI_PREDICTORS, LABELS))
 
 
-def differences(run: RssiRecords) -> Plot:
-    """Return the difference of the model's error from the best baseline's at each receiver, sorted."""
+def by_rows(run: RssiRecords) -> list[Figure]:
+    """Return the errors by the number of training rows, none if the rows are too few for parts of them."""
+    found = run.metrics["by_rows"]
+    if len(found) < 2:
+        return []
+    names = list(next(iter(found.values())))
+    figure, axes = figures.panel(5.6, 3.2)
+    lines = {name: ([int(n) for n in found], [row[name] for row in found.values()]) for name in names}
+    figures.curves(axes, palette(), lines, "training rows", "mean absolute error [dB]")
+    axes.set_ylim(0, None)
+    return [figure]
+
+
+def differences(run: RssiRecords) -> list[Plot]:
+    """Return the difference of the model's error from the best baseline's at each receiver, none for one receiver."""
+    if len(run.metrics["receivers"]) < 2:
+        return []
     own, best, errors = model_of(run), best_baseline(run), by_method(run)
     found = {}
     for name in run.metrics["receivers"]:
@@ -37,7 +54,8 @@ def differences(run: RssiRecords) -> Plot:
         f"Difference of the mean absolute error of {own} from that of {best}, the best baseline, at each receiver on "
         f"the same pairs; whiskers: 95 % intervals. Below zero {own} is better."
     )
-    return Plot(f"difference-{run.file_name}", [figure], caption, figures.dots_data("receiver", names, values, "db"))
+    data = figures.dots_data("receiver", names, values, "db")
+    return [Plot(f"difference-{run.file_name}", [figure], caption, data)]
 
 
 def where(run: RssiRecords) -> Plot:

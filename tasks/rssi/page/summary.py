@@ -25,8 +25,8 @@ def answer(run: RssiRecords) -> Answer:
         detection = entry.get("detection")
         cells = {f"{own} minus it [dB]": difference(errors, own, name)}
         cells |= {"detection": number(None if detection is None else sum(detection) / 2)} if scored else {}
-        cells["fit + predict [s]"] = " + ".join(number(entry["seconds"][stage]) for stage in ("fit", "predict"))
-        methods.append(Method(name, entry["abs_error_db"], name in REFERENCES and name != own, cells))
+        seconds = entry["seconds"]["fit"], entry["seconds"]["predict"]
+        methods.append(Method(name, entry["abs_error_db"], name in REFERENCES and name != own, seconds, cells))
     return Answer("dB", methods, own, conclusion(run), steps(run), (best_baseline(run),))
 
 
