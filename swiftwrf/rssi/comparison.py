@@ -30,7 +30,7 @@ from swiftwrf.rssi.paper import RssiPaperModel
 from swiftwrf.runtime.validation import Preset, checked
 
 Values = dict[str, Any]
-Keep = Callable[[str, Callable[[], tuple[RssiPredictor, Values]]], Values]
+Keep = Callable[[str, Callable[[], tuple[RssiPredictor | None, Values]]], Values]
 
 
 @checked
@@ -84,7 +84,7 @@ class RssiComparison:
             `detection` are the shares of detected and of empty test cells that are predicted as such, or None.
         left_out: Reason for each predictor that the data do not suffice for.
         predictors: Fitted predictors by name, without those whose values `keep` had.
-        fewer: Values of the model and of nearest neighbours that were fitted to fewer rows, by the number of rows.
+        by_rows: Mean absolute errors [dB] of the model and of "knn" by the number of training rows, a column for each.
 
     Example:
         >>> import swiftwrf
@@ -98,7 +98,7 @@ class RssiComparison:
     values: Mapping[str, Values]
     left_out: dict[str, str]
     predictors: dict[str, RssiPredictor] = field(default_factory=dict)
-    fewer: Mapping[int, Mapping[str, Values]] = field(default_factory=dict)
+    by_rows: DataFrame = field(default_factory=DataFrame)
 
     @property
     def model(self) -> str:
@@ -159,18 +159,6 @@ class RssiComparison:
         return found.assign(detection=found.index.map(right)) if right else found
 
     @property
-    def by_rows(self) -> DataFrame:
-        """Mean absolute error [dB] by the number of training rows, a column for each method that had fewer of them."""
-        names = {name for values in self.fewer.values() for name in values}
-        every = {**self.fewer, len(self.train): {name: value for name, value in self.values.items() if name in names}}
-        measured = self.test.rssi_dbm[self._pairs]
-        found = {
-            n: {name: float((self._at_pairs(value).mean - measured).abs().mean()) for name, value in values.items()}
-            for n, values in every.items()
-        }
-        return DataFrame.from_dict(found, orient="index").rename_axis("n_train")
-
-    @property
     def _pairs(self) -> tuple[Tensor, Tensor]:
         """Rows and receivers of the detected test pairs."""
         row, column = self.test.detected.nonzero(as_tuple=True)
@@ -181,11 +169,8 @@ class RssiComparison:
         return [self.test.receiver_names[number] for number in self._pairs[1].tolist()]
 
     def _prediction(self, name: str) -> Prediction:
-        return self._at_pairs(self.values[name])
-
-    def _at_pairs(self, values: Values) -> Prediction:
         """Return the prediction of the detected test pairs (n,), with the offsets of their groups."""
-        offsets = self.train.offsets
+        values, offsets = self.values[name], self.train.offsets
         mean = torch.as_tensor(values["predicted"], dtype=torch.float64)
         if offsets is not None:
             mean = mean + offsets.of(self.test)[self._pairs[0]]
@@ -271,22 +256,23 @@ def compare(
         std = None if prediction.std is None else prediction.std[test.detected]
         error = (prediction.mean + offset - test.rssi_dbm)[test.detected].abs()
         values = {"predicted": prediction.mean[test.detected], "std": std, "median_db": float(error.quantile(0.5))}
+        values["mean_db"] = float(error.mean())
         return predictor, seconds | values | {"detection": _detection(predictor, test)}
 
     keep = keep or (lambda name, compute: compute()[1])
     values = {name: keep(name, partial(compute, name)) for name in names}
     order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))
     parts = [order[: round(fraction * len(train))].sort().values for fraction in fewer]
-    less = {
-        len(rows): {
-            name: keep(f"{name}, {len(rows)} rows", partial(compute, name, rows))
-            for name in (model_of(train), "knn")
-            if name in names
-        }
-        for rows in parts
-        if int(train.detected[rows].sum(dim=0).min()) >= MIN_TRAINING
-    }
-    return RssiComparison(train, test, values, left_out, predictors, less)
+    parts = [rows for rows in parts if int(train.detected[rows].sum(dim=0).min()) >= MIN_TRAINING]
+    studied = [name for name in (model_of(train), "knn") if name in names]
+
+    def study() -> tuple[None, Values]:
+        less = {str(len(rows)): {name: compute(name, rows)[1]["mean_db"] for name in studied} for rows in parts}
+        return None, less | {str(len(train)): {name: values[name]["mean_db"] for name in studied}}
+
+    by_rows = DataFrame.from_dict(keep("fewer rows", study) if parts else {}, orient="index")
+    by_rows = by_rows.set_index(by_rows.index.astype(int)).rename_axis("n_train")
+    return RssiComparison(train, test, values, left_out, predictors, by_rows)
 
 
 def _detection(predictor: RssiPredictor, test: Rssi) -> tuple[float, float] | None:

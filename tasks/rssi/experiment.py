@@ -30,6 +30,8 @@ from tasks.source import measured_rssi, offset_notes, split_notes
 from tasks.terminal import console, terminal
 from tasks.workers import connected
 
+FEWER = (0.125, 0.25, 0.5)  # of the training rows, for the figure of the error against their number
+
 
 def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     """Run the experiment and write its directory, or continue an interrupted one.
@@ -53,19 +55,20 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         Run("rssi", config.out, label, config, device, source, resume) as directory,
     ):
 
-        def keep(name: str, compute: Callable[[], tuple[RssiPredictor, Row]]) -> Row:
+        def keep(name: str, compute: Callable[[], tuple[RssiPredictor | None, Row]]) -> Row:
+            if name == "fewer rows":
+                return directory.step(name, name, lambda: compute()[1], lambda value: "")
+
             def saved() -> Row:
                 predictor, value = compute()
                 if isinstance(predictor, RssiModel | PairModel) and name == model_of(data):
                     predictor.save(directory.path(MODEL))
                 return value | {"n_primitives": getattr(predictor, "n_primitives", 0)}
 
-            value = directory.step(name, f"fitting {name}", saved)
-            terminal.result(name, f"{value['median_db']:.2f} dB")
-            return value
+            return directory.step(name, name, saved, lambda value: f"{value['median_db']:.2f} dB")
 
-        terminal.expect(sum(not directory.holds(name) for name in names))
         with terminal.progress():
+            terminal.expect(sum(not directory.holds(name) for name in (*names, "fewer rows")))
             result = compare(
                 whole,
                 receivers=config.rx,
@@ -76,6 +79,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
                 not_detected=config.not_detected,
                 validation=config.validation,
                 reference=config.table.reference,
+                fewer=FEWER,
                 device=device,
                 parallel=cluster.map if cluster else None,
                 keep=keep,
@@ -148,6 +152,7 @@ def _metrics(config: RssiTaskConfig, data: Rssi, result: RssiComparison, model: 
         "model": result.model,
         "seconds": seconds[result.model],
         "interval": {"nominal": LEVEL, "coverage": result.coverage},
+        "by_rows": {str(n): {str(name): mean for name, mean in row.items()} for n, row in result.by_rows.iterrows()},
         "chosen": {
             "n_primitives": max(value["n_primitives"] for value in result.values.values()),
             "floor_attenuation_db": attenuation_db,

@@ -16,7 +16,7 @@ class RssiTaskConfig(Options):
 
     Without --data the built-in simulated floor is used. swiftwrf resume DIR.partial continues an interrupted run.
 
-    Example: python -m tasks.rssi --rx 6 --data DIR
+    Example: swiftwrf rssi --rx 6 --data DIR
     """
 
     rx: tuple[str, ...]

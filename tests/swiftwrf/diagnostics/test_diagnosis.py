@@ -136,7 +136,7 @@ def by_text(seed):
 
 
 def carrier_of_another_band(seed):
-    data, factor = scene(seed), (2.5, 2.8, 0.45, 1.3, 0.8)[seed % 5]
+    data, factor = scene(seed), (3.0, 2.8, 0.45, 1.3, 0.8)[seed % 5]
     return replace(data, array=PlanarArray(data.array.element, data.array.wavelength * factor))
 
 
@@ -218,6 +218,15 @@ CAUSES = {  # measurements, and the statement of the cause of an error
     "random order on a line": (lambda seed: random_order(seed, (1, 8)), "are exchanged"),
     "four cables of a line": (lambda seed: exchanged(seed, 4, (1, 8)), "are exchanged"),
 }
+OF_INSPECTION = (  # statements that are not those of an error of frames, elements or labels
+    "nothing",
+    "a line",
+    "behind",
+    "no line of sight",
+    "normalised positions",
+    "uncalibrated",
+    "one direction",
+)
 ERRORS = [says for name, (_, says) in CAUSES.items() if name not in ("nothing", "a line", "behind", "no line of sight")]
 ALSO = {"tilted": "The array is not calibrated"}  # its calibration includes the rotation
 

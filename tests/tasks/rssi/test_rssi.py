@@ -205,11 +205,12 @@ def test_a_lone_receiver_has_one_map_and_no_average(tmp_path, capsys):
     out = tmp_path / "her 'own' run"
     assert run("--rx", "1", "--out", out) == 0
     drawn = {file.stem.partition("-")[0] for file in (out / "figures").glob("*.svg")}
-    assert drawn == {"summary", "cdf", "where", "speed"}
+    assert drawn == {"summary", "errors", "where"}
     assert list((out / "figures").glob("summary*.csv"))
     for text in (capsys.readouterr().out, unescape(re.sub("<[^>]*>", "", (out / "report.html").read_text()))):
-        assert f"python -m tasks.view {shlex.quote(str(out))}" in text
-        assert f"swiftwrf.load({str(out / 'model.safetensors')!r})" in text
+        assert f"swiftwrf view {shlex.quote(str(out))}" in text
+        assert f"swiftwrf predict {shlex.quote(str(out))} positions.csv" in text
+        assert "--split block" in text
 
 
 @pytest.mark.parametrize(
