@@ -77,6 +77,15 @@ def test_every_member_of_a_lazy_package_exists():
         _ = swiftwrf.nowhere
 
 
+def test_documented_submodules_need_no_import():
+    code = """
+import augment, swiftwrf, sys
+names = swiftwrf.rssi.compare, swiftwrf.locate.compare, swiftwrf.metrics.summary, swiftwrf.datasets, augment.estimators
+print(0, file=sys.stderr)
+"""
+    assert imported(code)[0] == 0
+
+
 def test_a_submodule_does_not_hide_the_function_of_its_name():
     code = """
 import augment.mix, swiftwrf.rasterize.cpu, sys

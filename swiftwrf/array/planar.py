@@ -158,6 +158,36 @@ class PlanarArray:
         """
         return 2 * math.pi / self.wavelength * (direction[..., :2].to(self.element) @ self.element.T)
 
+    def phase_at(self, source: Tensor) -> Tensor:
+        """Return the phase lead (..., K) [rad] of each element over the origin for waves from points (..., 3) [m].
+
+        The waves are spheres; far away they become those of `phase`.
+        """
+        distance, element = source.norm(dim=-1, keepdim=True), torch.nn.functional.pad(self.element, (0, 1))
+        along = 2 * source.to(element) @ element.T - element.square().sum(dim=1)  # of squared distances
+        return (
+            2
+            * math.pi
+            / self.wavelength
+            * along
+            / (distance + torch.cdist(source.reshape(-1, 3), element).reshape(along.shape))
+        )
+
+    @property
+    def far_field_m(self) -> float:
+        """Distance 2 D^2 / wavelength [m] beyond which waves are plane over the extent D of the array."""
+        return 2 * float(torch.cdist(self.element, self.element).max()) ** 2 / self.wavelength
+
+    @property
+    def resolution(self) -> float:
+        """Error of a direction [rad] that costs a tenth of the power of the direct path, near the array's normal."""
+        offset = self.element - self.element.mean(dim=0)
+        return (
+            0.1**0.5
+            * self.wavelength
+            / (math.tau * float(offset.square().sum(dim=1).mean() / (1 + (self.axis is None))) ** 0.5)
+        )
+
     def spectrum(self, channel: Tensor, grid: AngularGrid, beamformer: str = PHASE) -> Tensor:
         """Return the magnitude at each direction, in [0, 1], float32 (n, n_elevation, n_azimuth).
 

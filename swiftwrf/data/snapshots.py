@@ -99,10 +99,14 @@ class Snapshots(PositionedData):
         )
 
     @property
+    def away(self) -> Tensor:
+        """Vectors from the array to the transmitter in array coordinates, float64 (n, 3) [m]. z may be negative."""
+        return (self.position - self.fixed_position) @ self.rotation
+
+    @property
     def direction(self) -> Tensor:
-        """Unit vectors of the line of sight in array coordinates, float64 (n, 3). z may be negative."""
-        away = self.position - self.fixed_position
-        direction: Tensor = away / away.norm(dim=1, keepdim=True) @ self.rotation
+        """Unit vectors of `away`, (n, 3)."""
+        direction: Tensor = self.away / self.away.norm(dim=1, keepdim=True)
         return direction
 
     def spectra(self, grid: AngularGrid | tuple[int, int] | None = None, beamformer: str = PHASE) -> Spectra:

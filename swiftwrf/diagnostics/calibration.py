@@ -30,8 +30,8 @@ from swiftwrf.array.beamforming import of_unit_power, unit
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.splits import FOLDS, MIN_TRAINING, slabs
-from swiftwrf.diagnostics.elements import phases_are_constant, unit_phasor
-from swiftwrf.errors import InputError
+from swiftwrf.diagnostics.elements import NOISE, constant_phases, noisy_elements, unit_phasor
+from swiftwrf.errors import InputError, ranges
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import checked
 
@@ -119,13 +119,18 @@ def calibrate(train: Snapshots) -> Calibration:
             f"the elements of {train.name} lie on a line, which receives the angle to its axis only, so the array's "
             "orientation cannot be estimated"
         )
-    if phases_are_constant(seen):
+    if bool(constant_phases(seen).any()):
         raise InputError(
             f"the phases between the elements of {train.name} hardly depend on the position, so they do not contain the "
             "direction of the line of sight"
         )
     problem = _Problem.of(seen)
-    found = problem.descend(problem.scan())
+    found = problem.descend(start := problem.scan())
+    if float(problem.away.norm(dim=1).min()) < seen.array.far_field_m:
+        curved = replace(problem, curved=True)
+        other = curved.descend(start)
+        if float(curved.shares(other).mean()) > float(problem.shares(found).mean()):
+            problem, found = curved, other
     if (turn := float(found.turn.norm())) > MAX_TURN:
         raise InputError(
             f"the phases of {train.name} fit best with the array turned by {math.degrees(turn):.0f} degrees; beyond "
@@ -138,16 +143,22 @@ def calibrate(train: Snapshots) -> Calibration:
             f"{math.degrees(MAX_TURN):.0f} degrees; a calibration needs at least {MIN_TRAINING} (is the frame right?)"
         )
     phase_std, turn_std = problem.standard_errors(found)
-    if float(turn_std.max()) > math.radians(3) or float(phase_std.max()) > math.radians(30):
-        reason = "phases change from position to position as no direct path explains"
+    wide, loose = turn_std.max() > math.radians(3), (phase_std > math.radians(30)).nonzero()[:, 0].tolist()
+    if wide or loose:
+        open_ones = (
+            [f"the rotation about its {'xyz'[int(turn_std.argmax())]} axis ({_degrees(turn_std)})"] if wide else []
+        )
+        open_ones += (
+            [f"the phases of elements {ranges(loose)}, counted from 0 ({_degrees(phase_std)})"] if loose else []
+        )
         mean = problem.direction.mean(dim=0).expand_as(problem.direction)
         cone = float(angular_distance(problem.direction, mean).median())
-        if cone < math.radians(20) and clear >= len(seen) / 2:
+        reason = "phases change from position to position as no direct path explains"
+        if noise := noisy_elements(seen, problem.away @ _matrix(found.turn)):
+            reason = NOISE.format(listed=", ".join(map(str, noise)), option=" ".join(map(str, noise)))
+        elif cone < math.radians(20) and clear >= len(seen) / 2:
             reason = "measure positions in more directions from the array"
-        raise InputError(
-            f"{train.name} does not determine the array's orientation and its elements' phases (standard errors "
-            f"{math.degrees(float(turn_std.max())):.1f} and {math.degrees(float(phase_std.max())):.0f} degrees); {reason}"
-        )
+        raise InputError(f"{train.name} does not determine {' and '.join(open_ones)}; {reason}")
     before, after = problem.held_out(found, slabs(seen.position, FOLDS))
     if after < before - 0.02:
         raise InputError(
@@ -167,26 +178,31 @@ class _Found:
 class _Problem:
     """Covariances of the phases and directions of the line of sight.
 
-    Covariances (n, K, K) have the principal eigenvectors (n, K). Directions (n, 3) are in declared array coordinates.
+    Covariances (n, K, K) have the principal eigenvectors (n, K). Vectors away from the array (n, 3) are in its declared
+    coordinates. Waves are plane, or spheres if `curved`.
     """
 
     array: PlanarArray
     position: Tensor
-    direction: Tensor
+    away: Tensor
     covariance: Tensor
     strongest: Tensor
+    curved: bool = False
 
     @classmethod
     def of(cls, data: Snapshots) -> _Problem:
         received = of_unit_power(unit(data.channel))
-        return cls(
-            data.array, data.position, data.direction, received, torch.linalg.eigh(received).eigenvectors[..., -1]
-        )
+        strongest = torch.linalg.eigh(received).eigenvectors[..., -1]
+        return cls(data.array, data.position, data.away, received, strongest)
+
+    @property
+    def direction(self) -> Tensor:
+        """Unit vectors of the line of sight, (n, 3)."""
+        return self.away / self.away.norm(dim=1, keepdim=True)
 
     def subset(self, rows: Tensor) -> _Problem:
-        return _Problem(
-            self.array, self.position[rows], self.direction[rows], self.covariance[rows], self.strongest[rows]
-        )
+        values = {name: getattr(self, name)[rows] for name in ("position", "away", "covariance", "strongest")}
+        return replace(self, **values)
 
     def scan(self) -> _Found:
         """Return the best of the scanned rotations, with its phases."""
@@ -247,7 +263,10 @@ class _Problem:
         return self._steering(found.turn) * unit_phasor(found.phase)
 
     def _steering(self, turn: Tensor) -> Tensor:
-        return unit_phasor(self.array.phase(self.direction @ _matrix(turn)))
+        away = self.away @ _matrix(turn)
+        return unit_phasor(
+            self.array.phase_at(away) if self.curved else self.array.phase(away / away.norm(dim=1, keepdim=True))
+        )
 
     def standard_errors(self, found: _Found) -> tuple[Tensor, Tensor]:
         """Return the jackknife standard errors of the phases (K,) and of the rotation (3,), infinite if not identifiable."""
@@ -278,3 +297,8 @@ class _Problem:
 def _matrix(turn: Tensor) -> Tensor:
     """Return the matrix of a rotation vector (3,)."""
     return torch.from_numpy(Rotation.from_rotvec(turn.numpy()).as_matrix())
+
+
+def _degrees(std: Tensor) -> str:
+    """Return the largest of standard errors [rad] in words."""
+    return f"standard error {math.degrees(float(std.max())):.1f} degrees"

@@ -7,35 +7,57 @@ the power along the line of sight.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
+from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from swiftwrf.array.beamforming import unit
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.snapshots import Snapshots
+from swiftwrf.errors import listed
 
+NOISE = "elements {listed}, counted from 0, hold noise: their phase follows no other element (--drop-elements {option})"
+MIN_SCALE = 0.06  # of wavelengths, relative to the declared one and to its half
+ORDERS = 40  # from which the order of the elements is searched
 ROUND_TRIP = (
     "the phases are those of the way there and back, as of RFID and backscatter (--round-trip); elements are then "
     "{spacing:.2f} wavelengths apart{ambiguous}"
 )
 
 
-def other_readings(data: Snapshots) -> dict[str, Snapshots]:
-    """Return the snapshots as they would be read under each error, by its description."""
+def other_readings(data: Snapshots, away: Tensor) -> Iterator[tuple[str, float, Snapshots]]:
+    """Yield each error, its number of fitted parameters, and the snapshots as they would be read without it.
+
+    Args:
+        data: Snapshots.
+        away: Points (n, 3) [m] in array coordinates where direct paths begin.
+    """
     channel, array = data.channel, data.array
-    found = {
-        f"the elements are given {name}": replace(data, channel=channel[..., order])
-        for name, order in _element_orders(array).items()
-    }
+    for name, order in _element_orders(array).items():
+        yield f"the elements are given {name}", 0, replace(data, channel=channel[..., order])
     if channel.shape[1] == channel.shape[2]:
-        swapped = "the axes of elements and subcarriers are swapped: give csi.transpose(0, 2, 1)"
-        found[swapped] = replace(data, channel=channel.mT.contiguous())
+        remedy = "give csi.transpose(0, 2, 1), in MATLAB permute(csi, [1 3 2])"
+        swapped = replace(data, channel=channel.mT.contiguous())
+        yield f"the axes of elements and subcarriers are swapped: {remedy}", 0, swapped
     halved = PlanarArray(array.element, array.wavelength / 2)
     ambiguous = ", so directions are ambiguous" if halved.spacing_wavelengths > 0.51 else ""
     meaning = ROUND_TRIP.format(spacing=halved.spacing_wavelengths, ambiguous=ambiguous)
-    return {meaning: replace(data, array=halved), **found}
+    yield meaning, 0, replace(data, array=halved)
+    scales = torch.logspace(math.log10(0.38), math.log10(3.5), 50, dtype=torch.float64).tolist()
+    scaled = {scale: replace(data, array=PlanarArray(array.element, array.wavelength / scale)) for scale in scales}
+    scale = max(scaled, key=lambda scale: float(evidence(scaled[scale], away).mean()))
+    if min(abs(math.log(scale)), abs(math.log(scale / 2))) > MIN_SCALE:
+        carrier = f"the carrier is about {scaled[scale].array.frequency_hz / 1e9:.2g} GHz"
+        yield f"{carrier}, or elements are {scale:.2f} times as far apart", 1, scaled[scale]
+    order = best_order(data, away)
+    if moved := (order != torch.arange(len(order))).nonzero()[:, 0].tolist():
+        names = " and ".join(map(str, moved)) if len(moved) == 2 else listed(moved)
+        remedy = f"are exchanged, counted from 0: give csi[..., {order.tolist()}]"
+        yield f"elements {names} {remedy}", len(moved) / 2, replace(data, channel=channel[..., order])
 
 
 def _element_orders(array: PlanarArray) -> dict[str, Tensor]:
@@ -66,23 +88,97 @@ def _ranks(values: Tensor, tolerance: float) -> Tensor:
     return rank
 
 
-def arrives_along(data: Snapshots, direction: Tensor) -> bool:
-    """Return True if most of the power arrives along directions (n, 3) in array coordinates.
+def wave_from(data: Snapshots, away: Tensor) -> Tensor:
+    """Return the unit phasors (n, K) of waves from points `away` (n, 3) [m] in array coordinates.
 
-    Random phases at K elements have the fraction 1 / K along any direction. Only the excess over it counts, and it must be
-    larger for fewer elements, whose phases agree more easily by chance.
+    Waves are spheres if points lie in the near field and spheres fit the channels better.
     """
-    residual = _unit_channel(data) * unit_phasor(data.array.phase(direction))[:, None].conj()
-    share, chance = float(residual.mean(dim=-1).abs().square().mean()), 1 / residual.shape[-1]
-    return (share - chance) / (1 - chance) >= 0.45 + chance
+    plane = unit_phasor(data.array.phase(away / away.norm(dim=1, keepdim=True).clamp_min(1e-12)))
+    if float(away.norm(dim=1).min()) > data.array.far_field_m:
+        return plane
+    curved = unit_phasor(data.array.phase_at(away))
+    return max(plane, curved, key=lambda wave: float(_coherence(unit_channel(data) * wave[:, None].conj()).mean()))
 
 
-def flipping_elements(data: Snapshots) -> list[int]:
-    """Return the elements whose phase changes by half a turn from measurement to measurement, counted from 1.
+def evidence(data: Snapshots, away: Tensor) -> Tensor:
+    """Return the fraction (n,) of the power that arrives from points `away` (n, 3) [m], in excess of random phases."""
+    return excess(_coherence(unit_channel(data) * wave_from(data, away)[:, None].conj()), 1 / data.channel.shape[2])
 
-    Of two groups that flip against each other, the larger one counts as steady.
+
+def excess(share: Tensor, chance: float) -> Tensor:
+    """Return a fraction as its excess over chance: 0 at chance, 1 at 1."""
+    return (share - chance) / (1 - chance)
+
+
+def _coherence(residual: Tensor) -> Tensor:
+    """Return the fraction (n,) of the power of residual phases (n, S, K) that is equal at all elements."""
+    power = residual.abs().square().sum(dim=(1, 2)).clamp_min(1e-12)
+    return residual.sum(dim=2).abs().square().sum(dim=1) / power / residual.shape[2]
+
+
+def best_order(data: Snapshots, away: Tensor) -> Tensor:
+    """Return the order (K,) of the channels with most power along the direct paths from points `away` (n, 3).
+
+    From several orders, each channel is assigned to the element whose wave it follows best, relative to the sum of all.
     """
-    channel, steering = _unit_channel(data), unit_phasor(data.array.phase(data.direction))
+    channel = unit_channel(data)
+    wave = wave_from(data, away)[:, None].conj().expand_as(channel).flatten(0, 1)
+    channel, elements = channel.flatten(0, 1), channel.shape[2]
+    draw = torch.Generator().manual_seed(0)
+
+    def total(order: Tensor) -> Tensor:
+        return (channel[:, order] * wave).sum(dim=1, keepdim=True)
+
+    found = []
+    for start in range(ORDERS):
+        order = torch.randperm(elements, generator=draw) if start else torch.arange(elements)
+        for _ in range(30):
+            aligned = channel * unit(total(order)).conj()
+            assigned = torch.from_numpy(linear_sum_assignment(-(wave.T @ aligned).real.numpy())[1])
+            if torch.equal(assigned, order):
+                break
+            order = assigned
+        found.append(order)
+    return max(found, key=lambda order: float(total(order).abs().square().mean()))
+
+
+def noisy_elements(data: Snapshots, away: Tensor) -> list[int]:
+    """Return the elements whose phase follows no other element, counted from 0, if most others follow each other."""
+    residual = (unit_channel(data) * wave_from(data, away)[:, None].conj()).flatten(0, 1)
+    coherence = (residual.T @ residual.conj() / len(residual)).abs().fill_diagonal_(0)
+    others = coherence.sort(dim=1, descending=True).values[:, : max(1, len(coherence) // 2)].mean(dim=1)
+    noise = others < 0.25
+    return noise.nonzero()[:, 0].tolist() if bool((others[~noise] > 0.5).all()) and int((~noise).sum()) >= 2 else []
+
+
+def sloped(data: Snapshots, away: Tensor) -> Tensor:
+    """Return the evidence (n,) for phases that grow with the element's number, by another slope in each snapshot.
+
+    Chance is that of slopes fitted to direct paths of other positions: a linear array confounds slopes and directions.
+    """
+    channel, wave = unit_channel(data), wave_from(data, away)
+    n, count, elements = channel.shape
+
+    def fitted(shift: int) -> tuple[Tensor, Tensor]:
+        power, slope = (
+            torch.fft.fft(channel * wave.roll(shift, 0)[:, None].conj(), 8 * elements).abs().square().max(dim=2)
+        )
+        return (power / elements**2).mean(dim=1), slope * math.tau / (8 * elements)
+
+    share, slope = fitted(0)
+    steady = unit_phasor(slope * (elements - 1) / 2).mean(dim=1).abs().mean()
+    if count < 2 or float(steady) > 0.9:
+        return torch.zeros(n)
+    chance = torch.stack([fitted(max(1, n * k // 6))[0] for k in range(1, 6)]).mean()
+    return excess(share, float(chance))
+
+
+def flipping_elements(data: Snapshots, away: Tensor) -> tuple[list[int], Tensor]:
+    """Return the elements whose phase changes by half a turn from measurement to measurement, and the evidence (n,).
+
+    Elements count from 0. Of two groups that flip against each other, the larger one counts as steady.
+    """
+    channel, steering = unit_channel(data), wave_from(data, away)
     residual = channel * steering[:, None].conj()
     plain, doubled = (residual.pow(power).mean(dim=-1).abs().square() for power in (1, 2))
     sign, mended = _without_flips(residual)
@@ -92,15 +188,15 @@ def flipping_elements(data: Snapshots) -> list[int]:
     gain = min(mended.mean() - plain.mean(), mended.mean() - chance)
     # fractions of the power along the line of sight; flips do not change that of the squared channel
     if gain < 0.15 or mended.median() < 0.75 or doubled.median() < 0.5:
-        return []
+        return [], torch.zeros(len(data))
     signs = sign.flatten(0, 1)
     together = (signs.T @ signs / len(signs)).abs() > 0.8
     steady = together[int(together.sum(dim=1).argmax())]
     reference = residual[..., steady].mean(dim=-1, keepdim=True).angle()
     cosine = (residual * unit_phasor(-reference)).real.abs().mean(dim=(0, 1))
     if bool((cosine[~steady] < 0.85).any()):  # phases that change by other angles; random ones have a mean of 0.64
-        return []
-    return [number + 1 for number in (~steady).nonzero()[:, 0].tolist()]
+        return [], torch.zeros(len(data))
+    return (~steady).nonzero()[:, 0].tolist(), excess(mended.mean(dim=1), float(chance))
 
 
 def _without_flips(residual: Tensor) -> tuple[Tensor, Tensor]:
@@ -111,18 +207,20 @@ def _without_flips(residual: Tensor) -> tuple[Tensor, Tensor]:
     return sign, (aligned * sign).mean(dim=-1).abs().square()
 
 
-def phases_are_constant(data: Snapshots) -> bool:
-    """Return True if the phases between elements hardly depend on the position, although the lines of sight differ."""
-    channel, steering = _unit_channel(data), unit_phasor(data.array.phase(data.direction))
+def constant_phases(data: Snapshots) -> Tensor:
+    """Return the evidence (n,) for phases between elements that hardly depend on the position, 0 if they do."""
+    channel, steering = unit_channel(data), unit_phasor(data.array.phase(data.direction))
     each = channel.mT @ channel.conj() / channel.shape[1]
     of_one_position = torch.linalg.eigvalsh(each)[:, -1].mean()
-    common = torch.linalg.eigvalsh(each.mean(dim=0))[-1] / of_one_position
+    power, vector = torch.linalg.eigh(each.mean(dim=0))
     geometric = torch.linalg.eigvalsh(steering.T @ steering.conj() / len(data))[-1] / len(data.array.element)
     # beyond 0.65 the lines of sight are too close to each other
-    return bool(common > 0.8 and geometric < 0.65)
+    if power[-1] / of_one_position <= 0.8 or geometric >= 0.65:
+        return torch.zeros(len(data))
+    return excess(_coherence(channel * vector[:, -1].conj()), 1 / channel.shape[2])
 
 
-def _unit_channel(data: Snapshots) -> Tensor:
+def unit_channel(data: Snapshots) -> Tensor:
     """Return the phases of some snapshots of each position, complex128 (n, S, K)."""
     few = data.channel[:, :: max(1, data.channel.shape[1] // 8)]
     return unit(few)

@@ -29,20 +29,30 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn import functional
 
-from swiftwrf.array.angles import AngularGrid, folded_to_front, to_angles, to_direction
+from swiftwrf.array.angles import AngularGrid, folded_to_front
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import slabs
-from swiftwrf.diagnostics.elements import arrives_along, other_readings
+from swiftwrf.diagnostics.elements import constant_phases, evidence, excess, flipping_elements, other_readings, sloped
+from swiftwrf.errors import ranges
 
 MIN_CLEAR_POSITIONS = 20  # with line of sight, to check frames
 MIN_EVIDENCE = 0.15  # agreement above chance to accept a frame, and above the declared frame to prefer another one
 # angle of a constant rotation that is reported, and the largest difference between those of two halves of the positions
 MIN_TURN = math.radians(5)
-MIN_GAIN = 0.03  # in agreement, of such a rotation or of a mirror
+COST, TIE = 0.03, 0.03  # of a fitted parameter; difference of errors that are not distinguished
+MIN_POWER = 0.05  # of an error, above the declared frame, in the fraction of the power
+MIN_EXPLAINED, MIN_REACHED = 0.5, 0.8  # agreement of an error; its fraction of what the best directions reach
+REACH_GRID = AngularGrid.hemisphere(30, 120)
+MAX_ELSEWHERE = 0.3  # of the positions, whose peak is elsewhere, in one frame
 UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
+CONSTANT = (
+    "phases between elements hardly depend on the position: the delay to each element may be missing in them, or the "
+    "elements may be another axis"
+)
+SLOPE = "phases grow with the element's number, by another slope in each snapshot, as of elements sampled in turn"
 AXES = torch.eye(3, dtype=torch.float64)
 SWAPS = {"x and y": AXES[[1, 0, 2]], "y and z": AXES[[0, 2, 1]], "x and z": AXES[[2, 1, 0]]}
 MIRRORS = {axis: AXES - 2 * torch.outer(unit, unit) for axis, unit in zip("xyz", AXES, strict=True)}
@@ -83,6 +93,8 @@ class FrameReport:
         agreement: Agreement in the declared frame, in [0, 1].
         chance: Chance level of the agreement.
         angle_deg: Median angle between peak and line of sight [deg].
+        limit_deg: Median angle up to which this array's peaks are in one frame with the lines of sight [deg].
+        elsewhere: Fraction of the positions with a peak beyond three times that angle.
         span_deg: Median angle between the lines of sight of two positions [deg].
         peak_span_deg: Median angle between the peaks of two positions [deg].
         behind: Fraction of the lines of sight that lie behind the array. 0 for a linear array, which has no front.
@@ -95,6 +107,8 @@ class FrameReport:
     agreement: float
     chance: float
     angle_deg: float
+    limit_deg: float
+    elsewhere: float
     span_deg: float
     peak_span_deg: float
     behind: float
@@ -111,7 +125,7 @@ class FrameReport:
     @property
     def fits(self) -> bool:
         """True if the declared frame explains most peaks, and no other frame does clearly better."""
-        return self.follows and self.angle_deg <= 10
+        return self.follows and self.angle_deg <= self.limit_deg and self.elsewhere <= MAX_ELSEWHERE
 
     @property
     def narrow(self) -> bool:
@@ -134,11 +148,13 @@ class _Frame:
     sign: float
     array: PlanarArray | None
 
+    def away(self) -> Tensor:
+        """Return vectors along the line of sight in array coordinates, (n, 3) [m]."""
+        return self.sign * (self.position - self.fixed) @ self.rotation
+
     def towards(self) -> Tensor:
         """Return unit vectors of the line of sight in array coordinates, (n, 3)."""
-        away = self.sign * (self.position - self.fixed) @ self.rotation
-        direction: Tensor = away / away.norm(dim=1, keepdim=True).clamp_min(1e-12)
-        return direction
+        return _unit(self.away())
 
     def direction(self) -> Tensor:
         """Return `towards`, folded to the directions that the array distinguishes."""
@@ -168,6 +184,26 @@ class _Frame:
         return replace(self, position=self.position @ matrix, fixed=self.fixed @ matrix if both else self.fixed)
 
 
+@dataclass(frozen=True, eq=False)
+class _Hypothesis:
+    """A possible error and its evidence (n,): at most 1 at each position, 0 for random phases.
+
+    `free` counts the parameters that were fitted. `seen` are the snapshots as they would be read, for what they can reach.
+    `chance` is the mean evidence for the direct paths of other positions.
+    """
+
+    evidence: Tensor
+    chance: float
+    free: float = 0
+    seen: Snapshots | None = None
+    turn: NDArray[np.float64] | None = None
+
+    @property
+    def score(self) -> float:
+        """Mean evidence less the costs of the fitted parameters."""
+        return float(self.evidence.mean()) - COST * self.free
+
+
 def check_frames(spectra: Spectra, snapshots: Snapshots | None = None, beamformer: str = PHASE) -> FrameReport | None:
     """Compare the peaks of the spectra with the lines of sight, in the declared frame and in others.
 
@@ -190,43 +226,100 @@ def check_frames(spectra: Spectra, snapshots: Snapshots | None = None, beamforme
     rows = rows[torch.linspace(0, len(rows) - 1, min(300, len(rows))).round().long()]
     sign = 1.0 if spectra.moving == "transmitter" else -1.0
     frame = _Frame(spectra.position[rows], spectra.fixed_position, spectra.rotation, sign, spectra.array)
-    peak, declared = frame.peaks(spectra.store[rows], spectra.grid), frame.direction()
-    agreement, chance = _agreement(declared, peak)
+    peak, direction = frame.peaks(spectra.store[rows], spectra.grid), frame.direction()
+    agreement, chance = _agreement(direction, peak)
     seen = None if snapshots is None else snapshots.subset(rows)
-    readings = {} if seen is None else other_readings(seen)
-    # directions of the line of sight and peaks under each error
-    tried = {name: (to, peak) for name, to in _others(frame, computed=seen is not None)}
-    for name, other in readings.items():
-        tried[name] = declared, frame.peaks(other.spectra(spectra.grid, beamformer).store[:], spectra.grid)
-    found = {name: _agreement(*pair) for name, pair in tried.items()}
-    best = max(value for value, _ in found.values())
-    for name, to in _mirrors(frame, peak):
-        if (agreed := _agreement(to, peak))[0] >= best + MIN_GAIN:
-            tried[name], found[name] = (to, peak), agreed
-    named, names = best_explanations({name: value for name, (value, _) in found.items()}, tie=0.03)
-    turn, turned, turned_by_chance = _constant_turn(frame, peak)
-    clear = named - max(max(found.values())[1], agreement) >= MIN_EVIDENCE
-    # with three angles, a rotation explains much
-    error = clear and named >= max(0.5, turned - MIN_GAIN)
-    explanations = names if error else []
-    if seen is not None:
-        explanations = [name for name in explanations if arrives_along(readings.get(name, seen), tried[name][0])]
-    rotates = not explanations and turned >= 0.8 and turned - turned_by_chance >= MIN_EVIDENCE
-    rotates = rotates and float(np.linalg.norm(turn)) >= MIN_TURN and turned - agreement >= MIN_GAIN
-    rotates = rotates and (seen is None or arrives_along(seen, seen.direction @ _matrix(turn)))
-    rotates = rotates and _constant(turn, frame, peak)
+    declared = float(_evidence(frame.away(), frame, peak, seen).mean())
+    time = None if snapshots is None else snapshots.time
+    tried: dict[str, _Hypothesis] = {}
+    for name, found in _hypotheses(spectra, rows, frame, peak, seen, time):
+        tried[name] = max(found, tried.get(name, found), key=lambda each: each.score)
+    best, names = best_explanations({name: each.score for name, each in tried.items()}, TIE)
+    is_clear = best - declared >= (MIN_EVIDENCE if seen is None else MIN_POWER)
+    explained = [name for name in names if is_clear and _reaches(tried[name])]
+    turn = next((tried[name].turn for name in explained if tried[name].turn is not None), None)
+    angle_deg, limit_deg = _nearest(direction, peak).rad2deg(), _limit_deg(spectra)
     return FrameReport(
         agreement=agreement,
         chance=chance,
-        angle_deg=math.degrees(float(_nearest(declared, peak).median())),
-        span_deg=_span_deg(declared),
+        angle_deg=float(angle_deg.median()),
+        limit_deg=limit_deg,
+        elsewhere=float((angle_deg > 3 * limit_deg).double().mean()),
+        span_deg=_span_deg(direction),
         peak_span_deg=_span_deg(peak[:, 0]),
-        behind=0.0 if frame.linear else float((frame.towards()[:, 2] < 0).double().mean()),
-        explanations=tuple(explanations),
-        explained=named if explanations else turned if rotates else agreement,
-        turn_deg=tuple(np.degrees(turn).tolist()) if rotates else None,
+        behind=0.0 if frame.linear else float((frame.away()[:, 2] < 0).double().mean()),
+        explanations=tuple(name for name in explained if tried[name].turn is None),
+        explained=best if explained else declared,
+        turn_deg=None if turn is None else tuple(np.degrees(turn).tolist()),
         positions=len(rows),
     )
+
+
+def _limit_deg(spectra: Spectra) -> float:
+    """Return the median angle [deg] between peak and line of sight up to which they are in one frame."""
+    pixel = math.degrees(max(spectra.grid.elevation_step, spectra.grid.azimuth_step))
+    return 10.0 if spectra.array is None else min(10.0, math.degrees(spectra.array.resolution) + pixel / 2)
+
+
+def _evidence(away: Tensor, frame: _Frame, peak: Tensor, seen: Snapshots | None) -> Tensor:
+    """Return the evidence (n,) for direct paths from points `away` (n, 3): power of snapshots, otherwise peaks."""
+    return _kernel(_nearest(frame.folded(_unit(away)), peak)) if seen is None else evidence(seen, away)
+
+
+def _reaches(found: _Hypothesis) -> bool:
+    """Return True if a hypothesis explains nearly what the array can reach, and more than by chance."""
+    mean = float(found.evidence.mean())
+    if mean - found.chance < MIN_EVIDENCE:
+        return False
+    if found.seen is None:
+        return mean >= MIN_EXPLAINED + 0.1 * found.free
+    share = found.seen.array.spectrum(found.seen.channel, REACH_GRID, PHASE).square().amax(dim=(1, 2))
+    chance = 1 / found.seen.channel.shape[2]
+    return mean >= max(0.45 + chance, MIN_REACHED * float(excess(share, chance).mean()))
+
+
+def _hypotheses(
+    spectra: Spectra, rows: Tensor, frame: _Frame, peak: Tensor, seen: Snapshots | None, time: Tensor | None
+) -> Iterator[tuple[str, _Hypothesis]]:
+    """Yield each error in words and its evidence at some rows of the spectra."""
+    away, other_rows = frame.away(), torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))
+
+    def at(away: Tensor, free: float = 0, seen: Snapshots | None = seen, peak: Tensor = peak) -> _Hypothesis:
+        same, other = (_evidence(each, frame, peak, seen) for each in (away, away[other_rows]))
+        return _Hypothesis(same, float(other.mean()), free, seen)
+
+    for meaning, other in _frames(frame):
+        yield meaning, at(other.away())
+    for meanings, matrix in AZIMUTH_ERRORS.items():
+        turned = torch.cat([away[:, :2] @ torch.tensor(matrix).double().T, away[:, 2:]], dim=1)
+        yield meanings[seen is not None], at(turned)
+    for meaning, other in _mirrors(frame, peak):
+        yield meaning, at(other.away(), free=1)
+
+    def placed(position: Tensor, free: float = 0) -> _Hypothesis:
+        return at(replace(frame, position=position[rows]).away(), free)
+
+    for meaning, position, free in _labels(spectra.position, time, lambda position: placed(position).score):
+        yield meaning, placed(position, free)
+    turn = _constant_turn(frame, peak)
+    if float(np.linalg.norm(turn)) >= MIN_TURN and _constant(turn, frame, peak):
+        found = at(away @ _matrix(turn), free=3)
+        yield "a constant rotation", replace(found, turn=turn)
+    if seen is None:
+        for meaning, peak_there in _grids(spectra, rows, frame):
+            yield meaning, at(away, peak=peak_there)
+        return
+    for meaning, fitted, reading in other_readings(seen, away):
+        yield meaning, at(away, fitted, reading)
+    flipping, power = flipping_elements(seen, away)
+    elements = f"{'element' if len(flipping) == 1 else 'elements'} {ranges(flipping)}, counted from 0,"
+    for meaning, found in {
+        f"the phase of {elements} jumps by half a turn from measurement to measurement": power,
+        CONSTANT: constant_phases(seen),
+        SLOPE: sloped(seen, away),
+    }.items():
+        # common phases fit channels whose phases hardly differ, too
+        yield meaning, _Hypothesis(found, 0.0, 2 if meaning == CONSTANT else 0, seen)
 
 
 def best_explanations(score: Mapping[str, float], tie: float) -> tuple[float, list[str]]:
@@ -259,6 +352,11 @@ def best_offset(coordinate: Tensor, score: Callable[[float], Any]) -> tuple[floa
     return max(offsets, key=score), (high - low) / 39
 
 
+def _unit(vector: Tensor) -> Tensor:
+    """Return vectors (n, 3), scaled to length 1."""
+    return vector / vector.norm(dim=1, keepdim=True).clamp_min(1e-12)
+
+
 def _nearest(direction: Tensor, peak: Tensor) -> Tensor:
     """Return the angle [rad] between directions (..., n, 3) and the nearest of the peaks (n, P, 3) of each."""
     return (direction[..., None, :] * peak).sum(dim=-1).amax(dim=-1).clamp(-1, 1).arccos()
@@ -283,18 +381,59 @@ def _span_deg(direction: Tensor) -> float:
     return float((direction @ direction.T)[first, second].clamp(-1, 1).arccos().rad2deg().median())
 
 
-def _others(frame: _Frame, computed: bool) -> Iterator[tuple[str, Tensor]]:
-    """Yield the directions (n, 3) of the line of sight under each error; of `computed` spectra the grid is right."""
-    for meaning, other in _frames(frame):
-        yield meaning, other.direction()
-    towards = frame.towards()
-    for meanings, matrix in AZIMUTH_ERRORS.items():
-        turned = torch.cat([towards[:, :2] @ torch.tensor(matrix).double().T, towards[:, 2:]], dim=1)
-        yield meanings[computed], frame.folded(turned)
-    if not computed and not frame.linear:
-        azimuth, elevation = to_angles(towards)
+def _grids(spectra: Spectra, rows: Tensor, frame: _Frame) -> Iterator[tuple[str, Tensor]]:
+    """Yield each error of the rows of spectra, and the peaks (n, P, 3) without it."""
+    values, grid = spectra.store[rows], spectra.grid
+    if not frame.linear:
         zenith = "rows of the spectra run from the zenith down; row 0 must be the lowest elevation"
-        yield zenith, to_direction(azimuth, math.pi / 2 - elevation)
+        yield zenith, frame.peaks(values.flip(1), grid)
+    half = grid.n_elevation // 2
+    upper, lower = values[:, half:], values.flip(1)[:, half:]
+    if half >= 2 and float(torch.corrcoef(torch.stack([upper.flatten(), lower.flatten()]))[0, 1]) > 0.95:
+        sphere = (
+            f"rows are elevations of -90 to 90 degrees, as their halves mirror each other: give spectrum[:, {half}:]"
+        )
+        yield sphere, frame.peaks(upper, AngularGrid.hemisphere(len(upper[0]), grid.n_azimuth))
+
+
+def _labels(
+    position: Tensor, time: Tensor | None, score: Callable[[Tensor], float]
+) -> Iterator[tuple[str, Tensor, float]]:
+    """Yield each error of the order of positions, the positions (n, 3) of all rows without it, and its fitted parameters.
+
+    Args:
+        position: Positions (n, 3) of all rows.
+        time: Time of each row [s], if it is known.
+        score: Evidence for positions (n, 3) of all rows.
+    """
+    n = len(position)
+    yield "positions are in reverse order", position.flip(0), 0
+    mixed = "rows of positions or channels are in the order of text (1, 10, 11, ..., 2)"
+    for start in (0, 1):
+        by_text = torch.tensor(sorted(range(n), key=lambda row: str(row + start)))
+        for order in (by_text, by_text.argsort()):
+            yield mixed, position[order], 0
+    late = max(shifts(n), key=lambda late: score(earlier(position, late)))
+    yield delay(late, time), earlier(position, late), 1
+
+
+def shifts(n: int) -> list[int]:
+    """Return numbers of rows, but 0, by which n positions may be late: all small ones and some of the larger ones."""
+    some = sorted({min(step, round(1.1**step)) for step in range(1, 60)})
+    return [sign * late for late in some if late <= n // 5 for sign in (1, -1)]
+
+
+def earlier(position: Tensor, late: int) -> Tensor:
+    """Return the position (n, 3) of the row that is `late` rows earlier than each, at the ends the nearest one."""
+    return position[(torch.arange(len(position)) - late).clamp(0, len(position) - 1)]
+
+
+def delay(late: int, time: Tensor | None) -> str:
+    """Return in words that positions are some rows late, and how many seconds if times are known."""
+    step = None if time is None else abs(late) * float(time.diff().nanmedian())
+    rows = f"{abs(late)} row{'s' if abs(late) > 1 else ''}"
+    by = rows if not step or not step > 0 else f"{step:.2g} s ({rows})"
+    return f"positions and radio differ in time: the positions are {by} {'late' if late > 0 else 'early'}"
 
 
 def _frames(frame: _Frame) -> Iterator[tuple[str, _Frame]]:
@@ -319,29 +458,28 @@ def _frames(frame: _Frame) -> Iterator[tuple[str, _Frame]]:
         yield metres, replace(frame, fixed=scale * frame.fixed)
 
 
-def _mirrors(frame: _Frame, peak: Tensor) -> Iterator[tuple[str, Tensor]]:
-    """Yield the directions (n, 3) of the line of sight for the mirror c - x of each axis with most agreement."""
+def _mirrors(frame: _Frame, peak: Tensor) -> Iterator[tuple[str, _Frame]]:
+    """Yield the frame for the mirror c - x of each axis with most agreement."""
     every = torch.cat([frame.position, frame.fixed[None]])
     for number, axis in enumerate("xyz"):
 
-        def mirrored(offset: float, number: int = number) -> Tensor:
-            return replace(frame, position=mirror(frame.position, number, offset)).direction()
+        def mirrored(offset: float, number: int = number) -> _Frame:
+            return replace(frame, position=mirror(frame.position, number, offset))
 
-        offset, _ = best_offset(every[:, number], lambda offset: _agreement(mirrored(offset), peak))
+        offset, _ = best_offset(every[:, number], lambda offset: _agreement(mirrored(offset).direction(), peak))
         yield (
             f"{axis} of the positions counts from the other side (near {axis} = {offset:.1f} - {axis})",
             mirrored(offset),
         )
 
 
-def _constant_turn(frame: _Frame, peak: Tensor) -> tuple[NDArray[np.float64], float, float]:
-    """Return the rotation of the array with most agreement, its agreement and its chance level.
+def _constant_turn(frame: _Frame, peak: Tensor) -> NDArray[np.float64]:
+    """Return the rotation of the array with most agreement, a rotation vector in array coordinates [rad].
 
-    The rotation is a rotation vector in array coordinates [rad]. A linear array does not determine its rotation, so it keeps
-    the declared one.
+    A linear array does not determine its rotation, so it keeps the declared one.
     """
     if frame.linear:
-        return np.zeros(3), *_agreement(frame.direction(), peak)
+        return np.zeros(3)
     scanned = Rotation.random(4000, rng=np.random.default_rng(0))
     turns = Rotation.concatenate([Rotation.identity(), scanned])
     matrices, towards = torch.from_numpy(turns.as_matrix()).float(), frame.towards().float()
@@ -349,8 +487,7 @@ def _constant_turn(frame: _Frame, peak: Tensor) -> tuple[NDArray[np.float64], fl
         [_kernel(_nearest(frame.folded(towards @ m), peak.float())).mean(-1) for m in matrices.split(200)]
     )
     starts = [np.zeros(3), *(turns[int(i)].as_rotvec() for i in score.topk(3).indices)]
-    turn = max((_refined(start, frame, peak) for start in starts), key=_turned(frame, peak))
-    return turn, *_agreement(frame.folded(frame.towards() @ _matrix(turn)), peak)
+    return max((_refined(start, frame, peak) for start in starts), key=_turned(frame, peak))
 
 
 def _constant(turn: NDArray[np.float64], frame: _Frame, peak: Tensor) -> bool:

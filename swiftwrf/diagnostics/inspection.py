@@ -15,10 +15,10 @@ from swiftwrf.data import Rssi, Snapshots, Spectra
 from swiftwrf.data.powers import has_frequent_edge
 from swiftwrf.data.splits import MAX_REPEATED, MIN_TRAINING, repeated_fraction
 from swiftwrf.diagnostics.calibration import calibrate
-from swiftwrf.diagnostics.elements import flipping_elements, phases_are_constant
+from swiftwrf.diagnostics.elements import NOISE, noisy_elements
 from swiftwrf.diagnostics.frames import MIN_CLEAR_POSITIONS, FrameReport, check_frames
 from swiftwrf.diagnostics.path_loss import check_path_loss
-from swiftwrf.errors import InputError, listed, ranges
+from swiftwrf.errors import InputError, listed
 from swiftwrf.positions import distance
 from swiftwrf.rssi import estimate_offsets
 from swiftwrf.runtime.validation import checked
@@ -109,6 +109,9 @@ def inspect(
         _check_snapshots(snapshots, findings)
     _check_spectra(spectra, findings)
     if _check_peaks(spectra, findings, snapshots, beamformer) != "explained" and snapshots is not None:
+        if noise := noisy_elements(snapshots, snapshots.away):
+            text = NOISE.format(listed=", ".join(map(str, noise)), option=" ".join(map(str, noise)))
+            findings.warn(f"E{text[1:]}.", noisy_elements=noise)
         _check_calibration(snapshots, findings)
     return findings
 
@@ -222,6 +225,13 @@ def _check_snapshots(data: Snapshots, findings: Findings) -> None:
         findings.warn(
             "Elements are more than half a wavelength apart, so spectra have several peaks for one direction."
         )
+    near = float((data.away.norm(dim=1) < data.array.far_field_m).double().mean())
+    if near > 0:
+        findings.add(
+            f"{near:.0%} of the positions are nearer than 2 D^2 / wavelength = {data.array.far_field_m:.2g} m, so waves are "
+            "curved over the array; frames and calibration are checked with distances.",
+            near_field_share=near,
+        )
     if data.time is not None and len(data) > 1:
         step = data.time.diff()
         findings.add(
@@ -268,7 +278,7 @@ def _check_peaks(
             f"{MIN_CLEAR_POSITIONS} positions with line of sight."
         )
         return "unknown"
-    frame, text = _error(data, report, snapshots) or _without_error(report)
+    frame, text = _error(data, report) or _without_error(report)
     if frame != "explained":
         _add_behind(data, report, findings)
     linear = data.array is not None and data.array.axis is not None
@@ -287,20 +297,12 @@ def _check_peaks(
     return frame
 
 
-def _error(data: Spectra, report: FrameReport, snapshots: Snapshots | None) -> tuple[Frame, str] | None:
+def _error(data: Spectra, report: FrameReport) -> tuple[Frame, str] | None:
     """Return the error that explains the peaks, in words, or None."""
     if not report.fits and (filled := _normalised(data.position)):
         return "explained", f". All coordinates fill {filled} exactly, so positions look normalised; give metres"
     if report.explanations:
         return "explained", f". That would fit if {'; or if '.join(report.explanations)}"
-    if snapshots is not None and (flipping := flipping_elements(snapshots)):
-        elements = f"{'element' if len(flipping) == 1 else 'elements'} {ranges(flipping)}"
-        return "explained", f". The phase of {elements} jumps by half a turn from measurement to measurement"
-    if snapshots is not None and phases_are_constant(snapshots):
-        return "explained", (
-            ". Phases between elements hardly depend on the position: the delay to each element may be missing in them, or "
-            "the elements may be another axis"
-        )
     if report.turn_deg:
         angle = sum(a * a for a in report.turn_deg) ** 0.5
         axis = ", ".join(f"{a / angle:.2f}" for a in report.turn_deg)
@@ -327,12 +329,12 @@ def _without_error(report: FrameReport) -> tuple[Frame, str]:
         )
     if report.follows:
         return "in part", (
-            ". They follow it at a part of the positions, and no other frame that was tried explains more: elsewhere "
-            "reflections are stronger"
+            f". They follow it in part: one frame reaches {report.limit_deg:.0f} degrees with this array, and "
+            f"{report.elsewhere:.0%} of the peaks are elsewhere. The rest is unexplained, e.g. reflections or wrong labels"
         )
     return "undecided", (
-        " and do not follow it in any frame that was tried: reflections are stronger, or the elements' phases are not "
-        "calibrated"
+        " and do not follow it in any frame that was tried: unexplained, e.g. reflections are stronger, or the elements' "
+        "phases are not calibrated"
     )
 
 

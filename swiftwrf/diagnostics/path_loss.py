@@ -17,7 +17,17 @@ from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING
-from swiftwrf.diagnostics.frames import MIRRORS, SWAPS, UNITS, best_explanations, best_offset, mirror
+from swiftwrf.diagnostics.frames import (
+    MIRRORS,
+    SWAPS,
+    UNITS,
+    best_explanations,
+    best_offset,
+    delay,
+    earlier,
+    mirror,
+    shifts,
+)
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, log_distance
 
 MIN_EXPLAINED = 0.25  # of the variance, by an error that is named
@@ -60,16 +70,20 @@ def check_path_loss(data: Rssi) -> PathLossReport | None:
         return None
     model = fit_path_loss(log_distance(data.transmitter_position, data.receiver_position), data.rssi_dbm, shared=True)
     report = PathLossReport(_explained(data.transmitter_position, data), float(model.level), float(-model.slope / 10))
-    data = _some_rows(data, 2000)
     data = data.columns(data.detected.sum(dim=0).argsort(descending=True, stable=True)[:20].tolist())
-    place = data.transmitter_position
+    walk, rows = data, torch.linspace(0, len(data) - 1, min(2000, len(data))).round().long()
+    data, place = data.subset(rows), data.transmitter_position[rows]
     found = {meaning: _explained(other, data) for meaning, other in _others(place)}
-    best = max(found.values(), default=0.0)
-    found |= {
+    fitted = {
         f"{axis} of the positions counts from the other side ({axis} = {offset:.1f} - {axis})": value
         for axis, offset, value in _mirrors(place, data)
-        if value >= best + TIE
     }
+    delays = {late: _explained(earlier(walk.transmitter_position, late)[rows], data) for late in shifts(len(walk))}
+    if delays:
+        late = max(delays, key=delays.__getitem__)
+        fitted[delay(late, walk.time)] = delays[late]
+    best = max(found.values(), default=0.0)
+    found |= {meaning: value for meaning, value in fitted.items() if value >= best + TIE}
     best, names = best_explanations(found, TIE)
     declared, attainable = _explained(place, data), _attainable(data)
     report = replace(report, attainable=attainable)

@@ -114,6 +114,56 @@ def image_axes(seed):
     return replace(data, position=data.position * torch.tensor([1.0, -1.0, 1.0]) + torch.tensor([0.0, top, 0.0]))
 
 
+def walk(seed: int, n: int = 120) -> Snapshots:
+    """A scene whose positions lie along a walk, 0.2 s apart."""
+    data = scene(seed, n=n)
+    draw = torch.Generator().manual_seed(2000 + seed)
+    time = torch.arange(n, dtype=torch.float64)
+    low, high = data.position.amin(dim=0), data.position.amax(dim=0)
+    rate, start = 0.05 + 0.1 * torch.rand(3, generator=draw), 6 * torch.rand(3, generator=draw)
+    position = low + (high - low) * (0.5 + 0.5 * torch.sin(time[:, None] * rate + start))
+    return received(replace(data, position=position, time=0.2 * time), seed)
+
+
+def delayed(seed):
+    data, late = walk(seed), (-9, -4, 3, 6, 11)[seed % 5]
+    return replace(data, position=data.position[(torch.arange(len(data)) + late).clamp(0, len(data) - 1)])
+
+
+def by_text(seed):
+    data = scene(seed)
+    return replace(data, position=data.position[sorted(range(len(data)), key=str)])
+
+
+def carrier_of_another_band(seed):
+    data, factor = scene(seed), (3.0, 2.8, 0.45, 1.3, 0.8)[seed % 5]
+    return replace(data, array=PlanarArray(data.array.element, data.array.wavelength * factor))
+
+
+def sampled_in_turn(seed):
+    """Carrier offsets turn the phases from element to element, by another angle in each packet."""
+    data = scene(seed, count=4)
+    draw = torch.Generator().manual_seed(3000 + seed)
+    slope = (0.4 + 0.1 * (seed % 5)) * torch.randn(len(data), 4, 1, generator=draw)
+    phase = slope * torch.arange(data.channel.shape[2])
+    return replace(data, channel=data.channel * torch.polar(torch.ones_like(phase), phase))
+
+
+def exchanged(seed, moved=2, shape=None):
+    """Cables of some elements exchanged, in a cycle."""
+    data = scene(seed, shape=shape)
+    elements = torch.randperm(data.channel.shape[2], generator=torch.Generator().manual_seed(seed))[:moved]
+    order = torch.arange(data.channel.shape[2])
+    order[elements] = elements.roll(1)
+    return replace(data, channel=data.channel[..., order])
+
+
+def random_order(seed, shape=(4, 4)):
+    data = scene(seed, shape=shape)
+    order = torch.randperm(data.channel.shape[2], generator=torch.Generator().manual_seed(seed))
+    return replace(data, channel=data.channel[..., order])
+
+
 def narrow(seed):
     data = scene(seed, n=4000)
     ahead = torch.nn.functional.normalize(data.direction.mean(dim=0), dim=0)
@@ -157,7 +207,26 @@ CAUSES = {  # measurements, and the statement of the cause of an error
     "millimetres": (lambda s: replace(d := scene(s), position=1000 * d.position), "the positions are in millimetres"),
     "image axes": (image_axes, "y of the positions counts from the other side"),
     "one direction": (narrow, "nearly one direction"),
+    "positions late or early": (delayed, "differ in time"),
+    "rows in reverse order": (lambda s: replace(d := scene(s), position=d.position.flip(0)), "in reverse order"),
+    "rows in the order of text": (by_text, "in the order of text"),
+    "carrier of another band": (carrier_of_another_band, "the carrier is about"),
+    "elements in turn": (sampled_in_turn, "another slope in each snapshot"),
+    "two cables": (exchanged, "are exchanged"),
+    "three cables": (lambda seed: exchanged(seed, 3, (3, 4)), "are exchanged"),
+    "random order": (random_order, "are exchanged"),
+    "random order on a line": (lambda seed: random_order(seed, (1, 8)), "are exchanged"),
+    "four cables of a line": (lambda seed: exchanged(seed, 4, (1, 8)), "are exchanged"),
 }
+OF_INSPECTION = (  # statements that are not those of an error of frames, elements or labels
+    "nothing",
+    "a line",
+    "behind",
+    "no line of sight",
+    "normalised positions",
+    "uncalibrated",
+    "one direction",
+)
 ERRORS = [says for name, (_, says) in CAUSES.items() if name not in ("nothing", "a line", "behind", "no line of sight")]
 ALSO = {"tilted": "The array is not calibrated"}  # its calibration includes the rotation
 
@@ -173,32 +242,14 @@ def check(name: str, seed: int) -> None:
 
 @pytest.mark.parametrize("name", CAUSES)
 def test_true_cause_is_stated_and_no_other(name):
-    for seed in range(5):
-        check(name, seed)
+    check(name, list(CAUSES).index(name) % 5)
 
 
 @pytest.mark.fuzz
 @pytest.mark.parametrize("name", CAUSES)
 def test_true_cause_is_stated_in_further_scenes(name):
-    for seed in range(5, 25):
+    for seed in range(25):
         check(name, seed)
-
-
-def random_order(seed):
-    data = scene(seed, shape=(4, 4))
-    return replace(data, channel=data.channel[..., torch.randperm(16, generator=torch.Generator().manual_seed(seed))])
-
-
-def random_order_on_a_line(seed):
-    data = scene(seed, shape=(1, 8))
-    return replace(data, channel=data.channel[..., torch.randperm(8, generator=torch.Generator().manual_seed(seed))])
-
-
-def two_exchanged(seed):
-    data = scene(seed, shape=(3, 4))
-    order = torch.arange(12)
-    order[[2, 7]] = order[[7, 2]]
-    return replace(data, channel=data.channel[..., order])
 
 
 def jumping(seed, turns):
@@ -221,15 +272,40 @@ def standardised(seed):
     return replace(data, position=(data.position - data.position.mean(dim=0)) / data.position.std(dim=0))
 
 
+def positions_of_other_rows(seed):
+    data = scene(seed)
+    return replace(
+        data, position=data.position[torch.randperm(len(data), generator=torch.Generator().manual_seed(seed))]
+    )
+
+
+def labels_mixed_in_part(seed):
+    data = scene(seed)
+    order = torch.arange(len(data))
+    order[:40] = order[:40].roll(1 + seed % 20)
+    return replace(data, position=data.position[order])
+
+
+def moved_and_turned(seed):
+    data = tilted(seed)
+    return replace(data, position=data.position @ torch.tensor([[0.8, 0.6, 0], [-0.6, 0.8, 0], [0, 0, 1.0]]).double())
+
+
+def stretched(seed):
+    return replace(d := scene(seed), position=d.position * torch.tensor([0.6, 1.5, 1.0]))
+
+
 UNKNOWN = {  # errors that no statement names
-    "random order": random_order,
-    "random order on a line": random_order_on_a_line,
-    "two elements exchanged": two_exchanged,
     "quarter turns": lambda seed: jumping(seed, 4),
     "boards without common phase": lambda seed: jumping(seed, 360),
     "uncalibrated line": uncalibrated_line,
     "standardised positions": standardised,
-    "positions of other rows": lambda s: replace(d := scene(s), position=d.position.flip(0)),
+    "positions of other rows": lambda s: replace(
+        d := scene(s), position=d.position[torch.randperm(len(d), generator=torch.Generator().manual_seed(s))]
+    ),
+    "labels mixed in part": labels_mixed_in_part,
+    "stretched": stretched,
+    "turned about the origin and tilted": moved_and_turned,
     "shifted": lambda s: replace(d := scene(s), position=d.position + torch.tensor([2.0, -3.0, 0.5])),
 }
 
@@ -244,12 +320,11 @@ def check_unknown(name: str, seed: int) -> None:
 
 @pytest.mark.parametrize("name", UNKNOWN)
 def test_no_cause_is_stated_of_other_errors(name):
-    for seed in range(31, 34):
-        check_unknown(name, seed)
+    check_unknown(name, 31 + list(UNKNOWN).index(name))
 
 
 @pytest.mark.fuzz
 @pytest.mark.parametrize("name", UNKNOWN)
 def test_no_cause_is_stated_of_other_errors_in_further_scenes(name):
-    for seed in range(34, 50):
+    for seed in range(31, 70):
         check_unknown(name, seed)

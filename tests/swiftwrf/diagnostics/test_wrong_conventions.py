@@ -12,6 +12,7 @@ from samples import FACING_X, snapshots, survey_rows, write_deepmimo, write_snap
 from scipy.spatial.transform import Rotation
 
 from swiftwrf import AngularGrid, InputError, load_rssi, load_snapshots, load_spectra, rssi_room
+from swiftwrf.data import Rssi
 from swiftwrf.data.store import Store
 from swiftwrf.diagnostics.inspection import inspect
 from swiftwrf.diagnostics.path_loss import check_path_loss
@@ -211,3 +212,18 @@ def test_axes_along_which_all_positions_are_equal_are_not_swapped():
     mirrored = replace(flat, transmitter_position=11.0 - flat.transmitter_position)
     report = check_path_loss(mirrored)
     assert "z" not in report.explanation
+
+
+@pytest.mark.parametrize(("late", "words"), [(0, ""), (8, "4 s (8 rows) late"), (-5, "2.5 s (5 rows) early")])
+def test_a_delay_between_positions_and_rssi_of_a_walk_is_named(late, words):
+    time = torch.arange(300, dtype=torch.float64)
+    place = torch.stack([5 + 4 * torch.sin(0.11 * time), 6 + 5 * torch.cos(0.07 * time), 1.2 + 0 * time], dim=1)
+    receivers = torch.tensor(
+        [[1.0, 1.0, 2.0], [9.0, 2.0, 2.0], [8.0, 11.0, 2.0], [1.0, 10.0, 2.0]], dtype=torch.float64
+    )
+    noise = 3 * torch.randn(300, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    rssi = -40 - 25 * torch.cdist(place, receivers).log10() + noise
+    walk = Rssi(rssi, place.roll(-late, 0), receiver_position=receivers, time=0.5 * time)
+    explanation = check_path_loss(walk).explanation
+    assert explanation.endswith(words)
+    assert bool(explanation) == bool(words)

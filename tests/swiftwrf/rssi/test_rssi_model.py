@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 
 from swiftwrf import InputError, Rssi, RssiModel, fit_rssi, load, rssi_room
 from swiftwrf.gp import Kernel
-from swiftwrf.rssi import RssiConfig, RssiPaperModel
+from swiftwrf.rssi import RssiConfig, RssiPaperModel, compare
 from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
 from swiftwrf.rssi.mixing import mixing_weights
 from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, harmonics, log_distance
@@ -23,6 +23,16 @@ from swiftwrf.runtime.threads import threads_kept
 KERNEL = Kernel(4.0, 1.0, matern12_weight=0.6, noise=1.0)
 FIELD_DB, NOISE_DB, PATH_LOSS_STD_DB = 3.0, 2.0, 30.0
 CPU, FIRST = torch.device("cpu"), slice(0, 1)
+
+
+def test_errors_by_the_number_of_training_rows():
+    room = rssi_room(n=200, seed=1)
+    found = compare(room, receivers=["6"], fewer=(0.01, 0.25, 0.5)).by_rows
+    assert list(found.columns) == ["swiftwrf", "knn"]
+    assert list(found.index) == [40, 80, 160]  # 2 rows determine nothing
+    errors = compare(room, receivers=["6"]).summary()["mean"]
+    assert found.loc[160].to_dict() == pytest.approx(errors[["swiftwrf", "knn"]].to_dict())
+    assert compare(room, receivers=["6"]).by_rows.empty
 
 
 def path_loss_only(n=60, noise=0.0, level=-50.0, exponent=2.0, seed=0):

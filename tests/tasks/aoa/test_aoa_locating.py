@@ -170,14 +170,16 @@ def test_a_better_method_that_is_not_recommended_has_a_reason(closed_form, tmp_p
     choice = mix_of(tmp_path / "run")["estimator_choice"]
     assert LOCATED not in choice["held_out_deg"]
     assert choice["better"][LOCATED] == "no planes were found without the held-out spectra"
-    assert f"{LOCATED} has 0." in (tmp_path / "run" / "report.html").read_text()
+    assert (
+        f"<code><span>{LOCATED.split()[0]}</span> <span>{LOCATED.split()[1]}</span></code> has 0."
+        in (tmp_path / "run" / "report.html").read_text()
+    )
 
 
 def test_the_report_shows_where_it_was(finished):
     html = (finished / "report.html").read_text()
     assert "Where was it?" in html
-    assert f"Take {LOCATOR} on this data" in html
-    assert f"tasks.predict {finished} SOURCE" in html.replace("<span>", "").replace("</span>", "")
+    assert f'<pre tabindex="0"><code>swiftwrf predict {finished} SOURCE</code></pre>' in html
     for kind in ("located", "posteriors"):
         assert list((finished / "figures").glob(f"{kind}-mix0.6-*.csv"))
 
@@ -243,7 +245,9 @@ def test_without_array_or_planes_it_is_left_out_with_one_sentence(closed_form, t
         assert reason == "no plane explains the spectra"
     assert LOCATED not in mix["estimator_choice"]["held_out_deg"]
     assert not (tmp_path / "run" / "positions.csv").exists()
-    assert "Where was it?" in (tmp_path / "run" / "report.html").read_text()
+    html = (tmp_path / "run" / "report.html").read_text()
+    assert "Where was it?" not in html
+    assert reason in html
 
 
 def test_fractions_and_repeats_share_the_search_in_all_spectra(closed_form, tmp_path):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import replace
 from unittest import mock
 
@@ -156,11 +155,11 @@ def test_whole_run(finished):
 
 def test_the_report_shows_errors_calibration_and_posteriors(finished):
     page = (finished / "report.html").read_text()
-    assert "the best nearest-neighbour fingerprinting" in page
+    assert "best nearest-neighbour fingerprinting" in page
     assert "What this does not show" in page
-    assert f"tasks.predict {finished} SOURCE" in re.sub("</?span>", "", page)
+    assert f"swiftwrf predict {finished} SOURCE" in page
     drawn = {file.stem.partition("-")[0] for file in (finished / "figures").glob("*.svg")}
-    assert drawn == {"summary", "calibration", "studies", "posteriors"}
+    assert drawn == {"summary", "errors", "calibration", "studies", "posteriors"}
     with np.load(finished / "maps.npz") as maps:
         assert maps["density"].shape == (6, len(maps["y"]), len(maps["x"]))
         assert np.nanmax(maps["density"], axis=(1, 2)) == pytest.approx(1)

@@ -157,6 +157,13 @@ def run(*arguments):
     return command_line("tasks.rssi", experiment.RssiTaskConfig, experiment.run, [str(a) for a in arguments])
 
 
+def test_a_floor_plan_whose_pixels_are_the_positions_needs_no_extent(tmp_path):
+    Image.new("RGB", (400, 300), "white").save(tmp_path / "plan.png")
+    config = SimpleNamespace(floor_plan=str(tmp_path / "plan.png"), floor_extent=None)
+    data = replace(rssi_room(n=12), plan_scale=20.0)
+    assert experiment._read_floor_plan(config, data)["plan_extent"].tolist() == [0, 20, -15, 0]
+
+
 def test_whole_run(small, tmp_path, monkeypatch):
     monkeypatch.setattr(Blend, "config_type", with_defaults(BlendConfig(members=("knn", "mri_residual"))))
     plan = tmp_path / "plan.png"
@@ -198,11 +205,12 @@ def test_a_lone_receiver_has_one_map_and_no_average(tmp_path, capsys):
     out = tmp_path / "her 'own' run"
     assert run("--rx", "1", "--out", out) == 0
     drawn = {file.stem.partition("-")[0] for file in (out / "figures").glob("*.svg")}
-    assert drawn == {"summary", "cdf", "where", "speed"}
+    assert drawn == {"summary", "errors", "where"}
     assert list((out / "figures").glob("summary*.csv"))
     for text in (capsys.readouterr().out, unescape(re.sub("<[^>]*>", "", (out / "report.html").read_text()))):
-        assert f"python -m tasks.view {shlex.quote(str(out))}" in text
-        assert f"swiftwrf.load({str(out / 'model.safetensors')!r})" in text
+        assert f"swiftwrf view {shlex.quote(str(out))}" in text
+        assert f"swiftwrf predict {shlex.quote(str(out))} positions.csv" in text
+        assert "--split block" in text
 
 
 @pytest.mark.parametrize(
