@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "swiftwrf" / "diagnostics"))
 
@@ -19,26 +18,25 @@ from swiftwrf.diagnostics.frames import check_frames
 
 @dataclass(frozen=True)
 class Config:
-    """Numbers of scenes of each cause that has a name, and of each that has none."""
+    """Number of scenes of each cause. They are inspected for the known causes, or for errors that have no name."""
 
-    known: int = 25
-    unknown: int = 40
+    kind: Literal["known", "unknown"] = "known"
+    scenes: int = 25
 
 
 def main(asked: Config) -> None:
-    """Inspect every scene and write `results/explanations.json`."""
-    done: dict[str, Any] = {"known": {}, "unknown": {}}
-    for name, (make, expected) in diagnosis.CAUSES.items():
-        right = sum(is_right(name, make, expected, seed) for seed in range(asked.known))
-        done["known"][name] = {"scenes": asked.known, "right": right}
-        print(name, done["known"][name], flush=True)
-        write_result("explanations", done)
-    for name, make in diagnosis.UNKNOWN.items():
-        seeds = range(100, 100 + asked.unknown)
-        false = sum(any("rotation" not in cause for cause in causes(make(seed))) for seed in seeds)
-        done["unknown"][name] = {"scenes": asked.unknown, "false": false}
-        print(name, done["unknown"][name], flush=True)
-        write_result("explanations", done)
+    """Inspect every scene and write `results/explanations_KIND.json`."""
+    done: dict[str, Any] = {}
+    for name in diagnosis.CAUSES if asked.kind == "known" else diagnosis.UNKNOWN:
+        if asked.kind == "known":
+            right = sum(is_right(name, seed) for seed in range(asked.scenes))
+            done[name] = {"scenes": asked.scenes, "right": right}
+        else:
+            found = [causes(diagnosis.UNKNOWN[name](seed)) for seed in range(100, 100 + asked.scenes)]
+            false = sum(any("rotation" not in cause for cause in each) for each in found)
+            done[name] = {"scenes": asked.scenes, "false": false, "rotations": sum(map(len, found)) - false}
+        print(name, done[name], flush=True)
+        write_result(f"explanations_{asked.kind}", done)
 
 
 def causes(data: Snapshots) -> list[str]:
@@ -48,8 +46,9 @@ def causes(data: Snapshots) -> list[str]:
     return [*report.explanations, *(["constant rotation of"] if report.turn_deg else [])]
 
 
-def is_right(name: str, make: Callable[[int], Snapshots], expected: str, seed: int) -> bool:
+def is_right(name: str, seed: int) -> bool:
     """Return True if the true cause is named and no other one."""
+    make, expected = diagnosis.CAUSES[name]
     if name not in diagnosis.OF_INSPECTION:
         found = causes(make(seed))
         return bool(found) and all(expected in cause for cause in found)

@@ -40,8 +40,9 @@ def other_readings(data: Snapshots, away: Tensor) -> Iterator[tuple[str, float, 
     for name, order in _element_orders(array).items():
         yield f"the elements are given {name}", 0, replace(data, channel=channel[..., order])
     if channel.shape[1] == channel.shape[2]:
-        swapped = "the axes of elements and subcarriers are swapped: give csi.transpose(0, 2, 1)"
-        yield swapped, 0, replace(data, channel=channel.mT.contiguous())
+        remedy = "give csi.transpose(0, 2, 1), in MATLAB permute(csi, [1 3 2])"
+        swapped = replace(data, channel=channel.mT.contiguous())
+        yield f"the axes of elements and subcarriers are swapped: {remedy}", 0, swapped
     halved = PlanarArray(array.element, array.wavelength / 2)
     ambiguous = ", so directions are ambiguous" if halved.spacing_wavelengths > 0.51 else ""
     meaning = ROUND_TRIP.format(spacing=halved.spacing_wavelengths, ambiguous=ambiguous)

@@ -46,6 +46,7 @@ COST, TIE = 0.03, 0.03  # of a fitted parameter; difference of errors that are n
 MIN_POWER = 0.05  # of an error, above the declared frame, in the fraction of the power
 MIN_EXPLAINED, MIN_REACHED = 0.5, 0.8  # agreement of an error; its fraction of what the best directions reach
 REACH_GRID = AngularGrid.hemisphere(30, 120)
+MAX_ELSEWHERE = 0.3  # of the positions, whose peak is elsewhere, in one frame
 UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
 CONSTANT = (
     "phases between elements hardly depend on the position: the delay to each element may be missing in them, or the "
@@ -93,6 +94,7 @@ class FrameReport:
         chance: Chance level of the agreement.
         angle_deg: Median angle between peak and line of sight [deg].
         limit_deg: Median angle up to which this array's peaks are in one frame with the lines of sight [deg].
+        elsewhere: Fraction of the positions with a peak beyond three times that angle.
         span_deg: Median angle between the lines of sight of two positions [deg].
         peak_span_deg: Median angle between the peaks of two positions [deg].
         behind: Fraction of the lines of sight that lie behind the array. 0 for a linear array, which has no front.
@@ -106,6 +108,7 @@ class FrameReport:
     chance: float
     angle_deg: float
     limit_deg: float
+    elsewhere: float
     span_deg: float
     peak_span_deg: float
     behind: float
@@ -122,7 +125,7 @@ class FrameReport:
     @property
     def fits(self) -> bool:
         """True if the declared frame explains most peaks, and no other frame does clearly better."""
-        return self.follows and self.angle_deg <= self.limit_deg
+        return self.follows and self.angle_deg <= self.limit_deg and self.elsewhere <= MAX_ELSEWHERE
 
     @property
     def narrow(self) -> bool:
@@ -183,12 +186,14 @@ class _Frame:
 
 @dataclass(frozen=True, eq=False)
 class _Hypothesis:
-    """A possible error and its evidence (n,): at most 1 at each position, 0 by chance.
+    """A possible error and its evidence (n,): at most 1 at each position, 0 for random phases.
 
     `free` counts the parameters that were fitted. `seen` are the snapshots as they would be read, for what they can reach.
+    `chance` is the mean evidence for the direct paths of other positions.
     """
 
     evidence: Tensor
+    chance: float
     free: float = 0
     seen: Snapshots | None = None
     turn: NDArray[np.float64] | None = None
@@ -224,30 +229,27 @@ def check_frames(spectra: Spectra, snapshots: Snapshots | None = None, beamforme
     peak, direction = frame.peaks(spectra.store[rows], spectra.grid), frame.direction()
     agreement, chance = _agreement(direction, peak)
     seen = None if snapshots is None else snapshots.subset(rows)
-    # no parameter is fitted for the declared frame
-    declared = _Hypothesis(_evidence(frame.away(), frame, peak, seen), seen=seen)
+    declared = float(_evidence(frame.away(), frame, peak, seen).mean())
     time = None if snapshots is None else snapshots.time
     tried: dict[str, _Hypothesis] = {}
     for name, found in _hypotheses(spectra, rows, frame, peak, seen, time):
         tried[name] = max(found, tried.get(name, found), key=lambda each: each.score)
     best, names = best_explanations({name: each.score for name, each in tried.items()}, TIE)
-    gain = best - declared.score
-    explained = [
-        name
-        for name in names
-        if gain >= (MIN_EVIDENCE if seen is None else MIN_POWER) and _reaches(tried[name], frame, declared)
-    ]
+    is_clear = best - declared >= (MIN_EVIDENCE if seen is None else MIN_POWER)
+    explained = [name for name in names if is_clear and _reaches(tried[name])]
     turn = next((tried[name].turn for name in explained if tried[name].turn is not None), None)
+    angle_deg, limit_deg = _nearest(direction, peak).rad2deg(), _limit_deg(spectra)
     return FrameReport(
         agreement=agreement,
         chance=chance,
-        angle_deg=math.degrees(float(_nearest(direction, peak).median())),
-        limit_deg=_limit_deg(spectra),
+        angle_deg=float(angle_deg.median()),
+        limit_deg=limit_deg,
+        elsewhere=float((angle_deg > 3 * limit_deg).double().mean()),
         span_deg=_span_deg(direction),
         peak_span_deg=_span_deg(peak[:, 0]),
         behind=0.0 if frame.linear else float((frame.away()[:, 2] < 0).double().mean()),
         explanations=tuple(name for name in explained if tried[name].turn is None),
-        explained=best if explained else declared.score,
+        explained=best if explained else declared,
         turn_deg=None if turn is None else tuple(np.degrees(turn).tolist()),
         positions=len(rows),
     )
@@ -264,25 +266,28 @@ def _evidence(away: Tensor, frame: _Frame, peak: Tensor, seen: Snapshots | None)
     return _kernel(_nearest(frame.folded(_unit(away)), peak)) if seen is None else evidence(seen, away)
 
 
-def _reaches(found: _Hypothesis, frame: _Frame, declared: _Hypothesis) -> bool:
-    """Return True if a hypothesis explains nearly what the array can reach, and far more than pairs by chance."""
+def _reaches(found: _Hypothesis) -> bool:
+    """Return True if a hypothesis explains nearly what the array can reach, and more than by chance."""
+    mean = float(found.evidence.mean())
+    if mean - found.chance < MIN_EVIDENCE:
+        return False
     if found.seen is None:
-        return float(found.evidence.mean()) >= MIN_EXPLAINED
+        return mean >= MIN_EXPLAINED + 0.1 * found.free
     share = found.seen.array.spectrum(found.seen.channel, REACH_GRID, PHASE).square().amax(dim=(1, 2))
     chance = 1 / found.seen.channel.shape[2]
-    reach = float(excess(share, chance).mean())
-    return float(found.evidence.mean()) >= max(0.45 + chance, MIN_REACHED * reach)
+    return mean >= max(0.45 + chance, MIN_REACHED * float(excess(share, chance).mean()))
 
 
 def _hypotheses(
     spectra: Spectra, rows: Tensor, frame: _Frame, peak: Tensor, seen: Snapshots | None, time: Tensor | None
 ) -> Iterator[tuple[str, _Hypothesis]]:
     """Yield each error in words and its evidence at some rows of the spectra."""
+    away, other_rows = frame.away(), torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))
 
-    def at(away: Tensor, free: float = 0) -> _Hypothesis:
-        return _Hypothesis(_evidence(away, frame, peak, seen), free, seen)
+    def at(away: Tensor, free: float = 0, seen: Snapshots | None = seen, peak: Tensor = peak) -> _Hypothesis:
+        same, other = (_evidence(each, frame, peak, seen) for each in (away, away[other_rows]))
+        return _Hypothesis(same, float(other.mean()), free, seen)
 
-    away = frame.away()
     for meaning, other in _frames(frame):
         yield meaning, at(other.away())
     for meanings, matrix in AZIMUTH_ERRORS.items():
@@ -301,10 +306,11 @@ def _hypotheses(
         found = at(away @ _matrix(turn), free=3)
         yield "a constant rotation", replace(found, turn=turn)
     if seen is None:
-        yield from _grids(spectra, rows, frame)
+        for meaning, peak_there in _grids(spectra, rows, frame):
+            yield meaning, at(away, peak=peak_there)
         return
     for meaning, fitted, reading in other_readings(seen, away):
-        yield meaning, _Hypothesis(evidence(reading, away), fitted, reading)
+        yield meaning, at(away, fitted, reading)
     flipping, power = flipping_elements(seen, away)
     elements = f"{'element' if len(flipping) == 1 else 'elements'} {ranges(flipping)}, counted from 0,"
     for meaning, found in {
@@ -313,7 +319,7 @@ def _hypotheses(
         SLOPE: sloped(seen, away),
     }.items():
         # common phases fit channels whose phases hardly differ, too
-        yield meaning, _Hypothesis(found, free=2 if meaning == CONSTANT else 0, seen=seen)
+        yield meaning, _Hypothesis(found, 0.0, 2 if meaning == CONSTANT else 0, seen)
 
 
 def best_explanations(score: Mapping[str, float], tie: float) -> tuple[float, list[str]]:
@@ -375,25 +381,19 @@ def _span_deg(direction: Tensor) -> float:
     return float((direction @ direction.T)[first, second].clamp(-1, 1).arccos().rad2deg().median())
 
 
-def _grids(spectra: Spectra, rows: Tensor, frame: _Frame) -> Iterator[tuple[str, _Hypothesis]]:
-    """Yield spectra on the other grids that they may have been computed on."""
-    values, grid, direction = spectra.store[rows], spectra.grid, frame.direction()
+def _grids(spectra: Spectra, rows: Tensor, frame: _Frame) -> Iterator[tuple[str, Tensor]]:
+    """Yield each error of the rows of spectra, and the peaks (n, P, 3) without it."""
+    values, grid = spectra.store[rows], spectra.grid
     if not frame.linear:
-        peak = frame.peaks(values.flip(1), grid)
-        yield (
-            "rows of the spectra run from the zenith down; row 0 must be the lowest elevation",
-            _Hypothesis(_kernel(_nearest(direction, peak))),
+        zenith = "rows of the spectra run from the zenith down; row 0 must be the lowest elevation"
+        yield zenith, frame.peaks(values.flip(1), grid)
+    half = grid.n_elevation // 2
+    upper, lower = values[:, half:], values.flip(1)[:, half:]
+    if half >= 2 and float(torch.corrcoef(torch.stack([upper.flatten(), lower.flatten()]))[0, 1]) > 0.95:
+        sphere = (
+            f"rows are elevations of -90 to 90 degrees, as their halves mirror each other: give spectrum[:, {half}:]"
         )
-    upper = values[:, grid.n_elevation // 2 :]
-    lower = values.flip(1)[:, grid.n_elevation // 2 :]
-    likeness = torch.corrcoef(torch.stack([upper.flatten(), lower.flatten()]))[0, 1]
-    if grid.n_elevation >= 4 and float(likeness) > 0.95:
-        peak = frame.peaks(upper, AngularGrid.hemisphere(upper.shape[1], grid.n_azimuth))
-        yield (
-            "rows of the spectra, whose halves mirror each other, are elevations of -90 to 90 degrees; give "
-            f"spectrum[:, {grid.n_elevation // 2}:]",
-            _Hypothesis(_kernel(_nearest(direction, peak))),
-        )
+        yield sphere, frame.peaks(upper, AngularGrid.hemisphere(len(upper[0]), grid.n_azimuth))
 
 
 def _labels(

@@ -329,8 +329,8 @@ def _without_error(report: FrameReport) -> tuple[Frame, str]:
         )
     if report.follows:
         return "in part", (
-            f". They follow it in part; one frame reaches {report.limit_deg:.0f} degrees with this array, and the rest is "
-            "unexplained: reflections, wrong labels or an error that was not tried"
+            f". They follow it in part: one frame reaches {report.limit_deg:.0f} degrees with this array, and "
+            f"{report.elsewhere:.0%} of the peaks are elsewhere. The rest is unexplained, e.g. reflections or wrong labels"
         )
     return "undecided", (
         " and do not follow it in any frame that was tried: unexplained, e.g. reflections are stronger, or the elements' "

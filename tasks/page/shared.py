@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pandas import DataFrame
 
@@ -35,7 +36,7 @@ def errors_section(
     quantity: str,
     caption: str,
     paragraphs: Sequence[str] = (),
-    plots: Sequence[Plot] = (),
+    panels: Sequence[Figure] = (),
 ) -> Section:
     """Return the table of all methods, and figures of those of the short table.
 
@@ -47,7 +48,7 @@ def errors_section(
         quantity: Name of the errors.
         caption: What the cells beside the errors mean.
         paragraphs: Sentences before the table.
-        plots: Further figures.
+        panels: Errors against the number of measured positions, if they are known.
     """
     unit, short = answer.unit, [one for block in answer.short() for one in block]
     further = list(dict.fromkeys(column for one in answer.methods for column in one.cells))
@@ -56,13 +57,12 @@ def errors_section(
             one.name,
             with_interval(one.error),
             number(one.error["p90"]),
-            number(one.error["mean"]),
             *(one.cells.get(column, "") for column in further),
             " + ".join(number(seconds) for seconds in one.seconds),
         ]
         for one in answer.methods
     ]
-    columns = ["method", f"median [{unit}]", f"90 % below [{unit}]", f"mean [{unit}]", *further, "fit + apply [s]"]
+    columns = ["method", f"median [{unit}]", f"90 % below [{unit}]", *further, "fit + apply [s]"]
     caption = f"{quantity.capitalize()} on the test rows; medians with their 95 % intervals. {caption}".strip()
     values = {"error": [interval(one.error) for one in short]}
     medians = [one.error["median"] for one in short if one.error["n"]]
@@ -74,15 +74,15 @@ def errors_section(
     limit = max((float(part.quantile(0.9)) for part in groups.values() if len(part)), default=1.0)
     shown = dict(list(groups.items())[:MAX_CURVES])
     figures.cdf(axes, palette, shown, f"{quantity} [{unit}]", max(limit, 1e-3))
-    cost, axes = figures.panel(4.6, 3.2)
+    cost, axes = figures.panel(5.6, 3.2)
     points = {one.name: (sum(one.seconds), one.error["median"]) for one in short if one.error["n"]}
     figures.speed(axes, palette, points, "seconds to fit and apply", f"median {quantity} [{unit}]")
     text = (
-        "Medians with 95 % intervals; the distribution of the errors, with a thin line at the median; and the median "
-        "against the time that it takes."
+        "Medians with 95 % intervals; the distribution of the errors, with a thin line at the median; the median against "
+        f"the time that it takes{'; and the error against the number of measured positions' if panels else ''}."
     )
-    plot = Plot(f"errors-{name}", [dots, figure, cost], text, errors)
-    return Section("", list(paragraphs), [Table(columns, rows, caption, frozenset([answer.chosen]))], [plot, *plots])
+    plot = Plot(f"errors-{name}", [dots, figure, cost, *panels], text, errors)
+    return Section("", list(paragraphs), [Table(columns, rows, caption, frozenset([answer.chosen]))], [plot])
 
 
 def difference(errors: DataFrame, own: str, other: str) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from swiftwrf import Rssi, load, rssi_room
+from swiftwrf import InputError, Rssi, load, rssi_room
 from swiftwrf.data.files import sha256
 from swiftwrf.metrics import summary
 from swiftwrf.rssi import LEVEL, PairModel, RssiComparison, RssiModel, RssiPredictor, compare
@@ -40,9 +40,9 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         InputError: A configuration that the data cannot meet or that contradicts itself.
     """
     device = choose_device("cpu" if config.device == "auto" else config.device)
-    plan = _read_floor_plan(config)
     whole = _load(config)
     data = whole.receivers(config.rx)
+    plan = _read_floor_plan(config, data)
     for note in data.notes:
         console.print(f"{data.name}: {note}")
     names, left_out = compared(data, config.also)
@@ -100,12 +100,15 @@ def _load(config: RssiTaskConfig) -> Rssi:
     return rssi_room(seed=config.seed) if measured is None else measured
 
 
-def _read_floor_plan(config: RssiTaskConfig) -> dict[str, Any]:
+def _read_floor_plan(config: RssiTaskConfig, data: Rssi) -> dict[str, Any]:
     """Return the floor plan and its corners as maps.npz stores them, or nothing if there is no plan."""
-    if config.floor_plan is None or config.floor_extent is None:
+    if config.floor_plan is None:
         return {}
+    if config.floor_extent is None and data.plan_scale is None:
+        raise InputError(f"--floor-plan needs --floor-extent x0 x1 y0 y1 [m], since {data.name} is not in its pixels")
     pixels = read_pixels(config.floor_plan, f"--floor-plan {config.floor_plan}")
-    return {"plan": pixels, "plan_extent": np.array(config.floor_extent)}
+    height, width = (side / (data.plan_scale or 1.0) for side in pixels.shape[:2])
+    return {"plan": pixels, "plan_extent": np.array(config.floor_extent or (0.0, width, -height, 0.0))}
 
 
 def _metrics(config: RssiTaskConfig, data: Rssi, result: RssiComparison, model: RssiModel | PairModel) -> RssiMetrics:

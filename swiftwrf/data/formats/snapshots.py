@@ -150,7 +150,7 @@ def _channel(file: Path, csi: NDArray[np.generic], n: int, elements: int) -> Ten
     if csi.ndim == 3 and csi.shape[0] == n and csi.shape[2] != elements and csi.shape[1] == elements:
         raise InputError(
             f"{file}: csi has shape {csi.shape} with its {elements} elements in the middle; they must be the last axis, so "
-            "give csi.transpose(0, 2, 1)"
+            "give csi.transpose(0, 2, 1), in MATLAB permute(csi, [1 3 2])"
         )
     if csi.ndim not in (2, 3) or csi.shape[0] != n or csi.shape[-1] != elements or 0 in csi.shape:
         raise InputError(

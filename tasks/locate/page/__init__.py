@@ -21,8 +21,8 @@ def page(runs: list[LocateRecords]) -> Page:
     """Return the page of these runs."""
     terms = {name: label.meaning for name, label in labels(LOCALIZERS, LABELS).items()}
     sections = [
-        sections_of("Where was it?", runs, lambda run: Section("", plots=[_posteriors(run)])),
-        sections_of("Errors", runs, lambda run: _errors(run, several=len(runs) > 1), terms),
+        sections_of("Where was it?", runs, lambda run: _posteriors(run, several=len(runs) > 1)),
+        sections_of("Errors", runs, _errors, terms),
         sections_of("How sure is it?", runs, lambda run: Section("", plots=[_calibration(run), *_studies(run)])),
         _limits(runs[0]),
     ]
@@ -59,7 +59,7 @@ def _comparison(runs: list[LocateRecords]) -> Summary:
     return Summary([], [plot], sentences, steps, table=table)
 
 
-def _errors(run: LocateRecords, several: bool) -> Section:
+def _errors(run: LocateRecords) -> Section:
     n_undetected = run.metrics["n_undetected"]
     return errors_section(
         answer(run),
@@ -69,7 +69,6 @@ def _errors(run: LocateRecords, several: bool) -> Section:
         quantity="position error",
         caption=f"Column of {OWN}: difference of the mean errors on the same rows, with its 95 % bootstrap interval.",
         paragraphs=[f"Test rows that no receiver detected are left out: {n_undetected}."] if n_undetected else [],
-        plots=[_overview(run, f"overview-{run.file_name}")] if several else [],
     )
 
 
@@ -119,13 +118,14 @@ def _studies(run: LocateRecords) -> list[Plot]:
     return [Plot(f"studies-{run.file_name}", drawing.studies(rows, receivers), caption, data)]
 
 
-def _posteriors(run: LocateRecords) -> Plot:
+def _posteriors(run: LocateRecords, several: bool) -> Section:
     caption = (
         "Posteriors of six test rows in plan, from the smallest error to the largest, each relative to its largest mass. "
         "Cross: true position; dot: estimate; circle: 80 % credible region; small dots: training positions."
     )
     maps = run.arrays("maps")
-    return Plot(f"posteriors-{run.file_name}", drawing.posteriors(maps), caption, drawing.posterior_cells(maps))
+    plot = Plot(f"posteriors-{run.file_name}", drawing.posteriors(maps), caption, drawing.posterior_cells(maps))
+    return Section("", plots=[plot, *([_overview(run, f"overview-{run.file_name}")] if several else [])])
 
 
 def _limits(run: LocateRecords) -> Section:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from swiftwrf.choices import RSSI_PREDICTORS
 from tasks.answer import NextStep
 from tasks.environment import command
@@ -23,11 +25,14 @@ def page(runs: list[RssiRecords]) -> Page:
         sections_of("Where the errors are", runs, lambda run: Section("", plots=[errors.where(run)])),
         _limits(runs[0]),
     ]
+    details = [provenance(runs)]
     if len(runs) > 1 or any(len(Maps(run).names) > 1 for run in runs):
-        sections.insert(1, sections_of("Maps", runs, _maps))
+        sections.insert(0, sections_of("Maps", runs, partial(_maps, kind="predicted")))
+        by_receiver = sections_of("Errors by receiver", runs, lambda run: Section("", plots=errors.differences(run)))
+        details[:0] = [by_receiver, sections_of("Widths of the intervals", runs, partial(_maps, kind="width"))]
     names = ", ".join(dict.fromkeys(run.place for run in runs))
     first = _summary(runs[0]) if len(runs) == 1 else _comparison(runs)
-    return Page(f"RSSI: {names}", first, sections, [provenance(runs)])
+    return Page(f"RSSI: {names}", first, sections, details)
 
 
 def _summary(run: RssiRecords) -> Summary:
@@ -61,8 +66,8 @@ def _comparison(runs: list[RssiRecords]) -> Summary:
     return Summary([], [plot], sentences, steps, table=table)
 
 
-def _maps(run: RssiRecords) -> Section:
-    return Section("", plots=[plot for maps in Maps.of_floors(run) for plot in maps.by_receiver()])
+def _maps(run: RssiRecords, kind: str) -> Section:
+    return Section("", plots=[maps.by_receiver(kind) for maps in Maps.of_floors(run)])
 
 
 def _errors(run: RssiRecords) -> Section:
@@ -79,7 +84,7 @@ def _errors(run: RssiRecords) -> Section:
         quantity="absolute error",
         caption=caption,
         paragraphs=[f"Left out: {reason}." for reason in run.metrics["left_out"].values()],
-        plots=errors.differences(run) + errors.by_rows(run),
+        panels=errors.by_rows(run),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pandas import DataFrame
+from matplotlib.figure import Figure
 
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.metrics import paired_difference
@@ -23,19 +23,17 @@ def palette() -> Palette:
     return Palette.of(labels(RSSI_PREDICTORS, LABELS))
 
 
-def by_rows(run: RssiRecords) -> list[Plot]:
+def by_rows(run: RssiRecords) -> list[Figure]:
     """Return the errors by the number of training rows, none if the rows are too few for parts of them."""
     found = run.metrics["by_rows"]
     if len(found) < 2:
         return []
     names = list(next(iter(found.values())))
-    figure, axes = figures.panel(4.6, 3.2)
+    figure, axes = figures.panel(5.6, 3.2)
     lines = {name: ([int(n) for n in found], [row[name] for row in found.values()]) for name in names}
     figures.curves(axes, palette(), lines, "training rows", "mean absolute error [dB]")
     axes.set_ylim(0, None)
-    caption = "Error against the number of measured positions, drawn at random from the training rows."
-    data = DataFrame.from_dict(found, orient="index").rename_axis("n_train").reset_index()
-    return [Plot(f"rows-{run.file_name}", [figure], caption, data)]
+    return [figure]
 
 
 def differences(run: RssiRecords) -> list[Plot]:

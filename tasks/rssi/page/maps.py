@@ -109,7 +109,7 @@ class Maps:
         receiver = None if several else 0
         title = self.titled("best server" if several else self.names[0])
         kinds = ("predicted", "width") if self.varies else ("predicted",)
-        panels = [self._panel(self.best, kind, title, receiver, 5.4) for kind in kinds]
+        panels = [self._panel(self.best, kind, title, receiver, 4.6 if self.varies else 5.4) for kind in kinds]
         width = np.median(self.best["width"][self.inside]) if self.inside.any() else np.median(self.best["width"])
         widths = f"width of the {LEVEL:.0%} interval of a measurement"
         widths = f", and the {widths}" if self.varies else f"; the {widths} is about {width:.0f} dB everywhere"
@@ -123,24 +123,23 @@ class Maps:
             f"summary{self.suffix}", panels, caption, self._cells({k: v[None] for k, v in self.best.items()}, [title])
         )
 
-    def by_receiver(self) -> list[Plot]:
-        """Return maps of the receivers that detected most rows: predictions, and widths of intervals."""
+    def by_receiver(self, kind: str) -> Plot:
+        """Return maps of the receivers that detected most rows.
+
+        Args:
+            kind: "predicted", or "width" for that of the intervals.
+        """
         shown = self.most_detected
         names, fields = [self.names[i] for i in shown], ("predicted", "width", "detection")
-        data = self._cells({kind: self.arrays[kind][shown] for kind in fields}, names)
-        plots = []
-        for kind, what in (("predicted", "Predicted RSSI"), ("width", f"Width of the {LEVEL:.0%} interval")):
-            values = [{kind: self.arrays[kind][i] for kind in fields} for i in shown]
-            panels = [
-                self._panel(each, kind, self.titled(self.names[i]), i, 3.6)
-                for each, i in zip(values, shown, strict=True)
-            ]
-            caption = (
-                f"{what} at each receiver. {HATCHED} Hollow dots: nothing was received. A cross marks the receiver."
-            )
-            name = "map" if kind == "predicted" else "width"
-            plots.append(Plot(f"{name}-{self.run.file_name}{self.suffix}", panels, caption, data))
-        return plots
+        data = self._cells({name: self.arrays[name][shown] for name in fields}, names)
+        values = [{name: self.arrays[name][i] for name in fields} for i in shown]
+        panels = [
+            self._panel(each, kind, self.titled(self.names[i]), i, 3.6) for each, i in zip(values, shown, strict=True)
+        ]
+        what = "Predicted RSSI" if kind == "predicted" else f"Width of the {LEVEL:.0%} interval"
+        caption = f"{what} at each receiver. {HATCHED} Hollow dots: nothing was received. A cross marks the receiver."
+        name = "map" if kind == "predicted" else "width"
+        return Plot(f"{name}-{self.run.file_name}{self.suffix}", panels, caption, data)
 
     def _panel(
         self, fields: dict[str, NDArray[Any]], kind: str, title: str, receiver: int | None, width: float = 4.6

@@ -208,7 +208,9 @@ def test_pixels_of_a_floor_plan(table, tmp_path, scale, above):
     if above is None:
         with pytest.raises(InputError, match="are in pixels; give --scale PIXELS_PER_METRE"):
             load_rssi(tmp_path / "walk.csv")
-    is_read_as(load_rssi(tmp_path / "walk.csv", scale=None if above else scale), table)
+    data = load_rssi(tmp_path / "walk.csv", scale=None if above else scale)
+    is_read_as(data, table)
+    assert data.plan_scale == scale
     plain = plan.rename(columns={"Map X (px)": "x", "Map Y (px)": "y"})
     is_read_as(Rssi.from_frame(plain, scale=scale, y_down=True), table)
 

@@ -136,7 +136,7 @@ def by_text(seed):
 
 
 def carrier_of_another_band(seed):
-    data, factor = scene(seed), (2.5, 2.8, 0.45, 1.3, 0.8)[seed % 5]
+    data, factor = scene(seed), (3.0, 2.8, 0.45, 1.3, 0.8)[seed % 5]
     return replace(data, array=PlanarArray(data.array.element, data.array.wavelength * factor))
 
 
