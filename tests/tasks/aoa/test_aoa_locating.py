@@ -39,7 +39,12 @@ PLANES = {(0.0, 0.0, -1.0): 0.0, (1.0, 0.0, 0.0): 5.0, (0.0, 1.0, 0.0): 4.0}  # 
 FEW_CELLS = MatchedFieldConfig(max_cells=2000, n_best=40, n_background=20, n_rounds=1, n_calibration=16)
 FIT = MatchedField.fit
 LEFT_OUT = {LOCATED, f"{LOCATOR}, all measured"}
-ON_SNAPSHOTS = {"music", "esprit", "maximum_likelihood"}  # left out too, because the data contain spectra alone
+ON_SNAPSHOTS = {
+    "music",
+    "esprit",
+    "maximum_likelihood",
+    "joint_music",
+}  # left out too, because the data contain spectra alone
 
 
 @pytest.fixture(scope="module")
