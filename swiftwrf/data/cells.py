@@ -35,7 +35,7 @@ UNITS = {  # of numbers in cells and at the end of names, and how many of them a
 PIXELS = ("px", "pixel", "pixels")
 OTHER_UNITS = ("dbm", "db", "deg", "degrees", "\u00b0")
 ANY_UNIT = "|".join(sorted((*UNITS, *PIXELS, *OTHER_UNITS), key=len, reverse=True))
-NUMBER = re.compile(rf"([+-]?\s*(?:\d+(?:\.\d*)?|\.\d+)(?:e[+-]?\d+)?)\s*({ANY_UNIT})", re.IGNORECASE)
+NUMBER = re.compile(rf"([+-]?\s*(?:\d+(?:\.\d*)?|\.\d+)(?:e[+-]?\d+)?)\s*({ANY_UNIT}|\u00b0?\s*[nsew])", re.IGNORECASE)
 UNIT_AT_THE_END = re.compile(rf"(?<=[a-z0-9])_({ANY_UNIT})$")
 EPOCH_UNITS = (  # of times since 1970 by their size, from the year 1973 on
     ("milliseconds", 1e3, 1e11, 1e14),
@@ -112,7 +112,8 @@ def _number_in(cell: str) -> float | None:
     if NO_VALUE.fullmatch(plain):
         return float("nan")
     number = NUMBER.fullmatch(plain)
-    value = float(pd.to_numeric(number[1].replace(" ", "") if number else plain, errors="coerce"))
+    sign = -1.0 if number and number[2][-1] in "SW" else 1.0  # of 47.4 N, 8.5 W
+    value = sign * float(pd.to_numeric(number[1].replace(" ", "") if number else plain, errors="coerce"))
     return None if np.isnan(value) else value
 
 

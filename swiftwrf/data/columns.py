@@ -73,6 +73,7 @@ GROUPS_OF_ROWS = re.compile(  # columns that distinguish rows, but not the recei
     r"|app\w*|sample\w*|index|idx|row|count\w*|seq\w*|packet\w*|frame\w*|node_?addr\w*|dev_?(?:eui|addr))"
     r"(?:_?(?:id|name|no|number))?"
 )
+MIN_ROWS = 5  # for a comparison of values
 MIN_REFERENCE_DBM = -25.0  # median of a column that is a received power by its values alone
 GEODETIC = {"x": "longitude", "y": "latitude"}  # that take the place of x and y
 
@@ -164,6 +165,8 @@ def receiver_columns(table: pd.DataFrame, names: Sequence[str]) -> tuple[list[st
     plausible = [name for name in found if _is_plausible(powers[name])] or found
     whole = [name for name in plausible if (powers[name] % 1 == 0).all()]
     reference = whole if len(whole) > 1 or set(whole) & set(bare) else plausible
+    if len(table) < MIN_ROWS:  # e.g. one of a stream
+        reference = found
     kin = {_kinship(plain[name]) for name in reference}
     doubtful = [name for name in found if name not in reference and _kinship(plain[name]) not in kin]
     notes = []

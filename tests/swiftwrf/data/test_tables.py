@@ -248,6 +248,17 @@ def test_degrees_in_other_units(table, unit, at):
     assert noted(data, "converted to degrees")
 
 
+def test_degrees_with_letters(table):
+    degrees = GeodeticOrigin(-33.9, -70.2).to_degrees(table[["x", "y"]].to_numpy())
+    text = {"Lat": [f"{-value:.8f} S" for value in degrees[:, 0]], "Lon": [f"{-v:.8f}\u00b0W" for v in degrees[:, 1]]}
+    is_read_as(Rssi.from_frame(table.assign(**text).drop(columns=["x", "y"])), table, atol=0.01)
+
+
+def test_one_row_of_a_stream_keeps_its_receivers(table):
+    row = table.iloc[:1].assign(a=-11.5, noise=-95)
+    assert Rssi.from_frame(row).receiver_names == ("a", "b", "c", "d")
+
+
 def test_metres_that_are_called_latitude_stay_metres(table):
     data = Rssi.from_frame(
         table.assign(longitude=table.x - 7541.26, latitude=table.y + 4864921.5).drop(columns=["x", "y"])
