@@ -89,11 +89,13 @@ def read_survey(
     up: Up = "z",
     window: float | None = None,
     receivers: Path | None = None,
+    keeps_rows: bool = False,
 ) -> dict[str, Any]:
     """Return the arguments of `Rssi` that a survey table determines: RSSI, positions, receivers and what rows are of.
 
     Columns get their roles, cells their units, and then rows are formed: one a place, time and packet of a receiver. The
-    label names the table in messages. Options are those of `load_rssi`, receivers is a table of their positions.
+    label names the table in messages. Options are those of `load_rssi`, receivers is a table of their positions. With
+    keeps_rows, repeated scans stay.
 
     Raises:
         InputError: A column that is missing or ambiguous, or a value that is no position or received power.
@@ -138,10 +140,10 @@ def read_survey(
     repeated = _repeated_scans(coordinate[row], rssi[row])
     if repeated.any():
         missing.append(
-            f"rows that repeat all values of the row before at another place, as cached scans do, are left out: "
-            f"{int(repeated.sum())} of {len(row)}"
+            f"rows that repeat all values of the row before at another place, as cached scans do, "
+            f"{'stay because of the given splits' if keeps_rows else 'are left out'}: {int(repeated.sum())} of {len(row)}"
         )
-        row = row[~repeated]
+        row = row if keeps_rows else row[~repeated]
     notes += missing
     position, origin, found = _local_metres(label, table, roles, coordinate[row], coordinates)
     notes += found

@@ -38,13 +38,14 @@ class SurveyTable(Format[Rssi]):
         file, others, table = _table(path)
         receivers = file.with_name(RECEIVERS)
         stated = receivers if receivers.is_file() else None
-        data = Rssi(**read_survey(file, table, **options.given, receivers=stated), name=file.stem)
+        splits = read_splits(file.parent, len(table), first=0)
+        found = read_survey(file, table, **options.given, receivers=stated, keeps_rows=bool(splits))
+        data = Rssi(**found, name=file.stem)
         if data.receiver_moves and bool(data.receiver_position.isnan().any()):
             raise InputError(
                 f"{file}: column {options.transmitter[0]} has names of positions, so {RECEIVERS} beside it must contain "
                 "each of them"
             )
-        splits = read_splits(file.parent, len(table), first=0)
         return replace(
             data,
             named_splits=kept_splits(splits, data.index, len(table)),

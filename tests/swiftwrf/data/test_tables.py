@@ -330,12 +330,16 @@ def test_packets_are_joined_in_windows(unit, cycle):
 
 
 @pytest.mark.parametrize("every", [2, 4])
-def test_scans_that_are_repeated_at_other_places(table, every):
+def test_scans_that_are_repeated_at_other_places(table, tmp_path, every):
     stale = table.copy()
     stale[["a", "b", "c", "d"]] = table[["a", "b", "c", "d"]].iloc[np.arange(N) // every * every].to_numpy()
     data = Rssi.from_frame(stale)
     np.testing.assert_array_equal(data.index, np.arange(0, N, every))
     assert noted(data, "cached scans", f"{N - len(data)} of {N}")
+    stale.to_csv(tmp_path / "walk.csv", index=False)
+    for part, rows in (("train", range(40)), ("test", range(40, N))):
+        (tmp_path / f"{part}_index.txt").write_text("\n".join(map(str, rows)))
+    assert len(load_rssi(tmp_path)) == N  # a published split stays as it is
     same = stale.assign(x=1.0, y=2.0)
     assert len(Rssi.from_frame(same)) == N  # measured again at one place
     assert len(Rssi.from_frame(table)) == N
