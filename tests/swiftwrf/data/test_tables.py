@@ -182,7 +182,7 @@ def test_rows_of_different_lengths_are_refused(table, tmp_path):
 def test_rssi_and_coordinates_in_two_files(table, tmp_path, names, header):
     rssi = table[["a", "b", "c", "d"]].mask(table[["a", "b", "c", "d"]] < -75, 100)
     rssi.astype(int).to_csv(tmp_path / names[0], index=False, header=header)
-    table[["x", "y"]].assign(z=3.5).to_csv(tmp_path / names[1], index=False, header=header)
+    table[["x", "y"]].sub([40, 30]).assign(z=3.5).to_csv(tmp_path / names[1], index=False, header=header)  # negative
     data = load_rssi(tmp_path)
     named = ("a", "b", "c", "d") if header else tuple(f"receiver{i}" for i in range(1, 5))
     is_read_as(data, table.mask(table < -75), named)
