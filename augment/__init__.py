@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from swiftwrf.runtime.lazy import import_lazily
 
 if TYPE_CHECKING:
+    from augment import estimators as estimators
     from augment.choose import Fold, ModelChoice, choose_model
     from augment.mix import Mixed, mix, withhold
     from augment.positions import SyntheticPositions, sample_positions, synthetic_positions
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
 import_lazily(
     __name__,
     {
+        "augment": ("estimators",),
         "augment.choose": ("Fold", "ModelChoice", "choose_model"),
         "augment.mix": ("Mixed", "mix", "withhold"),
         "augment.positions": ("SyntheticPositions", "sample_positions", "synthetic_positions"),

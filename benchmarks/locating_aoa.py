@@ -39,9 +39,8 @@ from swiftwrf.choices import fraction_key
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import GaussianProcess, choose_kernel
 from swiftwrf.metrics import angle_errors, summary
-from swiftwrf.models.geometry.furniture import coherence, field, waves
+from swiftwrf.models.geometry.channels import coherence, field, waves
 
-N_LOCATED = 200  # spectra whose time is measured
 KERNEL = "kernel_regression"
 Row = dict[str, Any]
 
@@ -81,7 +80,7 @@ def main(config: Config) -> None:
                 rows.append(measure(withhold(train, fraction, draw)[0], test, draw, config.kernel))
                 print(name, fraction, rows[-1], flush=True)
             found[name][fraction_key(fraction)] = {"median": median_of(rows), "draws": rows}
-            write_result(config.name, {"n_located": N_LOCATED, "scenes": found}, folder=config.out)
+            write_result(config.name, {"scenes": found}, folder=config.out)
 
 
 def scenes(config: Config) -> Iterator[tuple[str, Spectra]]:
@@ -110,11 +109,8 @@ def measure(measured: Spectra, test: Spectra, draw: int, kernel: bool) -> Row:
     except (InputError, FitError) as error:
         return row | {"left_out": str(error)}
     fitted = time.perf_counter()
-    timed = test.subset(torch.arange(N_LOCATED) % len(test))
-    ready = time.perf_counter()
-    locator.predict(timed)
-    seconds = {"room": searched - began, "fit": fitted - searched, "locate": time.perf_counter() - ready}
     result = located(locator, test)
+    seconds = {"room": searched - began, "fit": fitted - searched, "locate": time.perf_counter() - fitted}
     return row | {
         "planes": len(locator.room.planes),
         "weights": locator.weight.tolist(),
@@ -151,7 +147,7 @@ def channel_scores(room: GeometryModel, measured: Spectra, test: Spectra, seed: 
     walls.furniture = None
     for name, model in {"planes": walls, "furniture": room}.items():
         at_known, at_test = (
-            field(model.gains(part.scene), waves(model.tensors(), part.scene, part.frequency))
+            field(model.gains(part.scene), waves(model.reflectors, part.scene, part.frequency))
             for part in (known, truth)
         )
         factor = (at_known.conj() * known.value).sum() / at_known.abs().square().sum()

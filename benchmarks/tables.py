@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import re
 import statistics
+import warnings
+from importlib import import_module
+from typing import Any
 
 import aoa_tables
 import field_tables
 import rssi_tables
 import speed_tables
+import tyro
 from record import ROOT, load, markdown
 
 from augment.turbo.condition import LOCATED, MEASURED_NETWORK
+from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.datasets import catalogue
+from tasks.command import COMMANDS
+from tasks.options import OffsetSource, SpectraSource
 
 
 def random_rooms() -> str:
@@ -84,6 +91,43 @@ def datasets() -> str:
         for row in catalogue().itertuples()
     ]
     return markdown(["name", "content", "licence", "source"], rows)
+
+
+def _options(config: type[Any]) -> dict[str, str]:
+    """Return the help of each option of a command or group, by name."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        actions = tyro.extras.get_parser(config)._actions
+    return {
+        f"--{action.option_strings[0].lstrip('-').rpartition('.')[2]}": " ".join(str(action.help).split()).replace(
+            "%%", "%"
+        )
+        for action in actions
+        if action.option_strings and action.option_strings[0].startswith("--")
+    }
+
+
+def read_options() -> str:
+    """Return the options of reading, and the formats that take them."""
+    readers = {"spectra": SPECTRA_FORMATS, "snapshots": SNAPSHOT_FORMATS, "rssi": RSSI_FORMATS}
+    rows = []
+    for name, meaning in {**_options(SpectraSource), **_options(OffsetSource)}.items():
+        field = name.removeprefix("--").replace("-", "_")
+        formats = dict.fromkeys(one for found in readers.values() for one in found if field in found[one].takes)
+        rows.append([f"`{name}`", ", ".join(formats), meaning])
+    return markdown(["option", "formats", "meaning"], rows)
+
+
+def commands() -> str:
+    """Return all options of the commands but those of reading, with the commands that have them."""
+    reading = {*_options(SpectraSource), *_options(OffsetSource)}
+    found: dict[tuple[str, str], list[str]] = {}
+    for command, (_, config, *_) in COMMANDS.items():
+        for name, meaning in _options(getattr(import_module(f"tasks.{command}.options"), config)).items():
+            if name not in reading:
+                found.setdefault((name, meaning), []).append(f"`{command}`")
+    rows = [[f"`{name}`", ", ".join(names), meaning] for (name, meaning), names in sorted(found.items())]
+    return markdown(["option", "commands", "meaning"], rows)
 
 
 MODULES = (aoa_tables, field_tables, rssi_tables, speed_tables)

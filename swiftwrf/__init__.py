@@ -17,6 +17,10 @@ from swiftwrf.runtime.lazy import import_lazily
 __version__ = version("swiftwrf-tasks")
 
 if TYPE_CHECKING:
+    from swiftwrf import datasets as datasets
+    from swiftwrf import locate as locate
+    from swiftwrf import metrics as metrics
+    from swiftwrf import rssi as rssi
     from swiftwrf.array.angles import AngularGrid, ArrayPose
     from swiftwrf.data import Rssi, Snapshots, Spectra, load_rssi, load_snapshots, load_spectra
     from swiftwrf.data.simulated import rssi_room, simulated_room
@@ -36,6 +40,7 @@ if TYPE_CHECKING:
 import_lazily(
     __name__,
     {
+        "swiftwrf": ("datasets", "locate", "metrics", "rssi"),
         "swiftwrf.array.angles": ("AngularGrid", "ArrayPose"),
         "swiftwrf.data": ("Rssi", "Snapshots", "Spectra", "load_rssi", "load_snapshots", "load_spectra"),
         "swiftwrf.data.simulated": ("rssi_room", "simulated_room"),

@@ -186,23 +186,26 @@ class Run:
         """Write arrays by name."""
         write_npz(self.path(name), arrays)
 
-    def step(self, name: str, title: str, compute: Callable[[], Row]) -> Row:
+    def step(
+        self, name: str, title: str, compute: Callable[[], Row], described: Callable[[Row], str] = lambda value: ""
+    ) -> Row:
         """Return the plain values of `compute`, which is called once, also over a resumed run.
 
         Args:
             name: Key of the kept result.
             title: What is computed, for the terminal.
             compute: Computes the values.
+            described: Values in words, for the terminal.
 
         Raises:
             InputError: The kept result is damaged.
         """
         value = self.kept(name)
         if value is None:
-            terminal.begin(title)
+            terminal.begin(name, title)
             began = time.perf_counter()
             value = self.keep(name, compute(), time.perf_counter() - began)
-            terminal.end()
+            terminal.end(name, described(value))
         return value
 
     def holds(self, name: str) -> bool:

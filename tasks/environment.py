@@ -36,19 +36,17 @@ def now() -> str:
 def invocation(task: str) -> str:
     """Return the command line of this process, which runs a task."""
     program, *arguments = sys.argv
-    if Path(program).stem == "swiftwrf":
-        return shlex.join(["swiftwrf", *arguments])
-    return command(task, *arguments)
+    return command(*([] if Path(program).stem == "swiftwrf" else [task]), *arguments)
 
 
-def command(task: str, *arguments: str) -> str:
-    """Return the command line of a task, quoted for a shell.
+def command(*arguments: str) -> str:
+    """Return a command line of this project, quoted for a shell.
 
     Example:
         >>> command("view", "my run")
-        "python -m tasks.view 'my run'"
+        "swiftwrf view 'my run'"
     """
-    return shlex.join(["python", "-m", f"tasks.{task}", *arguments])
+    return shlex.join(["swiftwrf", *arguments])
 
 
 def choose_device(name: str) -> torch.device:

@@ -74,7 +74,8 @@ class RssiMetrics(RunMetrics):
     """Metrics of a run of tasks.rssi.
 
     `notes` are those of the reader. `receivers` is by receiver and method, `left_out` is the reason why a method is missing.
-    `model` is the method whose maps and intervals the run contains.
+    `model` is the method whose maps and intervals the run contains. `by_rows` are mean errors [dB] by the number of training
+    rows and by method.
     """
 
     notes: list[str]
@@ -86,6 +87,7 @@ class RssiMetrics(RunMetrics):
     receivers: dict[str, dict[str, ReceiverMetrics]]
     seconds: PredictorSeconds
     interval: IntervalMetrics
+    by_rows: dict[str, dict[str, float]]
     chosen: ChosenMetrics
 
 

@@ -17,8 +17,8 @@ from tasks.records import Row
 from tasks.terminal import terminal
 from tasks.workers import Workers, local_processes
 
-Arrived = Callable[[Step[Context], Row], None]
-"""function that shows a result when it arrives"""
+Described = Callable[[Step[Context], Row], str]
+"""function that returns the result of a step in words, empty if there is nothing to show"""
 
 
 def run_steps(
@@ -26,7 +26,7 @@ def run_steps(
     steps: Iterable[Step[Context]],
     context: Context,
     cluster: Workers | None = None,
-    arrived: Arrived[Context] = lambda step, value: None,
+    described: Described[Context] = lambda step, value: "",
 ) -> Iterator[tuple[Step[Context], Row]]:
     """Yield each step with its result, followed by the steps that follow from it.
 
@@ -35,7 +35,7 @@ def run_steps(
         steps: The first steps.
         context: Data and configuration that all steps share.
         cluster: Workers that compute the steps. Defaults to the processes of the run.
-        arrived: Called with each step and its result as soon as it arrives, in any order.
+        described: Result of a step in words, which the terminal shows when it arrives.
 
     Raises:
         FitError: The cluster or a process is lost.
@@ -43,21 +43,18 @@ def run_steps(
     steps = list(steps)
     if cluster is not None:
         try:
-            _compute_on(cluster, run, steps, context, arrived)
+            _compute_on(cluster, run, steps, context, described)
         finally:
             run.computed_on(cluster.machines)
     elif run.processes > 1:
         with local_processes(run.processes, run.folder) as processes:
-            _compute_on(processes, run, steps, context, arrived)
+            _compute_on(processes, run, steps, context, described)
 
     def expect(some: Iterable[Step[Context]]) -> None:
         terminal.expect(len({step.name for step in some if not run.holds(step.name)}))
 
     def compute(step: Step[Context]) -> Row:
-        is_new = not run.holds(step.name)
-        value = run.step(step.name, step.title, partial(step.compute, context, run.folder))
-        if is_new:
-            arrived(step, value)
+        value = run.step(step.name, step.title, partial(step.compute, context, run.folder), partial(described, step))
         expect(step.then(context, value))
         return value
 
@@ -66,7 +63,7 @@ def run_steps(
 
 
 def _compute_on(
-    workers: Workers, run: Run, steps: Iterable[Step[Context]], context: Context, arrived: Arrived[Context]
+    workers: Workers, run: Run, steps: Iterable[Step[Context]], context: Context, described: Described[Context]
 ) -> None:
     """Compute steps, and those that follow, on workers and keep each result in the run when it arrives.
 
@@ -95,12 +92,11 @@ def _compute_on(
         while waiting and len(pending) < workers.slots():
             step = waiting.pop(0)
             pending[workers.submit(compute, step)] = step
-        terminal.begin(", ".join(dict.fromkeys(step.title for step in pending.values())))
+            terminal.begin(step.name, step.title)
         future, (value, seconds) = workers.next(pending)
         step = pending.pop(future)
         value = run.keep(step.name, value, seconds)
-        terminal.end()
-        arrived(step, value)
+        terminal.end(step.name, described(step, value))
         for one in same.pop(step.name):
             begin(one.then(context, value))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 from pandas import DataFrame, Series
 
@@ -12,7 +11,6 @@ from swiftwrf.metrics import paired_difference
 MAX_COVERAGE_ERROR = 0.05  # difference from the nominal coverage below which intervals count as calibrated
 MIN_RELEVANT = 0.02  # difference of mean errors, relative to them, below which methods are equal in practice
 MAX_SPREAD = 0.5  # of labels about their mean direction, relative to the error of the peaks, for a warning
-SHORTEST = 1e-5  # seconds: what took less is drawn here, for logarithmic axes have no zero
 
 
 def comparison_sentence(
@@ -91,17 +89,3 @@ def fingerprinting(constant_deg: float, peak_deg: float) -> str:
 def running_median(values: Series) -> Series:
     """Median of the values around each, in a window of a fifth of them."""
     return values.rolling(max(len(values) // 5, 1), center=True).median()
-
-
-def rms_of_psnr(psnr_db: float) -> float:
-    """Root of the mean square error of a spectrum with this PSNR."""
-    return float(10 ** (-psnr_db / 20))
-
-
-def pareto(points: Mapping[str, tuple[float, float]]) -> list[str]:
-    """Names of the points (cost, error) that no other one beats or equals in both, by cost."""
-    front: list[str] = []
-    for name in sorted(points, key=lambda name: points[name]):
-        if not front or points[name][1] < points[front[-1]][1]:
-            front.append(name)
-    return front

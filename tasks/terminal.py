@@ -7,23 +7,21 @@ import logging
 import sys
 import time
 import webbrowser
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Console
 from rich.logging import RichHandler
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress, ProgressColumn, Task
 from rich.table import Table
+from rich.text import Text
 
 from swiftwrf.runtime.durable import strict
 from swiftwrf.runtime.progress import forwarding
+from tasks.answer import Answer
 from tasks.options import Answered, Output
-
-if TYPE_CHECKING:
-    from swiftwrf.metrics import ErrorSummary
 
 LOGGERS = ("swiftwrf", "augment", "tasks")  # whose messages --verbose shows
 PLAIN_WIDTH = 140  # characters of a table that is not shown on a terminal
@@ -31,48 +29,13 @@ SPEED_PERIOD_S = 120  # over which the speed is averaged for the time left
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Answer:
-    """The answer of a run: errors of everything that was compared, and what follows.
+class _Line(ProgressColumn):
+    """Number of the step and of all steps, what is computed, time left."""
 
-    Args:
-        unit: Unit of the errors.
-        rows: Names of what a row shows, e.g. condition and estimator, and the summary of its errors.
-        conclusion: One sentence.
-        next_steps: Sentences.
-    """
-
-    unit: str
-    rows: Sequence[tuple[Mapping[str, str], ErrorSummary]]
-    conclusion: str
-    next_steps: Sequence[str]
-
-    def values(self) -> dict[str, Any]:
-        """Return the answer as plain values, for `--json`."""
-        return {
-            "rows": [
-                {
-                    **names,
-                    **{key if key == "n" else f"{key}_{self.unit.lower()}": value for key, value in error.items()},
-                }
-                for names, error in self.rows
-            ],
-            "conclusion": self.conclusion,
-            "next_steps": list(self.next_steps),
-        }
-
-    def table(self) -> Table:
-        """Return the table of the terminal."""
-        table = Table(box=None, pad_edge=False, header_style="bold")
-        for name in self.rows[0][0]:
-            table.add_column(name)
-        for name in (f"median [{self.unit}]", "95 % interval", f"mean [{self.unit}]", f"90 % below [{self.unit}]"):
-            table.add_column(name, justify="right")
-        for names, error in self.rows:
-            interval = f"{error['low']:.2f} to {error['high']:.2f}"
-            cells = (f"{error['median']:.2f}", interval, f"{error['mean']:.2f}", f"{error['p90']:.2f}")
-            table.add_row(*names.values(), *cells)
-        return table
+    def render(self, task: Task) -> Text:
+        left = task.time_remaining if task.description else None
+        after = "" if left is None else f", {left:.0f} s left" if left < 100 else f", {left / 60:.0f} min left"
+        return Text(f"{task.description}{after}", no_wrap=True, overflow="ellipsis")
 
 
 class Terminal:
@@ -83,11 +46,11 @@ class Terminal:
     """
 
     def __init__(self) -> None:
-        self.console = Console(stderr=True, highlight=False)
+        self.console = Console(stderr=True, highlight=False, soft_wrap=True)
         self._output = Answered()
         self._progress: Progress | None = None
         self._done = self._expected = 0
-        self._began = 0.0  # of the current step [s]
+        self._steps: dict[str, tuple[str, int, float]] = {}  # those computed now: title, number, time of the beginning
 
     @contextmanager
     def of(self, output: Answered, verbose: bool = False) -> Iterator[None]:
@@ -108,16 +71,15 @@ class Terminal:
 
     @contextmanager
     def progress(self) -> Iterator[None]:
-        """Show the fraction of the steps that is done and the time left, on a terminal."""
-        columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+        """Show one line with the step that is computed and the time left; elsewhere than on a terminal, a line a step."""
         is_shown = self.console.is_terminal and not self.console.quiet
-        bar = Progress(
-            *columns, console=self.console, transient=True, disable=not is_shown, speed_estimate_period=SPEED_PERIOD_S
+        line = Progress(
+            _Line(), console=self.console, transient=True, disable=not is_shown, speed_estimate_period=SPEED_PERIOD_S
         )
-        self._done = self._expected = 0
-        with bar, forwarding(self._within):
-            bar.add_task("", total=None)
-            self._progress = bar
+        self._expected, self._done, self._steps = 0, 0, {}
+        with line, forwarding(self._within):
+            line.add_task("", total=None)
+            self._progress = line
             try:
                 yield
             finally:
@@ -127,36 +89,44 @@ class Terminal:
         """Add steps to those that are to be done."""
         self._expected += steps
 
-    def begin(self, title: str) -> None:
-        """Show what is computed now."""
-        logger.debug("%s", title)
-        self._began = time.perf_counter()
-        self._update(description=title)
+    def begin(self, name: str, title: str) -> None:
+        """Show that a step is computed now, by its unique name."""
+        self._steps[name] = title, self._done + len(self._steps) + 1, time.perf_counter()
+        self._log(self._numbered(name))
+        self._update()
 
-    def end(self) -> None:
-        """Count a step as done."""
-        logger.debug("done after %.1f s", time.perf_counter() - self._began)
+    def end(self, name: str, result: str = "") -> None:
+        """Count a step as done, and show its result."""
+        seconds = time.perf_counter() - self._steps[name][2]
+        self._log(f"{self._numbered(name)}: {result + ', ' if result else ''}{seconds:.1f} s")
+        del self._steps[name]
         self._done += 1
-        self._update(completed=self._done)
+        self._update()
+
+    def _numbered(self, name: str) -> str:
+        title, number, _ = self._steps[name]
+        return f"[{number}/{max(self._expected, number)}] {title}"
+
+    def _log(self, line: str) -> None:
+        """Print a line where no progress is shown; messages of `--verbose` contain it anyway."""
+        logger.debug("%s", line)
+        if not self.console.is_terminal and not logger.isEnabledFor(logging.DEBUG):
+            self.console.print(line, markup=False, soft_wrap=True)
 
     def _within(self, fraction: float) -> None:
         """Count a fraction of the current step as done."""
-        self._update(completed=self._done + fraction)
+        self._update(fraction)
 
-    def _update(self, **values: Any) -> None:
+    def _update(self, fraction: float = 0.0) -> None:
         if self._progress is not None:
-            task = self._progress.task_ids[0]
-            self._progress.update(task, total=max(self._expected, self._done), **values)
-
-    def result(self, name: str, text: str) -> None:
-        """Show a result as it comes."""
-        self.console.print(f"{name:<44} {text}", markup=False, soft_wrap=True)
+            title = ", ".join(self._numbered(name) for name in self._steps)
+            done, total = self._done + fraction, max(self._expected, self._done)
+            self._progress.update(self._progress.task_ids[0], description=title, completed=done, total=total)
 
     def answer(self, found: Answer, page: Path) -> None:
-        """Print the answer of a run and the place of its report."""
-        self._print(
-            found.values(), page, found.table(), "", found.conclusion, *(f"- {text}" for text in found.next_steps)
-        )
+        """Print the answer of a run: a short table, next steps, the conclusion, and the place of the report."""
+        steps = [f"{step.text}: {step.code}" if step.code else step.text for step in found.next_steps]
+        self._print(found.values(), page, _table(found), "", *steps, "", *found.conclusion)
 
     def page(self, values: Mapping[str, Any], text: str, page: Path | None = None) -> None:
         """Print the text of a command, or its values with `--json`, and the place of its page. Both may be missing."""
@@ -175,6 +145,23 @@ class Terminal:
                 out.print(f"report: {page}", markup=False)
         if page is not None and isinstance(self._output, Output) and self._output.open:
             webbrowser.open(page.resolve().as_uri())
+
+
+def _table(found: Answer) -> Table:
+    """Return the short table of an answer, in two blocks."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    unit = found.unit
+    table.add_column("what you can use")
+    for name in (f"median [{unit}]", "95 % interval", f"90 % below [{unit}]"):
+        table.add_column(name, justify="right")
+    for number, block in enumerate(found.short()):
+        if number and block:
+            table.add_row("references", style="bold")
+        for one in block:
+            error = one.error
+            cells = (f"{error['median']:.2f}", f"{error['low']:.2f} to {error['high']:.2f}", f"{error['p90']:.2f}")
+            table.add_row(f"{'*' if one.name == found.chosen else ' '} {one.name}", *cells)
+    return table
 
 
 terminal = Terminal()

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from printed import blocks, check_printed
 from tables import FILES, rewrite
 
 import swiftwrf
@@ -45,27 +46,34 @@ def test_links_of_a_page_lead_to_files_and_headings(name):
             assert anchor in anchors(linked), f"{target}#{anchor}"
 
 
-NUMBER = r"\d+\.\d+"
-
-
-def run_blocks(name: str) -> dict[str, object]:
-    """Run the Python blocks of a page in the working directory and return their names."""
+def run_blocks(name: str, capsys: pytest.CaptureFixture[str] | None = None) -> dict[str, object]:
+    """Run the Python blocks of a page in the working directory and return their names; `capsys` compares what they print."""
     names: dict[str, object] = {"__name__": "documented"}
-    for block in re.findall(r"```python\n(.*?)```", (ROOT / name).read_text(), flags=re.DOTALL):
-        exec(block, names)
+    for language, block, shown in blocks((ROOT / name).read_text()):
+        if language == "python":
+            exec(block, names)
+            if capsys and shown:
+                check_printed(shown, capsys.readouterr().out)
     return names
 
 
-def test_readme_prints_what_it_shows(tmp_path, monkeypatch, capsys):
+@pytest.mark.long
+def test_the_readme_prints_what_it_shows(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    run_blocks("README.md")
-    (shown,) = re.findall(r"```text\n(.*?)```", (ROOT / "README.md").read_text(), flags=re.DOTALL)
-    printed = capsys.readouterr().out
-    assert re.sub(NUMBER, "", printed) == re.sub(NUMBER, "", shown)
-    # other processors find a slightly different room
-    assert [float(x) for x in re.findall(NUMBER, printed)] == pytest.approx(
-        [float(x) for x in re.findall(NUMBER, shown)], abs=0.1
-    )
+    names = run_blocks("README.md", capsys)
+    assert len(names["measured"]) == 72
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["formats", "locating", "update"])
+def test_blocks_of_reference_and_how_to_run(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run_blocks(f"docs/{name}.md")
+
+
+def test_the_checks_run_the_test_command_of_the_readme():
+    (command,) = re.findall(r"pip install -e '\.\[dev\]' && (pytest .*)", (ROOT / "README.md").read_text())
+    assert command in (ROOT / ".ci" / "run").read_text().splitlines()
 
 
 def test_documented_extensions_work(tmp_path, monkeypatch):

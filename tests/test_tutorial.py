@@ -1,13 +1,16 @@
-"""Every block of the tutorial runs in a new shell, in order, in one directory. Long steps are made cheaper."""
+"""Every block of the tutorial runs in a new shell, in order, in one directory, and prints what is shown."""
 
 from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from unittest import mock
 
 import pytest
+from printed import blocks, check_printed
 from quick import PREDICTORS_KEPT, TASKS, QuickNetwork, QuickRssiConfig
 from small import glances
 
@@ -15,7 +18,6 @@ from augment.estimators import ESTIMATORS
 from augment.turbo.condition import NETWORKS
 from swiftwrf import RssiModel
 from swiftwrf.choices import RSSI_PREDICTORS
-from swiftwrf.rssi import RssiConfig
 from tasks.command_line import command_line
 
 TEXT = (Path(__file__).parent.parent / "docs" / "tutorial.md").read_text()
@@ -24,27 +26,30 @@ PARTS = re.split(r"^## ", TEXT, flags=re.MULTILINE)[1:]
 
 @pytest.mark.long
 @pytest.mark.parametrize("part", PARTS, ids=[part.splitlines()[0] for part in PARTS])
-def test_every_block_runs(part, tmp_path, monkeypatch):
+def test_every_block_runs_and_prints_what_is_shown(part, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    for language, block in re.findall(r"```(python|bash)\n(.*?)```", part, flags=re.DOTALL):
+    for language, block, shown in blocks(part):
         if language == "python":
             exec(block, {})
-            continue
-        python, dash_m, module, *arguments = shlex.split(block)
-        assert [python, dash_m] == ["python", "-m"]
-        name = module.removeprefix("tasks.")
-        config, function = TASKS[name]
-        rssi_config = (
-            RssiConfig if ".safetensors" in block else QuickRssiConfig
-        )  # files open with the class of their kind
-        with (
-            glances(),
-            mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
-            mock.patch.object(RssiModel, "config_type", rssi_config),
-            mock.patch.object(
-                RSSI_PREDICTORS, "_registered", {name: RSSI_PREDICTORS[name] for name in PREDICTORS_KEPT}
-            ),
-        ):
-            assert command_line(module, config, function, arguments) == 0, block
-        out = Path(arguments[arguments.index("--out") + 1] if "--out" in arguments else arguments[-1])
-        assert (out if out.suffix else out / "report.html").is_file()
+        else:
+            program, name, *arguments = shlex.split(block)
+            assert program == "swiftwrf"
+            config, function = TASKS[name]
+            with nullcontext() if shown or ".safetensors" in block else _cheap():
+                assert command_line(f"tasks.{name}", config, function, arguments) == 0, block
+            out = Path(arguments[arguments.index("--out") + 1] if "--out" in arguments else arguments[-1])
+            assert (out if out.suffix else out / "report.html").is_file()
+        check_printed(shown, capsys.readouterr().out)
+
+
+@contextmanager
+def _cheap() -> Iterator[None]:
+    """Replace what takes long: a run without shown output is a real one of cheap parts."""
+    predictors = {name: RSSI_PREDICTORS[name] for name in PREDICTORS_KEPT}
+    with (
+        glances(),
+        mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
+        mock.patch.object(RssiModel, "config_type", QuickRssiConfig),
+        mock.patch.object(RSSI_PREDICTORS, "_registered", predictors),
+    ):
+        yield

@@ -7,6 +7,7 @@ as "n/a", "--" or "not detected".
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 
 import numpy as np
 import pandas as pd
@@ -34,7 +35,7 @@ UNITS = {  # of numbers in cells and at the end of names, and how many of them a
 PIXELS = ("px", "pixel", "pixels")
 OTHER_UNITS = ("dbm", "db", "deg", "degrees", "\u00b0")
 ANY_UNIT = "|".join(sorted((*UNITS, *PIXELS, *OTHER_UNITS), key=len, reverse=True))
-NUMBER = re.compile(rf"([+-]?\s*(?:\d+(?:\.\d*)?|\.\d+)(?:e[+-]?\d+)?)\s*({ANY_UNIT})", re.IGNORECASE)
+NUMBER = re.compile(rf"([+-]?\s*(?:\d+(?:\.\d*)?|\.\d+)(?:e[+-]?\d+)?)\s*({ANY_UNIT}|\u00b0?\s*[nsew])", re.IGNORECASE)
 UNIT_AT_THE_END = re.compile(rf"(?<=[a-z0-9])_({ANY_UNIT})$")
 EPOCH_UNITS = (  # of times since 1970 by their size, from the year 1973 on
     ("milliseconds", 1e3, 1e11, 1e14),
@@ -44,7 +45,7 @@ EPOCH_UNITS = (  # of times since 1970 by their size, from the year 1973 on
 DIGITS_OF_DATE = re.compile(
     r"(?:19|20)\d\d(?:0[1-9]|1[0-2])(?:0[1-9]|[12]\d|3[01])(?:[01]\d|2[0-3])[0-5]\d[0-5]\d(?:\d{3})?"
 )
-DAY_FIRST = re.compile(r"\s*\d{1,2}\.\d{1,2}\.\d{2,4}\b.*")
+DAY_FIRST = re.compile(r"\s*(?:\d{1,2}\.\d{1,2}\.|(?:1[3-9]|2\d|3[01])/\d{1,2}/)\d{2,4}\b.*")
 CLOCK_ONLY = re.compile(r"\s*\d{1,2}:\d\d(?::\d\d(?:[.,]\d+)?)?\s*(?:[ap]\.?m\.?)?\s*", re.IGNORECASE)
 
 
@@ -65,7 +66,10 @@ def unit_of(column: pd.Series) -> str:
         >>> unit_of(pd.Series([1.0], name="Map X (px)")), unit_of(pd.Series(["3 cm"])), unit_of(pd.Series([1.0], name="x"))
         ('px', 'cm', '')
     """
-    found = UNIT_AT_THE_END.search(_words(str(column.name)))
+    words = _words(str(column.name))
+    if {*PIXELS} & {*words.split("_")}:
+        return PIXELS[0]
+    found = UNIT_AT_THE_END.search(words)
     cells = text_of(column[column.notna()].iloc[:1])
     number = NUMBER.fullmatch(cells.iloc[0].translate(MINUS)) if len(cells) else None
     return found[1] if found else number[2].lower() if number else ""
@@ -90,6 +94,9 @@ def parsed(column: pd.Series) -> tuple[Floats, NDArray[np.bool_]]:
     """
     if column.dtype.kind in "biuf":
         return column.to_numpy(np.float64), np.zeros(len(column), dtype=bool)
+    with suppress(ValueError, TypeError):  # numbers alone, the usual case, are parsed fast
+        if "_" not in (whole := "".join(column)) and whole.isascii():
+            return np.fromiter(map(float, column), np.float64, len(column)), np.zeros(len(column), dtype=bool)
     cells = column.astype(str).str.strip()
     values = pd.to_numeric(cells, errors="coerce").to_numpy(np.float64, copy=True)
     rest = np.isnan(values) & column.notna().to_numpy()
@@ -105,7 +112,8 @@ def _number_in(cell: str) -> float | None:
     if NO_VALUE.fullmatch(plain):
         return float("nan")
     number = NUMBER.fullmatch(plain)
-    value = float(pd.to_numeric(number[1].replace(" ", "") if number else plain, errors="coerce"))
+    sign = -1.0 if number and number[2][-1] in "SW" else 1.0  # of 47.4 N, 8.5 W
+    value = sign * float(pd.to_numeric(number[1].replace(" ", "") if number else plain, errors="coerce"))
     return None if np.isnan(value) else value
 
 

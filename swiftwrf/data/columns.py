@@ -19,22 +19,22 @@ from swiftwrf.errors import InputError, listed
 
 Floats = NDArray[np.float64]
 PLACE = (
-    "pos|position|coord|coordinate|loc|location|tx|rx|transmitter|receiver|map|plan|floorplan|image|point|pixel|local|robot|ue|"
+    "pos|position|coord|coordinate|loc|location|tx|rx|transmitter|receiver|map|plan|floorplan|image|point|pixels?|px|local|robot|ue|"
     "true|truth|gt"
 )
-MEAN = "(?:(?:mean|avg|average|median|max|raw|filtered|wifi|wlan|ble|bt|lora|lte|nr|ss|serving|measured)_)*"
-GPS = "(?:(?:gps|gnss|current|location|device|phone|best|trilat)_?)?"
+MEAN = "(?:(?:mean|avg|average|median|max|raw|filtered|wifi|wlan|ble|bt|lora|lte|nr|ss|serving|measured)_?)*"
+GPS, GPS_END = "(?:(?:gps|gnss|current|location|device|phone|best|tri)_?)?", "(?:_?(?:1?e7|dd|wgs_?84|nmea))?"
 CELL_ID = "(?:global_?)?cell_?id|cid|eci|cgi|pci"
 ROLES = {  # patterns of names in lower case with underscores and without units, the first ones preferred
     "x": [f"(?:(?:{PLACE})_?)*x(?:_?(?:{PLACE}))*|east(?:ing)?s?|e_?coord"],
     "y": [f"(?:(?:{PLACE})_?)*y(?:_?(?:{PLACE}))*|north(?:ing)?s?|n_?coord"],
     "z": [f"(?:(?:{PLACE})_?)*z(?:_?(?:{PLACE}))*", "height", f"{GPS}(?:alt|altitude|elevation)"],
-    "longitude": [f"{GPS}(?:lon|lng|long|longitude)"],
-    "latitude": [f"{GPS}(?:lat|latitude)"],
+    "longitude": [f"{GPS}(?:lon|lng|long|longitude){GPS_END}"],
+    "latitude": [f"{GPS}(?:lat|latitude){GPS_END}"],
     "floor": ["floor(?:_?(?:id|name|number|no|level))?|storey|etage|stockwerk"],
     "time": [
         "time_?stamp|date_?time|unix(?:_?time)?|epoch(?:_?time)?|(?:gps|utc|local|phone|system|event|measured|received)_?time",
-        "time|t",
+        "time|t|ts|elapsed(?:_?time)?|uptime",
         "date",
         "(?:first|last)_?seen|(?:received|measured|recorded|created|logged|reported)_?at",
     ],
@@ -42,7 +42,7 @@ ROLES = {  # patterns of names in lower case with underscores and without units,
     "receiver": [
         "receiver(?:_?(?:name|id))?|rx(?:_?(?:name|id))?",
         "(?:gateway|gw|gtw)(?:_?(?:name|id|eui))?",
-        "bssid|(?:ap_?)?mac(?:_?addr(?:ess)?)?(?:_of_ap)?",
+        "(?:(?:ap|wifi|wlan|ble|bt|beacon|router|station)_?)?(?:bssid|mac(?:_?addr(?:ess)?)?)(?:_of_ap)?",
         "(?:ap|access_?point)(?:_?(?:id|name|mac|address))?",
         "(?:anchor|sensor|node|station|beacon|tag_?reader|reader)(?:_?(?:id|name|mac|address))?|eui|(?:ble_?)?address",
         CELL_ID,
@@ -58,7 +58,7 @@ ROLES = {  # patterns of names in lower case with underscores and without units,
 }
 NO_POWER = re.compile(  # quantities beside received power that may be negative, as the last words of a name
     r"(?:.*_)?(?:"
-    r"rsrq|rsr_q|r?ss?nr|sinr|l?snr|esnr|ec_?[in]?o|cqi|noise(?:_?(?:floor|level|power))?|nf|offset|path_?loss|error|gain"
+    r"rsrq|rsr_q|r?ss?nr|sinr|l?snr|esnr|ec_?[in]?o|cqi|qual|quality|noise(?:_?(?:floor|level|power))?|nf|offset|path_?loss|error|gain"
     r"|tx_?p\w*|transmit\w*_power|power_?tx|eirp|erp|measured_power|ref\w*_power"
     r"|(?:mag|magnet\w*|geomag\w*|acc|accel\w*|gyro\w*|grav\w*|ori|orient\w*|rot|rotation\w*|imu|odom\w*)_?[xyzw]?\d?"
     r"|(?:b|m|q|v|vel|velocity|speed|est|estimated?|pred|predicted|hat|slam|vio|ekf|euler|angle)_?[xyzw]"
@@ -67,12 +67,13 @@ NO_POWER = re.compile(  # quantities beside received power that may be negative,
     r")(?:_(?:mean|avg|std|serving|\d+))*"
 )
 GROUPS_OF_ROWS = re.compile(  # columns that distinguish rows, but not the receivers
-    r"(?:.*_)?(?:device|phone|user|model|brand|person|operator|mode|weather|channel|ch|freq\w*|band|sf|data_?rate|modulation|bw"
+    r"(?:.*_)?(device|phone|user|model|brand|person|operator|mode|weather|channel|ch|freq\w*|band|sf|data_?rate|modulation|bw"
     r"|bandwidth|codr|building\w*|room|zone|area|space\w*|site|place|location|point|snapshot|direction|orientation|date|day"
     r"|time\w*|type|security|auth_?mode|capabilities|vendor|manufacturer|provider|experiment\w*|trial|comment|notes?|version|os"
     r"|app\w*|sample\w*|index|idx|row|count\w*|seq\w*|packet\w*|frame\w*|node_?addr\w*|dev_?(?:eui|addr))"
     r"(?:_?(?:id|name|no|number))?"
 )
+MIN_ROWS = 5  # for a comparison of values
 MIN_REFERENCE_DBM = -25.0  # median of a column that is a received power by its values alone
 GEODETIC = {"x": "longitude", "y": "latitude"}  # that take the place of x and y
 
@@ -164,6 +165,8 @@ def receiver_columns(table: pd.DataFrame, names: Sequence[str]) -> tuple[list[st
     plausible = [name for name in found if _is_plausible(powers[name])] or found
     whole = [name for name in plausible if (powers[name] % 1 == 0).all()]
     reference = whole if len(whole) > 1 or set(whole) & set(bare) else plausible
+    if len(table) < MIN_ROWS:  # e.g. one of a stream
+        reference = found
     kin = {_kinship(plain[name]) for name in reference}
     doubtful = [name for name in found if name not in reference and _kinship(plain[name]) not in kin]
     notes = []
@@ -218,18 +221,21 @@ def check_receiver_known(
     Raises:
         InputError: The question whether the column contains the receivers.
     """
+    timed = len(place) > 2
     together = table.groupby([text_of(table[name]) for name in place], sort=False).ngroup()
     several = together.groupby(together).transform("size") > 1
     for name in others:
         cell = text_of(table[name])
         values, is_text = parsed(table[name])
         count = cell.value_counts()
-        if GROUPS_OF_ROWS.fullmatch(plain_name(name)) or not 2 <= len(count) <= len(cell) / 3 or "" in count.index:
+        if not 2 <= len(count) <= len(cell) / 3 or "" in count.index:
             continue
         is_name = is_text.mean() > 0.9 or bool((values % 1 == 0).all())
         apart = ~pd.DataFrame({"row": together, "cell": cell}).duplicated(keep=False)
         is_packet = several.mean() > 0.3 and apart[several].mean() > 0.8
         alternates = is_text.all() and not several.any() and (cell != cell.shift()).mean() > 0.5
+        if (group := GROUPS_OF_ROWS.fullmatch(plain_name(name))) and not (timed and is_packet and group[1] == "device"):
+            continue
         if is_name and (is_packet or alternates):
             raise InputError(
                 f"{label}: is {name!r} the receiver of each row? Then give --columns receiver={name}, or --columns "

@@ -71,8 +71,6 @@ class PlanFrame(NamedTuple):
         up: Axis that points up, "y" as in ARCore, ARKit and Unity.
 
     Example:
-        >>> PlanFrame(up="y").to_world(np.array([[1.0, 2.0, 3.0]]))
-        array([[ 1., -3.,  2.]])
         >>> PlanFrame(scale=20.0, y_down=True).to_world(np.array([[10.0, 40.0, 3.0]]))
         array([[ 0.5, -2. ,  3. ]])
     """

@@ -240,9 +240,9 @@ def table_of(label: object, text: str, header: bool = True) -> pd.DataFrame:
 
 def _regular(label: object, lines: list[list[str]]) -> tuple[list[str], list[list[str]], list[str]]:
     """Return names of columns, rows of equal length, and notes on lines, rows and columns without content."""
-    names = [name.strip().removeprefix("#").strip() for name in lines[0]]
-    repeated = [line for line in lines[1:] if line == lines[0]]
-    rows = [line for line in lines[1:] if line != lines[0] and any(map(str.strip, line))]
+    names = _names_in(lines[0])
+    repeated = [line for line in lines[1:] if line[0].strip(" #") == names[0] and _names_in(line) == names]
+    rows = [line for line in lines[1:] if line not in repeated and any(map(str.strip, line))]
     notes = []
     if repeated:
         notes.append(f"lines that repeat the header are left out: {len(repeated)}")
@@ -277,6 +277,10 @@ def _regular(label: object, lines: list[list[str]]) -> tuple[list[str], list[lis
         twice = next(name for name in names if names.count(name) > 1)
         raise InputError(f"{label} names column {twice!r} twice; each needs a name of its own")
     return names, rows, notes
+
+
+def _names_in(line: list[str]) -> list[str]:
+    return [name.strip().removeprefix("#").strip() for name in line]
 
 
 def _is_second_header(row: list[str], below: list[str]) -> bool:

@@ -20,6 +20,7 @@ MIN_RSSI_DBM, MAX_RSSI_DBM = -150.0, 30.0
 # a frequent value from -1 dBm on is a filler, unless values within 10 dB are as frequent
 N_NEIGHBOURS_DB = 5  # of the next stronger values that a filler at the lower edge is compared with
 MIN_REPEATS = 5  # cells with a filler that is not known
+MIN_AT_END = 0.25  # fraction of the receivers that reach the upper end of the scale
 MIN_VALUES = 5  # different values that are left
 
 
@@ -69,12 +70,12 @@ def _is_frequent(value: Floats, count: NDArray[np.int64], index: int, within_db:
     return bool(count[index] > 3.0 * bins.max())
 
 
-def _fills_the_lower_edge(rssi: Floats, value: Floats, count: NDArray[np.int64]) -> bool:
-    """Return True if the least value is frequent, and the least of most receivers."""
+def _fills_the_lower_edge(rssi: Floats, value: Floats, count: NDArray[np.int64], share: float = 0.5) -> bool:
+    """Return True if the least value is frequent, and the least of more than a fraction of the receivers."""
     if len(value) <= MIN_VALUES or count[0] < MIN_REPEATS or not _is_frequent(value, count, 0, N_NEIGHBOURS_DB):
         return False
     weakest = np.where(rssi >= value[0], rssi, np.inf).min(axis=0)
-    return bool((weakest[np.isfinite(weakest)] == value[0]).mean() > 0.5)  # near receivers detect every row
+    return bool((weakest[np.isfinite(weakest)] == value[0]).mean() > share)  # near receivers detect every row
 
 
 def without_fillers(rssi: Floats, fillers: list[float]) -> tuple[Floats, list[str]]:
@@ -104,7 +105,7 @@ def end_of_scale(rssi: Floats) -> list[str]:
         ['the scale ends at -50 dBm: 6 of 12 cells (50%) have this largest value, so their power is at least that']
     """
     value, count = np.unique(-rssi[~np.isnan(rssi)], return_counts=True)
-    if not _fills_the_lower_edge(-rssi, value, count):
+    if not _fills_the_lower_edge(-rssi, value, count, MIN_AT_END):
         return []
     share = f"{count[0]} of {rssi.size} cells ({count[0] / rssi.size:.0%})"
     return [f"the scale ends at {-value[0]:g} dBm: {share} have this largest value, so their power is at least that"]

@@ -46,6 +46,7 @@ class Rssi(PositionedData):
         labels: Names of columns of the table that distinguish groups of rows.
         floors: Floors of the building, by height.
         receiver_moves: Whether the receivers are positions of one receiver that moves, too.
+        plan_scale: Pixels in a metre if positions were pixels of a floor plan, whose upper left corner is x = y = 0.
         session: Session of measurements that each row is of, e.g. a walk or a day: n names, or their numbers, int64 (n,).
         time: Time of each measurement [s], (n,), nan where unknown.
         name: Name of the data set.
@@ -71,6 +72,7 @@ class Rssi(PositionedData):
     labels: tuple[str, ...]
     floors: Floors | None
     receiver_moves: bool
+    plan_scale: float | None
     session: Tensor | None
     time: Tensor | None
 
@@ -90,6 +92,7 @@ class Rssi(PositionedData):
         labels: tuple[str, ...] = (),
         floors: Floors | None = None,
         receiver_moves: bool = False,
+        plan_scale: float | None = None,
         session: Tensor | Sequence[str | int] | None = None,
         time: Numbers | None = None,
         name: str = "rssi",
@@ -123,6 +126,7 @@ class Rssi(PositionedData):
             labels=labels,
             floors=floors,
             receiver_moves=receiver_moves,
+            plan_scale=plan_scale,
             session=None if session is None else numbered(session),
             time=None if time is None else to_tensor("time", time, torch.float64, (None,), missing=True),
         )

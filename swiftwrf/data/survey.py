@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import fnmatch
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -91,22 +91,8 @@ def read_survey(
 ) -> dict[str, Any]:
     """Return the arguments of `Rssi` that a survey table determines: RSSI, positions, receivers and what rows are of.
 
-    Columns get their roles, cells their units, and then rows are formed: one a place, time and packet of a receiver.
-
-    Args:
-        label: Name of the table, for messages.
-        table: One row a position (wide) or a packet (long).
-        columns: As the other arguments, those of `Rssi.from_frame`.
-        filler: Values that stand for not detected.
-        coordinates: Unit of the positions.
-        offset_by: Column with the group of each row. Packets of a row of RSSI are of one group.
-        transmitter: Columns of the second end where both ends move.
-        pool_by: Radios to pool.
-        scale: Pixels, or other units of x and y, in a metre.
-        y_down: y points down, as in images.
-        up: Axis that points up.
-        window: Length of the windows [s] whose packets are joined.
-        receivers: Table of positions of receivers.
+    Columns get their roles, cells their units, and then rows are formed: one a place, time and packet of a receiver. The
+    label names the table in messages. Options are those of `load_rssi`, receivers is a table of their positions.
 
     Raises:
         InputError: A column that is missing or ambiguous, or a value that is no position or received power.
@@ -115,9 +101,11 @@ def read_survey(
     table = table.set_axis([str(name).strip() for name in table.columns], axis=1).reset_index(drop=True)
     if not len(table) or not table.columns.is_unique:
         raise InputError(f"{label} must have rows, and a name of its own for each column")
-    roles, names, end, found = _roles(label, table, dict(columns or {}), transmitter, offset_by, pool_by)
+    if offset_by is not None and offset_by not in table.columns:
+        raise InputError(f"{label} has no column {offset_by!r} for offsets; there are {listed(table.columns)}")
+    kept_for = {offset_by, pool_by}
+    table, roles, names, end, unused, found = _roles(label, table, dict(columns or {}), transmitter, kept_for)
     notes += found
-    unused = [name for name in table.columns if name not in (*roles.values(), *names, offset_by, pool_by)]
 
     coordinate, frame, found = _coordinates(label, table, roles, PlanFrame(scale, y_down, up))
     notes += found
@@ -126,8 +114,8 @@ def read_survey(
         coordinate[np.isnan(coordinate).any(axis=1)] = np.nan
     group = text_of(table[offset_by]) if offset_by else pd.Series([""] * len(table))
     session = text_of(table[roles["session"]]) if "session" in roles else None
+    apart = group if session is None else group + "\n" + session
     if "receiver" in roles:
-        apart = group if session is None else group + "\n" + session
         names, rssi, source, coordinate, found = _long(label, table, roles, coordinate, apart)
     else:
         _check_size(label, len(table), len(names))
@@ -168,8 +156,7 @@ def read_survey(
     if window is not None:
         if time is None:
             raise InputError(f"{label} has no column of times, which a window of {window:g} s needs; leave it out")
-        kind = (group if session is None else group + "\n" + session).to_numpy()[origins]
-        first, rssi, position, time = _windows(kind, time, rssi, position, window)
+        first, rssi, position, time = _windows(apart.to_numpy()[origins], time, rssi, position, window)
         notes.append(f"{len(row)} rows are joined to {len(first)} by their mean in windows of {window:g} s")
         row, origins = row[first], origins[first]
     elif time is not None:
@@ -182,8 +169,11 @@ def read_survey(
         notes += found
     groups = Groups.of(offset_by, group.to_numpy()[origins].tolist()) if offset_by else None
     sessions = None if session is None else session.to_numpy()[origins].tolist()
-    # columns with few different values, each of them in several rows
+    # columns with few different values, each of them in several rows, that are no other names of the receivers
     times = {name: text_of(table[name]).value_counts() for name in (*unused, roles.get("session")) if name}
+    if "receiver" in roles:
+        several = table.groupby(roles["receiver"])[list(times)].nunique().max() > 1
+        times = {name: count for name, count in times.items() if several[name]}
     labels = tuple(name for name, count in times.items() if 2 <= len(count) <= 30 and int(count.min()) >= 10)
     if labels and not offset_by:
         notes.append(f"rows differ in {listed(labels)}; tasks.inspect tests whether its values have constant offsets")
@@ -204,6 +194,7 @@ def read_survey(
         "labels": labels,
         "floors": floors,
         "receiver_moves": moves,
+        "plan_scale": frame.scale if frame.y_down else None,
         "session": sessions,
         "time": time,
         "index": row,
@@ -216,23 +207,24 @@ def _roles(
     table: pd.DataFrame,
     asked: dict[str, str],
     transmitter: Sequence[str],
-    offset_by: str | None,
-    pool_by: str | None,
-) -> tuple[dict[str, str], list[str], dict[str, str], list[str]]:
-    """Return the columns by role, those of receivers of a wide table, those of the second end, and notes on all."""
+    kept_for: Set[str | None],
+) -> tuple[pd.DataFrame, dict[str, str], list[str], dict[str, str], list[str], list[str]]:
+    """Return the table, its columns by role, those of receivers if it is wide, of the second end, of no use, and notes.
+
+    Columns of groups and pools are kept for these.
+    """
     end = dict[str, str]()
     if len(transmitter) == 1:
         asked["receiver"] = transmitter[0]
     elif transmitter or not {"x", "y"} & asked.keys():
         end = transmitter_columns(label, table, transmitter)
     roles = find_roles(label, table, asked, end.values())
-    for name in (offset_by, pool_by):
-        if offset_by is not None and name == offset_by and name not in table.columns:
-            raise InputError(f"{label} has no column {name!r} for offsets; there are {listed(table.columns)}")
     names, left_out, notes = list[str](), list[str](), list[str]()
     if "receiver" not in roles:
         power = roles.pop("rssi", None)
-        others = [name for name in table.columns if name not in (*roles.values(), *end.values(), offset_by, pool_by)]
+        others = [name for name in table.columns if name not in {*roles.values(), *end.values(), *kept_for}]
+        numbers = {name: values for name in others for values, text in [parsed(table[name])] if not text.any()}
+        table = table.assign(**numbers)  # each cell is parsed once
         if "rssi" in asked:
             names = [power] if power else fnmatch.filter(others, asked["rssi"])
         else:
@@ -250,10 +242,11 @@ def _roles(
     if names:
         taken.append(f"RSSI of {len(names)} receivers = {listed(names)}" if len(names) > 1 else f"RSSI = {names[0]}")
     notes.insert(0, f"taken as: {', '.join(taken)}")
-    unused = {*table.columns} - {*roles.values(), *end.values(), *names, *left_out, offset_by, pool_by}
+    used = {*roles.values(), *end.values(), *names, *left_out, *kept_for}
+    unused = [name for name in table.columns if name not in used]
     if unused:
-        notes.append(f"columns that are not used: {listed(name for name in table.columns if name in unused)}")
-    return roles, names, end, notes
+        notes.append(f"columns that are not used: {listed(unused)}")
+    return table, roles, names, end, unused, notes
 
 
 def _power_of(label: object, table: pd.DataFrame, names: Sequence[str]) -> tuple[Floats, list[str]]:
@@ -266,7 +259,7 @@ def _power_of(label: object, table: pd.DataFrame, names: Sequence[str]) -> tuple
     words = pd.Series(table[list(names)].to_numpy(dtype=object)[text], dtype=object).astype(str).str.strip()
     if len(words) >= MIN_REPEATS and words.nunique() == 1:
         return values, [f"{words[0]!r} counts as not detected: {len(words)} of {text.size} cells ({text.mean():.0%})"]
-    for name in names:
+    for name in np.array(names)[text.any(axis=0)]:
         column_of_numbers(label, table, name)
     return values, []
 
@@ -307,9 +300,9 @@ def _times(table: pd.DataFrame, roles: dict[str, str], position: Floats) -> tupl
         return None, []
     column = table[roles["time"]]
     days = [name for name in candidates(table, "time") if plain_name(name) == "date" and name != column.name]
-    is_clock = column.dtype.kind not in "biufM" and bool(text_of(column).str.fullmatch(CLOCK_ONLY).all())
-    time, notes = seconds(column, table[days[0]] if days and is_clock else None)
-    if days and is_clock:
+    is_joined = bool(days) and column.dtype.kind not in "biufM" and text_of(column).str.fullmatch(CLOCK_ONLY).all()
+    time, notes = seconds(column, table[days[0]] if is_joined else None)
+    if is_joined:
         notes.append(f"columns {days[0]} and {column.name} together are the time")
     if not notes and np.isfinite(time).all() and len(time) > MIN_REPEATS and (parsed(column)[0] % 1 == 0).all():
         order = np.argsort(time, kind="stable")
@@ -352,8 +345,9 @@ def _windows(
     kind: NDArray[Any], time: Floats, rssi: Floats, position: Floats, window: float
 ) -> tuple[NDArray[np.int64], Floats, Floats, Floats]:
     """Return the first row, and mean RSSI [dBm], position and time of the rows in each window. Kinds are kept apart."""
-    keys = pd.DataFrame({"kind": kind, "window": np.floor((time - np.nanmin(time)) / window)})
-    number = keys.groupby(["kind", "window"], sort=False, dropna=False).ngroup().to_numpy()
+    alone = -1.0 - np.arange(len(time))  # rows without a time
+    keys = pd.DataFrame({"kind": kind, "window": np.where(np.isnan(time), alone, (time - np.nanmin(time)) // window)})
+    number = keys.groupby(["kind", "window"], sort=False).ngroup().to_numpy()
     _, first = np.unique(number, return_index=True)
     n_rssi, n_position = rssi.shape[1], position.shape[1]
     means = pd.DataFrame(np.column_stack([rssi, position, time])).groupby(number).mean().to_numpy()

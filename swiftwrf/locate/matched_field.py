@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Annotated, ClassVar, Self
 
@@ -22,20 +22,22 @@ from swiftwrf.gp import subsample
 from swiftwrf.locate.posterior import Posterior, inflation, normalised, pooled_weights, read_inflation
 from swiftwrf.locate.region import Cells, Region, best_cells, outside_mass, refined
 from swiftwrf.locate.spectrum_likelihood import (
+    CARRIER,
     ChannelLikelihood,
     CoarrayLikelihood,
     Features,
     PathWaves,
     PhaseLikelihood,
     SpectrumFeatures,
+    ends,
     gain_features,
     room_features,
 )
 from swiftwrf.locate.student import Student
 from swiftwrf.models.base import FieldModel
 from swiftwrf.models.geometry import GeometryModel
+from swiftwrf.models.geometry.channels import coherence
 from swiftwrf.models.geometry.fit import GeometryConfig, observe
-from swiftwrf.models.geometry.furniture import coherence
 from swiftwrf.models.geometry.model import kept_snapshots
 from swiftwrf.models.geometry.path_gains import PRIORS, PathGains, choose_prior, fit_path_gains, kernel_of
 from swiftwrf.positions import to_tensor
@@ -97,9 +99,10 @@ class _Fit:
 
 @dataclass(frozen=True, eq=False)
 class _Likelihoods:
-    """Likelihoods that share a room."""
+    """Likelihoods that share a room and the frequencies relative to the carrier."""
 
     room: GeometryModel
+    frequency: Tensor
     coarray: tuple[CoarrayLikelihood, ...]
     phases: PhaseLikelihood
     channel: tuple[ChannelLikelihood, ...]
@@ -115,10 +118,10 @@ class _Likelihoods:
         at, owner = position.reshape(-1, 3), torch.arange(n).repeat_interleave(m)
 
         def of_batch(rows: Tensor) -> Tensor:
-            waves, target = PathWaves.at(self.room, at[rows]), observed.subset(owner[rows])
+            waves, target = PathWaves.at(self.room, at[rows], self.frequency), observed.subset(owner[rows])
             return torch.stack([part(waves, target) for part in self.parts])
 
-        batches = torch.arange(n * m).split(BATCH_CANDIDATES)
+        batches = torch.arange(n * m).split(BATCH_CANDIDATES // len(self.frequency))
         return torch.cat(parallel_map(of_batch, batches), dim=1).reshape(len(self.parts), n, m)
 
 
@@ -150,12 +153,10 @@ class _ChannelScreen:
     """Likelihood of channels at all cells of the region.
 
     Args:
-        snapshot: Numbers of at most two snapshots that are compared.
-        predicted: Their channels at the cells, complex64 (F, m, K).
+        predicted: Channels at the cells, complex64 (F, m, K), of one snapshot or of the first and the last.
         likelihood: Likelihood of all snapshots.
     """
 
-    snapshot: Tensor
     predicted: Tensor
     likelihood: ChannelLikelihood
 
@@ -166,9 +167,10 @@ class _ChannelScreen:
     def log_likelihood(self, observed: SpectrumFeatures) -> Tensor:
         """Return the log-likelihoods (n, m) of n observations, up to a constant of each."""
         assert observed.channel is not None
-        channel = observed.channel[:, self.snapshot].movedim(1, 0)  # (F, n, K)
+        count = observed.channel.shape[1]
+        channel = observed.channel[:, ends(count)].movedim(1, 0)  # (F, n, K)
         match = (channel.conj() @ self.predicted.mT).abs().square().sum(dim=0)
-        power = channel.abs().square().sum(dim=2).T @ self._power
+        power = channel.abs().square().sum(dim=2).T @ self._power.expand(len(channel), -1)
         return self.likelihood.log_density(match / power.clamp_min(1e-30), observed.channel)
 
 
@@ -250,7 +252,7 @@ class MatchedField(Configured, Saved):
         def fitted(kept: Tensor) -> _Fit:
             phases = scene.subset(kept[rows].nonzero()[:, 0])
             part = chosen.refined_on(phases).furnished_on(train.subset(kept))
-            likelihood = PhaseLikelihood.fit(part, train.position[kept], features.subset(kept))
+            likelihood = PhaseLikelihood.fit(part, train.position[kept], features.subset(kept), self._frequency(part))
             return _Fit(part, None if self.n_snapshots else fit_path_gains(part, phases, kernel, prior), likelihood)
 
         everything = torch.ones_like(fold, dtype=torch.bool)
@@ -259,12 +261,11 @@ class MatchedField(Configured, Saved):
         self.residual = torch.empty(len(self._fit.features), *features.coarray.shape)
         missing = torch.ones(len(train))
         for number, part in enumerate(parts):
-            waves = PathWaves.at(part.room, train.position[fold == number])
+            waves = PathWaves.at(part.room, train.position[fold == number], self._frequency(part.room))
             for kind, predict in enumerate(part.features):
                 self.residual[kind, fold == number] = predict(waves) - features.coarray[fold == number]
             if features.channel is not None:
-                predicted = ChannelLikelihood(part.room, self._frequency(part.room), 0.0).predict(waves)
-                missing[fold == number] = 1 - coherence(features.channel[fold == number], predicted)
+                missing[fold == number] = 1 - coherence(features.channel[fold == number], waves.channel)
         self.floor = max(float(missing.median()), MIN_FLOOR)
         self.observed_power = float(features.coarray.square().mean())
         held_out = [train.position[fold == number] for number in range(FOLDS)]
@@ -289,15 +290,12 @@ class MatchedField(Configured, Saved):
         batches = self.cells.position.split(BATCH_CANDIDATES)
         if self.likelihoods.channel:
             (own,) = self.likelihoods.channel
-            snapshot = torch.arange(len(own.frequency))[:: max(1, len(own.frequency) - 1)]
-
-            few = replace(own, frequency=own.frequency[snapshot])
+            frequency = self._frequency(self.room)[ends(len(self._frequency(self.room)))]
 
             def predicted(position: Tensor) -> Tensor:
-                waves = PathWaves.at(self.room, position)
-                return few.predict(waves).movedim(1, 0)
+                return PathWaves.at(self.room, position, frequency).channel.movedim(1, 0)
 
-            self._screens = [_ChannelScreen(snapshot, torch.cat(parallel_map(predicted, batches), dim=1), own)]
+            self._screens = [_ChannelScreen(torch.cat(parallel_map(predicted, batches), dim=1), own)]
             return
         constant, varying = self.likelihoods.coarray
         assert self._fit.gains is not None
@@ -314,21 +312,20 @@ class MatchedField(Configured, Saved):
 
     def _likelihoods(self, fit: _Fit, kept: Tensor | None = None) -> _Likelihoods:
         residual = self.residual if kept is None else self.residual[:, kept]
+        frequency = self._frequency(fit.room)
         if self.n_snapshots:
-            channel = ChannelLikelihood(fit.room, self._frequency(fit.room), self.floor)
-            return _Likelihoods(fit.room, (), fit.phases, (channel,))
+            return _Likelihoods(fit.room, frequency, (), fit.phases, (ChannelLikelihood(self.floor),))
         coarray = (
             CoarrayLikelihood(predict, part, self.observed_power)
             for predict, part in zip(fit.features, residual, strict=True)
         )
-        return _Likelihoods(fit.room, tuple(coarray), fit.phases, ())
+        return _Likelihoods(fit.room, frequency, tuple(coarray), fit.phases, ())
 
     def _frequency(self, room: GeometryModel) -> Tensor:
-        """Return the frequencies of the snapshots relative to the carrier, (F,)."""
-        kept = kept_snapshots(self.n_snapshots)
+        """Return the frequencies of the kept snapshots relative to the carrier, (F,), one where all are at the carrier."""
         if self.frequency_hz is None:
-            return torch.ones(len(kept), dtype=torch.float64)
-        return self.frequency_hz[kept] * room.array.wavelength / LIGHT_SPEED
+            return CARRIER
+        return self.frequency_hz[kept_snapshots(self.n_snapshots)] * room.array.wavelength / LIGHT_SPEED
 
     def _calibrate(self, position: Tensor, features: SpectrumFeatures, fold: Tensor, parts: list[_Fit]) -> None:
         """Choose the weights of the likelihoods and the inflation of credible radii by held-out positions."""
@@ -447,7 +444,7 @@ class MatchedField(Configured, Saved):
         features, is_channel = 2 * len(differences(room.array)), bool(header["n_snapshots"])
         n, known = tensors["residual"].shape[1], len(tensors["region"])
         shapes = {
-            "statistics": (4 + len(room.planes),),
+            "statistics": (4 + room.reflectors.gain.shape[1],),
             "residual": (0 if is_channel else 2, n, features),
             "region": (known, 3),
             "weight": (2 if is_channel else 3,),

@@ -24,13 +24,13 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.locate.student import Student, covariance
+from swiftwrf.models.geometry.channels import coherence, field, waves
 from swiftwrf.models.geometry.fit import carrier_phases
-from swiftwrf.models.geometry.furniture import coherence, field
-from swiftwrf.models.geometry.furniture import waves as path_waves
 from swiftwrf.models.geometry.model import GeometryModel, kept_snapshots
-from swiftwrf.models.geometry.path_gains import PathGains, paths
+from swiftwrf.models.geometry.path_gains import PathGains
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation, coarray_numbers, retrieve_phases
 
+CARRIER = torch.ones(1, dtype=torch.float64)  # frequency relative to the carrier
 BOUNDS = (-10.0, 6.0)  # of the logarithms of variances: products of four of them stay within float32
 
 
@@ -40,7 +40,8 @@ class SpectrumFeatures:
 
     Args:
         coarray: Real and imaginary parts of the co-array numbers, float32 (n, F).
-        phases: Element phasors of unit modulus and their indistinguishable aliases, complex64 (n, T, K), T = 1 or 2.
+        phases: Element phasors of unit modulus and their indistinguishable aliases, complex64 (n, G, T, K). T is 2 if there
+            are aliases. G is 1 for spectra, and 2 if there are channels at several frequencies, the lowest and the highest.
         channel: Measured channels, complex64 (n, F, K), or None.
     """
 
@@ -55,14 +56,15 @@ class SpectrumFeatures:
         channel, _ = retrieve_phases(numbers, array, seed)
         opposite = array.opposite
         aliases = [channel] if opposite is None else [channel, channel.conj()[:, opposite]]
-        return cls(real_parts(numbers), torch.stack(aliases, dim=1).to(torch.complex64))
+        return cls(real_parts(numbers), torch.stack(aliases, dim=1).to(torch.complex64)[:, None])
 
     @classmethod
     def of_channels(cls, channel: Tensor, frequency_hz: Tensor | None, array: PlanarArray) -> SpectrumFeatures:
         """Compute the features of channels (n, S, K) at frequencies (S,) [Hz]."""
-        phases = carrier_phases(channel, frequency_hz, array)
+        carrier = carrier_phases(channel, frequency_hz, array)
         kept = channel[:, kept_snapshots(channel.shape[1])]
-        return cls(real_parts(autocorrelation(phases, array)), phases[:, None], kept)
+        phases = carrier[:, None] if frequency_hz is None else kept[:, ends(kept.shape[1])].sgn()
+        return cls(real_parts(autocorrelation(carrier, array)), phases[:, :, None], kept)
 
     def subset(self, rows: Tensor) -> SpectrumFeatures:
         """Return the features of some of the spectra."""
@@ -71,6 +73,11 @@ class SpectrumFeatures:
 
     def __len__(self) -> int:
         return len(self.coarray)
+
+
+def ends(number: int) -> list[int]:
+    """Return the numbers of the first and the last of some snapshots."""
+    return sorted({0, number - 1})
 
 
 def real_parts(numbers: Tensor) -> Tensor:
@@ -84,7 +91,7 @@ class PathWaves:
 
     Args:
         position: Candidate positions, float64 (m, 3) [m].
-        wave: Wave of the direct path and of each image at the elements, complex64 (m, 1 + S, K).
+        wave: Wave of the direct path and of each image at each frequency and element, complex64 (m, 1 + S, F, K).
         gain: Gains of the paths, (m, 1 + S).
     """
 
@@ -93,14 +100,15 @@ class PathWaves:
     gain: Tensor
 
     @classmethod
-    def at(cls, room: GeometryModel, position: Tensor) -> PathWaves:
-        """Compute the waves at positions (m, 3) [m]."""
-        return cls(position, *paths(room, room.scene(position)))
+    def at(cls, room: GeometryModel, position: Tensor, frequency: Tensor = CARRIER) -> PathWaves:
+        """Compute the waves at positions (m, 3) [m] and frequencies (F,) relative to the carrier."""
+        scene = room.scene(position)
+        return cls(position, waves(room.reflectors, scene, frequency), room.gains(scene))
 
     @cached_property
     def channel(self) -> Tensor:
-        """Channel of each element by the room's path gains, complex64 (m, K)."""
-        return (self.gain.to(self.wave.dtype)[:, None] @ self.wave)[:, 0]
+        """Channel of each element by the room's path gains, complex64 (m, F, K)."""
+        return field(self.gain, self.wave)
 
 
 Features = Callable[[PathWaves], Tensor]
@@ -108,14 +116,14 @@ Features = Callable[[PathWaves], Tensor]
 
 def room_features(array: PlanarArray) -> Features:
     """Return a function from waves of m positions to co-array numbers by constant path gains, float32 (m, F)."""
-    return lambda waves: real_parts(autocorrelation(waves.channel.sgn(), array))
+    return lambda waves: real_parts(autocorrelation(waves.channel[:, 0].sgn(), array))
 
 
 def gain_features(array: PlanarArray, gains: PathGains) -> Features:
     """Return a function from waves of m positions to co-array numbers by position-dependent path gains, float32 (m, F)."""
 
     def features(waves: PathWaves) -> Tensor:
-        channel = (waves.gain[:, None] + gains.change(waves.position)) @ waves.wave
+        channel = (waves.gain[:, None] + gains.change(waves.position)) @ waves.wave[:, :, 0]
         return real_parts(autocorrelation(channel.sgn(), array).mean(dim=1))
 
     return features
@@ -147,7 +155,7 @@ class PhaseLikelihood:
     The phase of the whole channel is unknown and integrated over.
 
     Args:
-        room: Room with P planes, and its paths.
+        room: Room with P planes and further surfaces, and its paths.
         log_variance: Logarithms of variances, (4 + P,), relative to the power of the direct path's mean gain. The first is
             that of the direct path's gain, the next P are those of a first-order gain in each plane. The next one is that
             of higher orders, relative to the product of their planes' variances and squared gains. The last two are those of
@@ -157,7 +165,7 @@ class PhaseLikelihood:
 
     def __init__(self, room: GeometryModel, log_variance: Tensor) -> None:
         self.log_variance = log_variance
-        found, value = room.tensors(), log_variance.exp()
+        found, value = room.reflectors, log_variance.exp()
         direct, plane, (order, self._diffuse, self._floor) = value[0], value[1:-3], value[-3:].unbind()
         second = found.gain[0].square() + plane
         images = [
@@ -168,10 +176,12 @@ class PhaseLikelihood:
         self._isotropic = _isotropic(room)
 
     @classmethod
-    def fit(cls, room: GeometryModel, position: Tensor, observed: SpectrumFeatures) -> Self:
+    def fit(
+        cls, room: GeometryModel, position: Tensor, observed: SpectrumFeatures, frequency: Tensor = CARRIER
+    ) -> Self:
         """Fit the variances by the marginal likelihood of n observations at known positions (n, 3)."""
-        start = np.array([-3.0, *[-2.0] * len(room.planes), 0.0, -2.0, -2.0])
-        waves = PathWaves.at(room, position)
+        start = np.array([-3.0, *[-2.0] * room.reflectors.gain.shape[1], 0.0, -2.0, -2.0])
+        waves = PathWaves.at(room, position, frequency)
 
         @torch.enable_grad()
         def loss(values: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
@@ -186,8 +196,19 @@ class PhaseLikelihood:
         return cls(room, torch.from_numpy(found.x).float())
 
     def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
-        """Return log-likelihoods (m,) of m observations at m candidates, up to a constant of each observation."""
-        mean, wave, phases = waves.channel, waves.wave, observed.phases
+        """Return log-likelihoods (m,) of m observations at m candidates, up to a constant of each observation.
+
+        The path gains at several frequencies count as independent.
+        """
+        rows = ends(waves.wave.shape[2])
+        parts = [
+            self._density(waves.channel[:, row], waves.wave[:, :, row], phases)
+            for row, phases in zip(rows, observed.phases.unbind(1), strict=True)
+        ]
+        return torch.stack(parts).sum(dim=0)
+
+    def _density(self, mean: Tensor, wave: Tensor, phases: Tensor) -> Tensor:
+        """Return log-likelihoods (m,) of phases (m, T, K) at one frequency, with mean (m, K) and waves (m, 1 + S, K)."""
         power = (self._variance[:, None] * wave.abs().square()).sum(dim=1).mean(dim=1) + mean.abs().square().mean(dim=1)
         total = power * (1 + self._diffuse + self._floor)
         weighted = wave * self._variance.sqrt()[:, None]
@@ -215,25 +236,15 @@ class ChannelLikelihood:
     The floor is the median missing coherence at held-out positions: below it, errors of the room decide.
 
     Args:
-        room: Room with its furniture.
-        frequency: Frequencies of the snapshots relative to the carrier, (F,).
         floor: Missing coherence at true positions.
     """
 
-    room: GeometryModel
-    frequency: Tensor
     floor: float
-
-    def predict(self, waves: PathWaves) -> Tensor:
-        """Return the channels at candidates, complex64 (m, F, K)."""
-        if bool((self.frequency == 1).all()):
-            return waves.channel[:, None].expand(-1, len(self.frequency), -1)
-        return field(waves.gain, path_waves(self.room.tensors(), self.room.scene(waves.position), self.frequency))
 
     def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
         """Return log-likelihoods (m,) of m observations at m candidates, up to a constant of each observation."""
         assert observed.channel is not None
-        return self.log_density(coherence(observed.channel, self.predict(waves)), observed.channel)
+        return self.log_density(coherence(observed.channel, waves.channel), observed.channel)
 
     def log_density(self, coherence: Tensor, channel: Tensor) -> Tensor:
         """Return the log-likelihoods of coherences of any shape with channels (n, F, K)."""

@@ -16,7 +16,7 @@ from swiftwrf.choices import RSSI_PREDICTORS, NotDetected
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.rssi import PLACE
-from swiftwrf.data.splits import Validation
+from swiftwrf.data.splits import MIN_TRAINING, Validation
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import method_summary
 from swiftwrf.models.prediction import Prediction
@@ -30,7 +30,7 @@ from swiftwrf.rssi.paper import RssiPaperModel
 from swiftwrf.runtime.validation import Preset, checked
 
 Values = dict[str, Any]
-Keep = Callable[[str, Callable[[], tuple[RssiPredictor, Values]]], Values]
+Keep = Callable[[str, Callable[[], tuple[RssiPredictor | None, Values]]], Values]
 
 
 @checked
@@ -84,6 +84,7 @@ class RssiComparison:
             `detection` are the shares of detected and of empty test cells that are predicted as such, or None.
         left_out: Reason for each predictor that the data do not suffice for.
         predictors: Fitted predictors by name, without those whose values `keep` had.
+        by_rows: Mean absolute errors [dB] of the model and of "knn" by the number of training rows, a column for each.
 
     Example:
         >>> import swiftwrf
@@ -97,6 +98,7 @@ class RssiComparison:
     values: Mapping[str, Values]
     left_out: dict[str, str]
     predictors: dict[str, RssiPredictor] = field(default_factory=dict)
+    by_rows: DataFrame = field(default_factory=DataFrame)
 
     @property
     def model(self) -> str:
@@ -193,6 +195,7 @@ def compare(
     reference: str | None = None,
     not_detected: NotDetected = "auto",
     validation: Validation | Literal["auto"] = "auto",
+    fewer: Sequence[float] = (),
     device: torch.device | str = "cpu",
     parallel: Map | None = None,
     keep: Keep | None = None,
@@ -210,6 +213,7 @@ def compare(
         reference: Group whose offset is 0. Defaults to the most frequent one.
         not_detected: Meaning of an empty cell; see `RssiConfig`.
         validation: Folds that choose all settings: "random", "block" or "session". Defaults to those like the test rows.
+        fewer: Fractions of the training rows that the model and "knn" are fitted to, too, e.g. (0.25, 0.5).
         device: Device to compute on.
         parallel: Function that maps a picklable fit over receivers as `map` does.
         keep: Memo `keep(name, compute)`, which returns the values that it has under a name, or the second item of
@@ -239,22 +243,36 @@ def compare(
     names, left_out = compared(chosen, also)
     predictors: dict[str, RssiPredictor] = {}
 
-    def compute(name: str) -> tuple[RssiPredictor, Values]:
+    def compute(name: str, rows: Tensor | None = None) -> tuple[RssiPredictor, Values]:
         predictor = make_predictor(name, preset, **options)
+        part, every = (train, pool) if rows is None else (train.subset(rows), pool.subset(rows))
         began = time.perf_counter()
-        predictor.fit(train, pool=pool, device=device, parallel=parallel, progress=progress)
+        predictor.fit(part, pool=every, device=device, parallel=parallel, progress=progress)
         fitted = time.perf_counter()
         prediction = predictor.predict_detected(test)
         seconds = {"fit": fitted - began, "predict": time.perf_counter() - fitted}
-        predictors[name] = predictor
+        if rows is None:
+            predictors[name] = predictor
         std = None if prediction.std is None else prediction.std[test.detected]
         error = (prediction.mean + offset - test.rssi_dbm)[test.detected].abs()
         values = {"predicted": prediction.mean[test.detected], "std": std, "median_db": float(error.quantile(0.5))}
+        values["mean_db"] = float(error.mean())
         return predictor, seconds | values | {"detection": _detection(predictor, test)}
 
     keep = keep or (lambda name, compute: compute()[1])
     values = {name: keep(name, partial(compute, name)) for name in names}
-    return RssiComparison(train, test, values, left_out, predictors)
+    order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))
+    parts = [order[: round(fraction * len(train))].sort().values for fraction in fewer]
+    parts = [rows for rows in parts if int(train.detected[rows].sum(dim=0).min()) >= MIN_TRAINING]
+    studied = [name for name in (model_of(train), "knn") if name in names]
+
+    def study() -> tuple[None, Values]:
+        less = {str(len(rows)): {name: compute(name, rows)[1]["mean_db"] for name in studied} for rows in parts}
+        return None, less | {str(len(train)): {name: values[name]["mean_db"] for name in studied}}
+
+    by_rows = DataFrame.from_dict(keep("fewer rows", study) if parts else {}, orient="index")
+    by_rows = by_rows.set_index(by_rows.index.astype(int)).rename_axis("n_train")
+    return RssiComparison(train, test, values, left_out, predictors, by_rows)
 
 
 def _detection(predictor: RssiPredictor, test: Rssi) -> tuple[float, float] | None:

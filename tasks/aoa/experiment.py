@@ -21,7 +21,7 @@ from swiftwrf.metrics import angle_errors, covered
 from swiftwrf.runtime.steps import Step
 from tasks.aoa.options import AoaConfig
 from tasks.aoa.page import page
-from tasks.aoa.page.summary import answer
+from tasks.aoa.page.summary import answer_of
 from tasks.directory import Run
 from tasks.environment import choose_device
 from tasks.metrics import AoaMetrics
@@ -35,7 +35,7 @@ from tasks.terminal import console, terminal
 from tasks.workers import connected
 
 # of the PSNR at the test positions, from the best spectrum to the worst
-EXAMPLE_QUANTILES = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
+EXAMPLE_QUANTILES = (1.0, 0.5, 0.0)
 
 
 def run(config: AoaConfig, resume: Path | None = None) -> None:
@@ -76,7 +76,7 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
         results = Results(experiment, console.print)
         with terminal.progress():
             for step, value in run_steps(
-                directory, first_steps(experiment), experiment, cluster, partial(_show, experiment)
+                directory, first_steps(experiment), experiment, cluster, partial(_described, experiment)
             ):
                 results.add(step, value)
                 _write_files(step, value, experiment.test, directory)
@@ -100,7 +100,7 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
             "mixes": {fraction_key(fraction): results.summary(fraction) for fraction in config.mix},
         }
         final = directory.finish(metrics, reporting(page))
-    terminal.answer(answer(Records(final)), final / "report.html")
+    terminal.answer(answer_of(Records(final)), final / "report.html")
 
 
 def measurements(config: AoaConfig) -> Spectra:
@@ -114,16 +114,12 @@ def measurements(config: AoaConfig) -> Spectra:
     return load_spectra(located(config.data), **reading(config.spectra, TableSource()).given)
 
 
-def _show(experiment: Experiment, step: Step[Experiment], value: Row) -> None:
-    """Show the median angular error of a condition on the terminal."""
+def _described(experiment: Experiment, step: Step[Experiment], value: Row) -> str:
+    """Return the median angular error of a condition in words."""
     if not isinstance(step, Evaluation | Locating) or "refused" in value:
-        return
-    condition = step.condition
+        return ""
     error = angle_errors(torch.tensor(value["estimate"], dtype=torch.float64), experiment.test.label)["great_circle"]
-    name = condition.method
-    if condition.training != "all measured" and len(experiment.fractions) > 1:
-        name = f"{condition.measured_fraction:.0%}: {name}"
-    terminal.result(name, f"{float(error.nanquantile(0.5).rad2deg()):.2f} deg")
+    return f"{float(error.nanquantile(0.5).rad2deg()):.2f} degrees"
 
 
 def _write_files(step: Step[Experiment], value: Row, test: Spectra, run: Run) -> None:

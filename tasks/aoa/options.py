@@ -21,7 +21,7 @@ class AoaConfig(Options):
 
     Without --data the built-in simulated room is used. swiftwrf resume DIR.partial continues an interrupted run.
 
-    Example: python -m tasks.aoa --mix 0.3 --data DIR --split block
+    Example: swiftwrf aoa --mix 0.3 --data DIR --split block
     """
 
     mix: tuple[float, ...] = ()

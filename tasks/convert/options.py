@@ -22,9 +22,9 @@ class ConvertConfig(Options):
     SOURCE is measurements of any known format (see docs/formats.md), the directory of a run of tasks.rssi or tasks.locate,
     or a saved RSSI model.
 
-    Example: python -m tasks.convert DIR converted --calibrate
+    Example: swiftwrf convert DIR converted --calibrate
 
-    Example: python -m tasks.convert runs/rssi/first map.tif
+    Example: swiftwrf convert runs/rssi/first map.tif
     """
 
     source: Annotated[str, tyro.conf.Positional]

@@ -13,7 +13,7 @@ from tasks.options import Options, Output, SpectraSource, TableSource, options
 class InspectConfig(Options):
     """Inspect measurements of any known format: counts, extents, neighbours, frames, calibration, suspicious columns.
 
-    Example: python -m tasks.inspect DIR
+    Example: swiftwrf inspect DIR
     """
 
     source: Annotated[str, tyro.conf.Positional]

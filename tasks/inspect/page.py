@@ -13,6 +13,7 @@ from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.data import Rssi, Spectra
 from swiftwrf.diagnostics.inspection import Findings, nearest
 from swiftwrf.rssi import fit_path_loss, log_distance
+from tasks.answer import NextStep
 from tasks.environment import command
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table
@@ -28,7 +29,7 @@ PLAN = (
     "(red), y (green) and its normal (blue)."
 )
 DIRECTIONS = (
-    "Lines of sight (left) and peaks of the spectra (middle) as the array sees them, coloured by the azimuth of the line of "
+    "Lines of sight and peaks of the spectra as the array receives them, coloured by the azimuth of the line of "
     "sight: one picture where frames and calibration are right."
 )
 
@@ -50,13 +51,19 @@ def page(findings: Findings, kind: str, source: str) -> Page:
         Number(str(len(data)), f"measurements, read as {kind}"),
         Number(f"{extent} m", "extent of the positions, x by y by z"),
     ]
-    mend = [f"Correct the warnings and inspect again: `{command('inspect', source)}`."] if warnings else []
-    steps = [*mend, f"Go on with `{command(*task, '--data', source)}`."]
-    meaning = warnings or ["Nothing looks wrong. Errors that the files alone do not reveal remain possible."]
-    conclusion = _fingerprinting(data) if isinstance(data, Spectra) else ""
+    mend = [NextStep("Correct the warnings and inspect again", command("inspect", source))] if warnings else []
+    steps = [*mend, NextStep("Go on", command(*task, "--data", source))]
+    conclusion = ["Nothing looks wrong. Errors that the files alone do not reveal remain possible."]
+    if warnings:
+        conclusion = [
+            f"{len(warnings)} {'warning' if len(warnings) == 1 else 'warnings'}: correct the data first.",
+            *warnings,
+        ]
+    if isinstance(data, Spectra) and (text := _fingerprinting(data)):
+        conclusion.append(text)
     return Page(
         f"Inspection: {data.name}",
-        Summary(numbers, plots[:1], meaning, steps, conclusion),
+        Summary(numbers, plots[:1], conclusion, steps),
         [Section("Findings", tables=[table]), Section("Figures", plots=plots[1:])],
     )
 

@@ -43,10 +43,11 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
     ):
         steps, values = (Localization(trial, config.suggest) for trial in measured.trials()), {}
         with terminal.progress():
-            for step, value in run_steps(directory, steps, measured, cluster):
+            for step, value in run_steps(
+                directory, steps, measured, cluster, lambda _, value: f"{value['median_m']:.2f} m"
+            ):
                 assert isinstance(step, Localization)
                 values[step.trial] = value
-                terminal.result(step.title, f"{value['median_m']:.2f} m")
         result = LocateComparison(measured, values)
         directory.write_csv("errors.csv", result.errors.to_dict("records"))
         final = directory.finish(_metrics(data, result), reporting(page))

@@ -14,9 +14,9 @@ from tasks.options import OffsetSource, Options, Output, Seed, options
 class LocateConfig(Options):
     """Compare localizers on a split of measured RSSI, by default of the built-in simulated floor, and report their errors.
 
-    swiftwrf resume DIR.partial continues an interrupted run. Positions of new rows: python -m tasks.predict.
+    swiftwrf resume DIR.partial continues an interrupted run. Positions of new rows: swiftwrf predict.
 
-    Example: python -m tasks.locate --rx all --data DIR
+    Example: swiftwrf locate --rx all --data DIR
     """
 
     data: str | None = None

@@ -14,12 +14,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.transforms import Bbox
+from matplotlib.ticker import LogLocator
 from numpy.typing import ArrayLike
 from pandas import DataFrame
 
 from tasks.labels import OTHER_COLOURS, Label
-from tasks.summarise import pareto
 
 DASHES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (2, 1.5)), (0, (7, 2, 1.5, 2)))
 """Line styles of the curves of one panel, in their order."""
@@ -30,7 +29,6 @@ MARKERS = "osD^"  # of the series of a dot plot
 MAX_LINE_LENGTH = 100  # characters of a line of text
 NAME = 24  # characters of a name among others
 LABEL = 7  # size of a point's name [pt]
-BESIDE = (((5, 3), "left"), ((5, -9), "left"), ((-5, 3), "right"), ((-5, -9), "right"))  # where it may stand [pt]
 STYLE: dict[str, Any] = {
     "svg.hashsalt": "swiftwrf-tasks",
     "svg.fonttype": "path",
@@ -82,14 +80,6 @@ def panel(width: float, height: float) -> tuple[Figure, Axes]:
     """Return a figure of width x height inches in the style of the reports, and its only axes."""
     figure, (axes,) = new_figure(1, 1, width, height)
     return figure, axes
-
-
-def in_space(figure: Figure, axes: Axes) -> Any:
-    """Axes with three dimensions in the place of others."""
-    place = axes.get_subplotspec()
-    axes.remove()
-    with matplotlib.style.context(STYLE):
-        return figure.add_subplot(place, projection="3d")
 
 
 def colour_bar(axes: Axes, drawn: Any, label: str = "", extend: str = "neither", pad: float = 0.03) -> None:
@@ -157,8 +147,8 @@ def cdf(axes: Axes, palette: Palette, errors: Mapping[str, ArrayLike], label: st
         if np.size(values):
             axes.ecdf(np.asarray(values), label=name, **style)
     axes.axhline(0.5, color=RULE, linewidth=0.8)
-    axes.set(xlabel=label, ylabel="fraction of test spectra", ylim=(0, 1.02), xlim=(0, limit))
-    end_labels(axes)
+    axes.set(xlabel=label, ylabel="fraction of test rows", ylim=(0, 1.02), xlim=(0, limit))
+    _named_below(axes)
 
 
 def curves(axes: Axes, palette: Palette, lines: Mapping[str, tuple[ArrayLike, ArrayLike]], x: str, y: str) -> None:
@@ -169,54 +159,26 @@ def curves(axes: Axes, palette: Palette, lines: Mapping[str, tuple[ArrayLike, Ar
             np.asarray(xs), np.asarray(ys), label=name, color=palette.colour(name), linestyle=dashes, linewidth=1.6
         )
     axes.set(xlabel=x, ylabel=y)
-    end_labels(axes)
+    _named_below(axes)
+
+
+def speed(axes: Axes, palette: Palette, points: Mapping[str, tuple[float, float]], x: str, y: str) -> None:
+    """Draw the cost and the error of each method, costs on a logarithmic scale."""
+    for marker, (name, (cost, error)) in zip("osD^vP", points.items(), strict=False):
+        axes.plot(max(cost, 1e-4), error, marker, color=palette.colour(name), label=name)
+    axes.set(xscale="log", xlabel=x, ylabel=y, ylim=(0, None))
+    _named_below(axes)
+
+
+def _named_below(axes: Axes) -> None:
+    figure = axes.get_figure(root=True)
+    assert figure is not None  # axes outside of a figure have no legend
+    legend_below(figure, axes)
 
 
 def _expect_few(lines: Mapping[str, Any]) -> None:
     if len(lines) > MAX_CURVES:
         raise ValueError(f"a panel has at most {MAX_CURVES} curves, got {len(lines)}: {', '.join(lines)}")
-
-
-def end_labels(axes: Axes) -> None:
-    """Write the name of each labelled line at its right end, in its colour, such that no name covers another."""
-    figure = axes.get_figure(root=True)
-    assert figure is not None  # an axes outside of a figure has no size
-    lines = [line for line in axes.get_lines() if not str(line.get_label()).startswith("_") and len(line.get_path())]
-    ends = []
-    for line in lines:
-        x, y = np.asarray(line.get_xdata(), dtype=float), np.asarray(line.get_ydata(), dtype=float)
-        inside = x <= axes.get_xlim()[1]
-        last = np.flatnonzero(inside)[-1] if inside.any() else 0
-        at = axes.transAxes.inverted().transform(axes.transData.transform((x[last], y[last])))
-        stays = line.get_drawstyle() == "steps-post"  # up to the right edge
-        ends.append((1.0 if stays else float(np.clip(at[0], 0, 1)), float(np.clip(at[1], 0, 1))))
-    order = np.argsort([y for _, y in ends], kind="stable")
-    spacing = 1.5 * LABEL / 72 / (0.75 * figure.get_figheight())
-    places = np.array([ends[i][1] for i in order])
-    for i in range(1, len(places)):
-        places[i] = max(places[i], places[i - 1] + spacing)
-    for i in reversed(range(len(places))):
-        places[i] = min(places[i], 1 - spacing * (len(places) - 1 - i))
-    for i, place in zip(order, places, strict=True):
-        colour = lines[i].get_color()
-        axes.annotate(
-            short(str(lines[i].get_label())),
-            ends[i],
-            xytext=(1.05, place),
-            xycoords="axes fraction",
-            color=colour,
-            fontsize=LABEL + 1,
-            verticalalignment="center",
-            annotation_clip=False,
-            arrowprops={
-                "arrowstyle": "-",
-                "color": colour,
-                "linewidth": 0.8,
-                "shrinkA": 1,
-                "shrinkB": 0,
-                "relpos": (0.0, 0.5),
-            },
-        )
 
 
 def dots(
@@ -238,24 +200,30 @@ def dots(
         log: Whether the axis is logarithmic.
     """
     _expect_few(values)
-    figure, axes = panel(5.6, 0.7 + 0.27 * len(rows) * max(1.0, 0.55 * len(values)) + (0.3 if len(values) > 1 else 0))
+    names = [plain(textwrap.fill(name, NAME)) for name in rows]
+    lines = max((name.count("\n") + 1 for name in names), default=1)
+    height = 0.27 * max(1.0, 0.55 * len(values), 0.6 * lines)
+    figure, axes = panel(5.6, 0.7 + height * len(rows) + (0.2 * len(values) if len(values) > 1 else 0))
     for number, (marker, (name, of_rows)) in enumerate(zip(MARKERS, values.items(), strict=False)):
         value, low, high = np.array(of_rows, dtype=float).reshape(-1, 3).T
         at = np.arange(len(rows)) + 0.2 * (number - (len(values) - 1) / 2)
         error = np.clip(np.nan_to_num([value - low, high - value]), 0, None)
         style: dict[str, Any] = {"color": palette.colour(name), "fmt": marker, "markersize": 5, "elinewidth": 1.4}
-        axes.errorbar(value, at, xerr=error, label=short(name), **style)
+        axes.errorbar(value, at, xerr=error, label=plain(name), **style)
     if zero:
         axes.axvline(0, color=RULE, linewidth=1)
-    axes.set(yticks=range(len(rows)), yticklabels=[plain(textwrap.fill(name, NAME)) for name in rows], xlabel=label)
+    axes.set(yticks=range(len(rows)), yticklabels=names, xlabel=label)
     axes.set_ylim(len(rows) - 0.4, -0.6)
     if log and any(value > 0 for of_rows in values.values() for value, *_ in of_rows):
         axes.set_xscale("log")
+        left, right = axes.get_xlim()
         axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_formatter("")
+        axes.xaxis.set_minor_formatter("{x:g}" if right < 10 * left else "")
+        if right >= 10 * left:  # a label a decade would be few
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.grid(axis="y", visible=False)
     if len(values) > 1:
-        figure.legend(loc="outside upper left", ncols=len(values), frameon=False, fontsize=LABEL + 1)
+        legend_below(figure, axes)
     return figure
 
 
@@ -265,48 +233,3 @@ def dots_data(
     """Return the numbers of `dots`, a row for each value."""
     cells = [(of, name, *value) for name, each in values.items() for of, value in zip(rows, each, strict=True)]
     return DataFrame(cells, columns=[row, "series", f"value_{unit}", f"low_{unit}", f"high_{unit}"])
-
-
-def speed(
-    axes: Axes,
-    palette: Palette,
-    points: Mapping[str, tuple[float, float]],
-    x: str,
-    y: str,
-    also: Sequence[str] = (),
-) -> None:
-    """Draw cost against error, both logarithmic, with the Pareto front and the names of its members and of `also`.
-
-    The part of a name before its first comma determines its colour.
-    """
-    front = pareto(points)
-    axes.plot(*zip(*(points[name] for name in front), strict=True), color=RULE, linewidth=1, zorder=1)
-    for name, (cost, error) in points.items():
-        colour = palette.colour(name.split(",")[0])
-        axes.plot(cost, error, "o", color=colour, markersize=5 if name in front else 3.5, zorder=2)
-    scale = "log" if any(min(point) > 0 for point in points.values()) else "linear"
-    axes.set(xscale=scale, yscale=scale, xlabel=x, ylabel=y)
-    axes.margins(x=0.25, y=0.1)
-    taken: list[Bbox] = []
-    for name, point in points.items():
-        if name in front or name in also:
-            taken.append(_annotated(axes, name, point, taken))
-    low, high = axes.get_ylim()
-    if high < 30 * low:  # plain numbers where powers of ten would be few
-        axes.yaxis.set_major_formatter("{x:g}")
-        axes.yaxis.set_minor_formatter("{x:g}")
-
-
-def _annotated(axes: Axes, name: str, point: tuple[float, float], taken: Sequence[Bbox]) -> Bbox:
-    """Names a point where that covers none of the boxes taken, if there is such a place, and returns its own box."""
-    figure = axes.get_figure(root=True)
-    assert figure is not None  # an axes outside of a figure has no places
-    x, y = axes.transData.transform(point) * 72 / figure.dpi
-    width, height = 0.65 * LABEL * len(name), LABEL
-    boxes = [
-        Bbox.from_bounds(x + dx - (width if side == "right" else 0), y + dy, width, height) for (dx, dy), side in BESIDE
-    ]
-    best = next((n for n, box in enumerate(boxes) if not any(box.overlaps(other) for other in taken)), 0)
-    offset, side = BESIDE[best]
-    axes.annotate(name, point, textcoords="offset points", xytext=offset, fontsize=LABEL, horizontalalignment=side)
-    return boxes[best]

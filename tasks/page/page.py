@@ -13,12 +13,13 @@ from matplotlib.figure import Figure
 from pandas import DataFrame
 
 from swiftwrf.runtime.durable import write_text
+from tasks.answer import NextStep
 from tasks.page.figures import as_svg, for_page
 from tasks.page.records import Metrics, Records
 from tasks.preload import served_map
 from tasks.records import write_table
 
-HALF = 84  # letters of a table that fit into half of the page
+HALF = 92  # letters of a table that fit into half of the page
 WIDE = 7.5  # [inches] figures that are wider take the whole width of the page, others half
 MAX_SECTIONS = 5  # of a page, whose navigation has the details, too
 
@@ -116,15 +117,14 @@ class Number:
 class Summary:
     """First screen of a page.
 
-    It contains numbers, figures, the conclusion in one sentence, its meaning, next steps, a table of runs, and notes on the
-    data.
+    It contains the conclusion, whose first sentence answers what the user asked, numbers, figures, next steps, a table of
+    runs, and notes on the data.
     """
 
     numbers: list[Number]
     plots: list[Plot]
-    meaning: list[str]
-    next_steps: list[str]
-    conclusion: str = ""
+    conclusion: Sequence[str]
+    next_steps: Sequence[NextStep]
     table: Table | None = None
     notes: list[str] = field(default_factory=list)
 

@@ -1,19 +1,24 @@
-"""Tables and figures that reports of several tasks share: comparison of runs, positions to measure next."""
+"""Parts of several reports: errors of methods, next steps, comparison of runs, positions to measure next."""
 
 from __future__ import annotations
 
+import math
+import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pandas import DataFrame
 
-from swiftwrf.metrics import ErrorSummary
+from swiftwrf.metrics import ErrorSummary, paired_difference
+from tasks.answer import Answer, NextStep
+from tasks.environment import command
 from tasks.page import figures
 from tasks.page.figures import MAX_CURVES, Palette
-from tasks.page.page import Plot, Table, number
+from tasks.page.page import Plot, Section, Summary, Table, number
+from tasks.page.records import Records
 
 MEASURED, SUGGESTED = "#3a7fd5", "#cf4a4a"
 MIN_REDUCTION = 0.1  # of the variance, below which more positions are not worth it
@@ -21,51 +26,132 @@ MAX_NUMBERED = 30  # suggestions with their rank beside them; more would hide ea
 NONE = (np.nan, np.nan, np.nan)
 
 
-@dataclass(frozen=True)
-class Compared:
-    """Errors of one run, or of one part of it.
+def errors_section(
+    answer: Answer,
+    errors: DataFrame,
+    palette: Palette,
+    *,
+    name: str,
+    quantity: str,
+    caption: str,
+    paragraphs: Sequence[str] = (),
+    panels: Sequence[Figure] = (),
+) -> Section:
+    """Return the table of all methods, and figures of those of the short table.
 
     Args:
-        name: Short name, unique among those that are compared.
-        errors: Summary of the errors by what is compared.
-        numbers: Further cells of its column by their rows.
-    """
-
-    name: str
-    errors: Mapping[str, ErrorSummary]
-    numbers: Mapping[str, str]
-
-
-def comparison(
-    compared: Sequence[Compared], palette: Palette, shown: Sequence[str], unit: str, quantity: str
-) -> tuple[Table, Plot]:
-    """Return the table of all errors, a column for each run, and the figure of some.
-
-    Args:
-        compared: Errors of each run.
-        palette: Colours of what is compared.
-        shown: What the figure shows. The first `MAX_CURVES` are taken.
-        unit: Unit of the errors.
+        answer: Errors of the methods.
+        errors: Errors in long form: `method`, the error in the last column, and what identifies a test row in the others.
+        palette: Colours of the methods.
+        name: End of the name of the figure.
         quantity: Name of the errors.
+        caption: What the cells beside the errors mean.
+        paragraphs: Sentences before the table.
+        panels: Errors against the number of measured positions, if they are known.
     """
-    columns = list(dict.fromkeys(name for one in compared for name in one.errors))
-    further = list(dict.fromkeys(name for one in compared for name in one.numbers))
+    unit, short = answer.unit, [one for block in answer.short() for one in block]
+    further = list(dict.fromkeys(column for one in answer.methods for column in one.cells))
     rows = [
-        [name, *(with_interval(one.errors[name]) if name in one.errors else "" for one in compared)] for name in columns
+        [
+            one.name,
+            with_interval(one.error),
+            number(one.error["p90"]),
+            *(one.cells.get(column, "") for column in further),
+            " + ".join(number(seconds) for seconds in one.seconds),
+        ]
+        for one in answer.methods
     ]
-    rows += [[name, *(one.numbers.get(name, "") for one in compared)] for name in further]
-    caption = f"Median {quantity} [{unit}] with its 95 % interval."
-    table = Table(["method", *(one.name for one in compared)], rows, caption)
-    names = [one.name for one in compared]
-    values = {
-        name: [interval(one.errors[name]) if name in one.errors else NONE for one in compared]
-        for name in shown[:MAX_CURVES]
-    }
-    medians = [one.errors[name]["median"] for one in compared for name in values if name in one.errors]
+    columns = ["method", f"median [{unit}]", f"90 % below [{unit}]", *further, "fit + apply [s]"]
+    caption = f"{quantity.capitalize()} on the test rows; medians with their 95 % intervals. {caption}".strip()
+    values = {"error": [interval(one.error) for one in short]}
+    medians = [one.error["median"] for one in short if one.error["n"]]
+    spread = max(medians, default=1.0) > 10 * min(medians, default=1.0) > 0
+    names = [one.name for one in short]
+    dots = figures.dots(names, values, Palette({"error": MEASURED}), f"median {quantity} [{unit}]", log=spread)
+    figure, axes = figures.panel(5.6, 3.2)
+    groups = {one: errors[errors["method"] == one].iloc[:, -1] for one in [*dict.fromkeys([answer.chosen, *names])]}
+    limit = max((float(part.quantile(0.9)) for part in groups.values() if len(part)), default=1.0)
+    shown = dict(list(groups.items())[:MAX_CURVES])
+    figures.cdf(axes, palette, shown, f"{quantity} [{unit}]", max(limit, 1e-3))
+    cost, axes = figures.panel(5.6, 3.2)
+    points = {one.name: (sum(one.seconds), one.error["median"]) for one in short if one.error["n"]}
+    figures.speed(axes, palette, points, "seconds to fit and apply", f"median {quantity} [{unit}]")
+    text = (
+        "Medians with 95 % intervals; the distribution of the errors, with a thin line at the median; the median against "
+        f"the time that it takes{'; and the error against the number of measured positions' if panels else ''}."
+    )
+    plot = Plot(f"errors-{name}", [dots, figure, cost, *panels], text, errors)
+    return Section("", list(paragraphs), [Table(columns, rows, caption, frozenset([answer.chosen]))], [plot])
+
+
+def difference(errors: DataFrame, own: str, other: str) -> str:
+    """Return the mean difference of the errors of two methods on the same rows, with its interval; empty for one method."""
+    if own == other:
+        return ""
+    mean, low, high = paired_difference(errors, own, other)
+    return f"{mean:+.2f}" + ("" if math.isnan(low) else f" [{low:+.2f}, {high:+.2f}]")
+
+
+def next_steps(
+    run: Records[Any], explore: str, predict: str, source: str, own: Sequence[NextStep] = (), model: str = ""
+) -> list[NextStep]:
+    """Return what to do next with a run.
+
+    Args:
+        run: Records of the run.
+        explore: What the page of `view` shows. Empty if it does not show the run.
+        predict: What `predict` does.
+        source: Its source.
+        own: Steps of the task.
+        model: Model to predict by. Defaults to that of the run.
+    """
+    steps = [NextStep(explore, command("view", run.path))] if explore else []
+    return [*steps, NextStep(predict, command("predict", model or run.path, source)), *own]
+
+
+def again(run: Records[Any], text: str, split: str) -> NextStep:
+    """Return the step to repeat a run on another split, into a new directory."""
+    words = shlex.split(run.config["command"])
+    for option in ("--out", "--split"):
+        if option in words:
+            at = words.index(option)
+            del words[at : at + 2]
+    unwanted = ("--out=", "--split=", "--quiet", "--json", "--open")
+    return NextStep(text, shlex.join([*(word for word in words if not word.startswith(unwanted)), "--split", split]))
+
+
+def compared(
+    answers: Mapping[str, Answer],
+    runs: Sequence[Records[Any]],
+    palette: Palette,
+    quantity: str,
+    steps: Sequence[NextStep] = (),
+) -> Summary:
+    """Return the first screen of several answers: the methods of their short tables, a column each.
+
+    Args:
+        answers: Answers by unique short names.
+        runs: Their runs.
+        palette: Colours of the methods.
+        quantity: Name of the errors.
+        steps: What to do next. Defaults to a look at each run.
+    """
+    unit, names = next(iter(answers.values())).unit, list(answers)
+    short = [{one.name: one.error for block in answer.short() for one in block} for answer in answers.values()]
+    methods = list(
+        dict.fromkeys([*(answer.chosen for answer in answers.values()), *(name for of in short for name in of)])
+    )
+    rows = [[name, *(with_interval(of[name]) if name in of else "" for of in short)] for name in methods]
+    table = Table(["method", *names], rows, f"Median {quantity} [{unit}] with its 95 % interval.")
+    values = {name: [interval(of[name]) if name in of else NONE for of in short] for name in methods[:MAX_CURVES]}
+    medians = [of[name]["median"] for of in short for name in values if name in of]
     spread = max(medians, default=1.0) > 10 * min(medians, default=1.0) > 0
     figure = figures.dots(names, values, palette, f"median {quantity} [{unit}]", log=spread)
     caption = f"Median {quantity} of each run; whiskers: 95 % intervals."
-    return table, Plot("summary", [figure], caption, figures.dots_data("run", names, values, unit.lower()))
+    plot = Plot("summary", [figure], caption, figures.dots_data("run", names, values, unit.lower()))
+    explore = [NextStep(f"Explore run {run.number}", command("view", run.path)) for run in runs]
+    sentences = [f"{name}: {answer.conclusion[0]}" for name, answer in answers.items()]
+    return Summary([], [plot], sentences, steps or explore, table=table)
 
 
 def interval(error: ErrorSummary) -> tuple[float, float, float]:
@@ -103,7 +189,7 @@ def suggestion_plot(name: str, arrays: Mapping[str, NDArray[Any]], ylabel: str) 
     second, gain = figures.panel(4.6, 3.4)
     gain.plot(range(len(left)), 100 * left, color=SUGGESTED)
     gain.set(xlabel="suggested positions measured", ylabel=ylabel, ylim=(0, None))
-    caption = "Left: in plan, numbered by rank. Right: expected variance over the region, averaged."
+    caption = "Suggested positions in plan, numbered by rank, and the expected variance over the region, averaged."
     data = DataFrame(suggested, columns=["x_m", "y_m", "z_m"]).assign(variance_left=left[1:])
     return Plot(name, [first, second], caption, data)
 

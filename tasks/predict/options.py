@@ -16,9 +16,9 @@ class PredictConfig(Options):
     An estimator gives the directions of spectra, and a locator the positions of transmitters. A field model gives spectra,
     and an RSSI model powers, at the positions of a table.
 
-    Example: python -m tasks.predict runs/aoa/first DIR
+    Example: swiftwrf predict runs/aoa/first DIR
 
-    Example: python -m tasks.predict runs/rssi/first/model.safetensors positions.csv --out predicted.csv
+    Example: swiftwrf predict runs/rssi/first/model.safetensors positions.csv --out predicted.csv
     """
 
     model: Annotated[str, tyro.conf.Positional]

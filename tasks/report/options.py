@@ -13,7 +13,7 @@ from tasks.options import Options, Output, options
 class ReportConfig(Options):
     """One report over several finished runs of one task.
 
-    Example: python -m tasks.report runs/rssi/first runs/rssi/second --out runs/report
+    Example: swiftwrf report runs/rssi/first runs/rssi/second --out runs/report
     """
 
     runs: Annotated[tuple[str, ...], tyro.conf.Positional]

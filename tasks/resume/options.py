@@ -20,7 +20,7 @@ RESUMABLE = ("aoa", "rssi", "locate")
 class ResumeConfig(Options):
     """Continue an interrupted run of aoa, rssi or locate with its options.
 
-    Example: python -m tasks.resume runs/aoa/first.partial
+    Example: swiftwrf resume runs/aoa/first.partial
     """
 
     run: Annotated[str, tyro.conf.Positional]

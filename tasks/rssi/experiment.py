@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from swiftwrf import Rssi, load, rssi_room
+from swiftwrf import InputError, Rssi, load, rssi_room
 from swiftwrf.data.files import sha256
 from swiftwrf.metrics import summary
 from swiftwrf.rssi import LEVEL, PairModel, RssiComparison, RssiModel, RssiPredictor, compare
@@ -30,6 +30,8 @@ from tasks.source import measured_rssi, offset_notes, split_notes
 from tasks.terminal import console, terminal
 from tasks.workers import connected
 
+FEWER = (0.125, 0.25, 0.5)  # of the training rows, for the figure of the error against their number
+
 
 def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     """Run the experiment and write its directory, or continue an interrupted one.
@@ -38,9 +40,9 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         InputError: A configuration that the data cannot meet or that contradicts itself.
     """
     device = choose_device("cpu" if config.device == "auto" else config.device)
-    plan = _read_floor_plan(config)
     whole = _load(config)
     data = whole.receivers(config.rx)
+    plan = _read_floor_plan(config, data)
     for note in data.notes:
         console.print(f"{data.name}: {note}")
     names, left_out = compared(data, config.also)
@@ -53,19 +55,20 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         Run("rssi", config.out, label, config, device, source, resume) as directory,
     ):
 
-        def keep(name: str, compute: Callable[[], tuple[RssiPredictor, Row]]) -> Row:
+        def keep(name: str, compute: Callable[[], tuple[RssiPredictor | None, Row]]) -> Row:
+            if name == "fewer rows":
+                return directory.step(name, name, lambda: compute()[1], lambda value: "")
+
             def saved() -> Row:
                 predictor, value = compute()
                 if isinstance(predictor, RssiModel | PairModel) and name == model_of(data):
                     predictor.save(directory.path(MODEL))
                 return value | {"n_primitives": getattr(predictor, "n_primitives", 0)}
 
-            value = directory.step(name, f"fitting {name}", saved)
-            terminal.result(name, f"{value['median_db']:.2f} dB")
-            return value
+            return directory.step(name, name, saved, lambda value: f"{value['median_db']:.2f} dB")
 
-        terminal.expect(sum(not directory.holds(name) for name in names))
         with terminal.progress():
+            terminal.expect(sum(not directory.holds(name) for name in (*names, "fewer rows")))
             result = compare(
                 whole,
                 receivers=config.rx,
@@ -76,6 +79,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
                 not_detected=config.not_detected,
                 validation=config.validation,
                 reference=config.table.reference,
+                fewer=FEWER,
                 device=device,
                 parallel=cluster.map if cluster else None,
                 keep=keep,
@@ -96,12 +100,15 @@ def _load(config: RssiTaskConfig) -> Rssi:
     return rssi_room(seed=config.seed) if measured is None else measured
 
 
-def _read_floor_plan(config: RssiTaskConfig) -> dict[str, Any]:
+def _read_floor_plan(config: RssiTaskConfig, data: Rssi) -> dict[str, Any]:
     """Return the floor plan and its corners as maps.npz stores them, or nothing if there is no plan."""
-    if config.floor_plan is None or config.floor_extent is None:
+    if config.floor_plan is None:
         return {}
+    if config.floor_extent is None and data.plan_scale is None:
+        raise InputError(f"--floor-plan needs --floor-extent x0 x1 y0 y1 [m], since {data.name} is not in its pixels")
     pixels = read_pixels(config.floor_plan, f"--floor-plan {config.floor_plan}")
-    return {"plan": pixels, "plan_extent": np.array(config.floor_extent)}
+    height, width = (side / (data.plan_scale or 1.0) for side in pixels.shape[:2])
+    return {"plan": pixels, "plan_extent": np.array(config.floor_extent or (0.0, width, -height, 0.0))}
 
 
 def _metrics(config: RssiTaskConfig, data: Rssi, result: RssiComparison, model: RssiModel | PairModel) -> RssiMetrics:
@@ -145,6 +152,7 @@ def _metrics(config: RssiTaskConfig, data: Rssi, result: RssiComparison, model: 
         "model": result.model,
         "seconds": seconds[result.model],
         "interval": {"nominal": LEVEL, "coverage": result.coverage},
+        "by_rows": {str(n): {str(name): mean for name, mean in row.items()} for n, row in result.by_rows.iterrows()},
         "chosen": {
             "n_primitives": max(value["n_primitives"] for value in result.values.values()),
             "floor_attenuation_db": attenuation_db,

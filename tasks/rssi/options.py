@@ -16,7 +16,7 @@ class RssiTaskConfig(Options):
 
     Without --data the built-in simulated floor is used. swiftwrf resume DIR.partial continues an interrupted run.
 
-    Example: python -m tasks.rssi --rx 6 --data DIR
+    Example: swiftwrf rssi --rx 6 --data DIR
     """
 
     rx: tuple[str, ...]
@@ -39,7 +39,7 @@ class RssiTaskConfig(Options):
     floor_plan: str | None = None
     """an image to draw behind the maps, PNG or JPEG"""
     floor_extent: tuple[float, float, float, float] | None = None
-    """x0 x1 y0 y1 of that image [m]"""
+    """x0 x1 y0 y1 of that image [m] (default: as pixels of the image are the positions in the table)"""
     scheduler: str | None = None
     """address of a Dask scheduler whose workers fit groups of receivers (extra: cluster)"""
     seed: Seed = 0
@@ -56,8 +56,8 @@ class RssiTaskConfig(Options):
         for name in self.also:
             RSSI_PREDICTORS.check(name)
         self.table.check_used(self.data)
-        if (self.floor_plan is None) != (self.floor_extent is None):
-            raise InputError("--floor-plan needs --floor-extent x0 x1 y0 y1 [m], and the other way round")
+        if self.floor_plan is None and self.floor_extent is not None:
+            raise InputError("--floor-extent needs --floor-plan FILE")
         if self.floor_extent is not None:
             x0, x1, y0, y1 = self.floor_extent
             if not (x0 < x1 and y0 < y1):

@@ -23,7 +23,7 @@ class ScenesConfig(Options):
 
     The directory holds paths.npz, which --data of the tasks reads, and scene.svg, a plan of the room and the positions.
 
-    Example: python -m tasks.scenes --room office --moving receiver --positions 1000 --out office
+    Example: swiftwrf scenes --room office --moving receiver --positions 1000 --out office
     """
 
     room: Annotated[str, tyro.conf.arg(help=ROOM_HELP)]

@@ -16,6 +16,7 @@ import torch
 
 from swiftwrf import FieldModel, InputError, Rssi, Spectra
 from swiftwrf.data.files import refusing_unreadable, table_of
+from swiftwrf.data.survey import spelled_as
 from swiftwrf.errors import CONTENT_ERRORS
 from swiftwrf.online import Step
 from swiftwrf.online.scores import LEVEL
@@ -152,10 +153,17 @@ def _number(value: object) -> float:
 
 def _of_row(text: str, config: UpdateConfig, model: RssiModel) -> Rssi:
     """Return the measurement in a table of one row; receivers that the model does not have are left out."""
-    columns, filler, coordinates = config.table.column_names, config.table.fillers, config.table.coordinates
-    table = table_of("the table", text)
-    data = Rssi.from_frame(table, columns=columns, filler=filler, coordinates=coordinates).about(model.origin)
-    rssi = zip(data.receiver_names, data.rssi_dbm[0].tolist(), strict=True)
+    source, table = config.table, table_of("the table", text)
+    data = Rssi.from_frame(
+        table,
+        columns=source.column_names,
+        filler=source.fillers,
+        coordinates=source.coordinates,
+        scale=source.scale,
+        y_down=source.y_down,
+        up=source.up,
+    ).about(model.origin)
+    rssi = zip(spelled_as(data.receiver_names, model.receiver_names)[0], data.rssi_dbm[0].tolist(), strict=True)
     value = {name: x for name, x in rssi if name in model.receiver_names}
     if not value:
         raise InputError("no receiver of the model detected the transmitter")

@@ -23,7 +23,7 @@ class UpdateConfig(Options):
     or {"position": [x, y, z], "spectrum": [[...], ...]}; or rows of RSSI in a CSV table, which has a column a receiver. The
     model in --out is replaced after each line.
 
-    Example: python -m tasks.update model.safetensors DIR --out updated
+    Example: swiftwrf update model.safetensors DIR --out updated
     """
 
     model: Annotated[str, tyro.conf.Positional]

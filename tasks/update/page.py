@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 from pandas import DataFrame
 
 from swiftwrf.positions import nearest
+from tasks.answer import NextStep
+from tasks.claim import MODEL
+from tasks.environment import command
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table
 from tasks.update.record import WINDOW, Record
@@ -16,8 +20,8 @@ N_NEIGHBOURS = 5  # measurements whose mean innovation a map shows at each posit
 BLUE, RED = "#4477aa", "#ee6677"
 
 
-def page(record: Record, name: str) -> Page:
-    """Return the page of a record, with the name of its data."""
+def page(record: Record, name: str, folder: Path) -> Page:
+    """Return the page of a record, with the name of its data, of an update in a directory."""
     numbers = [
         Number(str(len(record.rows)), "measurements learnt"),
         Number(f"{record.mean('error'):.3g}{record.unit}", "mean error before each was learnt"),
@@ -25,7 +29,10 @@ def page(record: Record, name: str) -> Page:
     ]
     if math.isfinite(covered := record.mean("covered")):
         numbers.append(Number(f"{covered:.0%}", "of the values inside their 80 % interval"))
-    summary = Summary(numbers, [error_plot(record)], record.sentences(), ["Continue with model.safetensors."])
+    step = NextStep(
+        "Continue with the updated model", command("update", str(folder / MODEL), "SOURCE", "--out", "NEXT")
+    )
+    summary = Summary(numbers, [error_plot(record)], record.sentences(), [step])
     order = record.column("innovation").nan_to_num().argsort(descending=True)[:MAX_SURPRISING].tolist()
     cells = [
         [
@@ -35,19 +42,8 @@ def page(record: Record, name: str) -> Page:
         for i in order
     ]
     columns = ["measurement", "x [m]", "y [m]", "z [m]", f"error{record.unit}", "innovation"]
-    changes = [[str(number), text] for number, text in sorted(record.alarms + record.notices)]
-    tables = [Table(columns, cells, "Measurements with the largest innovations.")]
-    if changes:
-        tables.append(
-            Table(
-                ["measurement", "change"],
-                changes,
-                "Detected changes, and changes of the model beside its data.",
-                long=True,
-            )
-        )
-    sections = [Section("Surprising measurements", tables=tables), Section("Changes", plots=[map_plot(record)])]
-    return Page(f"Update: {name}", summary, sections)
+    table = Table(columns, cells, "Measurements with the largest innovations.")
+    return Page(f"Update: {name}", summary, [Section("Surprising measurements", [], [table], [map_plot(record)])])
 
 
 def error_plot(record: Record) -> Plot:

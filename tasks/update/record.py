@@ -129,15 +129,17 @@ class Record:
         }
 
     def sentences(self) -> list[str]:
-        """Return the results in sentences."""
+        """Return the results in sentences, whether something changed first."""
         found = self.summary()
+        changes = len(self.alarms)
         text = [
-            f"{found['measurements']} measurements learnt, mean error {found['mean_error']:.4g}{self.unit} before each was "
-            f"learnt, {found['last_running_error'] or float('nan'):.4g} over the last {WINDOW}"
+            f"{changes or 'No'} change{'' if changes == 1 else 's'} detected in {found['measurements']} measurements, which "
+            "the model has learnt.",
+            f"Their mean error is {found['mean_error']:.4g}{self.unit} before each was learnt, "
+            f"{found['last_running_error'] or float('nan'):.4g} over the last {WINDOW}.",
         ]
-        text += [f"change at measurement {number}: {what}" for number, what in self.alarms] or ["no change detected"]
-        text += [what for _, what in self.notices]
-        return text
+        text += [f"Change at measurement {number}: {what}." for number, what in self.alarms]
+        return [*text, *(f"{what[0].upper()}{what[1:]}." for _, what in self.notices)]
 
     def write(self, folder: Path) -> None:
         """Write table and summary. Without measurements there is no table."""

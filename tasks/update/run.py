@@ -54,7 +54,7 @@ def run(config: UpdateConfig) -> None:
         _save(follower, folder / MODEL)
         record.write(folder)
         _write_config(config, folder)
-        write_page(folder, page(record, new.name))
+        write_page(folder, page(record, new.name, Path(config.out)))
     sentences = record.sentences()
     if follower.waiting is not None:
         sentences.append(

@@ -16,7 +16,7 @@ class ViewConfig(Options):
 
     Needs the optional extra: pip install 'swiftwrf-tasks[view]'. Ctrl-C ends it.
 
-    Example: python -m tasks.view runs/aoa/first
+    Example: swiftwrf view runs/aoa/first
     """
 
     source: Annotated[str, tyro.conf.Positional]

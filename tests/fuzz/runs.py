@@ -19,7 +19,7 @@ from unittest import mock
 import numpy as np
 import torch
 from PIL import Image
-from small import GLANCE
+from small import FLOOR
 
 from fuzz.misuse import MAX_RSSI_DB, check_plausible
 from fuzz.mutate import mutated
@@ -135,7 +135,7 @@ def _rssi_model() -> RssiModel:
 @functools.cache
 def _field_model(name: str) -> FieldModel:
     room = simulated_room(n=14, grid=AngularGrid.hemisphere(4, 8))
-    return (GeometryModel(GLANCE) if name == "geometry" else make_model(name)).fit(room)
+    return GeometryModel.of_planes(room, [FLOOR]) if name == "geometry" else make_model(name).fit(room)
 
 
 def json_lines(model: FieldModel | RssiModel) -> bytes:

@@ -317,7 +317,7 @@ def test_what_does_not_go_together_is_refused(room, arguments, reason, tmp_path,
     assert reason in said(capsys)
 
 
-@pytest.mark.parametrize(("out", "reason"), [("out", "is a model"), ("out.csv", "use python -m tasks.predict")])
+@pytest.mark.parametrize(("out", "reason"), [("out", "is a model"), ("out.csv", "use swiftwrf predict")])
 def test_a_file_of_a_model_is_a_map_of_rssi(field, model, out, reason, tmp_path, capsys):
     (model if out == "out" else field).save(tmp_path / "model.safetensors")
     assert run(tmp_path / "model.safetensors", tmp_path / out) == 2

@@ -5,16 +5,17 @@ from __future__ import annotations
 import ast
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from matplotlib.text import Text
 from pandas import DataFrame
 
 from swiftwrf import AngularGrid, Rssi, Spectra, plotting
 from swiftwrf.diagnostics.inspection import Findings
 from tasks import labels
+from tasks.answer import NextStep
 from tasks.aoa.page.records import CHOSEN, LOWER_REFERENCE, UPPER_REFERENCE
 from tasks.aoa.page.synthesis import SCALES, spectra
 from tasks.inspect.page import page as inspection
@@ -23,6 +24,7 @@ from tasks.page import figures
 from tasks.page.figures import Palette
 from tasks.page.maps import colour_image
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table, write_page
+from tasks.page.shared import again
 from tasks.records import read_table
 
 
@@ -35,7 +37,11 @@ def plot(name: str = "line", width: float = 6.0) -> Plot:
 
 def page(*sections: Section, first: Plot | None = None) -> Page:
     numbers = [Number("1 dB", "of <something>")]
-    return Page("A & B", Summary(numbers, [first or plot("first")], ["What."], ["Next."]), list(sections))
+    return Page(
+        "A & B",
+        Summary(numbers, [first or plot("first")], ["What."], [NextStep("Next", "swiftwrf view 'a b'")]),
+        list(sections),
+    )
 
 
 def test_every_figure_lies_in_the_page_and_as_a_file_with_its_numbers(tmp_path):
@@ -82,18 +88,20 @@ def test_what_is_wide_takes_the_whole_page():
     assert Table(["a", "b"], [["x", "y"]], long=True).wide
 
 
-def test_curves_of_a_panel_differ_by_dashes_and_have_their_names_at_their_ends():
+def test_curves_of_a_panel_differ_by_dashes_and_have_their_names_below():
     figure, axes = figures.panel(4, 3)
-    values = np.linspace(0, 1, 50)
-    figures.cdf(axes, Palette(), {name: factor * values for factor, name in enumerate("abcd", 1)}, "error", limit=4)
-    lines = axes.get_lines()[:4]
-    assert len({str(line._dash_pattern) + str(line.get_linestyle()) for line in lines}) == 4
-    figure.draw_without_rendering()
-    boxes = {text.get_text(): Text.get_window_extent(text) for text in axes.texts}  # without their arrows
-    assert set(boxes) == set("abcd")
-    assert not any(boxes[a].overlaps(boxes[b]) for a in boxes for b in boxes if a < b)
+    values, names = np.linspace(0, 1, 50), ["network, measured", "peak", "mean", "gp"]
+    figures.cdf(axes, Palette(), {name: factor * values for factor, name in enumerate(names, 1)}, "error", limit=4)
+    assert len({str(line._dash_pattern) + str(line.get_linestyle()) for line in axes.get_lines()[:4]}) == 4
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == names
     with pytest.raises(ValueError, match="at most 4 curves"):
         figures.cdf(axes, Palette(), dict.fromkeys("abcde", values), "error")
+
+
+@pytest.mark.parametrize("command", ["swiftwrf rssi --out 'a b' --rx 1", "swiftwrf rssi --rx 1 --split=random --json"])
+def test_a_run_is_repeated_on_another_split_into_a_new_directory(command):
+    run = SimpleNamespace(config={"command": command})
+    assert again(run, "Again", "block").code == "swiftwrf rssi --rx 1 --split block"
 
 
 def luminance(colour):
@@ -146,7 +154,6 @@ def test_figures_of_constant_empty_and_single_values(values):
     for draw in (
         lambda axes: figures.cdf(axes, Palette(), {"a": values}, "error"),
         lambda axes: figures.curves(axes, Palette(), {"a": (values, values)}, "x", "y"),
-        lambda axes: figures.speed(axes, Palette(), {str(i): (x, x) for i, x in enumerate(values)}, "x", "y"),
         lambda axes: plotting.plan(position, torch.tensor(values), "value", axes),
         lambda axes: plotting.plan_map((0, 1, 0, 1), values[None] if n else np.zeros((1, 1)), "v", axes),
     ):

@@ -34,7 +34,7 @@ def test_help_has_groups_names_examples_and_one_default_an_option(name, capsys, 
     options = re.split(r"^[│ ] (?=-|[A-Z\[])", text, flags=re.MULTILINE)[1:]
     assert all(option.count("(default") + option.count("(required)") <= 1 for option in options)
     assert "default: None" not in text
-    assert f"Example: python -m tasks.{name} " in text
+    assert f"Example: swiftwrf {name} " in text
     config_type = getattr(import_module(f"tasks.{name}.options"), COMMANDS[name].options)
     listed = [match[1] for option in options if (match := re.match(r"--([a-z-]+)", option))]
     assert {"config", "verbose"} <= {*listed}

@@ -4,41 +4,62 @@ from __future__ import annotations
 
 import io
 import json
+import re
+from html import unescape
 
 import pytest
 import quick
 from rich.console import Console
 
 from swiftwrf.runtime.progress import progress
+from tasks.answer import Answer, Method, NextStep
 from tasks.options import Output
-from tasks.terminal import Answer, Terminal, terminal
+from tasks.terminal import Terminal, terminal
 
 ERROR = {"median": 2.36, "p90": 7.0, "mean": 3.1, "low": 2.0, "high": 2.9, "n": 40}
 
 
+def method(name, median, **options):
+    return Method(name, ERROR | {"median": median}, **options)
+
+
 @pytest.fixture
 def found():
-    return Answer("deg", [({"condition": "measured alone"}, ERROR)], "It helps.", ["Measure more."])
+    methods = [method("peak", 9.0, is_reference=True), method("gp", 3.0), method("network, measured", 2.36)]
+    return Answer("deg", methods, "gp", ["It works.", "It helps."], [NextStep("Look", "swiftwrf view 'a b'")])
 
 
-def test_the_answer_is_a_table_a_conclusion_next_steps_and_the_report(tmp_path, capsys, found):
+def test_the_answer_is_a_sorted_table_next_steps_the_conclusion_and_the_report(tmp_path, capsys, found):
     Terminal().answer(found, tmp_path / "report.html")
-    head, row, *rest = capsys.readouterr().out.splitlines()
-    assert " ".join(head.split()) == "condition median [deg] 95 % interval mean [deg] 90 % below [deg]"
-    assert row.split() == ["measured", "alone", "2.36", "2.00", "to", "2.90", "3.10", "7.00"]
-    assert rest == ["", "It helps.", "- Measure more.", f"report: {tmp_path / 'report.html'}"]
+    head, *rows, none, step, empty, first, second, last = (
+        line.rstrip() for line in capsys.readouterr().out.splitlines()
+    )
+    assert " ".join(head.split()) == "what you can use median [deg] 95 % interval 90 % below [deg]"
+    assert rows[0].split() == ["network,", "measured", "2.36", "2.00", "to", "2.90", "7.00"]
+    assert [row.split()[0] for row in rows] == ["network,", "*", "references", "peak"]
+    assert (none, step, empty) == ("", "Look: swiftwrf view 'a b'", "")
+    assert (first, second, last) == ("It works.", "It helps.", f"report: {tmp_path / 'report.html'}")
+
+
+def test_the_short_table_has_six_rows_with_the_chosen_the_best_and_those_asked_for():
+    methods = [method(f"m{n}", float(n), is_reference=n > 7) for n in range(12)]
+    usable, references = Answer("m", methods, "m6", [], [], ("m5", "m11")).short()
+    assert [one.name for one in usable] == ["m0", "m1", "m5", "m6"]
+    assert [one.name for one in references] == ["m8", "m11"]
 
 
 def test_json_is_one_object_and_nothing_else(tmp_path, capsys, found):
     shown = Terminal()
     with shown.of(Output(json=True)):
         shown.console.print("a note")
-        shown.result("gp", "2 dB")
+        with shown.progress():
+            shown.begin("gp", "gp")
+            shown.end("gp", "2 dB")
         shown.answer(found, tmp_path / "report.html")
     out, err = capsys.readouterr()
     content = json.loads(out)
     assert content["rows"][0]["median_deg"] == 2.36
-    assert (content["conclusion"], content["report"]) == ("It helps.", str(tmp_path / "report.html"))
+    assert (content["conclusion"], content["report"]) == ("It works. It helps.", str(tmp_path / "report.html"))
     assert err == ""
 
 
@@ -57,43 +78,60 @@ def test_one_display_has_the_fraction_of_all_steps():
     seen = []
     with shown.progress():
         shown.expect(2)
-        for _ in range(2):
-            shown.begin("training")
+        for number, name in enumerate("ab", 1):
+            shown.begin(name, "training")
             for _ in progress(range(4), "inner"):
                 pass
             task = shown._progress.tasks[0]
+            assert task.description == f"[{number}/2] training"
             seen.append(task.completed / task.total)
-            shown.end()
+            shown.end(name)
             seen.append(task.completed / task.total)
     assert seen == [0.5, 0.5, 1.0, 1.0]
     assert "inner" not in shown.console.file.getvalue()
 
 
+def test_into_a_file_steps_have_a_line_at_their_start_and_their_end():
+    shown = Terminal()
+    shown.console = Console(file=io.StringIO(), width=20)
+    with shown.progress():
+        shown.expect(3)
+        shown.begin("a", "network, all measured")
+        shown.begin("b", "peak")
+        shown.end("b", "2.36 degrees")
+        shown.end("a")
+    first, second, third, fourth = shown.console.file.getvalue().splitlines()
+    assert (first, second) == ("[1/3] network, all measured", "[2/3] peak")
+    assert third.startswith("[2/3] peak: 2.36 degrees, ")
+    assert fourth.startswith("[1/3] network, all measured: ")
+
+
 @pytest.mark.parametrize(
-    ("arguments", "first"),
+    ("run", "answered", "unit"),
     [
-        (("rssi", "--rx", "1"), "model"),
-        (("locate",), "localizer"),
-        (("aoa", "--mix", "0.5", "--synthesizer", "nearest", "--extra", "0"), "condition"),
+        ("rssi_run", "above -75 dBm", "dB"),
+        ("locate_run", "Positions are found within", "m"),
+        ("aoa_run", "Directions are found within", "degrees"),
     ],
 )
-def test_a_run_shows_results_and_its_answer(tmp_path, capsys, arguments, first):
-    assert quick.run(*arguments, "--out", tmp_path / "run") == 0
-    out, err = capsys.readouterr()
-    assert out.startswith(first)
-    assert out.splitlines()[-1] == f"report: {tmp_path / 'run' / 'report.html'}"
-    conclusion = next(line for line in out.split("\n\n")[1].splitlines())
-    assert conclusion.replace("'", "&#39;") in (tmp_path / "run" / "report.html").read_text()
-    unit = {"rssi": "dB", "locate": "m", "aoa": "deg"}[arguments[0]]
-    results = [line for line in err.splitlines() if line.endswith(f" {unit}")]
-    assert len(results) >= 4
-    assert not {*json.loads((tmp_path / "run" / "config.json").read_text())["config"]} & {"open", "quiet", "json"}
+def test_a_run_shows_results_and_its_answer(request, run, answered, unit):
+    folder = request.getfixturevalue(run)
+    out, err = ((folder.parent / name).read_text() for name in ("out.txt", "err.txt"))
+    assert out.startswith("what you can use")
+    *_, conclusion = out.split("\n\n")
+    first, *_, last = conclusion.splitlines()
+    assert answered in first
+    assert last == f"report: {folder / 'report.html'}"
+    html = unescape(re.sub("<[^>]*>", "", (folder / "report.html").read_text()))
+    assert first.replace("`", "") in html
+    assert len(re.findall(rf"^\[\d+/\d+\] .*: [\d.]+ {unit}, [\d.]+ s$", err, flags=re.MULTILINE)) >= 4
+    assert not {*json.loads((folder / "config.json").read_text())["config"]} & {"open", "quiet", "json"}
 
 
 def test_quiet_runs_show_the_answer_alone(tmp_path, capsys):
     assert quick.run("rssi", "--rx", "1", "--quiet", "--out", tmp_path / "run") == 0
     out, err = capsys.readouterr()
-    assert out.startswith("model")
+    assert out.startswith("what you can use")
     assert err == ""
     assert not terminal.console.quiet
 

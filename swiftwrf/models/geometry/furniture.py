@@ -1,5 +1,6 @@
 """Furniture of a room: absorption in voxels and reflectivity in cells on each plane, estimated from channels.
 
+Surfaces of limited extent, such as table tops, are planes that reflect in some cells only.
 The path of an image reflects at planes w in cells c and crosses voxels v along lengths l_v. Its gain
 
     a = exp(-sum_v absorption_v l_v) prod_w sign_w reflectivity_wc
@@ -14,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -26,16 +27,10 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from swiftwrf.errors import InputError
-from swiftwrf.models.geometry.images import (
-    MAX_COSINE,
-    PhaseObservations,
-    PlaneSet,
-    Sequence,
-    images,
-    mirror,
-    visibility,
-)
-from swiftwrf.models.geometry.planes import advantage, log_explained
+from swiftwrf.models.geometry.channels import Channels, coherence, field, waves
+from swiftwrf.models.geometry.images import MAX_COSINE, PhaseObservations, PlaneSet, Sequence, mirror
+from swiftwrf.models.geometry.planes import Plane, advantage, log_explained, plane_set
+from swiftwrf.models.geometry.surfaces import find_surfaces
 from swiftwrf.plotting import Axes, corners_of, hatch, plan_map
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.threads import parallel_map, single_thread
@@ -46,7 +41,9 @@ N_STEPS = 150  # of Adam
 TENSORS = ("low", "absorption", "reflectivity", "crossed_m")
 SETTINGS = ((2.0, 1e-3), (1.0, 1e-3), (2.0, 3e-3))  # edge of a voxel [wavelengths] and weight of the penalty
 SIGNIFICANCE = 2.5  # standard errors by which furniture must explain held-out channels better
+SURFACE_SIGNIFICANCE = 2.5  # the same of each surface
 MAX_CHOICE = 200  # positions that choose the settings
+MAX_SEARCH = 600  # positions by which surfaces are searched
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +58,7 @@ class Furniture:
             along the axis that is closest to the normal.
         crossed_m: Length of the measured paths in each voxel, float32 (X, Y, Z) [m]. Where it is 0, absorption is unknown.
         penalty: Weight of the penalty that held-out positions chose.
+        surfaces: Reflecting surfaces besides the planes of the room, after which their rows of `reflectivity` come.
     """
 
     low: Tensor
@@ -69,24 +67,56 @@ class Furniture:
     reflectivity: Tensor
     crossed_m: Tensor
     penalty: float
+    surfaces: tuple[Plane, ...] = ()
+
+    def joined(self, planes: PlaneSet) -> PlaneSet:
+        """Return the planes of one room and the surfaces; these reflect at most twice, and no path meets two of them."""
+        if not self.surfaces:
+            return planes
+        n, both = planes.gain.shape[1], planes.joined(plane_set([*self.surfaces], planes.order))
+        kept = [s for s in both.sequence if max(s) < n or (len(s) <= 2 and min(s) < n) or len(s) == 1]
+        return replace(both, only=tuple(kept))
+
+    def with_surfaces(self, surfaces: list[Plane]) -> Furniture:
+        """Return the voxels with further surfaces, to fit."""
+        cells = torch.ones(len(surfaces), self.reflectivity.shape[1])
+        return replace(self, surfaces=tuple(surfaces), reflectivity=torch.cat([self.reflectivity, cells]))
+
+    def with_reflectivity(self, plane: int, value: float) -> Furniture:
+        """Return the furniture with one reflectivity of a whole plane or surface."""
+        reflectivity = self.reflectivity.clone()
+        reflectivity[plane] = value
+        return replace(self, reflectivity=reflectivity)
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         """Return the tensors by name, and plain values."""
-        return {name: getattr(self, name) for name in TENSORS}, {"voxel_m": self.voxel_m, "penalty": self.penalty}
+        return {name: getattr(self, name) for name in TENSORS}, {
+            "voxel_m": self.voxel_m,
+            "penalty": self.penalty,
+            "surfaces": [asdict(plane) for plane in self.surfaces],
+        }
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header, n_planes: int) -> Furniture:
         """Return the furniture of a room of planes that `state` describes."""
         shape = tuple(tensors["absorption"].shape)
         n_cells = math.prod(shape) // max(1, min(shape, default=1))
-        expect(tensors, {"low": (3,), "absorption": shape, "crossed_m": shape, "reflectivity": (n_planes, n_cells)})
-        found = cls(**{name: tensors[name] for name in TENSORS}, voxel_m=header["voxel_m"], penalty=header["penalty"])
+        surfaces = tuple(Plane(**{**plane, "normal": tuple(plane["normal"])}) for plane in header["surfaces"])
+        cells = n_planes + len(surfaces), n_cells
+        expect(tensors, {"low": (3,), "absorption": shape, "crossed_m": shape, "reflectivity": cells})
+        values = {name: tensors[name] for name in TENSORS}
+        found = cls(**values, voxel_m=header["voxel_m"], penalty=header["penalty"], surfaces=surfaces)
         if len(shape) != 3 or not (found.voxel_m > 0 and float(found.absorption.min()) >= 0):
             raise InputError("voxels of furniture need three dimensions, an edge above 0 and no negative absorption")
         return found
 
     def gains(self, planes: PlaneSet, scene: PhaseObservations) -> Tensor:
-        """Return the gains of the direct path and of each image at the positions of a scene, float32 (n, 1 + S)."""
+        """Return the gains of the direct path and of each image at the positions of a scene, float32 (n, 1 + S).
+
+        Args:
+            planes: Planes of the room and surfaces, as `joined`.
+            scene: Positions.
+        """
         padded = _padded(self.absorption)
 
         def transmission(group: _Crossings) -> Tensor:
@@ -284,40 +314,8 @@ def _orders(sequence: tuple[Sequence, ...], normal: tuple[tuple[float, ...], ...
     return torch.tensor([orders + orders[:1] * (most - len(orders)) for orders in found], dtype=torch.int64)
 
 
-def coherence(observed: Tensor, predicted: Tensor) -> Tensor:
-    """Return |x^H h|^2 / (|x|^2 |h|^2) of channels (n, F, K), with an unknown phase of each of the F snapshots, (n,)."""
-    match = (observed.conj() * predicted).sum(-1).abs().square().sum(-1)
-    power = (observed.abs().square().sum(-1) * predicted.abs().square().sum(-1)).sum(-1)
-    found: Tensor = match / power.clamp_min(1e-30)
-    return found
-
-
-def field(gain: Tensor, wave: Tensor) -> Tensor:
-    """Return the sums of waves (n, 1 + S, F, K) with gains (n, 1 + S), complex64 (n, F, K)."""
-    total: Tensor = (gain.to(wave.dtype)[:, None] @ wave.flatten(2))[:, 0].unflatten(1, wave.shape[2:])
-    return total
-
-
-def waves(planes: PlaneSet, scene: PhaseObservations, frequency: Tensor) -> Tensor:
-    """Return the waves of the direct path and of each image, complex64 (n, 1 + S, F, K).
-
-    Args:
-        planes: Planes of one room.
-        scene: Positions.
-        frequency: Frequencies relative to the carrier, (F,).
-    """
-    source, there, found = scene.transmitter[None], torch.ones(1, 1), []
-    if planes.sequence:
-        source, exists = torch.cat([source, images(scene, planes)[0]]), visibility(scene, planes)[0]
-        there = torch.cat([torch.ones_like(exists[:1]), exists])
-    for ratio in frequency.tolist():
-        at = replace(scene, element=scene.element * ratio, wavenumber=scene.wavenumber * ratio)
-        found.append(at.wave(source).expand(-1, len(scene), -1) * there[..., None])
-    return torch.stack(found, dim=2).transpose(0, 1)
-
-
 def fit_furniture(planes: PlaneSet, measured: Channels, start: Furniture) -> Furniture:
-    """Fit absorption and reflectivity to measured channels, with the voxels and the penalty of `start`."""
+    """Fit absorption and reflectivity to measured channels, with voxels, penalty and surfaces of `start`."""
     scene, observed = measured.scene, measured.value
     wave = waves(planes, scene, measured.frequency)
     crossings = start._crossings(planes, scene)
@@ -328,7 +326,7 @@ def fit_furniture(planes: PlaneSet, measured: Channels, start: Furniture) -> Fur
     strength = planes.gain[0].abs().clamp(0.05, 0.98)[:, None].expand_as(start.reflectivity)
     logit = torch.special.logit(strength).clone().requires_grad_()
     optimiser = torch.optim.Adam([{"params": [raw], "lr": 0.1}, {"params": [logit], "lr": 0.05}])
-    area, normal = start.voxel_m**2, planes.normal[0]
+    area, normal, n_planes = start.voxel_m**2, planes.normal[0], len(start.reflectivity) - len(start.surfaces)
     for _ in range(N_STEPS):
         absorption, reflectivity = softplus(raw), logit.sigmoid()
         values = _padded(absorption)
@@ -339,10 +337,12 @@ def fit_furniture(planes: PlaneSet, measured: Channels, start: Furniture) -> Fur
 
         gain = _gains(crossings, planes, transmission, reflectivity)
         penalty = 10 * start.voxel_m**3 * absorption.sum() + area * _variation(absorption)
-        for axis, values in zip(normal.abs().argmax(-1).tolist(), reflectivity, strict=True):
+        for number, (axis, values) in enumerate(zip(normal.abs().argmax(-1).tolist(), reflectivity, strict=True)):
             sides = [size for other, size in enumerate(absorption.shape) if other != axis]
             cells = values[: math.prod(sides)].reshape(sides)
-            penalty = penalty + start.voxel_m * _variation(cells) + area * (1 - cells).sum()
+            penalty = penalty + start.voxel_m * _variation(cells)
+            # a plane of the room reflects everywhere unless channels need less, another surface nowhere
+            penalty = penalty + area * (1 - cells if number < n_planes else cells).sum()
         loss = 1 - coherence(observed, field(gain, wave)).mean() + start.penalty * penalty
         optimiser.zero_grad()
         loss.backward()
@@ -354,29 +354,6 @@ def fit_furniture(planes: PlaneSet, measured: Channels, start: Furniture) -> Fur
         reflectivity=logit.sigmoid().detach(),
         crossed_m=crossed.reshape(shape)[1:-1, 1:-1, 1:-1],
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Channels:
-    """Measured channels at n positions.
-
-    Args:
-        scene: Positions.
-        value: Channels of F snapshots, complex64 (n, F, K).
-        frequency: Their frequencies relative to the carrier, (F,).
-    """
-
-    scene: PhaseObservations
-    value: Tensor
-    frequency: Tensor
-
-    def subset(self, rows: Tensor) -> Channels:
-        """Return the given positions."""
-        return replace(self, scene=self.scene.subset(rows), value=self.value[rows])
-
-    def coherence(self, planes: PlaneSet, gain: Tensor) -> Tensor:
-        """Return the coherence with the field of gains (n, 1 + S) at each position, (n,)."""
-        return coherence(self.value, field(gain, waves(planes, self.scene, self.frequency)))
 
 
 @single_thread()
@@ -405,20 +382,43 @@ def find_furniture(
     some = torch.linspace(0, len(fold) - 1, min(MAX_CHOICE, len(fold))).long()
     chosen, fold = measured.subset(some), fold[some]
     splits = [((fold != number).nonzero()[:, 0], (fold == number).nonzero()[:, 0]) for number in fold.unique()[:2]]
-    tasks = [(start, split) for start in empty for split in splits]
 
-    def held_out(task: tuple[Furniture, tuple[Tensor, Tensor]]) -> Tensor:
-        start, (kept, held) = task
-        test, found = chosen.subset(held), fit_furniture(planes, chosen.subset(kept), start)
-        return log_explained(test.coherence(planes, found.gains(planes, test.scene)))
+    def fitted(task: tuple[Furniture, tuple[Tensor, Tensor]]) -> Furniture:
+        start, (kept, _) = task
+        return fit_furniture(start.joined(planes), chosen.subset(kept), start)
 
-    explained = torch.cat(parallel_map(held_out, tasks)).reshape(len(empty), -1)
+    def explained(furniture: list[Furniture]) -> Tensor:
+        """Return how well furniture, fitted without each fold, explains the channels of the fold."""
+        found = []
+        for each, (_, held) in zip(furniture, splits, strict=True):
+            test, both = chosen.subset(held), each.joined(planes)
+            found.append(log_explained(test.coherence(both, each.gains(both, test.scene))))
+        return torch.cat(found)
+
+    fits = parallel_map(fitted, [(start, split) for start in empty for split in splits])
+    with_furniture = [explained(fits[row : row + len(splits)]) for row in range(0, len(fits), len(splits))]
+    best = max(range(len(empty)), key=lambda row: float(with_furniture[row].mean()))
     held = chosen.subset(torch.cat([held for _, held in splits]))
     alone = log_explained(held.coherence(planes, constant.expand(len(held.value), -1)))
-    best = int(explained.mean(dim=1).argmax())
-    if advantage(explained[best], alone) < SIGNIFICANCE:
+    if advantage(with_furniture[best], alone) < SIGNIFICANCE:
         return None
-    return fit_furniture(planes, measured, empty[best])
+    found = fit_furniture(planes, measured, empty[best])
+    many = measured.subset(torch.linspace(0, len(measured.value) - 1, min(MAX_SEARCH, len(measured.value))).long())
+    surfaces = find_surfaces(planes, found.gains(planes, many.scene), many, low, high)
+    if not surfaces:
+        return found
+    wider = empty[best].with_surfaces(surfaces)
+    fits = parallel_map(fitted, [(wider, split) for split in splits])
+    whole, n = explained(fits), planes.gain.shape[1]
+    kept = [
+        row
+        for row in range(len(surfaces))
+        if advantage(whole, explained([fit.with_reflectivity(n + row, 0.0) for fit in fits])) > SURFACE_SIGNIFICANCE
+    ]
+    if not kept or advantage(whole, with_furniture[best]) < SIGNIFICANCE:
+        return found
+    wider = empty[best].with_surfaces([surfaces[row] for row in kept])
+    return fit_furniture(wider.joined(planes), measured, wider)
 
 
 def _variation(values: Tensor) -> Tensor:

@@ -15,10 +15,11 @@ from swiftwrf.data.spectra import Spectra, check_training, fingerprint
 from swiftwrf.data.splits import folds
 from swiftwrf.errors import InputError
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, bounding_box
+from swiftwrf.models.geometry.channels import Channels, field, waves
 from swiftwrf.models.geometry.fit import GeometryConfig, extend_room, observe, search_room, update_room
-from swiftwrf.models.geometry.furniture import Channels, Furniture, field, find_furniture, fit_furniture, waves
+from swiftwrf.models.geometry.furniture import Furniture, find_furniture, fit_furniture
 from swiftwrf.models.geometry.images import PhaseObservations, PlaneSet, images
-from swiftwrf.models.geometry.planes import Plane, RoomEstimate, refine
+from swiftwrf.models.geometry.planes import Plane, RoomEstimate, plane_set, refine
 from swiftwrf.models.link import Link, Linked
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.threads import single_thread
@@ -121,7 +122,7 @@ class GeometryModel(Linked, FieldModel):
         """Return the room with its furniture fitted to the channels of other spectra, without another choice of options."""
         model = copy(self)
         if self.furniture is not None:
-            model.furniture = fit_furniture(self.tensors(), self.channels(train), self.furniture)
+            model.furniture = fit_furniture(self.reflectors, self.channels(train), self.furniture)
         return model
 
     def channels(self, data: Spectra) -> Channels:
@@ -230,12 +231,12 @@ class GeometryModel(Linked, FieldModel):
         """
         scene = self.scene(position)
         ratio = torch.ones(1) if frequency_hz is None else frequency_hz * self.array.wavelength / LIGHT_SPEED
-        found = field(self.gains(scene), waves(self.tensors(), scene, ratio))
+        found = field(self.gains(scene), waves(self.reflectors, scene, ratio))
         return found[:, 0] if frequency_hz is None else found
 
     def gains(self, scene: PhaseObservations) -> Tensor:
         """Return the gains of the direct path and of each image at the positions of a scene, float32 (n, 1 + S)."""
-        room = self.tensors()
+        room = self.reflectors
         if self.furniture is not None:
             return self.furniture.gains(room, scene)
         constant = torch.cat([torch.ones(1), room.image_gain[0]]) if room.sequence else torch.ones(1)
@@ -248,9 +249,12 @@ class GeometryModel(Linked, FieldModel):
 
     def tensors(self) -> PlaneSet:
         """Return the planes as tensors."""
-        normal = torch.tensor([p.normal for p in self.planes], dtype=torch.float64).reshape(1, -1, 3)
-        offset = torch.tensor([[p.offset_m for p in self.planes]], dtype=torch.float64)
-        return PlaneSet(normal, offset, torch.tensor([[p.gain for p in self.planes]]), self.order)
+        return plane_set(self.planes, self.order)
+
+    @property
+    def reflectors(self) -> PlaneSet:
+        """Planes and, after them, further surfaces of the furniture, whose paths have the `gains`."""
+        return self.tensors() if self.furniture is None else self.furniture.joined(self.tensors())
 
     def image_sources(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return the fixed end and its mirror images: positions (S, 3) [m], gains (S,) and numbers of reflections (S,)."""

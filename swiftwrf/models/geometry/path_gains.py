@@ -23,7 +23,7 @@ from torch import Tensor
 
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel
-from swiftwrf.models.geometry.furniture import waves
+from swiftwrf.models.geometry.channels import waves
 from swiftwrf.models.geometry.images import PhaseObservations
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation
@@ -95,7 +95,7 @@ class PathGains:
         prior = header[f"{PREFIX}prior"]
         check_value(f"{PREFIX}prior", prior, PriorName)
         process = GaussianProcess.from_state(tensors, header, torch.float32, exact=True, prefix=PREFIX)
-        return cls(process, len(geometry.image_sources()[0]), prior)
+        return cls(process, 1 + len(geometry.reflectors.sequence), prior)
 
     def averaged(self) -> PathGains:
         """Return the mean of the fields, as one field."""
@@ -116,7 +116,7 @@ class PathGains:
 
 def paths(geometry: GeometryModel, scene: PhaseObservations) -> tuple[Tensor, Tensor]:
     """Return the waves of the direct path and of each image, complex64 (n, 1 + S, K), and their gains, (n, 1 + S)."""
-    wave = waves(geometry.tensors(), scene, torch.ones(1))[:, :, 0]
+    wave = waves(geometry.reflectors, scene, torch.ones(1))[:, :, 0]
     return wave, geometry.gains(scene)
 
 
@@ -204,7 +204,7 @@ def choose_prior(
     kernel = kernel_of(scene.moving)
     candidates: list[tuple[GeometryModel, PriorName]] = [(geometry, name) for name in PRIORS]
     further = geometry.with_order(HIGHEST_ORDER)
-    if geometry.order < HIGHEST_ORDER and len(further.image_sources()[0]) <= MAX_PATHS:
+    if geometry.order < HIGHEST_ORDER and len(further.reflectors.sequence) < MAX_PATHS:
         candidates.append((further, "tight"))
     error: list[list[Tensor]] = [[] for _ in candidates]
     fits: list[dict[int, PathGains]] = [{} for _ in candidates]

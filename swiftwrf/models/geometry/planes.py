@@ -99,6 +99,13 @@ class RoomEstimate:
         return {"planes": planes, "order": self.order} | scores
 
 
+def plane_set(planes: list[Plane], order: int) -> PlaneSet:
+    """Return the planes of one room as tensors."""
+    normal = torch.tensor([p.normal for p in planes], dtype=torch.float64).reshape(1, -1, 3)
+    offset = torch.tensor([[p.offset_m for p in planes]], dtype=torch.float64)
+    return PlaneSet(normal, offset, torch.tensor([[p.gain for p in planes]]), order)
+
+
 def phase_jacobian(scene: PhaseObservations, planes: PlaneSet, movement: Tensor) -> tuple[Tensor, Tensor]:
     """Return the field h with the direct wave, complex64 (K, B, n), and the derivatives of its phase, (K, B, Q P, n).
 

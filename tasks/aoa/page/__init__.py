@@ -6,53 +6,90 @@ from augment.cross_validation import LOCATOR
 from augment.estimators import ESTIMATORS
 from augment.turbo.condition import NETWORK, NETWORKS
 from tasks import labels
-from tasks.aoa.page.cost import sizes, speed_section, time_section, trainings
-from tasks.aoa.page.field import field_section
-from tasks.aoa.page.locating import locating_section
-from tasks.aoa.page.overview import compared
-from tasks.aoa.page.records import AoaRecords, FractionRecords
-from tasks.aoa.page.results import results_section, turbo_distribution
+from tasks.aoa.page.locating import located_plan, locating_section
+from tasks.aoa.page.records import AoaRecords, FractionRecords, palette
 from tasks.aoa.page.room import choice_section, room_section
-from tasks.aoa.page.summary import conclusion, next_steps, summary
-from tasks.aoa.page.synthesis import similarity, synthesis_section
-from tasks.environment import command
-from tasks.page.page import Page, Plot, Section, Summary, provenance, sections_of
-from tasks.page.shared import suggestion_plot, worth
+from tasks.aoa.page.summary import answer, answer_of
+from tasks.aoa.page.synthesis import example_pair, synthesis_section
+from tasks.page.page import Number, Page, Plot, Section, Summary, provenance, sections_of
+from tasks.page.records import notes
+from tasks.page.shared import compared, errors_section, suggestion_plot, worth
 
 
 def page(runs: list[AoaRecords]) -> Page:
     """Return the page of these runs."""
     fractions = [fraction for run in runs for fraction in FractionRecords.of(run)]
     sections = [
-        sections_of("Errors", fractions, results_section, terms()),
+        sections_of("Errors", fractions, _errors, terms()),
+        sections_of("Where was it?", fractions, _positions),
         sections_of("Spectra", fractions, synthesis_section),
-        sections_of("Positions and room", fractions, _positions),
         sections_of("Measure or synthesize more?", fractions, _more),
         _limits(runs[0]),
     ]
-    sections = [section for section in sections if section.paragraphs or section.tables or section.parts]
-    details = [
-        sections_of("Field models", fractions, lambda fraction: Section("", plots=_field_models(fraction))),
-        sections_of("Speed against error", fractions, speed_section),
-        Section("Training and size", plots=[*sizes(runs), *trainings(runs)]),
-        sections_of("The field over the region", fractions, field_section),
-        time_section(fractions),
-        provenance(runs),
-    ]
+    sections = [section for section in sections if section.paragraphs or section.plots or section.parts]
+    details = [sections_of("What is left out", fractions, _left_out), provenance(runs)]
     names = ", ".join(dict.fromkeys(run.place for run in runs))
-    first = summary(fractions[0]) if len(fractions) == 1 else _comparison(fractions)
+    if len(fractions) == 1:
+        first = first_screen(fractions[0])
+    else:
+        answers = {fraction.scene: answer(fraction) for fraction in fractions}
+        colours = palette(condition for fraction in fractions for condition in fraction.conditions.values())
+        steps = answer_of(runs[0]).next_steps if len(runs) == 1 else ()
+        first = compared(answers, runs, colours, "angular error", steps)
     return Page(f"Angle of arrival: {names}", first, sections, details)
 
 
-def _comparison(fractions: list[FractionRecords]) -> Summary:
-    """Return the first screen of several measured fractions or runs."""
-    table, plot = compared(fractions)
-    meaning = [f"{fraction.scene}: {conclusion(fraction)}" for fraction in fractions]
-    runs = {fraction.run.path: fraction.run for fraction in fractions}
-    steps = [f"Explore{run.label.replace(',', '')}: `{command('view', path)}`." for path, run in runs.items()]
-    if len(runs) == 1:
-        steps = list(dict.fromkeys(step for fraction in fractions for step in next_steps(fraction)))
-    return Summary([], [plot], meaning, steps, table=table)
+def first_screen(fraction: FractionRecords) -> Summary:
+    """Return the first screen of one measured fraction."""
+    found, medians = answer(fraction), fraction.medians
+    turbo, baseline = fraction.turbo_method, "peak" if "peak" in medians else fraction.mix["reference"]
+    synthesizer = fraction.synthesizers([turbo])[0]
+    quality = fraction.mix["synthesis"][synthesizer]["psnr_db"]["median"]
+    numbers = [
+        *(
+            Number(f"{medians[name]:.2f}\N{DEGREE SIGN}", f"median angular error of {name}")
+            for name in dict.fromkeys((found.chosen, turbo, baseline))
+        ),
+        Number(
+            f"{quality:.1f} dB", f"median PSNR of the spectra that {synthesizer} predicts where nothing was measured"
+        ),
+    ]
+    panels, caption = example_pair(fraction)
+    if fraction.arrays("located"):
+        panels.insert(0, located_plan(fraction))
+        caption = (
+            "The room that was found (dashed walls are not identifiable), and test positions with the errors of their "
+            f"location. {caption}"
+        )
+    errors = fraction.table("errors")[["repeat", "index", "method", "great_circle_deg"]]
+    plot = Plot("summary", panels, caption, errors[errors["method"] == found.chosen])
+    return Summary(numbers, [plot], found.conclusion, found.next_steps, notes=notes(fraction.run))
+
+
+def _errors(fraction: FractionRecords) -> Section:
+    caption = (
+        "Near the zenith azimuth errors are large without meaning. Held out: on measured "
+        "spectra, which decide the choice. By synthetic spectra: change of the median of the same estimator on measured "
+        "spectra, a paired bootstrap over the test positions."
+    )
+    errors = fraction.table("errors")[["repeat", "index", "method", "great_circle_deg"]]
+    return errors_section(
+        answer(fraction),
+        errors,
+        fraction.palette,
+        name=fraction.file_name,
+        quantity="angular error",
+        caption=caption,
+    )
+
+
+def _left_out(fraction: FractionRecords) -> Section:
+    left_out = fraction.mix["left_out"]
+    texts = [
+        f"{', '.join(name for name, own in left_out.items() if own == reason)}: {reason}."
+        for reason in dict.fromkeys(left_out.values())
+    ]
+    return Section("", texts or ["Nothing."])
 
 
 def _positions(fraction: FractionRecords) -> Section | None:
@@ -78,10 +115,6 @@ def _suggestion_section(fraction: FractionRecords) -> Section | None:
     )
     plot = suggestion_plot(f"suggested-{fraction.file_name}", arrays, "variance left in the region [%]")
     return Section("Where to measure next", [text], plots=[plot])
-
-
-def _field_models(fraction: FractionRecords) -> list[Plot]:
-    return [similarity(fraction), *turbo_distribution(fraction)]
 
 
 def _limits(run: AoaRecords) -> Section:

@@ -1,11 +1,14 @@
-"""The report's section on located test positions: errors, where they are, posteriors, calibration."""
+"""The report's section on located test positions: where they are, posteriors, errors, calibration."""
 
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.figure import Figure
 from pandas import DataFrame, concat
 
+from augment.turbo.condition import LOCATED
 from tasks.aoa.page.records import FractionRecords
+from tasks.aoa.page.room import FIXED, draw_in_plan, extent
 from tasks.page import figures
 from tasks.page.page import Plot, Section, Table, number
 
@@ -15,13 +18,37 @@ MIN_WINDOW_M = 0.02  # half the side of the smallest map of a posterior
 MAX_MARK = 120  # area [pt^2] of the candidate with the largest mass
 
 
+def located_plan(fraction: FractionRecords) -> Figure:
+    """Return the plan of the room with a line from each test position to its estimate."""
+    table, room = fraction.table("positions"), fraction.arrays("located")
+    own = table[(table["method"] == LOCATED) & (table["repeat"] == 0)]
+    truth, estimate = own[["truth_x_m", "truth_y_m"]].to_numpy(), own[["estimate_x_m", "estimate_y_m"]].to_numpy()
+    figure, plan = figures.panel(4.6, 3.7)
+    planes = [
+        {"normal": normal, "offset_m": offset, "certain": certain}
+        for normal, offset, certain in zip(room["normal"], room["offset"], room["certain"], strict=True)
+    ]
+    low, high = extent(planes, np.concatenate([room["measured"], room["fixed"][None]]))
+    for plane in planes:
+        draw_in_plan(plan, plane, low, high)
+    plan.plot(*room["measured"][:, :2].T, ".", color=figures.RULE, markersize=3)
+    plan.plot(*room["fixed"][:2], "*", color=FIXED, markersize=11)
+    highest = max(float(own["error_m"].quantile(0.95)), 1e-3)
+    for at, to in zip(truth, estimate, strict=True):
+        plan.plot(*zip(at, to, strict=True), color=figures.RULE, linewidth=1, zorder=2)
+    drawn = plan.scatter(
+        truth[:, 0], truth[:, 1], c=100 * own["error_m"], s=14, cmap="viridis", vmin=0, vmax=100 * highest, zorder=3
+    )
+    plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    figures.colour_bar(plan, drawn, "position error [cm]", extend="max")
+    return figure
+
+
 def locating_section(fraction: FractionRecords) -> Section | None:
-    """Return the errors of located test positions; None if nothing was located and nothing was left out."""
-    located, left_out = fraction.mix["locating"], fraction.mix["left_out"]
-    title = "Where was it?"
-    notes = [f"{method} is left out: {reason}." for method, reason in left_out.items() if method not in located]
+    """Return the errors of located test positions; None if nothing was located."""
+    located = fraction.mix["locating"]
     if not located:
-        return Section(title, notes) if notes else None
+        return None
     rows = [
         [
             method,
@@ -30,58 +57,33 @@ def locating_section(fraction: FractionRecords) -> Section | None:
             number(100 * own["position_error_m"]["p90"], 1),
             f"{own['coverage_80']:.0%}",
             f"{own['ambiguous']:.0%}",
-            *(number(own["seconds"][stage], 1) for stage in ("room", "fit", "locate")),
         ]
         for method, own in located.items()
     ]
-    columns = [
-        "method",
-        "position error [cm]",
-        "90 %",
-        "in 80 % region",
-        "ambiguous",
-        "room [s]",
-        "fit [s]",
-        "locate [s]",
-    ]
+    columns = ["method", "median [cm]", "90 % [cm]", "in 80 % region", "ambiguous"]
     caption = (
-        "Median distance between true and estimated position with its 95 % interval over the test spectra. Regions are "
-        "balls around the estimate. Ambiguous: a second mode has at least a tenth of the posterior mass."
+        "Median distance between true and estimated position with its 95 % interval. Regions are balls around the estimate. "
+        "Ambiguous: a second mode has at least a tenth of the posterior mass."
     )
-    text = (
-        f"Matched-field processing searches the position of the moving end ({fraction.run.metrics['moving']}) whose "
-        "spectrum, predicted by the room that was found, matches the observed one. The direction follows from the posterior "
-        "over positions. The estimate is the posterior median."
-    )
-    plots = [_errors(fraction)]
-    if fraction.arrays("located"):
-        plots.append(_posteriors(fraction))
-    return Section(title, [text, *notes], [Table(columns, rows, caption)], plots)
+    plots = [_posteriors(fraction)] if fraction.arrays("located") else []
+    return Section("Positions", [], [Table(columns, rows, caption)], [*plots, _calibration(fraction)])
 
 
-def _errors(fraction: FractionRecords) -> Plot:
-    """Return the distribution of the position errors and the calibration of the credible regions."""
+def _calibration(fraction: FractionRecords) -> Plot:
+    """Return the calibration of the credible regions."""
     table = fraction.table("positions")
-    groups = {str(method): part for method, part in table.groupby("method", sort=False)}
-    errors = {method: 100 * part["error_m"] for method, part in groups.items()}
-    first, distribution = figures.panel(5, 3.4)
-    limit = max(*(float(part.quantile(0.95)) for part in errors.values()), 1e-3)
-    figures.cdf(distribution, fraction.palette, errors, "position error [cm]", limit=limit)
-    second, calibration = figures.panel(5, 3.4)
-    calibration.plot([0, 1], [0, 1], color=figures.RULE, linewidth=1)
-    calibration.set(xlim=(0, 1), ylim=(0, 1.02))
+    figure, axes = figures.panel(5.4, 3.2)
+    axes.plot([0, 1], [0, 1], color=figures.RULE, linewidth=1)
+    axes.set(xlim=(0, 1), ylim=(0, 1.02))
     inside = {
-        method: (LEVELS, [float((part["containing_level"] < level).mean()) for level in LEVELS])
-        for method, part in groups.items()
+        str(method): (LEVELS, [float((part["containing_level"] < level).mean()) for level in LEVELS])
+        for method, part in table.groupby("method", sort=False)
     }
     label = "fraction of test positions inside"
-    figures.curves(calibration, fraction.palette, inside, "level of the credible region", label)
-    caption = (
-        "Left: distribution of the position errors. Right: fraction of the test positions inside the credible region of "
-        "each level; on the diagonal the posterior is calibrated."
-    )
+    figures.curves(axes, fraction.palette, inside, "level of the credible region", label)
+    caption = "Fraction of the test positions inside the credible region of each level: calibrated on the diagonal."
     data = table[["method", "repeat", "index", "truth_x_m", "truth_y_m", "truth_z_m", "error_m", "containing_level"]]
-    return Plot(f"located-{fraction.file_name}", [first, second], caption, data)
+    return Plot(f"located-{fraction.file_name}", [figure], caption, data)
 
 
 def _posteriors(fraction: FractionRecords) -> Plot:
@@ -89,7 +91,7 @@ def _posteriors(fraction: FractionRecords) -> Plot:
     example = fraction.arrays("located")
     error, panels = np.linalg.norm(example["estimate"] - example["truth"], axis=1), []
     for row in range(len(error)):
-        figure, ax = figures.panel(3.6, 3.6)
+        figure, ax = figures.panel(2.4, 2.5)
         at, weight = example["candidate"][row], example["weight"][row]
         truth, estimate = example["truth"][row], example["estimate"][row]
         half = 1.3 * max(error[row], 2 * example["radius"][row], MIN_WINDOW_M)
@@ -102,7 +104,7 @@ def _posteriors(fraction: FractionRecords) -> Plot:
         ax.set(xlim=(x - half, x + half), ylim=(y - half, y + half), aspect="equal")
         ax.set_title(f"row {example['index'][row]}: {100 * error[row]:.1f} cm", fontsize=9)
         ax.set(xlabel="x [m]", ylabel="y [m]")
-        ax.locator_params(nbins=5)
+        ax.locator_params(nbins=3)
         panels.append(figure)
     caption = (
         "Posteriors of six test spectra in plan, from the smallest to the largest position error (quantiles 0, 0.2, ..., "

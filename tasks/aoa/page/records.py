@@ -63,10 +63,10 @@ class FractionRecords:
         return headline(self.conditions.values()).method
 
     @property
-    def learner(self) -> str:
-        """Estimator of `turbo_method` in words."""
-        condition = headline(self.conditions.values())
-        return "the network" if condition.is_network else condition.estimator
+    def chosen(self) -> str:
+        """Method that cross-validation chose, or `turbo_method` without a choice."""
+        choice = self.mix["estimator_choice"]
+        return choice["name"] if choice else self.turbo_method
 
     def table(self, name: str) -> DataFrame:
         """Return the rows of a table of the run, e.g. `errors`, with this measured fraction."""
@@ -98,11 +98,6 @@ class FractionRecords:
     def file_name(self) -> str:
         """Last part of the names of its figures."""
         return f"mix{self.key}-{self.run.file_name}"
-
-    @property
-    def title(self) -> str:
-        """The measured fraction, and the number of the run if there are several."""
-        return f"{self.percent} measured{self.run.label}"
 
     @property
     def scene(self) -> str:
@@ -140,20 +135,3 @@ def palette(conditions: Iterable[Condition]) -> Palette:
                 colour = CHOSEN if condition.synthesizer == AUTO else models.colour(condition.synthesizer)
         colours[condition.method] = colour
     return Palette(colours)
-
-
-def first_history(run: AoaRecords) -> DataFrame:
-    """Return the history of every training and fit of the first measured fraction and repeat."""
-    history = run.table("history")
-    if not len(history):
-        return history
-    return of_fraction(history[history["repeat"] == 0], next(iter(run.metrics["mixes"])))
-
-
-def fits(run: AoaRecords) -> tuple[DataFrame, DataFrame]:
-    """Return the history of the SwiftWRF fits of the first measured fraction: all sizes of the search, the final fit."""
-    history = first_history(run)
-    if "n_primitives" not in history:
-        return history.iloc[:0].assign(steps=0), history.iloc[:0].assign(steps=0)
-    own = history[(history["synthesizer"] == "swiftwrf") & history["stage"].notna()]
-    return own[own["stage"] == "search"], own[own["stage"] == "final"]

@@ -17,6 +17,7 @@ from swiftwrf.models import FIELD_MODELS
 from swiftwrf.plotting import corners_of, hatch
 from tasks import labels
 from tasks.aoa.page.records import FractionRecords
+from tasks.aoa.page.synthesis import quality_table
 from tasks.page import figures
 from tasks.page.page import Plot, Section, Table, number
 from tasks.records import read_json
@@ -62,30 +63,18 @@ def _best_and_rule(validation: CrossValidationMetrics) -> tuple[GainMetrics, Cha
     return best, validation["rule"] or best
 
 
-def choice_section(fraction: FractionRecords) -> Section | None:
-    """Return the comparison of the field models, and the gain over the number of extra positions."""
-    choice = fraction.mix["choice"]
-    if choice is None:
-        return None
-    rows = [
-        [name, number(db, 1), number(choice["seconds"].get(name), 1)]
-        for name, db in sorted(choice["psnr_db"].items(), key=lambda item: -item[1])
-    ]
-    table = Table(
-        ["field model", "held-out PSNR [dB]", "seconds"],
-        rows,
-        "Mean over held-out measured spectra, without the lowest and the highest tenth. Neither the fit nor the structure "
-        "of the model depends on them.",
-        frozenset({choice["name"]}),
-    )
-    name = choice["name"]
-    meaning = labels.labels(FIELD_MODELS, labels.FIELD_MODELS, [name])
-    text = f"{name} predicts held-out measured spectra best" + (f": {meaning[name].meaning}." if meaning else ".")
-    reasons = [f"{name} could not be fitted: {reason}." for name, reason in choice["left_out"].items()]
+def choice_section(fraction: FractionRecords) -> Section:
+    """Return the quality of the field models, why one was chosen, and the gain over the number of extra positions."""
+    choice, texts = fraction.mix["choice"], cross_validation_sentences(fraction)
+    if choice is not None:
+        name = choice["name"]
+        meaning = labels.labels(FIELD_MODELS, labels.FIELD_MODELS, [name])
+        texts.insert(
+            0, f"{name} predicts held-out measured spectra best{f': {meaning[name].meaning}' if meaning else ''}."
+        )
+        texts += [f"{name} could not be fitted: {reason}." for name, reason in choice["left_out"].items()]
     plots = [_gain(fraction, *item) for item in _cross_validations(fraction).items()]
-    return Section(
-        "Which field model, and does it help?", [text, *reasons, *cross_validation_sentences(fraction)], [table], plots
-    )
+    return Section("Do synthetic spectra help?", texts, [quality_table(fraction)], plots)
 
 
 def _gain(fraction: FractionRecords, name: str, validation: CrossValidationMetrics) -> Plot:
@@ -124,27 +113,23 @@ def room_section(fraction: FractionRecords) -> Section | None:
         ]
         for plane in room["planes"]
     ]
-    table = Table(
-        ["plane", "gain", "standard deviation [mm]", "identifiable"],
-        rows,
-        f"Mirror planes; images up to order {room['order']}. Not identifiable: another place explains the spectra nearly as "
-        "well, or held-out spectra hardly need the plane.",
+    caption = (
+        f"Mirror planes, also in `geometry-mix{fraction.key}.json`; images up to order {room['order']}. The room explains "
+        f"{1 - room['unexplained']:.0%} of the power of the spectra. Its spectra have a correlation of "
+        f"{1 - room['score_held_out']:.3f} with measured ones that the first stage of the search did not use. Not "
+        "identifiable: another place explains the spectra nearly as well, or held-out spectra hardly need the plane."
     )
-    text = (
-        f"The room explains {1 - room['unexplained']:.0%} of the power of the spectra. Its spectra have a correlation of "
-        f"{1 - room['score_held_out']:.3f} with measured ones that the first stage of the search did not use. "
-        f"`geometry-mix{fraction.key}.json` contains the planes."
-    )
+    table = Table(["plane", "gain", "standard deviation [mm]", "identifiable"], rows, caption)
     points = fraction.arrays("room")
     plot = Plot(
         f"room-{fraction.file_name}",
-        _room_panels(room["planes"], points),
-        "In plan and in space: the planes (dashed: uncertain), measured positions, the fixed end and its images of first "
+        [_room_panel(room["planes"], points)],
+        "The planes in plan (dashed: uncertain), measured positions, the fixed end and its images of first "
         "order. The images of a moving transmitter are those of the array that sees it.",
         _places(points),
     )
     if "plan" not in points:
-        return Section(title, [text], [table], [plot])
+        return Section(title, [], [table], [plot])
     furniture = Plot(
         f"furniture-{fraction.file_name}",
         furniture_panels(room["planes"], points),
@@ -152,7 +137,7 @@ def room_section(fraction: FractionRecords) -> Section | None:
         "because no measured path crosses it. Held-out channels need this furniture.",
         _cells(points),
     )
-    return Section(title, [text], [table], [plot, furniture])
+    return Section(title, [], [table], [plot, furniture])
 
 
 def furniture_panels(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) -> list[Figure]:
@@ -194,9 +179,9 @@ def _described(plane: dict[str, Any]) -> str:
     return f"({', '.join(f'{x:.3f}' for x in normal)}) . x = {plane['offset_m']:.3f} m"
 
 
-def _room_panels(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) -> list[Figure]:
+def _room_panel(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) -> Figure:
     low, high = extent(planes, np.concatenate([points["measured"], points["fixed"][None]]))
-    first, plan = figures.panel(5.4, 4.6)
+    figure, plan = figures.panel(5.4, 4.2)
     for plane in planes:
         draw_in_plan(plan, plane, low, high)
     own = points["order"] == 1
@@ -204,17 +189,8 @@ def _room_panels(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) 
     plan.plot(*points["fixed"][:2], "*", color=FIXED, markersize=11, label="fixed end")
     plan.plot(*points["image"][own][:, :2].T, "D", color=IMAGE, markersize=4, label="its images")
     plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    figures.legend_below(first, plan)
-    second, axes = figures.panel(5.2, 4.6)
-    space = figures.in_space(second, axes)
-    for plane in planes:
-        _draw_in_space(space, plane, low, high)
-    space.scatter(*points["measured"].T, s=2, color=MEASURED)
-    space.scatter(*points["fixed"], s=60, marker="*", color=FIXED)
-    space.scatter(*points["image"][own].T, s=12, marker="D", color=IMAGE)
-    space.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
-    space.set_box_aspect(np.ptp(np.concatenate([points["image"][own], [low, high]]), axis=0) + 0.5)
-    return [first, second]
+    figures.legend_below(figure, plan)
+    return figure
 
 
 def extent(planes: list[dict[str, Any]], inside: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -250,16 +226,3 @@ def draw_in_plan(ax: Axes, plane: dict[str, Any], low: NDArray[Any], high: NDArr
     ends = in_plan(plane, low - MARGIN, high + MARGIN)
     if ends is not None:
         ax.plot(*ends.T, "-" if plane["certain"] else "--", color="black", linewidth=1.3)
-
-
-def _draw_in_space(ax: Any, plane: dict[str, Any], low: NDArray[Any], high: NDArray[Any]) -> None:
-    normal = np.array(plane["normal"])
-    axis = int(np.abs(normal).argmax())
-    others = [i for i in range(3) if i != axis]
-    corner = np.zeros((2, 2, 3))
-    corner[..., others[0]], corner[..., others[1]] = np.meshgrid(
-        [low[others[0]], high[others[0]]], [low[others[1]], high[others[1]]], indexing="ij"
-    )
-    corner[..., axis] = (plane["offset_m"] - corner[..., others] @ normal[others]) / normal[axis]
-    alpha = 0.12 if plane["certain"] else 0.05
-    ax.plot_surface(*np.moveaxis(corner, -1, 0), color=figures.RULE, alpha=alpha, shade=False, edgecolor=figures.RULE)

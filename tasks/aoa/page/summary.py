@@ -1,142 +1,148 @@
-"""Summary of the report: three numbers, a picture, their meaning, next steps."""
+"""The answer of a run: errors of all methods, the conclusion, the next steps."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from augment.cross_validation import LOCATOR
 from augment.estimators import ESTIMATORS
-from augment.turbo.condition import LOCATED, MEASURED_STAND_IN
-from tasks.aoa.page.overview import overview
+from augment.turbo.condition import FULL_NETWORK, LOCATED, MEASURED_NETWORK, MEASURED_STAND_IN, NETWORK
+from swiftwrf.metrics import ChangeMetrics
+from tasks.answer import Answer, Method, NextStep
 from tasks.aoa.page.records import AoaRecords, FractionRecords
-from tasks.aoa.page.results import change_text, choice_sentence, gain_sentence, judgement
-from tasks.aoa.page.room import cross_validation_sentences
 from tasks.environment import command
-from tasks.page.page import Number, Summary
-from tasks.page.shared import worth
+from tasks.page.page import number
+from tasks.page.shared import again, next_steps, worth
 from tasks.summarise import fingerprinting
-from tasks.terminal import Answer
+
+BASELINES = ("peak", "constant")  # others must beat them
 
 
-def summary(fraction: FractionRecords) -> Summary:
-    """Return the summary of one measured fraction."""
-    metrics, mix = fraction.run.metrics, fraction.mix
-    meaning = [
-        f"On {fraction.run.scene}, {mix['n_measured']} of {metrics['n_train']} training spectra are measured "
-        f"({fraction.percent}). The spectra at the other positions are synthesized, and {fraction.learner} learns from "
-        f"both. It is tested on {metrics['n_test']} spectra that take no part in any fit.",
-        *(text for text in (choice_sentence(fraction), gain_sentence(fraction)) if text),
-        *cross_validation_sentences(fraction),
-    ]
-    return Summary(_numbers(fraction), [overview(fraction)], meaning, next_steps(fraction), conclusion(fraction))
+def answer(fraction: FractionRecords) -> Answer:
+    """Return the answer of one measured fraction."""
+    mix, chosen = fraction.mix, fraction.chosen
+    held_out = mix["estimator_choice"]["held_out_deg"] if mix["estimator_choice"] else {}
+    methods = []
+    for name, found in mix["methods"].items():
+        condition = fraction.conditions[name]
+        change = found["changes"].get(condition.measured_only.method)
+        cells = {
+            "azimuth [deg]": number(found["azimuth_deg"]["median"]),
+            "elevation [deg]": number(found["elevation_deg"]["median"]),
+            "held out [deg]": number(held_out[name]) if name in held_out else "",
+            "by synthetic spectra": change_text(change) if change else "",
+        }
+        seconds = found["seconds"]["train"], found["seconds"]["estimate"]
+        is_reference = condition.training == "all measured" or name in BASELINES
+        methods.append(Method(name, found["great_circle_deg"], is_reference and name != chosen, seconds, cells))
+    shown = (fraction.turbo_method, mix["reference"], MEASURED_NETWORK, LOCATED, FULL_NETWORK, "peak")
+    return Answer("deg", methods, chosen, conclusion(fraction), steps(fraction), shown)
 
 
-def _numbers(fraction: FractionRecords) -> list[Number]:
-    """Return errors of the chosen estimator, the network and the strongest peak, and the quality of the spectra."""
-    turbo = fraction.turbo_method
-    choice = fraction.mix["estimator_choice"]
-    first = choice["name"] if choice else turbo
-    synthesizer = fraction.synthesizers([turbo])[0]
-    quality = fraction.mix["synthesis"][synthesizer]["psnr_db"]
-    return [
-        *(_error(fraction, name) for name in dict.fromkeys((first, turbo)) if name in fraction.mix["methods"]),
-        *_strongest_peak(fraction),
-        Number(
-            f"{quality['median']:.1f} dB",
-            f"median PSNR of the spectra that {synthesizer} predicts at positions without a measurement",
-        ),
-    ]
-
-
-def answer(run: AoaRecords) -> Answer:
-    """Return what the terminal shows of a run."""
+def answer_of(run: AoaRecords) -> Answer:
+    """Return the answer of a run, whose methods of several measured fractions have the fraction in their names."""
     fractions = FractionRecords.of(run)
-    rows = []
-    for fraction in fractions:
-        share = {"measured": fraction.percent} if len(fractions) > 1 else {}
-        for method, condition in fraction.conditions.items():
-            names = {"estimator": condition.name, "training spectra": condition.training_set}
-            rows.append((share | names, fraction.mix["methods"][method]["great_circle_deg"]))
-    return Answer("deg", rows, conclusion(fractions[0]), next_steps(fractions[0]))
+    answers = {fraction.percent: answer(fraction) for fraction in fractions}
+    first = answers[fractions[0].percent]
+    if len(answers) == 1:
+        return first
+    named = [replace(one, name=f"{one.name}, {share} measured") for share, of in answers.items() for one in of.methods]
+    chosen = [f"{of.chosen}, {share} measured" for share, of in answers.items()]
+    sentences = [f"{share} measured: {of.conclusion[0]}" for share, of in answers.items()]
+    every = list(dict.fromkeys(step for of in answers.values() for step in of.next_steps))
+    return Answer("deg", named, chosen[0], sentences, every, chosen)
 
 
-def conclusion(fraction: FractionRecords) -> str:
-    """Return which estimator to take and what synthetic spectra change, in short sentences."""
-    sentences, medians = [], fraction.medians
-    if choice := fraction.mix["estimator_choice"]:
-        sentences.append(f"Take {choice['name']}: median error {medians[choice['name']]:.2f} degrees.")
-        for name, reason in list(choice["better"].items())[:1]:
-            sentences.append(f"{name} has {medians[name]:.2f} degrees, but is not recommended: {reason}.")
-    best = fraction.mix["reference"]
-    change = fraction.mix["methods"][fraction.turbo_method]["changes"][best]
-    without = "that uses neither them nor the room" if LOCATED in medians else "without them"
-    sentences.append(
-        f"With synthetic spectra {fraction.learner} changes the median error by {change_text(change)} against {best}, "
-        f"the best estimator {without}: {judgement(change)}."
+def conclusion(fraction: FractionRecords) -> list[str]:
+    """Return the error of the chosen method, how sure it is, and what synthetic spectra change."""
+    mix, metrics, chosen = fraction.mix, fraction.run.metrics, fraction.chosen
+    error, medians, choice = mix["methods"][chosen]["great_circle_deg"], fraction.medians, mix["estimator_choice"]
+    located = mix["locating"].get(chosen)
+    at = f", positions within {100 * located['position_error_m']['median']:.1f} cm" if located else ""
+    sure = (
+        f"The median's 95 % interval is {error['low']:.2f} to {error['high']:.2f} degrees over {metrics['n_test']} test "
+        f"spectra that no fit used; {mix['n_measured']} of {metrics['n_train']} training spectra count as measured "
+        f"({fraction.run.scene})."
     )
-    if "peak" in medians and "constant" in medians:
-        sentences.append(fingerprinting(medians["constant"], medians["peak"]))
-    return " ".join(sentence for sentence in sentences if sentence)
-
-
-def _error(fraction: FractionRecords, method: str) -> Number:
-    """Return the error of a method, with its position error if it locates."""
-    error = fraction.mix["methods"][method]["great_circle_deg"]
-    choice = fraction.mix["estimator_choice"]
-    chosen = choice is not None and choice["name"] == method
-    who = "network with synthetic spectra" if fraction.conditions[method].is_network else "estimator"
-    text = f"median angular error of {method}, {'the chosen ' if chosen else 'the '}{who}, 95 % interval "
-    text += f"[{error['low']:.2f}, {error['high']:.2f}]"
-    if located := fraction.mix["locating"].get(method):
-        text += f"; median position error {100 * located['position_error_m']['median']:.1f} cm"
-    return Number(f"{error['median']:.2f}\N{DEGREE SIGN}", text)
-
-
-def _strongest_peak(fraction: FractionRecords) -> list[Number]:
-    """Return the error of the strongest direction, which needs no training."""
-    if "peak" not in fraction.medians:
-        return []
-    without = "median angular error of the strongest peak, which needs no training"
-    if "constant" in fraction.medians:
-        without += f"; of the mean direction: {fraction.medians['constant']:.2f}\N{DEGREE SIGN}"
-    return [Number(f"{fraction.medians['peak']:.2f}\N{DEGREE SIGN}", without)]
-
-
-def next_steps(fraction: FractionRecords) -> list[str]:
-    """Return what to do next, a sentence each."""
-    metrics, key = fraction.run.metrics, fraction.key
-    path = fraction.run.path
-    files = {
-        file.name.removesuffix(f"-mix{key}.safetensors") for file in fraction.run.folder.glob(f"*-mix{key}.safetensors")
-    }
-    estimators = files & {*ESTIMATORS, LOCATOR, MEASURED_STAND_IN}
-    steps = []
-    if files - estimators:
-        steps.append(f"Explore the spectra: `{command('view', path)}`.")
-    choice = fraction.mix["estimator_choice"]
-    file = fraction.chosen_file
-    taken = file.name.removesuffix(f"-mix{key}.safetensors") if file else ""
-    if file:
-        model = path if len(metrics["mixes"]) == 1 else f"{path}/{file.name}"
-        steps.append(
-            f"Take {taken} on this data: cross-validation chose it, without the test spectra. Estimate directions of new "
-            f"spectra: `{command('predict', model, 'SOURCE')}`."
+    if choice:
+        sure += (
+            f" Cross-validation on the measured spectra chose it: {choice['held_out_deg'][chosen]:.2f} degrees on "
+            f"{choice['n_held_out']} held-out ones."
         )
-    elif choice:
-        steps.append(f"{choice['name']} needs no file: `augment.estimators.make_estimator('{choice['name']}')`.")
-    others = sorted(estimators - {taken})
-    if others:
-        kept = f"`{command('predict', f'{path}/{others[0]}-mix{key}.safetensors', 'SOURCE')}`"
-        more = f" Also kept: {', '.join(others[1:])}." if len(others) > 1 else ""
-        steps.append(f"{'Or by' if taken else 'Estimate directions by'} {others[0]}: {kept}.{more}")
-    steps += [
-        f"Predict spectra anywhere: `swiftwrf.load({f'{path}/{name}-mix{key}.safetensors'!r}).predict(positions)`."
-        for name in sorted(files - estimators)
+        for name, reason in list(choice["better"].items())[:1]:
+            sure += f" `{name}` has {medians[name]:.2f} degrees, but is not recommended: {reason}."
+    compared = comparison(fraction)
+    if "peak" in medians and chosen != "peak":
+        compared += f" The strongest peak, which needs no training, is within {medians['peak']:.2f} degrees."
+    if "peak" in medians and "constant" in medians:
+        compared += f" {fingerprinting(medians['constant'], medians['peak'])}"
+    return [
+        f"Directions are found within {error['median']:.2f} degrees{at} (median errors; 90 % of the directions within "
+        f"{error['p90']:.1f} degrees), by `{chosen}`.",
+        sure,
+        compared.strip(),
+    ]
+
+
+def comparison(fraction: FractionRecords) -> str:
+    """Return the changes of the learner's error by synthetic spectra, and whether they are significant."""
+    method, best = fraction.turbo_method, fraction.mix["reference"]
+    parts = [
+        f"{change_text(change)} against `{other}`"
+        f"{', the best one without them' if other == best else ''} ({judgement(change)})"
+        for other, change in fraction.mix["methods"][method]["changes"].items()
+    ]
+    return f"Synthetic spectra change the median error of `{method}` by {' and '.join(parts)}."
+
+
+def change_text(change: ChangeMetrics) -> str:
+    """Return a change with its 95 % interval.
+
+    Example:
+        >>> change_text({"median_deg": 1.0, "change": -0.49, "low": -0.6, "high": -0.3})
+        '-49% [-60%, -30%]'
+    """
+    return f"{change['change']:+.0%} [{change['low']:+.0%}, {change['high']:+.0%}]"
+
+
+def judgement(change: ChangeMetrics) -> str:
+    """Return whether a change is a gain, a loss or not significant, by its interval.
+
+    Example:
+        >>> judgement({"median_deg": 1.0, "change": -0.17, "low": -0.4, "high": 0.1})
+        'not significant'
+    """
+    if change["high"] < 0:
+        return "a gain"
+    return "a loss" if change["low"] > 0 else "not significant"
+
+
+def steps(fraction: FractionRecords) -> list[NextStep]:
+    """Return what to do next."""
+    run, key, path = fraction.run, fraction.key, fraction.run.path
+    ending = f"-mix{key}.safetensors"
+    files = {file.name.removesuffix(ending) for file in run.folder.glob(f"*{ending}")}
+    models = sorted(files - {*ESTIMATORS, LOCATOR, MEASURED_STAND_IN, NETWORK})
+    own, several = [], len(run.metrics["mixes"]) > 1
+    if fraction.chosen_file is None and fraction.mix["estimator_choice"]:
+        make = f"augment.estimators.make_estimator({fraction.conditions[fraction.chosen].estimator!r})"
+        own.append(NextStep(f"`{fraction.chosen}` needs no file", make))
+    own += [
+        NextStep(
+            f"Predict spectra anywhere by `{name}`", f"swiftwrf.load({f'{path}/{name}{ending}'!r}).predict(positions)"
+        )
+        for name in models[:1]
     ]
     if suggested := fraction.arrays("suggested"):
-        steps.append(f"Where to measure next is in suggested-mix{key}.csv. {worth(suggested['left'])}")
-    else:
-        steps.append("Ask where to measure next with `--suggest 20`.")
-    if metrics["repeats"] == 1:
-        steps.append("Repeat with `--repeats 3` before you rely on a difference: one random subset proves little.")
-    if metrics["split"] == "random" and metrics["data"] != "simulated-room":
-        steps.append("Run `--split block`: it shows the error in a region where nothing was measured.")
-    return steps
+        own.append(NextStep(f"Measure next where suggested-mix{key}.csv has positions. {worth(suggested['left'])}"))
+    if run.metrics["repeats"] == 1:
+        own.append(
+            NextStep("Repeat with `--repeats 3` before you rely on a difference: one random subset proves little.")
+        )
+    if run.metrics["split"] == "random" and run.metrics["data"] != "simulated-room":
+        own.append(again(run, "Test a region where nothing was measured", "block"))
+    explore = "Explore the spectra" if models else ""
+    if fraction.chosen_file is None:
+        return [NextStep(explore, command("view", path)), *own] if explore else own
+    model = f"{path}/{fraction.chosen_file.name}" if several else path
+    return next_steps(run, explore, f"Estimate directions of new spectra by `{fraction.chosen}`", "SOURCE", own, model)

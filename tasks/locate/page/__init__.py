@@ -2,60 +2,62 @@
 
 from __future__ import annotations
 
-import math
-
 from pandas import concat
 
 from swiftwrf.locate.baselines import LOCALIZERS
-from swiftwrf.metrics import paired_difference
-from tasks.environment import command
 from tasks.labels import LOCALIZERS as LABELS
 from tasks.labels import labels
 from tasks.locate.page import drawing
-from tasks.locate.page.summary import LEVEL, NEIGHBOURS, OWN, LocateRecords, by_method, conclusion, summary
+from tasks.locate.page.summary import LEVEL, NEIGHBOURS, OWN, LocateRecords, answer
 from tasks.locate.steps import SUGGESTED
-from tasks.page.page import Page, Plot, Section, Summary, Table, number, provenance, sections_of
-from tasks.page.shared import Compared, comparison, suggestion_plot, with_interval, worth
+from tasks.page.page import Number, Page, Plot, Section, Summary, provenance, sections_of
+from tasks.page.records import notes
+from tasks.page.shared import compared, errors_section, suggestion_plot, worth
 
 
 def page(runs: list[LocateRecords]) -> Page:
     """Return the page of these runs."""
     terms = {name: label.meaning for name, label in labels(LOCALIZERS, LABELS).items()}
     sections = [
-        sections_of("Position errors", runs, lambda run: _errors(run, several=len(runs) > 1), terms),
-        sections_of("Posterior maps", runs, lambda run: Section("", plots=[_posteriors(run)])),
-        sections_of("Calibration", runs, lambda run: Section("", _weights(run), plots=[_calibration(run)])),
+        sections_of("Where was it?", runs, lambda run: _posteriors(run, several=len(runs) > 1)),
+        sections_of("Errors", runs, _errors, terms),
+        sections_of("How sure is it?", runs, lambda run: Section("", plots=[_calibration(run), *_studies(run)])),
         _limits(runs[0]),
     ]
     if any(run.holds(SUGGESTED) for run in runs):
         sections.insert(3, sections_of("Where to measure next", runs, _suggestion))
-    details = []
-    if any(run.metrics["by_rows"] or run.metrics["by_receivers"] for run in runs):
-        details.append(sections_of("Errors against training rows and receivers", runs, _studies))
     names = ", ".join(dict.fromkeys(run.place for run in runs))
-    first = summary(runs[0], _overview(runs[0], "summary")) if len(runs) == 1 else _comparison(runs)
-    return Page(f"Localization: {names}", first, sections, [*details, provenance(runs)])
+    if len(runs) == 1:
+        first = _summary(runs[0])
+    else:
+        answers = {f"{run.number}: {run.place}": answer(run) for run in runs}
+        first = compared(answers, runs, drawing.palette(), "position error")
+    return Page(f"Localization: {names}", first, sections, [provenance(runs)])
 
 
-def _comparison(runs: list[LocateRecords]) -> Summary:
-    """Return the first screen of several runs."""
-    compared = []
-    for run in runs:
-        found = {name: entry["position_error_m"] for name, entry in run.metrics["overall"].items()}
-        further = {"in 80 % region": f"{run.metrics['calibration'][str(LEVEL)]:.0%}"}
-        compared.append(Compared(f"{run.number}: {run.place}", found, further))
-    shown = [name for name in (OWN, *NEIGHBOURS, "mean") if any(name in one.errors for one in compared)]
-    table, plot = comparison(compared, drawing.palette(), shown, "m", "position error")
-    meaning = [f"Run {run.number}, {run.place}: {conclusion(run)}" for run in runs]
-    steps = [f"Explore run {run.number}: `{command('view', run.path)}`." for run in runs]
-    return Summary([], [plot], meaning, steps, table=table)
+def _summary(run: LocateRecords) -> Summary:
+    """Return the first screen of one run."""
+    error = {name: entry["position_error_m"]["median"] for name, entry in run.metrics["overall"].items()}
+    nearest, found = min(NEIGHBOURS, key=lambda name: error[name]), answer(run)
+    numbers = [
+        Number(f"{error[OWN]:.2f} m", "median position error of the posterior"),
+        Number(f"{error[nearest]:.2f} m", f"that of {nearest}, the best nearest-neighbour fingerprinting"),
+        Number(f"{run.metrics['calibration'][str(LEVEL)]:.0%}", f"of the true positions in their {LEVEL:.0%} region"),
+    ]
+    return Summary(numbers, [_overview(run, "summary")], found.conclusion, found.next_steps, notes=notes(run))
 
 
-def _errors(run: LocateRecords, several: bool) -> Section:
+def _errors(run: LocateRecords) -> Section:
     n_undetected = run.metrics["n_undetected"]
-    notes = [f"Test rows that no receiver detected are left out: {n_undetected}."] if n_undetected else []
-    overview = [_overview(run, f"overview-{run.file_name}")] if several else []
-    return Section("", notes, [_table(run), _paired(run)], overview)
+    return errors_section(
+        answer(run),
+        run.table("errors")[["index", "place", "method", "position_error_m"]],
+        drawing.palette(),
+        name=run.file_name,
+        quantity="position error",
+        caption=f"Column of {OWN}: difference of the mean errors on the same rows, with its 95 % bootstrap interval.",
+        paragraphs=[f"Test rows that no receiver detected are left out: {n_undetected}."] if n_undetected else [],
+    )
 
 
 def _suggestion(run: LocateRecords) -> Section | None:
@@ -75,83 +77,43 @@ def _suggestion(run: LocateRecords) -> Section | None:
 
 def _overview(run: LocateRecords, name: str) -> Plot:
     caption = (
-        "Left: position errors of the posterior in plan, a line from each true position (dot) to its estimate, coloured by "
-        "the error. Right: distribution of the position errors of all localizers."
+        "Errors of the posterior in plan: a line from each true position (dot) to its estimate, coloured by the error."
     )
     columns = ["method", "index", "position_error_m", "truth_x_m", "truth_y_m", "x_m", "y_m"]
     return Plot(name, drawing.overview(run.table("errors")), caption, run.table("errors")[columns])
 
 
-def _table(run: LocateRecords) -> Table:
-    rows = []
-    for name, entry in run.metrics["overall"].items():
-        error, horizontal = entry["position_error_m"], entry["horizontal_error_m"]
-        seconds = f"{number(entry['seconds']['fit'])} + {number(entry['seconds']['predict'])}"
-        rows.append(
-            [
-                name,
-                with_interval(error),
-                number(error["p90"]),
-                number(error["mean"]),
-                number(horizontal["median"]),
-                seconds,
-                *([f"{entry['floor_hit_rate']:.1%}"] if "floor_hit_rate" in entry else []),
-            ]
-        )
-    columns = ["localizer", "median [m]", "90 % [m]", "mean [m]", "median in plan [m]", "fit + locate [s]"]
-    if rows and len(rows[0]) > len(columns):
-        columns.append("floors right")
-    return Table(columns, rows, "Position error of the test rows; median with its 95 % interval.", frozenset([OWN]))
-
-
-def _paired(run: LocateRecords) -> Table:
-    errors, rows = by_method(run), []
-    for name in run.metrics["overall"]:
-        if name != OWN:
-            mean, low, high = paired_difference(errors, OWN, name)
-            interval = "" if math.isnan(low) else f" [{low:+.2f}, {high:+.2f}]"
-            rows.append([name, f"{mean:+.2f}{interval}"])
-    caption = "Mean of the posterior's position error minus that of the localizer on the same rows; 95 % bootstrap."
-    return Table(["against", "difference [m]"], rows, caption)
-
-
-def _weights(run: LocateRecords) -> list[str]:
-    weights = ", ".join(f"{name} {weight:.2f}" for name, weight in run.metrics["weights"].items())
-    return [
-        f"Weights of the posterior's likelihoods, which maximise the density at held-out training positions: {weights}. A "
-        "weight below 1 widens the posterior."
-    ]
-
-
 def _calibration(run: LocateRecords) -> Plot:
+    weights = ", ".join(f"{name} {weight:.2f}" for name, weight in run.metrics["weights"].items())
     caption = (
         "Fraction of the true positions inside the posterior's credible regions (dots; bars: 95 % interval) against their "
-        "probability. On the line the posterior is calibrated, below it the regions are too small."
+        "probability. On the line the posterior is calibrated, below it the regions are too small. Weights of the "
+        f"likelihoods, which maximise the density at held-out training positions: {weights}."
     )
     data = drawing.coverage(run.metrics["calibration"], run.metrics["n_test"])
     return Plot(f"calibration-{run.file_name}", [drawing.calibration(data)], caption, data)
 
 
-def _studies(run: LocateRecords) -> Section | None:
+def _studies(run: LocateRecords) -> list[Plot]:
     if not (run.metrics["by_rows"] or run.metrics["by_receivers"]):
-        return None
+        return []
     caption = (
         "Median position error (bars: 95 % interval) of localizers fitted to a random part of the training rows, and with a "
         "random part of the receivers."
     )
     rows, receivers = drawing.study_table(run.metrics["by_rows"]), drawing.study_table(run.metrics["by_receivers"])
     data = concat([rows, receivers]).drop_duplicates()
-    plot = Plot(f"studies-{run.file_name}", drawing.studies(rows, receivers), caption, data)
-    return Section("", plots=[plot])
+    return [Plot(f"studies-{run.file_name}", drawing.studies(rows, receivers), caption, data)]
 
 
-def _posteriors(run: LocateRecords) -> Plot:
+def _posteriors(run: LocateRecords, several: bool) -> Section:
     caption = (
         "Posteriors of six test rows in plan, from the smallest error to the largest, each relative to its largest mass. "
         "Cross: true position; dot: estimate; circle: 80 % credible region; small dots: training positions."
     )
     maps = run.arrays("maps")
-    return Plot(f"posteriors-{run.file_name}", drawing.posteriors(maps), caption, drawing.posterior_cells(maps))
+    plot = Plot(f"posteriors-{run.file_name}", drawing.posteriors(maps), caption, drawing.posterior_cells(maps))
+    return Section("", plots=[plot, *([_overview(run, f"overview-{run.file_name}")] if several else [])])
 
 
 def _limits(run: LocateRecords) -> Section:

@@ -18,7 +18,7 @@ from swiftwrf.locate.baselines import LOCALIZERS
 from swiftwrf.plotting import corners_of
 from tasks.labels import LOCALIZERS as LABELS
 from tasks.labels import labels
-from tasks.locate.page.summary import NEIGHBOURS, OWN
+from tasks.locate.page.summary import OWN
 from tasks.metrics import StudyMetrics
 from tasks.page import figures
 from tasks.page.figures import DASHES, MAX_CURVES, Palette
@@ -33,7 +33,7 @@ def palette() -> Palette:
 
 
 def overview(errors: DataFrame) -> list[Figure]:
-    """Draw the posterior's errors in plan, and the distributions of the errors of some localizers."""
+    """Draw the posterior's errors in plan."""
     first, plan = figures.panel(5.4, 4.2)
     own = errors[errors["method"] == OWN]
     truth, estimate = own[["truth_x_m", "truth_y_m"]].to_numpy(), own[["x_m", "y_m"]].to_numpy()
@@ -48,13 +48,7 @@ def overview(errors: DataFrame) -> list[Figure]:
     plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     plan.autoscale()
     figures.colour_bar(plan, lines, "position error [m]", extend="max")
-    second, cdf = figures.panel(5.4, 3.4)
-    present = [name for name in (OWN, *NEIGHBOURS, "mean") if name in set(errors["method"])]
-    groups = {name: errors[errors["method"] == name]["position_error_m"] for name in present}
-    without = errors[errors["method"] != "mean"]["position_error_m"]
-    figures.cdf(cdf, palette(), groups, "position error [m]", float(without.quantile(0.98)) or 1.0)
-    cdf.set_ylabel("fraction of test rows")
-    return [first, second]
+    return [first]
 
 
 def coverage(measured: Mapping[str, float], n: int) -> DataFrame:
@@ -68,7 +62,7 @@ def coverage(measured: Mapping[str, float], n: int) -> DataFrame:
 
 def calibration(data: DataFrame) -> Figure:
     """Draw measured against nominal coverage."""
-    figure, axes = figures.panel(5, 4)
+    figure, axes = figures.panel(5, 3.2)
     axes.plot([0, 1], [0, 1], color=figures.RULE, linewidth=1)
     _with_bars(axes, OWN, data, "nominal", "measured")
     axes.set(xlim=(0, 1), ylim=(0, 1))
@@ -94,7 +88,7 @@ def studies(by_rows: DataFrame, by_receivers: DataFrame) -> list[Figure]:
     ]
     panels = []
     for table, x, label in shown:
-        figure, ax = figures.panel(5, 3.4)
+        figure, ax = figures.panel(3.6, 3.2)
         names = list(table["localizer"].unique())[:MAX_CURVES]
         for dashes, name in zip(DASHES, names, strict=False):
             _with_bars(ax, str(name), table[table["localizer"] == name].sort_values(x), x, "median", line=dashes)

@@ -1,15 +1,15 @@
-"""The summary of a report: three numbers, a picture, their meaning and the next steps."""
+"""The answer of a localization run: errors of all localizers, the conclusion, the next steps."""
 
 from __future__ import annotations
 
 from pandas import DataFrame
 
-from tasks.environment import command
+from tasks.answer import Answer, Method, NextStep
 from tasks.metrics import LocateMetrics
-from tasks.page.page import Number, Plot, Summary
-from tasks.page.records import Records, notes
+from tasks.page.page import number
+from tasks.page.records import Records
+from tasks.page.shared import again, difference, next_steps
 from tasks.summarise import comparison_sentence, coverage_warning
-from tasks.terminal import Answer
 
 LocateRecords = Records[LocateMetrics]
 OWN = "posterior"  # the localizer that all others are compared with
@@ -17,61 +17,40 @@ NEIGHBOURS = ("knn", "knn_difference")
 LEVEL = 0.8  # probability of the credible regions in the summary
 
 
-def summary(run: LocateRecords, picture: Plot) -> Summary:
-    """Return the summary of one run."""
-    error = {name: entry["position_error_m"] for name, entry in run.metrics["overall"].items()}
-    own, nearest = error[OWN], min(NEIGHBOURS, key=lambda name: error[name]["median"])
-    best = error[nearest]
-    numbers = [
-        Number(
-            f"{own['median']:.2f} m",
-            f"the posterior's median position error, 95 % interval [{own['low']:.2f}, {own['high']:.2f}]; 90 % of the "
-            f"errors are below {own['p90']:.1f} m",
-        ),
-        Number(
-            f"{best['median']:.2f} m",
-            f"the best nearest-neighbour fingerprinting, {nearest}, 95 % interval [{best['low']:.2f}, {best['high']:.2f}]; "
-            f"90 % are below {best['p90']:.1f} m",
-        ),
-        Number(
-            f"{run.metrics['calibration'][str(LEVEL)]:.0%}",
-            f"of the true positions lie in the {LEVEL:.0%} credible region that comes with each estimate",
-        ),
-    ]
-    receivers = run.metrics["n_receivers"]
-    meaning = [
-        f"On {run.scene}: {run.metrics['n_train']} training rows and {run.metrics['n_test']} test rows at {receivers} "
-        f"{'receiver' if receivers == 1 else 'receivers'}.",
-    ]
-    return Summary(numbers, [picture], meaning, _next_steps(run), conclusion(run), notes=notes(run))
-
-
 def answer(run: LocateRecords) -> Answer:
-    """Return what the terminal shows of a run."""
-    overall = sorted(run.metrics["overall"].items(), key=lambda item: item[1]["position_error_m"]["median"])
-    rows = [({"localizer": name}, entry["position_error_m"]) for name, entry in overall]
-    return Answer("m", rows, conclusion(run), _next_steps(run))
+    """Return the answer of a run."""
+    errors, methods = by_method(run), []
+    for name, entry in run.metrics["overall"].items():
+        cells = {"median in plan [m]": number(entry["horizontal_error_m"]["median"])}
+        cells |= {"floors right": f"{entry['floor_hit_rate']:.1%}"} if "floor_hit_rate" in entry else {}
+        cells |= {f"{OWN} minus it [m]": difference(errors, OWN, name)}
+        seconds = entry["seconds"]["fit"], entry["seconds"]["predict"]
+        methods.append(Method(name, entry["position_error_m"], name == "mean", seconds, cells))
+    return Answer("m", methods, OWN, conclusion(run), _steps(run), NEIGHBOURS)
 
 
-def conclusion(run: LocateRecords) -> str:
-    """Return a sentence that compares the posterior with the best other localizer."""
-    error = {name: entry["position_error_m"]["median"] for name, entry in run.metrics["overall"].items() if name != OWN}
-    best = min(error, key=lambda name: error[name])
-    n_test = run.metrics["n_test"]
-    return comparison_sentence(by_method(run), OWN, best, name="the posterior", unit="m", rows="rows", n_test=n_test)
-
-
-def _next_steps(run: LocateRecords) -> list[str]:
-    steps = [
-        f"Explore posteriors and maps: `{command('view', run.path)}`.",
-        f"Locate new observations: `{command('predict', run.path, 'SOURCE')}`.",
+def conclusion(run: LocateRecords) -> list[str]:
+    """Return the position error, how sure it is, and how the posterior compares with the best other localizer."""
+    error = {name: entry["position_error_m"] for name, entry in run.metrics["overall"].items()}
+    best = min((name for name in error if name != OWN), key=lambda name: error[name]["median"])
+    own, receivers, n_test = error[OWN], run.metrics["n_receivers"], run.metrics["n_test"]
+    return [
+        f"Positions are found within {own['median']:.2f} m (median error; 90 % within {own['p90']:.1f} m).",
+        f"The median's 95 % interval is {own['low']:.2f} to {own['high']:.2f} m, and "
+        f"{run.metrics['calibration'][str(LEVEL)]:.0%} of the true positions lie in the {LEVEL:.0%} region that comes with "
+        f"each estimate. Tested on {n_test} rows, fitted to {run.metrics['n_train']} rows at {receivers} "
+        f"{'receiver' if receivers == 1 else 'receivers'}; {run.scene}.",
+        comparison_sentence(by_method(run), OWN, best, name="the posterior", unit="m", rows="rows", n_test=n_test),
     ]
-    coverage = run.metrics["calibration"][str(LEVEL)]
+
+
+def _steps(run: LocateRecords) -> list[NextStep]:
+    own, coverage = [], run.metrics["calibration"][str(LEVEL)]
     if warning := coverage_warning("credible regions", coverage, LEVEL, run.metrics["n_test"]):
-        steps.append(warning)
+        own.append(NextStep(warning))
     if run.metrics["split"] == "random":
-        steps.append("Run `--split block`: it shows the error in a region where nothing was measured.")
-    return steps
+        own.append(again(run, "Test a region where nothing was measured", "block"))
+    return next_steps(run, "Explore posteriors and maps", "Locate new observations", "SOURCE", own)
 
 
 def by_method(run: LocateRecords) -> DataFrame:

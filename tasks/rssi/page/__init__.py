@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from swiftwrf.choices import RSSI_PREDICTORS
-from tasks.environment import command
 from tasks.labels import PREDICTORS as LABELS
 from tasks.labels import labels
 from tasks.page.page import Number, Page, Section, Summary, provenance, sections_of
 from tasks.page.records import notes
-from tasks.page.shared import Compared, comparison
+from tasks.page.shared import compared, errors_section
 from tasks.rssi.page import errors
-from tasks.rssi.page.maps import CERTAINTY, COVERED_DBM, Maps, RssiRecords
-from tasks.rssi.page.summary import best_baseline, conclusion, model_of, next_steps, title
+from tasks.rssi.page.maps import COVERED_DBM, Maps, RssiRecords
+from tasks.rssi.page.summary import answer, best_baseline, model_of
 
 
 def page(runs: list[RssiRecords]) -> Page:
@@ -22,81 +23,55 @@ def page(runs: list[RssiRecords]) -> Page:
         sections_of("Where the errors are", runs, lambda run: Section("", plots=[errors.where(run)])),
         _limits(runs[0]),
     ]
+    details = [provenance(runs)]
     if len(runs) > 1 or any(len(Maps(run).names) > 1 for run in runs):
-        sections.insert(1, sections_of("Maps", runs, _maps))
-    speed = sections_of("Speed against error", runs, lambda run: Section("", plots=[errors.speed(run)]))
+        sections.insert(0, sections_of("Maps", runs, partial(_maps, kind="predicted")))
+        by_receiver = sections_of("Errors by receiver", runs, lambda run: Section("", plots=errors.differences(run)))
+        details[:0] = [by_receiver, sections_of("Widths of the intervals", runs, partial(_maps, kind="width"))]
     names = ", ".join(dict.fromkeys(run.place for run in runs))
-    first = _summary(runs[0]) if len(runs) == 1 else _comparison(runs)
-    return Page(f"RSSI: {names}", first, sections, [speed, provenance(runs)])
+    if len(runs) == 1:
+        first = _summary(runs[0])
+    else:
+        answers = {f"{run.number}: {run.place}": answer(run) for run in runs}
+        first = compared(answers, runs, errors.palette(), "absolute error")
+    return Page(f"RSSI: {names}", first, sections, details)
 
 
 def _summary(run: RssiRecords) -> Summary:
     """Return the first screen of one run."""
+    found, floors, interval = answer(run), Maps.of_floors(run), run.metrics["interval"]
     error = {name: entry["abs_error_db"] for name, entry in run.metrics["overall"].items()}
-    own, best, interval, floors = error[model_of(run)], best_baseline(run), run.metrics["interval"], Maps.of_floors(run)
-    who = "a receiver" if len(floors[0].names) > 1 else "the receiver"
+    best = best_baseline(run)
     numbers = [
-        Number(
-            f"{own['median']:.2f} dB",
-            f"median absolute error of {title(run)}, 95 % interval [{own['low']:.2f}, {own['high']:.2f}]; 90 % of the "
-            f"errors are below {own['p90']:.1f} dB",
-        ),
-        Number(f"{error[best]['median']:.2f} dB", f"median absolute error of the best baseline, {best}"),
-        Number(
-            f"{interval['coverage']:.0%}",
-            f"of the test measurements lie in the {interval['nominal']:.0%} interval of their prediction",
-        ),
+        *(Number(f"{maps.covered:.0%}", f"of {maps.place} above {COVERED_DBM:g} dBm") for maps in floors),
+        Number(f"{error[found.chosen]['median']:.2f} dB", f"median absolute error of {found.chosen}"),
+        Number(f"{error[best]['median']:.2f} dB", f"that of {best}, the best other method"),
+        Number(f"{interval['coverage']:.0%}", f"of the test measurements in their {interval['nominal']:.0%} interval"),
     ]
-    numbers[:0] = [
-        Number(
-            f"{maps.covered:.0%}",
-            f"of {maps.place} has {who} above {COVERED_DBM:g} dBm with {CERTAINTY:.0%} certainty",
-        )
-        for maps in floors
-    ]
-    if found := run.metrics["overall"][model_of(run)].get("detection"):
-        detected, empty = found
-        numbers.append(
-            Number(
-                f"{empty:.0%}", f"of the empty test cells are predicted as empty, and {detected:.0%} of the others not"
-            )
-        )
-    receivers = len(run.metrics["receivers"])
-    meaning = [
-        f"On {run.scene}: {run.metrics['n_train']} training rows and {run.metrics['n_test']} test rows with {own['n']} "
-        f"detected pairs at {receivers} {'receiver' if receivers == 1 else 'receivers'}.",
-    ]
-    return Summary(
-        numbers, [maps.summary() for maps in floors], meaning, next_steps(run), conclusion(run), notes=notes(run)
-    )
+    plots = [maps.summary() for maps in floors]
+    return Summary(numbers, plots, found.conclusion, found.next_steps, notes=notes(run))
 
 
-def _comparison(runs: list[RssiRecords]) -> Summary:
-    """Return the first screen of several runs."""
-    compared, every = [], set[str]()
-    for run in runs:
-        found = {name: entry["abs_error_db"] for name, entry in run.metrics["overall"].items()}
-        further = {"in 80 % interval": f"{run.metrics['interval']['coverage']:.0%}"}
-        compared.append(Compared(f"{run.number}: {run.place}", found, further))
-        every.update(found)
-    baselines = dict.fromkeys([*(best_baseline(run) for run in runs), "mean"])
-    shown = [*dict.fromkeys(map(model_of, runs)), *(name for name in baselines if name in every)]
-    table, plot = comparison(compared, errors.palette(), shown, "dB", "absolute error")
-    meaning = [f"Run {run.number}, {run.place}: {conclusion(run)}" for run in runs]
-    steps = [f"Explore run {run.number}: `{command('view', run.path)}`." for run in runs]
-    return Summary([], [plot], meaning, steps, table=table)
-
-
-def _maps(run: RssiRecords) -> Section:
-    return Section("", plots=[plot for maps in Maps.of_floors(run) for plot in maps.by_receiver()])
+def _maps(run: RssiRecords, kind: str) -> Section:
+    return Section("", plots=[maps.by_receiver(kind) for maps in Maps.of_floors(run)])
 
 
 def _errors(run: RssiRecords) -> Section:
-    left_out = [f"Left out: {reason}." for reason in run.metrics["left_out"].values()]
-    plots = [errors.distribution(run)]
-    if len(run.metrics["receivers"]) > 1:
-        plots.append(errors.differences(run))
-    return Section("", left_out, [errors.table(run)], plots)
+    caption = (
+        f"Column of {model_of(run)}: difference of the mean absolute errors on the same pairs, with its 95 % bootstrap "
+        "interval over test rows. Detection: mean of the fractions of detected and of empty test cells that are predicted "
+        "as such; 0.5 is chance."
+    )
+    return errors_section(
+        answer(run),
+        run.table("errors")[["receiver", "index", "method", "abs_error_db"]],
+        errors.palette(),
+        name=run.file_name,
+        quantity="absolute error",
+        caption=caption,
+        paragraphs=[f"Left out: {reason}." for reason in run.metrics["left_out"].values()],
+        panels=errors.by_rows(run),
+    )
 
 
 def _limits(run: RssiRecords) -> Section:

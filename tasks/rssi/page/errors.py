@@ -1,11 +1,8 @@
-"""Errors of the RSSI report: tables, differences between methods, distributions, places, seconds."""
+"""Figures of the RSSI report: where the errors are, and differences between methods."""
 
 from __future__ import annotations
 
-import math
-from typing import Any
-
-from pandas import DataFrame
+from matplotlib.figure import Figure
 
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.metrics import paired_difference
@@ -13,11 +10,10 @@ from tasks.labels import PREDICTORS as LABELS
 from tasks.labels import labels
 from tasks.page import figures
 from tasks.page.figures import Palette
-from tasks.page.page import Plot, Table, number
-from tasks.page.shared import with_interval
+from tasks.page.page import Plot
 from tasks.rssi.page.maps import MAX_VECTOR_DOTS, RssiRecords
-from tasks.rssi.page.summary import best_baseline, by_method, model_of, title
-from tasks.summarise import SHORTEST, running_median
+from tasks.rssi.page.summary import best_baseline, by_method, model_of
+from tasks.summarise import running_median
 
 MAX_RECEIVERS = 40  # of the figure of differences; all are in its table
 
@@ -27,39 +23,23 @@ def palette() -> Palette:
     return Palette.of(labels(RSSI_PREDICTORS, LABELS))
 
 
-def table(run: RssiRecords) -> Table:
-    """Return the errors of all methods, and the differences of the run's model from them."""
-    errors, rows, own = by_method(run), [], model_of(run)
-    scored = any(entry.get("detection") for entry in run.metrics["overall"].values())
-    for name, entry in sorted(run.metrics["overall"].items(), key=lambda item: item[1]["abs_error_db"]["median"]):
-        error, difference = entry["abs_error_db"], ""
-        if name != own:
-            mean, low, high = paired_difference(errors, own, name)
-            difference = f"{mean:+.2f}" + ("" if math.isnan(low) else f" [{low:+.2f}, {high:+.2f}]")
-        detection = entry.get("detection")
-        right = [number(None if detection is None else sum(detection) / 2)] if scored else []
-        rows.append([name, with_interval(error), number(error["mean"]), number(error["p90"]), *right, difference])
-    columns = [
-        "method",
-        "median [dB]",
-        "mean [dB]",
-        "90 % [dB]",
-        *["detection"] * scored,
-        f"{title(run)} minus method [dB]",
-    ]
-    caption = (
-        "Absolute error over all detected test pairs; median with its 95 % interval. Last column: mean difference of the "
-        "absolute errors on the same pairs; 95 % bootstrap over test rows."
-    ) + (
-        " Detection: mean of the shares of detected and of empty test cells that are predicted as such; 0.5 is chance."
-        if scored
-        else ""
-    )
-    return Table(columns, rows, caption, frozenset([own]))
+def by_rows(run: RssiRecords) -> list[Figure]:
+    """Return the errors by the number of training rows, none if the rows are too few for parts of them."""
+    found = run.metrics["by_rows"]
+    if len(found) < 2:
+        return []
+    names = list(next(iter(found.values())))
+    figure, axes = figures.panel(5.6, 3.2)
+    lines = {name: ([int(n) for n in found], [row[name] for row in found.values()]) for name in names}
+    figures.curves(axes, palette(), lines, "training rows", "mean absolute error [dB]")
+    axes.set_ylim(0, None)
+    return [figure]
 
 
-def differences(run: RssiRecords) -> Plot:
-    """Return the difference of the model's error from the best baseline's at each receiver, sorted."""
+def differences(run: RssiRecords) -> list[Plot]:
+    """Return the difference of the model's error from the best baseline's at each receiver, none for one receiver."""
+    if len(run.metrics["receivers"]) < 2:
+        return []
     own, best, errors = model_of(run), best_baseline(run), by_method(run)
     found = {}
     for name in run.metrics["receivers"]:
@@ -68,29 +48,14 @@ def differences(run: RssiRecords) -> Plot:
             found[name] = paired_difference(at_receiver, own, best)
     names = sorted(found, key=lambda name: found[name][0])
     shown, values = names[:MAX_RECEIVERS], {own: [found[name] for name in names]}
-    label = f"{title(run)} minus {best}, mean absolute error [dB]"
+    label = f"{own} minus {best}, mean absolute error [dB]"
     figure = figures.dots(shown, {own: values[own][: len(shown)]}, palette(), label, zero=True)
     caption = (
-        f"Difference of the mean absolute error of {title(run)} from that of {best}, the best baseline, at each receiver on "
-        f"the same pairs; whiskers: 95 % intervals. Left of zero {title(run)} is better."
+        f"Difference of the mean absolute error of {own} from that of {best}, the best baseline, at each receiver on "
+        f"the same pairs; whiskers: 95 % intervals. Below zero {own} is better."
     )
-    return Plot(f"difference-{run.file_name}", [figure], caption, figures.dots_data("receiver", names, values, "db"))
-
-
-def distribution(run: RssiRecords) -> Plot:
-    """Return the distribution of the errors of the model, the best baseline, one path-loss model, and the mean."""
-    table = run.table("errors")
-    shown = [
-        name
-        for name in dict.fromkeys((model_of(run), best_baseline(run), "mri_pooled", "mean"))
-        if name in set(table["method"])
-    ]
-    figure, axes = figures.panel(5.8, 3.4)
-    groups = {name: table[table["method"] == name]["abs_error_db"] for name in shown}
-    figures.cdf(axes, palette(), groups, "absolute error [dB]", float(table["abs_error_db"].quantile(0.98)))
-    axes.set_ylabel("fraction of test pairs")
-    pairs = table[["receiver", "index", "method", "abs_error_db"]]
-    return Plot(f"cdf-{run.file_name}", [figure], "Distribution of the absolute errors over all receivers.", pairs)
+    data = figures.dots_data("receiver", names, values, "db")
+    return [Plot(f"difference-{run.file_name}", [figure], caption, data)]
 
 
 def where(run: RssiRecords) -> Plot:
@@ -122,23 +87,3 @@ def where(run: RssiRecords) -> Plot:
     )
     data = own[["receiver", "index", "measured_dbm", "predicted_dbm", "abs_error_db", *columns]]
     return Plot(f"where-{run.file_name}", panels, caption, data)
-
-
-def speed(run: RssiRecords) -> Plot:
-    """Return the error against the seconds to fit and to predict."""
-    overall = run.metrics["overall"]
-    error = {name: entry["abs_error_db"]["median"] for name, entry in overall.items()}
-    seconds: dict[str, dict[str, Any]] = {
-        stage: {name: max(entry["seconds"][stage], SHORTEST) for name, entry in overall.items()}
-        for stage in ("fit", "predict")
-    }
-    panels = []
-    for stage, each in seconds.items():
-        panel, ax = figures.panel(5, 3.6)
-        points = {name: (each[name], error[name]) for name in overall}
-        figures.speed(ax, palette(), points, f"seconds to {stage}", "median absolute error [dB]", also=[*overall])
-        panels.append(panel)
-    caption = "Seconds to fit and to predict the test rows against the median error. The line is the Pareto front."
-    columns = {"fit_s": seconds["fit"], "predict_s": seconds["predict"], "median_abs_error_db": error}
-    data = DataFrame(columns).rename_axis("method").reset_index()
-    return Plot(f"speed-{run.file_name}", panels, caption, data)

@@ -22,14 +22,14 @@ from tasks.page.records import Records
 
 MAX_MAPS = 24  # receivers with a map in the report; all are in the tables
 MAX_VECTOR_DOTS = 300  # more dots become an image: the page would grow to megabytes
-MAX_WIDTH_DB = 30.0  # end of the scale of interval widths, the same in all reports
+MAX_WIDTH_DB = 30.0  # end of the scale of interval widths of the page
+MIN_RATIO = 1.2  # of the widest interval inside to the median one, for which the widths are drawn
 COVERED_DBM, CERTAINTY = -75.0, 0.9  # coverage of the summary
 RECEIVER = "#cf4a4a"
 WIDTH_PER_STD = 2 * NormalDist().inv_cdf((1 + LEVEL) / 2)
-CAPTION = (
-    "First: predicted RSSI. Second: width of the {level:.0%} interval of a measurement, on a scale from 0 to {most:g} dB "
-    "that is the same in all reports. Hatched like /: outside the measured positions, where predictions are extrapolated. "
-    "Hatched like \\: a packet is more likely lost than received."
+HATCHED = (
+    "Hatched like /: outside the measured positions, where predictions are extrapolated; like \\: a packet is more likely "
+    "lost than received."
 )
 RssiRecords = Records[RssiMetrics]
 
@@ -108,8 +108,12 @@ class Maps:
         several = len(self.names) > 1
         receiver = None if several else 0
         title = self.titled("best server" if several else self.names[0])
-        panels = [self._panel(self.best, kind, title, receiver) for kind in ("predicted", "width")]
-        caption = CAPTION.format(level=LEVEL, most=MAX_WIDTH_DB) + (
+        kinds = ("predicted", "width") if self.varies else ("predicted",)
+        panels = [self._panel(self.best, kind, title, receiver, 4.6 if self.varies else 5.4) for kind in kinds]
+        width = np.median(self.best["width"][self.inside]) if self.inside.any() else np.median(self.best["width"])
+        widths = f"width of the {LEVEL:.0%} interval of a measurement"
+        widths = f", and the {widths}" if self.varies else f"; the {widths} is about {width:.0f} dB everywhere"
+        caption = f"Predicted RSSI{widths}. {HATCHED}" + (
             " The best server is the receiver with the highest prediction; crosses mark receivers."
             if several
             else " Dots: training measurements in the colours of the map, hollow where nothing was received; the cross "
@@ -119,25 +123,23 @@ class Maps:
             f"summary{self.suffix}", panels, caption, self._cells({k: v[None] for k, v in self.best.items()}, [title])
         )
 
-    def by_receiver(self) -> list[Plot]:
-        """Return maps of the receivers that detected most rows: predictions, and widths of intervals."""
+    def by_receiver(self, kind: str) -> Plot:
+        """Return maps of the receivers that detected most rows.
+
+        Args:
+            kind: "predicted", or "width" for that of the intervals.
+        """
         shown = self.most_detected
         names, fields = [self.names[i] for i in shown], ("predicted", "width", "detection")
-        data = self._cells({kind: self.arrays[kind][shown] for kind in fields}, names)
-        plots = []
-        for kind, what in (("predicted", "Predicted RSSI"), ("width", f"Width of the {LEVEL:.0%} interval")):
-            values = [{kind: self.arrays[kind][i] for kind in fields} for i in shown]
-            panels = [
-                self._panel(each, kind, self.titled(self.names[i]), i, 3.6)
-                for each, i in zip(values, shown, strict=True)
-            ]
-            caption = (
-                f"{what} at each receiver. Hatched like /: outside the measured positions; like \\: a packet is more likely "
-                "lost than received. Hollow dots: nothing was received. A cross marks the receiver."
-            )
-            name = "map" if kind == "predicted" else "width"
-            plots.append(Plot(f"{name}-{self.run.file_name}{self.suffix}", panels, caption, data))
-        return plots
+        data = self._cells({name: self.arrays[name][shown] for name in fields}, names)
+        values = [{name: self.arrays[name][i] for name in fields} for i in shown]
+        panels = [
+            self._panel(each, kind, self.titled(self.names[i]), i, 3.6) for each, i in zip(values, shown, strict=True)
+        ]
+        what = "Predicted RSSI" if kind == "predicted" else f"Width of the {LEVEL:.0%} interval"
+        caption = f"{what} at each receiver. {HATCHED} Hollow dots: nothing was received. A cross marks the receiver."
+        name = "map" if kind == "predicted" else "width"
+        return Plot(f"{name}-{self.run.file_name}{self.suffix}", panels, caption, data)
 
     def _panel(
         self, fields: dict[str, NDArray[Any]], kind: str, title: str, receiver: int | None, width: float = 4.6
@@ -147,7 +149,7 @@ class Maps:
         x0, x1, y0, y1 = corners_of(a["x"], a["y"])
         shape = (y1 - y0) / (x1 - x0)
         figure, ax = figures.panel(width, 0.8 + (width - 1.2) * float(np.clip(shape, 0.4, 1.6)))
-        limits, colours = ((0.0, MAX_WIDTH_DB), "magma") if kind == "width" else (self._limits, "viridis")
+        limits, colours = (self._widths, "magma") if kind == "width" else (self._limits, "viridis")
         if kind == "predicted" and receiver is None:
             limits = (float(values.min()), float(values.max()))
         plan = (a["plan"], tuple(a["plan_extent"].tolist())) if "plan" in a else None
@@ -168,9 +170,19 @@ class Maps:
                     ax.plot(*at[:2], "x", color=colour, markersize=8, markeredgewidth=size, zorder=4)
         ax.set_title(figures.short(title), fontsize=9)
         label = "interval width [dB]" if kind == "width" else "predicted RSSI [dBm]"
-        extend = "max" if kind == "width" else "both"
-        figures.colour_bar(ax, drawn, label, extend)
+        figures.colour_bar(ax, drawn, label, "both")
         return figure
+
+    @property
+    def varies(self) -> bool:
+        """True if the widths of the intervals inside the measured positions differ so much that a map shows it."""
+        known = self.best["width"][self.inside]
+        return bool(len(known)) and float(known.max()) >= MIN_RATIO * float(np.median(known))
+
+    @cached_property
+    def _widths(self) -> tuple[float, float]:
+        low, high = np.quantile(self.arrays["width"], (0.01, 0.99)).tolist()
+        return float(np.floor(low)), float(np.ceil(high))
 
     @cached_property
     def _limits(self) -> tuple[float, float]:

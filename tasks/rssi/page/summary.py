@@ -1,36 +1,38 @@
-"""Sentences of the RSSI report and of the terminal: the conclusion and the next steps."""
+"""The answer of an RSSI run: errors of all methods, the conclusion, the next steps."""
 
 from __future__ import annotations
 
 import numpy as np
 from pandas import DataFrame
 
-from tasks.environment import command
-from tasks.rssi.page.maps import CERTAINTY, COVERED_DBM, Maps, RssiRecords
+from tasks.answer import Answer, Method, NextStep
+from tasks.page.page import number
+from tasks.page.shared import again, difference, next_steps
+from tasks.rssi.page.maps import CERTAINTY, COVERED_DBM, MIN_RATIO, Maps, RssiRecords
 from tasks.summarise import comparison_sentence, coverage_warning
-from tasks.terminal import Answer
 
+REFERENCES = ("mean", "mri_pooled")  # which explain no place
 WIDTH_OF_80_PERCENT = 2.563  # of an interval, in standard deviations of a normal distribution
 MIN_REPEATS = 10  # of measurements at one place
 MAX_RATIO_TO_SCATTER = 1.3  # of an interval to the one of repeated measurements, which then explain it
-MIN_RATIO = 1.2  # of the widest interval inside to the median one, for which more positions are proposed
 
 
 def answer(run: RssiRecords) -> Answer:
-    """Return what the terminal shows of a run."""
-    overall = sorted(run.metrics["overall"].items(), key=lambda item: item[1]["abs_error_db"]["median"])
-    rows = [({"model": name}, entry["abs_error_db"]) for name, entry in overall]
-    return Answer("dB", rows, conclusion(run), next_steps(run))
+    """Return the answer of a run."""
+    own, errors, methods = model_of(run), by_method(run), []
+    scored = any(entry.get("detection") for entry in run.metrics["overall"].values())
+    for name, entry in run.metrics["overall"].items():
+        detection = entry.get("detection")
+        cells = {f"{own} minus it [dB]": difference(errors, own, name)}
+        cells |= {"detection": number(None if detection is None else sum(detection) / 2)} if scored else {}
+        seconds = entry["seconds"]["fit"], entry["seconds"]["predict"]
+        methods.append(Method(name, entry["abs_error_db"], name in REFERENCES and name != own, seconds, cells))
+    return Answer("dB", methods, own, conclusion(run), steps(run), (best_baseline(run),))
 
 
 def model_of(run: RssiRecords) -> str:
     """Return the predictor that all others are compared with, whose maps and intervals the run contains."""
     return run.metrics["model"]
-
-
-def title(run: RssiRecords) -> str:
-    """Return the name of that predictor in sentences."""
-    return {"swiftwrf": "SwiftWRF"}.get(model_of(run), model_of(run))
 
 
 def best_baseline(run: RssiRecords) -> str:
@@ -40,45 +42,47 @@ def best_baseline(run: RssiRecords) -> str:
     return min(error, key=lambda name: error[name])
 
 
-def conclusion(run: RssiRecords) -> str:
-    """Return coverage, error and intervals of the model, and how it compares with the best baseline."""
+def conclusion(run: RssiRecords) -> list[str]:
+    """Return coverage and error, how sure they are, and how the model compares with the best baseline."""
     best, n_test, interval = best_baseline(run), run.metrics["n_test"], run.metrics["interval"]
-    own, name, floors = model_of(run), title(run), Maps.of_floors(run)
-    who = "a receiver" if len(run.metrics["receivers"]) > 1 else "the receiver"
+    own, floors, names = model_of(run), Maps.of_floors(run), list(run.metrics["receivers"])
+    who = f"one of {len(names)} receivers" if len(names) > 1 else names[0]
     covered = [f"{maps.covered:.0%} of {maps.place}" for maps in floors]
-    error = run.metrics["overall"][own]["abs_error_db"]["median"]
-    compared = comparison_sentence(by_method(run), own, best, name=name, unit="dB", rows="pairs", n_test=n_test)
-    return (
-        f"{', '.join(covered)} {'has' if len(covered) == 1 else 'have'} {who} above {COVERED_DBM:g} dBm with "
-        f"{CERTAINTY:.0%} certainty. Half of the errors at new positions are below {error:.1f} dB, and "
-        f"{interval['coverage']:.0%} of the measurements lie in their {interval['nominal']:.0%} intervals. {compared}"
+    error = run.metrics["overall"][own]["abs_error_db"]
+    sure = (
+        f"90 % of the errors are below {error['p90']:.1f} dB, and {interval['coverage']:.0%} of the measurements lie in "
+        f"their {interval['nominal']:.0%} intervals. Tested on {error['n']} measurements, fitted to "
+        f"{run.metrics['n_train']} rows ({run.scene})."
     )
+    compared = comparison_sentence(by_method(run), own, best, name=own, unit="dB", rows="pairs", n_test=n_test)
+    return [
+        f"{', '.join(covered)} {'has' if len(covered) == 1 else 'have'} {who} above {COVERED_DBM:g} dBm with "
+        f"{CERTAINTY:.0%} certainty; predictions are within {error['median']:.1f} dB (median error).",
+        sure,
+        compared,
+    ]
 
 
-def next_steps(run: RssiRecords) -> list[str]:
-    """Return what to do next, a sentence each."""
+def steps(run: RssiRecords) -> list[NextStep]:
+    """Return what to do next."""
     interval = run.metrics["interval"]
     pairs = model_of(run) == "pairs"  # its maps depend on both ends, and the page shows one
-    steps = [] if pairs else [f"Explore maps and coverage: `{command('view', run.path)}`."]
+    own = [NextStep(where_next(run))]
     if unknown := int(np.isnan(run.arrays("maps")["receiver"]).any(axis=1).sum()):
-        steps.insert(
-            0,
-            "Give the positions of the access points in `receivers.csv` (columns receiver, x, y, z) beside the table: "
-            f"{unknown} are unknown, so that the distance from them explains nothing.",
+        text = (
+            f"Give the positions of the {unknown} access points that are unknown, in `receivers.csv` beside the table"
         )
-    steps.append(where_next(run))
-    steps.append(
-        f"Predict anywhere: `swiftwrf.load({f'{run.path}/model.safetensors'!r}).predict(positions)`, with intervals."
-    )
+        own.insert(0, NextStep(text, "receiver,x,y,z"))
     # the receivers of a row are not independent
     n_test = min(run.metrics["n_test"], run.metrics["overall"][model_of(run)]["abs_error_db"]["n"])
     if warning := coverage_warning("intervals", interval["coverage"], interval["nominal"], n_test):
-        steps.append(warning)
+        own.append(NextStep(warning))
     if pairs and run.metrics["split"] != "place":
-        steps.append("Run `--split place`: it shows the error of a receiver at positions where it measured nothing.")
+        own.append(again(run, "Test receivers at positions where they measured nothing", "place"))
     elif run.metrics["split"] == "random":
-        steps.append("Run `--split block`: it shows the error in a region where nothing was measured.")
-    return steps
+        own.append(again(run, "Test a region where nothing was measured", "block"))
+    explore = "" if pairs else "Explore maps and coverage"
+    return next_steps(run, explore, "Predict at other positions, with intervals", "positions.csv", own)
 
 
 def where_next(run: RssiRecords) -> str:

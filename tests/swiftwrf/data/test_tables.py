@@ -208,7 +208,9 @@ def test_pixels_of_a_floor_plan(table, tmp_path, scale, above):
     if above is None:
         with pytest.raises(InputError, match="are in pixels; give --scale PIXELS_PER_METRE"):
             load_rssi(tmp_path / "walk.csv")
-    is_read_as(load_rssi(tmp_path / "walk.csv", scale=None if above else scale), table)
+    data = load_rssi(tmp_path / "walk.csv", scale=None if above else scale)
+    is_read_as(data, table)
+    assert data.plan_scale == scale
     plain = plan.rename(columns={"Map X (px)": "x", "Map Y (px)": "y"})
     is_read_as(Rssi.from_frame(plain, scale=scale, y_down=True), table)
 
@@ -244,6 +246,17 @@ def test_degrees_in_other_units(table, unit, at):
     data = Rssi.from_frame(table.assign(latitude=values[:, 0], longitude=values[:, 1]).drop(columns=["x", "y"]))
     is_read_as(data, table, atol=0.03)
     assert noted(data, "converted to degrees")
+
+
+def test_degrees_with_letters(table):
+    degrees = GeodeticOrigin(-33.9, -70.2).to_degrees(table[["x", "y"]].to_numpy())
+    text = {"Lat": [f"{-value:.8f} S" for value in degrees[:, 0]], "Lon": [f"{-v:.8f}\u00b0W" for v in degrees[:, 1]]}
+    is_read_as(Rssi.from_frame(table.assign(**text).drop(columns=["x", "y"])), table, atol=0.01)
+
+
+def test_one_row_of_a_stream_keeps_its_receivers(table):
+    row = table.iloc[:1].assign(a=-11.5, noise=-95)
+    assert Rssi.from_frame(row).receiver_names == ("a", "b", "c", "d")
 
 
 def test_metres_that_are_called_latitude_stay_metres(table):

@@ -16,8 +16,9 @@ from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data import PropagationPaths, Snapshots
 from swiftwrf.data.store import Store
 from swiftwrf.models.geometry import GeometryModel, Plane, furniture
+from swiftwrf.models.geometry.channels import coherence, field, waves
 from swiftwrf.models.geometry.fit import observe
-from swiftwrf.models.geometry.furniture import Furniture, coherence, field, waves
+from swiftwrf.models.geometry.furniture import Furniture
 from swiftwrf.models.geometry.images import PlaneSet
 from tasks.aoa.page.room import furniture_panels
 
@@ -45,12 +46,15 @@ def furnished(room: GeometryModel, absorption: float) -> Furniture:
     return Furniture(low, 0.25, values, reflectivity, torch.zeros(shape), 1e-3)
 
 
-def measured(absorption: float, moving="transmitter", n: int = 100) -> tuple[Spectra, GeometryModel]:
+def measured(
+    absorption: float, moving="transmitter", n: int = 100, surfaces: tuple[Plane, ...] = ()
+) -> tuple[Spectra, GeometryModel]:
     """Return the channels of a furnished room at four subcarriers, and its walls."""
     data = mirror_room({}, moving=moving, n=n)
     walls = GeometryModel.of_planes(data, WALLS)
     truth = GeometryModel.of_planes(data, WALLS)
-    truth.furniture = furnished(truth, absorption)
+    shelf = furnished(truth, absorption)
+    truth.furniture = shelf.with_surfaces([*surfaces]) if surfaces else shelf
     frequency = LIGHT_SPEED / data.array.wavelength + torch.linspace(-40e6, 40e6, 4, dtype=torch.float64)
     channel = truth.channel(data.position, frequency)
     phase = torch.randn(n, 4, 1, generator=torch.Generator().manual_seed(0))
@@ -106,7 +110,7 @@ def test_furniture_is_found_where_it_stands_and_explains_new_channels(moving, tm
     before = 1 - channels.coherence(walls.tensors(), walls.gains(channels.scene))
     room = fitted(walls, train)
     assert room.furniture is not None
-    after = 1 - channels.coherence(room.tensors(), room.gains(channels.scene))
+    after = 1 - channels.coherence(room.reflectors, room.gains(channels.scene))
     assert float(after.mean()) < 0.5 * float(before.mean())
     centre = (
         (torch.tensor([2.75, 2.3, 0.7 if moving == "transmitter" else 2.1]).double() - room.furniture.low)
@@ -117,6 +121,20 @@ def test_furniture_is_found_where_it_stands_and_explains_new_channels(moving, tm
     assert room.furniture.crossed_m.min() == 0  # what no path crosses is unknown
     room.save(tmp_path / "room.safetensors")
     assert torch.equal(load(tmp_path / "room.safetensors").channel(test.position), room.channel(test.position))
+
+
+def test_a_reflecting_surface_is_found_where_it_is(tmp_path):
+    lamp = Plane((0.0, 0.0, 1.0), 2.2, 0.9)
+    data, walls = measured(1.0, n=150, surfaces=(lamp,))
+    room = fitted(walls, data.subset(torch.arange(120)))
+    assert room.furniture is not None
+    (found,) = room.furniture.surfaces
+    assert (found.normal, found.offset_m) == (lamp.normal, pytest.approx(lamp.offset_m, abs=0.01))
+    channels = room.channels(data.subset(torch.arange(120, 150)))
+    missing = 1 - channels.coherence(room.reflectors, room.gains(channels.scene))
+    assert float(missing.median()) < 0.1
+    room.save(tmp_path / "room.safetensors")
+    assert torch.equal(load(tmp_path / "room.safetensors").channel(data.position[:5]), room.channel(data.position[:5]))
 
 
 def test_furniture_is_drawn_by_height_and_hatched_where_it_is_unknown(tmp_path):

@@ -18,9 +18,9 @@ from swiftwrf import simulated_room
 from swiftwrf.metrics import median_interval, paired_change
 from swiftwrf.metrics import summary as error_summary
 from tasks.aoa.options import AoaConfig
+from tasks.aoa.page import first_screen
 from tasks.aoa.page.records import FractionRecords
-from tasks.aoa.page.results import gain_sentence, gain_table
-from tasks.aoa.page.summary import summary
+from tasks.aoa.page.summary import answer, comparison
 from tasks.page.records import Records
 
 MEASURED = Condition("aann_kernel", "measured", measured_fraction=0.3)
@@ -108,6 +108,18 @@ def test_the_chosen_estimator_is_named_as_in_the_results_where_repeats_choose_ot
     assert choice["name"] in found._method_metrics(0.3)[0]
 
 
+def test_a_better_method_that_is_not_recommended_has_a_reason():
+    """Here the search finds no planes without the spectra of a fold."""
+    regression, locator = (replace(MEASURED, estimator=name) for name in ("kernel_regression", LOCATOR))
+    spread = np.linspace(0.9, 1.1, 20)
+    found = results_of({MEASURED: 4 * spread, regression: 2 * spread, locator: spread})
+    found.chosen["0.3"] = {"choice": {"name": "gp"}, "errors": {regression.method: [[2.0, 2.0]]}}
+    found.located_folds["0.3"] = {0: None}
+    choice = found._estimator_choice(0.3)
+    assert choice["name"] == regression.method
+    assert choice["better"] == {locator.method: "no planes were found without the held-out spectra"}
+
+
 def test_the_reference_of_a_gain_is_the_best_estimator_without_synthetic_spectra():
     peak, locator = (replace(MEASURED, estimator=name) for name in ("peak", LOCATOR))
     spread = np.linspace(0.9, 1.1, 20)
@@ -132,14 +144,12 @@ def test_repeats_do_not_narrow_the_interval_of_a_gain():
 
 def test_the_report_states_gain_interval_and_judgement(aoa_run):
     fraction = FractionRecords.of(Records(aoa_run))[0]
+    sentence = comparison(fraction)
     for other, change in fraction.mix["methods"]["network, measured + synthetic (swiftwrf)"]["changes"].items():
-        assert (
-            f"{change['change']:+.0%} [{change['low']:+.0%}, {change['high']:+.0%}] against {other}"
-            in gain_sentence(fraction)
-        )
-    assert any(text in gain_sentence(fraction) for text in ("a gain", "a loss", "not significant"))
-    (table,) = gain_table(fraction)
-    assert {row[0] for row in table.rows} >= {
+        assert f"{change['change']:+.0%} [{change['low']:+.0%}, {change['high']:+.0%}] against `{other}`" in sentence
+    assert any(text in sentence for text in ("a gain", "a loss", "not significant"))
+    changed = {one.name for one in answer(fraction).methods if one.cells["by synthetic spectra"]}
+    assert changed >= {
         "network, measured + synthetic (swiftwrf)",
         "kernel_regression, measured + synthetic (swiftwrf)",
     }
@@ -148,10 +158,14 @@ def test_the_report_states_gain_interval_and_judgement(aoa_run):
 def test_the_summary_begins_with_the_estimator_that_cross_validation_chose(aoa_run):
     fraction = FractionRecords.of(Records(aoa_run))[0]
     fraction.mix["estimator_choice"] = {"name": "peak", "held_out_deg": {"peak": 1.0}, "n_held_out": 9, "better": {}}
-    numbers = summary(fraction).numbers
-    assert numbers[0].value == f"{fraction.medians['peak']:.2f}\N{DEGREE SIGN}"
-    assert "peak" in numbers[0].meaning
-    assert "network, measured + synthetic (swiftwrf)" in numbers[1].meaning
+    first = first_screen(fraction)
+    assert first.conclusion[0].startswith(f"Directions are found within {fraction.medians['peak']:.2f} degrees")
+    assert first.numbers[0].value == f"{fraction.medians['peak']:.2f}\N{DEGREE SIGN}"
+    assert "peak" in first.numbers[0].meaning
+    assert "network, measured + synthetic (swiftwrf)" in first.numbers[1].meaning
+    usable, references = answer(fraction).short()
+    assert "peak" in {one.name for one in usable}
+    assert all(one.name not in ("peak", "network, measured") for one in references)
 
 
 def test_the_preset_of_the_paper_has_its_fractions_and_no_further_positions():

@@ -1,0 +1,197 @@
+"""Search for reflecting surfaces of limited extent, such as table tops and fronts of cupboards, in the residual of channels.
+
+A room and its furniture predict the field h at each position, and the measured channel x leaves the residual r = x - c h. A
+surface at one more coordinate adds the wave w of its image with a gain of one sign where the surface is, and 0 elsewhere.
+The gain is estimated in cells of the surface by matched filtering at half of the positions, and scored at the other half:
+
+    improvement = 2 g Re(w^H r) - g^2 |w|^2.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from swiftwrf.models.geometry.channels import Channels, field, waves
+from swiftwrf.models.geometry.images import PlaneSet, mirror
+from swiftwrf.models.geometry.planes import Plane
+from swiftwrf.runtime.threads import parallel_map
+
+MAX_SURFACES = 6
+MAX_STARTS = 40  # local maxima that are followed
+SIGNIFICANCE = 2.0  # standard errors of the improvement; more than chance, because furniture that is fitted decides
+START_GAIN = 0.12
+RARITY = 1.2  # factor by which a sign that most planes do not have must explain more; a small shift may imitate it
+SIDE_LOBE = 0.2  # of the strongest improvement: less may be left of a surface that is modelled imperfectly
+MARGIN = 2.0  # wavelengths beyond the voxels
+STEP = 1 / 12  # of the offsets of the scan, in wavelengths
+CELL, MAX_CELLS = 4.0, 12  # least edge of a cell in wavelengths, and cells along each side of the region
+BATCH = 16  # offsets whose waves stay in a processor's cache
+
+
+def find_surfaces(planes: PlaneSet, gain: Tensor, measured: Channels, low: Tensor, high: Tensor) -> list[Plane]:
+    """Return surfaces along the axes that explain the residual of measured channels, the best first.
+
+    Args:
+        planes: Planes of one room.
+        gain: Gains of its paths at the measured positions, (n, 1 + S).
+        measured: Measured channels.
+        low: Lower corner of the region with furniture, (3,) [m].
+        high: Opposite corner (3,) [m].
+    """
+    ends = torch.tensor([0, len(measured.frequency) - 1]).unique()
+    measured = replace(measured, value=measured.value[:, ends], frequency=measured.frequency[ends])
+    scene = measured.scene
+    wavelength = math.tau / scene.wavenumber
+    residual = _Residual.of(measured, field(gain, waves(planes, scene, measured.frequency)), low, high)
+    step, margin = STEP * wavelength, MARGIN * wavelength
+
+    def scanned(axis: int) -> list[tuple[float, int, float]]:
+        offset = torch.arange(float(low[axis]) - margin, float(high[axis]) + margin, step, dtype=torch.float64)
+        parts = [residual.improvement(axis, some)[0].mean(-1).amax(0) for some in offset.split(BATCH)]
+        value = torch.cat(parts)
+        top = (value[1:-1] > value[:-2]) & (value[1:-1] >= value[2:]) & (value[1:-1] > 0)
+        rows = top.nonzero()[:, 0] + 1
+        return [(v, axis, o) for v, o in zip(value[rows].tolist(), offset[rows].tolist(), strict=True)]
+
+    starts = sorted((s for some in parallel_map(scanned, range(3)) for s in some), reverse=True)[:MAX_STARTS]
+    found: list[Plane] = []
+    strongest = 0.0
+    usual = float(planes.gain[0].sign().sum()) >= 0
+    rarity = torch.tensor([[1.0 if usual else RARITY], [RARITY if usual else 1.0]])  # of either sign
+    fine = torch.linspace(-step, step, 9, dtype=torch.float64)
+    while starts and len(found) < MAX_SURFACES:
+        tried = []
+        for _, axis, at in starts:
+            improvement = residual.improvement(axis, at + fine, planes)[0]
+            sign, row = divmod(int((improvement.mean(-1) / rarity).argmax()), len(fine))
+            each = improvement[sign, row]
+            error = float(each.std()) / math.sqrt(len(each))
+            if float(each.mean()) > SIGNIFICANCE * error > 0:
+                tried.append((float(each.mean() / rarity[sign]), axis, at + float(fine[row]), sign))
+        if not tried:
+            break
+        value, axis, at, sign = max(tried)
+        strongest = max(value, strongest)
+        if value < SIDE_LOBE * strongest:
+            break
+        residual = residual.without(axis, at, sign, planes)
+        side = math.copysign(1.0, at - float(residual.fixed[axis]))
+        normal = [side * float(other == axis) for other in range(3)]
+        found.append(Plane((normal[0], normal[1], normal[2]), side * at, (START_GAIN, -START_GAIN)[sign]))
+        starts = [(v, a, o) for v, a, o, _ in tried if a != axis or abs(o - at) > 2 * step]
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Residual:
+    """Measured channels and the part of them that is explained.
+
+    Args:
+        measured: Measured channels, of unit power at each position.
+        factor: Factor of predicted waves in each snapshot, complex64 (n, F, 1).
+        known: Explained part (n, F, K).
+        low, cell_m: Corner [m] and edges (3,) [m] of the cells.
+    """
+
+    measured: Channels
+    factor: Tensor
+    known: Tensor
+    low: Tensor
+    cell_m: Tensor
+
+    @classmethod
+    def of(cls, measured: Channels, predicted: Tensor, low: Tensor, high: Tensor) -> _Residual:
+        value = measured.value / measured.value.abs().square().sum((1, 2), keepdim=True).sqrt().clamp_min(1e-30)
+        factor = _factor(value, predicted)
+        edge = CELL * math.tau / measured.scene.wavenumber
+        cell = ((high - low) / MAX_CELLS).clamp_min(edge)
+        return cls(replace(measured, value=value), factor, factor * predicted, low, cell)
+
+    @property
+    def fixed(self) -> Tensor:
+        """Position of the fixed end, (3,) [m]."""
+        scene = self.measured.scene
+        return (scene.receiver if scene.end == "transmitter" else scene.transmitter)[0]
+
+    def _waves(self, axis: int, offset: Tensor, planes: PlaneSet | None) -> tuple[Tensor, Tensor]:
+        """Return the waves of surfaces at offsets (B,) [m], (B, C n, F, K), and the cell of each reflection, (B, C n).
+
+        The C paths reflect at the surface alone and, given planes, at each of these between the surface and either end.
+        """
+        scene, normal = self.measured.scene, torch.zeros(3, 1, 1, dtype=torch.float64)
+        normal[axis] = 1.0
+        fixed, moving, transmitter = (x.T[:, None] for x in (self.fixed[None], scene.moving, scene.transmitter))
+        beside, at_surface = [other for other in range(3) if other != axis], (normal, offset[:, None])
+        nowhere = torch.zeros(3, 1, 1, dtype=torch.float64), torch.ones((), dtype=torch.float64)
+        paths = [(fixed, moving, [at_surface], 1.0, nowhere)]
+        for n, o, g in zip(*(x[0] for x in (planes.normal, planes.offset, planes.gain)), strict=True) if planes else ():
+            at_plane = n[:, None, None], o
+            ends = [(mirror(fixed, *at_plane), moving), (fixed, mirror(moving, *at_plane))]
+            first = [at_plane, at_surface]
+            orders = [first, first[::-1]] if scene.end == "receiver" else [first[::-1], first]
+            paths += [(*both, order, float(g), at_plane) for both, order in zip(ends, orders, strict=True)]
+        waves, cells = [], []
+        for start, end, order, gain, plane in paths:
+            source = transmitter
+            for where in order:
+                source = mirror(source, *where)
+            near, far = start[axis] - offset[:, None], end[axis] - offset[:, None]
+            hit = start + (near / (near + far)).nan_to_num(0.5, 0.5, 0.5) * (end - start)
+            there = (near * far > 0) & ((hit * plane[0]).sum(0) < plane[1])
+            wave = []
+            for ratio in self.measured.frequency.tolist():
+                at = replace(scene, element=scene.element * ratio, wavenumber=scene.wavenumber * ratio)
+                wave.append(at.wave(source.movedim(0, -1)).expand(-1, len(scene), -1))
+            waves.append(self.factor * torch.stack(wave, dim=2) * (gain * there)[..., None, None])
+            row, column = (
+                ((hit[a] - self.low[a]) / self.cell_m[a]).long().clamp(0, MAX_CELLS).expand_as(there) for a in beside
+            )
+            cells.append(row * (MAX_CELLS + 1) + column)
+        return torch.cat(waves, dim=1), torch.cat(cells, dim=1)
+
+    def improvement(self, axis: int, offset: Tensor, planes: PlaneSet | None = None) -> tuple[Tensor, Tensor]:
+        """Return what a surface of gains of either sign explains, and these gains.
+
+        Args:
+            axis: Axis of the normal.
+            offset: Offsets (B,) [m].
+            planes: Planes of the room, whose reflections of the surface count, too.
+
+        Returns:
+            Improvement at positions whose channels did not determine the gain, (2, B, n), as a fraction of their power, and
+            the added waves by the gains from all positions, (2, B, n, F, K).
+        """
+        whole, number = self._waves(axis, offset, planes)
+        n, count = len(self.known), number.shape[1] // len(self.known)
+        known, residual = (x.repeat(count, 1, 1) for x in (self.known, self.measured.value - self.known))
+        wave = whole - known * _factor(whole, known)
+        match = (wave.conj() * residual).real.sum((2, 3))
+        power = wave.abs().square().sum((2, 3))
+        prior, size = power.mean(), (len(offset), (MAX_CELLS + 1) ** 2)
+
+        def gains(rows: Tensor) -> Tensor:
+            among = torch.zeros(size).scatter_add(1, number, match * rows).gather(1, number)
+            total = torch.zeros(size).scatter_add(1, number, power * rows).gather(1, number)
+            return (torch.stack([among, -among]) / (total + prior).clamp_min(1e-30)).clamp(0, 1)
+
+        half = (torch.arange(n).repeat(count) % 2).float()
+        gain = torch.where(half > 0, gains(1 - half), gains(half))
+        improvement = 2 * gain * torch.stack([match, -match]) - gain.square() * power
+        added = torch.tensor([1.0, -1.0])[:, None, None] * gains(torch.ones_like(half))
+        total = (added[..., None, None] * whole).unflatten(2, (count, n)).sum(2)
+        return improvement.unflatten(2, (count, n)).sum(2), total
+
+    def without(self, axis: int, offset: float, sign: int, planes: PlaneSet) -> _Residual:
+        """Return the residual after a surface."""
+        known = self.known + self.improvement(axis, torch.tensor([offset], dtype=torch.float64), planes)[1][sign, 0]
+        return replace(self, known=_factor(self.measured.value, known) * known)
+
+
+def _factor(value: Tensor, part: Tensor) -> Tensor:
+    """Return the factor of a part that explains most of a value in each snapshot, (..., F, K) to (..., F, 1)."""
+    match = (part.conj() * value).sum(-1, keepdim=True)
+    return match / part.abs().square().sum(-1, keepdim=True).clamp_min(1e-30)
