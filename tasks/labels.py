@@ -60,6 +60,7 @@ ESTIMATORS = {
     "peak": Label("the strongest direction", "#a0623a"),
     "music": Label("MUSIC on the array snapshots, for one source", "#b5539f"),
     "esprit": Label("ESPRIT on the array snapshots, for one source", "#3a8fb7"),
+    "joint_music": Label("MUSIC over elements and subcarriers, for the earliest path", "#8f5fb5"),
     "maximum_likelihood": Label("maximum likelihood on the array snapshots, for one source", "#5f8f3a"),
 }
 

@@ -18,6 +18,7 @@ from swiftwrf import AngularGrid, InputError, Spectra, make_model, simulated_roo
 from swiftwrf.data.raytraced import sionna
 from swiftwrf.data.writing import write_spectra
 
+collect_ignore = ["cuda_shim"]  # programs of tests, which have no examples
 torch.set_num_threads(1)  # tests run side by side, and mocks reach steps that are computed in this process alone
 os.environ["OMP_NUM_THREADS"] = "1"
 
@@ -124,9 +125,9 @@ def aoa_run(tmp_path_factory: pytest.TempPathFactory, room: Spectra) -> Path:
         (folder / "data").mkdir()
         write_spectra(room, folder / "data")
         options = ("--synthesizer", "swiftwrf", "--extra", 0, "--data", folder / "data", "--out", folder / "run")
-        with mock.patch("augment.turbo.experiment.candidates", return_value=["idw"]):
+        with mock.patch("augment.turbo.experiment.candidates", return_value=["idw"]), quick.recorded(folder):
             assert quick.run("aoa", "--mix", 0.5, 1, *options, drawn=True) == 0
-        make_model("idw").fit(room).save(folder / "run" / "model-mix1.safetensors")
+        make_model("idw").fit(room).save(folder / "run" / "swiftwrf-mix1.safetensors")
 
     return made_once(tmp_path_factory, "aoa", make) / "run"
 
@@ -139,6 +140,19 @@ def rssi_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     def make(folder: Path) -> None:
         Image.new("RGB", (40, 30), "white").save(folder / "plan.png")
         plan = ("--floor-plan", folder / "plan.png", "--floor-extent", 0, 20, 0, 15)
-        assert quick.run("rssi", "--rx", 1, 6, 12, *plan, "--out", folder / "run", drawn=True) == 0
+        with quick.recorded(folder):
+            assert quick.run("rssi", "--rx", 1, 6, 12, *plan, "--out", folder / "run", drawn=True) == 0
 
     return made_once(tmp_path_factory, "rssi", make) / "run"
+
+
+@pytest.fixture(scope="session")
+def locate_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that locates on the built-in floor."""
+    import quick
+
+    def make(folder: Path) -> None:
+        with quick.recorded(folder):
+            assert quick.run("locate", "--cells", 300, "--out", folder / "run", drawn=True) == 0
+
+    return made_once(tmp_path_factory, "locate", make) / "run"

@@ -8,7 +8,8 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
+from pathlib import Path
 from unittest import mock
 
 from matplotlib.figure import Figure
@@ -90,11 +91,19 @@ def sketched() -> Iterator[None]:
     def outline(figure: Figure, title: str | None = None) -> str:
         return "<svg></svg>\n"
 
+    with mock.patch("tasks.page.page.as_svg", outline), one_example():
+        yield
+
+
+@contextmanager
+def one_example() -> Iterator[None]:
+    """Write reports with one example of a spectrum, each of which takes as long as the other figures."""
+
     def first(fraction: FractionRecords) -> list[synthesis.Example]:
         return every(fraction)[:1]
 
     every = synthesis.examples
-    with mock.patch("tasks.page.page.as_svg", outline), mock.patch.object(synthesis, "examples", first):
+    with mock.patch.object(synthesis, "examples", first):
         yield
 
 
@@ -112,7 +121,7 @@ def quick(drawn: bool = False) -> Iterator[None]:
         mock.patch.object(locate, "rssi_room", return_value=rssi_room(n=80)),
         mock.patch.object(RssiModel, "config_type", QuickRssiConfig),
         mock.patch("swiftwrf.rssi.maps.CELLS", 8),
-        nullcontext() if drawn else sketched(),
+        one_example() if drawn else sketched(),
         mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
         mock.patch.object(RSSI_PREDICTORS, "_registered", {name: RSSI_PREDICTORS[name] for name in PREDICTORS_KEPT}),
     ):
@@ -124,6 +133,18 @@ def run(task: str, *arguments: object, drawn: bool = False) -> int:
     config, function = TASKS[task]
     with quick(drawn):
         return command_line(f"tasks.{task}", config, function, [str(a) for a in arguments])
+
+
+@contextmanager
+def recorded(folder: Path) -> Iterator[None]:
+    """Keep what a run prints in out.txt and err.txt of the folder, for the tests that read it."""
+    with (
+        (folder / "out.txt").open("w") as out,
+        (folder / "err.txt").open("w") as err,
+        redirect_stdout(out),
+        redirect_stderr(err),
+    ):
+        yield
 
 
 def dask_setup(worker: object) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from swiftwrf import rssi_room
@@ -323,3 +324,31 @@ def write_captures(
         content = nexmon(channel[i]) if suffix == ".pcap" else b"".join(bfee(csi[..., None]) for csi in channel[i])
         (folder / f"walk{i}{suffix}").write_bytes(content)
     return channel
+
+
+def install(folder: Path, group: str, **points: str) -> None:
+    """Write the metadata of an installed package with entry points, for processes whose path has the folder."""
+    described = folder / f"{next(iter(points))}_package-1.dist-info"
+    described.mkdir()
+    (described / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {next(iter(points))}-package\nVersion: 1\n")
+    lines = [f"[{group}]", *(f"{name} = {value}" for name, value in points.items()), ""]
+    (described / "entry_points.txt").write_text("\n".join(lines))
+
+
+def write_nerf2(folder: Path, images: list[np.ndarray], orientation: str = "[0, 0, 0, 1]") -> Path:
+    """Write spectra in the NeRF2 layout, at positions along a line."""
+    (folder / "spectrum").mkdir(parents=True)
+    (folder / "gateway_info.yml").write_text(f"g:\n  position: [0, 0, 0]\n  orientation: {orientation}\n")
+    (folder / "tx_pos.csv").write_text("x,y,z\n" + "".join(f"{i},{10 + i},1.5\n" for i in range(len(images))))
+    for number, image in enumerate(images, start=1):
+        Image.fromarray(image).save(folder / "spectrum" / f"{number:05d}.png")
+    return folder
+
+
+def write_nerf2_rssi(folder: Path, names: str, position: str, rows: list[str]) -> Path:
+    """Write RSSI in the NeRF2 layout, at positions along a line."""
+    folder.mkdir(exist_ok=True)
+    (folder / "gateway_position.yml").write_text(position)
+    (folder / "tx_pos.csv").write_text("x,y,z\n" + "".join(f"{i},1,1\n" for i in range(len(rows))))
+    (folder / "gateway_rssi.csv").write_text("\n".join([names, *rows, ""]))
+    return folder

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from samples import write_paths
+from samples import write_nerf2, write_nerf2_rssi, write_paths
 
 from swiftwrf import InputError, load_rssi, load_spectra
 
@@ -68,9 +68,10 @@ def _bomb(header):
     return content.getvalue()
 
 
-def test_small_archives_that_claim_much_are_refused_before_memory_is_taken(tmp_path):
-    (tmp_path / "paths.npz").write_bytes(_bomb(bytes(2**30 + 1)))
-    assert (tmp_path / "paths.npz").stat().st_size < 2**21
+def test_small_archives_that_claim_much_are_refused_before_memory_is_taken(tmp_path, monkeypatch):
+    monkeypatch.setattr("swiftwrf.data.archives.MAX_UNPACKED_BYTES", 2**26)
+    (tmp_path / "paths.npz").write_bytes(_bomb(bytes(2**26 + 1)))
+    assert (tmp_path / "paths.npz").stat().st_size < 2**18
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(InputError, match="unpacks to"):
         load_spectra(tmp_path)
@@ -95,13 +96,7 @@ def _png(rows, columns, kind=b"IHDR"):
 @pytest.fixture
 def scene(tmp_path):
     """Twelve spectra in the NeRF2 layout."""
-    folder = tmp_path / "scene"
-    (folder / "spectrum").mkdir(parents=True)
-    (folder / "gateway_info.yml").write_text("g:\n  position: [0, 0, 0]\n  orientation: [0, 0, 0, 1]\n")
-    (folder / "tx_pos.csv").write_text("x,y,z\n" + "".join(f"{i},1,1\n" for i in range(N)))
-    for i in range(N):
-        Image.fromarray(np.full((8, 32), i, np.uint8)).save(folder / "spectrum" / f"{i + 1:05d}.png")
-    return folder
+    return write_nerf2(tmp_path / "scene", [np.full((8, 32), i, np.uint8) for i in range(N)])
 
 
 def test_every_file_counts_as_input(scene):
@@ -126,11 +121,7 @@ def test_other_formats_called_png_are_not_opened(scene, kind):
 
 
 def _rssi(folder, names="a,b", position="a: [0, 0, 1]\nb: [5, 0, 1]\n"):
-    folder.mkdir(exist_ok=True)
-    (folder / "gateway_position.yml").write_text(position)
-    (folder / "tx_pos.csv").write_text("x,y,z\n" + "".join(f"{i},1,1\n" for i in range(N)))
-    (folder / "gateway_rssi.csv").write_text(names + "\n" + "-50,-60\n" * N)
-    return folder
+    return write_nerf2_rssi(folder, names, position, ["-50,-60"] * N)
 
 
 @pytest.mark.parametrize(

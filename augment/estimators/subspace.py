@@ -1,4 +1,4 @@
-"""Estimators from array snapshots, without training: MUSIC, ESPRIT and maximum likelihood for one source."""
+"""Estimators from array snapshots, without training: MUSIC, ESPRIT and maximum likelihood."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from augment.estimators.base import ESTIMATORS, Estimator
 from swiftwrf import InputError, Spectra
 from swiftwrf.array.angles import to_angles
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.array.subspace import esprit, maximum_likelihood, music
+from swiftwrf.array.subspace import esprit, joint_music, maximum_likelihood, music
 
 MIN_SNAPSHOTS = 2  # of one position: with one snapshot all methods are the peak of its spectrum
 
@@ -24,8 +24,8 @@ class SnapshotEstimator(Estimator):
 
     @staticmethod
     @abstractmethod
-    def directions(array: PlanarArray, channel: Tensor) -> Tensor:
-        """Return unit vectors (n, 3) from snapshots (n, S, K)."""
+    def directions(array: PlanarArray, channel: Tensor, frequency_hz: Tensor | None) -> Tensor:
+        """Return unit vectors (n, 3) from snapshots (n, S, K), at frequencies (S,) [Hz] if these are known."""
 
     def _fit(self, train: Mixed, device: torch.device) -> None:
         """Learn nothing."""
@@ -40,7 +40,7 @@ class SnapshotEstimator(Estimator):
             raise InputError(f"{type(self).__name__} is not possible: {lacking}")
         assert data.array is not None
         assert data.channel is not None
-        return torch.stack(to_angles(self.directions(data.array, data.channel)), dim=-1)
+        return torch.stack(to_angles(self.directions(data.array, data.channel, data.frequency_hz)), dim=-1)
 
     @classmethod
     def lacking(cls, data: Spectra) -> str:
@@ -50,7 +50,7 @@ class SnapshotEstimator(Estimator):
         if data.channel.shape[1] < MIN_SNAPSHOTS:
             return f"{needed}, and {data.name} contains one"
         try:
-            cls.directions(data.array, data.channel[:1])
+            cls.directions(data.array, data.channel[:1], data.frequency_hz)
         except InputError as error:
             return str(error)
         return ""
@@ -67,7 +67,7 @@ class Music(SnapshotEstimator):
     """
 
     @staticmethod
-    def directions(array: PlanarArray, channel: Tensor) -> Tensor:
+    def directions(array: PlanarArray, channel: Tensor, frequency_hz: Tensor | None) -> Tensor:
         return music(array, channel)
 
 
@@ -76,7 +76,7 @@ class Esprit(SnapshotEstimator):
     """The direction of one source by ESPRIT."""
 
     @staticmethod
-    def directions(array: PlanarArray, channel: Tensor) -> Tensor:
+    def directions(array: PlanarArray, channel: Tensor, frequency_hz: Tensor | None) -> Tensor:
         return esprit(array, channel)
 
 
@@ -85,5 +85,16 @@ class MaximumLikelihood(SnapshotEstimator):
     """The direction of one source by maximum likelihood."""
 
     @staticmethod
-    def directions(array: PlanarArray, channel: Tensor) -> Tensor:
+    def directions(array: PlanarArray, channel: Tensor, frequency_hz: Tensor | None) -> Tensor:
         return maximum_likelihood(array, channel)
+
+
+@ESTIMATORS.register("joint_music")
+class JointMusic(SnapshotEstimator):
+    """The direction of the earliest path by MUSIC over elements and subcarriers."""
+
+    @staticmethod
+    def directions(array: PlanarArray, channel: Tensor, frequency_hz: Tensor | None) -> Tensor:
+        if frequency_hz is None:
+            raise InputError("delays of paths need subcarriers; these are snapshots without frequencies")
+        return joint_music(array, channel, frequency_hz)

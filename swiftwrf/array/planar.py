@@ -159,19 +159,14 @@ class PlanarArray:
         return 2 * math.pi / self.wavelength * (direction[..., :2].to(self.element) @ self.element.T)
 
     def phase_at(self, source: Tensor) -> Tensor:
-        """Return the phase lead (..., K) [rad] of each element over the origin for waves from points (..., 3) [m].
+        """Return the phase lead (n, K) [rad] of each element over the origin for waves from points (n, 3) [m].
 
         The waves are spheres; far away they become those of `phase`.
         """
-        distance, element = source.norm(dim=-1, keepdim=True), torch.nn.functional.pad(self.element, (0, 1))
-        along = 2 * source.to(element) @ element.T - element.square().sum(dim=1)  # of squared distances
-        return (
-            2
-            * math.pi
-            / self.wavelength
-            * along
-            / (distance + torch.cdist(source.reshape(-1, 3), element).reshape(along.shape))
-        )
+        element = torch.nn.functional.pad(self.element, (0, 1))
+        difference = 2 * source @ element.T - element.square().sum(dim=1)  # of squared distances to origin and element
+        total: Tensor = source.norm(dim=-1, keepdim=True) + torch.cdist(source, element)
+        return math.tau / self.wavelength * difference / total
 
     @property
     def far_field_m(self) -> float:
@@ -181,12 +176,9 @@ class PlanarArray:
     @property
     def resolution(self) -> float:
         """Error of a direction [rad] that costs a tenth of the power of the direct path, near the array's normal."""
-        offset = self.element - self.element.mean(dim=0)
-        return (
-            0.1**0.5
-            * self.wavelength
-            / (math.tau * float(offset.square().sum(dim=1).mean() / (1 + (self.axis is None))) ** 0.5)
-        )
+        axes = 1 if self.axis is not None else 2
+        width = float((self.element - self.element.mean(dim=0)).square().sum(dim=1).mean() / axes) ** 0.5
+        return math.sqrt(0.1) * self.wavelength / (math.tau * width)
 
     def spectrum(self, channel: Tensor, grid: AngularGrid, beamformer: str = PHASE) -> Tensor:
         """Return the magnitude at each direction, in [0, 1], float32 (n, n_elevation, n_azimuth).

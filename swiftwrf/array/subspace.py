@@ -1,4 +1,4 @@
-"""Direction of arrival of one source from array snapshots: MUSIC, ESPRIT and maximum likelihood.
+"""Direction of arrival from array snapshots: MUSIC, ESPRIT and maximum likelihood of one source, and of the earliest path.
 
 A snapshot of K elements is h = a(u) s + noise, with the steering vector a(u) = exp(j 2 pi x u), the positions x of the
 elements in wavelengths and the direction cosines u of the source. All methods use the covariance R of the snapshots of one
@@ -10,6 +10,8 @@ position:
              (R. Roy and T. Kailath, IEEE Trans. ASSP 37, 1989)
     maximum likelihood: maximum of a^H R a, that of the Bartlett beamformer
              (I. Ziskind and M. Wax, IEEE Trans. ASSP 36, 1988)
+
+Subcarriers resolve paths by their delays, too: `joint_music` searches directions and delays together.
 """
 
 from __future__ import annotations
@@ -28,6 +30,10 @@ Method = Callable[[PlanarArray, Tensor], Tensor]  # (array, covariance (n, K, K)
 
 EDGE = 1e-9  # distance of direction cosines from the unit circle within which they are on it
 BATCH_ROWS = 256  # covariances at a time
+BATCH_JOINT = 8  # positions whose directions and delays are searched together
+MIN_SUBCARRIERS, MAX_SUBCARRIERS = 4, 16  # of which blocks of half as many are smoothed
+MIN_EIGENVALUE = 0.02  # of the signals, relative to the largest
+MIN_PEAK, MIN_GAIN = 0.7, 0.3  # of the paths among which the earliest is taken, relative to the strongest
 
 
 def music(array: PlanarArray, channel: Tensor) -> Tensor:
@@ -76,6 +82,94 @@ def maximum_likelihood(array: PlanarArray, channel: Tensor) -> Tensor:
         [[0.6, 0.64, 0.48]]
     """
     return _directions(_maximum, array, channel)
+
+
+def joint_music(array: PlanarArray, channel: Tensor, frequency_hz: Tensor) -> Tensor:
+    """Return the direction of the earliest path by MUSIC over elements and subcarriers.
+
+    Blocks of subcarriers are snapshots of one another (smoothing), because all paths are coherent (M. Kotaru, K. Joshi,
+    D. Bharadia and S. Katti, "SpotFi: Decimeter level localization using WiFi", SIGCOMM 2015). A delay and a phase of each
+    channel may be unknown.
+
+    Args:
+        array: The K elements and the wavelength.
+        channel: Channels of n positions at S subcarriers, complex (n, S, K). At most 16 of them are used.
+        frequency_hz: Frequencies (S,) [Hz], at least 4, at equal distances.
+
+    Returns:
+        Unit vectors in array coordinates, float64 (n, 3), folded as `PlanarArray.folded`.
+
+    Raises:
+        InputError: Fewer subcarriers, or others.
+
+    Example:
+        >>> array = PlanarArray.grid(4, 4, spacing=0.06, frequency_hz=2.4e9)
+        >>> towards = torch.tensor([[0.6, 0.64, 0.48], [-0.6, 0.0, 0.8]], dtype=torch.float64)
+        >>> frequency, delay = torch.linspace(2.36e9, 2.44e9, 8).double(), torch.tensor([20e-9, 40e-9]).double()
+        >>> wave = torch.exp(1j * (array.phase(towards)[:, None] - math.tau * (delay[:, None] * frequency)[..., None]))
+        >>> joint_music(array, wave.sum(dim=0)[None], frequency).round(decimals=2).tolist()
+        [[0.6, 0.64, 0.48]]
+    """
+    order = frequency_hz.argsort()
+    step, channel = frequency_hz[order].diff(), channel[:, order]
+    if len(frequency_hz) < MIN_SUBCARRIERS or bool(((step / step.mean() - 1).abs() > 1e-3).any()):
+        raise InputError(
+            f"MUSIC over elements and subcarriers needs at least {MIN_SUBCARRIERS} subcarriers at equal distances, got "
+            f"{len(frequency_hz)} snapshots; use music"
+        )
+    channel = channel[:, :: math.ceil(len(frequency_hz) / MAX_SUBCARRIERS)].to(torch.complex128)
+    found = torch.cat([_earliest(array, some) for some in channel.split(BATCH_JOINT)])
+    z = (1 - found.square().sum(-1, keepdim=True)).clamp_min(0).sqrt()
+    return torch.cat([found @ _axes(array).T, z], dim=-1)
+
+
+def _earliest(array: PlanarArray, channel: Tensor) -> Tensor:
+    """Return the direction cosines (n, d) of the earliest of the strong paths of channels (n, S, K)."""
+    n, count, _ = channel.shape
+    size = (count + 1) // 2
+    block = channel.unfold(1, size, 1)  # (n, blocks, K, size)
+    if (opposite := array.opposite) is not None:
+        block = torch.cat([block, block[:, :, opposite].flip(-1).conj()], dim=1)
+    value, vector = torch.linalg.eigh(covariance(block.flatten(2)))
+    most = min(block.shape[1], value.shape[1] // 2)
+    strong = value[:, -most:] > MIN_EIGENVALUE * value[:, -1:]
+    signal = (vector[..., -most:] * strong[:, None]).unflatten(1, (-1, size))  # (n, K, size, q)
+    element = array.element.double() @ _axes(array) / array.wavelength
+    half = math.ceil(8 * float((element.amax(dim=0) - element.amin(dim=0)).max()))
+    axis = torch.linspace(-1, 1, 2 * half + 1, dtype=torch.float64)
+    cosine = torch.cartesian_prod(*[axis] * element.shape[1]).reshape(-1, element.shape[1])
+    delay = torch.arange(4 * size, dtype=torch.float64) / (4 * size)  # times the distance of the subcarriers
+
+    def power(cosine: Tensor, delay: Tensor) -> Tensor:
+        """Return the fraction of waves (n or 1, G, d) with delays (n or 1, G) in the signal subspace, (n, G)."""
+        at_element = torch.exp(-1j * math.tau * (cosine @ element.T))
+        at_subcarrier = torch.exp(1j * math.tau * delay[..., None] * torch.arange(size))
+        wave = (at_element[..., None] * at_subcarrier[..., None, :]).flatten(2)
+        inside = cosine.norm(dim=-1) <= 1 + EDGE
+        matched: Tensor = (wave @ signal.flatten(1, 2)).abs().square().sum(-1) / wave.shape[-1] * inside
+        return matched
+
+    each = torch.cat([power(cosine[None], at.expand(1, len(cosine))) for at in delay], dim=1)
+    whole = each.reshape(n, 1, len(delay), len(axis), -1)
+    around = torch.cat([whole[:, :, -1:], whole, whole[:, :, :1]], dim=2)
+    highest = torch.nn.functional.max_pool3d(around, 3, stride=1, padding=(0, 1, 1))
+    top = (whole * (whole == highest)).flatten(1).topk(most, dim=1)
+    at, late = cosine[top.indices % len(cosine)], delay[top.indices // len(cosine)]
+    reach = torch.tensor([*[axis[1] - axis[0]] * element.shape[1], delay[1]])
+    offset = torch.cartesian_prod(*[torch.tensor([-0.5, 0.0, 0.5], dtype=torch.float64)] * len(reach))
+    for _ in range(8):  # towards the maxima, on smaller and smaller grids
+        near = torch.cat([at, late[..., None]], dim=-1)[:, :, None] + offset * reach
+        value = power(near[..., :-1].flatten(1, 2), near[..., -1].flatten(1)).unflatten(1, (most, -1))
+        best = near.gather(2, value.argmax(2)[..., None, None].expand(-1, -1, 1, near.shape[-1]))[:, :, 0]
+        at, late, reach = best[..., :-1], best[..., -1], reach / 2
+    wave = torch.exp(1j * math.tau * (at @ element.T))[:, :, None]
+    wave = (wave * torch.exp(-1j * math.tau * late[..., None] * torch.arange(count))[..., None]).flatten(2)
+    wave = wave * (top.values > MIN_PEAK * top.values[:, :1])[..., None]
+    gain = (torch.linalg.pinv(wave.mT, rtol=1e-3) @ channel.flatten(1)[..., None])[..., 0].abs()
+    strongest = late.gather(1, gain.argmax(1, keepdim=True))
+    later = (late - strongest + 0.5) % 1 - 0.5
+    first = later.masked_fill(gain < MIN_GAIN * gain.amax(1, keepdim=True), torch.inf).argmin(1)
+    return at[torch.arange(n), first]
 
 
 def _directions(method: Method, array: PlanarArray, channel: Tensor) -> Tensor:

@@ -198,7 +198,8 @@ class _Problem:
     @property
     def direction(self) -> Tensor:
         """Unit vectors of the line of sight, (n, 3)."""
-        return self.away / self.away.norm(dim=1, keepdim=True)
+        direction: Tensor = self.away / self.away.norm(dim=1, keepdim=True)
+        return direction
 
     def subset(self, rows: Tensor) -> _Problem:
         values = {name: getattr(self, name)[rows] for name in ("position", "away", "covariance", "strongest")}

@@ -220,6 +220,14 @@ def constant_phases(data: Snapshots) -> Tensor:
     return excess(_coherence(channel * vector[:, -1].conj()), 1 / channel.shape[2])
 
 
+def uncalibrated(data: Snapshots, away: Tensor) -> Tensor:
+    """Return the evidence (n,) for constant phases of the elements beside those of the direct paths."""
+    residual = unit_channel(data) * wave_from(data, away)[:, None].conj()
+    rows = residual.flatten(0, 1)
+    phase = torch.linalg.eigh(rows.T @ rows.conj()).eigenvectors[:, -1]
+    return excess(_coherence(residual * unit(phase).conj()), 1 / residual.shape[2])
+
+
 def unit_channel(data: Snapshots) -> Tensor:
     """Return the phases of some snapshots of each position, complex128 (n, S, K)."""
     few = data.channel[:, :: max(1, data.channel.shape[1] // 8)]

@@ -35,7 +35,15 @@ from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import slabs
-from swiftwrf.diagnostics.elements import constant_phases, evidence, excess, flipping_elements, other_readings, sloped
+from swiftwrf.diagnostics.elements import (
+    constant_phases,
+    evidence,
+    excess,
+    flipping_elements,
+    other_readings,
+    sloped,
+    uncalibrated,
+)
 from swiftwrf.errors import ranges
 
 MIN_CLEAR_POSITIONS = 20  # with line of sight, to check frames
@@ -44,7 +52,7 @@ MIN_EVIDENCE = 0.15  # agreement above chance to accept a frame, and above the d
 MIN_TURN = math.radians(5)
 COST, TIE = 0.03, 0.03  # of a fitted parameter; difference of errors that are not distinguished
 MIN_POWER = 0.05  # of an error, above the declared frame, in the fraction of the power
-MIN_EXPLAINED, MIN_REACHED = 0.5, 0.8  # agreement of an error; its fraction of what the best directions reach
+MIN_EXPLAINED, MIN_REACHED = 0.5, 0.87  # agreement of an error; its fraction of what the best directions reach
 REACH_GRID = AngularGrid.hemisphere(30, 120)
 MAX_ELSEWHERE = 0.3  # of the positions, whose peak is elsewhere, in one frame
 UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
@@ -52,6 +60,7 @@ CONSTANT = (
     "phases between elements hardly depend on the position: the delay to each element may be missing in them, or the "
     "elements may be another axis"
 )
+UNCALIBRATED = "elements have constant phases"  # which a calibration reports
 SLOPE = "phases grow with the element's number, by another slope in each snapshot, as of elements sampled in turn"
 AXES = torch.eye(3, dtype=torch.float64)
 SWAPS = {"x and y": AXES[[1, 0, 2]], "y and z": AXES[[0, 2, 1]], "x and z": AXES[[2, 1, 0]]}
@@ -236,7 +245,7 @@ def check_frames(spectra: Spectra, snapshots: Snapshots | None = None, beamforme
         tried[name] = max(found, tried.get(name, found), key=lambda each: each.score)
     best, names = best_explanations({name: each.score for name, each in tried.items()}, TIE)
     is_clear = best - declared >= (MIN_EVIDENCE if seen is None else MIN_POWER)
-    explained = [name for name in names if is_clear and _reaches(tried[name])]
+    explained = [name for name in names if is_clear and name != UNCALIBRATED and _reaches(tried[name])]
     turn = next((tried[name].turn for name in explained if tried[name].turn is not None), None)
     angle_deg, limit_deg = _nearest(direction, peak).rad2deg(), _limit_deg(spectra)
     return FrameReport(
@@ -313,13 +322,14 @@ def _hypotheses(
         yield meaning, at(away, fitted, reading)
     flipping, power = flipping_elements(seen, away)
     elements = f"{'element' if len(flipping) == 1 else 'elements'} {ranges(flipping)}, counted from 0,"
-    for meaning, found in {
+    for meaning, excess_power in {
         f"the phase of {elements} jumps by half a turn from measurement to measurement": power,
         CONSTANT: constant_phases(seen),
         SLOPE: sloped(seen, away),
+        UNCALIBRATED: uncalibrated(seen, away),
     }.items():
-        # common phases fit channels whose phases hardly differ, too
-        yield meaning, _Hypothesis(found, 0.0, 2 if meaning == CONSTANT else 0, seen)
+        # constant phases fit channels whose phases hardly differ, too
+        yield meaning, _Hypothesis(excess_power, 0.0, 2 if meaning in (CONSTANT, UNCALIBRATED) else 0, seen)
 
 
 def best_explanations(score: Mapping[str, float], tie: float) -> tuple[float, list[str]]:
@@ -354,7 +364,8 @@ def best_offset(coordinate: Tensor, score: Callable[[float], Any]) -> tuple[floa
 
 def _unit(vector: Tensor) -> Tensor:
     """Return vectors (n, 3), scaled to length 1."""
-    return vector / vector.norm(dim=1, keepdim=True).clamp_min(1e-12)
+    unit: Tensor = vector / vector.norm(dim=1, keepdim=True).clamp_min(1e-12)
+    return unit
 
 
 def _nearest(direction: Tensor, peak: Tensor) -> Tensor:

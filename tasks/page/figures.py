@@ -167,6 +167,9 @@ def speed(axes: Axes, palette: Palette, points: Mapping[str, tuple[float, float]
     for marker, (name, (cost, error)) in zip("osD^vP", points.items(), strict=False):
         axes.plot(max(cost, 1e-4), error, marker, color=palette.colour(name), label=name)
     axes.set(xscale="log", xlabel=x, ylabel=y, ylim=(0, None))
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 3)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter("")
     _named_below(axes)
 
 
@@ -203,13 +206,13 @@ def dots(
     names = [plain(textwrap.fill(name, NAME)) for name in rows]
     lines = max((name.count("\n") + 1 for name in names), default=1)
     height = 0.27 * max(1.0, 0.55 * len(values), 0.6 * lines)
-    figure, axes = panel(5.6, 0.7 + height * len(rows) + (0.3 if len(values) > 1 else 0))
+    figure, axes = panel(5.6, 0.7 + height * len(rows) + (0.2 * len(values) if len(values) > 1 else 0))
     for number, (marker, (name, of_rows)) in enumerate(zip(MARKERS, values.items(), strict=False)):
         value, low, high = np.array(of_rows, dtype=float).reshape(-1, 3).T
         at = np.arange(len(rows)) + 0.2 * (number - (len(values) - 1) / 2)
         error = np.clip(np.nan_to_num([value - low, high - value]), 0, None)
         style: dict[str, Any] = {"color": palette.colour(name), "fmt": marker, "markersize": 5, "elinewidth": 1.4}
-        axes.errorbar(value, at, xerr=error, label=short(name), **style)
+        axes.errorbar(value, at, xerr=error, label=plain(name), **style)
     if zero:
         axes.axvline(0, color=RULE, linewidth=1)
     axes.set(yticks=range(len(rows)), yticklabels=names, xlabel=label)
@@ -223,7 +226,7 @@ def dots(
             axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.grid(axis="y", visible=False)
     if len(values) > 1:
-        figure.legend(loc="outside upper left", ncols=len(values), frameon=False, fontsize=LABEL + 1)
+        legend_below(figure, axes)
     return figure
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from tasks.answer import Answer, NextStep
 from tasks.environment import command
 from tasks.page import figures
 from tasks.page.figures import MAX_CURVES, Palette
-from tasks.page.page import Plot, Section, Table, number
+from tasks.page.page import Plot, Section, Summary, Table, number
 from tasks.page.records import Records
 
 MEASURED, SUGGESTED = "#3a7fd5", "#cf4a4a"
@@ -121,51 +120,38 @@ def again(run: Records[Any], text: str, split: str) -> NextStep:
     return NextStep(text, shlex.join([*(word for word in words if not word.startswith(unwanted)), "--split", split]))
 
 
-@dataclass(frozen=True)
-class Compared:
-    """Errors of one run, or of one part of it.
+def compared(
+    answers: Mapping[str, Answer],
+    runs: Sequence[Records[Any]],
+    palette: Palette,
+    quantity: str,
+    steps: Sequence[NextStep] = (),
+) -> Summary:
+    """Return the first screen of several answers: the methods of their short tables, a column each.
 
     Args:
-        name: Short name, unique among those that are compared.
-        errors: Summary of the errors by what is compared.
-        numbers: Further cells of its column by their rows.
-    """
-
-    name: str
-    errors: Mapping[str, ErrorSummary]
-    numbers: Mapping[str, str]
-
-
-def comparison(
-    compared: Sequence[Compared], palette: Palette, shown: Sequence[str], unit: str, quantity: str
-) -> tuple[Table, Plot]:
-    """Return the table of all errors, a column for each run, and the figure of some.
-
-    Args:
-        compared: Errors of each run.
-        palette: Colours of what is compared.
-        shown: What the figure shows. The first `MAX_CURVES` are taken.
-        unit: Unit of the errors.
+        answers: Answers by unique short names.
+        runs: Their runs.
+        palette: Colours of the methods.
         quantity: Name of the errors.
+        steps: What to do next. Defaults to a look at each run.
     """
-    columns = list(dict.fromkeys(name for one in compared for name in one.errors))
-    further = list(dict.fromkeys(name for one in compared for name in one.numbers))
-    rows = [
-        [name, *(with_interval(one.errors[name]) if name in one.errors else "" for one in compared)] for name in columns
-    ]
-    rows += [[name, *(one.numbers.get(name, "") for one in compared)] for name in further]
-    caption = f"Median {quantity} [{unit}] with its 95 % interval."
-    table = Table(["method", *(one.name for one in compared)], rows, caption)
-    names = [one.name for one in compared]
-    values = {
-        name: [interval(one.errors[name]) if name in one.errors else NONE for one in compared]
-        for name in shown[:MAX_CURVES]
-    }
-    medians = [one.errors[name]["median"] for one in compared for name in values if name in one.errors]
+    unit, names = next(iter(answers.values())).unit, list(answers)
+    short = [{one.name: one.error for block in answer.short() for one in block} for answer in answers.values()]
+    methods = list(
+        dict.fromkeys([*(answer.chosen for answer in answers.values()), *(name for of in short for name in of)])
+    )
+    rows = [[name, *(with_interval(of[name]) if name in of else "" for of in short)] for name in methods]
+    table = Table(["method", *names], rows, f"Median {quantity} [{unit}] with its 95 % interval.")
+    values = {name: [interval(of[name]) if name in of else NONE for of in short] for name in methods[:MAX_CURVES]}
+    medians = [of[name]["median"] for of in short for name in values if name in of]
     spread = max(medians, default=1.0) > 10 * min(medians, default=1.0) > 0
     figure = figures.dots(names, values, palette, f"median {quantity} [{unit}]", log=spread)
     caption = f"Median {quantity} of each run; whiskers: 95 % intervals."
-    return table, Plot("summary", [figure], caption, figures.dots_data("run", names, values, unit.lower()))
+    plot = Plot("summary", [figure], caption, figures.dots_data("run", names, values, unit.lower()))
+    explore = [NextStep(f"Explore run {run.number}", command("view", run.path)) for run in runs]
+    sentences = [f"{name}: {answer.conclusion[0]}" for name, answer in answers.items()]
+    return Summary([], [plot], sentences, steps or explore, table=table)
 
 
 def interval(error: ErrorSummary) -> tuple[float, float, float]:

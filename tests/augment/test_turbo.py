@@ -5,11 +5,11 @@ from __future__ import annotations
 import pandas as pd
 import pytest
 import torch
-from quick import run
+from small import small_swiftwrf
 
 from augment import turbo_learning
 from augment.estimators import Estimator
-from swiftwrf import AngularGrid, InputError, make_model, simulated_room
+from swiftwrf import AngularGrid, InputError, load_spectra, make_model, simulated_room
 from swiftwrf.metrics import angle_errors
 from swiftwrf.models.neighbours import NearestModel
 
@@ -58,10 +58,12 @@ def test_models_and_estimators_of_ones_own(data):
     )
 
 
-def test_the_call_gives_the_errors_of_the_command(data, tmp_path):
-    result = turbo_learning(data, measured=0.5, models=["idw"], estimators=["peak", "nearest_spectrum"], extra=0)
-    assert run("aoa", "--mix", 0.5, "--synthesizer", "idw", "--extra", 0, "--out", tmp_path / "run") == 0
-    command = pd.read_csv(tmp_path / "run" / "errors.csv").set_index(["method", "index"])["great_circle_deg"]
+def test_the_call_gives_the_errors_of_the_command(aoa_run):
+    data, estimators = load_spectra(aoa_run.parent / "data"), ["peak", "nearest_spectrum"]
+    with small_swiftwrf():
+        result = turbo_learning(data, measured=0.5, models=["swiftwrf"], estimators=estimators, extra=0)
+    command = pd.read_csv(aoa_run / "errors.csv").query("measured_fraction == 0.5")
+    command = command.set_index(["method", "index"])["great_circle_deg"]
     found = result.errors.set_index(["method", "index"])["great_circle_deg"]
     pd.testing.assert_series_equal(found, command.loc[found.index], atol=1e-3)
 

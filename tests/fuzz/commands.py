@@ -50,29 +50,6 @@ REQUIRED_OPTIONS = {
     "locate": ["--cells", "100"],
     "update": ["model", "data"],
 }
-RIGHT = {
-    "aoa": {
-        "--mix": ("0.5", "1", "0.45 0.9"),
-        "--synthesizer": ("nearest", "idw nearest"),
-        "--extra": ("0", "7"),
-        "--suggest": ("3",),
-        "--moving": ("transmitter", "receiver"),
-        "--split": ("random", "block"),
-        "--repeats": ("1", "2"),
-        "--seed": ("0", "4294967290"),
-    },
-    "rssi": {
-        "--rx": ("1", "receiver06 2", "all"),
-        "--split": ("random", "block"),
-        "--seed": ("0", "4294967295"),
-    },
-    "locate": {
-        "--rx": ("1", "receiver06 2", "all"),
-        "--split": ("random", "block"),
-        "--cells": ("10", "100"),
-        "--seed": ("0", "4294967295"),
-    },
-}
 
 
 def command_lines(draw: random.Random, folder: Path, count: int) -> Iterator[tuple[str, list[str]]]:
@@ -92,17 +69,6 @@ def command_lines(draw: random.Random, folder: Path, count: int) -> Iterator[tup
         if draw.random() < 0.1:
             arguments.append(draw.choice(values))
         yield task, arguments if task in ("convert", "resume", "view") else [*arguments, "--out", str(taken)]
-
-
-def right_command_lines(draw: random.Random, folder: Path, count: int) -> Iterator[tuple[str, list[str]]]:
-    """Yield `count` valid command lines, each a short run into a separate directory."""
-    for number in range(count):
-        task = draw.choice(list(RIGHT))
-        (needed, values), *others = RIGHT[task].items()
-        arguments = [needed, *draw.choice(values).split()]
-        for option, values in draw.sample(others, draw.randint(0, len(others))):
-            arguments += [option, *draw.choice(values).split()]
-        yield task, [*arguments, "--out", str(folder / f"run{number}")]
 
 
 SAVED = {

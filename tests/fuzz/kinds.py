@@ -16,7 +16,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from PIL import Image
 from samples import snapshots as made_snapshots
 from samples import (
     survey_rows,
@@ -24,11 +23,13 @@ from samples import (
     write_deepmimo,
     write_dichasus,
     write_espargos,
+    write_nerf2,
+    write_nerf2_rssi,
     write_paths,
     write_snapshots,
     write_survey,
 )
-from small import GLANCE, PUBLISHED, PUBLISHED_RSSI
+from small import FLOOR, PUBLISHED, PUBLISHED_RSSI
 
 from augment import Mixed
 from augment.estimators.kernel_regression import KernelRegression
@@ -69,19 +70,13 @@ Attempt = Callable[[random.Random, Path], object]
 
 
 def spectra_nerf2(folder: Path) -> None:
-    (folder / "spectrum").mkdir()
-    (folder / "gateway_info.yml").write_text("name: a\ng:\n  position: [0, 0, 0]\n  orientation: [0, 0, 0, 1]\n")
-    (folder / "tx_pos.csv").write_text("x,y,z\n" + "".join(f"{i},1,1\n" for i in range(N)))
+    write_nerf2(folder, [np.arange(8 * 32, dtype=np.uint8).reshape(8, 32)] * N, "[0, 0, 0, 1]\nname: a")
     (folder / "train_index.txt").write_text("".join(f"{i:05d}\n" for i in range(1, 11)))
     (folder / "test_index.txt").write_text("00011\n00012\n")
-    for i in range(N):
-        Image.fromarray(np.arange(8 * 32, dtype=np.uint8).reshape(8, 32)).save(folder / "spectrum" / f"{i + 1:05d}.png")
 
 
 def rssi_nerf2(folder: Path) -> None:
-    (folder / "gateway_position.yml").write_text("a: [0, 0, 1]\nb: [5, 0, 1]\n")
-    (folder / "tx_pos.csv").write_text("x,y,z\n" + "".join(f"{i},1,1\n" for i in range(N)))
-    (folder / "gateway_rssi.csv").write_text("a,b\n" + "-50,-100\n" * N)
+    write_nerf2_rssi(folder, "a,b", "a: [0, 0, 1]\nb: [5, 0, 1]\n", ["-50,-100"] * N)
     (folder / "train_index.txt").write_text("".join(f"{i}\n" for i in range(10)))
     (folder / "test_index.txt").write_text("10\n11\n")
 
@@ -134,11 +129,11 @@ def model_coarray(folder: Path) -> None:
 
 
 def model_geometry(folder: Path) -> None:
-    GeometryModel(GLANCE).fit(_room()).save(folder / "model")
+    GeometryModel.of_planes(_room(), [FLOOR]).save(folder / "model")
 
 
 def model_hybrid(folder: Path) -> None:
-    geometry = GeometryModel(GLANCE).fit(_room())
+    geometry = GeometryModel.of_planes(_room(), [FLOOR])
     model = HybridModel().fit(_room(), like=geometry)
     model.path_gains = fit_path_gains(geometry, observe(_room())[0], Kernel())
     model.save(folder / "model")
@@ -229,7 +224,7 @@ def model_rssi_locator(folder: Path) -> None:
 def model_matched_field(folder: Path) -> None:
     room = simulated_room(n=20, grid=GRID)
     locator = MatchedField(spacing=0.5, n_best=20, n_background=10, n_split=4)
-    locator.fit(room, room=GeometryModel(GLANCE).fit(room)).save(folder / "model")
+    locator.fit(room, room=GeometryModel.of_planes(room, [FLOOR])).save(folder / "model")
 
 
 def read_locator(folder: Path) -> torch.Tensor:

@@ -19,7 +19,7 @@ from unittest import mock
 import numpy as np
 import torch
 from PIL import Image
-from small import GLANCE
+from small import FLOOR
 
 from fuzz.misuse import MAX_RSSI_DB, check_plausible
 from fuzz.mutate import mutated
@@ -76,7 +76,9 @@ def run_of_rssi(folder: Path) -> None:
 
 
 def run_of_aoa(folder: Path) -> None:
-    fit(simulated_room(n=20, grid=AngularGrid.hemisphere(4, 8)), n_primitives=3).save(folder / "model-mix1.safetensors")
+    fit(simulated_room(n=20, grid=AngularGrid.hemisphere(4, 8)), n_primitives=3).save(
+        folder / "swiftwrf-mix1.safetensors"
+    )
     plane = {"normal": [1.0, 0, 0], "offset_m": 6.0, "gain": -0.5, "std_mm": 1.0, "certain": True}
     write_json(folder / "geometry-mix1.json", {"planes": [plane]})
     write_json(folder / "config.json", {"task": "aoa", "config": plain(AoaConfig(mix=(1.0,), data="gone"))})
@@ -135,7 +137,7 @@ def _rssi_model() -> RssiModel:
 @functools.cache
 def _field_model(name: str) -> FieldModel:
     room = simulated_room(n=14, grid=AngularGrid.hemisphere(4, 8))
-    return (GeometryModel(GLANCE) if name == "geometry" else make_model(name)).fit(room)
+    return GeometryModel.of_planes(room, [FLOOR]) if name == "geometry" else make_model(name).fit(room)
 
 
 def json_lines(model: FieldModel | RssiModel) -> bytes:

@@ -1,7 +1,7 @@
 """Whatever is done to files and command lines, there is a result that is finite, or one sentence; never a traceback.
 
-40 mutations of files a kind and 12 attempts of any other kind with every test run. `pytest -m fuzz` makes 10,000 and 5,000
-more, 200 command lines, and some whole runs.
+8 mutations of files a kind and 3 attempts of any other kind with every test run. `pytest -m fuzz` makes 10,000 and 5,000
+more, and 200 command lines.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from quick import run
 
-from fuzz.commands import command_lines, right_command_lines
+from fuzz.commands import command_lines
 from fuzz.kinds import ATTEMPTS, KINDS, Attempt
 from fuzz.mutate import spoil
 from swiftwrf import FitError, InputError
@@ -25,11 +25,6 @@ from swiftwrf.data.files import read_table, read_yaml
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.errors import MAX_LENGTH
 from swiftwrf.runtime.checkpoint import Saved
-
-SHORT = 40  # mutations a kind
-SHORT_ATTEMPTS = 12
-LONG = -(-10_000 // len(KINDS))
-LONG_ATTEMPTS = -(-5_000 // len(ATTEMPTS))
 
 
 def attack(kind: str, folder: Path, seeds: range) -> dict[str, int]:
@@ -81,29 +76,24 @@ def test_every_format_and_model_is_fuzzed():
     assert own <= set(KINDS), "add a sample of the model to fuzz/kinds.py"
 
 
+def few_or_many(few: int, many: int):
+    """Give a test few seeds, and many others if a person asks for them."""
+    more = pytest.param(range(few, few + many), marks=pytest.mark.fuzz)
+    return pytest.mark.parametrize("seeds", [range(few), more], ids=["few", "many"])
+
+
+@few_or_many(8, -(-10_000 // len(KINDS)))
 @pytest.mark.parametrize("kind", KINDS)
-def test_mutations(kind, tmp_path):
-    ends = attack(kind, tmp_path, range(SHORT))
+def test_mutations(kind, seeds, tmp_path):
+    ends = attack(kind, tmp_path, seeds)
     assert ends["refused"] > 0
 
 
 @pytest.mark.usefixtures("without_annotation_checks")
+@few_or_many(3, -(-5_000 // len(ATTEMPTS)))
 @pytest.mark.parametrize("kind", ATTEMPTS)
-def test_attempts(kind, tmp_path):
-    attack(kind, tmp_path, range(SHORT_ATTEMPTS))
-
-
-@pytest.mark.fuzz
-@pytest.mark.parametrize("kind", KINDS)
-def test_many_mutations(kind, tmp_path):
-    attack(kind, tmp_path, range(SHORT, SHORT + LONG))
-
-
-@pytest.mark.usefixtures("without_annotation_checks")
-@pytest.mark.fuzz
-@pytest.mark.parametrize("kind", ATTEMPTS)
-def test_many_attempts(kind, tmp_path):
-    attack(kind, tmp_path, range(SHORT, SHORT + LONG_ATTEMPTS))
+def test_attempts(kind, seeds, tmp_path):
+    attack(kind, tmp_path, seeds)
 
 
 def _end(task, arguments, capfd):
@@ -122,32 +112,17 @@ def _end(task, arguments, capfd):
     return code
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_command_lines(seed, tmp_path, monkeypatch, capfd):
+@pytest.mark.parametrize("count", [20, pytest.param(200, marks=pytest.mark.fuzz)])
+def test_command_lines(count, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
-    for task, arguments in command_lines(random.Random(seed), tmp_path, 10):
+    for task, arguments in command_lines(random.Random(count), tmp_path, count):
         _end(task, arguments, capfd)
-
-
-@pytest.mark.fuzz
-def test_many_command_lines(tmp_path, monkeypatch, capfd):
-    monkeypatch.chdir(tmp_path)
-    for task, arguments in command_lines(random.Random(99), tmp_path, 200):
-        _end(task, arguments, capfd)
-
-
-@pytest.mark.fuzz
-def test_right_command_lines(tmp_path, monkeypatch, capfd):
-    monkeypatch.chdir(tmp_path)
-    for task, arguments in right_command_lines(random.Random(0), tmp_path, 5):
-        assert _end(task, arguments, capfd) == 0
-        assert (Path(arguments[-1]) / "metrics.json").exists()
 
 
 text = st.text(alphabet=st.characters(codec="utf-8"), max_size=200)
 
 
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(text)
 def test_any_text_as_yaml_or_table(tmp_path, content):
     file = tmp_path / "file"

@@ -24,7 +24,6 @@ from swiftwrf.data.store import Store
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import search, uncertainty
 from swiftwrf.models.geometry.fit import observe
-from swiftwrf.models.swiftwrf import smallest
 from swiftwrf.rssi.mixing import rounding_std
 from swiftwrf.rssi.pairs import PairPathLoss
 
@@ -179,11 +178,6 @@ def test_a_search_without_reach_finds_no_plane():
     (_, found), *_ = search.find_rooms(scene, reach=1e-4, width=1)
     assert not found.by_side()
     assert search.oblique_planes(scene, scene.direct, 1e-4, 3) == []
-
-
-@pytest.mark.parametrize("losses", [[-2e-8, 1e-8, 3e-8], [0.0, 0.0, 0.0], [1.0, 0.5, 0.499]])
-def test_the_search_for_a_size_finds_one_at_any_loss(losses):
-    assert smallest(lambda size: losses[size - 1], (1, 2)) == (2 if losses[0] == 1.0 else 1)
 
 
 def test_rssi_falls_with_the_distance_beyond_the_data_and_grows_uncertain():

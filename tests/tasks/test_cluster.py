@@ -16,7 +16,7 @@ import pytest
 import torch
 from quick import run, said
 from sums import STEPS, Kill, KillOnce, Sum, results
-from test_interrupts import same_results
+from test_interrupts import RSSI, same_results
 from test_rssi_model import with_field
 
 from swiftwrf import AngularGrid, FitError, InputError, fit_rssi, simulated_room
@@ -29,7 +29,6 @@ distributed = pytest.importorskip("distributed", reason="needs the extra 'cluste
 
 HERE = Path(__file__).parents[1]
 CPU = torch.device("cpu")
-AOA = ("aoa", "--mix", 0.5, "--synthesizer", "idw", "--extra", 10)
 
 
 @pytest.fixture(autouse=True)
@@ -71,12 +70,10 @@ def test_rssi_has_the_same_bits(cluster):
     assert torch.equal(there.predict(data.transmitter_position).mean, here.predict(data.transmitter_position).mean)
 
 
-@pytest.mark.long
-def test_aoa_has_the_same_numbers(local, tmp_path, monkeypatch):
-    monkeypatch.setattr("augment.turbo.experiment.candidates", lambda data: ["idw"])  # rooms have tests of their own
-    assert run(*AOA, "--out", tmp_path / "here") == 0
-    assert run(*AOA, "--scheduler", local.scheduler_address, "--out", tmp_path / "there") == 0
-    same_results("aoa", tmp_path / "here", tmp_path / "there")
+def test_a_run_has_the_same_numbers(local, tmp_path):
+    assert run(*RSSI, "--out", tmp_path / "here") == 0
+    assert run(*RSSI, "--scheduler", local.scheduler_address, "--out", tmp_path / "there") == 0
+    same_results("rssi", tmp_path / "here", tmp_path / "there")
     assert {file.name for file in (tmp_path / "there").iterdir()} == {
         file.name for file in (tmp_path / "here").iterdir()
     }

@@ -7,14 +7,14 @@ import io
 import json
 import sys
 import time
-from functools import cache, partial
+from functools import cache
 from types import SimpleNamespace
 
 import pytest
 import small
 import torch
 
-from swiftwrf import AngularGrid, InputError, Rssi, RssiModel, load, make_model, rssi_room, simulated_room
+from swiftwrf import AngularGrid, Rssi, RssiModel, load, make_model, rssi_room, simulated_room
 from swiftwrf.data.writing import write_rssi
 from swiftwrf.models.geometry import GeometryModel, Plane
 from swiftwrf.online import Follower
@@ -113,12 +113,6 @@ def test_a_directory_of_something_else_is_refused_and_unchanged(follow, model, t
     assert contents(folder) == {name: text.encode() for name, text in files.items()}
 
 
-def test_an_empty_directory_is_taken(follow, model, tmp_path):
-    (tmp_path / "out").mkdir()
-    assert follow(model, content=line(40))[0] == 0
-    assert indices(tmp_path / "out") == [0]
-
-
 @pytest.mark.parametrize("change", ["other", "missing", "rewritten", "data"])
 def test_a_run_goes_on_with_the_model_and_data_that_it_began_with(follow, model, tmp_path, change):
     assert follow(model, content=line(40))[0] == 0
@@ -169,49 +163,6 @@ def test_a_source_goes_on_after_the_lines_learnt_or_begins_again(follow, model, 
     assert code == 130
     assert observed(answers) == expected
     assert indices(tmp_path / "out") == list(range(3 + len(expected)))
-
-
-def rewrite(source):
-    source.write_bytes(b"".join([b"g" * 5 + b"\n"] * 6))
-
-
-def rotate(source):
-    with source.open("ab") as file:
-        file.write(b"c\nrest")
-    source.rename(source.with_suffix(".1"))
-    source.write_bytes(b"d\ne\nf\n")
-
-
-def replace_with_more(source):
-    """Save the file under its name, as editors and rsync do."""
-    source.with_suffix(".new").write_bytes(source.read_bytes() + b"c\nd\n")
-    source.with_suffix(".new").replace(source)
-
-
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        (rewrite, [b"ggggg"] * 6),
-        (rotate, [b"c", b"rest", b"d", b"e", b"f"]),
-        (replace_with_more, [b"c", b"d"]),
-    ],
-)
-def test_a_file_that_changes_while_it_is_followed_loses_no_line(tmp_path, monkeypatch, change, expected):
-    source, waits = tmp_path / "rows.ndjson", []
-    source.write_bytes(b"a\nb\n")
-
-    def sleep(seconds):
-        waits.append(seconds)
-        if len(waits) == 1:
-            change(source)
-        if len(waits) > 4:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(followed_lines, "time", SimpleNamespace(sleep=sleep))
-    found = []
-    with pytest.raises(KeyboardInterrupt):
-        found.extend(one.content.strip() for one in followed_lines.lines(str(source)))
-    assert found == [b"a", b"b", *expected]
 
 
 # rows and spectra
@@ -348,21 +299,6 @@ def test_names_of_receivers_are_any_text(follow, tmp_path, monkeypatch):
     assert any("caf\u00e9 hall stronger" in row["alarm"] for row in rows)
 
 
-def test_answers_are_ascii(follow, model, monkeypatch):
-    monkeypatch.setattr("builtins.print", partial(print_ascii, print))
-    names = ("caf\u00e9", *floor().receiver_names[1:])
-    data = Rssi(floor().rssi_dbm, floor().transmitter_position, receiver_names=names)
-    RssiModel().fit(data.subset(torch.arange(40))).save(model)
-    _, answers, _ = follow(model, content=line(40, rssi_dbm={names[0]: -60.0}))
-    assert answers[0]["observed"]["caf\u00e9"] == -60
-
-
-def print_ascii(write, text, **options):
-    """Print as on a terminal with LC_ALL=C."""
-    text.encode("ascii")
-    write(text, **options)
-
-
 # sources and ends
 
 
@@ -409,11 +345,6 @@ def test_a_last_line_without_its_end(follow, model, tmp_path):
     assert observed(follow(model, source, out=tmp_path / "table")[1]) == [-61]
 
 
-def test_messages_are_whole_lines(follow, model):
-    bad = line(41, rssi_dbm={"receiver with a long name " * 5: -60.0})
-    assert follow(model, content=bad)[2].count("\n") == 1
-
-
 @pytest.mark.parametrize("kind", ["source", "data"])
 def test_names_of_public_data_sets_are_sources(model, tmp_path, monkeypatch, capsys, kind):
     folder = tmp_path / "public" / "tetam-tracks"
@@ -438,8 +369,3 @@ def test_a_line_costs_the_same_in_a_long_record():
     assert time.process_time() - begin < 0.2
     assert found["measurements"] == 100_010
     assert found["mean_error"] == pytest.approx(first.rows[0]["error"])
-
-
-def test_a_source_is_checked():
-    with pytest.raises(InputError, match="is missing"):
-        followed_lines.check_source("nowhere.csv", rssi_model())

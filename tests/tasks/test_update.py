@@ -60,7 +60,7 @@ orders = st.permutations(range(M)), st.lists(st.integers(1, 5), max_size=5)
 
 
 @pytest.mark.parametrize("name", PROCESSES)
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(order=orders[0], sizes=orders[1])
 def test_an_update_in_any_order_is_a_regression_on_all_spectra(name, order, sizes):
     model, rows = fitted(name), N + torch.tensor(order)
@@ -165,7 +165,7 @@ def test_wrong_spectra_are_refused():
         fitted("coarray").aged(0.0)
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(order=st.permutations(range(30)), sizes=orders[1])
 def test_rssi_in_any_order_solves_the_least_squares_of_all_rows(order, sizes):
     model = fitted_rssi()

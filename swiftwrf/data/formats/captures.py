@@ -167,7 +167,7 @@ TOOLS = {
 class Captures(Format[Snapshots]):
     """Packets of a capture and their subcarriers are the snapshots of its position."""
 
-    takes = frozenset({"beamformer", "grid", "every", "round_trip"})
+    takes = frozenset({"beamformer", "grid", "every", "drop_elements", "round_trip"})
 
     def recognises(self, path: Path) -> bool:
         return holds_captures(path)

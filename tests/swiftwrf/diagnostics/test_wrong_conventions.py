@@ -40,6 +40,12 @@ def drawn(change):
     return replace(SPECTRA, store=Store(change(SPECTRA.spectrum)))
 
 
+def whole_sphere():
+    """Spectra with elevations of -90 to 90 degrees."""
+    both = torch.cat([SPECTRA.spectrum.flip(1), SPECTRA.spectrum], dim=1)
+    return replace(SPECTRA, store=Store(both), grid=AngularGrid.hemisphere(48, 96))
+
+
 def placed(change, receivers=False):
     places = change(ROOM.receiver_position) if receivers else ROOM.receiver_position
     return replace(ROOM, transmitter_position=change(ROOM.transmitter_position), receiver_position=places)
@@ -77,6 +83,7 @@ NAMED = {
     "azimuth clockwise": (drawn(lambda s: s.flip(2).roll(1, 2)), "azimuths of the spectra turn clockwise"),
     "azimuth from y": (drawn(lambda s: s.roll(-24, 2)), "azimuths of the spectra count from y"),
     "zenith for elevation": (drawn(lambda s: s.flip(1)), "run from the zenith down"),
+    "elevations of -90 to 90": (whole_sphere(), "give spectrum[:, 24:]"),
     "phases reversed": (replace(DATA, channel=DATA.channel.conj()), "phases have the wrong sign"),
     "phases uncalibrated": (offsets(), "The array is not calibrated"),
     "RSSI, x and y swapped": (placed(lambda p: p[:, [1, 0, 2]]), "x and y of the positions are swapped"),

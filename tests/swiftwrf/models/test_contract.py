@@ -13,6 +13,7 @@ import outside_mean
 import pytest
 import small
 import torch
+from samples import install
 
 import swiftwrf
 from swiftwrf import AngularGrid, FieldModel, InputError, Spectra, load, make_model
@@ -86,12 +87,16 @@ def test_predictions_are_spectra(fitted, room, position, name):
     if found.std is not None:
         assert found.std.shape == found.mean.shape
         assert (found.std >= 0).all()
+    else:
+        with pytest.raises(InputError, match="no standard deviation"):
+            found.interval()
     assert torch.equal(model.predict(position).mean, found.mean)
     assert torch.equal(model.synthesize(position), found.mean)
     alone = torch.cat([model.predict(one[None]).mean for one in position])
     torch.testing.assert_close(alone, found.mean, atol=2e-5, rtol=0)
     assert model.predict(position[:0]).mean.shape == (0, *room.grid.shape)
     model.predict(position.float())
+    assert model.synthesize(torch.tensor([[1e7] * 3, [1e9] * 3], dtype=torch.float64)).isfinite().all()
 
 
 @every
@@ -207,33 +212,23 @@ def test_unknown_names_are_refused():
 
 
 USE = """
-import sys, torch, swiftwrf
-from swiftwrf.models import FIELD_MODELS
-assert "outside_mean" in FIELD_MODELS
-room = swiftwrf.simulated_room(n=12, grid=swiftwrf.AngularGrid.hemisphere(8, 32))
-model = swiftwrf.make_model("outside_mean", seed=1).fit(room)
-assert torch.equal(model.predict(room.position[:2]).mean[1], room.spectrum.mean(dim=0))
-model.save(sys.argv[1])
+import sys
+sys.path.append(sys.argv[1])
+import swiftwrf
+for model in (*map(swiftwrf.load, sys.argv[2:]), swiftwrf.make_model("outside_mean", seed=1)):
+    print(type(model).__name__)
 """
-OPEN = "import sys, swiftwrf; print(type(swiftwrf.load(sys.argv[1])).__module__)"
 
 
-def test_a_model_of_another_package_is_listed_fitted_and_loaded(tmp_path):
+def test_models_of_this_and_other_packages_are_opened_and_made_with_swiftwrf_alone(fitted, room, tmp_path):
     shutil.copy(outside_mean.__file__, tmp_path)
-    installed = tmp_path / "outside_mean-1.dist-info"
-    installed.mkdir()
-    (installed / "METADATA").write_text("Metadata-Version: 2.1\nName: outside-mean\nVersion: 1\n")
-    (installed / "entry_points.txt").write_text("[swiftwrf.models]\noutside_mean = outside_mean:Mean\n")
-
-    def run(script):
-        setup = f"import sys; sys.path.append({str(tmp_path)!r})\n"
-        command = [sys.executable, "-c", setup + script, tmp_path / "model"]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-        return done.stdout.strip()
-
-    run(USE)
-    assert run(OPEN) == "outside_mean"
+    install(tmp_path, "swiftwrf.models", outside_mean="outside_mean:Mean")
+    models = [*map(fitted, ("gp", "hybrid", "vae")), outside_mean.Mean(seed=1).fit(room)]
+    files = [tmp_path / str(number) for number in range(len(models))]
+    for model, file in zip(models, files, strict=True):
+        model.save(file)
+    done = subprocess.run([sys.executable, "-c", USE, tmp_path, *files], capture_output=True, text=True, check=False)
+    assert done.stdout.split() == [*(type(model).__name__ for model in models), "Mean"], done.stderr
 
 
 def test_predictions_of_each_device_are_drawn_tabulated_and_stored(fitted, position):

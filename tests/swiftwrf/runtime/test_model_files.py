@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from samples import install
 
-from swiftwrf import CoarrayModel, InputError, SwiftWRF, fit, load, make_model
-from swiftwrf.models import FIELD_MODELS
+from swiftwrf import CoarrayModel, InputError, SwiftWRF, fit, load
 from swiftwrf.models.swiftwrf_paper import SwiftWRFPaper
 from swiftwrf.runtime.checkpoint import Saved, read, write
 
@@ -144,59 +144,11 @@ def test_a_damaged_state_of_a_fit_is_refused(room, tmp_path):
         SwiftWRFPaper(**TINY).fit(room, checkpoint=state)
 
 
-def test_an_interrupted_fit_has_its_whole_history(room, tmp_path):
-    class Cut(Exception):
-        pass
-
-    whole, first, second = [], [], []
-    SwiftWRFPaper(**TINY).fit(room, on_record=whole.append)
-
-    def cut(record):
-        first.append(record)
-        raise Cut
-
-    with pytest.raises(Cut):
-        SwiftWRFPaper(**TINY).fit(room, checkpoint=tmp_path / "state", on_record=cut)
-    SwiftWRFPaper(**TINY).fit(room, checkpoint=tmp_path / "state", on_record=second.append)
-    assert [(r["step"], r["loss"]) for r in second] == [(r["step"], r["loss"]) for r in whole]
-    assert second[0] == first[0]
-    elapsed = [record["elapsed"] for record in second]
-    assert elapsed == sorted(elapsed)
-    assert elapsed[1] > elapsed[0] >= first[0]["seconds"]
-
-
-@pytest.mark.parametrize("name", list(FIELD_MODELS))
-def test_far_positions_give_finite_spectra(room, small_published, floor_alone, name):
-    model = make_model(name).fit(room)
-    for far in (1e7, 1e9):
-        assert model.synthesize(torch.full((1, 3), far, dtype=torch.float64)).isfinite().all()
-
-
-ONLY_SWIFTWRF = """
-import sys, swiftwrf
-print(type(swiftwrf.load(sys.argv[1])).__name__)
-"""
-
-
-@pytest.mark.long
-def test_models_of_every_kind_are_opened_with_swiftwrf_alone(room, tmp_path, small_published):
-    for name in ("gp", "hybrid", "vae"):
-        make_model(name).fit(room).save(tmp_path / name)
-        opened = subprocess.run(
-            [sys.executable, "-c", ONLY_SWIFTWRF, tmp_path / name], capture_output=True, text=True, check=True
-        )
-        assert opened.stdout.strip() == FIELD_MODELS[name].__name__
-
-
 def test_estimators_are_opened_with_swiftwrf_alone(tmp_path):
     """The entry points of pyproject.toml suffice, as in an installation."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     points = project["entry-points"]["swiftwrf.estimators"]
-    installed = tmp_path / "project-1.dist-info"
-    installed.mkdir()
-    (installed / "METADATA").write_text("Metadata-Version: 2.1\nName: project\nVersion: 1\n")
-    lines = [f"{name} = {value}" for name, value in points.items()]
-    (installed / "entry_points.txt").write_text("\n".join(["[swiftwrf.estimators]", *lines]))
+    install(tmp_path, "swiftwrf.estimators", **points)
     import augment.estimators  # noqa: F401 (defines the kinds)
 
     kinds = {kind for kind, made in Saved.kinds.items() if made.__module__.startswith("augment.estimators")}

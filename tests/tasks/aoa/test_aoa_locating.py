@@ -22,7 +22,7 @@ from augment.cross_validation import LOCATOR
 from augment.estimators import ESTIMATORS
 from augment.turbo.condition import LOCATED, NETWORKS
 from augment.turbo.experiment import Experiment
-from augment.turbo.locating import Locating, containing_level
+from augment.turbo.locating import containing_level
 from swiftwrf import MatchedField, load, make_model
 from swiftwrf.locate import MatchedFieldConfig, Posterior, matched_field
 from swiftwrf.models import FIELD_MODELS
@@ -34,20 +34,23 @@ from tasks.aoa.options import AoaConfig
 from tasks.command_line import command_line
 from tasks.predict.options import PredictConfig
 from tasks.predict.run import run as predict
-from tasks.resume.options import ResumeConfig
-from tasks.resume.run import run as resume
 
 PLANES = {(0.0, 0.0, -1.0): 0.0, (1.0, 0.0, 0.0): 5.0, (0.0, 1.0, 0.0): 4.0}  # outward normal to offset [m]
-FEW_CELLS = MatchedFieldConfig(max_cells=3000, n_best=60, n_background=20, n_rounds=1, n_calibration=16)
+FEW_CELLS = MatchedFieldConfig(max_cells=2000, n_best=40, n_background=20, n_rounds=1, n_calibration=16)
 FIT = MatchedField.fit
 LEFT_OUT = {LOCATED, f"{LOCATOR}, all measured"}
-ON_SNAPSHOTS = {"music", "esprit", "maximum_likelihood"}  # left out too, because the data contain spectra alone
+ON_SNAPSHOTS = {
+    "music",
+    "esprit",
+    "maximum_likelihood",
+    "joint_music",
+}  # left out too, because the data contain spectra alone
 
 
 @pytest.fixture(scope="module")
 def closed_form():
     """Spectra of three planes in closed form, without noise."""
-    data = mirror_room(PLANES, moving="transmitter", n=50)
+    data = mirror_room(PLANES, moving="transmitter", n=40)
     return replace(data, label=data.direction_at(data.position))
 
 
@@ -102,10 +105,10 @@ def mix_of(folder):
 
 @pytest.fixture(scope="module")
 def finished(closed_form, tmp_path_factory):
-    """The directory of a run that locates."""
+    """The directory of a run that locates, with a field model that has no room."""
     folder = tmp_path_factory.mktemp("located") / "run"
     with quickly(closed_form):
-        assert run("--mix", 0.6, "--extra", 0, "--out", folder) == 0
+        assert run("--mix", 0.6, "--extra", 0, "--synthesizer", "nearest", "--out", folder) == 0
     return folder
 
 
@@ -137,38 +140,10 @@ def test_a_known_room_without_noise_is_located(finished):
     error = {name: method["great_circle_deg"]["median"] for name, method in mix["methods"].items()}
     assert error[LOCATED] < 0.3 * error["kernel_regression, measured"]
     assert mix["locating"][LOCATED]["position_error_m"]["median"] < 0.1
-    assert mix["estimator_choice"]["name"] == LOCATED
+    assert mix["estimator_choice"]["name"] == LOCATED  # whatever field models were asked for
+    assert mix["estimator_choice"]["better"] == {}
     alone = {name for name, method in mix["methods"].items() if method["training"] == "measured"}
     assert set(mix["estimator_choice"]["held_out_deg"]) == alone - {"network, measured"}
-
-
-def test_the_recommendation_does_not_depend_on_the_field_models_asked_for(closed_form, tmp_path):
-    """A method that a user can have is never ten times better than the recommended one without a reason."""
-    with quickly(closed_form):
-        assert run("--mix", 0.6, "--extra", 0, "--synthesizer", "nearest", "--out", tmp_path / "run") == 0
-    mix = mix_of(tmp_path / "run")
-    choice, methods = mix["estimator_choice"], mix["methods"]
-    assert choice["name"] == LOCATED
-    assert choice["better"] == {}
-    possible = [m["great_circle_deg"]["median"] for m in methods.values() if m["training"] != "all measured"]
-    assert methods[LOCATED]["great_circle_deg"]["median"] < 10 * min(possible)
-    evaluated = {name for name, method in methods.items() if method["training"] == "measured"}
-    assert set(choice["held_out_deg"]) == evaluated - {
-        "network, measured"
-    }  # kernel regression stands in for the network
-
-
-def test_a_better_method_that_is_not_recommended_has_a_reason(closed_form, tmp_path):
-    """Here the search finds no planes without the spectra of a fold."""
-    with quickly(closed_form), mock.patch("augment.turbo.choice.located_errors", return_value=None):
-        assert run("--mix", 0.6, "--extra", 0, "--synthesizer", "idw", "--out", tmp_path / "run") == 0
-    choice = mix_of(tmp_path / "run")["estimator_choice"]
-    assert LOCATED not in choice["held_out_deg"]
-    assert choice["better"][LOCATED] == "no planes were found without the held-out spectra"
-    assert (
-        f"<code><span>{LOCATED.split()[0]}</span> <span>{LOCATED.split()[1]}</span></code> has 0."
-        in (tmp_path / "run" / "report.html").read_text()
-    )
 
 
 def test_the_report_shows_where_it_was(finished):
@@ -196,28 +171,6 @@ def test_the_trained_locator_is_kept_and_estimates_directions(closed_form, finis
     np.save(tmp_path / "other.npy", np.zeros((1, 5, 5), dtype=np.float32))
     assert command_line("tasks.predict", PredictConfig, predict, [str(file), str(tmp_path / "other.npy")]) == 2
     assert "trained on others" in capsys.readouterr().err
-
-
-def test_a_resumed_run_has_equal_numbers(closed_form, finished, tmp_path, monkeypatch):
-    with quickly(closed_form):
-        honest = Locating.compute
-
-        def interrupt(self, *given):
-            if self.condition.training == "all measured":
-                raise KeyboardInterrupt
-            return honest(self, *given)
-
-        monkeypatch.setattr(Locating, "compute", interrupt)
-        assert run("--mix", 0.6, "--extra", 0, "--out", tmp_path / "cut") == 130
-        monkeypatch.setattr(Locating, "compute", honest)
-        assert command_line("tasks.resume", ResumeConfig, resume, [str(tmp_path / "cut.partial")]) == 0
-    whole, cut = mix_of(finished), mix_of(tmp_path / "cut")
-    for mix in (whole, cut):
-        for entry in (*mix["methods"].values(), *mix["locating"].values()):
-            del entry["seconds"]
-    assert whole["methods"] == cut["methods"]
-    assert whole["locating"] == cut["locating"]
-    assert whole["estimator_choice"] == cut["estimator_choice"]
 
 
 @pytest.mark.parametrize("missing", ["array", "planes"])

@@ -108,6 +108,18 @@ def test_the_chosen_estimator_is_named_as_in_the_results_where_repeats_choose_ot
     assert choice["name"] in found._method_metrics(0.3)[0]
 
 
+def test_a_better_method_that_is_not_recommended_has_a_reason():
+    """Here the search finds no planes without the spectra of a fold."""
+    regression, locator = (replace(MEASURED, estimator=name) for name in ("kernel_regression", LOCATOR))
+    spread = np.linspace(0.9, 1.1, 20)
+    found = results_of({MEASURED: 4 * spread, regression: 2 * spread, locator: spread})
+    found.chosen["0.3"] = {"choice": {"name": "gp"}, "errors": {regression.method: [[2.0, 2.0]]}}
+    found.located_folds["0.3"] = {0: None}
+    choice = found._estimator_choice(0.3)
+    assert choice["name"] == regression.method
+    assert choice["better"] == {locator.method: "no planes were found without the held-out spectra"}
+
+
 def test_the_reference_of_a_gain_is_the_best_estimator_without_synthetic_spectra():
     peak, locator = (replace(MEASURED, estimator=name) for name in ("peak", LOCATOR))
     spread = np.linspace(0.9, 1.1, 20)

@@ -1,14 +1,7 @@
 """Conditions of several repeats that chose differently."""
 
-import json
 from dataclasses import replace
-from itertools import cycle
-from unittest import mock
 
-import pandas as pd
-from quick import run
-
-from augment.turbo.choice import choose_model
 from augment.turbo.condition import Condition, MeasuredSubset, pooled
 from augment.turbo.experiment import Experiment
 from augment.turbo.results import Results
@@ -105,26 +98,3 @@ def test_the_time_of_all_networks_counts():
         metrics = found.summary(0.3)
         assert metrics["seconds"] == {"fit": 4.0, "synthesize": 6.0, "train": 50.0}
         assert metrics["synthesis"]["gp"]["seconds"] == {"fit": 2.0, "synthesize": 1.0}
-
-
-def test_a_run_whose_repeats_choose_differently(tmp_path):
-    chosen = cycle(("gp", "idw"))
-
-    def choose(measured, names, **options):
-        return replace(choose_model(measured, ("gp", "idw"), **options), name=next(chosen))
-
-    with (
-        mock.patch("augment.turbo.choice.choose_model", choose),
-        mock.patch(
-            "augment.turbo.experiment.candidates", return_value=[]
-        ),  # a search for rooms would take most of the time
-    ):
-        assert run("aoa", "--mix", 0.7, "--repeats", 2, "--extra", 0, "--out", tmp_path / "run") == 0
-    methods = json.loads((tmp_path / "run" / "metrics.json").read_text())["mixes"]["0.7"]["methods"]
-    assert [name for name in methods if name.startswith("network, measured +")] == [
-        "network, measured + synthetic (auto)"
-    ]
-    errors = pd.read_csv(tmp_path / "run" / "errors.csv")
-    by_method = errors.groupby("method").size()
-    assert by_method["network, measured + synthetic (auto)"] == by_method["network, measured"]
-    assert "network, measured + synthetic (auto)" in (tmp_path / "run" / "report.html").read_text()

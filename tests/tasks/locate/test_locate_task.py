@@ -55,14 +55,6 @@ def write_rssi(file, data, located=True):
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """The directory of a run on the built-in floor."""
-    folder = tmp_path_factory.mktemp("locate") / "run"
-    assert quick.run("locate", "--cells", 300, "--out", folder, drawn=True) == 0
-    return folder
-
-
-@pytest.fixture(scope="module")
 def matched(tmp_path_factory):
     """Spectra of the built-in room, and the file of a coarse locator that was fitted to them."""
     data = simulated_room(n=40, grid=GRID)
@@ -72,11 +64,11 @@ def matched(tmp_path_factory):
     return data, file
 
 
-def test_a_comparison_without_a_folder_has_the_errors_of_the_command(finished):
+def test_a_comparison_without_a_folder_has_the_errors_of_the_command(locate_run):
     with quick.quick():
         result = compare(rssi_room(n=80), n_cells=300)
-    pd.testing.assert_frame_equal(result.errors, pd.read_csv(finished / "errors.csv"), check_dtype=False)
-    metrics = strict_json(finished / "metrics.json")
+    pd.testing.assert_frame_equal(result.errors, pd.read_csv(locate_run / "errors.csv"), check_dtype=False)
+    metrics = strict_json(locate_run / "metrics.json")
     medians = {name: entry["position_error_m"]["median"] for name, entry in metrics["overall"].items()}
     assert result.summary()["median"].to_dict() == pytest.approx(medians)
     assert {str(level): fraction for level, fraction in result.coverage.items()} == pytest.approx(
@@ -125,8 +117,8 @@ def test_test_rows_reach_no_fit():
         torch.testing.assert_close(values[0]["estimate"], values[1]["estimate"])
 
 
-def test_whole_run(finished):
-    metrics = strict_json(finished / "metrics.json")
+def test_whole_run(locate_run):
+    metrics = strict_json(locate_run / "metrics.json")
     assert (metrics["task"], metrics["data"], metrics["split"], metrics["seed"]) == (
         "locate",
         "simulated-floor",
@@ -136,7 +128,7 @@ def test_whole_run(finished):
     assert (metrics["n_train"], metrics["n_test"], metrics["n_receivers"], metrics["n_undetected"]) == (64, 16, 12, 0)
     assert list(metrics["overall"]) == list(LOCALIZERS)
     assert set(metrics["weights"]) == {"values", "detections", "fingerprints"}
-    errors = pd.read_csv(finished / "errors.csv")
+    errors = pd.read_csv(locate_run / "errors.csv")
     for name, entry in metrics["overall"].items():
         own = errors[errors.method == name]
         assert entry["position_error_m"]["median"] == pytest.approx(own.position_error_m.median())
@@ -153,20 +145,20 @@ def test_whole_run(finished):
     assert sizes == [("posterior", 12), ("knn", 12), ("posterior", 3), ("knn", 3), ("posterior", 6), ("knn", 6)]
 
 
-def test_the_report_shows_errors_calibration_and_posteriors(finished):
-    page = (finished / "report.html").read_text()
+def test_the_report_shows_errors_calibration_and_posteriors(locate_run):
+    page = (locate_run / "report.html").read_text()
     assert "best nearest-neighbour fingerprinting" in page
     assert "What this does not show" in page
-    assert f"swiftwrf predict {finished} SOURCE" in page
-    drawn = {file.stem.partition("-")[0] for file in (finished / "figures").glob("*.svg")}
+    assert f"swiftwrf predict {locate_run} SOURCE" in page
+    drawn = {file.stem.partition("-")[0] for file in (locate_run / "figures").glob("*.svg")}
     assert drawn == {"summary", "errors", "calibration", "studies", "posteriors"}
-    with np.load(finished / "maps.npz") as maps:
+    with np.load(locate_run / "maps.npz") as maps:
         assert maps["density"].shape == (6, len(maps["y"]), len(maps["x"]))
         assert np.nanmax(maps["density"], axis=(1, 2)) == pytest.approx(1)
 
 
-def test_runs_are_merged(finished, tmp_path):
-    assert quick.run("report", finished, finished, "--out", tmp_path / "merged") == 0
+def test_runs_are_merged(locate_run, tmp_path):
+    assert quick.run("report", locate_run, locate_run, "--out", tmp_path / "merged") == 0
     assert "run 2" in (tmp_path / "merged" / "report.html").read_text()
 
 
@@ -195,7 +187,7 @@ def test_rows_that_no_receiver_detected_are_left_out(tmp_path, capsys):
         LocateSplit.of(data, "random", 100, 0)
 
 
-def test_an_interrupted_run_goes_on_to_the_same_numbers(finished, tmp_path):
+def test_an_interrupted_run_goes_on_to_the_same_numbers(locate_run, tmp_path):
     out = tmp_path / "run"
     with mock.patch.object(RegressedCoordinates, "fit", side_effect=KeyboardInterrupt):
         assert run("--cells", 300, "--out", out) == 130
@@ -203,33 +195,33 @@ def test_an_interrupted_run_goes_on_to_the_same_numbers(finished, tmp_path):
     kept = {file.stem for file in (partial / "steps").iterdir()}
     assert {"posterior", "knn", "knn_difference"} <= kept
     assert quick.run("resume", partial) == 0
-    same, other = (pd.read_csv(folder / "errors.csv") for folder in (finished, out))
+    same, other = (pd.read_csv(folder / "errors.csv") for folder in (locate_run, out))
     pd.testing.assert_frame_equal(same, other)
-    assert strict_json(out / "metrics.json")["calibration"] == strict_json(finished / "metrics.json")["calibration"]
+    assert strict_json(out / "metrics.json")["calibration"] == strict_json(locate_run / "metrics.json")["calibration"]
 
 
-def test_positions_of_new_rows(finished, tmp_path, capsys):
-    test = rssi_room(n=80).subset(torch.tensor(pd.read_csv(finished / "errors.csv")["index"].unique()))
+def test_positions_of_new_rows(locate_run, tmp_path, capsys):
+    test = rssi_room(n=80).subset(torch.tensor(pd.read_csv(locate_run / "errors.csv")["index"].unique()))
     known = write_rssi(tmp_path / "known.csv", test)
     unknown = write_rssi(tmp_path / "unknown.csv", test.columns([3, 0, 1, 2, *range(4, 12)]), located=False)
-    assert locate(finished / MODEL, known, "--out", tmp_path / "positions.csv") == 0
+    assert locate(locate_run / MODEL, known, "--out", tmp_path / "positions.csv") == 0
     assert "16 positions, median error" in capsys.readouterr().out
-    assert locate(finished / MODEL, unknown, "--out", tmp_path / "unknown_positions.csv") == 0
+    assert locate(locate_run / MODEL, unknown, "--out", tmp_path / "unknown_positions.csv") == 0
     assert "16 positions: " in capsys.readouterr().out
     found, other = pd.read_csv(tmp_path / "positions.csv"), pd.read_csv(tmp_path / "unknown_positions.csv")
     columns = ["index", "x_m", "y_m", "z_m", "std_x_m", "std_y_m", "std_z_m", "credible_radius_80_m", "ambiguous"]
     assert list(other) == columns
     assert list(found) == [*columns, "truth_x_m", "truth_y_m", "truth_z_m", "position_error_m"]
     pd.testing.assert_frame_equal(found[columns], other)
-    errors = pd.read_csv(finished / "errors.csv").query("method == 'posterior'")
+    errors = pd.read_csv(locate_run / "errors.csv").query("method == 'posterior'")
     assert found.equals(found.round(dict.fromkeys([c for c in found if c.endswith("_m")], 3)))
     np.testing.assert_allclose(found.position_error_m, errors.position_error_m, atol=5.001e-4)
 
 
-def test_receivers_of_the_model_are_found_by_name(finished, tmp_path, capsys):
+def test_receivers_of_the_model_are_found_by_name(locate_run, tmp_path, capsys):
     data = rssi_room(n=80)
     some = replace(data.columns([1, 0]), receiver_names=("receiver02", "kitchen"))
-    locator = load(finished / MODEL)
+    locator = load(locate_run / MODEL)
     placed = aligned(some, locator.receiver_names, ignore_others=True)
     assert placed.receiver_names == locator.receiver_names
     torch.testing.assert_close(placed.rssi_dbm[:, 1], data.rssi_dbm[:, 1], equal_nan=True)
@@ -251,34 +243,34 @@ def test_a_table_without_positions(tmp_path):
     assert read_rssi(str(write_rssi(tmp_path / "c.csv", rssi_room(n=20))), ReadOptions())[1]
 
 
-def test_other_rows_are_refused(finished, matched, tmp_path, capsys):
+def test_other_rows_are_refused(locate_run, matched, tmp_path, capsys):
     data, out = rssi_room(n=20), tmp_path / "out.csv"
     others = write_rssi(tmp_path / "a.csv", replace(data, receiver_names=tuple("abcdefghijkl")))
-    assert locate(finished / MODEL, others, "--out", out) == 2
+    assert locate(locate_run / MODEL, others, "--out", out) == 2
     assert "has other receivers (a, b" in said(capsys)
-    assert locate(finished / MODEL, others, "--every", 2, "--out", out) == 2
+    assert locate(locate_run / MODEL, others, "--every", 2, "--out", out) == 2
     assert "--every is for reading spectra" in said(capsys)
     assert not out.exists()
 
 
-def test_no_receiver_detected(finished, tmp_path, capsys):
+def test_no_receiver_detected(locate_run, tmp_path, capsys):
     data = rssi_room(n=20)
     data.rssi_dbm[:] = torch.nan
     with mock.patch("tasks.predict.observations.read_rssi", return_value=(data, True)):
-        assert locate(finished / MODEL, "walk", "--out", tmp_path / "out.csv") == 2
+        assert locate(locate_run / MODEL, "walk", "--out", tmp_path / "out.csv") == 2
     assert "no receiver of" in said(capsys)
     data.rssi_dbm[3] = -70.0
     with mock.patch("tasks.predict.observations.read_rssi", return_value=(data, True)):
-        assert locate(finished / MODEL, "walk", "--out", tmp_path / "out.csv") == 0
+        assert locate(locate_run / MODEL, "walk", "--out", tmp_path / "out.csv") == 0
     assert "left out: 19" in capsys.readouterr().err
     assert pd.read_csv(tmp_path / "out.csv")["index"].tolist() == [3]
 
 
-def test_receivers_that_moved_are_refused(finished, tmp_path, capsys):
+def test_receivers_that_moved_are_refused(locate_run, tmp_path, capsys):
     data = rssi_room(n=20)
     moved = replace(data, receiver_position=data.receiver_position + torch.tensor([0.0, 2.0, 0.0]))
     with mock.patch("tasks.predict.observations.read_rssi", return_value=(moved, True)):
-        assert locate(finished / MODEL, "walk", "--out", tmp_path / "out.csv") == 2
+        assert locate(locate_run / MODEL, "walk", "--out", tmp_path / "out.csv") == 2
     assert "receiver01 2 m away from its position" in said(capsys)
 
 

@@ -34,12 +34,11 @@ from tasks.options import plain
 from tasks.page.maps import FloorPlan, colour_image
 from tasks.update.record import Record
 from tasks.view import charts, spectra
-from tasks.view.locating import N_POSITIONS, RssiLocating
+from tasks.view.locating import RssiLocating
 from tasks.view.options import ViewConfig
 from tasks.view.rssi import MapSelection, RssiView, at_least, probability_above
 from tasks.view.run import run
 from tasks.view.sources import open_source
-from tasks.view.spectra import angle_between
 
 GRID = AngularGrid.hemisphere(15, 60)
 needs_the_extra = pytest.mark.skipif(find_spec("nicegui") is None, reason="needs the extra view")
@@ -179,11 +178,6 @@ def test_far_ends_leave_room_to_drag(aoa_run):
     assert far.box[1][0] == pytest.approx(view.positions[:, 0].max() + spectra.MAX_BEYOND_DATA * width)
 
 
-def test_angles_are_great_circles():
-    assert angle_between((350, 0), (10, 0)) == pytest.approx(20)
-    assert angle_between((0, 80), (180, 80)) == pytest.approx(20)
-
-
 def test_measurements_that_changed_or_went_are_not_shown(aoa_run, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(aoa_run, folder)
@@ -311,6 +305,12 @@ def located_floor():
     return RssiLocator(n_cells=400).fit(train), data, torch.isin(data.index, train.index)
 
 
+@pytest.fixture(autouse=True)
+def few_positions(monkeypatch):
+    """Fewer positions on maps of expected errors, each of which takes many located rows."""
+    monkeypatch.setattr("tasks.view.locating.N_POSITIONS", 60)
+
+
 @pytest.fixture
 def locating(located_floor):
     return RssiLocating(*located_floor)
@@ -348,7 +348,7 @@ def test_expected_error_is_that_of_the_test_rows(locating, located_floor):
     error = (locator.locate(test.rssi_dbm).median - test.transmitter_position).norm(dim=1).mean()
     expected = locating.expected_error
     inside = np.isfinite(expected.values)
-    assert 0.5 * N_POSITIONS <= inside.sum() <= 2 * N_POSITIONS
+    assert 30 <= inside.sum() <= 120
     assert expected.values[inside].mean() == pytest.approx(float(error), rel=0.5)
     assert np.isnan(expected.at(1e3, 0))
     again = RssiLocating(*located_floor).expected_error
@@ -422,7 +422,7 @@ def test_posterior_of_a_spectrum_is_that_of_the_locator(aoa_run, room, tmp_path)
     assert x0 <= low[0] <= high[0] <= x1
     assert y0 <= low[1] <= high[1] <= y1
     assert np.nanmax(found.density.values) == 1
-    shutil.copy(folder / "model-mix1.safetensors", folder / "matched_field-mix1.safetensors")
+    shutil.copy(folder / "swiftwrf-mix1.safetensors", folder / "matched_field-mix1.safetensors")
     with pytest.raises(InputError, match="expected a matched-field locator"):
         open_source(folder).models[1].locator  # noqa: B018
 
@@ -466,14 +466,6 @@ def test_without_the_extra(capsys, monkeypatch, rssi_run):
     assert "pip install 'swiftwrf-tasks[view]'" in said(capsys, rssi_run)
 
 
-def test_records_that_are_damaged(aoa_run, tmp_path):
-    folder = tmp_path / "run"
-    shutil.copytree(aoa_run, folder)
-    (folder / "geometry-mix1.json").write_text("{}")
-    with pytest.raises(InputError, match="not those of a run"):
-        open_source(folder)
-
-
 def test_a_dropped_floor_plan_lies_at_its_scale_and_origin_and_stays(rssi_run, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(rssi_run, folder)
@@ -508,7 +500,7 @@ def test_a_followed_run_is_read_again_when_it_grows(tmp_path):
     assert view.snapshot() is shown
     assert [row["index"] for row in shown.rows] == [62, 61, 60]
     assert shown.rows[0]["alarm"] == "hall weaker everywhere"
-    assert "change at measurement 2: hall weaker everywhere" in shown.sentences
+    assert "Change at measurement 2: hall weaker everywhere." in shown.sentences
     assert all(figure.startswith("<svg") for figure in shown.figures.values())
     record.append(tmp_path, record.add(63, step))
     assert view.version != shown.version
