@@ -5,7 +5,7 @@ from __future__ import annotations
 from statistics import mean
 from typing import Any
 
-from record import load, markdown
+from record import RESULTS, load, markdown
 
 SPECTRA = ("locating_rooms", "locating_newrf")  # results of locating_aoa.py
 RELEVANT_DB = 0.02  # difference of medians below which predictors are level
@@ -38,7 +38,8 @@ def rssi_glance() -> str:
 def channels() -> str:
     """Return errors of matched fields on channels, and coherence and errors of channels predicted at unseen positions."""
     rows = []
-    for scene, fractions in load("channels_1")["scenes"].items():
+    files = sorted(RESULTS.glob("channels_*.json"))  # channels_ and the number of subcarriers, then perhaps the scene
+    for name, scene, fractions in [(f.stem, *item) for f in files for item in load(f.stem)["scenes"].items()]:
         for fraction, found in fractions.items():
             row = found["median"]
             error = [f"{row[key]['median']:.2g} / {row[key]['p90']:.2g}" for key in ("angle_deg", "position_m")]
@@ -47,8 +48,9 @@ def channels() -> str:
                 for name in ("nearest", "gaussian_process", "planes", "furniture")
                 if name in row["channel"]
             ]
-            rows.append([scene, f"{float(fraction):.0%}", *error, f"{row['coverage_80']:.0%}", *predicted])
-    columns = ["scene", "measured", "angle [deg]", "position [m]", "80 % regions hold"]
+            what = [scene, f"{float(fraction):.0%}", name.split("_")[1], str(len(found["draws"]))]
+            rows.append([*what, *error, f"{row['coverage_80']:.0%}", *predicted])
+    columns = ["scene", "measured", "subcarriers", "draws", "angle [deg]", "position [m]", "80 % regions hold"]
     return markdown([*columns, "nearest", "Gaussian process", "planes", "planes and furniture"], rows)
 
 

@@ -16,8 +16,10 @@ import tyro
 from record import ROOT, load, markdown
 
 from augment.turbo.condition import LOCATED, MEASURED_NETWORK
+from swiftwrf.choices import ROOMS
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.datasets import catalogue
+from tasks import labels
 from tasks.command import COMMANDS
 from tasks.options import OffsetSource, SpectraSource
 
@@ -128,6 +130,21 @@ def commands() -> str:
                 found.setdefault((name, meaning), []).append(f"`{command}`")
     rows = [[f"`{name}`", ", ".join(names), meaning] for (name, meaning), names in sorted(found.items())]
     return markdown(["option", "commands", "meaning"], rows)
+
+
+def predictors() -> str:
+    """Return the predictors of RSSI."""
+    return markdown(["predictor", "method"], [[f"`{name}`", one.meaning] for name, one in labels.PREDICTORS.items()])
+
+
+def localizers() -> str:
+    """Return the localizers."""
+    return markdown(["localizer", "estimate"], [[f"`{name}`", one.meaning] for name, one in labels.LOCALIZERS.items()])
+
+
+def rooms() -> str:
+    """Return the built-in rooms of ray tracing."""
+    return markdown(["`--room`", "scene"], [[f"`{name}`", meaning] for name, meaning in ROOMS.items()])
 
 
 MODULES = (aoa_tables, field_tables, rssi_tables, speed_tables)

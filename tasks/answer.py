@@ -33,7 +33,7 @@ class Method:
 
 @dataclass(frozen=True)
 class NextStep:
-    """What to do next: a sentence, and a line of code to copy, if there is one."""
+    """Sentence on what to do next, and a line of code to copy, if there is one."""
 
     text: str
     code: str = ""

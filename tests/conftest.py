@@ -127,7 +127,7 @@ def aoa_run(tmp_path_factory: pytest.TempPathFactory, room: Spectra) -> Path:
         options = ("--synthesizer", "swiftwrf", "--extra", 0, "--data", folder / "data", "--out", folder / "run")
         with mock.patch("augment.turbo.experiment.candidates", return_value=["idw"]), quick.recorded(folder):
             assert quick.run("aoa", "--mix", 0.5, 1, *options, drawn=True) == 0
-        make_model("idw").fit(room).save(folder / "run" / "model-mix1.safetensors")
+        make_model("idw").fit(room).save(folder / "run" / "swiftwrf-mix1.safetensors")
 
     return made_once(tmp_path_factory, "aoa", make) / "run"
 

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from swiftwrf import Spectra, SwiftWRF
+from swiftwrf import Spectra
 from swiftwrf.models import FieldModel
 from swiftwrf.models.neighbours import MemoryModel
 from swiftwrf.runtime.durable import write_json, write_npz
 
-MODEL_FILE = "model"  # name of the file of a swiftwrf model; other field models have their own names
 N_LAYERS = 3  # of heights between which furniture is shown
 
 
@@ -24,7 +23,7 @@ def model_file(folder: Path, name: str, key: str) -> Path:
         name: Name of the field model.
         key: Measured fraction in file names.
     """
-    return folder / f"{MODEL_FILE if name == SwiftWRF.name else name}-mix{key}.safetensors"
+    return folder / f"{name}-mix{key}.safetensors"
 
 
 def save_artifacts(model: FieldModel, key: str, measured: Spectra, test: Spectra, folder: Path) -> None:

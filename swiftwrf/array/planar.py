@@ -177,7 +177,7 @@ class PlanarArray:
     def resolution(self) -> float:
         """Error of a direction [rad] that costs a tenth of the power of the direct path, near the array's normal."""
         axes = 1 if self.axis is not None else 2
-        width = float((self.element - self.element.mean(dim=0)).square().sum(dim=1).mean() / axes) ** 0.5
+        width = math.sqrt(float((self.element - self.element.mean(dim=0)).square().sum(dim=1).mean() / axes))
         return math.sqrt(0.1) * self.wavelength / (math.tau * width)
 
     def spectrum(self, channel: Tensor, grid: AngularGrid, beamformer: str = PHASE) -> Tensor:

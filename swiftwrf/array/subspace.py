@@ -146,8 +146,8 @@ def _earliest(array: PlanarArray, channel: Tensor) -> Tensor:
         at_subcarrier = torch.exp(1j * math.tau * delay[..., None] * torch.arange(size))
         wave = (at_element[..., None] * at_subcarrier[..., None, :]).flatten(2)
         inside = cosine.norm(dim=-1) <= 1 + EDGE
-        fraction: Tensor = (wave @ signal.flatten(1, 2)).abs().square().sum(-1) / wave.shape[-1]
-        return fraction * inside
+        matched: Tensor = (wave @ signal.flatten(1, 2)).abs().square().sum(-1) / wave.shape[-1] * inside
+        return matched
 
     each = torch.cat([power(cosine[None], at.expand(1, len(cosine))) for at in delay], dim=1)
     whole = each.reshape(n, 1, len(delay), len(axis), -1)

@@ -203,7 +203,9 @@ def read_table(file: Path, header: bool = True) -> pd.DataFrame:
 
 
 def has_header(file: Path) -> bool:
-    """Return False if the first line of a CSV file holds values: numbers alone, with signs, fractions or twice the same."""
+    """Return False if the first line of a table holds values: numbers alone, with signs, fractions or twice the same."""
+    if file.suffix.lower() == ".parquet":
+        return True
     line = read_text(file).split("\n", 1)[0]
     return not _holds_values(next(csv.reader([line], delimiter=max(SEPARATORS, key=line.count)), []))
 

@@ -65,6 +65,7 @@ ADDRESS = re.compile(r"((?:[0-9a-f]{2}[:-]?){4}[0-9a-f]{2})[:-]?[0-9a-f]{2}", re
 MAX_FROM_ORIGIN_DEG = 2.0  # of receivers in degrees
 MIN_EXTENT_OF_WALK_M = 3.0
 MAX_SPEED_OF_MILLISECONDS, MAX_STEP_M = 2e-3, 1.0  # [m/s] if they were seconds, and between rows of a log of movement
+N_PHASES = 20  # of windows that are compared
 MIN_REPEATED_RECEIVERS, MIN_REPEATED = 3, 0.05  # with the same values, and fraction of rows, of scans that are repeated
 
 
@@ -88,11 +89,13 @@ def read_survey(
     up: Up = "z",
     window: float | None = None,
     receivers: Path | None = None,
+    keeps_rows: bool = False,
 ) -> dict[str, Any]:
     """Return the arguments of `Rssi` that a survey table determines: RSSI, positions, receivers and what rows are of.
 
     Columns get their roles, cells their units, and then rows are formed: one a place, time and packet of a receiver. The
-    label names the table in messages. Options are those of `load_rssi`, receivers is a table of their positions.
+    label names the table in messages. Options are those of `load_rssi`, receivers is a table of their positions. With
+    keeps_rows, repeated scans stay.
 
     Raises:
         InputError: A column that is missing or ambiguous, or a value that is no position or received power.
@@ -137,10 +140,10 @@ def read_survey(
     repeated = _repeated_scans(coordinate[row], rssi[row])
     if repeated.any():
         missing.append(
-            f"rows that repeat all values of the row before at another place, as cached scans do, are left out: "
-            f"{int(repeated.sum())} of {len(row)}"
+            f"rows that repeat all values of the row before at another place, as cached scans do, "
+            f"{'stay because of the given splits' if keeps_rows else 'are left out'}: {int(repeated.sum())} of {len(row)}"
         )
-        row = row[~repeated]
+        row = row if keeps_rows else row[~repeated]
     notes += missing
     position, origin, found = _local_metres(label, table, roles, coordinate[row], coordinates)
     notes += found
@@ -344,10 +347,19 @@ def _split_packets(rssi: Floats, time: Floats) -> list[str]:
 def _windows(
     kind: NDArray[Any], time: Floats, rssi: Floats, position: Floats, window: float
 ) -> tuple[NDArray[np.int64], Floats, Floats, Floats]:
-    """Return the first row, and mean RSSI [dBm], position and time of the rows in each window. Kinds are kept apart."""
+    """Return the first row, and mean RSSI [dBm], position and time of the rows in each window. Kinds are kept apart.
+
+    Windows begin where the cycles of the receivers do: where they contain the fewest packets of one receiver twice.
+    """
     alone = -1.0 - np.arange(len(time))  # rows without a time
-    keys = pd.DataFrame({"kind": kind, "window": np.where(np.isnan(time), alone, (time - np.nanmin(time)) // window)})
-    number = keys.groupby(["kind", "window"], sort=False).ngroup().to_numpy()
+    row, receiver = np.nonzero(~np.isnan(rssi))
+    most = -1
+    for phase in np.linspace(0, 1, N_PHASES, endpoint=False):
+        place = np.where(np.isnan(time), alone, np.floor((time - np.nanmin(time)) / window + phase))
+        keys = pd.DataFrame({"kind": kind, "window": place})
+        tried = keys.groupby(["kind", "window"], sort=False).ngroup().to_numpy()
+        if (n := len(np.unique(tried[row] * rssi.shape[1] + receiver))) > most:
+            most, number = n, tried
     _, first = np.unique(number, return_index=True)
     n_rssi, n_position = rssi.shape[1], position.shape[1]
     means = pd.DataFrame(np.column_stack([rssi, position, time])).groupby(number).mean().to_numpy()

@@ -167,6 +167,9 @@ def speed(axes: Axes, palette: Palette, points: Mapping[str, tuple[float, float]
     for marker, (name, (cost, error)) in zip("osD^vP", points.items(), strict=False):
         axes.plot(max(cost, 1e-4), error, marker, color=palette.colour(name), label=name)
     axes.set(xscale="log", xlabel=x, ylabel=y, ylim=(0, None))
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 3)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter("")
     _named_below(axes)
 
 

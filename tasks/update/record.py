@@ -133,8 +133,7 @@ class Record:
         found = self.summary()
         changes = len(self.alarms)
         text = [
-            f"{changes or 'No'} change{'' if changes == 1 else 's'} detected in {found['measurements']} measurements, which "
-            "the model has learnt.",
+            f"{changes or 'No'} change{'' if changes == 1 else 's'} detected, {found['measurements']} measurements learnt.",
             f"Their mean error is {found['mean_error']:.4g}{self.unit} before each was learnt, "
             f"{found['last_running_error'] or float('nan'):.4g} over the last {WINDOW}.",
         ]

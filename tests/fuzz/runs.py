@@ -76,7 +76,9 @@ def run_of_rssi(folder: Path) -> None:
 
 
 def run_of_aoa(folder: Path) -> None:
-    fit(simulated_room(n=20, grid=AngularGrid.hemisphere(4, 8)), n_primitives=3).save(folder / "model-mix1.safetensors")
+    fit(simulated_room(n=20, grid=AngularGrid.hemisphere(4, 8)), n_primitives=3).save(
+        folder / "swiftwrf-mix1.safetensors"
+    )
     plane = {"normal": [1.0, 0, 0], "offset_m": 6.0, "gain": -0.5, "std_mm": 1.0, "certain": True}
     write_json(folder / "geometry-mix1.json", {"planes": [plane]})
     write_json(folder / "config.json", {"task": "aoa", "config": plain(AoaConfig(mix=(1.0,), data="gone"))})

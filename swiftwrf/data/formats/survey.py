@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from swiftwrf.data.columns import is_rssi
+from swiftwrf.data.columns import is_coordinate, is_rssi
 from swiftwrf.data.files import SUFFIXES, digests, has_header, read_table
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
 from swiftwrf.data.formats.captures import holds_captures
@@ -19,7 +19,8 @@ from swiftwrf.data.survey import has_positions, read_survey
 from swiftwrf.errors import InputError, listed
 
 RECEIVERS = "receivers.csv"  # beside the table: receiver,x,y,z
-HALF = re.compile(r"[ _-]*(?:rssi?|crd|coord(?:inate)?s?|pos(?:ition)?s?|loc(?:ation)?s?|places?)(?![a-z])[ _-]*")
+COORDINATES = re.compile(r"(?:crd|coord(?:inate)?s?|pos(?:ition)?s?|loc(?:ation)?s?|places?)(?![a-z])")
+HALF = re.compile(rf"[ _-]*(?:rssi?(?![a-z])|{COORDINATES.pattern})[ _-]*")
 MAX_COORDINATES = 6  # columns of a table of positions: x, y, z, floor, building, ...
 
 
@@ -38,13 +39,14 @@ class SurveyTable(Format[Rssi]):
         file, others, table = _table(path)
         receivers = file.with_name(RECEIVERS)
         stated = receivers if receivers.is_file() else None
-        data = Rssi(**read_survey(file, table, **options.given, receivers=stated), name=file.stem)
+        splits = read_splits(file.parent, len(table), first=0)
+        found = read_survey(file, table, **options.given, receivers=stated, keeps_rows=bool(splits))
+        data = Rssi(**found, name=file.stem)
         if data.receiver_moves and bool(data.receiver_position.isnan().any()):
             raise InputError(
                 f"{file}: column {options.transmitter[0]} has names of positions, so {RECEIVERS} beside it must contain "
                 "each of them"
             )
-        splits = read_splits(file.parent, len(table), first=0)
         return replace(
             data,
             named_splits=kept_splits(splits, data.index, len(table)),
@@ -65,42 +67,35 @@ def _tables(path: Path) -> list[Path]:
 def _table(path: Path) -> tuple[Path, list[Path], pd.DataFrame]:
     """Return the file of RSSI, other files that its table is of, and the table, which may be in two halves."""
     files = _tables(path)
-    if path.is_file() and not _is_whole(path):
-        related = [file for file in _tables(path.parent) if _set_of(file) == _set_of(path)]
+    if path.is_file() and not has_header(path):
+        name_of_both = HALF.sub("", path.stem.lower())
+        related = [file for file in _tables(path.parent) if HALF.sub("", file.stem.lower()) == name_of_both]
         files = related if len(related) == 2 else files
     if len(files) == 1:
         return files[0], [], read_table(files[0])
-    tables = {file: read_table(file, header=_is_whole(file)) for file in files} if len(files) == 2 else {}
-    halves = {_holds_places(table): file for file, table in tables.items()}
+    tables = {file: read_table(file, header=has_header(file)) for file in files} if len(files) == 2 else {}
+    halves = {_holds_places(file, table): file for file, table in tables.items()}
     if halves.keys() != {False, True} or len({len(table) for table in tables.values()}) > 1:
         raise InputError(
             f"{path} holds {len(files)} tables ({listed(file.name for file in files)}); name the one to read"
         )
     file, other = halves[False], halves[True]
     rssi, place = tables[file], tables[other]
-    if not _is_whole(other):
+    if not has_header(other):
         place = place.iloc[:, :3].set_axis(["x", "y", "z"][: place.shape[1]], axis=1)
-    if not _is_whole(file):
+    if not has_header(file):
         rssi = rssi.add_prefix("receiver")
     table = pd.concat([place, rssi], axis=1)
     table.attrs["notes"] = [f"{file.name} holds the RSSI and {other.name} the positions of the same {len(table)} rows"]
     return file, [other], table
 
 
-def _is_whole(file: Path) -> bool:
-    return file.suffix.lower() != ".csv" or has_header(file)
-
-
-def _set_of(file: Path) -> str:
-    """Return the name of the set of measurements that a file is a half of."""
-    return HALF.sub("", file.stem.lower())
-
-
-def _holds_places(table: pd.DataFrame) -> bool | None:
+def _holds_places(file: Path, table: pd.DataFrame) -> bool | None:
     """Return True for a table of positions alone, False for one of RSSI alone, None for another one."""
-    powers = [is_rssi(table[name]) for name in table]
+    powers = [is_rssi(table[name]) and not is_coordinate(name) for name in table]
     if has_positions(table, {}):
-        return True if not any(powers[2:]) and len(powers) <= MAX_COORDINATES else None
-    if all(powers):
-        return False
-    return True if 2 <= len(powers) <= MAX_COORDINATES and "1" in table else None
+        return None if any(powers) or len(powers) > MAX_COORDINATES else True
+    may_be_places = 2 <= len(powers) <= MAX_COORDINATES and "1" in table  # without header
+    if may_be_places and (not all(powers) or COORDINATES.search(file.stem.lower())):
+        return True
+    return False if all(powers) else None

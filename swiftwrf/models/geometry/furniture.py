@@ -37,13 +37,13 @@ from swiftwrf.runtime.threads import parallel_map, single_thread
 
 Floats = NDArray[np.float64]
 MAX_VOXELS = 50_000
+MIN_SHOWN_DB = 1.0  # absorption [dB/m] of a voxel in JSON: less differs little from empty space
 N_STEPS = 150  # of Adam
 TENSORS = ("low", "absorption", "reflectivity", "crossed_m")
 SETTINGS = ((2.0, 1e-3), (1.0, 1e-3), (2.0, 3e-3))  # edge of a voxel [wavelengths] and weight of the penalty
 SIGNIFICANCE = 2.5  # standard errors by which furniture must explain held-out channels better
 SURFACE_SIGNIFICANCE = 2.5  # the same of each surface
 MAX_CHOICE = 200  # positions that choose the settings
-MAX_SEARCH = 600  # positions by which surfaces are searched
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +109,27 @@ class Furniture:
         if len(shape) != 3 or not (found.voxel_m > 0 and float(found.absorption.min()) >= 0):
             raise InputError("voxels of furniture need three dimensions, an edge above 0 and no negative absorption")
         return found
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what stands in the room as plain values.
+
+        Returns:
+            Corner, edge and numbers of the voxels, the absorption [dB/m] of those that measured paths cross and that absorb
+            more than 1 dB/m, by their indices, and normal, offset [m] and mean reflectivity of each surface.
+        """
+        decibel = 20 / math.log(10) * self.absorption
+        rows = ((self.crossed_m > 0) & (decibel > MIN_SHOWN_DB)).nonzero()
+        mean = self.reflectivity[len(self.reflectivity) - len(self.surfaces) :].mean(dim=1).tolist()
+        return {
+            "low_m": self.low.tolist(),
+            "voxel_m": self.voxel_m,
+            "shape": [*self.absorption.shape],
+            "voxels": [[*row, round(float(decibel[tuple(row)]), 2)] for row in rows.tolist()],
+            "surfaces": [
+                {"normal": [*surface.normal], "offset_m": surface.offset_m, "reflectivity": value}
+                for surface, value in zip(self.surfaces, mean, strict=True)
+            ],
+        }
 
     def gains(self, planes: PlaneSet, scene: PhaseObservations) -> Tensor:
         """Return the gains of the direct path and of each image at the positions of a scene, float32 (n, 1 + S).
@@ -403,8 +424,7 @@ def find_furniture(
     if advantage(with_furniture[best], alone) < SIGNIFICANCE:
         return None
     found = fit_furniture(planes, measured, empty[best])
-    many = measured.subset(torch.linspace(0, len(measured.value) - 1, min(MAX_SEARCH, len(measured.value))).long())
-    surfaces = find_surfaces(planes, found.gains(planes, many.scene), many, low, high)
+    surfaces = find_surfaces(planes, found.gains(planes, measured.scene), measured, low, high)
     if not surfaces:
         return found
     wider = empty[best].with_surfaces(surfaces)

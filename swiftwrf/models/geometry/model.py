@@ -267,8 +267,9 @@ class GeometryModel(Linked, FieldModel):
         return torch.cat([at, found]), torch.cat([strength, room.image_gain[0]]), torch.cat([order, reflections])
 
     def to_json(self) -> dict[str, Any]:
-        """Return the room as plain values, see `RoomEstimate.to_json`."""
-        return self.estimate.to_json()
+        """Return the room as plain values, see `RoomEstimate.to_json`, and the `Furniture`, if there is any."""
+        furniture = None if self.furniture is None else self.furniture.to_json()
+        return self.estimate.to_json() | ({} if furniture is None else {"furniture": furniture})
 
     def region(self) -> Tensor:
         """Return the middle of the room and two opposite corners (3, 3) [m]."""
@@ -280,7 +281,7 @@ class GeometryModel(Linked, FieldModel):
         return torch.stack([(low + high) / 2, low, high])
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
-        header = self.to_json() | {"conclusion": self.conclusion, "fingerprint": self.fingerprint}
+        header = self.estimate.to_json() | {"conclusion": self.conclusion, "fingerprint": self.fingerprint}
         if self.furniture is None:
             return {"covariance": self.estimate.covariance}, header
         tensors, own = self.furniture.state()

@@ -29,6 +29,8 @@ SIDE_LOBE = 0.2  # of the strongest improvement: less may be left of a surface t
 MARGIN = 2.0  # wavelengths beyond the voxels
 STEP = 1 / 12  # of the offsets of the scan, in wavelengths
 CELL, MAX_CELLS = 4.0, 12  # least edge of a cell in wavelengths, and cells along each side of the region
+MAX_OFFSETS = 4000  # along each axis, those nearest to the fixed end
+MAX_CHANNELS = 10_000  # positions times elements by which surfaces are searched
 BATCH = 16  # offsets whose waves stay in a processor's cache
 
 
@@ -42,7 +44,10 @@ def find_surfaces(planes: PlaneSet, gain: Tensor, measured: Channels, low: Tenso
         low: Lower corner of the region with furniture, (3,) [m].
         high: Opposite corner (3,) [m].
     """
+    n, _, n_elements = measured.value.shape
+    rows = torch.linspace(0, n - 1, min(n, max(1, MAX_CHANNELS // n_elements))).long()
     ends = torch.tensor([0, len(measured.frequency) - 1]).unique()
+    measured, gain = measured.subset(rows), gain[rows]
     measured = replace(measured, value=measured.value[:, ends], frequency=measured.frequency[ends])
     scene = measured.scene
     wavelength = math.tau / scene.wavenumber
@@ -51,6 +56,7 @@ def find_surfaces(planes: PlaneSet, gain: Tensor, measured: Channels, low: Tenso
 
     def scanned(axis: int) -> list[tuple[float, int, float]]:
         offset = torch.arange(float(low[axis]) - margin, float(high[axis]) + margin, step, dtype=torch.float64)
+        offset = offset[(offset - residual.fixed[axis]).abs().argsort()[:MAX_OFFSETS].sort().values]
         parts = [residual.improvement(axis, some)[0].mean(-1).amax(0) for some in offset.split(BATCH)]
         value = torch.cat(parts)
         top = (value[1:-1] > value[:-2]) & (value[1:-1] >= value[2:]) & (value[1:-1] > 0)

@@ -182,7 +182,7 @@ def test_rows_of_different_lengths_are_refused(table, tmp_path):
 def test_rssi_and_coordinates_in_two_files(table, tmp_path, names, header):
     rssi = table[["a", "b", "c", "d"]].mask(table[["a", "b", "c", "d"]] < -75, 100)
     rssi.astype(int).to_csv(tmp_path / names[0], index=False, header=header)
-    table[["x", "y"]].assign(z=3.5).to_csv(tmp_path / names[1], index=False, header=header)
+    table[["x", "y"]].sub([40, 30]).assign(z=3.5).to_csv(tmp_path / names[1], index=False, header=header)  # negative
     data = load_rssi(tmp_path)
     named = ("a", "b", "c", "d") if header else tuple(f"receiver{i}" for i in range(1, 5))
     is_read_as(data, table.mask(table < -75), named)
@@ -299,43 +299,47 @@ def test_date_and_time_in_two_columns(table):
     assert noted(data, "Date and Time together are the time")
 
 
-def packets(seed: int, unit: float = 1.0) -> pd.DataFrame:
-    """A log of a walk at 1 m/s, one packet of a random receiver a row, each with its own time and place."""
+def packets(seed: int, unit: float, cycle: float) -> pd.DataFrame:
+    """A log of a walk at 1 m/s: four receivers have a packet each at a random time of a cycle, with its own place."""
     draw = np.random.default_rng(seed)
-    time = np.cumsum(draw.exponential(0.2, 400))
-    anchor = draw.integers(0, 4, 400)
+    time = cycle * (0.37 + np.arange(100)[:, None] + draw.uniform(0, 0.8, (100, 4)))
+    order = time.ravel().argsort()
+    time, anchor = time.ravel()[order], np.tile(np.arange(4), 100)[order]
     xy = np.column_stack([np.abs(time % 40 - 20), 3 * np.floor(time / 20)])
     at = draw.uniform((0, 0), (20, 12), (4, 2))
-    rssi = -45 - 22 * np.log10(1 + np.linalg.norm(xy - at[anchor], axis=1)) + draw.normal(0, 2, 400)
-    time = (unit * time).round(0 if unit > 1 else 3)
-    x, y = xy.T
-    return pd.DataFrame({"timestamp": time, "x": x, "y": y, "anchor": anchor.astype(str), "rssi": rssi.round()})
+    rssi = (-45 - 22 * np.log10(1 + np.linalg.norm(xy - at[anchor], axis=1)) + draw.normal(0, 2, 400)).round()
+    log = {"timestamp": (unit * (time - time[0])).round(0 if unit > 1 else 3), "x": xy[:, 0], "y": xy[:, 1]}
+    return pd.DataFrame(log | {"anchor": anchor.astype(str), "rssi": rssi})
 
 
 @pytest.mark.parametrize("unit", [1.0, 1000.0])
-@pytest.mark.parametrize("window", [1.0, 2.5])
-def test_packets_are_joined_in_windows(unit, window):
-    log = packets(4, unit)
+@pytest.mark.parametrize("cycle", [1.0, 2.5])
+def test_packets_are_joined_in_windows(unit, cycle):
+    log = packets(4, unit, cycle)
     apart = Rssi.from_frame(log)
     assert noted(apart, "--window 1")
-    data = Rssi.from_frame(log, window=window)
-    second = np.floor((log.timestamp - log.timestamp.iloc[0]) / unit / window).astype(int)
-    assert len(data) == second.nunique()
-    assert noted(data, "rows are joined", f"windows of {window:g} s")
-    expected = log.assign(second=second).pivot_table(index="second", columns="anchor", values="rssi")
-    np.testing.assert_allclose(data.rssi_dbm[:, [data.receiver_names.index(name) for name in expected]], expected)
-    assert float(data.detected.double().mean()) > 1.5 * float(apart.detected.double().mean())
+    data = Rssi.from_frame(log, window=cycle)
+    assert noted(data, "400 rows are joined to 100", f"windows of {cycle:g} s")
+    assert bool(data.detected.all())
+    for name in data.receiver_names:
+        mine = log.rssi[log.anchor == name]
+        np.testing.assert_array_equal(data.rssi_dbm[:, data.receiver_names.index(name)], mine)
+    np.testing.assert_allclose(data.transmitter_position[0, :2], log[["x", "y"]][:4].mean(), atol=1e-9)
     with pytest.raises(InputError, match="has no column of times"):
-        Rssi.from_frame(log.drop(columns="timestamp"), window=window)
+        Rssi.from_frame(log.drop(columns="timestamp"), window=cycle)
 
 
 @pytest.mark.parametrize("every", [2, 4])
-def test_scans_that_are_repeated_at_other_places(table, every):
+def test_scans_that_are_repeated_at_other_places(table, tmp_path, every):
     stale = table.copy()
     stale[["a", "b", "c", "d"]] = table[["a", "b", "c", "d"]].iloc[np.arange(N) // every * every].to_numpy()
     data = Rssi.from_frame(stale)
     np.testing.assert_array_equal(data.index, np.arange(0, N, every))
     assert noted(data, "cached scans", f"{N - len(data)} of {N}")
+    stale.to_csv(tmp_path / "walk.csv", index=False)
+    for part, rows in (("train", range(40)), ("test", range(40, N))):
+        (tmp_path / f"{part}_index.txt").write_text("\n".join(map(str, rows)))
+    assert len(load_rssi(tmp_path)) == N  # a published split stays as it is
     same = stale.assign(x=1.0, y=2.0)
     assert len(Rssi.from_frame(same)) == N  # measured again at one place
     assert len(Rssi.from_frame(table)) == N

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 
@@ -149,6 +150,9 @@ def test_furniture_is_drawn_by_height_and_hatched_where_it_is_unknown(tmp_path):
     assert shown.plot(0.0, 0.24).get_xlabel() == "x [m]"
     walls.furniture = shown
     save_artifacts(walls, "0.3", data, data, tmp_path)
+    found = json.loads((tmp_path / "geometry-mix0.3.json").read_text())["furniture"]
+    assert (found["shape"], found["voxel_m"], found["surfaces"]) == ([26, 22, 14], 0.25, [])
+    assert [11, 5, 3, pytest.approx(2 * 20 / math.log(10), abs=0.01)] in found["voxels"]
     points = dict(np.load(tmp_path / "room-mix0.3.npz"))
     assert points["plan"].shape == (3, 22, 26)
     assert len(furniture_panels(walls.to_json()["planes"], points)) == 3

@@ -441,7 +441,7 @@ def test_whole_run(small, registered, tmp_path):
     assert "What this does not show" in html
     assert "<svg" in html
     assert not [line for line in html.splitlines() if 'src="http' in line or 'href="http' in line]
-    assert load(out / "model-mix0.5.safetensors").synthesize(small.position[:2]).shape == (2, 10, 40)
+    assert load(out / "swiftwrf-mix0.5.safetensors").synthesize(small.position[:2]).shape == (2, 10, 40)
     assert not list(tmp_path.glob("*.partial"))
 
 
@@ -571,7 +571,7 @@ def test_whole_run_on_a_gpu(small, small_published, tmp_path):
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())["mixes"]["0.5"]
     assert {f"network, measured + synthetic + extra ({name})" for name in trained} <= set(metrics["methods"])
     assert set(trained) <= set(metrics["synthesis"])
-    assert load(tmp_path / "run" / "model-mix0.5.safetensors").device.type == "cpu"
+    assert load(tmp_path / "run" / "swiftwrf-mix0.5.safetensors").device.type == "cpu"
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

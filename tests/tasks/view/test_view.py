@@ -422,7 +422,7 @@ def test_posterior_of_a_spectrum_is_that_of_the_locator(aoa_run, room, tmp_path)
     assert x0 <= low[0] <= high[0] <= x1
     assert y0 <= low[1] <= high[1] <= y1
     assert np.nanmax(found.density.values) == 1
-    shutil.copy(folder / "model-mix1.safetensors", folder / "matched_field-mix1.safetensors")
+    shutil.copy(folder / "swiftwrf-mix1.safetensors", folder / "matched_field-mix1.safetensors")
     with pytest.raises(InputError, match="expected a matched-field locator"):
         open_source(folder).models[1].locator  # noqa: B018
 
@@ -500,7 +500,7 @@ def test_a_followed_run_is_read_again_when_it_grows(tmp_path):
     assert view.snapshot() is shown
     assert [row["index"] for row in shown.rows] == [62, 61, 60]
     assert shown.rows[0]["alarm"] == "hall weaker everywhere"
-    assert "change at measurement 2: hall weaker everywhere" in shown.sentences
+    assert "Change at measurement 2: hall weaker everywhere." in shown.sentences
     assert all(figure.startswith("<svg") for figure in shown.figures.values())
     record.append(tmp_path, record.add(63, step))
     assert view.version != shown.version

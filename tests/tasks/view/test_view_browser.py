@@ -261,7 +261,7 @@ def test_page_of_a_followed_run_grows_without_reloading(browser, serve, tmp_path
     for i in range(61, 66):
         learn(i, alarms=("hall weaker everywhere",) if i == 63 else ())
     until(lambda: "6 measurements learnt" in said(browser, "sentence"))
-    assert "change at measurement 3: hall weaker everywhere" in said(browser, "sentence")
+    assert "Change at measurement 3: hall weaker everywhere." in said(browser, "sentence")
     assert len(browser.find_elements("css selector", "#rows tbody tr")) == 6
     assert find(browser, "#changes").get_attribute("innerHTML") != before
     assert find(browser, "#error svg").is_displayed()
