@@ -44,7 +44,7 @@ class TurboResult:
         >>> data = swiftwrf.simulated_room(n=40, grid=swiftwrf.AngularGrid.hemisphere(10, 40))
         >>> result = turbo_learning(data, measured=0.5, models=["nearest"], estimators=["peak"], extra=0)
         >>> result.choice["name"], type(result.best).__name__
-        ('kernel_regression', 'KernelRegression')
+        ('kernel_regression, measured', 'KernelRegression')
     """
 
     def __init__(self, results: Results, metrics: MixMetrics, best: Estimator | MatchedField | None) -> None:
@@ -129,7 +129,7 @@ def turbo_learning(
         >>> import swiftwrf
         >>> data = swiftwrf.simulated_room(n=40, grid=swiftwrf.AngularGrid.hemisphere(10, 40))
         >>> result = turbo_learning(data, measured=0.5, models=["idw"], estimators=["peak"], extra=0)
-        >>> bool(result.summary().loc["kernel_regression", "median"] < result.summary().loc["peak", "median"])
+        >>> bool(result.summary().loc["kernel_regression, measured", "median"] < result.summary().loc["peak", "median"])
         True
     """
     models = (models,) if isinstance(models, str) else models
