@@ -349,9 +349,10 @@ def test_positions_in_a_plane_leave_no_plane_certain():
 
 def test_pure_noise_has_no_certain_plane():
     generator = torch.Generator().manual_seed(0)
-    data = mirror_room({}, n=30)
-    channel = torch.randn(30, 16, dtype=torch.complex128, generator=generator)
-    model = fit(replace(data, store=Store(ARRAY.spectrum(channel, GRID))), max_extra_planes=0, beam_width=1)
+    data = mirror_room({}, n=14)
+    channel = torch.randn(14, 16, dtype=torch.complex128, generator=generator)
+    noise = replace(data, store=Store(ARRAY.spectrum(channel, GRID)))
+    model = fit(noise, search_distance_m=0.5, max_extra_planes=0, beam_width=1)
     assert not any(p.certain for p in model.planes)
 
 
