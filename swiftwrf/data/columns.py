@@ -151,7 +151,7 @@ def receiver_columns(table: pd.DataFrame, names: Sequence[str]) -> tuple[list[st
         names: Those without another role.
 
     Example:
-        >>> table = pd.DataFrame({"AP1": [-60, -61], "AP2": [-70, -71], "SNR": [-3, -4], "drift": [-20.5, 3.5]})
+        >>> table = pd.DataFrame({"AP1": [-60] * 9, "AP2": [-70] * 9, "SNR": [-3] * 9, "drift": [-20.5] * 9})
         >>> receiver_columns(table, list(table))[0]
         ['AP1', 'AP2']
     """

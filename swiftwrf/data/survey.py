@@ -674,17 +674,20 @@ def read_receivers(
     return found, [*notes, *unknown_positions(unknown)]
 
 
-def read_places(file: Path, origin: GeodeticOrigin | None = None) -> Tensor:
+def read_places(file: Path, origin: GeodeticOrigin | None = None, frame: PlanFrame | None = None) -> Tensor:
     """Return the positions in a table with columns x, y, z or longitude, latitude, altitude, float64 (n, 3) [m].
 
     Args:
         file: CSV or Parquet file. Without a column of heights, z is 0.
         origin: Origin of the metres, if positions are in degrees.
+        frame: Axes of positions that are not in degrees.
 
     Raises:
         InputError: A column that is missing, or a position that is not usable.
     """
-    return check_positions(_positions(file, read_table(file), origin, "x,y,z"), f"positions of {file}")
+    return check_positions(
+        _positions(file, read_table(file), origin, "x,y,z", frame or PlanFrame()), f"positions of {file}"
+    )
 
 
 def _positions(

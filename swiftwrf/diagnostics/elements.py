@@ -176,7 +176,7 @@ def sloped(data: Snapshots, away: Tensor) -> Tensor:
 def flipping_elements(data: Snapshots, away: Tensor) -> tuple[list[int], Tensor]:
     """Return the elements whose phase changes by half a turn from measurement to measurement, and the evidence (n,).
 
-    Elements count from 0. Of two groups that flip against each other, the larger one counts as steady.
+    Elements count from 1. Of two groups that flip against each other, the larger one counts as steady.
     """
     channel, steering = unit_channel(data), wave_from(data, away)
     residual = channel * steering[:, None].conj()
@@ -196,7 +196,7 @@ def flipping_elements(data: Snapshots, away: Tensor) -> tuple[list[int], Tensor]
     cosine = (residual * unit_phasor(-reference)).real.abs().mean(dim=(0, 1))
     if bool((cosine[~steady] < 0.85).any()):  # phases that change by other angles; random ones have a mean of 0.64
         return [], torch.zeros(len(data))
-    return (~steady).nonzero()[:, 0].tolist(), excess(mended.mean(dim=1), float(chance))
+    return ((~steady).nonzero()[:, 0] + 1).tolist(), excess(mended.mean(dim=1), float(chance))
 
 
 def _without_flips(residual: Tensor) -> tuple[Tensor, Tensor]:

@@ -52,7 +52,9 @@ MIN_EVIDENCE = 0.15  # agreement above chance to accept a frame, and above the d
 MIN_TURN = math.radians(5)
 COST, TIE = 0.03, 0.03  # of a fitted parameter; difference of errors that are not distinguished
 MIN_POWER = 0.05  # of an error, above the declared frame, in the fraction of the power
-MIN_EXPLAINED, MIN_REACHED = 0.5, 0.87  # agreement of an error; its fraction of what the best directions reach
+MIN_EXPLAINED = 0.5  # agreement of an error
+# fraction of the power in the best directions that an error must explain, without and with fitted parameters
+MIN_REACHED, MIN_REACHED_FITTED = 0.8, 0.87
 REACH_GRID = AngularGrid.hemisphere(30, 120)
 MAX_ELSEWHERE = 0.3  # of the positions, whose peak is elsewhere, in one frame
 UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
@@ -284,7 +286,8 @@ def _reaches(found: _Hypothesis) -> bool:
         return mean >= MIN_EXPLAINED + 0.1 * found.free
     share = found.seen.array.spectrum(found.seen.channel, REACH_GRID, PHASE).square().amax(dim=(1, 2))
     chance = 1 / found.seen.channel.shape[2]
-    return mean >= max(0.45 + chance, MIN_REACHED * float(excess(share, chance).mean()))
+    least = MIN_REACHED_FITTED if found.free else MIN_REACHED
+    return mean >= max(0.45 + chance, least * float(excess(share, chance).mean()))
 
 
 def _hypotheses(
@@ -321,7 +324,7 @@ def _hypotheses(
     for meaning, fitted, reading in other_readings(seen, away):
         yield meaning, at(away, fitted, reading)
     flipping, power = flipping_elements(seen, away)
-    elements = f"{'element' if len(flipping) == 1 else 'elements'} {ranges(flipping)}, counted from 0,"
+    elements = f"{'element' if len(flipping) == 1 else 'elements'} {ranges(flipping)}, counted from 1,"
     for meaning, excess_power in {
         f"the phase of {elements} jumps by half a turn from measurement to measurement": power,
         CONSTANT: constant_phases(seen),
@@ -329,7 +332,7 @@ def _hypotheses(
         UNCALIBRATED: uncalibrated(seen, away),
     }.items():
         # constant phases fit channels whose phases hardly differ, too
-        yield meaning, _Hypothesis(excess_power, 0.0, 2 if meaning in (CONSTANT, UNCALIBRATED) else 0, seen)
+        yield meaning, _Hypothesis(excess_power, 0.0, {CONSTANT: 5, UNCALIBRATED: 2}.get(meaning, 0), seen)
 
 
 def best_explanations(score: Mapping[str, float], tie: float) -> tuple[float, list[str]]:

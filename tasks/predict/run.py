@@ -7,6 +7,7 @@ from pathlib import Path
 
 from augment.estimators import SavedEstimator
 from swiftwrf import FieldModel, InputError, load
+from swiftwrf.data.coordinates import PlanFrame
 from swiftwrf.data.survey import read_places
 from swiftwrf.errors import with_article
 from swiftwrf.locate import MatchedField, RssiLocator
@@ -53,7 +54,8 @@ def run(config: PredictConfig) -> None:
         )
     if isinstance(model, FieldModel | RssiPredictor):
         origin = model.origin if isinstance(model, RssiPredictor) else None
-        prediction = model.predict(read_places(Path(config.source), origin))
+        frame = PlanFrame(config.table.scale, config.table.y_down, config.table.up)
+        prediction = model.predict(read_places(Path(config.source), origin, frame))
         terminal.page({"table": str(out)}, f"{write_file(prediction, out)}: {out}")
         return
     if isinstance(model, RssiLocator):

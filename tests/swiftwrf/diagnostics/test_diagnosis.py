@@ -198,6 +198,7 @@ CAUSES = {  # measurements, and the statement of the cause of an error
     "normalised positions": (normalised, "look normalised"),
     "there and back": (there_and_back, "there and back"),
     "half-turn flips": (flipped, "jumps by half a turn"),
+    "there and back with strong echoes": (lambda s: received(scene(s), s, echo=0.35, ways=2), "there and back"),
     "uncalibrated": (uncalibrated, "The array is not calibrated"),
     "tilted": (tilted, "constant rotation of"),
     "x and y swapped": (

@@ -38,7 +38,7 @@ from swiftwrf.models.geometry.uncertainty import _AlternativeTable, phase_altern
 from swiftwrf.models.neighbours import NearestModel
 from swiftwrf.runtime.checkpoint import write
 
-QUICK = GeometryConfig(search_distance_m=1.6, beam_width=2)
+QUICK = GeometryConfig(search_distance_m=2.0, beam_width=2)
 SIX = {
     (-1, 0, 0): 0.0,
     (1, 0, 0): 5.0,
@@ -291,7 +291,7 @@ def test_a_room_of_a_search_is_extended_to_more_spectra_unless_it_does_not_expla
 
 @pytest.mark.long
 def test_a_tilted_plane_is_found_to_a_millimetre():
-    model = fit(mirror_room({(0.8, 0.5, 0.1): 5.0}, -0.7, n=40), search_distance_m=0.5, beam_width=1)
+    model = fit(mirror_room({(0.8, 0.5, 0.1): 5.0}, -0.7, n=60), beam_width=1)
     assert len(model.planes) == 1
     assert errors(model, {(0.8, 0.5, 0.1): 5.0})[0][0] < 1
     torch.testing.assert_close(
@@ -356,10 +356,10 @@ def test_positions_in_a_plane_leave_no_plane_certain():
 
 def test_pure_noise_has_no_certain_plane():
     generator = torch.Generator().manual_seed(0)
-    data = mirror_room({}, n=14)
-    channel = torch.randn(14, 16, dtype=torch.complex128, generator=generator)
+    data = mirror_room({}, n=30)
+    channel = torch.randn(30, 16, dtype=torch.complex128, generator=generator)
     noise = replace(data, store=Store(ARRAY.spectrum(channel, GRID)))
-    model = fit(noise, search_distance_m=0.5, max_extra_planes=0, beam_width=1)
+    model = fit(noise, search_distance_m=1.0, max_extra_planes=0, beam_width=1)
     assert not any(p.certain for p in model.planes)
 
 

@@ -317,7 +317,7 @@ def test_a_primitive_that_is_not_a_number_shows():
 
 
 def test_operators_are_registered_properly(device):
-    """By PyTorch's own checks of operators."""
+    """PyTorch checks its operators itself."""
     inputs = [x.detach().to(device).requires_grad_() for x in random_scene(4, 2)]
     torch.library.opcheck(operators._field, (*inputs, 0.1, 0.2, 5, 0.0, 9, 1e-4))
     grad = torch.ones(2, 2, 5, 9, device=device)

@@ -330,7 +330,7 @@ def test_each_floor_has_its_maps_its_rows_and_its_coverage():
     assert (ground.place, first.titled("a")) == ("floor Ground", "a, First")
     assert first.arrays["measured"].ravel().tolist() == [4.0] * 4
     assert first.summary().name == "summary-1"
-    assert len(first.by_receiver()) == 2
+    assert [first.by_receiver(kind).name for kind in ("predicted", "width")] == ["map-run-1", "width-run-1"]
 
 
 @pytest.mark.parametrize("seed", [0, 1])
