@@ -73,7 +73,7 @@ def errors_section(
     limit = max((float(part.quantile(0.9)) for part in groups.values() if len(part)), default=1.0)
     shown = dict(list(groups.items())[:MAX_CURVES])
     figures.cdf(axes, palette, shown, f"{quantity} [{unit}]", max(limit, 1e-3))
-    cost, axes = figures.panel(5.6, 3.2)
+    cost, axes = figures.panel(5.6, 3.0 + 0.2 * len(short))
     points = {one.name: (sum(one.seconds), one.error["median"]) for one in short if one.error["n"]}
     figures.speed(axes, palette, points, "seconds to fit and apply", f"median {quantity} [{unit}]")
     text = (
