@@ -206,7 +206,7 @@ def dots(
     names = [plain(textwrap.fill(name, NAME)) for name in rows]
     lines = max((name.count("\n") + 1 for name in names), default=1)
     height = 0.27 * max(1.0, 0.55 * len(values), 0.6 * lines)
-    figure, axes = panel(5.6, 0.7 + height * len(rows) + (0.2 * len(values) if len(values) > 1 else 0))
+    figure, axes = panel(5.1, 0.7 + height * len(rows) + (0.2 * len(values) if len(values) > 1 else 0))
     for number, (marker, (name, of_rows)) in enumerate(zip(MARKERS, values.items(), strict=False)):
         value, low, high = np.array(of_rows, dtype=float).reshape(-1, 3).T
         at = np.arange(len(rows)) + 0.2 * (number - (len(values) - 1) / 2)

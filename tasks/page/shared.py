@@ -68,12 +68,12 @@ def errors_section(
     spread = max(medians, default=1.0) > 10 * min(medians, default=1.0) > 0
     names = [one.name for one in short]
     dots = figures.dots(names, values, Palette({"error": MEASURED}), f"median {quantity} [{unit}]", log=spread)
-    figure, axes = figures.panel(5.6, 3.2)
+    figure, axes = figures.panel(5.1, 3.2)
     groups = {one: errors[errors["method"] == one].iloc[:, -1] for one in [*dict.fromkeys([answer.chosen, *names])]}
     limit = max((float(part.quantile(0.9)) for part in groups.values() if len(part)), default=1.0)
     shown = dict(list(groups.items())[:MAX_CURVES])
     figures.cdf(axes, palette, shown, f"{quantity} [{unit}]", max(limit, 1e-3))
-    cost, axes = figures.panel(5.6, 3.0 + 0.2 * len(short))
+    cost, axes = figures.panel(5.1, 3.0 + 0.2 * len(short))
     points = {one.name: (sum(one.seconds), one.error["median"]) for one in short if one.error["n"]}
     figures.speed(axes, palette, points, "seconds to fit and apply", f"median {quantity} [{unit}]")
     text = (
