@@ -23,11 +23,14 @@ def page(runs: list[AoaRecords]) -> Page:
         sections_of("Errors", fractions, _errors, terms()),
         sections_of("Where was it?", fractions, _positions),
         sections_of("Spectra", fractions, synthesis_section),
-        sections_of("Measure or synthesize more?", fractions, _more),
         _limits(runs[0]),
     ]
-    sections = [section for section in sections if section.paragraphs or section.plots or section.parts]
-    details = [sections_of("What is left out", fractions, _left_out), provenance(runs)]
+    more = sections_of("Measure or synthesize more?", fractions, _more)
+    details = [more, sections_of("What is left out", fractions, _left_out), provenance(runs)]
+    sections, details = (
+        [section for section in part if section.paragraphs or section.plots or section.parts or section.tables]
+        for part in (sections, details)
+    )
     names = ", ".join(dict.fromkeys(run.place for run in runs))
     if len(fractions) == 1:
         first = first_screen(fractions[0])
