@@ -369,7 +369,7 @@ def test_outputs_of_a_table_in_degrees(tmp_path):
     table[40:].to_csv(tmp_path / "later.csv", index=False)
     run = tmp_path / "rssi"
     assert quick.run("rssi", "--rx", "all", "--data", tmp_path / "walk.csv", "--out", run) == 0
-    assert "Give the positions of the access points" in (run / "report.html").read_text()
+    assert "access points that are unknown" in (run / "report.html").read_text()
     predicted = pd.read_csv(run / "predictions.csv")
     near = np.abs(predicted[["latitude_deg", "longitude_deg"]].to_numpy()[:, None] - degrees).max(axis=2).min(axis=1)
     assert near.max() < 1e-8

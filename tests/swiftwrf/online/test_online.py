@@ -358,4 +358,4 @@ def test_a_notice_is_recorded(tmp_path):
         record.append(tmp_path, record.add(i, replace(step, notice="kernel chosen again" if i == 61 else "")))
     again = Record.read(tmp_path)
     assert again.notices == [(1, "kernel chosen again")]
-    assert "kernel chosen again" in again.sentences()
+    assert "Kernel chosen again." in again.sentences()
