@@ -73,7 +73,7 @@ def test_blocks_of_reference_and_how_to_run(name, tmp_path, monkeypatch):
 
 def test_the_checks_run_the_test_command_of_the_readme():
     (command,) = re.findall(r"pip install -e '\.\[dev\]' && (pytest .*)", (ROOT / "README.md").read_text())
-    assert command in (ROOT / ".ci" / "run").read_text().splitlines()
+    assert any(line.startswith(command) for line in (ROOT / ".ci" / "run").read_text().splitlines())
 
 
 def test_documented_extensions_work(tmp_path, monkeypatch):
