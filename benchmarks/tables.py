@@ -45,6 +45,22 @@ def random_rooms() -> str:
     )
 
 
+def hard_cases() -> str:
+    """Return the largest errors over cutoffs of each backend in each case."""
+    found: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    for row in load("stability_cpu")["backends"]:
+        found.setdefault(row["case"], {}).setdefault(row["backend"], []).append(row)
+    rows = []
+    for case, backends in found.items():
+        cells = []
+        for entries in backends.values():
+            value = {entry["cutoff"]: entry["value"] for entry in entries}
+            gradient = max(max(entry["gradient"], entry["magnitude_gradient"]) for entry in entries)
+            cells.append(f"{value[None]:.0e}, {value[1e-4]:.0e}; {gradient:.0e}")
+        rows.append([case, next(iter(backends.values()))[0]["rule"].replace("|", "\\|"), *cells])
+    return markdown(["case", "rule", *(f"`{backend}` (float32)" for backend in found[rows[0][0]])], rows)
+
+
 def headline() -> str:
     """Return one row for each question: the simplest method, the best other method, and this project."""
     located = {name: one["localizers"] for name, one in load("locating_rssi")["sets"].items()}
