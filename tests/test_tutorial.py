@@ -12,14 +12,17 @@ from unittest import mock
 import pytest
 from printed import blocks, check_printed
 from quick import PREDICTORS_KEPT, TASKS, QuickNetwork, QuickRssiConfig
-from small import glances
+from small import glances, with_defaults
 
+from augment import cross_validation
 from augment.estimators import ESTIMATORS
 from augment.turbo.condition import NETWORKS
 from swiftwrf import RssiModel
 from swiftwrf.choices import RSSI_PREDICTORS
+from swiftwrf.locate import MatchedField, MatchedFieldConfig
 from tasks.command_line import command_line
 
+FEW_CELLS = MatchedFieldConfig(max_cells=2000, n_best=40, n_background=20, n_rounds=1, n_calibration=16)
 TEXT = (Path(__file__).parent.parent / "docs" / "tutorial.md").read_text()
 PARTS = re.split(r"^## ", TEXT, flags=re.MULTILINE)[1:]
 
@@ -48,6 +51,8 @@ def _cheap() -> Iterator[None]:
     predictors = {name: RSSI_PREDICTORS[name] for name in PREDICTORS_KEPT}
     with (
         glances(),
+        mock.patch.object(MatchedField, "config_type", with_defaults(FEW_CELLS)),
+        mock.patch.object(cross_validation, "FOLD_LOCATOR", FEW_CELLS),
         mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
         mock.patch.object(RssiModel, "config_type", QuickRssiConfig),
         mock.patch.object(RSSI_PREDICTORS, "_registered", predictors),
