@@ -77,7 +77,7 @@ class Terminal:
             _Line(), console=self.console, transient=True, disable=not is_shown, speed_estimate_period=SPEED_PERIOD_S
         )
         self._expected, self._done, self._steps = 0, 0, {}
-        with line, forwarding(self._within):
+        with line, forwarding(self._update):
             line.add_task("", total=None)
             self._progress = line
             try:
@@ -113,11 +113,8 @@ class Terminal:
         if not self.console.is_terminal and not logger.isEnabledFor(logging.DEBUG):
             self.console.print(line, markup=False, soft_wrap=True)
 
-    def _within(self, fraction: float) -> None:
-        """Count a fraction of the current step as done."""
-        self._update(fraction)
-
     def _update(self, fraction: float = 0.0) -> None:
+        """Show the steps that are computed, with a fraction of the current one counted as done."""
         if self._progress is not None:
             title = ", ".join(self._numbered(name) for name in self._steps)
             done, total = self._done + fraction, max(self._expected, self._done)

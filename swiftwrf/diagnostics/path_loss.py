@@ -71,7 +71,7 @@ def check_path_loss(data: Rssi) -> PathLossReport | None:
     model = fit_path_loss(log_distance(data.transmitter_position, data.receiver_position), data.rssi_dbm, shared=True)
     report = PathLossReport(_explained(data.transmitter_position, data), float(model.level), float(-model.slope / 10))
     data = data.columns(data.detected.sum(dim=0).argsort(descending=True, stable=True)[:20].tolist())
-    walk, rows = data, torch.linspace(0, len(data) - 1, min(2000, len(data))).round().long()
+    walk, rows = data, _some_rows(data, 2000)
     data, place = data.subset(rows), data.transmitter_position[rows]
     found = {meaning: _explained(other, data) for meaning, other in _others(place)}
     fitted = {
@@ -92,9 +92,9 @@ def check_path_loss(data: Rssi) -> PathLossReport | None:
     return replace(report, misplaced=attainable >= MIN_EXPLAINED and declared < attainable / 2)
 
 
-def _some_rows(data: Rssi, count: int) -> Rssi:
-    """Return at most `count` rows, equally spaced."""
-    return data.subset(torch.linspace(0, len(data) - 1, min(count, len(data))).round().long())
+def _some_rows(data: Rssi, count: int) -> Tensor:
+    """Return the numbers of at most `count` rows, equally spaced."""
+    return torch.linspace(0, len(data) - 1, min(count, len(data))).round().long()
 
 
 def _others(place: Tensor) -> Iterator[tuple[str, Tensor]]:
@@ -146,7 +146,7 @@ def _attainable(data: Rssi) -> float:
 
     The position of each receiver is that of a grid around the positions with the highest fraction, then of finer grids.
     """
-    data = _some_rows(data, 400)
+    data = data.subset(_some_rows(data, 400))
     residual = total = 0.0
     for rssi, detected in zip(data.rssi_dbm.T, data.detected.T, strict=True):
         if int(detected.sum()) < MIN_TRAINING:

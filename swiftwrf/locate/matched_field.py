@@ -29,14 +29,13 @@ from swiftwrf.locate.spectrum_likelihood import (
     PathWaves,
     PhaseLikelihood,
     SpectrumFeatures,
-    ends,
     gain_features,
     room_features,
 )
 from swiftwrf.locate.student import Student
 from swiftwrf.models.base import FieldModel
 from swiftwrf.models.geometry import GeometryModel
-from swiftwrf.models.geometry.channels import coherence
+from swiftwrf.models.geometry.channels import coherence, ends
 from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.model import kept_snapshots
 from swiftwrf.models.geometry.path_gains import PRIORS, PathGains, choose_prior, fit_path_gains, kernel_of

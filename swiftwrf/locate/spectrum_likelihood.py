@@ -24,7 +24,7 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.locate.student import Student, covariance
-from swiftwrf.models.geometry.channels import coherence, field, waves
+from swiftwrf.models.geometry.channels import coherence, ends, field, waves
 from swiftwrf.models.geometry.fit import carrier_phases
 from swiftwrf.models.geometry.model import GeometryModel, kept_snapshots
 from swiftwrf.models.geometry.path_gains import PathGains
@@ -73,11 +73,6 @@ class SpectrumFeatures:
 
     def __len__(self) -> int:
         return len(self.coarray)
-
-
-def ends(number: int) -> list[int]:
-    """Return the numbers of the first and the last of some snapshots."""
-    return sorted({0, number - 1})
 
 
 def real_parts(numbers: Tensor) -> Tensor:

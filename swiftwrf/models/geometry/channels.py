@@ -18,6 +18,11 @@ def coherence(observed: Tensor, predicted: Tensor) -> Tensor:
     return found
 
 
+def ends(number: int) -> list[int]:
+    """Return the numbers of the first and the last of some snapshots."""
+    return sorted({0, number - 1})
+
+
 def field(gain: Tensor, wave: Tensor) -> Tensor:
     """Return the sums of waves (n, 1 + S, F, K) with gains (n, 1 + S), complex64 (n, F, K)."""
     total: Tensor = (gain.to(wave.dtype)[:, None] @ wave.flatten(2))[:, 0].unflatten(1, wave.shape[2:])
@@ -32,14 +37,11 @@ def waves(planes: PlaneSet, scene: PhaseObservations, frequency: Tensor) -> Tens
         scene: Positions.
         frequency: Frequencies relative to the carrier, (F,).
     """
-    source, there, found = scene.transmitter[None], torch.ones(1, 1), []
+    source, there = scene.transmitter[None], torch.ones(1, 1)
     if planes.sequence:
         source, exists = torch.cat([source, images(scene, planes)[0]]), visibility(scene, planes)[0]
         there = torch.cat([torch.ones_like(exists[:1]), exists])
-    for ratio in frequency.tolist():
-        at = replace(scene, element=scene.element * ratio, wavenumber=scene.wavenumber * ratio)
-        found.append(at.wave(source).expand(-1, len(scene), -1) * there[..., None])
-    return torch.stack(found, dim=2).transpose(0, 1)
+    return (scene.waves(source, frequency) * there[..., None, None]).transpose(0, 1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -207,6 +207,14 @@ class PhaseObservations:
         wave = self.wave(self.transmitter)
         return torch.cat([wave.real, wave.imag], dim=1)[..., None]
 
+    def waves(self, source: Tensor, frequency: Tensor) -> Tensor:
+        """Return the waves of `wave` at frequencies (F,) relative to the carrier, complex64 (S, n, F, K)."""
+        found = []
+        for ratio in frequency.tolist():
+            at = replace(self, element=self.element * ratio, wavenumber=self.wavenumber * ratio)
+            found += [at.wave(source).expand(-1, len(self), -1)]
+        return torch.stack(found, dim=2)
+
     def wave(self, source: Tensor) -> Tensor:
         """Return the wave exp(-j k d) / d of sources (..., n or 1, 3) [m] at each element, complex64 (..., n, K)."""
         phase, length = self.phases((source - self.receiver).float().movedim(-1, 0))

@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from swiftwrf.models.geometry.channels import Channels, field, waves
+from swiftwrf.gp import subsample
+from swiftwrf.models.geometry.channels import Channels, ends, field, waves
 from swiftwrf.models.geometry.images import PlaneSet, mirror
 from swiftwrf.models.geometry.planes import Plane
 from swiftwrf.runtime.threads import parallel_map
@@ -44,11 +45,10 @@ def find_surfaces(planes: PlaneSet, gain: Tensor, measured: Channels, low: Tenso
         low: Lower corner of the region with furniture, (3,) [m].
         high: Opposite corner (3,) [m].
     """
-    n, _, n_elements = measured.value.shape
-    rows = torch.linspace(0, n - 1, min(n, max(1, MAX_CHANNELS // n_elements))).long()
-    ends = torch.tensor([0, len(measured.frequency) - 1]).unique()
+    n, count, n_elements = measured.value.shape
+    (rows,) = subsample(torch.arange(n), rows=max(1, MAX_CHANNELS // n_elements))
     measured, gain = measured.subset(rows), gain[rows]
-    measured = replace(measured, value=measured.value[:, ends], frequency=measured.frequency[ends])
+    measured = replace(measured, value=measured.value[:, ends(count)], frequency=measured.frequency[ends(count)])
     scene = measured.scene
     wavelength = math.tau / scene.wavenumber
     residual = _Residual.of(measured, field(gain, waves(planes, scene, measured.frequency)), low, high)
@@ -136,10 +136,10 @@ class _Residual:
         paths = [(fixed, moving, [at_surface], 1.0, nowhere)]
         for n, o, g in zip(*(x[0] for x in (planes.normal, planes.offset, planes.gain)), strict=True) if planes else ():
             at_plane = n[:, None, None], o
-            ends = [(mirror(fixed, *at_plane), moving), (fixed, mirror(moving, *at_plane))]
+            pairs = [(mirror(fixed, *at_plane), moving), (fixed, mirror(moving, *at_plane))]
             first = [at_plane, at_surface]
             orders = [first, first[::-1]] if scene.end == "receiver" else [first[::-1], first]
-            paths += [(*both, order, float(g), at_plane) for both, order in zip(ends, orders, strict=True)]
+            paths += [(*both, order, float(g), at_plane) for both, order in zip(pairs, orders, strict=True)]
         waves, cells = [], []
         for start, end, order, gain, plane in paths:
             source = transmitter
@@ -148,11 +148,8 @@ class _Residual:
             near, far = start[axis] - offset[:, None], end[axis] - offset[:, None]
             hit = start + (near / (near + far)).nan_to_num(0.5, 0.5, 0.5) * (end - start)
             there = (near * far > 0) & ((hit * plane[0]).sum(0) < plane[1])
-            wave = []
-            for ratio in self.measured.frequency.tolist():
-                at = replace(scene, element=scene.element * ratio, wavenumber=scene.wavenumber * ratio)
-                wave.append(at.wave(source.movedim(0, -1)).expand(-1, len(scene), -1))
-            waves.append(self.factor * torch.stack(wave, dim=2) * (gain * there)[..., None, None])
+            wave = scene.waves(source.movedim(0, -1), self.measured.frequency)
+            waves.append(self.factor * wave * (gain * there)[..., None, None])
             row, column = (
                 ((hit[a] - self.low[a]) / self.cell_m[a]).long().clamp(0, MAX_CELLS).expand_as(there) for a in beside
             )
