@@ -70,11 +70,6 @@ class PropagationPaths:
         return self.corner[..., 0].isfinite().sum(dim=1)
 
     @property
-    def power_db(self) -> Tensor:
-        """Sum of the powers of each link's paths, relative to the transmitted power, float64 (n,)."""
-        return 10 * torch.zeros(len(self.count)).double().index_add(0, self.owner, self.gain.abs().square()).log10()
-
-    @property
     def reached(self) -> PropagationPaths:
         """The links that have a path."""
         some = self.count > 0
