@@ -29,9 +29,6 @@ MAX_TEXT_BYTES = 2**28  # a million rows of positions take a tenth of it
 MAX_PREAMBLE_LINES = 20  # before the header of a table
 MAX_MISSING_CELLS = 3  # at the end of all rows
 DECIMAL_COMMA = re.compile(r"^(\s*[+-]?\d+),(\d+\s*)$")
-PLAIN_TAGS = {
-    f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "timestamp", "seq", "map")
-}
 
 
 def sha256(file: Path) -> str:
@@ -105,15 +102,15 @@ def number(text: object) -> float:
 
 
 def read_yaml(file: Path) -> dict[str, Any]:
-    """Return a YAML mapping. Scalars stay text, so that a name such as `NA` or `2001-01-01` stays a name.
+    """Return a YAML mapping. Scalars stay text, so a name such as `NA` or `2001-01-01` stays a name, and no objects arise.
 
     Raises:
-        InputError: No such file, not YAML, not a mapping, a name twice, or a tag (YAML's way to create objects).
+        InputError: No such file, not YAML, not a mapping, or a name twice.
     """
     text = read_text(file)
     try:
         content = yaml.load(text, Loader=_PlainLoader)
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
+    except (yaml.YAMLError, RecursionError, TypeError, ValueError) as error:
         raise InputError(f"{file} is not valid YAML: {error or 'nested too deeply'}") from None
     if not isinstance(content, dict):
         raise InputError(f"{file} must hold names and values, got {type(content).__name__}")
@@ -121,16 +118,9 @@ def read_yaml(file: Path) -> dict[str, Any]:
 
 
 class _PlainLoader(yaml.BaseLoader):
-    """Loader of texts, lists and mappings, without tags and with each name once, of which YAML would keep the last."""
-
-    def construct_object(self, node: Any, deep: bool = False) -> Any:
-        if node.tag not in PLAIN_TAGS:
-            raise ValueError(f"the tag {node.tag} is not allowed")
-        return super().construct_object(node, deep)
+    """Loader of texts, lists and mappings that refuses a name given twice, of which YAML would keep the last."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
-        if not all(isinstance(key, yaml.ScalarNode) for key, _ in node.value):
-            raise ValueError("a name must be text")
         names = [key.value for key, _ in node.value]
         if len(set(names)) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
