@@ -56,15 +56,14 @@ def load_spectra(
         Traceback (most recent call last):
         swiftwrf.errors.InputError: nowhere is not a folder or file; expected measurements (formats: ...)
     """
-    directions = None if grid is None else AngularGrid.of(grid)
     options = ReadOptions(
-        array,
-        beamformer,
-        directions,
-        every,
-        station,
-        subcarriers,
-        bandwidth,
+        array=array,
+        beamformer=beamformer,
+        grid=None if grid is None else AngularGrid.of(grid),
+        every=every,
+        station=station,
+        subcarriers=subcarriers,
+        bandwidth=bandwidth,
         drop_null=drop_null,
         drop_elements=drop_elements,
         round_trip=round_trip,
@@ -147,13 +146,12 @@ def load_rssi(
         ...     load_rssi(file).receiver_names
         ('kitchen', 'hall')
     """
-    values = None if filler is None else tuple(map(float, filler))
     options = ReadOptions(
         columns=columns,
-        filler=values,
+        filler=filler,
         coordinates=coordinates,
         offset_by=offset_by,
-        transmitter=tuple(transmitter),
+        transmitter=transmitter,
         pool_by=pool_by,
         scale=scale,
         y_down=y_down,

@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
+import pandas as pd
 import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from swiftwrf.data.cells import PIXELS, UNITS, unit_of
 from swiftwrf.errors import InputError
 
 Floats = NDArray[np.float64]
@@ -85,6 +87,24 @@ class PlanFrame(NamedTuple):
         if self.y_down:
             y = -y
         return np.stack([x, -z, y] if self.up == "y" else [x, y, z], axis=1)
+
+
+def frame_of(label: object, table: pd.DataFrame, names: Sequence[str], frame: PlanFrame) -> tuple[PlanFrame, list[str]]:
+    """Return the frame of coordinates in two columns, with the scale and direction that they state, and notes on these."""
+    unit, stated = unit_of(table[names[0]]), stated_scale(table.attrs.get("preamble", ""))
+    scale = frame.scale or stated
+    if unit in PIXELS and scale is None:
+        raise InputError(f"{label}: columns {' and '.join(names)} are in pixels; give --scale PIXELS_PER_METRE")
+    in_pixels = unit in PIXELS or (frame.scale is None and stated is not None and not unit)
+    frame = PlanFrame(UNITS.get(unit) or scale or 1.0, frame.y_down or in_pixels, frame.up)
+    notes = []
+    if frame.scale != 1:
+        notes.append(f"columns {' and '.join(names)} have {frame.scale:.4g} {unit or 'units'} in a metre")
+    if frame.y_down:
+        notes.append(f"{names[1]} points down, so y is its negative")
+    if frame.up != "z":
+        notes.append(f"{frame.up} points up in the table, so its axes x, y, z are x, z, -y of the data")
+    return frame, notes
 
 
 class GeodeticOrigin(NamedTuple):
