@@ -169,7 +169,7 @@ class PropagationPaths:
             InputError: An array for another carrier, spectra of too many pixels, or as `subcarriers`.
         """
         grid = grid or GRID
-        check_pixels(name, len(self.count), grid)
+        check_pixels(name, len(self.count), grid.shape)
         array, wavelength = array or PlanarArray.square(4, self.frequency_hz), LIGHT_SPEED / self.frequency_hz
         if abs(array.wavelength - wavelength) > 1e-3 * wavelength:
             raise InputError(

@@ -324,9 +324,6 @@ class Rssi(PositionedData):
             "receiver_position": (("receiver", "axis"), self.receiver_position.numpy(), {"units": "m"}),
         }
 
-    def _measured(self) -> Tensor:
-        return self.rssi_dbm
-
     def _summary(self) -> str:
         share = float(self.detected.double().mean()) if len(self) else 0.0
         return f"{len(self)} rows at {len(self.receiver_names)} receivers, {share:.0%} detected"

@@ -120,7 +120,7 @@ class Snapshots(PositionedData):
             InputError: An unknown beamformer, too few snapshots for it, or spectra of too many pixels.
         """
         grid = AngularGrid.of(grid or GRID)
-        check_pixels(self.name, len(self), grid)
+        check_pixels(self.name, len(self), grid.shape)
         same = (
             "position",
             "line_of_sight",
@@ -148,9 +148,6 @@ class Snapshots(PositionedData):
 
     def variables(self) -> Arrays:
         return {"channel": (("position", "snapshot", "element"), self.channel.numpy())}
-
-    def _measured(self) -> Tensor:
-        return self.channel
 
     def _summary(self) -> str:
         return f"{len(self)} channels of {self.channel.shape[1]} snapshots, {self.array.summary}"

@@ -19,7 +19,7 @@ from swiftwrf.array.planar import PlanarArray, folded_angles
 from swiftwrf.choices import Moving
 from swiftwrf.data.dataset import Arrays, Numbers, PositionedData, to_positions, to_rotation
 from swiftwrf.data.splits import MIN_TRAINING
-from swiftwrf.data.store import BATCH_PIXELS, MAX_MEMORY_PIXELS, Store, stored, too_many
+from swiftwrf.data.store import BATCH_PIXELS, MAX_FILE_PIXELS, MAX_FINE_PIXELS, MAX_MEMORY_PIXELS, Store, stored
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import WINDOW
 from swiftwrf.plotting import Axes, mark_direction, polar_spectrum
@@ -239,9 +239,6 @@ class Spectra(PositionedData):
             "line_of_sight": (("position",), self.line_of_sight.numpy()),
         }
 
-    def _measured(self) -> Tensor:
-        return self.spectrum
-
     def _summary(self) -> str:
         rows, columns = self.grid.shape
         array = f", {self.array.summary}" if self.array else ""
@@ -316,16 +313,17 @@ def direction_of_link(
     return folded_angles(array, torch.stack(to_angles(towards @ rotation), dim=-1))
 
 
-def check_pixels(name: str, n: int, grid: AngularGrid) -> None:
-    """Raise InputError if there are more pixels than any measurement has.
+def check_pixels(name: str, n: int, shape: Sequence[int]) -> None:
+    """Refuse n spectra of a shape (rows, columns) with more pixels than any measurement has.
 
     Raises:
         InputError: The spectra exceed 2^34 pixels, or 2^29 pixels at more than 2^20 pixels each.
     """
-    if too_many((n, *grid.shape)):
+    each = math.prod(shape)
+    if n * each > MAX_FILE_PIXELS or (n * each > MAX_MEMORY_PIXELS and each > MAX_FINE_PIXELS):
         raise InputError(
-            f"{name} has {n} positions, whose spectra would have {n * math.prod(grid.shape):.3g} pixels; take "
-            "one measurement of several (every) or a coarser grid"
+            f"{name} has {n} positions, whose spectra would have {n * each:.3g} pixels; take one measurement of several "
+            "(every) or a coarser grid"
         )
 
 

@@ -249,29 +249,3 @@ def matching_validation(train: Tensor, test: Tensor) -> Validation:
 
     kinds: tuple[Validation, Validation] = ("random", "block")
     return min(kinds, key=misfit)
-
-
-def choose_split(
-    name: str, seed: int, position: Tensor, named: dict[str, tuple[Tensor, Tensor]], data: str
-) -> tuple[Tensor, Tensor]:
-    """Return training and test rows of a split that came with the data, or of a seeded random or block split.
-
-    Raises:
-        InputError: An unknown name, or fewer than 10 training measurements.
-    """
-    if name in named:
-        train, test = named[name]
-    elif name == "random":
-        train, test = random_split(position, seed)
-    elif name == "block":
-        train, test = block_split(position, seed)
-    else:
-        raise InputError(
-            f"{data} has no split {name!r}; choose one of {', '.join(sorted({*named, 'random', 'block'}))}"
-        )
-    if len(train) < MIN_TRAINING:
-        raise InputError(
-            f"split {name!r} of {data} has {len(train)} training measurements, too few to fit anything; "
-            f"at least {MIN_TRAINING} are needed"
-        )
-    return train, test

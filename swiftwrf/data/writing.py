@@ -5,10 +5,12 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 import yaml
 from scipy.io import savemat
@@ -48,14 +50,16 @@ def write_spectra(data: Spectra, folder: Path) -> None:
     if data.array is not None:
         gateway |= {"frequency_hz": data.array.frequency_hz, "element_position": data.array.element.tolist()}
     write_text(folder / "gateway_info.yml", yaml.safe_dump({"gateway1": gateway}, sort_keys=False))
-    write_text(folder / f"{'tx' if data.moving == 'transmitter' else 'rx'}_pos.csv", _csv("x,y,z", data.position))
+    write_text(
+        folder / f"{'tx' if data.moving == 'transmitter' else 'rx'}_pos.csv", _csv(["x", "y", "z"], data.position)
+    )
     with replacing(folder / "spectrum.npz") as temporary, zipfile.ZipFile(temporary, "w") as archive:
         with archive.open("spectrum.npy", "w", force_zip64=True) as stream:
             dtype, batches = data.store.exact()
             write_npy(stream, data.store.shape, dtype, batches)
         with archive.open("line_of_sight.npy", "w") as stream:
             np.save(stream, data.line_of_sight.numpy())
-    _write_splits(data.named_splits, folder, first=1)
+    write_splits(data.named_splits, folder, first=1)
 
 
 def write_rssi(data: Rssi, folder: Path) -> None:
@@ -71,18 +75,15 @@ def write_rssi(data: Rssi, folder: Path) -> None:
         folder: Existing folder.
     """
     rssi = data.rssi_dbm.where(data.rssi_dbm != NOT_DETECTED_DBM, NOT_DETECTED_DBM + 0.01)
-    quoted = ",".join('"' + name.replace('"', '""') + '"' for name in data.receiver_names)
-    write_text(folder / "gateway_rssi.csv", _csv(quoted, rssi.nan_to_num(NOT_DETECTED_DBM)))
-    write_text(folder / "tx_pos.csv", _csv("x,y,z", data.transmitter_position))
+    write_text(folder / "gateway_rssi.csv", _csv(list(data.receiver_names), rssi.nan_to_num(NOT_DETECTED_DBM)))
+    write_text(folder / "tx_pos.csv", _csv(["x", "y", "z"], data.transmitter_position))
     if data.located:
         known = zip(data.receiver_names, data.receiver_position.tolist(), data.receiver_located.tolist(), strict=True)
         places = {name: position for name, position, is_located in known if is_located}
         write_text(folder / "gateway_position.yml", yaml.safe_dump(places, sort_keys=False, allow_unicode=True))
     of_rows = {"session": data.session, "time": data.time}
-    columns = {name: values.tolist() for name, values in of_rows.items() if values is not None}
-    if columns:
-        rows = (",".join(map(repr, row)) for row in zip(*columns.values(), strict=True))
-        write_text(folder / META, "\n".join([",".join(columns), *rows, ""]))
+    if columns := {name: values.numpy() for name, values in of_rows.items() if values is not None}:
+        write_text(folder / META, pd.DataFrame(columns).to_csv(index=False))
     survey: dict[str, Any] = {}
     if data.origin is not None:
         survey["origin"] = list(data.origin)
@@ -92,7 +93,7 @@ def write_rssi(data: Rssi, folder: Path) -> None:
         survey["receiver_moves"] = True
     if survey:
         write_text(folder / SURVEY, yaml.safe_dump(survey, sort_keys=False, allow_unicode=True))
-    _write_splits(data.named_splits, folder, first=0)
+    write_splits(data.named_splits, folder, first=0)
 
 
 def write_paths(paths: PropagationPaths, folder: Path) -> None:
@@ -154,7 +155,7 @@ def write_deepmimo(paths: PropagationPaths, folder: Path) -> None:
     empty = torch.full((len(paths.count), int(paths.count.max())), torch.nan, dtype=torch.float64)
     arrays = {name: empty.index_put(place, values.double()) for name, values in columns.items()}
     for name, values in (arrays | {"rx_pos": paths.receiver, "tx_pos": transmitter}).items():
-        with replacing(folder / f"{name}_{'t000_tx000_r001'}.npz") as temporary, temporary.open("wb") as stream:
+        with replacing(folder / f"{name}_t000_tx000_r001.npz") as temporary, temporary.open("wb") as stream:
             np.savez_compressed(stream, **{name: values.numpy()})
     params = {"rt_params": {"frequency": paths.frequency_hz, "raytracer_name": "SwiftWRF"}}
     write_text(folder / "params.json", json.dumps(params, indent=1) + "\n")
@@ -172,12 +173,12 @@ def write_mat(data: Labelled, file: Path) -> None:
         savemat(stream, arrays, do_compression=True, oned_as="column")
 
 
-def _csv(header: str, values: Tensor) -> str:
-    rows = (",".join(f"{value!r}" for value in row) for row in values.tolist())
-    return "\n".join([header, *rows]) + "\n"
+def _csv(columns: list[str], values: Tensor) -> str:
+    return str(pd.DataFrame(values.numpy(), columns=columns).to_csv(index=False))
 
 
-def _write_splits(splits: dict[str, tuple[Tensor, Tensor]], folder: Path, first: int) -> None:
+def write_splits(splits: Mapping[str, tuple[Tensor, Tensor]], folder: Path, first: int) -> None:
+    """Write the rows of splits, of which row 0 gets the number `first`: 1 for spectra, 0 for RSSI."""
     for name, parts in splits.items():
         suffix = "" if name == "random" else f"_{name}"
         for part, rows in zip(("train", "test"), parts, strict=True):

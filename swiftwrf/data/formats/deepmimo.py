@@ -31,7 +31,7 @@ from swiftwrf.data.archives import read_arrays
 from swiftwrf.data.files import check_carrier, digests, read_text
 from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format, ReadOptions
 from swiftwrf.data.paths import PropagationPaths
-from swiftwrf.data.spectra import GRID, Spectra, check_pixels
+from swiftwrf.data.spectra import Spectra
 from swiftwrf.errors import InputError
 from swiftwrf.positions import check_positions
 
@@ -77,7 +77,6 @@ class DeepMimo(Format[Spectra]):
             raise InputError(f"{path} has no receiver with a path for pair {pair}")
         notes = [] if reached.all() else [f"receivers without a path are left out: {int((~reached).sum())}"]
         index, receiver, known = index[reached], receiver[reached], known[reached]
-        check_pixels(str(path), len(receiver), options.grid or GRID)
         table = {key: values[reached] for key, values in table.items()}
         paths, found = _paths(path, table, known, receiver, transmitter, frequency, tracer)
         return paths.spectra(

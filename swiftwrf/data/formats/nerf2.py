@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from swiftwrf.array.angles import AngularGrid, ArrayPose
+from swiftwrf.array.angles import ArrayPose
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.choices import Moving
 from swiftwrf.data.archives import array_header, array_names, read_arrays, read_rows, refusing_broken
@@ -43,7 +43,7 @@ from swiftwrf.data.files import (
 from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format, ReadOptions
 from swiftwrf.data.spectra import Spectra, check_pixels
 from swiftwrf.data.splits import read_splits
-from swiftwrf.data.store import BATCH_PIXELS, MAX_FINE_PIXELS, MAX_MEMORY_PIXELS, Store, stored, too_many
+from swiftwrf.data.store import BATCH_PIXELS, Store, stored
 from swiftwrf.errors import InputError
 from swiftwrf.positions import check_positions, to_tensor
 
@@ -152,7 +152,7 @@ def _read_values(file: Path, n: int, digest: str) -> Store:
             f"{file}: spectra have {shape[1]} elevations and {shape[2]} azimuths; these look swapped, so give "
             "spectrum.transpose(0, 2, 1)"
         )
-    check_pixels(str(file), n, AngularGrid.hemisphere(*shape[1:]))
+    check_pixels(str(file), n, shape[1:])
     kept = {1: torch.uint8, 2: torch.float16}.get(kind.itemsize, torch.float32)
     if kind.kind == "u" and kept == torch.float16:
         kept = torch.float32  # 16 bits in full
@@ -223,11 +223,7 @@ def _check_size(file: Path, content: bytes, n: int, shape: tuple[int, int] | Non
             f"{file} has {rows} x {columns} pixels; a spectrum has 4 columns a row "
             "(elevations to 90, azimuths to 360 degrees), e.g. 90 x 360"
         )
-    if too_many((n, rows, columns)):
-        raise InputError(
-            f"{file} has {rows} x {columns} pixels, with {n} images {n * rows * columns:.3g}; average them down to "
-            f"at most {MAX_MEMORY_PIXELS:.3g} in all or {MAX_FINE_PIXELS:.3g} each"
-        )
+    check_pixels(str(file), n, (rows, columns))
     if shape is not None and (rows, columns) != shape:
         raise InputError(
             f"{file} has {rows} x {columns} pixels, the first image {shape[0]} x {shape[1]}; all spectra must have one shape"
