@@ -141,14 +141,10 @@ def find_roles(
 
 
 def receiver_columns(table: pd.DataFrame, names: Sequence[str]) -> tuple[list[str], list[str], list[str]]:
-    """Return the columns of a wide table that hold the RSSI of receivers, others that look like it, and notes on these.
+    """Return those columns that hold the RSSI of receivers, others that look like it, and notes on these.
 
     Names of other quantities are left out. Of several columns whose names are nothing but received power, the most specific
     one counts. Other columns must be akin to columns of received power, by their names or by their values.
-
-    Args:
-        table: Columns.
-        names: Those without another role.
 
     Example:
         >>> table = pd.DataFrame({"AP1": [-60] * 9, "AP2": [-70] * 9, "SNR": [-3] * 9, "drift": [-20.5] * 9})
@@ -209,14 +205,8 @@ def check_receiver_known(
 ) -> None:
     """Refuse a table with one column of RSSI beside names that may be those of its receivers.
 
-    Such names repeat. Several of them occur at one place and time, or they alternate from row to row.
-
-    Args:
-        label: Name of the table, for messages.
-        table: Its columns.
-        rssi: Column of RSSI.
-        others: Columns without a role.
-        place: Columns of position and time.
+    Such names repeat in one of the other columns. Several of them occur at one place and time, or they alternate from row to
+    row.
 
     Raises:
         InputError: The question whether the column contains the receivers.

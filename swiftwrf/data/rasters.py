@@ -45,16 +45,7 @@ class Cells(NamedTuple):
 
 
 def write_geotiff(file: Path, bands: Mapping[str, Floats], cells: Cells) -> None:
-    """Write bands (rows, columns) by name as a GeoTIFF of float32, the northernmost row first.
-
-    Args:
-        file: File to write.
-        bands: Values by name of the band, rows from south to north, nan for no data.
-        cells: Places of the values.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Write bands (rows, columns) by name as a GeoTIFF of float32. Their rows run from south to north, nan is no data."""
     pixels = zlib.compress(np.stack([band[::-1] for band in bands.values()], axis=-1).astype("<f4").tobytes())
     west, north = cells.x[0] - cells.edge / 2, cells.y[-1] + cells.edge / 2
     names = "".join(  # GDAL escapes descriptions twice
@@ -119,10 +110,7 @@ def _geo_keys(origin: GeodeticOrigin | None) -> tuple[list[int], list[float]]:
 def write_geojson(file: Path, bands: Mapping[str, Floats], cells: Cells) -> None:
     """Write a GeoJSON collection (RFC 7946) with one square for each cell, whose properties are the values by band.
 
-    Args:
-        file: File to write.
-        bands: Values (rows, columns) by name, rows from south to north, nan for no data. They are written with 2 decimals.
-        cells: Places of the values.
+    Rows of the bands run from south to north, nan is no data. Values are written with 2 decimals.
 
     Raises:
         InputError: Cells in local metres.
@@ -155,9 +143,6 @@ def write_world_file(file: Path, cells: Cells) -> None:
     """Write the world file of an image of the cells, the northernmost row on top.
 
     It contains longitude and latitude (WGS84), exact in the middle of the map, or x and y [m] without an origin.
-
-    Raises:
-        OSError: The file cannot be written.
     """
     middle = np.array([(cells.x[0] + cells.x[-1]) / 2, (cells.y[0] + cells.y[-1]) / 2])
     place = middle + cells.edge * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, -1.0]])

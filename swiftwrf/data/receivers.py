@@ -59,9 +59,7 @@ def spelled_as(names: Sequence[str], known: Sequence[str]) -> tuple[list[str], l
 def pool_names(names: Sequence[str], by: str) -> list[str]:
     """Return the access point of each radio; a radio that does not match is one of its own.
 
-    Args:
-        names: Names of the radios.
-        by: "mac" for the first five bytes of a MAC address, else a regular expression whose group is the access point.
+    `by` is "mac" for the first five bytes of an address, else a regular expression whose group is the access point.
 
     Raises:
         InputError: An expression that is broken, has no group, or matches no radio.
@@ -85,14 +83,9 @@ def pool_names(names: Sequence[str], by: str) -> list[str]:
 
 
 def pooled(rssi: Floats, pools: Sequence[str]) -> tuple[list[str], Floats]:
-    """Return the access points and their RSSI: the mean power of those radios that detected the transmitter.
+    """Return P access points in order of their first radio, and their RSSI (n, P) [dBm] from that of R radios (n, R).
 
-    Args:
-        rssi: RSSI of the radios (n, R) [dBm], nan where not detected.
-        pools: Access point of each radio, R names.
-
-    Returns:
-        P names in order of their first radio, and RSSI (n, P) [dBm].
+    It is the mean power of those radios of the access point that detected the transmitter.
 
     Example:
         >>> pooled(np.array([[-50.0, -50.0], [-60.0, np.nan]]), ["hall", "hall"])
@@ -150,10 +143,7 @@ def unknown_positions(names: list[str]) -> list[str]:
 def read_places(file: Path, origin: GeodeticOrigin | None, frame: PlanFrame) -> Tensor:
     """Return the positions in a table with columns x, y, z or longitude, latitude, altitude, float64 (n, 3) [m].
 
-    Args:
-        file: CSV or Parquet file. Without a column of heights, z is 0.
-        origin: Origin of the metres, if positions are in degrees.
-        frame: Axes of positions that are not in degrees.
+    Without a column of heights, z is 0. Origin and axes are those of `read_receivers`.
 
     Raises:
         InputError: A column that is missing, or a position that is not usable.

@@ -179,11 +179,7 @@ class Rssi(PositionedData):
         return ~self.rssi_dbm.isnan()
 
     def about(self, origin: GeodeticOrigin | None) -> Rssi:
-        """Return the data in local metres about another origin.
-
-        Args:
-            origin: Origin of the metres. With None, or if the data have none, nothing changes.
-        """
+        """Return the data in local metres about another origin. With None, or if the data have none, nothing changes."""
         if origin is None or self.origin is None or origin == self.origin:
             return self
         own = self.origin
@@ -362,12 +358,7 @@ class Offsets:
 
 @checked
 def receiver_row(names: Sequence[str], asked: str, owner: str) -> int:
-    """Return the index of a receiver.
-
-    Args:
-        names: Names of all receivers.
-        asked: Name, or number counted from 1.
-        owner: What has these receivers, for the message.
+    """Return the index of a receiver that is asked for by its name or its number from 1; the owner is for the message.
 
     Raises:
         InputError: An unknown receiver.

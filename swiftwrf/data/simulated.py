@@ -70,11 +70,7 @@ class ShoeboxRoom:
     """frequency of the carrier [Hz]"""
 
     def paths(self, transmitter: Tensor, receiver: Tensor) -> PropagationPaths:
-        """Return the 25 paths with at most two reflections of each link, the direct path first.
-
-        Args:
-            transmitter: Positions, (n, 3) [m]. Both ends broadcast.
-            receiver: Positions, (n, 3) [m].
+        """Return the 25 paths with at most two reflections of each link between positions (n, 3) [m], the direct path first.
 
         Raises:
             InputError: A position outside the room, or both ends at one position.
@@ -132,12 +128,9 @@ class ShoeboxRoom:
 
 
 def _hits(segments: Sequence[tuple[Tensor, Tensor]], low: Point, high: Point) -> Tensor:
-    """Return whether segments pass through the box between the corners low and high, bool (...).
+    """Return whether segments pass through the box between two corners, bool (...).
 
-    Args:
-        segments: Start and step (...) along each axis; no step is 0.
-        low: Corner of lowest coordinates.
-        high: Opposite corner.
+    Segments are start and step (...) along each axis; no step is 0.
     """
     enter = torch.zeros_like(segments[0][0])
     leave = torch.ones_like(enter)

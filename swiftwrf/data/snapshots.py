@@ -183,14 +183,8 @@ class Measured(NamedTuple):
 def measured(source: Path, channel: Tensor, drop_null: bool = False, drop: Sequence[int] = ()) -> Measured:
     """Return a channel (n, S, K) with missing values as 0: those that are 0 or NaN. Beamformers do not use them.
 
-    Elements without any value are left out, so are snapshots if other rows have fewer of them. Null, guard and DC
-    subcarriers hold a constant or nothing: they are the same at every position and element.
-
-    Args:
-        source: File or folder, for messages.
-        channel: Complex channels.
-        drop_null: Leave out null subcarriers, too.
-        drop: Elements to leave out, counted from 0.
+    Elements to drop, counted from 0, and those without any value are left out. So are snapshots if other rows have fewer of
+    them. Null, guard and DC subcarriers hold a constant or nothing: they are the same at every position and element.
 
     Raises:
         InputError: A position without any value, fewer than 2 elements, or one to leave out that does not exist.

@@ -330,10 +330,7 @@ def check_pixels(name: str, n: int, shape: Sequence[int]) -> None:
 def coarsening(shape: Sequence[int], max_azimuths: int, least_rows: int = 1) -> int:
     """Return the smallest factor that divides both sizes and brings spectra to at most `max_azimuths` columns.
 
-    Args:
-        shape: Rows and columns of the spectra.
-        max_azimuths: Largest number of columns. 0 stands for all pixels.
-        least_rows: Smallest number of rows. If no factor leaves that many, the result is 1.
+    A maximum of 0 stands for all pixels. If no factor leaves `least_rows`, the result is 1.
     """
     least = math.ceil(shape[1] / max_azimuths) if max_azimuths else 1
     factors = range(least, shape[0] // least_rows + 1)

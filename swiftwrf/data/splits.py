@@ -34,10 +34,8 @@ def split_names(folder: Path) -> list[str]:
 def read_splits(folder: Path, n: int, first: int) -> dict[str, tuple[Tensor, Tensor]]:
     """Return training and test rows of all splits in a folder, int64, in file order and counted from 0.
 
-    Args:
-        folder: Folder of `train_index[_NAME].txt` and `test_index[_NAME].txt`. Files without a name are the split random.
-        n: Number of measurements.
-        first: Number of the first measurement in the files: 1 for spectra, 0 for RSSI.
+    Files are `train_index[_NAME].txt` and `test_index[_NAME].txt`. The first of n measurements has the number `first`:
+    1 for spectra, 0 for RSSI.
 
     Raises:
         InputError: A missing file, a value that is no whole number, an index out of range, twice in a part or in both parts.
@@ -227,10 +225,6 @@ def matching_validation(train: Tensor, test: Tensor) -> Validation:
     """Return the kind of folds whose held-out distances resemble those of the test positions.
 
     A distance is that to the nearest training position (C. Mila et al., Methods in Ecology and Evolution 13, 2022).
-
-    Args:
-        train: Training positions, (n, 3) [m].
-        test: Positions of the test rows, (m, 3) [m].
 
     Example:
         >>> line = torch.linspace(0, 99, 100)[:, None] * torch.tensor([1.0, 0.0, 0.0])

@@ -95,14 +95,8 @@ def read_survey(
 ) -> dict[str, Any]:
     """Return the arguments of `Rssi` that a survey table determines: RSSI, positions, receivers and what rows are of.
 
-    Columns get their roles, cells their units, and then rows are formed: one a place, time and packet of a receiver.
-
-    Args:
-        label: Name of the table, for messages.
-        table: Columns of positions and RSSI.
-        options: What the user states about them.
-        receivers: Table of the receivers' positions.
-        keeps_rows: Whether repeated scans stay.
+    Columns get their roles, cells their units, and then rows are formed: one a place, time and packet of a receiver. The
+    label names the table in messages, `receivers` is a table of their positions. With keeps_rows, repeated scans stay.
 
     Raises:
         InputError: A column that is missing or ambiguous, or a value that is no position or received power.
@@ -272,11 +266,7 @@ class _Survey:
         return tuple(name for name, count in counts.items() if 2 <= len(count) <= 30 and int(count.min()) >= 10)
 
     def powers(self, names: Sequence[str]) -> Floats:
-        """Return the RSSI in columns (n, len(names)), nan where it was not detected; a word may stand for that.
-
-        Raises:
-            InputError: Text that is no such word.
-        """
+        """Return the RSSI in columns (n, len(names)), nan where it was not detected, for which one word may stand."""
         values, text = (
             np.stack(part, axis=1) for part in zip(*(parsed(self.table[name]) for name in names), strict=True)
         )
@@ -477,9 +467,6 @@ def _columns_of_end(label: object, table: pd.DataFrame, given: Sequence[str]) ->
 
     They are the given ones. Otherwise they are those marked tx or transmitter beside others, or those marked rx or receiver
     beside unmarked ones.
-
-    Raises:
-        InputError: A missing column, or another number of columns.
     """
     if given:
         missing = [name for name in given if name not in table.columns]
@@ -501,19 +488,11 @@ def _mark(name: str) -> str:
 
 
 def _as_receivers(label: object, rssi: Floats, ends: Floats) -> tuple[list[str], Floats, Floats, Floats, list[str]]:
-    """Return links as RSSI of one moving end at the positions of the other, which has fewer of them.
-
-    Args:
-        label: Name of the table, for messages.
-        rssi: RSSI of the links, (n, 1) [dBm].
-        ends: Positions of both ends, (n, 6) [m].
+    """Return links of two ends (n, 6) [m] as RSSI of one at the positions of the other, which has fewer of them.
 
     Returns:
         Names of P receivers, RSSI (n, P) [dBm], positions of the moving end (n, 3) [m] and of the receivers (P, 3) [m], and
         notes.
-
-    Raises:
-        InputError: RSSI of several receivers.
     """
     if rssi.shape[1] != 1:
         raise InputError(

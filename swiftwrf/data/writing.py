@@ -30,11 +30,7 @@ from swiftwrf.runtime.durable import replacing, write_bytes, write_text
 
 
 def write_spectra(data: Spectra, folder: Path) -> None:
-    """Write gateway_info.yml, tx_pos.csv or rx_pos.csv, spectrum.npz and the splits.
-
-    Args:
-        data: Spectra with known fixed end and orientation.
-        folder: Existing folder.
+    """Write gateway_info.yml, tx_pos.csv or rx_pos.csv, spectrum.npz and the splits into a folder.
 
     Raises:
         InputError: Both ends move, the orientation is unknown, or the layout does not have the grid.
@@ -63,16 +59,12 @@ def write_spectra(data: Spectra, folder: Path) -> None:
 
 
 def write_rssi(data: Rssi, folder: Path) -> None:
-    """Write tx_pos.csv, gateway_rssi.csv, the splits, and what else is known of the measurements.
+    """Write tx_pos.csv, gateway_rssi.csv, the splits, and what else is known of the measurements, into a folder.
 
     That is meta.csv with sessions and times, gateway_position.yml with positions of receivers, and survey.yml with the
     origin of the coordinates, the floors, and whether the receiver moves.
 
     Measurements of exactly -100 dBm, which the layout uses for not detected, are written as -99.99.
-
-    Args:
-        data: RSSI, nan where not detected.
-        folder: Existing folder.
     """
     rssi = data.rssi_dbm.where(data.rssi_dbm != NOT_DETECTED_DBM, NOT_DETECTED_DBM + 0.01)
     write_text(folder / "gateway_rssi.csv", _csv(list(data.receiver_names), rssi.nan_to_num(NOT_DETECTED_DBM)))
@@ -97,12 +89,7 @@ def write_rssi(data: Rssi, folder: Path) -> None:
 
 
 def write_paths(paths: PropagationPaths, folder: Path) -> None:
-    """Write paths.npz.
-
-    Args:
-        paths: At least one path a link, with known corners.
-        folder: Existing folder.
-    """
+    """Write paths with known corners, at least one a link, as paths.npz."""
     stream = io.BytesIO()
     length: dict[str, Any] = {} if paths.length is None else {"length": paths.length.numpy()}
     np.savez_compressed(
@@ -120,13 +107,9 @@ def write_paths(paths: PropagationPaths, folder: Path) -> None:
 
 
 def write_deepmimo(paths: PropagationPaths, folder: Path) -> None:
-    """Write the folder of a DeepMIMO v4 scenario, which `load_spectra` reads.
+    """Write paths of known length from one transmitter as a folder of a DeepMIMO v4 scenario, which `load_spectra` reads.
 
     Interactions (`inter`) are 0 for direct paths and nan for others, whose kinds the paths do not contain.
-
-    Args:
-        paths: Paths of known length from one transmitter.
-        folder: Existing folder.
 
     Raises:
         InputError: Unknown lengths, or several transmitters.
@@ -162,11 +145,7 @@ def write_deepmimo(paths: PropagationPaths, folder: Path) -> None:
 
 
 def write_mat(data: Labelled, file: Path) -> None:
-    """Write coordinates and variables as a MATLAB file of version 5: arrays of one dimension as (n, 1), names as cells.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Write coordinates and variables as a MATLAB file of version 5: arrays of one dimension as (n, 1), names as cells."""
     arrays = {name: values for name, (_, values, *_) in (data.coordinates() | data.variables()).items()}
     arrays |= {name: values.astype(object) for name, values in arrays.items() if values.dtype.kind == "U"}  # to cells
     with replacing(file) as temporary, temporary.open("wb") as stream:

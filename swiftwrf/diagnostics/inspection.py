@@ -15,7 +15,7 @@ from swiftwrf.data import Rssi, Snapshots, Spectra
 from swiftwrf.data.powers import has_frequent_edge
 from swiftwrf.data.splits import MAX_REPEATED, MIN_TRAINING, repeated_fraction
 from swiftwrf.diagnostics.calibration import calibrate
-from swiftwrf.diagnostics.elements import NOISE, noisy_elements
+from swiftwrf.diagnostics.elements import in_noise, noisy_elements, some_rows
 from swiftwrf.diagnostics.frames import MIN_CLEAR_POSITIONS, FrameReport, check_frames
 from swiftwrf.diagnostics.path_loss import check_path_loss
 from swiftwrf.errors import InputError, listed
@@ -108,10 +108,9 @@ def inspect(
     if snapshots is not None:
         _check_snapshots(snapshots, findings)
     _check_spectra(spectra, findings)
-    if _check_peaks(spectra, findings, snapshots, beamformer) != "explained" and snapshots is not None:
+    if _check_peaks(spectra, findings, snapshots) != "explained" and snapshots is not None:
         if noise := noisy_elements(snapshots, snapshots.away):
-            text = NOISE.format(listed=", ".join(map(str, noise)), option=" ".join(map(str, noise)))
-            findings.warn(f"E{text[1:]}.", noisy_elements=noise)
+            findings.warn(f"E{in_noise(noise)[1:]}.", noisy_elements=noise)
         _check_calibration(snapshots, findings)
     return findings
 
@@ -169,7 +168,7 @@ def _normalised(position: Tensor) -> str:
 
 def nearest(position: Tensor) -> tuple[Tensor, Tensor]:
     """Return rows of positions (n, 3), a subset of many, and the distance from each to the nearest other one [m]."""
-    some = torch.linspace(0, len(position) - 1, min(MAX_POSITIONS, len(position))).round().long()
+    some = some_rows(len(position), MAX_POSITIONS)
     apart = torch.cat([distance(position[rows], position) for rows in some.split(500)])
     apart[torch.arange(len(some)), some] = torch.inf
     return some, apart.amin(dim=1)
@@ -260,25 +259,16 @@ def _check_calibration(data: Snapshots, findings: Findings) -> None:
         findings.add(f"The array needs no calibration: {text}.", calibration=found.to_json())
 
 
-def _check_peaks(
-    data: Spectra, findings: Findings, snapshots: Snapshots | None = None, beamformer: str = PHASE
-) -> Frame:
-    """Report whether the peaks of the spectra follow the lines of sight, and return the result in a word.
-
-    Args:
-        data: Spectra.
-        findings: Findings to add to.
-        snapshots: Snapshots that the spectra were computed from.
-        beamformer: Beamformer of those spectra.
-    """
-    report = check_frames(data, snapshots, beamformer)
+def _check_peaks(data: Spectra, findings: Findings, snapshots: Snapshots | None) -> Frame:
+    """Report whether the peaks of the spectra follow the lines of sight, and return the result in a word."""
+    report = check_frames(data, snapshots)
     if report is None:
         findings.warn(
             "Frames cannot be checked: that needs the fixed end, the orientation and "
             f"{MIN_CLEAR_POSITIONS} positions with line of sight."
         )
         return "unknown"
-    frame, text = _error(data, report) or _without_error(report)
+    frame, text = _in_words(data, report)
     if frame != "explained":
         _add_behind(data, report, findings)
     linear = data.array is not None and data.array.axis is not None
@@ -297,8 +287,8 @@ def _check_peaks(
     return frame
 
 
-def _error(data: Spectra, report: FrameReport) -> tuple[Frame, str] | None:
-    """Return the error that explains the peaks, in words, or None."""
+def _in_words(data: Spectra, report: FrameReport) -> tuple[Frame, str]:
+    """Return the error that explains the peaks, or else how far they agree with the lines of sight, in words."""
     if not report.fits and (filled := _normalised(data.position)):
         return "explained", f". All coordinates fill {filled} exactly, so positions look normalised; give metres"
     if report.explanations:
@@ -310,11 +300,6 @@ def _error(data: Spectra, report: FrameReport) -> tuple[Frame, str] | None:
             f". A constant rotation of {angle:.0f} degrees about ({axis}) in array coordinates would mend most of it: "
             "is the orientation right?"
         )
-    return None
-
-
-def _without_error(report: FrameReport) -> tuple[Frame, str]:
-    """Return how far peaks and lines of sight agree in the declared frame, in words."""
     if report.fits:
         return "fits", " and follow it: positions, orientation and angles are in one frame"
     if report.narrow:
@@ -372,12 +357,7 @@ def _check_rssi(data: Rssi, findings: Findings) -> None:
 
 
 def propose_offsets(data: Rssi, findings: Findings) -> None:
-    """Warn of a column whose values have constant offsets of RSSI.
-
-    Args:
-        data: RSSI with the groups of such a column.
-        findings: Where the warning is added.
-    """
+    """Warn of the column of the groups of RSSI if its values have constant offsets."""
     if data.groups is None or len(data.groups.code.unique()) < 2:
         return
     column = data.groups.column

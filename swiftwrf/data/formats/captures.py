@@ -239,11 +239,7 @@ def _read_description(file: Path) -> Arrays:
 
 
 def _files(table: Path, frame: pd.DataFrame) -> list[Path]:
-    """Return the captures that a table of positions names.
-
-    Raises:
-        InputError: No column of files, a file twice, or one that is missing or of another kind.
-    """
+    """Return the captures that a table of positions names, each once."""
     if "file" not in frame.columns:
         raise InputError(f"{table} has no column file; there are {listed(frame.columns)}: {NEEDED}")
     files = [table.parent / name for name in text_of(frame["file"])]

@@ -192,15 +192,8 @@ def _from_horizon(
 ) -> bool:
     """Return True if elevations count from the horizon, and refuse other conventions than those of docs/formats.md.
 
-    Direct paths come from the transmitter, which reveals the convention. With few of them negative angles do.
-
-    Args:
-        folder: Source, for the message.
-        azimuth: Azimuths of the paths, (n, paths) [deg].
-        zenith: Zenith angles of the paths, (n, paths) [deg].
-        direct: True for direct paths, (n, paths).
-        known: True for paths that exist, (n, paths).
-        away: Vectors from the receivers to the transmitter, (n, 3).
+    Direct paths come from the transmitter, `away` (n, 3) from the receivers. They reveal the convention of angles (n, paths)
+    [deg]. With few of them negative angles do.
 
     Raises:
         InputError: Angles that point the other way, or another frame.

@@ -129,11 +129,7 @@ def _properties(file: Path) -> dict[str, Any]:
 
 
 def _one_of(path: Path, names: tuple[str, ...]) -> Path:
-    """Return the only file with one of these names.
-
-    Raises:
-        InputError: None of them, or several.
-    """
+    """Return the only file with one of these names, and refuse none or several."""
     found = [path / name for name in names if (path / name).is_file()]
     if len(found) > 1:
         raise InputError(f"{path} holds {' and '.join(file.name for file in found)}; keep one of them")
