@@ -41,11 +41,6 @@ def sha256(file: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def sha256_of_all(digests: Iterable[tuple[str, str]]) -> str:
-    """Return one digest for many files, from pairs of their names and digests."""
-    return hashlib.sha256("".join(f"{digest}  {name}\n" for name, digest in digests).encode()).hexdigest()
-
-
 def digests(files: Iterable[Path], split_folder: Path | None = None) -> dict[str, str]:
     """Return sha256 by name of the given files, and of all split files in a folder."""
     splits = sorted(split_folder.glob("*_index*.txt")) if split_folder else []
@@ -251,7 +246,9 @@ def _regular(label: object, lines: list[list[str]]) -> tuple[list[str], list[lis
     for row, line in enumerate(rows, start=1):
         if len(line) != len(names):
             raise InputError(f"{label} row {row} has {len(line)} values, but the header has {len(names)}")
-    if len(rows) > 1 and _is_second_header(rows[0], rows[1]):
+    filled = [column for column, cell in enumerate(rows[0]) if cell.strip()]
+    is_text = all(math.isnan(number(rows[0][c])) and not NO_VALUE.fullmatch(rows[0][c]) for c in filled)
+    if len(rows) > 1 and is_text and sum(not math.isnan(number(rows[1][c])) for c in filled) > 1:  # e.g. of units
         notes.append(f"row 1 is a second header and left out: {', '.join(filter(None, rows[0]))}")
         rows = rows[1:]
     nameless = [column for column, name in enumerate(names) if not name]
@@ -273,13 +270,6 @@ def _regular(label: object, lines: list[list[str]]) -> tuple[list[str], list[lis
 
 def _names_in(line: list[str]) -> list[str]:
     return [name.strip().removeprefix("#").strip() for name in line]
-
-
-def _is_second_header(row: list[str], below: list[str]) -> bool:
-    """Return True for a row of text alone above numbers, e.g. of units or names of networks."""
-    filled = [column for column, cell in enumerate(row) if cell.strip()]
-    is_text = all(math.isnan(number(row[column])) and not NO_VALUE.fullmatch(row[column]) for column in filled)
-    return is_text and sum(not math.isnan(number(below[column])) for column in filled) > 1
 
 
 def read_xyz(file: Path) -> NDArray[np.float64]:

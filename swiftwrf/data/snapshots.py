@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -121,25 +121,14 @@ class Snapshots(PositionedData):
         """
         grid = AngularGrid.of(grid or GRID)
         check_pixels(self.name, len(self), grid.shape)
-        same = (
-            "position",
-            "line_of_sight",
-            "index",
-            "named_splits",
-            "array",
-            "source",
-            "fixed_position",
-            "rotation",
-            "channel",
-            "frequency_hz",
-        )
+        same = "position line_of_sight index named_splits array source fixed_position rotation channel frequency_hz"
         return Spectra(
             store=array_spectra(self.array, self.channel, grid, beamformer),
             grid=grid,
             moving="transmitter",
             name=self.name,
             notes=self.notes,
-            **{field: getattr(self, field) for field in same},
+            **{field: getattr(self, field) for field in same.split()},
         )
 
     def _columns(self) -> dict[str, Any]:
@@ -171,17 +160,12 @@ def check_spacing(file: Path, array: PlanarArray) -> None:
         )
 
 
-class Measured(NamedTuple):
-    """Channel (n, S, K) without what is missing, its snapshots and elements among those of the source, and notes."""
+def measured(
+    source: Path, channel: Tensor, drop_null: bool = False, drop: Sequence[int] = ()
+) -> tuple[Tensor, Tensor, Tensor, tuple[str, ...]]:
+    """Return a channel (n, S, K) without what is missing, its snapshots and elements among those given, and notes.
 
-    channel: Tensor
-    snapshot: Tensor
-    element: Tensor
-    notes: tuple[str, ...]
-
-
-def measured(source: Path, channel: Tensor, drop_null: bool = False, drop: Sequence[int] = ()) -> Measured:
-    """Return a channel (n, S, K) with missing values as 0: those that are 0 or NaN. Beamformers do not use them.
+    Missing are values that are 0 or NaN. They become 0, which beamformers do not use.
 
     Elements to drop, counted from 0, and those without any value are left out. So are snapshots if other rows have fewer of
     them. Null, guard and DC subcarriers hold a constant or nothing: they are the same at every position and element.
@@ -236,7 +220,7 @@ def measured(source: Path, channel: Tensor, drop_null: bool = False, drop: Seque
             )
     if some := int((missing & ~empty[..., None]).sum()):
         notes.append(f"{some} of {missing.numel()} values of single elements are 0 or NaN and not used")
-    return Measured(channel[:, kept], kept.nonzero()[:, 0], used.nonzero()[:, 0], tuple(notes))
+    return channel[:, kept], kept.nonzero()[:, 0], used.nonzero()[:, 0], tuple(notes)
 
 
 def round_trip_array(array: PlanarArray) -> tuple[PlanarArray, tuple[str, ...]]:

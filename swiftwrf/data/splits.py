@@ -40,20 +40,18 @@ def read_splits(folder: Path, n: int, first: int) -> dict[str, tuple[Tensor, Ten
     Raises:
         InputError: A missing file, a value that is no whole number, an index out of range, twice in a part or in both parts.
     """
-    return {name: _read_split(folder, name, n, first) for name in split_names(folder)}
-
-
-def _read_split(folder: Path, name: str, n: int, first: int) -> tuple[Tensor, Tensor]:
-    named = name != "random" or (folder / "train_index_random.txt").is_file()
-    suffix = f"_{name}" if named else ""
-    train, test = (_read_indices(folder / f"{part}_index{suffix}.txt", n, first) for part in ("train", "test"))
-    both = sorted(set(train) & set(test))
-    if both:
-        raise InputError(
-            f"split {name!r} in {folder} has index {both[0] + first} in both its training and its test part "
-            f"({len(both)} such); take them out of one"
-        )
-    return torch.tensor(train, dtype=torch.int64), torch.tensor(test, dtype=torch.int64)
+    splits = {}
+    for name in split_names(folder):
+        named = name != "random" or (folder / "train_index_random.txt").is_file()
+        suffix = f"_{name}" if named else ""
+        train, test = (_read_indices(folder / f"{part}_index{suffix}.txt", n, first) for part in ("train", "test"))
+        if both := sorted(set(train) & set(test)):
+            raise InputError(
+                f"split {name!r} in {folder} has index {both[0] + first} in both its training and its test part "
+                f"({len(both)} such); take them out of one"
+            )
+        splits[name] = torch.tensor(train, dtype=torch.int64), torch.tensor(test, dtype=torch.int64)
+    return splits
 
 
 def _read_indices(file: Path, n: int, first: int) -> list[int]:
@@ -85,9 +83,8 @@ def kept_splits(splits: dict[str, tuple[Tensor, Tensor]], kept: Tensor, n: int) 
         {'days': (tensor([0]), tensor([1]))}
     """
     number = torch.full((n,), -1).scatter(0, kept, torch.arange(len(kept)))
-    return {
-        name: (a[a >= 0], b[b >= 0]) for name, (a, b) in ((k, (number[x], number[y])) for k, (x, y) in splits.items())
-    }
+    parts = {name: (number[train], number[test]) for name, (train, test) in splits.items()}
+    return {name: (train[train >= 0], test[test >= 0]) for name, (train, test) in parts.items()}
 
 
 def places(position: Tensor, n_parts: int) -> Tensor:
@@ -197,23 +194,18 @@ def folds(
     if validation == "session":
         if session is None:
             raise InputError('validation="session" needs measurements with sessions, see docs/formats.md')
-        if len(session.unique()) > 1:
-            return _whole(session, number)
+        _, own, size = session.unique(return_inverse=True, return_counts=True)
+        if len(size) > 1:  # whole sessions in folds of nearly equal size
+            fold, filled = torch.zeros_like(size), torch.zeros(min(number, len(size)), dtype=torch.int64)
+            for which in size.argsort(descending=True, stable=True).tolist():
+                fold[which] = filled.argmin()
+                filled[fold[which]] += size[which]
+            return fold[own]
     if validation == "block":
         return slabs(position, number)
     place = places(position, number)
     order = torch.randperm(len(place.unique()), generator=torch.Generator().manual_seed(seed))
     return (order % number)[place]
-
-
-def _whole(session: Tensor, number: int) -> Tensor:
-    """Return folds of whole sessions, of nearly equal size."""
-    _, own, size = session.unique(return_inverse=True, return_counts=True)
-    fold, filled = torch.zeros_like(size), torch.zeros(min(number, len(size)), dtype=torch.int64)
-    for which in size.argsort(descending=True, stable=True).tolist():
-        fold[which] = filled.argmin()
-        filled[fold[which]] += size[which]
-    return fold[own]
 
 
 def validation_for(split: str) -> Validation:

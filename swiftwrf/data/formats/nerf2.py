@@ -38,7 +38,6 @@ from swiftwrf.data.files import (
     read_xyz,
     read_yaml,
     sha256,
-    sha256_of_all,
 )
 from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format, ReadOptions
 from swiftwrf.data.spectra import Spectra, check_pixels
@@ -59,7 +58,12 @@ class Nerf2(Format[Spectra]):
 
     def read(self, path: Path, options: ReadOptions) -> Spectra:
         described = path / "gateway_info.yml"
-        gateway = _read_gateway(described)
+        gateways = [value for value in read_yaml(described).values() if isinstance(value, dict)]
+        if len(gateways) != 1:
+            raise InputError(
+                f"{described} must describe one gateway with its position and orientation, got {len(gateways)}"
+            )
+        (gateway,) = gateways
         pose = _read_pose(described, gateway)
         array = _read_array(described, gateway)
         if options.array is not None and array is not None and array != options.array:
@@ -84,15 +88,6 @@ class Nerf2(Format[Spectra]):
             named_splits=read_splits(path, len(position), first=1),
             source=digests([described, tables[0]], path) | read,
         )
-
-
-def _read_gateway(file: Path) -> dict[str, Any]:
-    content = read_yaml(file)
-    gateways = [value for value in content.values() if isinstance(value, dict)]
-    if len(gateways) != 1:
-        raise InputError(f"{file} must describe one gateway with its position and orientation, got {len(gateways)}")
-    gateway: dict[str, Any] = gateways[0]
-    return gateway
 
 
 def _read_pose(file: Path, gateway: dict[str, Any]) -> ArrayPose:
@@ -189,20 +184,19 @@ def _read_images(folder: Path, n: int) -> tuple[Store, str]:
         raise InputError(f"{folder} holds {found} images, but there are {n} positions; each position needs its image")
     files = [folder / f"{number:05d}.png" for number in range(1, n + 1)]
     shape: tuple[int, int] | None = None
-    digests = []
+    digest = hashlib.sha256()
     for file in files:
         if not file.is_file():
             raise InputError(f"{file} is missing; images are numbered from 00001.png without gaps")
         content = read_bytes(file)
-        digests.append((file.name, hashlib.sha256(content).hexdigest()))
+        digest.update(f"{hashlib.sha256(content).hexdigest()}  {file.name}\n".encode())
         shape = _check_size(file, content, n, shape)
     assert shape is not None
-    digest = sha256_of_all(digests)
 
     def batches() -> Iterator[Tensor]:
         return (torch.from_numpy(_decode(file, read_bytes(file)).copy())[None] for file in files)
 
-    return stored((n, *shape), torch.uint8, lambda: digest, batches), digest
+    return stored((n, *shape), torch.uint8, digest.hexdigest, batches), digest.hexdigest()
 
 
 def _opened(content: bytes) -> Image.Image:
