@@ -112,9 +112,7 @@ class FrameReport:
         peak_span_deg: Median angle between the peaks of two positions [deg].
         behind: Fraction of the lines of sight that lie behind the array. 0 for a linear array, which has no front.
         explanations: Errors with clearly more agreement than the declared frame, in words; several are not distinguished.
-        explained: Agreement with them.
         turn_deg: Constant rotation with more agreement, as a rotation vector in array coordinates [deg], or None.
-        positions: Number of positions used.
     """
 
     agreement: float
@@ -126,9 +124,7 @@ class FrameReport:
     peak_span_deg: float
     behind: float
     explanations: tuple[str, ...]
-    explained: float
     turn_deg: tuple[float, float, float] | None
-    positions: int
 
     @property
     def follows(self) -> bool:
@@ -139,16 +135,6 @@ class FrameReport:
     def fits(self) -> bool:
         """True if the declared frame explains most peaks, and no other frame does clearly better."""
         return self.follows and self.angle_deg <= self.limit_deg and self.elsewhere <= MAX_ELSEWHERE
-
-    @property
-    def narrow(self) -> bool:
-        """True if all lines of sight have nearly one direction, so that frames cannot be checked."""
-        return self.span_deg < 10
-
-    @property
-    def steady(self) -> bool:
-        """True if the spectra hardly differ, although the lines of sight do."""
-        return not self.narrow and self.peak_span_deg < self.span_deg / 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,7 +236,10 @@ def check_frames(spectra: Spectra, snapshots: Snapshots | None = None) -> FrameR
     is_clear = best - declared >= (MIN_EVIDENCE if seen is None else MIN_POWER)
     explained = [name for name in names if is_clear and name != UNCALIBRATED and _reaches(tried[name])]
     turn = next((tried[name].turn for name in explained if tried[name].turn is not None), None)
-    angle_deg, limit_deg = _nearest(direction, peak).rad2deg(), _limit_deg(spectra)
+    angle_deg, limit_deg = _nearest(direction, peak).rad2deg(), 10.0
+    if spectra.array is not None:
+        pixel = math.degrees(max(spectra.grid.elevation_step, spectra.grid.azimuth_step))
+        limit_deg = min(limit_deg, math.degrees(spectra.array.resolution) + pixel / 2)
     return FrameReport(
         agreement=agreement,
         chance=chance,
@@ -261,25 +250,15 @@ def check_frames(spectra: Spectra, snapshots: Snapshots | None = None) -> FrameR
         peak_span_deg=_span_deg(peak[:, 0]),
         behind=0.0 if frame.linear else float((frame.away()[:, 2] < 0).double().mean()),
         explanations=tuple(name for name in explained if tried[name].turn is None),
-        explained=best if explained else declared,
         turn_deg=None if turn is None else tuple(np.degrees(turn).tolist()),
-        positions=len(rows),
     )
-
-
-def _limit_deg(spectra: Spectra) -> float:
-    """Return the median angle [deg] between peak and line of sight up to which they are in one frame."""
-    pixel = math.degrees(max(spectra.grid.elevation_step, spectra.grid.azimuth_step))
-    return 10.0 if spectra.array is None else min(10.0, math.degrees(spectra.array.resolution) + pixel / 2)
 
 
 def _evidence(away: Tensor, frame: _Frame, peak: Tensor, seen: Snapshots | None) -> Tensor:
     """Return the evidence (n,) for direct paths from points `away` (n, 3): power of snapshots, otherwise peaks."""
-    return (
-        _kernel(_nearest(frame.folded(functional.normalize(away, dim=1)), peak))
-        if seen is None
-        else evidence(seen, away)
-    )
+    if seen is not None:
+        return evidence(seen, away)
+    return _kernel(_nearest(frame.folded(functional.normalize(away, dim=1)), peak))
 
 
 def _reaches(found: _Hypothesis) -> bool:

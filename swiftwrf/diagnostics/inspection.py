@@ -30,6 +30,7 @@ SPARSE = 2.0  # wavelengths between neighbours, beyond which a search for a room
 MAX_END_OFFSET = 1e-3  # of normalised coordinates from the ends of their interval
 MAX_EXTENT_M = 1000.0  # beyond, coordinates may be millimetres or pixels
 MIN_GAIN = 0.1  # of a recommended calibration, in the fraction of the power along the line of sight
+MIN_SPAN_DEG = 10.0  # between lines of sight, to check frames
 MIN_BEHIND = 0.01  # share of the lines of sight behind the array that is reported
 Frame = Literal["unknown", "fits", "in part", "explained", "turned", "undecided"]
 MAX_LEVEL_DBM = 10.0  # at 1 m, which no usual transmitter reaches
@@ -269,8 +270,13 @@ def _check_peaks(data: Spectra, findings: Findings, snapshots: Snapshots | None)
         )
         return "unknown"
     frame, text = _in_words(data, report)
-    if frame != "explained":
-        _add_behind(data, report, findings)
+    if frame != "explained" and report.behind >= MIN_BEHIND:
+        where = "of the positions lie" if data.moving == "transmitter" else "of the positions have the transmitter"
+        behind = f"{report.behind:.0%} {where} behind the array, and their directions are folded to its front"
+        if report.behind > 1 - MIN_BEHIND:
+            findings.add(f"{behind}.")
+        else:
+            findings.warn(f"{behind}: two places share one label.")
     linear = data.array is not None and data.array.axis is not None
     by = ", by the angle to the array's axis" if linear else ""
     add = findings.add if frame in ("fits", "in part") else findings.warn
@@ -302,12 +308,12 @@ def _in_words(data: Spectra, report: FrameReport) -> tuple[Frame, str]:
         )
     if report.fits:
         return "fits", " and follow it: positions, orientation and angles are in one frame"
-    if report.narrow:
+    if report.span_deg < MIN_SPAN_DEG:
         return "undecided", (
             f". All lines of sight have nearly one direction ({report.span_deg:.1f} degrees between two, median), so frames "
             "cannot be checked"
         )
-    if report.steady:
+    if report.peak_span_deg < report.span_deg / 4:
         return "undecided", (
             f". The spectra hardly differ: two peaks are {report.peak_span_deg:.1f} degrees apart, two lines of sight "
             f"{report.span_deg:.1f} degrees (medians)"
@@ -321,18 +327,6 @@ def _in_words(data: Spectra, report: FrameReport) -> tuple[Frame, str]:
         " and do not follow it in any frame that was tried: unexplained, e.g. reflections are stronger, or the elements' "
         "phases are not calibrated"
     )
-
-
-def _add_behind(data: Spectra, report: FrameReport, findings: Findings) -> None:
-    """Report lines of sight behind a planar array, whose directions are folded to its front."""
-    if report.behind < MIN_BEHIND:
-        return
-    where = "of the positions lie" if data.moving == "transmitter" else "of the positions have the transmitter"
-    text = f"{report.behind:.0%} {where} behind the array, and their directions are folded to its front"
-    if report.behind > 1 - MIN_BEHIND:
-        findings.add(f"{text}.")
-    else:
-        findings.warn(f"{text}: two places share one label.")
 
 
 def _check_rssi(data: Rssi, findings: Findings) -> None:
