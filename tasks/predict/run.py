@@ -8,7 +8,7 @@ from pathlib import Path
 from augment.estimators import SavedEstimator
 from swiftwrf import FieldModel, InputError, load
 from swiftwrf.data.coordinates import PlanFrame
-from swiftwrf.data.survey import read_places
+from swiftwrf.data.receivers import read_places
 from swiftwrf.errors import with_article
 from swiftwrf.locate import MatchedField, RssiLocator
 from swiftwrf.rssi.base import RssiPredictor
