@@ -45,10 +45,9 @@ from swiftwrf.runtime.threads import set_threads
 from swiftwrf.runtime.validation import Preset
 from tasks import labels
 from tasks.aoa.experiment import run as run_aoa
-from tasks.aoa.options import AoaConfig
+from tasks.configs import AoaConfig, ScenesConfig
 from tasks.page import figures
-from tasks.scenes.options import ScenesConfig
-from tasks.scenes.run import run as trace
+from tasks.scenes import run as trace
 from tasks.workers import connected
 
 Study = Literal["coverage", "raytracing", "comparison", "paper_scale"]

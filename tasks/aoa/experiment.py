@@ -19,9 +19,9 @@ from swiftwrf.data.files import sha256
 from swiftwrf.data.raytraced import sionna
 from swiftwrf.metrics import angle_errors, covered
 from swiftwrf.runtime.steps import Step
-from tasks.aoa.options import AoaConfig
 from tasks.aoa.page import page
 from tasks.aoa.page.summary import answer_of
+from tasks.configs import AoaConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
 from tasks.metrics import AoaMetrics

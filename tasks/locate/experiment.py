@@ -6,9 +6,9 @@ from pathlib import Path
 
 from swiftwrf import Rssi, rssi_room
 from swiftwrf.locate.comparison import LocateComparison, LocateSplit, Trial
+from tasks.configs import LocateConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
-from tasks.locate.options import LocateConfig
 from tasks.locate.page import page
 from tasks.locate.page.summary import answer
 from tasks.locate.steps import Localization

@@ -18,8 +18,7 @@ from swiftwrf.locate.baselines import PosteriorLocalizer
 from swiftwrf.locate.comparison import LocateSplit, Trial
 from swiftwrf.runtime.durable import write_npz
 from swiftwrf.runtime.steps import Step
-from tasks.claim import LOCATOR
-from tasks.records import Row, write_table
+from tasks.records import LOCATOR, Row, write_table
 
 MAPS = "maps.npz"
 SUGGESTED = "suggested"

@@ -15,15 +15,14 @@ from swiftwrf.metrics import summary
 from swiftwrf.rssi import LEVEL, PairModel, RssiComparison, RssiModel, RssiPredictor, compare
 from swiftwrf.rssi.comparison import compared, model_of
 from swiftwrf.rssi.maps import RssiMap
-from tasks.claim import MODEL
+from tasks.configs import RssiTaskConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
 from tasks.metrics import PredictorSeconds, RssiMetrics
 from tasks.page.maps import read_pixels
 from tasks.page.page import reporting
 from tasks.page.records import Records
-from tasks.records import Row
-from tasks.rssi.options import RssiTaskConfig
+from tasks.records import MODEL, Row
 from tasks.rssi.page import page
 from tasks.rssi.page.summary import answer
 from tasks.source import measured_rssi, offset_notes, split_notes

@@ -18,7 +18,7 @@ from tasks import labels
 from tasks.answer import NextStep
 from tasks.aoa.page.records import CHOSEN, LOWER_REFERENCE, UPPER_REFERENCE
 from tasks.aoa.page.synthesis import SCALES, spectra
-from tasks.inspect.page import page as inspection
+from tasks.inspect import page as inspection
 from tasks.locate.page.drawing import posteriors
 from tasks.page import figures
 from tasks.page.figures import Palette

@@ -38,11 +38,11 @@ from swiftwrf.metrics import angle_errors
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import model as geometry
 from tasks.aoa import experiment
-from tasks.aoa.options import AoaConfig
 from tasks.aoa.page.records import palette
 from tasks.command_line import command_line
+from tasks.configs import AoaConfig
 from tasks.page.figures import Palette
-from tasks.report.run import merge
+from tasks.report import merge
 
 
 @pytest.fixture

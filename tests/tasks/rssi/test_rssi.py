@@ -33,7 +33,7 @@ from swiftwrf.rssi.comparison import make_predictor, pool_of
 from swiftwrf.runtime import registry
 from tasks.command_line import command_line
 from tasks.labels import PREDICTORS as LABELS
-from tasks.report.run import merge
+from tasks.report import merge
 from tasks.rssi import experiment
 from tasks.rssi.page.maps import Maps
 from tasks.rssi.page.summary import where_next

@@ -9,12 +9,12 @@ from typing import Any
 
 from swiftwrf import InputError
 from tasks.aoa import page as aoa
+from tasks.configs import ReportConfig
 from tasks.directory import new_directory
 from tasks.environment import stamp
 from tasks.locate import page as locate
 from tasks.page.page import Page, write_page
 from tasks.page.records import Records
-from tasks.report.options import ReportConfig
 from tasks.rssi import page as rssi
 from tasks.terminal import terminal
 
