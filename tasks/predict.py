@@ -25,7 +25,7 @@ from swiftwrf.locate import MatchedField, Posterior, RssiLocator, smoothed
 from swiftwrf.locate.baselines import BATCH_ROWS
 from swiftwrf.metrics import angle_errors
 from swiftwrf.rssi.base import RssiPredictor
-from tasks.aoa.page.records import AoaRecords, FractionRecords
+from tasks.aoa.records import FractionRecords
 from tasks.configs import PredictConfig
 from tasks.convert import write_file
 from tasks.directory import check_new_file, model_file
@@ -100,7 +100,7 @@ def saved_file(model: Path) -> Path:
         return model
     if kept := model_file(model):
         return kept
-    records: AoaRecords = Records(model)
+    records = Records(model)
     fractions = FractionRecords.of(records) if "mixes" in records.metrics else []
     chosen = max(fractions, key=lambda fraction: float(fraction.key)).chosen_file if fractions else None
     if chosen is None:

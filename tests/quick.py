@@ -24,8 +24,8 @@ from swiftwrf.errors import MAX_LENGTH
 from swiftwrf.rssi import RssiConfig
 from swiftwrf.runtime.validation import configuration
 from tasks.aoa import experiment as aoa
-from tasks.aoa.page import synthesis
-from tasks.aoa.page.records import FractionRecords
+from tasks.aoa import synthesis
+from tasks.aoa.records import FractionRecords
 from tasks.command_line import command_line
 from tasks.configs import (
     AoaConfig,

@@ -17,9 +17,8 @@ from augment.turbo.synthesis import Evaluation
 from swiftwrf import simulated_room
 from swiftwrf.metrics import median_interval, paired_change
 from swiftwrf.metrics import summary as error_summary
-from tasks.aoa.page import first_screen
-from tasks.aoa.page.records import FractionRecords
-from tasks.aoa.page.summary import answer, comparison
+from tasks.aoa.page import answer, comparison, first_screen
+from tasks.aoa.records import FractionRecords
 from tasks.configs import AoaConfig
 from tasks.page.records import Records
 
