@@ -22,7 +22,7 @@ from swiftwrf.online import Step
 from swiftwrf.online.scores import LEVEL
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime.durable import strict
-from tasks.update.options import TABLE, UpdateConfig
+from tasks.configs import TABLE, UpdateConfig
 
 POLL_S = 0.2  # between two looks at a file that grows
 CHUNK_BYTES = 2**20

@@ -28,8 +28,8 @@ from swiftwrf.data.simulated import ShoeboxRoom
 from swiftwrf.data.writing import write_deepmimo, write_mat, write_paths, write_rssi, write_spectra
 from swiftwrf.rssi.maps import RssiMap
 from tasks.command_line import command_line
-from tasks.convert.options import ConvertConfig
-from tasks.convert.run import run as convert
+from tasks.configs import ConvertConfig
+from tasks.convert import run as convert
 
 GRID = AngularGrid.hemisphere(8, 32)
 ORIGIN = GeodeticOrigin(48.1, 11.6)
