@@ -12,7 +12,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from swiftwrf.data.columns import Groups, numbered
+from swiftwrf.data.columns import numbered
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin
 from swiftwrf.data.dataset import Arrays, Numbers, PositionedData, position_coordinates, to_positions
 from swiftwrf.data.powers import check_powers
@@ -41,7 +41,7 @@ class Rssi(PositionedData):
         receiver_position: Positions of the receivers, (R, 3) [m], nan where unknown. Defaults to nan for all.
         receiver_names: Names of the receivers. Defaults to receiver1, receiver2, ...
         origin: Latitude and longitude of x = y = 0, if the positions were projected from degrees.
-        groups: Groups of rows between which RSSI has constant offsets.
+        groups: Name of each row's group, e.g. a device, between which RSSI has constant offsets; named as their column.
         offsets: Offsets that were removed from the RSSI.
         labels: Names of columns of the table that distinguish groups of rows.
         floors: Floors of the building, by height.
@@ -67,7 +67,7 @@ class Rssi(PositionedData):
     receiver_position: Tensor
     receiver_names: tuple[str, ...]
     origin: GeodeticOrigin | None
-    groups: Groups | None
+    groups: pd.Series | None
     offsets: Offsets | None
     labels: tuple[str, ...]
     floors: Floors | None
@@ -87,7 +87,7 @@ class Rssi(PositionedData):
         receiver_position: Numbers | None = None,
         receiver_names: Sequence[str] | None = None,
         origin: GeodeticOrigin | None = None,
-        groups: Groups | None = None,
+        groups: pd.Series | None = None,
         offsets: Offsets | None = None,
         labels: tuple[str, ...] = (),
         floors: Floors | None = None,
@@ -121,7 +121,7 @@ class Rssi(PositionedData):
             receiver_position=to_positions("receiver_position", places, (count, 3), missing=True),
             receiver_names=names,
             origin=origin,
-            groups=groups,
+            groups=None if groups is None else groups.astype("category"),
             offsets=offsets,
             labels=labels,
             floors=floors,
@@ -343,7 +343,7 @@ class Offsets:
 
     def of(self, data: Rssi) -> Tensor:
         """Return the offset of each row, float64 (n,) [dB]; 0 for a group without an estimate, or without groups."""
-        labels = data.groups.labels() if data.groups else [self.reference] * len(data)
+        labels = [self.reference] * len(data) if data.groups is None else data.groups.tolist()
         return torch.tensor([self.offset_db.get(label, 0.0) for label in labels], dtype=torch.float64)
 
     def removed(self, data: Rssi) -> Rssi:
