@@ -18,7 +18,7 @@ from torch import Tensor
 
 from swiftwrf.errors import InputError
 from swiftwrf.positions import to_tensor
-from swiftwrf.runtime.validation import checked, configuration
+from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, checked, configuration
 
 MAX_GRID_PIXELS = 2**24  # of one spectrum
 Size = Annotated[int, Ge(2), Le(MAX_GRID_PIXELS)]
@@ -44,23 +44,16 @@ class AngularGrid:
     """
 
     elevation_start: float
-    elevation_step: float
-    n_elevation: int
+    elevation_step: PositiveFloat
+    n_elevation: PositiveInt
     azimuth_start: float
-    n_azimuth: int
+    n_azimuth: PositiveInt
 
     def check(self) -> None:
-        """Refuse no pixels, too many of them, and angles that are not finite."""
-        sizes, angles = (
-            (self.n_elevation, self.n_azimuth),
-            (self.elevation_start, self.elevation_step, self.azimuth_start),
-        )
-        if min(sizes) < 1 or math.prod(sizes) > MAX_GRID_PIXELS:
-            raise InputError(
-                f"a grid has whole numbers of rows and columns and at most {MAX_GRID_PIXELS} pixels, got {sizes}"
-            )
-        if not all(map(math.isfinite, angles)) or self.elevation_step <= 0:
-            raise InputError(f"a grid needs finite angles and a step above 0, got {angles} [rad]")
+        """Refuse too many pixels, and angles that are not finite."""
+        angles = self.elevation_start, self.elevation_step, self.azimuth_start
+        if math.prod(self.shape) > MAX_GRID_PIXELS or not all(map(math.isfinite, angles)):
+            raise InputError(f"a grid has finite angles [rad] and at most {MAX_GRID_PIXELS} pixels, got {self}")
 
     @classmethod
     @checked

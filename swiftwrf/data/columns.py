@@ -8,9 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 import pandas as pd
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from swiftwrf.data.cells import parsed, plain_name, text_of
 from swiftwrf.data.powers import KNOWN_FILLERS, MIN_RSSI_DBM
@@ -244,15 +242,3 @@ def is_coordinate(name: str) -> bool:
         for role in (*GEODETIC, "z", *GEODETIC.values())
         for pattern in ROLES[role]
     )
-
-
-def numbered(names: Tensor | Sequence[str | int]) -> Tensor:
-    """Return the number of each name in the order of first occurrence, int64 (n,); numbers of a tensor stay.
-
-    Example:
-        >>> numbered(["out", "back", "out"])
-        tensor([0, 1, 0])
-    """
-    if isinstance(names, Tensor):
-        return names.long()
-    return torch.from_numpy(pd.factorize(np.asarray(names, dtype=object))[0].astype(np.int64))

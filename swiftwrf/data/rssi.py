@@ -12,7 +12,6 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from swiftwrf.data.columns import numbered
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin
 from swiftwrf.data.dataset import Arrays, Numbers, PositionedData, position_coordinates, to_positions
 from swiftwrf.data.powers import check_powers
@@ -112,6 +111,8 @@ class Rssi(PositionedData):
             raise InputError(
                 f"{name} has {count} receivers, but the names {listed(names)}; give each receiver one of its own"
             )
+        if session is not None and not isinstance(session, Tensor):
+            session = torch.from_numpy(pd.factorize(np.asarray(session, dtype=object))[0])
         places = torch.full((count, 3), torch.nan) if receiver_position is None else receiver_position
         super().__init__(
             name,
@@ -127,7 +128,7 @@ class Rssi(PositionedData):
             floors=floors,
             receiver_moves=receiver_moves,
             plan_scale=plan_scale,
-            session=None if session is None else numbered(session),
+            session=None if session is None else session.long(),
             time=None if time is None else to_tensor("time", time, torch.float64, (None,), missing=True),
         )
         check_powers(name, rssi.numpy(), names, self.index.numpy()[:, None])
