@@ -131,7 +131,9 @@ def calibrate(train: Snapshots) -> Calibration:
             f"the phases between the elements of {train.name} hardly depend on the position, so they do not contain the "
             "direction of the line of sight"
         )
-    problem = _Problem.of(seen)
+    received = of_unit_power(unit(seen.channel))
+    strongest = torch.linalg.eigh(received).eigenvectors[..., -1]
+    problem = _Problem(seen.array, seen.position, seen.away, received, strongest)
     found = problem.descend(start := problem.scan())
     if float(problem.away.norm(dim=1).min()) < seen.array.far_field_m:
         curved = replace(problem, curved=True)
@@ -195,12 +197,6 @@ class _Problem:
     covariance: Tensor
     strongest: Tensor
     curved: bool = False
-
-    @classmethod
-    def of(cls, data: Snapshots) -> _Problem:
-        received = of_unit_power(unit(data.channel))
-        strongest = torch.linalg.eigh(received).eigenvectors[..., -1]
-        return cls(data.array, data.position, data.away, received, strongest)
 
     @property
     def direction(self) -> Tensor:
