@@ -23,7 +23,7 @@ from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.phase_retrieval import correlations, retrieve_phases
 from swiftwrf.models.link import Link
 from swiftwrf.models.process import ProcessModel
-from swiftwrf.online.scores import Alarm, Cusum, Scores, alarm_threshold, learnt, score
+from swiftwrf.online.scores import ALLOWANCE, Alarm, Scores, alarm_threshold, learnt, score
 from swiftwrf.positions import nearest
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.runtime.validation import checked
@@ -69,7 +69,9 @@ def adapted(before: ProcessModel, after: Spectra) -> tuple[ProcessModel, float]:
 
 
 class Monitor:
-    """Cumulative sums of innovations: of all positions and of each region; for RSSI of each receiver, up and down.
+    """One-sided cumulative sums of innovations: of all positions and of each region; for RSSI of each receiver, up and down.
+
+    A sum over its threshold is an alarm (E. S. Page, Biometrika 41, 1954).
 
     Innovations of spectra are replaced by normal scores, their rank among those of a reference. Innovations of RSSI are
     standard normal if the standard deviations of the model are right.
@@ -108,8 +110,10 @@ class Monitor:
         n_regions = min(n_regions, max(1, len(position) // 10))
         self.centre = torch.from_numpy(kmeans2(position.double().numpy(), n_regions, seed=0, minit="++")[0])
         self.reference = torch.zeros(0, dtype=torch.float64) if reference is None else reference.double()
-        self.cusum = Cusum.start((1 + n_regions) * (2 * len(self.receiver_names) or 1))
-        self.threshold = alarm_threshold(false_alarm_rate, len(self.cusum.value))
+        n_series = (1 + n_regions) * (2 * len(self.receiver_names) or 1)
+        self.value, self.count = torch.zeros(n_series, dtype=torch.float64), 0
+        self.since = torch.zeros(n_series, dtype=torch.int64)
+        self.threshold = alarm_threshold(false_alarm_rate, n_series)
 
     @classmethod
     def of(
@@ -136,7 +140,7 @@ class Monitor:
         if self.receiver_names:
             standard = value.clamp(-3.0, 3.0)  # single outliers raise no alarm
             standard = torch.cat([standard, -standard])
-        elif self.cusum.count == 0 and len(self.reference) < N_REFERENCE:
+        elif self.count == 0 and len(self.reference) < N_REFERENCE:
             self.reference = torch.cat([self.reference, value])
             return []
         else:
@@ -144,22 +148,34 @@ class Monitor:
             standard = torch.special.ndtri(rank / (len(self.reference) + 1))[None]
         series = torch.full((1 + len(self.centre), len(standard)), torch.nan, dtype=torch.float64)
         series[[0, 1 + int(nearest(position[None], self.centre, 1)[1])]] = standard
-        self.cusum, alarms = self.cusum.updated(series.flatten(), self.threshold)
+        return self.add(series.flatten())
+
+    def add(self, series: Tensor) -> list[Alarm]:
+        """Add one more value of each series (C,), nan for none, to its sum; return the alarms, largest sum first.
+
+        A sum that raises an alarm starts again at 0.
+        """
+        added = (self.value + (series.double() - ALLOWANCE).nan_to_num(0.0)).clamp_min(0)
+        self.since = self.since.where(self.value > 0, self.count)
+        over = (added > self.threshold).nonzero()[:, 0]
+        over = over[added[over].argsort(descending=True)]
+        alarms = [Alarm(int(c), self.count, int(self.since[c])) for c in over]
+        self.value, self.count = added.where(added <= self.threshold, 0.0), self.count + 1
         return alarms
 
     def state(self) -> dict[str, Any]:
         """Return reference, regions and sums as plain values."""
-        sums = {"value": self.cusum.value.tolist(), "since": self.cusum.since.tolist(), "count": self.cusum.count}
+        sums = {"value": self.value.tolist(), "since": self.since.tolist(), "count": self.count}
         return {"reference": self.reference.tolist(), "centre": self.centre.tolist(), "cusum": sums}
 
     def resume(self, state: dict[str, Any]) -> None:
         """Continue with the reference, regions and sums of a `state`."""
         sums = state["cusum"]
-        self.reference, self.centre, value = (
+        self.reference, self.centre, self.value = (
             torch.tensor(values, dtype=torch.float64) for values in (state["reference"], state["centre"], sums["value"])
         )
-        self.cusum = Cusum(value, torch.tensor(sums["since"]), int(sums["count"]))
-        self.threshold = alarm_threshold(self.false_alarm_rate, len(self.cusum.value))
+        self.since, self.count = torch.tensor(sums["since"]), int(sums["count"])
+        self.threshold = alarm_threshold(self.false_alarm_rate, len(self.value))
 
     def describe(self, alarm: Alarm) -> str:
         """Return what changed and where, in words."""
