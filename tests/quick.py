@@ -24,29 +24,31 @@ from swiftwrf.errors import MAX_LENGTH
 from swiftwrf.rssi import RssiConfig
 from swiftwrf.runtime.validation import configuration
 from tasks.aoa import experiment as aoa
-from tasks.aoa.options import AoaConfig
-from tasks.aoa.page import synthesis
-from tasks.aoa.page.records import FractionRecords
+from tasks.aoa import synthesis
+from tasks.aoa.records import FractionRecords
 from tasks.command_line import command_line
-from tasks.convert.options import ConvertConfig
-from tasks.convert.run import run as convert
-from tasks.inspect.options import InspectConfig
-from tasks.inspect.run import run as inspect
+from tasks.configs import (
+    AoaConfig,
+    ConvertConfig,
+    InspectConfig,
+    LocateConfig,
+    PredictConfig,
+    ReportConfig,
+    ResumeConfig,
+    RssiTaskConfig,
+    ScenesConfig,
+    UpdateConfig,
+    ViewConfig,
+)
+from tasks.convert import run as convert
+from tasks.inspect import run as inspect
 from tasks.locate import experiment as locate
-from tasks.locate.options import LocateConfig
-from tasks.predict.options import PredictConfig
-from tasks.predict.run import run as predict
-from tasks.report.options import ReportConfig
-from tasks.report.run import run as report
-from tasks.resume.options import ResumeConfig
-from tasks.resume.run import run as resume
+from tasks.predict import run as predict
+from tasks.report import run as report
+from tasks.resume import run as resume
 from tasks.rssi import experiment as rssi
-from tasks.rssi.options import RssiTaskConfig
-from tasks.scenes.options import ScenesConfig
-from tasks.scenes.run import run as scenes
-from tasks.update.options import UpdateConfig
+from tasks.scenes import run as scenes
 from tasks.update.run import run as update
-from tasks.view.options import ViewConfig
 from tasks.view.run import run as view
 
 TASKS = {

@@ -215,11 +215,8 @@ class PlanarArray:
     def channel(self, direction: Tensor, gain: Tensor, owner: Tensor, n: int) -> Tensor:
         """Return the sum of paths at each element, gain * exp(j phase), complex128 (n, K).
 
-        Args:
-            direction: Unit vectors towards where the P paths come from, in array coordinates, (P, 3).
-            gain: Complex amplitude of each path at the origin, (P,).
-            owner: Index of the channel to which each path belongs, int64 (P,).
-            n: Number of channels.
+        Paths come from directions (P, 3) in array coordinates, with gains (P,) at the origin. Their owner (P,) is one of n
+        channels.
         """
         phase = self.phase(direction.double())
         wave = gain.to(torch.complex128)[:, None] * torch.polar(torch.ones_like(phase), phase)

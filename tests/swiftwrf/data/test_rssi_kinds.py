@@ -24,8 +24,8 @@ from swiftwrf.data.splits import folds, random_split, repeated_fraction
 from swiftwrf.data.writing import write_rssi
 from swiftwrf.locate import RssiLocator
 from swiftwrf.rssi import estimate_offsets
-from tasks.predict.options import PredictConfig
-from tasks.predict.run import run as predict
+from tasks.configs import PredictConfig
+from tasks.predict import run as predict
 
 FEW_CELLS = ("--cells", "200")
 NAMES = ["ap-a", "ap-b", "ap-c", "ap-d"]

@@ -22,8 +22,8 @@ from scipy.io import savemat
 from swiftwrf import InputError, Rssi, Spectra, datasets, load_rssi, load_spectra
 from swiftwrf.datasets import DATA_SETS, DataSet, conversions
 from tasks.command_line import command_line
-from tasks.inspect.options import InspectConfig
-from tasks.inspect.run import run as inspect
+from tasks.configs import InspectConfig
+from tasks.inspect import run as inspect
 
 pytest.importorskip("pooch", reason="needs the extra data")
 

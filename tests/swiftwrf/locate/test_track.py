@@ -12,8 +12,8 @@ from swiftwrf.locate import Posterior, RssiLocator, smoothed
 from swiftwrf.locate import posterior as module
 from swiftwrf.locate.posterior import normalised
 from tasks.command_line import command_line
-from tasks.predict.options import PredictConfig
-from tasks.predict.run import run as predict
+from tasks.configs import PredictConfig
+from tasks.predict import run as predict
 
 STEP_M, NOISE_M = 0.4, 1.5
 

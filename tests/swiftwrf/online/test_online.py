@@ -191,7 +191,7 @@ def test_wrong_options_are_refused(arguments, capsys):
 
 def follow(model_file, source, out, **options):
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[3]), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "tasks.update", str(model_file), str(source), "--out", str(out), "--follow"]
+    command = [sys.executable, "-m", "tasks", "update", str(model_file), str(source), "--out", str(out), "--follow"]
     return subprocess.Popen(
         command,
         env=environment,

@@ -29,10 +29,9 @@ from swiftwrf.models.geometry.model import fingerprint
 from swiftwrf.models.geometry.path_gains import PRIORS
 from swiftwrf.models.geometry.planes import Plane
 from tasks.aoa import experiment
-from tasks.aoa.options import AoaConfig
 from tasks.command_line import command_line
-from tasks.predict.options import PredictConfig
-from tasks.predict.run import run as predict
+from tasks.configs import AoaConfig, PredictConfig
+from tasks.predict import run as predict
 
 PLANES = {(0.0, 0.0, -1.0): 0.0, (1.0, 0.0, 0.0): 5.0, (0.0, 1.0, 0.0): 4.0}  # outward normal to offset [m]
 FEW_CELLS = MatchedFieldConfig(max_cells=2000, n_best=40, n_background=20, n_rounds=1, n_calibration=16)

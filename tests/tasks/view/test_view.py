@@ -28,14 +28,13 @@ from swiftwrf.locate import MatchedField, RssiLocator
 from swiftwrf.models.geometry import HybridModel, Plane
 from swiftwrf.online import Follower
 from tasks.command_line import command_line
-from tasks.convert.outputs import saved_model
-from tasks.locate.options import LocateConfig
+from tasks.configs import LocateConfig, ViewConfig
+from tasks.convert import saved_model
 from tasks.options import plain
 from tasks.page.maps import FloorPlan, colour_image
 from tasks.update.record import Record
 from tasks.view import charts, spectra
 from tasks.view.locating import RssiLocating
-from tasks.view.options import ViewConfig
 from tasks.view.rssi import MapSelection, RssiView, at_least, probability_above
 from tasks.view.run import run
 from tasks.view.sources import open_source

@@ -15,7 +15,6 @@ from pandas import DataFrame
 from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
 from swiftwrf.plotting import corners_of
 from swiftwrf.rssi import LEVEL
-from tasks.metrics import RssiMetrics
 from tasks.page import figures, maps
 from tasks.page.page import Plot
 from tasks.page.records import Records
@@ -31,7 +30,6 @@ HATCHED = (
     "Hatched like /: outside the measured positions, where predictions are extrapolated; like \\: a packet is more likely "
     "lost than received."
 )
-RssiRecords = Records[RssiMetrics]
 
 
 @dataclass(frozen=True)
@@ -43,11 +41,11 @@ class Maps:
         floor: Number of the floor; 0 in data without floors.
     """
 
-    run: RssiRecords
+    run: Records
     floor: int = 0
 
     @classmethod
-    def of_floors(cls, run: RssiRecords) -> list[Maps]:
+    def of_floors(cls, run: Records) -> list[Maps]:
         """Return the maps of each floor that was measured, from below."""
         return [cls(run, int(floor)) for floor in np.unique(run.arrays("maps")["floor_of_row"])]
 

@@ -14,11 +14,11 @@ from swiftwrf.data.files import sha256
 from swiftwrf.data.raytraced import ROOMS, FurnishedRoom, Scene, Tracing, trace
 from swiftwrf.data.writing import write_paths
 from swiftwrf.runtime.durable import write_json
+from tasks.configs import ScenesConfig
 from tasks.directory import new_directory
 from tasks.environment import invocation
 from tasks.options import plain
 from tasks.page import figures
-from tasks.scenes.options import ScenesConfig
 from tasks.terminal import console, terminal
 
 PLAN = "scene.svg"  # the room and the positions, seen from above

@@ -5,20 +5,19 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from swiftwrf import InputError
-from tasks.aoa import page as aoa
+from tasks.aoa.page import page as aoa
+from tasks.configs import ReportConfig
 from tasks.directory import new_directory
 from tasks.environment import stamp
-from tasks.locate import page as locate
+from tasks.locate.page import page as locate
 from tasks.page.page import Page, write_page
 from tasks.page.records import Records
-from tasks.report.options import ReportConfig
-from tasks.rssi import page as rssi
+from tasks.rssi.page import page as rssi
 from tasks.terminal import terminal
 
-PAGES: dict[str, Callable[[list[Records[Any]]], Page]] = {"aoa": aoa.page, "rssi": rssi.page, "locate": locate.page}
+PAGES: dict[str, Callable[[list[Records]], Page]] = {"aoa": aoa, "rssi": rssi, "locate": locate}
 
 
 def run(config: ReportConfig) -> None:
@@ -36,7 +35,7 @@ def merge(folders: list[Path], out: Path) -> None:
         InputError: There are no runs, one is unfinished, their tasks differ, their records are damaged, or `out` exists.
     """
     several = len(folders) > 1
-    runs: list[Records[Any]] = [Records(f, number=n if several else 0) for n, f in enumerate(folders, start=1)]
+    runs = [Records(f, number=n if several else 0) for n, f in enumerate(folders, start=1)]
     tasks = sorted({str(run.metrics.get("task")) for run in runs})
     if len(tasks) != 1 or tasks[0] not in PAGES:
         raise InputError(
@@ -46,7 +45,7 @@ def merge(folders: list[Path], out: Path) -> None:
         _write(unfinished, tasks[0], runs)
 
 
-def _write(folder: Path, task: str, runs: list[Records[Any]]) -> None:
+def _write(folder: Path, task: str, runs: list[Records]) -> None:
     try:
         write_page(folder, PAGES[task](runs))
     except InputError:

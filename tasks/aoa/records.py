@@ -14,13 +14,9 @@ from pandas import DataFrame
 from augment.turbo.condition import Condition, chosen_file, conditions_of, headline
 from augment.turbo.results import MixMetrics
 from swiftwrf.choices import AUTO, fraction_key
-from swiftwrf.models import FIELD_MODELS
 from tasks import labels
-from tasks.metrics import AoaMetrics
-from tasks.page.figures import Palette
 from tasks.page.records import Records
 
-AoaRecords = Records[AoaMetrics]
 # colours of conditions without a field model
 LOWER_REFERENCE, UPPER_REFERENCE, CHOSEN = "#cf4a4a", "#2a9165", "#3a7fd5"
 
@@ -34,18 +30,19 @@ class FractionRecords:
         key: Measured fraction in metrics.json and in file names.
     """
 
-    run: AoaRecords
+    run: Records
     key: str
 
     @classmethod
-    def of(cls, run: AoaRecords) -> list[FractionRecords]:
+    def of(cls, run: Records) -> list[FractionRecords]:
         """Return all measured fractions of a run."""
         return [cls(run, key) for key in run.metrics["mixes"]]
 
     @cached_property
     def mix(self) -> MixMetrics:
         """Metrics of the measured fraction."""
-        return self.run.metrics["mixes"][self.key]
+        found: MixMetrics = self.run.metrics["mixes"][self.key]
+        return found
 
     @cached_property
     def conditions(self) -> dict[str, Condition]:
@@ -105,7 +102,7 @@ class FractionRecords:
         return f"{self.percent} measured, {self.run.scene}"
 
     @property
-    def palette(self) -> Palette:
+    def palette(self) -> dict[str, str]:
         """Colours of its field models and conditions."""
         return palette(self.conditions.values())
 
@@ -115,23 +112,21 @@ def of_fraction(table: DataFrame, key: str) -> DataFrame:
     return table[[fraction_key(float(text)) == key for text in table["measured_fraction"]]]
 
 
-def palette(conditions: Iterable[Condition]) -> Palette:
+def palette(conditions: Iterable[Condition]) -> dict[str, str]:
     """Return colours of all field models and of these conditions.
 
     Conditions of one field model have its colour.
     """
-    models = Palette.of(labels.labels(FIELD_MODELS, labels.FIELD_MODELS))
-    estimators = Palette.of(labels.ESTIMATORS)
-    colours = dict(models.colours)
+    found = models = labels.colours(labels.FIELD_MODELS)
     for condition in conditions:
         match condition.training:
             case "measured" if condition.is_network:
-                colour = LOWER_REFERENCE
+                own = LOWER_REFERENCE
             case "measured":
-                colour = estimators.colour(condition.estimator)
+                own = labels.colour(labels.colours(labels.ESTIMATORS), condition.estimator)
             case "all measured":
-                colour = UPPER_REFERENCE
+                own = UPPER_REFERENCE
             case _:
-                colour = CHOSEN if condition.synthesizer == AUTO else models.colour(condition.synthesizer)
-        colours[condition.method] = colour
-    return Palette(colours)
+                own = CHOSEN if condition.synthesizer == AUTO else labels.colour(models, condition.synthesizer)
+        found = found | {condition.method: own}
+    return found

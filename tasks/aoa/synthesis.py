@@ -15,7 +15,7 @@ from pandas import DataFrame, concat
 
 from swiftwrf import AngularGrid
 from swiftwrf.plotting import polar_spectrum
-from tasks.aoa.page.records import FractionRecords
+from tasks.aoa.records import FractionRecords
 from tasks.page.figures import LABEL, STYLE, colour_bar, plain
 from tasks.page.page import Plot, Section, Table, number
 

@@ -1,6 +1,9 @@
-"""The page of an inspection: findings, a plan with the array's axes or the receivers, measurements against geometry."""
+"""Inspection of measurements before a model is fitted: findings, and a page with figures."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -10,14 +13,47 @@ from pandas import DataFrame
 from torch import Tensor
 
 from swiftwrf.array.angles import angular_distance, to_direction
-from swiftwrf.data import Rssi, Spectra
-from swiftwrf.diagnostics.inspection import Findings, nearest
+from swiftwrf.array.beamforming import PHASE
+from swiftwrf.data import Rssi, Snapshots, Spectra
+from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
+from swiftwrf.diagnostics.inspection import Findings, inspect, nearest, propose_offsets
 from swiftwrf.rssi import fit_path_loss, log_distance
+from swiftwrf.runtime.durable import write_json
 from tasks.answer import NextStep
-from tasks.environment import command
+from tasks.configs import InspectConfig
+from tasks.directory import new_directory
+from tasks.environment import command, stamp
 from tasks.page import figures
-from tasks.page.page import Number, Page, Plot, Section, Summary, Table
+from tasks.page.page import Number, Page, Plot, Section, Summary, Table, write_page
+from tasks.source import located, reading
 from tasks.summarise import fingerprinting
+from tasks.terminal import terminal
+
+
+def run(config: InspectConfig) -> None:
+    """Print the findings, and write a page and inspect.json.
+
+    Raises:
+        InputError: Measurements that cannot be read.
+    """
+    source, options = located(config.source), reading(config.spectra, config.table)
+    out = Path(config.out) if config.out else Path("runs") / "inspect" / stamp()
+    with new_directory(out, "an inspection") as folder:
+        data = read(source, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS)
+        kind = "RSSI" if isinstance(data, Rssi) else "array snapshots" if isinstance(data, Snapshots) else "spectra"
+        findings = inspect(data, grid=options.grid, beamformer=options.beamformer or PHASE)
+        for column in data.labels if isinstance(data, Rssi) else ():
+            propose_offsets(read(source, replace(options, offset_by=column), RSSI_FORMATS), findings)
+        content = {
+            "source": config.source,
+            "kind": kind,
+            "findings": [{"level": finding.level, "text": finding.text} for finding in findings.sentences],
+            "numbers": findings.numbers,
+        }
+        write_json(folder / "inspect.json", content)
+        write_page(folder, page(findings, kind, str(config.source)))
+    terminal.page(content, f"{config.source}: {kind}\n{findings}", out / "report.html")
+
 
 AXES = {"x": "#cf4a4a", "y": "#2a9165", "normal": "#3a7fd5"}
 DOTS, NONE = "#3a7fd5", "#7f8794"  # with line of sight, without

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from pathlib import Path
 
 from swiftwrf.errors import InputError
-from tasks.claim import CONFIG, ENVIRONMENT
+from tasks import configs
 from tasks.command import COMMANDS, run_task
 from tasks.command_line import parse
+from tasks.configs import ResumeConfig
 from tasks.directory import digest
-from tasks.records import read_json
-from tasks.resume.options import ResumeConfig
-
-CHANGING = ("scheduler", "processes")  # options of a run that may change when it is resumed
+from tasks.records import CONFIG, ENVIRONMENT, read_json
 
 
 def run(config: ResumeConfig) -> None:
@@ -29,10 +26,10 @@ def run(config: ResumeConfig) -> None:
             f"{folder / CONFIG} is not what the run began with, and its steps would mix two configurations; restore it or "
             "start a new run"
         )
-    given = {name: value for name in CHANGING if (value := getattr(config, name)) is not None}
+    changing = ("scheduler", "processes")
+    given = {name: value for name in changing if (value := getattr(config, name)) is not None}
     arguments = [text for name, value in given.items() for text in (f"--{name}", str(value))]
-    saved = {name: value for name, value in saved.items() if name not in CHANGING}
-    config_type = getattr(import_module(f"tasks.{task}.options"), COMMANDS[task].options)
-    resumed = parse(config_type, arguments, "swiftwrf resume", saved, folder)
+    saved = {name: value for name, value in saved.items() if name not in changing}
+    resumed = parse(getattr(configs, COMMANDS[task].options), arguments, "swiftwrf resume", saved, folder)
     resumed.check()
     run_task(task, resumed, folder)

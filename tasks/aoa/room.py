@@ -1,4 +1,4 @@
-"""The report's sections on the field model: why it was chosen, what it gains, the room that it found."""
+"""The report's sections on the field model and on positions: gains, the room that was found, located test positions."""
 
 from __future__ import annotations
 
@@ -12,18 +12,23 @@ from numpy.typing import NDArray
 from pandas import DataFrame, concat
 
 from augment.cross_validation import CrossValidationMetrics, GainMetrics
+from augment.turbo.condition import LOCATED
 from swiftwrf.metrics import ChangeMetrics
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.plotting import corners_of, hatch
 from tasks import labels
-from tasks.aoa.page.records import FractionRecords
-from tasks.aoa.page.synthesis import quality_table
+from tasks.aoa.records import FractionRecords
+from tasks.aoa.synthesis import quality_table
 from tasks.page import figures
 from tasks.page.page import Plot, Section, Table, number
 from tasks.records import read_json
 
 MARGIN = 0.5  # [m] around the room in a plan
 FIXED, MEASURED, IMAGE = "#cf4a4a", "#3a7fd5", "#d1620f"
+LEVELS = np.linspace(0, 1, 21)  # of credible regions
+TRUTH, ESTIMATE, MASS = "#2a9165", "#cf4a4a", "#3a7fd5"
+MIN_WINDOW_M = 0.02  # half the side of the smallest map of a posterior
+MAX_MARK = 120  # area [pt^2] of the candidate with the largest mass
 
 
 def _cross_validations(fraction: FractionRecords) -> dict[str, CrossValidationMetrics]:
@@ -68,10 +73,8 @@ def choice_section(fraction: FractionRecords) -> Section:
     choice, texts = fraction.mix["choice"], cross_validation_sentences(fraction)
     if choice is not None:
         name = choice["name"]
-        meaning = labels.labels(FIELD_MODELS, labels.FIELD_MODELS, [name])
-        texts.insert(
-            0, f"{name} predicts held-out measured spectra best{f': {meaning[name].meaning}' if meaning else ''}."
-        )
+        meaning = labels.meanings(FIELD_MODELS, labels.FIELD_MODELS).get(name)
+        texts.insert(0, f"{name} predicts held-out measured spectra best{f': {meaning}' if meaning else ''}.")
         texts += [f"{name} could not be fitted: {reason}." for name, reason in choice["left_out"].items()]
     plots = [_gain(fraction, *item) for item in _cross_validations(fraction).items()]
     return Section("Do synthetic spectra help?", texts, [quality_table(fraction)], plots)
@@ -79,7 +82,7 @@ def choice_section(fraction: FractionRecords) -> Section:
 
 def _gain(fraction: FractionRecords, name: str, validation: CrossValidationMetrics) -> Plot:
     figure, ax = figures.panel(5.8, 3.2)
-    colour = fraction.palette.colour(name)
+    colour = labels.colour(fraction.palette, name)
     gains = sorted(validation["gains"], key=lambda gain: gain["n_synthetic"])
     at = [0, *(gain["n_synthetic"] for gain in gains)]
     change, low, high = ([0, *(100 * gain[end] for gain in gains)] for end in ("change", "low", "high"))
@@ -189,7 +192,7 @@ def _room_panel(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) -
     plan.plot(*points["fixed"][:2], "*", color=FIXED, markersize=11, label="fixed end")
     plan.plot(*points["image"][own][:, :2].T, "D", color=IMAGE, markersize=4, label="its images")
     plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    figures.legend_below(figure, plan)
+    figures.legend_below(plan)
     return figure
 
 
@@ -226,3 +229,105 @@ def draw_in_plan(ax: Axes, plane: dict[str, Any], low: NDArray[Any], high: NDArr
     ends = in_plan(plane, low - MARGIN, high + MARGIN)
     if ends is not None:
         ax.plot(*ends.T, "-" if plane["certain"] else "--", color="black", linewidth=1.3)
+
+
+def located_plan(fraction: FractionRecords) -> Figure:
+    """Return the plan of the room with a line from each test position to its estimate."""
+    table, room = fraction.table("positions"), fraction.arrays("located")
+    own = table[(table["method"] == LOCATED) & (table["repeat"] == 0)]
+    truth, estimate = own[["truth_x_m", "truth_y_m"]].to_numpy(), own[["estimate_x_m", "estimate_y_m"]].to_numpy()
+    figure, plan = figures.panel(4.6, 3.7)
+    planes = [
+        {"normal": normal, "offset_m": offset, "certain": certain}
+        for normal, offset, certain in zip(room["normal"], room["offset"], room["certain"], strict=True)
+    ]
+    low, high = extent(planes, np.concatenate([room["measured"], room["fixed"][None]]))
+    for plane in planes:
+        draw_in_plan(plan, plane, low, high)
+    plan.plot(*room["measured"][:, :2].T, ".", color=figures.RULE, markersize=3)
+    plan.plot(*room["fixed"][:2], "*", color=FIXED, markersize=11)
+    highest = max(float(own["error_m"].quantile(0.95)), 1e-3)
+    for at, to in zip(truth, estimate, strict=True):
+        plan.plot(*zip(at, to, strict=True), color=figures.RULE, linewidth=1, zorder=2)
+    drawn = plan.scatter(
+        truth[:, 0], truth[:, 1], c=100 * own["error_m"], s=14, cmap="viridis", vmin=0, vmax=100 * highest, zorder=3
+    )
+    plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    figures.colour_bar(plan, drawn, "position error [cm]", extend="max")
+    return figure
+
+
+def locating_section(fraction: FractionRecords) -> Section | None:
+    """Return the errors of located test positions; None if nothing was located."""
+    located = fraction.mix["locating"]
+    if not located:
+        return None
+    rows = [
+        [
+            method,
+            f"{number(100 * own['position_error_m']['median'], 1)} [{number(100 * own['position_error_m']['low'], 1)}, "
+            f"{number(100 * own['position_error_m']['high'], 1)}]",
+            number(100 * own["position_error_m"]["p90"], 1),
+            f"{own['coverage_80']:.0%}",
+            f"{own['ambiguous']:.0%}",
+        ]
+        for method, own in located.items()
+    ]
+    columns = ["method", "median [cm]", "90 % [cm]", "in 80 % region", "ambiguous"]
+    caption = (
+        "Median distance between true and estimated position with its 95 % interval. Regions are balls around the estimate. "
+        "Ambiguous: a second mode has at least a tenth of the posterior mass."
+    )
+    plots = [_posteriors(fraction)] if fraction.arrays("located") else []
+    return Section("Positions", [], [Table(columns, rows, caption)], [*plots, _calibration(fraction)])
+
+
+def _calibration(fraction: FractionRecords) -> Plot:
+    """Return the calibration of the credible regions."""
+    table = fraction.table("positions")
+    figure, axes = figures.panel(5.4, 3.2)
+    axes.plot([0, 1], [0, 1], color=figures.RULE, linewidth=1)
+    axes.set(xlim=(0, 1), ylim=(0, 1.02))
+    inside = {
+        str(method): (LEVELS, [float((part["containing_level"] < level).mean()) for level in LEVELS])
+        for method, part in table.groupby("method", sort=False)
+    }
+    label = "fraction of test positions inside"
+    figures.curves(axes, fraction.palette, inside, "level of the credible region", label)
+    caption = "Fraction of the test positions inside the credible region of each level: calibrated on the diagonal."
+    data = table[["method", "repeat", "index", "truth_x_m", "truth_y_m", "truth_z_m", "error_m", "containing_level"]]
+    return Plot(f"located-{fraction.file_name}", [figure], caption, data)
+
+
+def _posteriors(fraction: FractionRecords) -> Plot:
+    """Return maps of the posteriors of six test spectra, from the best to the worst."""
+    example = fraction.arrays("located")
+    error, panels = np.linalg.norm(example["estimate"] - example["truth"], axis=1), []
+    for row in range(len(error)):
+        figure, ax = figures.panel(2.4, 2.5)
+        at, weight = example["candidate"][row], example["weight"][row]
+        truth, estimate = example["truth"][row], example["estimate"][row]
+        half = 1.3 * max(error[row], 2 * example["radius"][row], MIN_WINDOW_M)
+        ax.scatter(
+            at[:, 0], at[:, 1], s=MAX_MARK * weight / weight.max(), color=MASS, alpha=0.4, linewidths=0, rasterized=True
+        )
+        ax.plot(*truth[:2], "o", color=TRUTH, markersize=9, markerfacecolor="none")
+        ax.plot(*estimate[:2], "x", color=ESTIMATE, markersize=8)
+        x, y = estimate[:2]
+        ax.set(xlim=(x - half, x + half), ylim=(y - half, y + half), aspect="equal")
+        ax.set_title(f"row {example['index'][row]}: {100 * error[row]:.1f} cm", fontsize=9)
+        ax.set(xlabel="x [m]", ylabel="y [m]")
+        ax.locator_params(nbins=3)
+        panels.append(figure)
+    caption = (
+        "Posteriors of six test spectra in plan, from the smallest to the largest position error (quantiles 0, 0.2, ..., "
+        "1), each around its estimate. Circle: true position; cross: estimate. The area of a dot is proportional to the "
+        "posterior mass."
+    )
+    parts = [
+        DataFrame(example["candidate"][row], columns=["x_m", "y_m", "z_m"]).assign(
+            index=example["index"][row], mass=example["weight"][row]
+        )
+        for row in range(len(error))
+    ]
+    return Plot(f"posteriors-{fraction.file_name}", panels, caption, concat(parts))
