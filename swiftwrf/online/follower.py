@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import torch
@@ -123,7 +123,7 @@ class Monitor:
 
         Args:
             model: Fitted model.
-            train: Its training data in their order. Spectra give the reference; see `held_out_scores`.
+            train: Its training data in their order. Spectra give the reference.
             false_alarm_rate: False alarms a measurement.
         """
         if isinstance(model, RssiModel):
@@ -131,7 +131,10 @@ class Monitor:
         reference = None
         if isinstance(train, Spectra):
             model.check_measurements(train)
-            reference = held_out_scores(model, train).innovation[:, 0]
+            reference = score(model, train).innovation[:, 0]
+            if isinstance(model, ProcessModel):  # it can forget spectra: each fifth is predicted without itself
+                for rows in torch.randperm(len(train), generator=torch.Generator().manual_seed(0)).chunk(N_FOLDS):
+                    reference[rows] = score(model.forget(rows), train.subset(rows)).innovation[:, 0]
         return cls(model.region(), (), reference, false_alarm_rate)
 
     def observe(self, position: Tensor, innovation: Tensor) -> list[Alarm]:
@@ -187,24 +190,6 @@ class Monitor:
             return f"spectra {where}"
         change = "stronger" if column < len(self.receiver_names) else "weaker"
         return f"{self.receiver_names[column % len(self.receiver_names)]} {change} {where}"
-
-
-def held_out_scores(model: FieldModel, train: Spectra) -> Scores:
-    """Return the scores of training spectra, each fifth of them predicted without itself if the model can forget spectra.
-
-    Args:
-        model: Fitted model.
-        train: Its training spectra in their order.
-    """
-    if not isinstance(model, ProcessModel):
-        return score(model, train)
-    parts, order = [], []
-    for rows in torch.randperm(len(train), generator=torch.Generator().manual_seed(0)).chunk(N_FOLDS):
-        parts.append(score(model.forget(rows), train.subset(rows)))
-        order.append(rows)
-    back = torch.cat(order).argsort()
-    joined = Scores.joined(parts)
-    return Scores(*(getattr(joined, field.name)[back] for field in fields(joined)))
 
 
 @dataclass(frozen=True, eq=False)

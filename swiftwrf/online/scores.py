@@ -58,6 +58,7 @@ class Scores:
         return cls(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(cls)))
 
 
+@torch.no_grad()
 def score(model: FieldModel | RssiPredictor, new: Spectra | Rssi) -> Scores:
     """Return the scores of measurements that a model has not learnt.
 
@@ -70,38 +71,28 @@ def score(model: FieldModel | RssiPredictor, new: Spectra | Rssi) -> Scores:
         >>> score(swiftwrf.make_model("coarray").fit(train), test).innovation.shape
         torch.Size([10, 1])
     """
-    with torch.no_grad():
-        if isinstance(model, RssiPredictor):
-            assert isinstance(new, Rssi)
-            model.check_measurements(new)
-            return _of_rssi(model, new)
+    model.check_measurements(new)  # type: ignore[arg-type]  # measurements of the model's kind
+    if isinstance(model, RssiPredictor):
+        assert isinstance(new, Rssi)
+        position, measured = new.transmitter_position, new.rssi_dbm
+        predicted = model.predict(position)
+        miss = measured - predicted.mean
+        error, innovation = miss.abs().nanmean(dim=1), torch.full_like(miss, torch.nan)
+        if predicted.std is not None:
+            innovation = miss / predicted.std
+    else:
         assert isinstance(new, Spectra)
-        model.check_measurements(new)
-        return _of_spectra(model, new)
-
-
-def _of_spectra(model: FieldModel, new: Spectra) -> Scores:
-    predicted, measured = model.predict(new.position), new.store[:].to(model.device)
-    error = (measured - predicted.mean).square().mean(dim=(1, 2)).sqrt().double()
-    expected = torch.ones_like(error)
-    if isinstance(model, ProcessModel):
-        expected = model.expected_error(new.position)
-    covered = torch.full_like(error, torch.nan)
+        position, measured = new.position, new.store[:].to(model.device)
+        predicted = model.predict(position)
+        miss = measured - predicted.mean
+        error = miss.square().mean(dim=(1, 2)).sqrt().double()
+        expected = model.expected_error(position) if isinstance(model, ProcessModel) else torch.ones_like(error)
+        innovation = (error / expected)[:, None]
+    covered = torch.full_like(miss, torch.nan)
     if predicted.std is not None:
-        low, high = predicted.interval(LEVEL)
-        covered = ((low <= measured) & (measured <= high)).double().mean(dim=(1, 2))
-    return Scores(new.position, error.cpu(), (error / expected)[:, None].cpu(), covered.cpu())
-
-
-def _of_rssi(model: RssiPredictor, new: Rssi) -> Scores:
-    predicted, measured = model.predict(new.transmitter_position), new.rssi_dbm
-    miss = measured - predicted.mean
-    innovation, covered = torch.full_like(miss, torch.nan), torch.full_like(miss, torch.nan)
-    if predicted.std is not None:
-        innovation = miss / predicted.std
         low, high = predicted.interval(LEVEL)
         covered = ((low <= measured) & (measured <= high)).double().where(~miss.isnan(), torch.nan)
-    return Scores(new.transmitter_position, miss.abs().nanmean(dim=1), innovation, covered.nanmean(dim=1))
+    return Scores(position, error.cpu(), innovation.cpu(), covered.flatten(1).nanmean(dim=1).cpu())
 
 
 def learnt(model: Model, new: Spectra | Rssi) -> Model:
