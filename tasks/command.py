@@ -58,10 +58,7 @@ COMMANDS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the console script.
-
-    Args:
-        arguments: Command and its options. Defaults to those of the process.
+    """Run the console script with a command and its options, by default those of the process, and return its exit code.
 
     Returns:
         Exit code; see `tasks.command_line.command_line`.
@@ -91,13 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run_command(name: str, options: Sequence[str], program: str) -> int:
-    """Run one command and return its exit code.
-
-    Args:
-        name: Key of `COMMANDS`.
-        options: Options of the command line.
-        program: Name of the program in the help.
-    """
+    """Run a command of `COMMANDS`, under the name of its program in the help, and return its exit code."""
     if "OMP_WAIT_POLICY" not in os.environ:
         # threads that share a loop wait busily for milliseconds by default, which makes the steps of a network up to eight
         # times slower if other work uses the same cores; libgomp reads the variable when torch is loaded

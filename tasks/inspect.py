@@ -25,8 +25,8 @@ from tasks.directory import new_directory
 from tasks.environment import command, stamp
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table, write_page
+from tasks.page.shared import fingerprinting
 from tasks.source import located, reading
-from tasks.summarise import fingerprinting
 from tasks.terminal import terminal
 
 

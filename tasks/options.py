@@ -132,14 +132,7 @@ def plain(config: Any) -> dict[str, Any]:
 
 
 def choice(meaning: str, registry: Registry[Any] | None, known: Mapping[str, labels.Label], default: str) -> Any:
-    """Return the annotation of an option that takes names of a registry. Its help lists the names.
-
-    Args:
-        meaning: Meaning of the option.
-        registry: Registry of the names. None if `known` has all of them.
-        known: Labels by name. Names of other packages have the first line of their docstring.
-        default: Default that the help shows.
-    """
+    """Return the annotation of an option that takes names of a registry, or of `known`. Its help lists the names."""
 
     def entries(_: str) -> str:
         if registry is None:

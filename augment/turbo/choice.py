@@ -147,12 +147,7 @@ class CrossValidation(Step[Experiment]):
 class FoldLocating(Step[Experiment]):
     """Locate held-out measured spectra of a fold, for the choice of the estimator.
 
-    Args:
-        compared: Comparison of field models that has the fold.
-        number: Number of the fold.
-        room_file: File of the fold's room.
-        train: Training spectra of the fold, by their numbers in the data set.
-        test: Test spectra of the fold, in the same way.
+    Training and test spectra of the fold are given by their numbers in the data set.
     """
 
     compared: CrossValidation
@@ -180,11 +175,7 @@ class FoldLocating(Step[Experiment]):
 
 @dataclass(frozen=True)
 class Suggestion(Step[Experiment]):
-    """Suggest positions for the next measurements.
-
-    Args:
-        subset: Measured spectra.
-    """
+    """Suggest positions for the next measurements."""
 
     subset: MeasuredSubset
 

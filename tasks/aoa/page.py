@@ -16,8 +16,7 @@ from tasks.aoa.synthesis import example_pair, synthesis_section
 from tasks.environment import command
 from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of
 from tasks.page.records import Records, notes
-from tasks.page.shared import again, compared, errors_section, next_steps, suggestion_section, worth
-from tasks.summarise import fingerprinting
+from tasks.page.shared import again, compared, errors_section, fingerprinting, next_steps, suggestion_section, worth
 
 BASELINES = ("peak", "constant")  # others must beat them
 

@@ -11,8 +11,7 @@ from typing import Any
 from numpy.typing import NDArray
 from pandas import DataFrame
 
-from augment.turbo.condition import Condition, chosen_file, conditions_of, headline
-from augment.turbo.results import MixMetrics
+from augment.turbo.condition import Condition, Row, chosen_file, conditions_of, headline
 from swiftwrf.choices import AUTO, fraction_key
 from tasks import labels
 from tasks.page.records import Records
@@ -23,12 +22,7 @@ LOWER_REFERENCE, UPPER_REFERENCE, CHOSEN = "#cf4a4a", "#2a9165", "#3a7fd5"
 
 @dataclass(frozen=True)
 class FractionRecords:
-    """One measured fraction of one run.
-
-    Args:
-        run: Records of the run.
-        key: Measured fraction in metrics.json and in file names.
-    """
+    """One measured fraction, by its key in metrics.json and in file names, of one run."""
 
     run: Records
     key: str
@@ -39,9 +33,9 @@ class FractionRecords:
         return [cls(run, key) for key in run.metrics["mixes"]]
 
     @cached_property
-    def mix(self) -> MixMetrics:
+    def mix(self) -> Row:
         """Metrics of the measured fraction."""
-        found: MixMetrics = self.run.metrics["mixes"][self.key]
+        found: Row = self.run.metrics["mixes"][self.key]
         return found
 
     @cached_property

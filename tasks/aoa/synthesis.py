@@ -32,13 +32,7 @@ SCALES = {
 
 @dataclass(frozen=True)
 class Example:
-    """A test spectrum and its prediction.
-
-    Args:
-        title: Row and quality.
-        images: Values (n_elevation, n_azimuth) by kind, as `spectra` takes them.
-        truth: True direction [deg]. None if it is unknown.
-    """
+    """A test spectrum and its prediction: title, values (n_elevation, n_azimuth) by kind, true direction if known."""
 
     title: str
     images: dict[str, NDArray[Any]]

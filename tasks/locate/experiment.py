@@ -36,12 +36,7 @@ N_MAPS = 6  # test rows with a posterior map
 
 @dataclass(frozen=True)
 class Localization(Step[LocateSplit]):
-    """Fit a localizer and locate the test rows.
-
-    Args:
-        trial: The localizer and its part of the data.
-        suggest: Number of positions to suggest for the next measurements.
-    """
+    """Fit the localizer of a trial and locate the test rows; suggest a number of positions for the next measurements."""
 
     trial: Trial
     suggest: int = 0

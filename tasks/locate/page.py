@@ -26,13 +26,14 @@ from tasks.page.shared import (
     again,
     by_method,
     compared,
+    comparison_sentence,
+    coverage_warning,
     difference,
     errors_section,
     limits,
     next_steps,
     suggestion_section,
 )
-from tasks.summarise import comparison_sentence, coverage_warning
 
 OWN = "posterior"  # the localizer that all others are compared with
 NEIGHBOURS = ("knn", "knn_difference")

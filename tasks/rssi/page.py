@@ -14,9 +14,18 @@ from tasks.labels import PREDICTORS, colour, colours, meanings
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of
 from tasks.page.records import Records, notes
-from tasks.page.shared import again, by_method, compared, difference, errors_section, limits, next_steps
+from tasks.page.shared import (
+    again,
+    by_method,
+    compared,
+    comparison_sentence,
+    coverage_warning,
+    difference,
+    errors_section,
+    limits,
+    next_steps,
+)
 from tasks.rssi.maps import CERTAINTY, COVERED_DBM, MAX_VECTOR_DOTS, MIN_RATIO, Maps
-from tasks.summarise import comparison_sentence, coverage_warning
 
 COLUMNS = ["index", "receiver", "method", "abs_error_db"]  # of the errors of methods
 COLOURS = colours(PREDICTORS)

@@ -120,14 +120,9 @@ def circle(centre: ArrayLike, radius: float) -> Values:
 
 
 def colour_bar(colours: str, limits: tuple[float, float], label: str, layer: str, extend: str = "neither") -> Option:
-    """Return a colour bar.
+    """Return a colour bar of a matplotlib colour map for the values of a layer, with quantity and unit.
 
-    Args:
-        colours: Name of a matplotlib colour map.
-        limits: Values of its first and its last colour.
-        label: Quantity and unit.
-        layer: Name of the layer whose values it colours.
-        extend: Ends that stand for all values beyond, "neither", "max" or "both".
+    Ends that stand for all values beyond are "neither", "max" or "both".
     """
     low, high = (f"{value:.3g}" for value in limits)
     ends = [f"{'≥ ' * (extend != 'neither')}{high}  {label}", f"{'≤ ' * (extend == 'both')}{low}"]
@@ -215,15 +210,9 @@ def plan(corners: Sequence[float], layers: list[Option], bottom: int) -> Option:
 
 
 def spectrum(polar: bool, colours: str, high: float, extend: str, peak: str, sight: str) -> Option:
-    """Return the options of a chart of a spectrum with a ring in one colour and a cross in another.
+    """Return the options of a chart of a spectrum up to a value, with a ring at the peak and a cross at the line of sight.
 
-    Args:
-        polar: Whether directions are (angle to the normal, azimuth) in polar coordinates, else (azimuth, elevation) [deg].
-        colours: Name of a matplotlib colour map.
-        high: Value of its last colour.
-        extend: Ends of the colour bar that stand for all values beyond, "neither" or "max".
-        peak: Colour of the ring.
-        sight: Colour of the cross.
+    In polar coordinates directions are (angle to the normal, azimuth), else (azimuth, elevation) [deg].
     """
     system = "polar" if polar else "cartesian2d"
     layers = [pictures("spectrum", system), rings("peak", peak, 14, system), crosses("sight", sight, system)]

@@ -61,12 +61,7 @@ class Located:
 
 
 class RssiLocating:
-    """A locator, the rows to choose from, and the expected error over the floor.
-
-    Args:
-        locator: Fitted locator.
-        rows: Measured rows at the receivers of the locator. Rows that no receiver detected are left out.
-        in_training: Whether the locator was fitted to each row, bool (n,).
+    """A locator, the rows that it detects and whether it was fitted to each of them, and the expected error over the floor.
 
     Example:
         >>> import swiftwrf

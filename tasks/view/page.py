@@ -66,9 +66,6 @@ class NewestOnly:
     """Queue of one: runs one request at a time, then the newest of those that arrived in the meantime.
 
     A slow model therefore follows the pointer instead of trailing behind it.
-
-    Args:
-        handle: Coroutine function of a request's arguments.
     """
 
     def __init__(self, handle: Callable[..., Awaitable[None]]) -> None:
@@ -105,13 +102,7 @@ def header(title: str, notes: list[str]) -> ui.row:
 
 
 class Chart:
-    """A chart whose layers change one by one.
-
-    Args:
-        name: Identifier of the element on the page.
-        options: Options of ECharts.
-        style: Size of the element, as CSS.
-    """
+    """A chart whose layers change one by one, in an element with an identifier and a size as CSS."""
 
     def __init__(self, name: str, options: Option, style: str) -> None:
         # SVG follows the colours of the page and keeps pixels sharp
@@ -126,16 +117,7 @@ class Chart:
 
 
 class PlanChart(Chart):
-    """A chart of positions, to scale, that reports the position of the pointer.
-
-    Args:
-        name: Identifier of the element on the page.
-        corners: Edges x0, x1, y0, y1 [m].
-        layers: Layers from the lowest to the highest.
-        max_px: Maximum width and height.
-        pointed: Called with kind of the event, pressed buttons, x and y [m].
-        has_bar: Whether there is a colour bar below.
-    """
+    """A chart of positions, to scale, that calls `pointed` with kind of the event, pressed buttons, x and y [m]."""
 
     def __init__(
         self,
@@ -250,15 +232,7 @@ def free_port(host: str, port: int) -> int:
 
 
 def serve(title: str, build: Callable[[], object], host: str, port: int, show: bool = False) -> None:
-    """Serve one page and nothing else of this machine, until the process is interrupted.
-
-    Args:
-        title: Title of the page.
-        build: Builds the page for one visitor.
-        host: Address to listen on.
-        port: Port to listen on.
-        show: Whether the browser opens the page.
-    """
+    """Serve one page, built for each visitor, and nothing else of this machine, until the process is interrupted."""
 
     async def announce() -> None:
         """Print the address once the server answers."""

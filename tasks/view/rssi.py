@@ -329,11 +329,7 @@ def probability_above(rssi: Prediction, selection: MapSelection) -> Tensor:
 
 
 def at_least(probability: Tensor, number: int) -> Tensor:
-    """Return the probability that at least a number of receivers exceed the threshold, independent of each other.
-
-    Args:
-        probability: Probability of each receiver, (R, ...).
-        number: Number of receivers, at least 1.
+    """Return the probability that at least a number of receivers exceed the threshold, from those of each one, (R, ...).
 
     Example:
         >>> at_least(torch.tensor([0.5, 0.5]), 1)

@@ -105,14 +105,7 @@ class PredictedSpectrum:
 
 @dataclass(frozen=True, eq=False)
 class SpectraView:
-    """Fitted models and the measured spectra, as far as they are known.
-
-    Args:
-        title: Title of the page.
-        models: Models to choose from, at least one.
-        data: Measured spectra. None if they are unknown.
-        notes: Remarks on the data, a sentence each.
-    """
+    """Fitted models, at least one, and the measured spectra, as far as they are known."""
 
     title: str
     models: list[LoadedModel]

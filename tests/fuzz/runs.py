@@ -48,7 +48,7 @@ from tasks.page.maps import FloorPlan
 from tasks.update import lines
 from tasks.update.record import TABLE, Record
 from tasks.view.charts import around, picture, points
-from tasks.view.followed import FollowedView
+from tasks.view.followed import FollowedView, snapshot
 from tasks.view.rssi import MapSelection, RssiView
 from tasks.view.sources import open_source
 
@@ -97,7 +97,7 @@ def show(folder: Path) -> None:
     with mock.patch("swiftwrf.rssi.maps.CELLS", 9), mock.patch("tasks.view.followed.as_svg", return_value="<svg"):
         view = open_source(folder)
         if isinstance(view, FollowedView):
-            view.snapshot()
+            snapshot(view, view.version)
         elif isinstance(view, RssiView):
             _show_rssi(view)
         else:
