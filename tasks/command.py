@@ -22,13 +22,11 @@ class Command(NamedTuple):
         summary: One line for the help.
         options: Dataclass of the options, in `tasks.configs`.
         module: Module with `run(config)`, or `run(config, resume)` if its runs can be resumed.
-        preloaded: Modules that processes of a run load while the run itself begins.
     """
 
     summary: str
     options: str
     module: str
-    preloaded: tuple[str, ...] = ()
 
 
 COMMANDS = {
@@ -36,7 +34,6 @@ COMMANDS = {
         "estimate angles of arrival with few measured spectra, and report the errors",
         "AoaConfig",
         "tasks.aoa.experiment",
-        ("augment.turbo.choice", "torchvision", "torch._dynamo"),
     ),
     "rssi": Command("predict RSSI maps of receivers, and report the errors", "RssiTaskConfig", "tasks.rssi.experiment"),
     "locate": Command(
@@ -55,6 +52,10 @@ COMMANDS = {
     "scenes": Command("trace ray paths in a room (extra: raytrace)", "ScenesConfig", "tasks.scenes"),
     "view": Command("show a fitted field in the browser (extra: view)", "ViewConfig", "tasks.view.run"),
 }
+
+
+# modules that processes of a run load while the run itself begins
+PRELOADED = {"aoa": ("augment.turbo.choice", "torchvision", "torch._dynamo")}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -103,6 +104,5 @@ def run_task(name: str, config: Any, *folder: Path) -> None:
     """Run a command with checked options, or continue its run in a directory."""
     from tasks.preload import preload
 
-    command = COMMANDS[name]
-    preload(command.preloaded if getattr(config, "processes", None) != 1 else ())
-    import_module(command.module).run(config, *folder)
+    preload(PRELOADED.get(name, ()) if getattr(config, "processes", None) != 1 else ())
+    import_module(COMMANDS[name].module).run(config, *folder)

@@ -11,7 +11,6 @@ import torch
 from augment.choose import Fold, ModelChoice, choose_model
 from augment.cross_validation import (
     STAND_IN,
-    CrossValidationMetrics,
     cross_validate,
     located_errors,
     located_folds,
@@ -86,7 +85,9 @@ class CrossValidation(Step[Experiment]):
         trained = [name for name in self.compared if name in choice.folds] or [choice.name]
         validation = {name: cross_validate(choice.folds[name], experiment.n_synthetic, seed) for name in trained}
         first = validation[trained[0]]
-        turbo = self._turbo(experiment, trained[0], first.metrics)
+        number = experiment.n_extra(first.metrics)
+        training: Training = "measured + synthetic + extra" if number else "measured + synthetic"
+        turbo = Condition(STAND_IN, training, trained[0], number)
         errors = {Condition(STAND_IN, "measured").method: first.measured_only}
         errors |= {turbo.method: first.turbo} if first.turbo else {}
         folds = choice.folds[trained[0]]
@@ -97,12 +98,7 @@ class CrossValidation(Step[Experiment]):
                 ]
         with_room = self._with_room(experiment, measured, choice)
         return {
-            "choice": {
-                "name": choice.name,
-                "psnr_db": choice.psnr_db,
-                "seconds": choice.seconds,
-                "left_out": choice.left_out,
-            },
+            "choice": {name: value for name, value in vars(choice).items() if name != "folds"},
             "cross_validation": {name: entry.metrics for name, entry in validation.items()},
             "errors": errors,
             "folds": {number: self._keep(fold, number, folder) for number, fold in located_folds(with_room).items()},
@@ -125,13 +121,6 @@ class CrossValidation(Step[Experiment]):
         assert fold.model.room is not None
         fold.model.room.save(folder / file)
         return {"file": file, "train": fold.train.index, "test": fold.test.index}
-
-    def _turbo(self, experiment: Experiment, synthesizer: str, validation: CrossValidationMetrics) -> Condition:
-        """Return the condition of the stand-in with all spectra of a field model."""
-        number = experiment.n_extra(validation)
-        return Condition(
-            STAND_IN, "measured + synthetic + extra" if number else "measured + synthetic", synthesizer, number
-        )
 
     def then(self, experiment: Experiment, value: Row) -> Sequence[Step[Experiment]]:
         named = [name for name in experiment.models if name != AUTO]

@@ -231,8 +231,8 @@ def comparison(fraction: FractionRecords) -> str:
     """Return the changes of the learner's error by synthetic spectra, and whether they are significant."""
     method, best = fraction.turbo_method, fraction.mix["reference"]
     parts = [
-        f"{change_text(change)} against `{other}`"
-        f"{', the best one without them' if other == best else ''} ({judgement(change)})"
+        f"{change_text(change)} against `{other}`{', the best one without them' if other == best else ''} "
+        f"({'a gain' if change['high'] < 0 else 'a loss' if change['low'] > 0 else 'not significant'})"
         for other, change in fraction.mix["methods"][method]["changes"].items()
     ]
     return f"Synthetic spectra change the median error of `{method}` by {' and '.join(parts)}."
@@ -246,18 +246,6 @@ def change_text(change: ChangeMetrics) -> str:
         '-49% [-60%, -30%]'
     """
     return f"{change['change']:+.0%} [{change['low']:+.0%}, {change['high']:+.0%}]"
-
-
-def judgement(change: ChangeMetrics) -> str:
-    """Return whether a change is a gain, a loss or not significant, by its interval.
-
-    Example:
-        >>> judgement({"median_deg": 1.0, "change": -0.17, "low": -0.4, "high": 0.1})
-        'not significant'
-    """
-    if change["high"] < 0:
-        return "a gain"
-    return "a loss" if change["low"] > 0 else "not significant"
 
 
 def steps(fraction: FractionRecords) -> list[NextStep]:

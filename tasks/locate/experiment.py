@@ -25,7 +25,7 @@ from tasks.locate.page import SUGGESTED, answer, page
 from tasks.page.page import reporting
 from tasks.page.records import Records
 from tasks.page.shared import write_suggestion
-from tasks.records import LOCATOR, Row
+from tasks.records import LOCATOR, Row, write_table
 from tasks.source import measured_rssi, split_notes
 from tasks.steps import run_steps
 from tasks.terminal import console, terminal
@@ -94,7 +94,7 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
                 assert isinstance(step, Localization)
                 values[step.trial] = value
         result = LocateComparison(measured, values)
-        directory.write_csv("errors.csv", result.errors.to_dict("records"))
+        write_table(directory.path("errors.csv"), result.errors.to_dict("records"))
         final = directory.finish(_metrics(data, result), reporting(page))
     terminal.answer(answer(Records(final)), final / "report.html")
 
