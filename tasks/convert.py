@@ -69,12 +69,11 @@ def _write_new_file(config: ConvertConfig, model: RssiModel | None) -> None:
     if model is not None and (options := reading(config.spectra, config.table).given):
         raise InputError(f"{config.source} is a model; --{next(iter(options)).replace('_', '-')} is for measurements")
     check_new_file(out)
-    data = (
-        _spectra_or_rssi(_read(config), reading(config.spectra, config.table))
-        if model is None
-        else map_of(model, config)
-    )
-    _answer(config, write_file(data, out))
+    if model is None:
+        _answer(config, write_file(_spectra_or_rssi(_read(config), reading(config.spectra, config.table)), out))
+    else:
+        found = RssiMap.predict(model, config.cell, config.height)
+        _answer(config, write_file(found.receivers(config.rx) if config.rx else found, out))
 
 
 def _read(config: ConvertConfig) -> Spectra | Snapshots | Rssi:
@@ -163,16 +162,6 @@ def saved_model(source: Path) -> RssiModel | None:
     if not isinstance(model, RssiModel):
         raise InputError(f"{file} holds {with_article(model.kind)}, which predicts neither spectra nor RSSI")
     return model
-
-
-def map_of(model: RssiModel, config: ConvertConfig) -> RssiMap:
-    """Return the map of an RSSI model.
-
-    Raises:
-        InputError: An unknown receiver.
-    """
-    found = RssiMap.predict(model, config.cell, config.height)
-    return found.receivers(config.rx) if config.rx else found
 
 
 def write_file(data: Labelled, file: Path) -> str:

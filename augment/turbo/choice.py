@@ -96,12 +96,17 @@ class CrossValidation(Step[Experiment]):
                 errors[Condition(name, "measured").method] = [
                     measured_errors(fold, experiment.make_estimator(name, self.subset)) for fold in folds
                 ]
-        with_room = self._with_room(experiment, measured, choice)
+        kept = {}  # rooms of folds, and the numbers of their spectra in the data set
+        for number, fold in located_folds(self._with_room(experiment, measured, choice)).items():
+            file = f"{STEPS}/{self.name}-room{number}.safetensors"
+            assert fold.model.room is not None
+            fold.model.room.save(folder / file)
+            kept[number] = {"file": file, "train": fold.train.index, "test": fold.test.index}
         return {
             "choice": {name: value for name, value in vars(choice).items() if name != "folds"},
             "cross_validation": {name: entry.metrics for name, entry in validation.items()},
             "errors": errors,
-            "folds": {number: self._keep(fold, number, folder) for number, fold in located_folds(with_room).items()},
+            "folds": kept,
         }
 
     def _with_room(self, experiment: Experiment, measured: Spectra, choice: ModelChoice) -> list[Fold]:
@@ -114,13 +119,6 @@ class CrossValidation(Step[Experiment]):
             return choose_model(measured, (ROOM_MODEL,), seed=seed, device=experiment.device).folds[ROOM_MODEL]
         except InputError:
             return []
-
-    def _keep(self, fold: Fold, number: int, folder: Path) -> Row:
-        """Keep the room of a fold. Return its file, and the numbers of the spectra in the data set."""
-        file = f"{STEPS}/{self.name}-room{number}.safetensors"
-        assert fold.model.room is not None
-        fold.model.room.save(folder / file)
-        return {"file": file, "train": fold.train.index, "test": fold.test.index}
 
     def then(self, experiment: Experiment, value: Row) -> Sequence[Step[Experiment]]:
         named = [name for name in experiment.models if name != AUTO]

@@ -12,7 +12,7 @@ from tasks import labels
 from tasks.answer import Answer, Method, NextStep
 from tasks.aoa.records import FractionRecords, palette
 from tasks.aoa.room import choice_section, located_plan, locating_section, room_section
-from tasks.aoa.synthesis import example_pair, synthesis_section
+from tasks.aoa.synthesis import example_pair, examples_plot
 from tasks.environment import command
 from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of
 from tasks.page.records import Records, notes
@@ -27,7 +27,7 @@ def page(runs: list[Records]) -> Page:
     sections = [
         sections_of("Errors", fractions, _errors, _terms()),
         sections_of("Where was it?", fractions, _positions),
-        sections_of("Spectra", fractions, synthesis_section),
+        sections_of("Spectra", fractions, lambda fraction: Section("", plots=[examples_plot(fraction)])),
         _limits(runs[0]),
     ]
     more = sections_of("Measure or synthesize more?", fractions, _more)

@@ -61,7 +61,8 @@ class FractionRecords:
 
     def table(self, name: str) -> DataFrame:
         """Return the rows of a table of the run, e.g. `errors`, with this measured fraction."""
-        return of_fraction(self.run.table(name), self.key)
+        table = self.run.table(name)
+        return table[[fraction_key(float(text)) == self.key for text in table["measured_fraction"]]]
 
     def arrays(self, kind: str) -> dict[str, NDArray[Any]]:
         """Return the arrays of one kind, e.g. `located`, that the run left; none if it left no such file."""
@@ -99,11 +100,6 @@ class FractionRecords:
     def palette(self) -> dict[str, str]:
         """Colours of its field models and conditions."""
         return palette(self.conditions.values())
-
-
-def of_fraction(table: DataFrame, key: str) -> DataFrame:
-    """Return the rows of a measured fraction."""
-    return table[[fraction_key(float(text)) == key for text in table["measured_fraction"]]]
 
 
 def palette(conditions: Iterable[Condition]) -> dict[str, str]:

@@ -38,7 +38,8 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         InputError: A configuration that the data cannot meet or that contradicts itself.
     """
     device = choose_device("cpu" if config.device == "auto" else config.device)
-    whole = _load(config)
+    measured = measured_rssi(config.data, config.table)
+    whole = rssi_room(seed=config.seed) if measured is None else measured
     data = whole.receivers(config.rx)
     plan = _read_floor_plan(config, data)
     for note in data.notes:
@@ -91,11 +92,6 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         write_npz(directory.path("maps.npz"), _maps(model, result.train) | plan)
         final = directory.finish(_metrics(config, data, result, model), reporting(page))
     terminal.answer(answer(Records(final)), final / "report.html")
-
-
-def _load(config: RssiTaskConfig) -> Rssi:
-    measured = measured_rssi(config.data, config.table)
-    return rssi_room(seed=config.seed) if measured is None else measured
 
 
 def _read_floor_plan(config: RssiTaskConfig, data: Rssi) -> dict[str, Any]:

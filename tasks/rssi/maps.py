@@ -90,12 +90,6 @@ class Maps:
         lower = self.best["predicted"] - NormalDist().inv_cdf(CERTAINTY) * self.best["width"] / WIDTH_PER_STD
         return float((lower >= COVERED_DBM)[self.inside].mean()) if self.inside.any() else float("nan")
 
-    @property
-    def most_detected(self) -> list[int]:
-        """Receivers with a map, those that detected most rows, ascending."""
-        detected = (~np.isnan(self.arrays["measured"])).sum(axis=0)
-        return sorted(np.argsort(-detected, kind="stable")[:MAX_MAPS].tolist())
-
     def summary(self) -> Plot:
         """Return map and uncertainty of the only receiver, or of the best server."""
         several = len(self.names) > 1
@@ -118,7 +112,8 @@ class Maps:
 
     def by_receiver(self, kind: str) -> Plot:
         """Return maps of the receivers that detected most rows: "predicted", or "width" for that of the intervals."""
-        shown = self.most_detected
+        detected = (~np.isnan(self.arrays["measured"])).sum(axis=0)
+        shown = sorted(np.argsort(-detected, kind="stable")[:MAX_MAPS].tolist())
         names, fields = [self.names[i] for i in shown], ("predicted", "width", "detection")
         data = self._cells({name: self.arrays[name][shown] for name in fields}, names)
         values = [{name: self.arrays[name][i] for name in fields} for i in shown]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import cache
 from typing import Any
 
@@ -28,7 +28,6 @@ CROSS = "path://M0 2L2 0L8 6L14 0L16 2L10 8L16 14L14 16L8 10L2 16L0 14L6 8Z"
 BAR = "bar"  # name of the colour bar
 N_STOPS = 17  # of a colour bar
 DISC_PX = 240
-PLAN_LEFT, PLAN_RIGHT, PLAN_TOP = 50, 12, 10  # pixels around a plan
 PLAN_MARGIN = 0.04  # of the longer side
 MIN_PLAN_ASPECT = 0.4  # a path along one axis needs room to drag across it
 PICTURE = """(params, api) => {
@@ -194,19 +193,6 @@ def _nearest_direction(grid: AngularGrid) -> NDArray[np.integer]:
     column = np.round((azimuth - grid.azimuth_start) / grid.azimuth_step).astype(int) % grid.n_azimuth
     row = np.round((elevation - grid.elevation_start) / grid.elevation_step).astype(int)
     return np.where(elevation < 0, -1, row.clip(0, grid.n_elevation - 1) * grid.n_azimuth + column)
-
-
-def plan(corners: Sequence[float], layers: list[Option], bottom: int) -> Option:
-    """Return the options of a chart of positions in plan, edges x0, x1, y0, y1 [m], with room below for a colour bar."""
-    x0, x1, y0, y1 = corners
-    box = {"left": PLAN_LEFT, "right": PLAN_RIGHT, "top": PLAN_TOP, "bottom": bottom, "outerBoundsMode": "none"}
-    axes = {"xAxis": axis(x0, x1, "x [m]"), "yAxis": axis(y0, y1, "y [m]", gap=34)}
-    return {
-        "animation": False,
-        "grid": box,
-        **axes,
-        "series": [layer | {"z": 2 + number} for number, layer in enumerate(layers)],
-    }
 
 
 def spectrum(polar: bool, colours: str, high: float, extend: str, peak: str, sight: str) -> Option:

@@ -19,19 +19,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from swiftwrf import InputError
 from tasks.page.maps import Corners
-from tasks.view.charts import (
-    PLAN_LEFT,
-    PLAN_RIGHT,
-    PLAN_TOP,
-    Data,
-    Option,
-    circle,
-    crosses,
-    lines,
-    paths,
-    plan,
-    points,
-)
+from tasks.view.charts import Data, Option, axis, circle, crosses, lines, paths, points
 from tasks.view.locating import Located
 
 MAX_UPLOAD_BYTES, MAX_FRAME_BYTES = 2**25, 2**12  # of an image, and of the form around it
@@ -129,13 +117,19 @@ class PlanChart(Chart):
         has_bar: bool = False,
     ) -> None:
         self.corners, (x0, x1, y0, y1) = corners, corners
-        bottom, ratio = 80 if has_bar else 40, (y1 - y0) / (x1 - x0)
+        left, right, top, bottom = 50, 12, 10, 80 if has_bar else 40  # pixels around the plan
+        ratio = (y1 - y0) / (x1 - x0)
         width = min(max_px[0], max_px[1] / ratio)
-        style = (
-            f"width: 100%; height: calc((100cqw - {PLAN_LEFT + PLAN_RIGHT}px) * {ratio:.5f} + {PLAN_TOP + bottom}px)"
-        )
+        style = f"width: 100%; height: calc((100cqw - {left + right}px) * {ratio:.5f} + {top + bottom}px)"
+        options = {
+            "animation": False,
+            "grid": {"left": left, "right": right, "top": top, "bottom": bottom, "outerBoundsMode": "none"},
+            "xAxis": axis(x0, x1, "x [m]"),
+            "yAxis": axis(y0, y1, "y [m]", gap=34),
+            "series": [layer | {"z": 2 + number} for number, layer in enumerate(layers)],
+        }
         with ui.element().style(f"width: {width:.0f}px; max-width: 100%; container-type: inline-size"):
-            super().__init__(name, plan(corners, layers, bottom), style)
+            super().__init__(name, options, style)
         self.element.classes("drag")
 
         def inside(event: events.GenericEventArguments) -> None:
