@@ -18,7 +18,8 @@ from swiftwrf.data import ReadOptions
 from swiftwrf.data.coordinates import Floors, PlanFrame, degree_columns
 from swiftwrf.data.files import SUFFIXES, read_table
 from swiftwrf.data.formats import RSSI_FORMATS, read
-from swiftwrf.data.survey import has_positions, read_places
+from swiftwrf.data.receivers import read_places
+from swiftwrf.data.survey import has_positions
 from swiftwrf.errors import with_article
 from swiftwrf.locate import MatchedField, Posterior, RssiLocator, smoothed
 from swiftwrf.locate.baselines import BATCH_ROWS

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.rasterize import reference
-from swiftwrf.rasterize.magnitude import magnitude
+from swiftwrf.rasterize.operators import magnitude
 
 Inputs = tuple[Tensor, Tensor, Tensor]  # mean, Cholesky factor, weight
 Draw = Callable[[Tensor, Tensor, Tensor, AngularGrid, float | None], Tensor]

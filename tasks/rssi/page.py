@@ -123,7 +123,9 @@ def model_of(run: Records) -> str:
 
 def best_baseline(run: Records) -> str:
     """Return the name of the baseline with the lowest median error."""
-    error = {name: float(entry["abs_error_db"]["median"]) for name, entry in run.metrics["overall"].items()}
+    error: dict[str, float] = {
+        name: float(entry["abs_error_db"]["median"]) for name, entry in run.metrics["overall"].items()
+    }
     return min((name for name in error if name != model_of(run)), key=error.__getitem__)
 
 

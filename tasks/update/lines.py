@@ -16,7 +16,7 @@ import torch
 
 from swiftwrf import FieldModel, InputError, Rssi, Spectra
 from swiftwrf.data.files import refusing_unreadable, table_of
-from swiftwrf.data.survey import spelled_as
+from swiftwrf.data.receivers import spelled_as
 from swiftwrf.errors import CONTENT_ERRORS
 from swiftwrf.online import Step
 from swiftwrf.online.scores import LEVEL

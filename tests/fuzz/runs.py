@@ -180,7 +180,7 @@ def followed(model: FieldModel | RssiModel, content: bytes, folder: Path, source
         redirect_stderr(said),
     ):
         source = source if source == "-" else str(folder / source)
-        code = run_command("update", [str(file), source, "--follow", "--out", str(out)])
+        code = run_command("update", [str(file), source, "--follow", "--out", str(out)], "swiftwrf update")
     errors, learnt = said.getvalue().splitlines(), [json.loads(line) for line in answers.getvalue().splitlines()]
     assert all(line.startswith(ERROR) and len(line) <= MAX_LENGTH + len(ERROR) for line in errors), errors
     if code == 2 and len(errors) == 1 and not learnt:

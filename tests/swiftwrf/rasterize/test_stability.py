@@ -12,7 +12,7 @@ from scenes import random_scene
 
 from swiftwrf import AngularGrid, InputError, rasterize
 from swiftwrf.metrics import ssim
-from swiftwrf.rasterize.magnitude import magnitude
+from swiftwrf.rasterize.operators import magnitude
 
 REFUSED = {
     "a pixel that is not a number": "spectrum of training spectrum 3 is not finite; mend or leave it out",

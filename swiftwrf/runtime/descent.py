@@ -1,4 +1,4 @@
-"""Long fits: their state, which one file keeps so that an interrupted fit can continue, and their gradient descent."""
+"""Gradient descent of long fits, whose state one file keeps so that an interrupted fit can continue."""
 
 from __future__ import annotations
 
@@ -7,17 +7,16 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
 import torch
-from rich.progress import Progress
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from swiftwrf.errors import FitError, InputError
-from swiftwrf.runtime import checkpoint
+from swiftwrf.runtime import checkpoint as files
+from swiftwrf.runtime.progress import progress_bar
 
 Record = dict[str, Any]  # one evaluation of a fit
 KIND = "fit state"
@@ -27,88 +26,13 @@ MAX_GROWTH = 1.1  # of the loss of a fit that is not refused: steps have differe
 SAVED_VALUES = {"step": int, "seconds": float, "first_loss": float, "last_loss": float}  # attributes in a checkpoint
 
 
-@dataclass(frozen=True)
-class State:
-    """Saved state of one run: plain values and tensors."""
-
-    header: dict[str, Any]
-    tensors: dict[str, Tensor]
-
-
-@dataclass
-class Session:
-    """State shared by the runs of one fit: their checkpoint, records and callback.
+class Descent(ABC, Generic[Model]):
+    """Adam with a running average of the parameters.
 
     Args:
-        path: Checkpoint. None keeps no state.
-        owner: Fingerprint of configuration and spectra.
-        bar: Progress bar.
-        on_record: Called at each evaluation; at first with the records of the checkpoint.
-
-    Attributes:
-        saved: State of the interrupted run, if the checkpoint exists.
-        losses: Held-out losses of completed runs by name.
-        records: Records of all evaluations, including those of the checkpoint.
-        earlier: Seconds of the fit up to the checkpoint.
-
-    Raises:
-        InputError: The checkpoint is damaged or belongs to another fit.
-    """
-
-    path: Path | None
-    owner: str
-    bar: Progress
-    on_record: Callable[[Record], None] | None
-    saved: State | None = None
-    losses: dict[str, float] = field(default_factory=dict)
-    records: list[Record] = field(default_factory=list)
-    earlier: float = 0.0
-    began: float = field(default_factory=time.perf_counter)
-
-    def __post_init__(self) -> None:
-        if self.path is not None and self.path.exists():
-            self.saved = self._read(self.path)
-        for record in self.records:
-            self._send(record)
-
-    def _read(self, path: Path) -> State:
-        _, tensors, header = checkpoint.read(path, KIND)
-        if header.get("fingerprint") != self.owner:
-            raise InputError(
-                f"{path} is the state of another fit (other spectra or settings); remove it or give another path"
-            )
-        with checkpoint.refusing(f"{path} is no state that a fit can continue from"):
-            self.losses, self.records = dict(header["losses"]), list(header["records"])
-            self.earlier = float(header["elapsed"])
-        return State(header, tensors)
-
-    @property
-    def elapsed(self) -> float:
-        """Seconds of the fit, including those before an interruption."""
-        return self.earlier + time.perf_counter() - self.began
-
-    def evaluated(self, record: Record, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
-        """Save the record of an evaluation with the state of the current run, then send it.
-
-        The record is saved first, so that the history after an interruption contains it once.
-        """
-        record = record | {"elapsed": self.elapsed}
-        self.records.append(record)
-        if self.path is not None:
-            shared = {"losses": self.losses, "fingerprint": self.owner, "records": self.records}
-            checkpoint.write(self.path, KIND, tensors, header | shared | {"elapsed": self.elapsed})
-        self._send(record)
-
-    def _send(self, record: Record) -> None:
-        if self.on_record is not None:
-            self.on_record(record)
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """Length and step rule of a descent.
-
-    Args:
+        name: Name of the run on the progress bar.
+        model: Module to train, on its device.
+        groups: Parameter groups of Adam, each with its peak learning rate, `peak`.
         steps: Number of steps.
         check_every: Steps between two evaluations, at which a record is sent and the state is saved.
         averaging: Decay per step of the weights in the averaged parameters; 0 takes the last parameters.
@@ -116,36 +40,31 @@ class Schedule:
         betas, weight_decay: Options of Adam.
     """
 
-    steps: int
-    check_every: int
-    averaging: float = 0.98  # averaged parameters predict better than the last ones
-    clip: float = 1.0
-    betas: tuple[float, float] = (0.9, 0.99)
-    weight_decay: float = 0.0
-
-
-class Descent(ABC, Generic[Model]):
-    """Adam with a running average of the parameters.
-
-    Args:
-        name: Name of the run within its fit, also on the progress bar.
-        model: Module to train, on its device.
-        groups: Parameter groups of Adam, each with its peak learning rate, `peak`.
-        schedule: Length and step rule.
-    """
-
-    def __init__(self, name: str, model: Model, groups: Iterable[dict[str, Any]], schedule: Schedule) -> None:
-        self.name, self.model, self.schedule = name, model, schedule
-        self.optimiser = torch.optim.Adam(groups, betas=schedule.betas, weight_decay=schedule.weight_decay)
+    def __init__(
+        self,
+        name: str,
+        model: Model,
+        groups: Iterable[dict[str, Any]],
+        *,
+        steps: int,
+        check_every: int,
+        averaging: float = 0.98,  # averaged parameters predict better than the last ones
+        clip: float = 1.0,
+        betas: tuple[float, float] = (0.9, 0.99),
+        weight_decay: float = 0.0,
+    ) -> None:
+        self.name, self.model, self.steps, self.check_every = name, model, steps, check_every
+        self.averaging, self.clip = averaging, clip
+        self.optimiser = torch.optim.Adam(groups, betas=betas, weight_decay=weight_decay)
         self.average = self.averaged()
         self.step, self.seconds = 0, 0.0
         self.first_loss = self.last_loss = math.inf
         device = next(model.parameters()).device
-        self.broken_at = torch.tensor(schedule.steps, device=device)  # the first step whose loss was not finite
+        self.broken_at = torch.tensor(steps, device=device)  # the first step whose loss was not finite
 
     def averaged(self) -> AveragedModel:
         """The running average, which begins with the parameters as they are."""
-        return AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(self.schedule.averaging))
+        return AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(self.averaging))
 
     @abstractmethod
     def objective(self) -> Tensor:
@@ -168,7 +87,7 @@ class Descent(ABC, Generic[Model]):
             raise FitError(f"the fit broke at step {self.step}: {error}; {self._advice()}") from None
         self.optimiser.zero_grad()
         loss.backward()
-        norm = nn.utils.clip_grad_norm_(self.model.parameters(), max_norm=self.schedule.clip)
+        norm = nn.utils.clip_grad_norm_(self.model.parameters(), max_norm=self.clip)
         finite = loss.detach().isfinite() & norm.isfinite()
         self.broken_at = torch.where(finite, self.broken_at, self.broken_at.clamp(max=self.step))
         if (not loss.is_cuda or self._evaluates_after(self.step + 1)) and (broken := int(self.broken_at)) <= self.step:
@@ -184,7 +103,7 @@ class Descent(ABC, Generic[Model]):
         return loss.detach()
 
     def _evaluates_after(self, step: int) -> bool:
-        return step % self.schedule.check_every == 0 or step == self.schedule.steps
+        return step % self.check_every == 0 or step == self.steps
 
     def _advice(self) -> str:
         return f"try a learning rate below {max(group['peak'] for group in self.optimiser.param_groups):g}"
@@ -194,45 +113,76 @@ class Descent(ABC, Generic[Model]):
         """Model with the averaged parameters."""
         return cast(Model, self.average.module)
 
-    def run(self, session: Session) -> None:
-        """Take all steps, from the saved state if it belongs to this run, and save the state at each evaluation.
+    def run(
+        self,
+        owner: str,
+        *,
+        checkpoint: Path | None = None,
+        on_record: Callable[[Record], None] | None = None,
+        progress: bool = False,
+        **_: Any,
+    ) -> Model:
+        """Take all steps and return the model with averaged parameters, without gradients.
+
+        Args:
+            owner: Fingerprint of configuration and spectra.
+            checkpoint: File for the state at each evaluation. If it exists, the run continues from it.
+            on_record: Called at each evaluation; at first with the records of the checkpoint.
+            progress: Show a progress bar on a terminal.
 
         Raises:
+            InputError: The checkpoint is damaged or belongs to another fit.
             FitError: The mean loss before the last evaluation is a tenth above that before the first.
         """
-        if session.saved is not None and session.saved.header.get("run") == self.name:
-            with checkpoint.refusing(f"{session.path} is no state that a fit can continue from"):
-                self._restore(session.saved)
-        steps = self.schedule.steps
-        task = session.bar.add_task(self.name, total=steps, completed=self.step)
+        records: list[Record] = []
+        send = on_record or (lambda record: None)
+        if checkpoint is not None and checkpoint.exists():
+            tensors, header = files.read(checkpoint, KIND)[1:]
+            if header.get("fingerprint") != owner:
+                raise InputError(
+                    f"{checkpoint} is the state of another fit (other spectra or settings); remove it or give another path"
+                )
+            with files.refusing(f"{checkpoint} is no state that a fit can continue from"):
+                records = list(header["records"])
+                self._restore(tensors, header)
+            for record in records:
+                send(record)
         began = time.perf_counter() - self.seconds
         losses = []  # since the last evaluation; their mean depends less on the choice of spectra than one of them
-        while self.step < steps:
-            losses.append(self.advance())
-            session.bar.update(task, completed=self.step)
-            if self._evaluates_after(self.step):
+        with progress_bar(progress) as bar:
+            task = bar.add_task(self.name, total=self.steps, completed=self.step)
+            while self.step < self.steps:
+                losses.append(self.advance())
+                bar.update(task, completed=self.step)
+                if not self._evaluates_after(self.step):
+                    continue
                 loss = torch.stack(losses).mean()
                 losses.clear()
                 self.seconds, self.last_loss = time.perf_counter() - began, float(loss)
                 if math.isinf(self.first_loss):
                     self.first_loss = self.last_loss
-                session.evaluated(self.record(loss), *self._state())
-        session.bar.remove_task(task)
+                records.append(self.record(loss))
+                if checkpoint is not None:  # before it is sent, so that the history after an interruption has it once
+                    tensors, header = self._state()
+                    files.write(checkpoint, KIND, tensors, header | {"fingerprint": owner, "records": records})
+                send(records[-1])
         if self.last_loss > MAX_GROWTH * self.first_loss:  # also if the checkpoint is that of a completed run
             raise FitError(
                 f"the fit ended with a loss of {self.last_loss:.3g}, worse than the {self.first_loss:.3g} it began with; "
                 f"{self._advice()}"
             )
+        return self.result.eval().requires_grad_(False)
 
     def record(self, loss: Tensor) -> Record:
         """Return the record of an evaluation."""
         return {
             "stage": "final",
-            "steps": self.schedule.steps,
+            "steps": self.steps,
             "step": self.step,
             "loss": float(loss),
             "validation": None,
             "seconds": self.seconds,
+            "elapsed": self.seconds,
         }
 
     def _state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -240,15 +190,13 @@ class Descent(ABC, Generic[Model]):
         tensors |= {f"average.{name}": value for name, value in self.average.state_dict().items()}
         for number, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{number}.{name}": torch.as_tensor(value) for name, value in moments.items()}
-        header = {name: getattr(self, name) for name in SAVED_VALUES}
-        return tensors, header | {"run": self.name}
+        return tensors, {name: getattr(self, name) for name in SAVED_VALUES}
 
-    def _restore(self, saved: State) -> None:
-        header, tensors = saved.header, saved.tensors
+    def _restore(self, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
         for name, kind in SAVED_VALUES.items():
             setattr(self, name, kind(header[name]))
-        if not 0 <= self.step <= self.schedule.steps:
-            raise InputError(f"its step {self.step} is not one of {self.schedule.steps}")
+        if not 0 <= self.step <= self.steps:
+            raise InputError(f"its step {self.step} is not one of {self.steps}")
         for prefix, module in (("model.", self.model), ("average.", self.average)):
             module.load_state_dict({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
         state: dict[str, Any] = copy.deepcopy(self.optimiser.state_dict())
