@@ -16,17 +16,11 @@ from typing import Any, NamedTuple
 
 
 class Command(NamedTuple):
-    """A command of the console script.
+    """A command of the console script."""
 
-    Args:
-        summary: One line for the help.
-        options: Dataclass of the options, in `tasks.configs`.
-        module: Module with `run(config)`, or `run(config, resume)` if its runs can be resumed.
-    """
-
-    summary: str
-    options: str
-    module: str
+    summary: str  # one line for the help
+    options: str  # dataclass of the options, in `tasks.configs`
+    module: str  # module with `run(config)`, or `run(config, resume)` if its runs can be resumed
 
 
 COMMANDS = {

@@ -53,15 +53,12 @@ def _first_steps(experiment: Experiment, subset: MeasuredSubset) -> list[Step[Ex
 
 @dataclass(frozen=True)
 class CrossValidation(Step[Experiment]):
-    """Compare field models on held-out measured spectra, and determine whether turbo learning helps.
+    """Compare field models on held-out measured spectra, and determine whether turbo learning helps."""
 
-    Args:
-        subset: Measured spectra.
-        compared: Names of the field models. Empty for all that are fast and whose requirements the data meet.
-    """
-
-    subset: MeasuredSubset
-    compared: tuple[str, ...]
+    subset: MeasuredSubset  # measured spectra
+    compared: tuple[
+        str, ...
+    ]  # names of the field models. Empty for all that are fast and whose requirements the data meet
 
     title = "comparing field models"
 

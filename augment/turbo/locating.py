@@ -30,17 +30,11 @@ BATCH_SPECTRA = 256  # spectra located at a time: a posterior has a thousand can
 
 @dataclass(frozen=True)
 class Locating(Step[Experiment]):
-    """Locate the moving end from the test spectra by the room that was found.
+    """Locate the moving end from the test spectra by the room that was found."""
 
-    Args:
-        subset: Measured spectra.
-        room_file: File of the room in the run's directory.
-        room_seconds: Time of the search for the room [s], which counts as part of the training.
-    """
-
-    subset: MeasuredSubset
-    room_file: str
-    room_seconds: float = 0.0
+    subset: MeasuredSubset  # measured spectra
+    room_file: str  # file of the room in the run's directory
+    room_seconds: float = 0.0  # time of the search for the room [s], which counts as part of the training
 
     title = LOCATED
 

@@ -43,19 +43,12 @@ class Table:
 
 @dataclass(frozen=True)
 class Plot:
-    """A figure and what it shows.
+    """A figure and what it shows."""
 
-    Args:
-        name: Name of its files without suffix.
-        panels: Figures, which stand side by side where the page is wide enough, and below each other elsewhere.
-        caption: A sentence or two.
-        data: Numbers that it shows.
-    """
-
-    name: str
-    panels: Sequence[Figure]
-    caption: str
-    data: DataFrame
+    name: str  # name of its files without suffix
+    panels: Sequence[Figure]  # figures, side by side where the page is wide enough
+    caption: str  # A sentence or two
+    data: DataFrame  # numbers that it shows
 
     @property
     def widths(self) -> list[float]:

@@ -43,17 +43,11 @@ WINDOW = 30  # measurements of the running error
 
 @dataclass(eq=False)
 class Record:
-    """Measurements that a model learnt one after the other.
+    """Measurements that a model learnt one after the other."""
 
-    Args:
-        source: Where the measurements come from.
-        unit: Unit of the errors, in brackets.
-        rows: A row of `measurements.csv` for each measurement.
-    """
-
-    source: str
-    unit: str
-    rows: list[Row] = field(default_factory=list)
+    source: str  # where the measurements come from
+    unit: str  # unit of the errors, in brackets
+    rows: list[Row] = field(default_factory=list)  # A row of `measurements.csv` for each measurement
 
     @property
     def alarms(self) -> list[tuple[int, str]]:
