@@ -33,6 +33,8 @@ from tasks.records import CONFIG, rounded, write_table
 from tasks.source import located, reading
 from tasks.terminal import console, terminal
 
+WORLD_FILE = ".pgw"  # suffix beside a .png
+
 
 def run(config: ConvertConfig) -> None:
     """Read measurements or a model, and write a directory or a file.
@@ -131,9 +133,6 @@ def _write(data: Spectra | Snapshots | Rssi, options: ReadOptions, folder: Path)
         return f"{len(spectra)} rows of RSSI at {len(spectra.receiver_names)} receivers"
     write_spectra(spectra, folder)
     return f"{len(spectra)} spectra of {spectra.grid.shape[0]} x {spectra.grid.shape[1]} pixels"
-
-
-WORLD_FILE = ".pgw"  # suffix beside a .png
 
 
 def saved_model(source: Path) -> RssiModel | None:

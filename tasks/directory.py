@@ -34,6 +34,9 @@ NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # errors of file syst
 LOCK = "lock"
 
 
+MAX_LABEL = 60  # characters of the label in the name of a directory under runs/
+
+
 def model_file(folder: Path) -> Path | None:
     """Return the file of the RSSI model or of the locator that a run keeps, None if it keeps neither."""
     return next((file for name in (MODEL, LOCATOR) if isfile(file := folder / name)), None)
@@ -109,9 +112,6 @@ class Claim:
     def release(self) -> None:
         """Let other processes claim the directory."""
         self._lock.release()
-
-
-MAX_LABEL = 60  # characters of the label in the name of a directory under runs/
 
 
 def _versions(environment: Row) -> dict[str, str]:

@@ -39,6 +39,11 @@ from tasks.terminal import console, terminal
 MEDIANS = {"great_circle_deg": "degrees", "position_error_m": "m"}  # columns of errors and their units
 
 
+Columns = dict[str, Any]  # of tensors, and arrays of names
+MAX_STEP_S = 1000.0  # between rows of a walk
+MAX_TRACKED = 20_000_000  # candidate positions of a walk that are in memory together
+
+
 def run(config: PredictConfig) -> None:
     """Write one row for each measurement or position, with truth and error where they are known.
 
@@ -102,11 +107,6 @@ def saved_file(model: Path) -> Path:
         raise InputError(f"{model} is a run whose choice has no file; name one of its models, {model}/....safetensors")
     console.print(f"applied: {chosen}")
     return chosen
-
-
-Columns = dict[str, Any]  # of tensors, and arrays of names
-MAX_STEP_S = 1000.0  # between rows of a walk
-MAX_TRACKED = 20_000_000  # candidate positions of a walk that are in memory together
 
 
 def positions_of_rssi(locator: RssiLocator, config: PredictConfig) -> Columns:

@@ -41,6 +41,11 @@ TYPES = dict.fromkeys(COLUMNS, float) | {"index": int} | dict.fromkeys(WORDS, st
 WINDOW = 30  # measurements of the running error
 
 
+MAX_SURPRISING = 10
+N_NEIGHBOURS = 5  # measurements whose mean innovation a map shows at each position
+BLUE, RED = "#4477aa", "#ee6677"
+
+
 @dataclass(eq=False)
 class Record:
     """Measurements that a model learnt one after the other."""
@@ -156,11 +161,6 @@ def _rows(table: Path) -> list[Row]:
         return list(rows[list(COLUMNS)].fillna(dict.fromkeys(WORDS, "")).to_dict("records"))
     except (OSError, ValueError, KeyError, OverflowError) as error:
         raise InputError(f"{table} is not the table of an update ({error}); restore it") from None
-
-
-MAX_SURPRISING = 10
-N_NEIGHBOURS = 5  # measurements whose mean innovation a map shows at each position
-BLUE, RED = "#4477aa", "#ee6677"
 
 
 def page(record: Record, name: str, folder: Path) -> Page:
