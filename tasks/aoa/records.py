@@ -66,8 +66,7 @@ class FractionRecords:
 
     def arrays(self, kind: str) -> dict[str, NDArray[Any]]:
         """Return the arrays of one kind, e.g. `located`, that the run left; none if it left no such file."""
-        name = f"{kind}-mix{self.key}"
-        return self.run.arrays(name) if self.run.holds(name) else {}
+        return self.run.arrays(f"{kind}-mix{self.key}")
 
     def synthesizers(self, methods: Iterable[str]) -> list[str]:
         """Return the field models behind these methods, that of the first repeat where repeats chose differently."""

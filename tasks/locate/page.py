@@ -61,7 +61,7 @@ def page(runs: list[Records]) -> Page:
         sections_of("How sure is it?", runs, lambda run: Section("", plots=[_calibration(run), *_studies(run)])),
         limits(runs[0], *LIMITS),
     ]
-    if any(run.holds(SUGGESTED) for run in runs):
+    if any(run.arrays(SUGGESTED) for run in runs):
         sections.insert(3, sections_of("Where to measure next", runs, _suggestion))
     names = ", ".join(dict.fromkeys(run.place for run in runs))
     if len(runs) == 1:
@@ -98,11 +98,11 @@ def _errors(run: Records) -> Section:
 
 
 def _suggestion(run: Records) -> Section | None:
-    if not run.holds(SUGGESTED):
+    if not (arrays := run.arrays(SUGGESTED)):
         return None
     return suggestion_section(
         "",
-        run.arrays(SUGGESTED),
+        arrays,
         SUGGESTED,
         run.file_name,
         what="the variance of the radio maps",
