@@ -55,9 +55,10 @@ def _linear_algebra() -> ThreadpoolController:
 
 _torch_threads = _Shared(torch.get_num_threads, torch.set_num_threads)
 _one_blas_thread = _Shared(lambda: _linear_algebra().limit(limits=1), lambda limits: limits.restore_original_limits())
+_threads = torch.get_num_threads()
 # of `parallel_map`: all threads that torch has at the start, also where processes of a run share them, because an idle
 # process leaves its own to the others; 1 inside
-_workers: ContextVar[int] = ContextVar("workers", default=torch.get_num_threads())
+_workers: ContextVar[int] = ContextVar("workers", default=_threads)
 
 
 def to_device(device: torch.device | str) -> torch.device:
