@@ -67,17 +67,15 @@ class DeepMimo(Format[Spectra]):
         frequency, tracer = _params(path / "params.json")
         table, receiver, transmitter = _tables(path, pair)
         files = [path / f"{key}_{pair}.npz" for key in (*table, "rx_pos", "tx_pos")]
-        stride = options.every or 1
-        index = np.arange(0, len(receiver), stride)
-        table, receiver = {key: values[::stride] for key, values in table.items()}, receiver[::stride]
         known = np.isfinite(np.stack([table[key] for key in KEYS])).all(axis=0) & (table["power"] > -math.inf)
-        reached = known.any(axis=1)
+        index = np.arange(0, len(receiver), options.every or 1)
+        reached = known[index].any(axis=1)
         if not reached.any():
             raise InputError(f"{path} has no receiver with a path for pair {pair}")
         notes = [] if reached.all() else [f"receivers without a path are left out: {int((~reached).sum())}"]
-        index, receiver, known = index[reached], receiver[reached], known[reached]
-        table = {key: values[reached] for key, values in table.items()}
-        paths, found = _paths(path, table, known, receiver, transmitter, frequency, tracer)
+        index = index[reached]
+        table = {key: values[index] for key, values in table.items()}
+        paths, found = _paths(path, table, known[index], receiver[index], transmitter, frequency, tracer)
         return paths.spectra(
             path.resolve().name,
             options.array,
