@@ -145,14 +145,7 @@ class Kernels:
         self._function = cache(partial(_call, self._driver.cuModuleGetFunction, self._module))
 
     def launch(self, kernel: str, blocks: int, threads: int, *arguments: Tensor | int | np.ndarray | None) -> None:
-        """Queue a kernel on torch's current stream of the device, without waiting for it.
-
-        Args:
-            kernel: Name of the kernel.
-            blocks: Number of blocks.
-            threads: Number of threads of a block.
-            arguments: Arguments of the kernel; see `packed`.
-        """
+        """Queue a kernel on torch's current stream, in blocks of a number of threads, without waiting for it."""
         values = packed(*arguments)
         pointers = np.array([value.ctypes.data for value in values], np.uint64)
         with torch.cuda.device(self._device):

@@ -14,18 +14,11 @@ from small import PUBLISHED, PUBLISHED_RSSI
 from torch.nn import functional
 
 from swiftwrf import AngularGrid, FitError, InputError, Spectra, load, make_model, rssi_room, simulated_room
-from swiftwrf.comparison import (
-    DcganConfig,
-    NeRF2Config,
-    NeRF2Rssi,
-    VaeConfig,
-    WrfGsConfig,
-    wrfgs,
-)
+from swiftwrf.comparison import NeRF2Rssi, wrfgs
 from swiftwrf.comparison.base import Training, draw_parameters
-from swiftwrf.comparison.generative import double, halve, stages
-from swiftwrf.comparison.nerf2 import FIRST_PHASE, PATH_GAIN, Field, integrate, received
-from swiftwrf.comparison.wrfgs import on_sphere
+from swiftwrf.comparison.generative import DcganConfig, VaeConfig, double, halve, stages
+from swiftwrf.comparison.nerf2 import FIRST_PHASE, PATH_GAIN, Field, NeRF2Config, integrate, received
+from swiftwrf.comparison.wrfgs import WrfGsConfig, on_sphere
 from swiftwrf.data.store import Store
 from swiftwrf.metrics import psnr
 from swiftwrf.models import FIELD_MODELS

@@ -24,7 +24,8 @@ from test_rssi_model import path_loss_only
 
 from swiftwrf import InputError, fit_rssi, load, rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
-from swiftwrf.comparison import NeRF2Rssi, NeRF2RssiConfig
+from swiftwrf.comparison import NeRF2Rssi
+from swiftwrf.comparison.nerf2 import NeRF2RssiConfig
 from swiftwrf.data.splits import folds
 from swiftwrf.metrics import paired_difference
 from swiftwrf.rssi import RssiPredictor, compare
