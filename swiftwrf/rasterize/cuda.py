@@ -71,10 +71,7 @@ def architectures() -> list[int]:
 
 
 def target(capability: int) -> str:
-    """Return the compilation target for a GPU: machine code, or portable PTX if the GPU is newer than NVRTC.
-
-    Args:
-        capability: Ten times the compute capability of the GPU.
+    """Return the target for ten times a compute capability: machine code, or portable PTX if it is newer than NVRTC.
 
     Raises:
         CudaUnavailable: The GPU is too old.
@@ -89,12 +86,7 @@ def target(capability: int) -> str:
 
 
 def compile_source(source: str, target: str, *options: str) -> tuple[bytes, str]:
-    """Compile CUDA C++. Needs neither a GPU nor a driver.
-
-    Args:
-        source: CUDA C++ source.
-        target: Architecture such as "sm_90" for a CUBIN or "compute_90" for PTX.
-        options: Further options of NVRTC.
+    """Compile CUDA C++ for a target such as "sm_90" or "compute_90". Needs neither a GPU nor a driver.
 
     Returns:
         The CUBIN or PTX, and the compiler's log.
@@ -122,9 +114,6 @@ def compile_source(source: str, target: str, *options: str) -> tuple[bytes, str]
 
 class Kernels:
     """The compiled kernels of `rasterize.cu`, loaded on one GPU.
-
-    Args:
-        device: GPU to load the kernels on.
 
     Raises:
         CudaUnavailable: `cuda.bindings`, NVRTC or the driver is missing, or the GPU is too old.
