@@ -16,6 +16,7 @@ from swiftwrf.data.splits import folds
 from swiftwrf.gp import choose_kernel, most_informative
 from swiftwrf.metrics import psnr
 from tasks.aoa.experiment import _write_files
+from tasks.records import read_table
 
 
 def test_suggestions_lie_in_the_region_and_lower_the_variance(room):
@@ -30,18 +31,15 @@ def test_suggestions_lie_in_the_region_and_lower_the_variance(room):
     )  # not where it is known
 
 
-def test_suggested_positions_keep_the_digits_of_maps(room):
+def test_suggested_positions_keep_the_digits_of_maps(room, tmp_path):
     """Coordinates on a map have more digits than single precision."""
     measured = replace(room, position=room.position.double() + torch.tensor([712345.678, 5412345.678, 0]).double())
-    found, kept = suggest(measured, 3), {}
-    directory = SimpleNamespace(
-        write_csv=lambda name, rows: kept.update({name: rows}), write_npz=lambda name, arrays: None
-    )
+    found, directory = suggest(measured, 3), SimpleNamespace(path=tmp_path.joinpath)
     positions = {"measured": measured.position.tolist(), "position": found.position.tolist()}
     value = positions | {"variance": found.variance.tolist()}
     _write_files(Suggestion(MeasuredSubset(0.5)), value, measured, directory)
-    rows = kept["suggested-mix0.5.csv"]
-    assert [[row["x_m"], row["y_m"], row["z_m"]] for row in rows] == found.position.tolist()
+    table = read_table(tmp_path / "suggested-mix0.5.csv")
+    assert table[["x_m", "y_m", "z_m"]].to_numpy() == pytest.approx(found.position.numpy(), rel=1e-12)
 
 
 def test_measuring_at_suggested_positions_beats_random_ones():
