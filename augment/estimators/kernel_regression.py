@@ -38,8 +38,6 @@ PENALTY_CANDIDATES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 MAX_CHOICE_ROWS = 600  # rows of the cross-validation; with fewer rows it chooses too large a penalty
 MAX_ROWS = 4000  # training rows; the time of a fit grows with their cube
 MAX_AZIMUTHS = 60  # columns of coarse spectra; the beams of an array are wider than one of them
-
-
 BATCH_SPECTRA = 512  # spectra that are loaded at a time
 
 

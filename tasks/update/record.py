@@ -40,8 +40,6 @@ WORDS = ("alarm", "notice")  # columns of text
 TYPES = dict.fromkeys(COLUMNS, float) | {"index": int} | dict.fromkeys(WORDS, str)
 MEANS = ("error", "covered")  # columns whose means are kept
 WINDOW = 30  # measurements of the running error
-
-
 MAX_SURPRISING = 10
 N_NEIGHBOURS = 5  # measurements whose mean innovation a map shows at each position
 BLUE, RED = "#4477aa", "#ee6677"
@@ -53,7 +51,7 @@ class Record:
 
     source: str  # where the measurements come from
     unit: str  # unit of the errors, in brackets
-    rows: list[Row] = field(default_factory=list)  # A row of `measurements.csv` for each measurement
+    rows: list[Row] = field(default_factory=list)  # a row of `measurements.csv` for each measurement
 
     alarms: list[tuple[int, str]] = field(default_factory=list, init=False)
     """number of the measurement that raised each alarm, and the change in words"""
