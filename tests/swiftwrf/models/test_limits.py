@@ -50,10 +50,9 @@ def test_predictors_do_not_depend_on_the_origin(small_published, name):
 
 def test_grids_arrays_and_kernels_refuse_what_they_cannot_be():
     nan = float("nan")
-    with pytest.raises(InputError, match="ascend"):
-        AngularGrid.degrees([nan, nan], range(360))
-    with pytest.raises(InputError, match="ascend"):
-        AngularGrid.degrees(range(90), [nan, nan])
+    for start, step in ((nan, 0.1), (0.0, nan), (0.0, -0.1)):
+        with pytest.raises(InputError, match=r"elevation_st|step above 0"):
+            AngularGrid(start, step, 90, 0.0, 360)
     for frequency, spacing in ((nan, 0.1), (1e9, nan), (float("inf"), 0.1)):
         with pytest.raises(InputError):
             PlanarArray.square(4, frequency, spacing)
