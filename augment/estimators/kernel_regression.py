@@ -55,20 +55,15 @@ def coarse_pixels(spectrum: Tensor) -> Tensor:
 class NadarayaWatson:
     """A fitted regression: the prediction is the mean of dual coefficients, weighted by the normalised kernel.
 
-    Args:
-        known: Features of the training rows, (n, p).
-        dual: Dual coefficients of the training rows, (n, k).
-        gamma: Inverse squared width of the kernel exp(-gamma |a - b|^2).
-
     Example:
         >>> x = np.linspace(0, 1, 20)[:, None]
         >>> bool(np.abs(NadarayaWatson.fit(x, x, seed=0)(x) - x).max() < 0.05)
         True
     """
 
-    known: NDArray[Any]
-    dual: NDArray[Any]
-    gamma: float
+    known: NDArray[Any]  # features of the training rows, (n, p)
+    dual: NDArray[Any]  # dual coefficients of the training rows, (n, k)
+    gamma: float  # inverse squared width of the kernel exp(-gamma |a - b|^2)
 
     @classmethod
     def fit(cls, feature: NDArray[Any], target: NDArray[Any], seed: int) -> NadarayaWatson:

@@ -121,13 +121,9 @@ def spectra(
 ) -> Figure:
     """Return a panel with one hemisphere for each image, two in a row.
 
-    Azimuth runs counter-clockwise from the right. Magnitudes have the scale of `SCALES`.
-
-    Args:
-        images: Values (n_elevation, n_azimuth) of a hemisphere whose last row is the zenith, by kind: keys of `SCALES`.
-        title: Title of the panel.
-        truth: True direction, a cross. The ring is the peak of each magnitude.
-        most: End of the scale of differences and standard deviations.
+    Azimuth runs counter-clockwise from the right. Images (n_elevation, n_azimuth), whose last row is the zenith, are by
+    kind, with the scale of `SCALES`. `most` ends that of differences and standard deviations. A cross marks the true
+    direction, a ring the peak.
     """
     n_rows = -(-len(images) // 2)
     with matplotlib.style.context(STYLE):

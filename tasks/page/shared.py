@@ -203,17 +203,10 @@ def suggestion_section(
     how: str,
     label: str,
 ) -> Section:
-    """Return a plan of the suggested positions, and the expected variance after measuring there.
+    """Return a plan of suggested positions, from arrays of `write_suggestion`, and the variance after measuring there.
 
-    Args:
-        title: Title of the section.
-        arrays: Arrays of `write_suggestion`.
-        table: Name of the files with the positions.
-        name: End of the name of the figure.
-        what: The variance that falls.
-        whole: What it is a fraction of.
-        how: How it is estimated.
-        label: Label of the variance in percent.
+    The text names the table, what falls, the whole that it is a fraction of, and how it is estimated. The axis of the
+    variance [%] has the label.
     """
     measured, suggested, left = (arrays[key] for key in ("measured", "suggested", "left"))
     first, plan = figures.panel(5, 4.2)
