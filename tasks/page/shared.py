@@ -168,14 +168,15 @@ def interval(error: ErrorSummary) -> tuple[float, float, float]:
     return error["median"], error["low"], error["high"]
 
 
-def with_interval(error: ErrorSummary) -> str:
+def with_interval(error: Mapping[str, Any], digits: int = 2) -> str:
     """Return the median and its interval as text.
 
     Example:
         >>> with_interval({"median": 1.0, "low": 0.5, "high": 2.0})
         '1.00 [0.50, 2.00]'
     """
-    return f"{number(error['median'])} [{number(error['low'])}, {number(error['high'])}]"
+    median, low, high = (number(error[name], digits) for name in ("median", "low", "high"))
+    return f"{median} [{low}, {high}]"
 
 
 def write_suggestion(
