@@ -20,7 +20,7 @@ from sklearn.model_selection import KFold
 from small import FIT, with_defaults
 
 from augment import Mixed, choose, cross_validation, sample_positions
-from augment.estimators import ESTIMATORS, make_estimator, nadaraya_watson
+from augment.estimators import ESTIMATORS, kernel_regression, make_estimator
 from augment.estimators.aann import AANN, AANNConfig
 from augment.estimators.aann_kernel import AANNKernel, AANNKernelConfig
 from augment.estimators.baselines import Constant, NearestSpectrum, Peak
@@ -107,7 +107,7 @@ def test_nearest_spectrum_distinguishes_spectra_that_differ_in_their_last_digits
 
 
 def test_kernel_regression_reads_only_the_spectra_that_it_keeps(room, monkeypatch):
-    monkeypatch.setattr(nadaraya_watson, "MAX_ROWS", 12)
+    monkeypatch.setattr(kernel_regression, "MAX_ROWS", 12)
     train, read = Mixed.measured(room), []
     select = Mixed.select
     monkeypatch.setattr(Mixed, "batches", lambda self: pytest.fail("all spectra were read"))
@@ -192,7 +192,7 @@ def test_keys_of_fractions_are_exact():
     assert keys[:3] == ["0.3", "1", "0.1"]
 
 
-def test_kernel_regression_regression_is_what_its_definition_says():
+def test_kernel_regression_is_what_its_definition_says():
     """The chosen width and penalty have the least error on held-out rows, each row's value found by plain inversion."""
     generator = np.random.default_rng(0)
     feature, target = generator.normal(size=(60, 2)), generator.normal(size=(60, 3))
@@ -213,14 +213,14 @@ def test_kernel_regression_regression_is_what_its_definition_says():
         (width / median, alpha): sum(
             np.abs(told(*fold, width / median, alpha) - target[fold[1]]).mean() for fold in folds
         )
-        for width in nadaraya_watson.WIDTH_CANDIDATES
-        for alpha in nadaraya_watson.PENALTY_CANDIDATES
+        for width in kernel_regression.WIDTH_CANDIDATES
+        for alpha in kernel_regression.PENALTY_CANDIDATES
     }
     best = min(errors, key=errors.get)
-    assert nadaraya_watson.choose(apart, target, seed=3) == pytest.approx(best)
+    assert kernel_regression.choose(apart, target, seed=3) == pytest.approx(best)
     rows, new = np.arange(50), np.arange(50, 60)
-    gamma, alpha = nadaraya_watson.choose(apart[:50, :50], target[:50], seed=3)
-    found = nadaraya_watson.NadarayaWatson.fit(feature[:50], target[:50], seed=3)(feature[50:])
+    gamma, alpha = kernel_regression.choose(apart[:50, :50], target[:50], seed=3)
+    found = kernel_regression.NadarayaWatson.fit(feature[:50], target[:50], seed=3)(feature[50:])
     np.testing.assert_allclose(found, told(rows, new, gamma, alpha), rtol=1e-8)
 
 
@@ -228,7 +228,7 @@ def test_what_all_distances_have_in_common_does_not_move_an_estimate():
     """Noise adds a constant to all distances of a measured spectrum; synthetic ones have none."""
     generator = np.random.default_rng(0)
     feature, new = generator.normal(size=(40, 3)), generator.normal(size=(5, 3))
-    regression = nadaraya_watson.NadarayaWatson.fit(np.c_[feature, np.zeros(40)], feature, seed=0)
+    regression = kernel_regression.NadarayaWatson.fit(np.c_[feature, np.zeros(40)], feature, seed=0)
     clean, noisy = (regression(np.c_[new, np.full(5, beside)]) for beside in (0, 100))
     np.testing.assert_allclose(noisy, clean, rtol=1e-8)
     assert np.abs(clean - new).mean() < 0.5 * np.abs(new).mean()
