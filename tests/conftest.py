@@ -1,13 +1,10 @@
 """Fixtures of several tests: toy scenes, and the measured data if available."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from unittest import mock
 
-import jaxtyping
 import pytest
 import small
 import torch
@@ -32,14 +29,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.skip(reason="needs an NVIDIA GPU"))
         if item.get_closest_marker("data") and not os.environ.get("SWIFTWRF_DATA"):
             item.add_marker(pytest.mark.skip(reason="needs the measured data: set SWIFTWRF_DATA to their folder"))
-
-
-@pytest.fixture
-def without_annotation_checks() -> Iterator[None]:
-    """Leaves wrong arguments to the checks of the product, which users meet."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

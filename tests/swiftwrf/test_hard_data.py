@@ -1,7 +1,5 @@
 """Constant, empty, collinear and badly scaled data: finite predictions with a standard deviation, or one sentence."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """The console script: its sub-commands, its speed, and where it may be started."""
 
-from __future__ import annotations
-
 import os
 import re
 import resource

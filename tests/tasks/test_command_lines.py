@@ -1,7 +1,5 @@
 """Command lines that cannot be: each ends in one sentence and exit code 2, and leaves nothing."""
 
-from __future__ import annotations
-
 import os
 
 import pytest

@@ -1,7 +1,5 @@
 """tasks.inspect on valid measurements: findings and page. Wrong ones are in test_wrong_conventions.py."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """Reports in a real browser: widths from a phone to a desktop, light and dark."""
 
-from __future__ import annotations
-
 import shutil
 from importlib.util import find_spec
 

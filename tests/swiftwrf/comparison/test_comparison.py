@@ -1,7 +1,5 @@
 """The methods of comparison: what is published of them, the physics that they draw, and that they fit as SwiftWRF does."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache
@@ -14,14 +12,7 @@ from small import PUBLISHED, PUBLISHED_RSSI
 from torch.nn import functional
 
 from swiftwrf import AngularGrid, FitError, InputError, Spectra, load, make_model, rssi_room, simulated_room
-from swiftwrf.comparison import (
-    DcganConfig,
-    NeRF2Config,
-    NeRF2Rssi,
-    VaeConfig,
-    WrfGsConfig,
-    wrfgs,
-)
+from swiftwrf.comparison import DcganConfig, NeRF2Config, NeRF2Rssi, VaeConfig, WrfGsConfig, wrfgs
 from swiftwrf.comparison.base import Training, draw_parameters
 from swiftwrf.comparison.convolution import double, halve, stages
 from swiftwrf.comparison.nerf2 import FIRST_PHASE, PATH_GAIN, Field, integrate, received
@@ -370,12 +361,6 @@ def test_any_resolution(room, name):
     torch.testing.assert_close(fine[:, 1::2, ::2], coarse, atol=1e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize("name", ["nerf2", "wrfgs"])
-def test_rays_need_to_know_where_they_start(room, name):
-    with pytest.raises(InputError, match="needs the fixed end"):
-        fit(replace(room, fixed_position=None), name)
-
-
 def test_the_compiled_field_is_the_field(room, monkeypatch):
     honest = torch.nn.Module.compile
     monkeypatch.setattr(torch.nn.Module, "compile", lambda self: honest(self, backend="eager"))  # no minute of C++
@@ -391,8 +376,7 @@ def fitted(room):
 
 @every
 @pytest.mark.parametrize(
-    "change",
-    [{"options": {"width": 10**9}}, {"options": {"bands": 10**6}}, {"grid": None}, {"moving": "both"}],
+    "change", [{"options": {"width": 10**9}}, {"options": {"bands": 10**6}}, {"grid": None}, {"moving": "both"}]
 )
 def test_damaged_models_are_refused(fitted, tmp_path, name, change):
     fitted(name).save(tmp_path / "model")

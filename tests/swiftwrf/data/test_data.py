@@ -1,14 +1,12 @@
 """Readers of spectra: what they read, and everything they refuse."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
-from samples import write_nerf2
+from samples import write_nerf2, write_paths
 
 from swiftwrf import InputError, load_spectra, simulated_room
 from swiftwrf.data.spectra import coarsening
@@ -120,25 +118,8 @@ def test_refuses_what_is_no_folder(tmp_path):
         load_spectra(tmp_path / "nothing")
 
 
-def paths_file(folder, **changes):
-    """Paths of five receivers, one of them with two paths, with some arrays replaced or (None) left out."""
-    arrays = {
-        "transmitter_position": np.tile([0.0, 0.0, 2.0], (5, 1)),
-        "receiver_position": np.stack([np.arange(1.0, 6.0), np.zeros(5), np.ones(5)], axis=1),
-        "path_count": np.array([1, 1, 2, 1, 1], dtype=np.int32),
-        "last_point": np.tile([0.0, 0.0, 2.0], (6, 1)),
-        "gain": np.ones(6, dtype=np.complex64),
-        "line_of_sight": np.ones(5, dtype=bool),
-        "frequency_hz": np.float64(2.4e9),
-    }
-    arrays = {name: value for name, value in {**arrays, **changes}.items() if value is not None}
-    folder.mkdir(exist_ok=True)
-    np.savez(folder / "paths.npz", **arrays)
-    return folder
-
-
 def test_spectrum_of_one_path_peaks_where_it_comes_from(tmp_path):
-    data = load_spectra(paths_file(tmp_path / "paths"))
+    data = load_spectra(write_paths(tmp_path / "paths"))
     assert data.moving == "receiver"
     row, column = divmod(int(data.spectrum[0].argmax()), 360)
     assert (column, row + 1) == (180, 45)  # from -x, as far up as away
@@ -147,30 +128,14 @@ def test_spectrum_of_one_path_peaks_where_it_comes_from(tmp_path):
 
 
 def test_the_end_with_more_positions_moves(tmp_path):
-    still = np.tile([3.0, 0.0, 1.0], (5, 1))
-    moves = np.stack([np.arange(5.0), np.ones(5), np.ones(5)], axis=1)
-    data = load_spectra(paths_file(tmp_path / "p", receiver_position=still, transmitter_position=moves))
+    still = np.tile([3.0, 0.0, 1.0], (N, 1))
+    moves = np.stack([np.arange(1.0 * N), np.ones(N), np.ones(N)], axis=1)
+    data = load_spectra(write_paths(tmp_path / "p", receiver_position=still, transmitter_position=moves))
     assert data.moving == "transmitter"
 
 
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
-        ({"gain": None}, "lacks gain"),
-        ({"gain": np.ones(5, np.complex64)}, "gain must have shape"),
-        ({"gain": np.full(6, np.nan, np.complex64)}, "gain must be finite"),
-        ({"path_count": np.array([0, 2, 2, 1, 1], np.int32)}, "at least one path"),
-        ({"frequency_hz": np.float64(-1)}, "frequency_hz"),
-        ({"last_point": np.array([object()] * 6)}, "plain numbers"),
-    ],
-)
-def test_refuses_paths(tmp_path, changes, says):
-    with pytest.raises(InputError, match=says):
-        load_spectra(paths_file(tmp_path / "paths", **changes))
-
-
 def test_refuses_a_broken_archive(tmp_path):
-    paths_file(tmp_path / "paths")
+    write_paths(tmp_path / "paths")
     file = tmp_path / "paths" / "paths.npz"
     file.write_bytes(file.read_bytes()[:100])
     with pytest.raises(InputError, match="not an npz archive"):

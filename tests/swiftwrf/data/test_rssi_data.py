@@ -1,7 +1,5 @@
 """The reader of RSSI, and the built-in floor."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from samples import write_nerf2_rssi

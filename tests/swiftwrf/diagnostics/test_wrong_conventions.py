@@ -1,7 +1,5 @@
 """Wrong frames, units and conventions: each is refused by the reader or named by the inspection."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Locating: posteriors with known answers, rooms in closed form, invariances, and what is refused."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,18 +1,14 @@
 """Posteriors smoothed along a walk."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest
 import torch
+from quick import command
 
 from swiftwrf import InputError, Rssi, rssi_room
 from swiftwrf.locate import Posterior, RssiLocator, smoothed, track
 from swiftwrf.locate.posterior import normalised
-from tasks.command_line import command_line
-from tasks.predict.options import PredictConfig
-from tasks.predict.run import run as predict
 
 STEP_M, NOISE_M = 0.4, 1.5
 
@@ -132,10 +128,6 @@ def test_other_speeds_and_times_are_refused(time, speed, message):
         smoothed(posterior, None if time is None else torch.tensor(time), speed)
 
 
-def locate(*arguments):
-    return command_line("tasks.predict", PredictConfig, predict, [str(a) for a in arguments])
-
-
 def times(table, **options):
     time = Rssi.from_frame(table, **options).time
     return None if time is None else time.tolist()
@@ -166,7 +158,10 @@ def test_walks_without_a_time_are_refused(cell, tmp_path, capsys):
     RssiLocator(n_cells=300).fit(data).save(tmp_path / "locator")
     table = pd.DataFrame(data.rssi_dbm[:3].numpy(), columns=list(data.receiver_names)).assign(time=["2", cell, "7"])
     table.to_csv(tmp_path / "walk.csv", index=False)
-    assert locate(tmp_path / "locator", tmp_path / "walk.csv", "--track", 1, "--out", tmp_path / "out.csv") == 2
+    assert (
+        command("predict", tmp_path / "locator", tmp_path / "walk.csv", "--track", 1, "--out", tmp_path / "out.csv")
+        == 2
+    )
     assert "row 1 (counted from 0) has no time" in capsys.readouterr().err
 
 
@@ -179,12 +174,12 @@ def test_positions_of_a_walk(tmp_path, capsys):
     row = data.rssi_dbm[7] + 6 * torch.randn(10, 12, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     table = pd.DataFrame(row.clamp(-149, 0).numpy(), columns=list(data.receiver_names)).assign(time=np.arange(10) / 10)
     table.to_csv(tmp_path / "walk.csv", index=False)
-    assert locate(file, tmp_path / "walk.csv", "--out", tmp_path / "alone.csv") == 0
-    assert locate(file, tmp_path / "walk.csv", "--track", 0.1, "--out", tmp_path / "tracked.csv") == 0
+    assert command("predict", file, tmp_path / "walk.csv", "--out", tmp_path / "alone.csv") == 0
+    assert command("predict", file, tmp_path / "walk.csv", "--track", 0.1, "--out", tmp_path / "tracked.csv") == 0
     alone, tracked = (pd.read_csv(tmp_path / name) for name in ("alone.csv", "tracked.csv"))
     assert list(tracked.columns) == list(alone.columns)
     assert tracked[["x_m", "y_m"]].std().sum() < 0.5 * alone[["x_m", "y_m"]].std().sum()
     assert (tracked.credible_radius_80_m <= alone.credible_radius_80_m + 0.5).all()
     capsys.readouterr()
-    assert locate(file, tmp_path / "walk.csv", "--track", 0, "--out", tmp_path / "out.csv") == 2
+    assert command("predict", file, tmp_path / "walk.csv", "--track", 0, "--out", tmp_path / "out.csv") == 2
     assert "speed is a number above 0" in capsys.readouterr().err

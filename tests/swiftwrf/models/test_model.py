@@ -1,7 +1,5 @@
 """SwiftWRF after its fit: predictions, gradients, cache, files, options."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The CUDA backend: compiled by NVRTC, run on the CPU through a shim and, on a machine with a GPU, on it."""
 
-from __future__ import annotations
-
 import ctypes
 import math
 import os
@@ -15,9 +13,16 @@ from unittest import mock
 
 import pytest
 import torch
-from hard_cases import HARD_CASES, Case, degrees, field_errors, magnitude_errors
-from scenes import random_scene
-from tolerances import GRADIENT_TOLERANCE, VALUE_TOLERANCE
+from hard_cases import (
+    GRADIENT_TOLERANCE,
+    HARD_CASES,
+    VALUE_TOLERANCE,
+    Case,
+    degrees,
+    field_errors,
+    magnitude_errors,
+    random_scene,
+)
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from swiftwrf import AngularGrid, InputError, rasterize

@@ -1,7 +1,5 @@
 """The CPU backend against the reference, in value and gradient; refused arguments; behaviour without numba."""
 
-from __future__ import annotations
-
 import math
 import os
 import subprocess
@@ -10,11 +8,9 @@ import sys
 import numba
 import pytest
 import torch
-from hard_cases import Case, field_errors
+from hard_cases import GRADIENT_TOLERANCE, GRID, VALUE_TOLERANCE, Case, field_errors, random_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import GRID, random_scene
-from tolerances import GRADIENT_TOLERANCE, VALUE_TOLERANCE
 
 from swiftwrf import AngularGrid, InputError, rasterize
 from swiftwrf.rasterize import operators
@@ -115,14 +111,14 @@ def test_torch_compile_traces_the_whole_function():
     assert torch.equal(compiled(*inputs), rasterize(*inputs, GRID))
 
 
-def test_without_numba_the_reference_renders():
+def test_without_numba_the_reference_renders_and_default_fits_need_none():
     code = """
 import sys
 sys.modules["numba"] = None
 import warnings, torch, swiftwrf
 from swiftwrf.models.swiftwrf_paper import SwiftWRFPaper
 from swiftwrf.runtime.threads import set_threads
-from scenes import GRID, random_scene
+from hard_cases import GRID, random_scene
 
 set_threads(1)
 inputs = [x.detach() for x in random_scene()]
@@ -130,9 +126,11 @@ with warnings.catch_warnings(record=True) as caught:
     rendered = swiftwrf.rasterize(*inputs, GRID)
 print(caught[0].message)
 assert torch.equal(rendered, swiftwrf.rasterize(*inputs, GRID, "reference"))
+room = swiftwrf.simulated_room(n=20, grid=swiftwrf.AngularGrid.hemisphere(8, 32))
+swiftwrf.SwiftWRF(n_primitives=8).fit(room).predict(room.position)
 for use in (
     lambda: swiftwrf.rasterize(*inputs, GRID, "cpu"),
-    lambda: SwiftWRFPaper(steps=1).fit(swiftwrf.simulated_room(n=20)),
+    lambda: SwiftWRFPaper(steps=1).fit(room),
 ):
     try:
         use()
@@ -187,7 +185,7 @@ def test_preparing_compiles_once_and_leaves_threads_and_torchs_compiler_alone():
     code = """
 import sys, torch
 from swiftwrf.rasterize import cpu, prepare, rasterize
-from scenes import GRID, random_scene
+from hard_cases import GRID, random_scene
 
 prepare("cpu")
 print(torch.get_num_threads(), "torch._dynamo" in sys.modules, len(cpu.render.signatures))
@@ -200,16 +198,3 @@ print(len(cpu.render.signatures))
     environment = WITH_TESTS | {"OMP_NUM_THREADS": "1"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True, check=True)
     assert done.stdout.split() == ["1", "False", "1", "1"]
-
-
-def test_default_fits_and_predictions_of_spectra_need_no_numba():
-    code = """
-import sys
-from swiftwrf import AngularGrid, SwiftWRF, simulated_room
-
-room = simulated_room(n=20, grid=AngularGrid.hemisphere(8, 32))
-SwiftWRF(n_primitives=8).fit(room).predict(room.position)
-print("numba" in sys.modules)
-"""
-    done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True)
-    assert done.stdout.split() == ["False"]

@@ -1,14 +1,11 @@
 """Hard cases: every backend within its tolerance, every fit good or refused in a sentence, never not-a-number."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
 import stability
 import torch
-from hard_cases import HARD_CASES
-from scenes import random_scene
+from hard_cases import HARD_CASES, random_scene
 
 from swiftwrf import AngularGrid, InputError, rasterize
 from swiftwrf.metrics import ssim

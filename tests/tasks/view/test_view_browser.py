@@ -4,8 +4,6 @@ Ten seconds a server: it starts as a program, as it does for a visitor. The brow
 system (Debian: chromium, chromium-driver).
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal
