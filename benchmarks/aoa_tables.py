@@ -10,7 +10,6 @@ from augment.turbo.condition import FULL_NETWORK, LOCATED, MEASURED_NETWORK, Con
 from augment.turbo.condition import headline as chosen
 from augment.turbo.results import MixMetrics
 from swiftwrf.metrics import ChangeMetrics
-from tasks.metrics import AoaMetrics
 
 
 def aoa_shares() -> list[tuple[str, MixMetrics, dict[str, Any]]]:
@@ -21,7 +20,7 @@ def aoa_shares() -> list[tuple[str, MixMetrics, dict[str, Any]]]:
     scenes: dict[tuple[str, str, str], dict[str, dict[str, Any]]] = {}
     for file in sorted(RESULTS.glob("aoa_*.json")):
         result = load(file.stem)
-        metrics: AoaMetrics = result["metrics"]
+        metrics = result["metrics"]
         shares = scenes.setdefault((metrics["data"], metrics["split"], metrics["moving"]), {})
         for share in metrics["mixes"]:
             shares[share] = max(shares.get(share, result), result, key=lambda run: str(run["environment"]["end"]))

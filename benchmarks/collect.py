@@ -10,13 +10,12 @@ from typing import Any
 
 from record import without_folders
 
-from tasks.metrics import RunMetrics
 from tasks.page.records import Records
 
 
 def collect(folder: Path, name: str) -> None:
     """Write command, environment, metrics and rooms of the run to `results/NAME.json`."""
-    run: Records[RunMetrics] = Records(folder)
+    run = Records(folder)
     command = without_folders(shlex.split(run.config["command"]))
     content: dict[str, Any] = {"command": command, "environment": run.environment, "metrics": run.metrics}
     rooms = {

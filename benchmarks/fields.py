@@ -45,10 +45,9 @@ from swiftwrf.runtime.threads import set_threads
 from swiftwrf.runtime.validation import Preset
 from tasks import labels
 from tasks.aoa.experiment import run as run_aoa
-from tasks.aoa.options import AoaConfig
+from tasks.configs import AoaConfig, ScenesConfig
 from tasks.page import figures
-from tasks.scenes.options import ScenesConfig
-from tasks.scenes.run import run as trace
+from tasks.scenes import run as trace
 from tasks.workers import connected
 
 Study = Literal["coverage", "raytracing", "comparison", "paper_scale"]
@@ -442,19 +441,20 @@ def angles(work: Path) -> Row:
 
 def draw(rows: Sequence[Row]) -> None:
     """Draw SSIM against the number of training spectra."""
-    palette = figures.Palette.of(labels.FIELD_MODELS)
+    colours = labels.colours(labels.FIELD_MODELS)
     curves: dict[str, dict[int, float]] = {}
     for row in rows:
         if (row["scene"], row["split"]) == MEASURED[0]:
             curves.setdefault(row["method"], {})[row["n_train"]] = row["ssim"]["median"]
-    panel, (ax,) = figures.new_figure(1, 1, 6, 3.4)
+    panel, ax = figures.panel(6, 3.4)
     for name, curve in curves.items():
-        ax.plot(*zip(*sorted(curve.items()), strict=True), "o-", markersize=3, label=name, color=palette.colour(name))
+        colour = labels.colour(colours, name)
+        ax.plot(*zip(*sorted(curve.items()), strict=True), "o-", markersize=3, label=name, color=colour)
     numbers = sorted({n for curve in curves.values() for n in curve})
     ax.set(xscale="log", xlabel="training spectra", ylabel="median SSIM")
     ax.set_xticks(numbers, [str(n) for n in numbers])
     ax.minorticks_off()
-    figures.legend_below(panel, ax)
+    figures.legend_below(ax)
     (ROOT / "docs" / "figures" / "comparison_counts.svg").write_text(figures.as_svg(panel))
 
 

@@ -20,8 +20,10 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import matplotlib.style
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 from record import ROOT, kept, options, write_result
 
 from augment import Mixed
@@ -89,7 +91,9 @@ def slopes(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
 
 def draw(rows: list[dict[str, Any]]) -> None:
     """Draw seconds and peak memory of the stages against the number of spectra."""
-    panels, (time_axis, memory_axis) = figures.new_figure(1, 2, 9, 3.4)
+    with matplotlib.style.context(figures.STYLE):
+        panels = Figure(figsize=(9, 3.4), layout="constrained")
+        time_axis, memory_axis = panels.subplots(1, 2)
     sizes = [row["n"] for row in rows]
     for number, stage in enumerate(STAGES):
         found = [row["stages"][stage] for row in rows]
@@ -105,7 +109,7 @@ def draw(rows: list[dict[str, Any]]) -> None:
     for axis, label in ((time_axis, "seconds of a processor"), (memory_axis, "peak resident memory [GiB]")):
         axis.set(xscale="log", xlabel="spectra of 90 x 360 pixels", ylabel=label)
     time_axis.set(yscale="log")
-    figures.legend_below(panels, time_axis)
+    figures.legend_below(time_axis)
     (ROOT / "docs" / "figures" / "scaling.svg").write_text(figures.as_svg(panels))
 
 

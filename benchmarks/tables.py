@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import statistics
 import warnings
-from importlib import import_module
 from typing import Any
 
 import aoa_tables
@@ -19,7 +18,7 @@ from augment.turbo.condition import LOCATED, MEASURED_NETWORK
 from swiftwrf.choices import ROOMS
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.datasets import catalogue
-from tasks import labels
+from tasks import configs, labels
 from tasks.command import COMMANDS
 from tasks.options import OffsetSource, SpectraSource
 
@@ -141,7 +140,7 @@ def commands() -> str:
     reading = {*_options(SpectraSource), *_options(OffsetSource)}
     found: dict[tuple[str, str], list[str]] = {}
     for command, (_, config, *_) in COMMANDS.items():
-        for name, meaning in _options(getattr(import_module(f"tasks.{command}.options"), config)).items():
+        for name, meaning in _options(getattr(configs, config)).items():
             if name not in reading:
                 found.setdefault((name, meaning), []).append(f"`{command}`")
     rows = [[f"`{name}`", ", ".join(names), meaning] for (name, meaning), names in sorted(found.items())]

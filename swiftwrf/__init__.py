@@ -21,21 +21,35 @@ if TYPE_CHECKING:
     from swiftwrf import locate as locate
     from swiftwrf import metrics as metrics
     from swiftwrf import rssi as rssi
-    from swiftwrf.array.angles import AngularGrid, ArrayPose
-    from swiftwrf.data import Rssi, Snapshots, Spectra, load_rssi, load_snapshots, load_spectra
-    from swiftwrf.data.simulated import rssi_room, simulated_room
-    from swiftwrf.diagnostics.calibration import calibrate
-    from swiftwrf.diagnostics.inspection import inspect
-    from swiftwrf.errors import FitError, InputError
-    from swiftwrf.locate import MatchedField, RssiLocator
-    from swiftwrf.models.base import FieldModel, make_model
-    from swiftwrf.models.coarray import CoarrayModel
-    from swiftwrf.models.geometry import GeometryModel, HybridModel
-    from swiftwrf.models.prediction import Prediction
-    from swiftwrf.models.swiftwrf import SwiftWRF, fit
-    from swiftwrf.rasterize import rasterize
-    from swiftwrf.rssi import PairModel, RssiModel, fit_rssi
-    from swiftwrf.runtime.checkpoint import load
+    from swiftwrf.array.angles import AngularGrid as AngularGrid
+    from swiftwrf.array.angles import ArrayPose as ArrayPose
+    from swiftwrf.data import Rssi as Rssi
+    from swiftwrf.data import Snapshots as Snapshots
+    from swiftwrf.data import Spectra as Spectra
+    from swiftwrf.data import load_rssi as load_rssi
+    from swiftwrf.data import load_snapshots as load_snapshots
+    from swiftwrf.data import load_spectra as load_spectra
+    from swiftwrf.data.simulated import rssi_room as rssi_room
+    from swiftwrf.data.simulated import simulated_room as simulated_room
+    from swiftwrf.diagnostics.calibration import calibrate as calibrate
+    from swiftwrf.diagnostics.inspection import inspect as inspect
+    from swiftwrf.errors import FitError as FitError
+    from swiftwrf.errors import InputError as InputError
+    from swiftwrf.locate import MatchedField as MatchedField
+    from swiftwrf.locate import RssiLocator as RssiLocator
+    from swiftwrf.models.base import FieldModel as FieldModel
+    from swiftwrf.models.base import make_model as make_model
+    from swiftwrf.models.coarray import CoarrayModel as CoarrayModel
+    from swiftwrf.models.geometry import GeometryModel as GeometryModel
+    from swiftwrf.models.geometry import HybridModel as HybridModel
+    from swiftwrf.models.prediction import Prediction as Prediction
+    from swiftwrf.models.swiftwrf import SwiftWRF as SwiftWRF
+    from swiftwrf.models.swiftwrf import fit as fit
+    from swiftwrf.rasterize import rasterize as rasterize
+    from swiftwrf.rssi import PairModel as PairModel
+    from swiftwrf.rssi import RssiModel as RssiModel
+    from swiftwrf.rssi import fit_rssi as fit_rssi
+    from swiftwrf.runtime.checkpoint import load as load
 
 import_lazily(
     __name__,
@@ -58,35 +72,3 @@ import_lazily(
         "swiftwrf.runtime.checkpoint": ("load",),
     },
 )
-
-__all__ = [
-    "AngularGrid",
-    "ArrayPose",
-    "CoarrayModel",
-    "FieldModel",
-    "FitError",
-    "GeometryModel",
-    "HybridModel",
-    "InputError",
-    "MatchedField",
-    "PairModel",
-    "Prediction",
-    "Rssi",
-    "RssiLocator",
-    "RssiModel",
-    "Snapshots",
-    "Spectra",
-    "SwiftWRF",
-    "calibrate",
-    "fit",
-    "fit_rssi",
-    "inspect",
-    "load",
-    "load_rssi",
-    "load_snapshots",
-    "load_spectra",
-    "make_model",
-    "rasterize",
-    "rssi_room",
-    "simulated_room",
-]

@@ -212,14 +212,8 @@ def summary(errors: ArrayLike, group: ArrayLike | None = None) -> ErrorSummary:
     finite = np.isfinite(values)
     values = values[finite]
     if len(values) == 0:
-        return {
-            "median": float("nan"),
-            "p90": float("nan"),
-            "mean": float("nan"),
-            "low": float("nan"),
-            "high": float("nan"),
-            "n": 0,
-        }
+        nan = float("nan")
+        return ErrorSummary(median=nan, p90=nan, mean=nan, low=nan, high=nan, n=0)
     low, high = median_interval(values)
     group = None if group is None else np.asarray(group)[finite]
     if group is not None and len(np.unique(group, axis=0)) < len(values):

@@ -20,14 +20,14 @@ class Command(NamedTuple):
 
     Args:
         summary: One line for the help.
-        options: Dataclass of the options, in the module `options` of the command's package, which imports no torch.
-        module: Module of that package with `run(config)`, or `run(config, resume)` if its runs can be resumed.
+        options: Dataclass of the options, in `tasks.configs`.
+        module: Module with `run(config)`, or `run(config, resume)` if its runs can be resumed.
         preloaded: Modules that processes of a run load while the run itself begins.
     """
 
     summary: str
     options: str
-    module: str = "run"
+    module: str
     preloaded: tuple[str, ...] = ()
 
 
@@ -35,19 +35,25 @@ COMMANDS = {
     "aoa": Command(
         "estimate angles of arrival with few measured spectra, and report the errors",
         "AoaConfig",
-        "experiment",
+        "tasks.aoa.experiment",
         ("augment.turbo.choice", "torchvision", "torch._dynamo"),
     ),
-    "rssi": Command("predict RSSI maps of receivers, and report the errors", "RssiTaskConfig", "experiment"),
-    "locate": Command("locate transmitters from RSSI, and report the errors", "LocateConfig", "experiment"),
-    "predict": Command("apply a saved model to new measurements or positions", "PredictConfig"),
-    "report": Command("merge finished runs of one task into one report", "ReportConfig"),
-    "inspect": Command("check measurements before a run: counts, frames, calibration", "InspectConfig"),
-    "convert": Command("write measurements and RSSI maps in other formats", "ConvertConfig"),
-    "update": Command("update a fitted model with new measurements, and detect changes", "UpdateConfig"),
-    "resume": Command("continue an interrupted run: swiftwrf resume DIR.partial", "ResumeConfig"),
-    "scenes": Command("trace ray paths in a room (extra: raytrace)", "ScenesConfig"),
-    "view": Command("show a fitted field in the browser (extra: view)", "ViewConfig"),
+    "rssi": Command("predict RSSI maps of receivers, and report the errors", "RssiTaskConfig", "tasks.rssi.experiment"),
+    "locate": Command(
+        "locate transmitters from RSSI, and report the errors", "LocateConfig", "tasks.locate.experiment"
+    ),
+    "predict": Command("apply a saved model to new measurements or positions", "PredictConfig", "tasks.predict"),
+    "report": Command("merge finished runs of one task into one report", "ReportConfig", "tasks.report"),
+    "inspect": Command(
+        "check measurements before a run: counts, frames, calibration", "InspectConfig", "tasks.inspect"
+    ),
+    "convert": Command("write measurements and RSSI maps in other formats", "ConvertConfig", "tasks.convert"),
+    "update": Command(
+        "update a fitted model with new measurements, and detect changes", "UpdateConfig", "tasks.update.run"
+    ),
+    "resume": Command("continue an interrupted run: swiftwrf resume DIR.partial", "ResumeConfig", "tasks.resume"),
+    "scenes": Command("trace ray paths in a room (extra: raytrace)", "ScenesConfig", "tasks.scenes"),
+    "view": Command("show a fitted field in the browser (extra: view)", "ViewConfig", "tasks.view.run"),
 }
 
 
@@ -58,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: Command and its options. Defaults to those of the process.
 
     Returns:
-        Exit code; see `tasks.command_line.exit_code`.
+        Exit code; see `tasks.command_line.command_line`.
 
     Example:
         >>> main(["--help"])  # doctest: +ELLIPSIS
@@ -69,7 +75,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     name, *options = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if name in ("-h", "--help"):
         try:
-            print(_help(), flush=True)
+            print("usage: swiftwrf COMMAND [OPTIONS]\n")
+            for name, command in COMMANDS.items():
+                print(f"  {name:<9} {command.summary}")
+            print("\noptions of a command: swiftwrf COMMAND --help", flush=True)
         except BrokenPipeError:
             from tasks.command_line import without_reader
 
@@ -81,19 +90,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return run_command(name, options, f"swiftwrf {name}")
 
 
-def run_command(name: str, options: Sequence[str], program: str | None = None) -> int:
+def run_command(name: str, options: Sequence[str], program: str) -> int:
     """Run one command and return its exit code.
 
     Args:
         name: Key of `COMMANDS`.
         options: Options of the command line.
-        program: Name of the program in the help. Defaults to `python -m tasks.NAME`.
+        program: Name of the program in the help.
     """
-    _shorten_waits()
+    if "OMP_WAIT_POLICY" not in os.environ:
+        # threads that share a loop wait busily for milliseconds by default, which makes the steps of a network up to eight
+        # times slower if other work uses the same cores; libgomp reads the variable when torch is loaded
+        os.environ.setdefault("GOMP_SPINCOUNT", "30000")
     from tasks.command_line import command_line
 
-    config_type = getattr(import_module(f"tasks.{name}.options"), COMMANDS[name].options)
-    return command_line(f"tasks.{name}", config_type, partial(run_task, name), options, program)
+    config_type = getattr(import_module("tasks.configs"), COMMANDS[name].options)
+    return command_line(program, config_type, partial(run_task, name), options)
 
 
 def run_task(name: str, config: Any, *folder: Path) -> None:
@@ -102,21 +114,4 @@ def run_task(name: str, config: Any, *folder: Path) -> None:
 
     command = COMMANDS[name]
     preload(command.preloaded if getattr(config, "processes", None) != 1 else ())
-    import_module(f"tasks.{name}.{command.module}").run(config, *folder)
-
-
-def _help() -> str:
-    lines = (f"  {name:<9} {command.summary}" for name, command in COMMANDS.items())
-    return "\n".join(
-        ["usage: swiftwrf COMMAND [OPTIONS]", "", *lines, "", "options of a command: swiftwrf COMMAND --help"]
-    )
-
-
-def _shorten_waits() -> None:
-    """Let threads wait for each other a tenth as long before they sleep, unless the user has set it.
-
-    By default threads that share a loop wait busily for milliseconds. If other work uses the same cores, that makes the
-    steps of a network up to eight times slower. libgomp reads the variable when torch is loaded.
-    """
-    if "OMP_WAIT_POLICY" not in os.environ:
-        os.environ.setdefault("GOMP_SPINCOUNT", "30000")
+    import_module(command.module).run(config, *folder)

@@ -11,7 +11,6 @@ from argparse import ArgumentError, ArgumentParser
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import MISSING, fields, is_dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
@@ -31,25 +30,16 @@ BROKEN_PIPE = 141  # exit code that shells show for a process ended by SIGPIPE
 
 
 def command_line(
-    name: str,
-    config_type: type[Config],
-    task: Callable[[Config], None],
-    arguments: Sequence[str],
-    program: str | None = None,
+    program: str, config_type: type[Config], task: Callable[[Config], None], arguments: Sequence[str]
 ) -> int:
-    """Run a task with the options of a command line; see `execute` and `exit_code`."""
-    return exit_code(partial(execute, name, config_type, task, arguments, program))
-
-
-def exit_code(action: Callable[[], None]) -> int:
-    """Return the exit code of an action and print its error as one sentence.
+    """Run a task with the options of a command line, and print an error as one sentence; see `execute`.
 
     Returns:
         0: done. 1: a fit failed. 2: wrong input, or a file that cannot be written. 130: interrupted. 141: the reader of the
         output, e.g. `head`, is gone.
     """
     try:
-        action()
+        execute(program, config_type, task, arguments)
         sys.stdout.flush()
     except BrokenPipeError:
         return without_reader()
@@ -92,28 +82,21 @@ def _no_access(error: OSError) -> str:
     return f"cannot read or write {file} ({reason}); choose another path"
 
 
-def execute(
-    name: str,
-    config_type: type[Config],
-    task: Callable[[Config], None],
-    arguments: Sequence[str],
-    program: str | None = None,
-) -> None:
+def execute(program: str, config_type: type[Config], task: Callable[[Config], None], arguments: Sequence[str]) -> None:
     """Parse a command line and run the task.
 
     Args:
-        name: Module of the task, e.g. tasks.aoa.
+        program: Name of the command in the help.
         config_type: Dataclass of the options. Its docstring is the description in the help.
         task: Function of the configuration.
         arguments: Options of the command line.
-        program: Name of the command in the help. Defaults to `python -m NAME`.
 
     Raises:
         InputError: Wrong options, or the error of the task.
     """
     file = file_of_options(arguments)
     saved = None if file is None else file_options(Path(file))
-    config = parse(config_type, arguments, program or f"python -m {name}", saved, file)
+    config = parse(config_type, arguments, program, saved, file)
     config.check()
     with terminal.of(getattr(config, "output", Answered()), config.verbose):
         task(config)

@@ -35,8 +35,10 @@ def now() -> str:
 
 def invocation(task: str) -> str:
     """Return the command line of this process, which runs a task."""
-    program, *arguments = sys.argv
-    return command(*([] if Path(program).stem == "swiftwrf" else [task]), *arguments)
+    arguments = sys.argv[1:]
+    return command(
+        *([] if arguments[:1] == [task] else [task]), *arguments
+    )  # python -m tasks.aoa has no name of a task
 
 
 def command(*arguments: str) -> str:

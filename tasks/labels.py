@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 from swiftwrf.runtime.registry import Registry
 
@@ -12,17 +11,26 @@ from swiftwrf.runtime.registry import Registry
 OTHER_COLOURS = ("#cf4a4a", "#2a9165", "#8f7d12", "#1b8fa6", "#c04f9d", "#7f8794")  # of methods of other packages
 
 
-@dataclass(frozen=True)
-class Label:
-    """Appearance of a method in reports.
-
-    Args:
-        meaning: One line.
-        colour: `#rrggbb`. None for one that follows from the name.
-    """
+class Label(NamedTuple):
+    """Meaning of a method in one line, and its colour `#rrggbb`, None for one that follows from the name."""
 
     meaning: str
     colour: str | None = None
+
+
+def colours(known: Mapping[str, Label]) -> dict[str, str]:
+    """Return the colours of labelled methods by name."""
+    return {name: label.colour for name, label in known.items() if label.colour}
+
+
+def colour(known: Mapping[str, str], name: str) -> str:
+    """Return the colour of a method among the colours by name. One that is missing there follows from the name.
+
+    Example:
+        >>> colour({"gp": "#d1620f"}, "gp")
+        '#d1620f'
+    """
+    return known.get(name) or OTHER_COLOURS[sum(name.encode()) % len(OTHER_COLOURS)]
 
 
 FIELD_MODELS = {
@@ -100,13 +108,6 @@ LOCALIZERS = {
 }
 
 
-def labels(registry: Registry[Any], known: dict[str, Label], names: Iterable[str] | None = None) -> dict[str, Label]:
-    """Return the labels of registered methods; a method of another package has the first line of its docstring.
-
-    Args:
-        registry: Registry of the methods.
-        known: Labels of the methods of this package.
-        names: Methods, all registered ones by default. Names that are not registered are left out.
-    """
-    found = registry if names is None else [name for name in names if name in registry]
-    return {name: known.get(name) or Label(registry.summary(name)) for name in found}
+def meanings(registry: Registry[Any], known: Mapping[str, Label]) -> dict[str, str]:
+    """Return the meanings of registered methods. That of another package's method is the first line of its docstring."""
+    return {name: known[name].meaning if name in known else registry.summary(name) for name in registry}

@@ -142,8 +142,11 @@ def choice(meaning: str, registry: Registry[Any] | None, known: Mapping[str, lab
     """
 
     def entries(_: str) -> str:
-        found = known if registry is None else labels.labels(registry, dict(known))
-        return f"{'; '.join(f'{name}: {label.meaning}' for name, label in found.items())} (default: {default})"
+        if registry is None:
+            found = {name: label.meaning for name, label in known.items()}
+        else:
+            found = labels.meanings(registry, known)
+        return f"{'; '.join(f'{name}: {meaning}' for name, meaning in found.items())} (default: {default})"
 
     return tyro.conf.arg(help=f"{meaning}:", help_behavior_hint=entries)
 

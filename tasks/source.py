@@ -15,9 +15,9 @@ from swiftwrf import AngularGrid, InputError, Rssi, Spectra
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data import ReadOptions, load_rssi, load_spectra
 from swiftwrf.data.archives import array_header, read_rows
+from swiftwrf.data.receivers import spelled_as
 from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
 from swiftwrf.data.store import Store
-from swiftwrf.data.survey import spelled_as
 from swiftwrf.datasets import DATA_SETS, fetch
 from swiftwrf.errors import listed
 from tasks.options import OffsetSource, SpectraSource, TableSource

@@ -11,9 +11,8 @@ from typing import Any
 
 from swiftwrf import InputError
 from swiftwrf.runtime.steps import Context, Step, walk
-from tasks.claim import ENVIRONMENT
 from tasks.directory import Run
-from tasks.records import Row
+from tasks.records import ENVIRONMENT, Row
 from tasks.terminal import terminal
 from tasks.workers import Workers, local_processes
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from pandas import DataFrame, Series
+from pandas import DataFrame
 
 from swiftwrf.metrics import paired_difference
 
@@ -84,8 +84,3 @@ def fingerprinting(constant_deg: float, peak_deg: float) -> str:
         f"This is fingerprinting along a path rather than estimation of angles: directions lie within {constant_deg:.1f} "
         f"degrees of their mean (median), and peaks are {peak_deg:.0f} degrees off."
     )
-
-
-def running_median(values: Series) -> Series:
-    """Median of the values around each, in a window of a fifth of them."""
-    return values.rolling(max(len(values) // 5, 1), center=True).median()

@@ -15,7 +15,7 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.models.primitives import MIN_WIDTH_PIXELS
 from swiftwrf.rasterize import reference
-from swiftwrf.rasterize.magnitude import magnitude
+from swiftwrf.rasterize.operators import magnitude
 
 VALUE_TOLERANCE = {None: 5e-6, 1e-4: 3e-4}
 GRADIENT_TOLERANCE = {None: 1e-5, 1e-4: 1e-5}

@@ -25,20 +25,17 @@ from swiftwrf.errors import MAX_LENGTH
 from swiftwrf.locate import MatchedFieldConfig
 from swiftwrf.rssi import RssiConfig
 from swiftwrf.runtime.validation import configuration
+from tasks import configs
 from tasks.aoa import experiment as aoa
-from tasks.aoa.page import synthesis
-from tasks.aoa.page.records import FractionRecords
+from tasks.aoa import synthesis
+from tasks.aoa.records import FractionRecords
 from tasks.command import COMMANDS
 from tasks.command_line import command_line
 from tasks.locate import experiment as locate
 from tasks.rssi import experiment as rssi
 
 TASKS = {
-    name: (
-        getattr(import_module(f"tasks.{name}.options"), command.options),
-        import_module(f"tasks.{name}.{command.module}").run,
-    )
-    for name, command in COMMANDS.items()
+    name: (getattr(configs, command.options), import_module(command.module).run) for name, command in COMMANDS.items()
 }
 FEW_CELLS = MatchedFieldConfig(max_cells=2000, n_best=40, n_background=20, n_rounds=1, n_calibration=16)
 FOR_LIFE = ExitStack()

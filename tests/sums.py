@@ -9,7 +9,7 @@ import torch
 
 from swiftwrf import InputError
 from swiftwrf.runtime.steps import Step
-from tasks.aoa.options import AoaConfig
+from tasks.configs import AoaConfig
 from tasks.directory import Run
 from tasks.steps import run_steps
 

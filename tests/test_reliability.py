@@ -19,11 +19,11 @@ from quick import run, said
 from swiftwrf import InputError, rssi_room
 from swiftwrf.runtime import durable
 from tasks import environment
-from tasks.claim import Claim
 from tasks.command import main
+from tasks.directory import Claim
 from tasks.page.records import Records
 from tasks.records import read_table, write_table
-from tasks.report.run import merge
+from tasks.report import merge
 from tasks.rssi import experiment as rssi
 
 TABLES = ("errors.csv", "predictions.csv")
@@ -63,7 +63,7 @@ def _files(folder):
 def test_a_report_without_out_is_new_each_time(finished, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for time in ("first", "second"):
-        monkeypatch.setattr("tasks.report.run.stamp", lambda time=time: time)
+        monkeypatch.setattr("tasks.report.stamp", lambda time=time: time)
         assert run("report", finished) == 0
     assert capsys.readouterr().out.splitlines()[-1] == "report: runs/report/second/report.html"
 

@@ -18,7 +18,7 @@ from augment.cross_validation import (
     measured_errors,
 )
 from augment.suggest import suggest
-from augment.turbo.condition import EVERYTHING, NETWORKS, Condition, MeasuredSubset, Row, Training
+from augment.turbo.condition import NETWORKS, Condition, MeasuredSubset, Row, Training
 from augment.turbo.experiment import ROOM_MODEL, Experiment
 from augment.turbo.synthesis import Evaluation, RoomSearch, syntheses
 from swiftwrf import GeometryModel, InputError, Spectra, load
@@ -47,9 +47,7 @@ def _first_steps(experiment: Experiment, subset: MeasuredSubset) -> list[Step[Ex
         *(syntheses(experiment, subset, named, {}) if named and not compared else [CrossValidation(subset, compared)]),
     ]
     if ROOM_MODEL in experiment.candidates:
-        fractions = experiment.fractions
-        shared = subset == MeasuredSubset(fractions[0]) and 1.0 not in fractions
-        steps.append(RoomSearch(subset, (), experiment.located_by(subset), EVERYTHING if shared else None))
+        steps.append(RoomSearch(subset, (), locates=True))
     # independent of the measured fraction, so all fractions share these steps
     return [*steps, *(reference(estimator, "all measured") for estimator in experiment.trainable)]
 

@@ -49,9 +49,6 @@ class MeasuredSubset:
         return {"measured_fraction": self.measured_fraction, "repeat": self.repeat}
 
 
-EVERYTHING = MeasuredSubset(1.0)  # all training spectra
-
-
 @dataclass(frozen=True)
 class Condition:
     """One estimator on one training set.
@@ -131,6 +128,11 @@ class Condition:
 
 
 DESCRIPTION = ("estimator", "training", "synthesizer", "n_synthetic")
+
+
+def located_by(subset: MeasuredSubset) -> Condition:
+    """Return the condition of matched-field processing that uses the room found in these measured spectra."""
+    return Condition(LOCATOR, "measured", **subset.columns)
 
 
 def conditions_of(methods: Mapping[str, Mapping[str, Any]]) -> dict[str, Condition]:

@@ -10,11 +10,11 @@ from functools import cached_property
 import torch
 
 from augment.choose import candidates
-from augment.cross_validation import LOCATOR, STAND_IN, CrossValidationMetrics
+from augment.cross_validation import STAND_IN, CrossValidationMetrics
 from augment.estimators import ESTIMATORS, Estimator, make_estimator
 from augment.mix import withhold
 from augment.positions import SyntheticPositions
-from augment.turbo.condition import EVERYTHING, NETWORKS, Condition, MeasuredSubset
+from augment.turbo.condition import NETWORKS, MeasuredSubset
 from swiftwrf.choices import AUTO, RAYTRACE
 from swiftwrf.data import Spectra
 from swiftwrf.errors import InputError
@@ -165,18 +165,3 @@ class Experiment:
         # by default only where held-out measured spectra gain from extra positions
         wanted = self.extra is not None or bool(validation and validation["recommended_n_synthetic"])
         return self.n_synthetic if wanted else 0
-
-    def located_by(self, subset: MeasuredSubset) -> tuple[Condition, ...]:
-        """Return the conditions of matched-field processing that use the room found in these measured spectra."""
-        found = []
-        if subset.measured_fraction in self.fractions:
-            found.append(
-                Condition(LOCATOR, "measured", measured_fraction=subset.measured_fraction, repeat=subset.repeat)
-            )
-        if subset == EVERYTHING:
-            found += [
-                Condition(LOCATOR, "all measured", measured_fraction=fraction, repeat=repeat)
-                for repeat in range(self.repeats)
-                for fraction in self.fractions
-            ]
-        return tuple(found)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from augment.cross_validation import LOCATOR
 from augment.mix import Mixed
-from augment.turbo.condition import Condition, Row
+from augment.turbo.condition import LOCATED, Condition, MeasuredSubset, Row, located_by
 from augment.turbo.experiment import Experiment
 from swiftwrf import FitError, InputError, Spectra, load
 from swiftwrf.locate import MatchedField, Posterior
@@ -33,41 +33,43 @@ class Locating(Step[Experiment]):
     """Locate the moving end from the test spectra by the room that was found.
 
     Args:
-        condition: Condition of the measured spectra.
+        subset: Measured spectra.
         room_file: File of the room in the run's directory.
         room_seconds: Time of the search for the room [s], which counts as part of the training.
     """
 
-    condition: Condition
+    subset: MeasuredSubset
     room_file: str
     room_seconds: float = 0.0
+
+    title = LOCATED
+
+    @property
+    def condition(self) -> Condition:
+        """Condition of the result."""
+        return located_by(self.subset)
 
     @property
     def name(self) -> str:
         return self.condition.result_name
 
-    @property
-    def title(self) -> str:
-        return f"{self.condition.method}"
-
     def compute(self, experiment: Experiment, folder: Path) -> Row:
-        condition, test = self.condition, experiment.test
-        of_all = condition.training == "all measured"
-        measured = experiment.train if of_all else experiment.withhold(condition.subset)[0]
+        subset, test = self.subset, experiment.test
+        measured, _ = experiment.withhold(subset)
         room = load(folder / self.room_file)
         assert isinstance(room, FieldModel)
         began = time.perf_counter()
         try:
-            locator = MatchedField(seed=experiment.seed_of(condition.subset)).fit(measured, room=room)
+            locator = MatchedField(seed=experiment.seed_of(subset)).fit(measured, room=room)
         except (InputError, FitError) as error:
             return {"refused": str(error)}
         fitted = time.perf_counter()
         parts = [located(locator, test.subset(rows)) for rows in torch.arange(len(test)).split(BATCH_SPECTRA)]
         found = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
         ended = time.perf_counter()
-        if condition.repeat == 0 and not of_all:
-            locator.save(folder / f"{LOCATOR}-mix{condition.subset.key}.safetensors")
-            write_npz(folder / f"located-mix{condition.subset.key}.npz", examples(locator, measured, test, found))
+        if subset.repeat == 0:
+            locator.save(folder / f"{LOCATOR}-mix{subset.key}.safetensors")
+            write_npz(folder / f"located-mix{subset.key}.npz", examples(locator, measured, test, found))
         seconds = {"room": self.room_seconds, "fit": fitted - began, "locate": ended - fitted}
         return {
             "estimate": found.pop("estimate"),

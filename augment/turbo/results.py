@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal, TypedDict, get_args
 
 import numpy as np
@@ -20,7 +20,7 @@ from augment.cross_validation import (
     choose_estimator,
 )
 from augment.turbo.choice import CrossValidation, FoldLocating
-from augment.turbo.condition import EVERYTHING, LOCATED, Condition, MeasuredSubset, Row, pooled, reference_of
+from augment.turbo.condition import LOCATED, Condition, MeasuredSubset, Row, located_by, pooled, reference_of
 from augment.turbo.experiment import ROOM_MODEL, Experiment
 from augment.turbo.locating import LEVEL, NO_PLANE, Locating
 from augment.turbo.synthesis import Evaluation, RoomSearch, Synthesis
@@ -138,8 +138,7 @@ class Results:
         if missing := FIELD_MODELS[ROOM_MODEL].lacking(self.test):
             reason = f"it needs the {missing[0]}, which {self.test.name} does not describe"
             self._note(f"{LOCATOR} is left out: {reason}")
-            located = (c for subset in (*fractions, EVERYTHING) for c in experiment.located_by(subset))
-            self.left_out |= dict.fromkeys(located, reason)
+            self.left_out |= {located_by(subset): reason for subset in fractions}
 
     def add(self, step: Step[Experiment], value: Row) -> None:
         """Add the result of one step."""
@@ -153,9 +152,10 @@ class Results:
             case Synthesis():
                 self._add_synthesis(step, value)
             case RoomSearch() if not value.get("planes"):
-                self._leave_out(step.located, value.get("refused", NO_PLANE))
+                if step.locates:
+                    self._leave_out_locating(step.subset, value.get("refused", NO_PLANE))
             case Locating() if "refused" in value:
-                self._leave_out((step.condition,), value["refused"])
+                self._leave_out_locating(step.subset, value["refused"])
             case Evaluation() | Locating():
                 self.evaluated.append((step.condition, value))
                 self.history += [step.condition.columns | row for row in value["history"]]
@@ -205,12 +205,10 @@ class Results:
             rows += rows_of(condition.columns, columns)
         return rows
 
-    def _leave_out(self, conditions: Iterable[Condition], reason: str) -> None:
-        """Record why conditions are not in the results."""
-        for condition in conditions:
-            share = "everything" if condition.training == "all measured" else f"{condition.measured_fraction:.0%}"
-            self._note(f"{condition.name} is left out with {share} measured: {reason}")
-            self.left_out[condition] = reason
+    def _leave_out_locating(self, subset: MeasuredSubset, reason: str) -> None:
+        """Record why matched-field processing is not in the results of a subset."""
+        self._note(f"{LOCATOR} is left out with {subset.measured_fraction:.0%} measured: {reason}")
+        self.left_out[located_by(subset)] = reason
 
     def _note(self, sentence: str) -> None:
         if sentence not in self.notes:
@@ -264,7 +262,7 @@ class Results:
         }
         located = self.located_folds.get(key, {})
         if not any(c.estimator == LOCATOR and c.measured_fraction == fraction for c, _ in self.pooled):
-            located = {}  # its fit to all measured spectra was refused
+            located = {}  # its fit was refused
         choice = choose_estimator(
             errors,
             {n: None if own is None else np.array(own) for n, own in located.items()},

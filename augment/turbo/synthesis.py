@@ -19,7 +19,7 @@ from augment.turbo.artifacts import save_artifacts
 from augment.turbo.condition import MEASURED_STAND_IN, NETWORKS, Condition, MeasuredSubset, Row, Training
 from augment.turbo.experiment import ROOM_MODEL, Experiment
 from augment.turbo.locating import Locating
-from swiftwrf import FitError, GeometryModel, InputError, Spectra, load
+from swiftwrf import FitError, InputError, Spectra, load
 from swiftwrf.choices import AUTO
 from swiftwrf.data.store import Store
 from swiftwrf.metrics import l1, psnr, ssim
@@ -58,16 +58,12 @@ class RoomSearch(Step[Experiment]):
     Args:
         subset: Measured spectra.
         syntheses: Steps of these models.
-        located: Conditions of matched-field processing.
-        larger: Larger subset whose room is estimated next, from this one.
-        start: Search in a smaller subset. If its room explains the other spectra, no other room is searched.
+        locates: Whether matched-field processing locates the test spectra by the room.
     """
 
     subset: MeasuredSubset
     syntheses: tuple[Synthesis, ...]
-    located: tuple[Condition, ...] = ()
-    larger: MeasuredSubset | None = None
-    start: RoomSearch | None = None
+    locates: bool = False
 
     title = "finding the room"
 
@@ -84,7 +80,7 @@ class RoomSearch(Step[Experiment]):
         measured, _ = experiment.withhold(self.subset)
         began = time.perf_counter()
         try:
-            model = self._extended(experiment, measured, folder) or experiment.make_model(ROOM_MODEL, self.subset).fit(
+            model = experiment.make_model(ROOM_MODEL, self.subset).fit(
                 measured, device=experiment.device, progress=True
             )
         except (InputError, FitError) as error:
@@ -92,22 +88,13 @@ class RoomSearch(Step[Experiment]):
         model.save(folder / self.file)
         return {"seconds": time.perf_counter() - began, "planes": len(model.room.planes) if model.room else 0}
 
-    def _extended(self, experiment: Experiment, measured: Spectra, folder: Path) -> FieldModel | None:
-        """Return the room of the start, fitted to all measured spectra of the subset if it explains them."""
-        if self.start is None:
-            return None
-        room, known = load(folder / self.start.file), experiment.withhold(self.start.subset)[0]
-        assert isinstance(room, GeometryModel)
-        return room.extended(measured, ~torch.isin(measured.index, known.index))
-
     def then(self, experiment: Experiment, value: Row) -> Sequence[Step[Experiment]]:
         found = None if "refused" in value else self  # without a room the models refuse the spectra themselves
         seconds = value.get("seconds", 0.0)
         steps: list[Step[Experiment]] = [replace(one, room=found, room_seconds=seconds) for one in self.syntheses]
-        if self.larger:
-            start = replace(self, larger=None) if found else None
-            steps.append(RoomSearch(self.larger, (), experiment.located_by(self.larger), start=start))
-        return steps + [Locating(condition, self.file, seconds) for condition in self.located if value.get("planes")]
+        if self.locates and value.get("planes"):
+            steps.append(Locating(self.subset, self.file, seconds))
+        return steps
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Annotated
 
 import torch
@@ -15,12 +15,12 @@ from swiftwrf.array.angles import AngularGrid, folded_to_front, to_angles, to_di
 from swiftwrf.array.beamforming import BEAMFORMERS, PHASE
 from swiftwrf.errors import InputError
 from swiftwrf.positions import to_tensor
-from swiftwrf.runtime.cache import cached_tensors
 from swiftwrf.runtime.validation import PositiveFloat, check_value, checked
 
 LIGHT_SPEED = 299_792_458.0  # [m / s]
 MAX_ELEMENTS = 4096  # of an array: the co-array grows with their square
 MAX_BASIS_VALUES = 2**28  # of the co-array's basis functions on a grid: 2 GiB
+MAX_CACHED_VALUES = 2**25  # of basis functions that are kept: 256 MiB
 Side = Annotated[int, Ge(1), Le(MAX_ELEMENTS)]
 
 
@@ -215,11 +215,8 @@ class PlanarArray:
     def channel(self, direction: Tensor, gain: Tensor, owner: Tensor, n: int) -> Tensor:
         """Return the sum of paths at each element, gain * exp(j phase), complex128 (n, K).
 
-        Args:
-            direction: Unit vectors towards where the P paths come from, in array coordinates, (P, 3).
-            gain: Complex amplitude of each path at the origin, (P,).
-            owner: Index of the channel to which each path belongs, int64 (P,).
-            n: Number of channels.
+        Paths come from directions (P, 3) in array coordinates, with gains (P,) at the origin. Their owner (P,) is one of n
+        channels.
         """
         phase = self.phase(direction.double())
         wave = gain.to(torch.complex128)[:, None] * torch.polar(torch.ones_like(phase), phase)
@@ -243,7 +240,7 @@ def pairs(array: PlanarArray) -> tuple[Tensor, Tensor, Tensor]:
     return _lags(array)[1:]
 
 
-@cached_tensors
+@lru_cache(maxsize=4)
 @torch.inference_mode(False)  # cached tensors must also serve calls that record gradients
 def _lags(array: PlanarArray) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the half co-array (P, 2) [wavelengths], and the pairs of elements a, b with their index in it."""
@@ -258,19 +255,24 @@ def _lags(array: PlanarArray) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return mean[first], pair // len(element), pair % len(element), number
 
 
-@cached_tensors
-@torch.inference_mode(False)
 def basis(array: PlanarArray, grid: AngularGrid, dtype: torch.dtype = torch.float64) -> Tensor:
     """Return the functions whose sums are squared spectra: 1, P cosines and P sines, (1 + 2 P, pixels).
 
     Raises:
         InputError: The functions take more than 2 GiB on this grid.
     """
-    lag = differences(array)
-    if (values := (1 + 2 * len(lag)) * math.prod(grid.shape)) > MAX_BASIS_VALUES:
+    n_functions = 1 + 2 * len(differences(array))
+    if (values := n_functions * math.prod(grid.shape)) > MAX_BASIS_VALUES:
         raise InputError(
-            f"the {1 + 2 * len(lag)} functions of this array take {values:.2g} values on a grid of {grid.shape}, more "
+            f"the {n_functions} functions of this array take {values:.2g} values on a grid of {grid.shape}, more "
             f"than {MAX_BASIS_VALUES:.2g}; take a coarser grid or an array of fewer elements"
         )
-    phase = 2 * math.pi * lag @ grid.direction[..., :2].reshape(-1, 2).T
+    compute = _basis if values <= MAX_CACHED_VALUES else _basis.__wrapped__
+    return compute(array, grid, dtype)
+
+
+@lru_cache(maxsize=4)
+@torch.inference_mode(False)
+def _basis(array: PlanarArray, grid: AngularGrid, dtype: torch.dtype) -> Tensor:
+    phase = 2 * math.pi * differences(array) @ grid.direction[..., :2].reshape(-1, 2).T
     return torch.cat([torch.ones_like(phase[:1]), phase.cos(), phase.sin()]).to(dtype)

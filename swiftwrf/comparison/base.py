@@ -6,7 +6,6 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
-from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
@@ -20,8 +19,7 @@ from swiftwrf.models.base import CPU, FieldModel
 from swiftwrf.models.link import Linked
 from swiftwrf.positions import frame, normalise
 from swiftwrf.runtime.checkpoint import Header, expect
-from swiftwrf.runtime.progress import progress_bar
-from swiftwrf.runtime.session import Descent, Model, Record, Schedule, Session, warm_cosine
+from swiftwrf.runtime.descent import Descent, Model, warm_cosine
 from swiftwrf.runtime.validation import Fraction, NonNegativeInt, PositiveFloat, PositiveInt, configuration
 
 # sizes of networks, limited because a damaged file may claim any
@@ -92,9 +90,9 @@ class Training(Descent[Model]):
         betas: tuple[float, float] = (0.9, 0.99),
         weight_decay: float = 0.0,
     ) -> None:
-        schedule = Schedule(config.steps, config.check_every, config.averaging, config.clip, betas, weight_decay)
         every = {"params": list(network.parameters()), "peak": config.rate}
-        super().__init__("final", network, list(groups) or [every], schedule)
+        shared = {name: getattr(config, name) for name in ("steps", "check_every", "averaging", "clip")}
+        super().__init__("final", network, list(groups) or [every], betas=betas, weight_decay=weight_decay, **shared)
         self.config, self.loss = config, loss
 
     def objective(self) -> Tensor:
@@ -109,31 +107,12 @@ class Training(Descent[Model]):
         (state,) = np.random.SeedSequence((self.config.seed, self.step)).generate_state(1)
         return torch.Generator().manual_seed(int(state))
 
-    def trained(
-        self,
-        owner: str,
-        *,
-        checkpoint: Path | None = None,
-        on_record: Callable[[Record], None] | None = None,
-        progress: bool = False,
-        **_: Any,
-    ) -> Model:
-        """Take all steps and return the trained network without gradients; `owner` is the fingerprint of the fit."""
-        with progress_bar(progress) as bar:
-            self.run(Session(checkpoint, owner, bar, on_record))
-        return self.result.eval().requires_grad_(False)
-
 
 class TrainedModel(Linked, FieldModel):
     """Field model of a trained network.
 
     A subclass sets a `config_type` that derives from `Config`, and implements `blank`, `training` and `render`. If it
     requires the fixed end, it finds both ends of the link in the frame of the training positions by `ends`.
-
-    Example:
-        >>> from swiftwrf.comparison import Vae
-        >>> issubclass(Vae, TrainedModel)
-        True
     """
 
     slow = True
@@ -159,7 +138,7 @@ class TrainedModel(Linked, FieldModel):
 
     def _fit(self, train: Spectra, *, device: torch.device = CPU, **arguments: Any) -> None:
         owner = fingerprint(train, type(self).__name__, asdict(self.config))
-        self.network = self.training(train, device).trained(owner, **arguments)
+        self.network = self.training(train, device).run(owner, **arguments)
 
     def local(self, position: Tensor, device: torch.device) -> Tensor:
         """Return positions, float32 (n, 3) within [-1, 1]^3 in the box around the training positions, on a device."""

@@ -1,4 +1,4 @@
-"""NeRF2: a network of absorption, phase shift and emission in space, integrated along rays.
+"""NeRF2: a network of absorption, phase shift and emission in space, integrated along rays, for spectra and for RSSI.
 
 X. Zhao, Z. An, Q. Pan and L. Yang, "NeRF2: Neural Radio-Frequency Radiance Fields", ACM MobiCom 2023. `NeRF2Config.paper()`
 has the sizes, rates and steps of its code: 690,564 parameters, 64 samples over 5 m, 8,192 single rays a step.
@@ -12,11 +12,19 @@ Changed everywhere: positions are relative to the centre of the training positio
 millimetres. The attenuation network is evaluated once for all transmitters (the same function). Transmittance is the
 exponential of a sum, without the 1e-10 that keeps a product from 0. Rays start at the moving array if the receiver moves.
 
-The quick preset is sized for two cores. The values of the publication are in parentheses.
+For RSSI all receivers have one field, and the signal of all rays is averaged:
 
-- Width 64 (256), 24 samples (64), 7 frequency bands (10).
-- 3,000 steps (30,000) of 16 spectra that share 64 rays (8,192 of any spectra).
-- Rate 3e-3 (8e-4), which decays once (three times), clipped gradients, no weight decay (5e-5).
+    rssi = 100 (a - 1) dBm,    a = |mean over the rays of S|
+
+`NeRF2RssiConfig.paper()` has the field of the publication's code and 36 x 9 rays over the upper half space. (That code
+averages a ninth of them, by a slip of an index.) The mean before the magnitude, the batch and the number of steps are not
+from the publication.
+
+The quick presets are sized for two cores. The values of the publication are in parentheses.
+
+- Width 64, for RSSI 32 (256), 24 and 8 samples (64), 7 and 4 frequency bands (10).
+- 3,000 steps (30,000) of 16 spectra that share 64 rays (8,192 of any spectra), or 2,400 steps of 32 positions at 6 x 3 rays.
+- Rate 3e-3 and 5e-3 (8e-4), which decays once (three times), clipped gradients, no weight decay (5e-5).
 - Averaged parameters (the last).
 """
 
@@ -24,17 +32,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.comparison.base import Config, Count, Depth, TrainedModel, Training, draw_parameters
+from swiftwrf.comparison.base import Config, Count, Depth, TrainedModel, Training, draw_parameters, restored
+from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.models.base import FIXED_END
+from swiftwrf.models.base import CPU, FIXED_END, check_finite
 from swiftwrf.models.mlp import SkipMLP, encode
+from swiftwrf.positions import frame, normalise
+from swiftwrf.rssi.base import SavedRssiPredictor
+from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
 
 MAX_SAMPLES_ON_CPU = 2**16  # the same on a CPU: layers of more samples leave its caches
@@ -46,22 +58,14 @@ Medium = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 @configuration
-class NeRF2Config(Config):
-    """Options of `NeRF2`.
-
-    Example:
-        >>> NeRF2(NeRF2Config(width=32), rays=128).config.rays
-        128
-    """
+class FieldConfig(Config):
+    """Options of a neural field."""
 
     published: ClassVar[dict[str, Any]] = {
         "width": 256,
         "bands": 10,
         "samples": 64,
         "steps": 30_000,
-        "batch": 8192,
-        "rays": 1,
-        "shared_rays": False,
         "rate": 8e-4,
         "warm_up": 1,
         "final_rate": 1e-6 / 8e-4,
@@ -82,18 +86,51 @@ class NeRF2Config(Config):
     """samples along a ray"""
     reach: PositiveFloat = 5.0
     """length of a ray [m]"""
+    weight_decay: NonNegativeFloat = 0.0
+    """weight decay of Adam"""
+
+
+@configuration
+class NeRF2Config(FieldConfig):
+    """Options of `NeRF2`.
+
+    Example:
+        >>> NeRF2(NeRF2Config(width=32), rays=128).config.rays
+        128
+    """
+
+    published = FieldConfig.published | {"batch": 8192, "rays": 1, "shared_rays": False}
+
     steps: PositiveInt = 3000
-    batch: PositiveInt = 16
     rate: PositiveFloat = 3e-3
     check_every: PositiveInt = 100
     rays: PositiveInt = 64
     """rays per spectrum and step"""
     shared_rays: bool = True
     """the spectra of a step share their rays"""
-    weight_decay: NonNegativeFloat = 0.0
-    """weight decay of Adam"""
-    compiled: bool = False
-    """compile the network with torch.compile, which needs a C++ compiler, or Triton on a GPU"""
+
+
+@configuration
+class NeRF2RssiConfig(FieldConfig):
+    """Options of `NeRF2Rssi`; a batch consists of transmitter positions.
+
+    Example:
+        >>> NeRF2Rssi(NeRF2RssiConfig(weight_decay=1e-4)).config.weight_decay
+        0.0001
+    """
+
+    published = FieldConfig.published | {"azimuths": 36, "elevations": 9, "batch": 8}
+
+    width: Count = 32
+    bands: Count = 4
+    samples: Count = 8
+    azimuths: Count = 6
+    """azimuths of the rays"""
+    elevations: Count = 3
+    """elevations of the rays"""
+    steps: PositiveInt = 2400
+    batch: PositiveInt = 32
+    rate: PositiveFloat = 5e-3
 
 
 class Field(nn.Module):
@@ -196,8 +233,6 @@ class NeRF2(TrainedModel):
         """Return the descent of the squared error of magnitudes on random rays."""
         config, field = self.config, self.blank()
         draw_parameters(field, torch.Generator().manual_seed(config.seed))
-        if config.compiled:
-            field.compile()
         position, spectrum = train.position, train.spectrum.flatten(1).to(device)
         direction = self._to_world(train.grid, device)
 
@@ -225,3 +260,72 @@ class NeRF2(TrainedModel):
     def _to_world(self, grid: AngularGrid, device: torch.device) -> Tensor:
         """Return the directions of the pixels in world coordinates, float32 (H W, 3)."""
         return (grid.direction.flatten(0, 1).to(device, torch.float64) @ self.rotation.T.to(device)).float()
+
+
+class NeRF2Rssi(SavedRssiPredictor):
+    """A neural field for all receivers, its rays averaged; predictions are differentiable in the position.
+
+    Example:
+        >>> import swiftwrf
+        >>> model = NeRF2Rssi(steps=1, batch=4).fit(swiftwrf.rssi_room(n=20))
+        >>> model.predict(torch.zeros(1, 3)).mean.shape
+        torch.Size([1, 12])
+    """
+
+    kind: ClassVar[str] = "nerf2 rssi model"
+    name = "nerf2"
+    config_type = NeRF2RssiConfig
+    requires_receiver_position = True
+    slow = True
+
+    field: Field
+    centre: Tensor
+    """centre of the box around the training positions, (3,) [m]"""
+
+    def _fit(self, train: Rssi, *, device: torch.device = CPU, progress: bool = False, **_: Any) -> None:
+        """Descend the squared error of amplitudes where RSSI was detected."""
+        self.centre = frame(train.transmitter_position)[0]
+        config, field = self.config, self._blank()
+        draw_parameters(field, torch.Generator().manual_seed(config.seed))
+        detected = (~train.rssi_dbm.isnan()).any(dim=1)
+        position = train.transmitter_position[detected]
+        amplitude = (1 + train.rssi_dbm[detected] / 100).float().to(device)
+
+        def loss(field: Field, generator: torch.Generator) -> Tensor:
+            row = torch.randint(len(position), (config.batch,), generator=generator)
+            measured = amplitude[row.to(device)]
+            known = ~measured.isnan()
+            return functional.mse_loss(self._amplitude(field, position[row].to(device))[known], measured[known])
+
+        training = Training(config, field.to(device), loss, betas=(0.9, 0.999), weight_decay=config.weight_decay)
+        self.field = training.run("", progress=progress).cpu()
+
+    def _blank(self) -> Field:
+        return Field(self.config.width, self.config.depth, self.config.bands)
+
+    def _amplitude(self, field: Field, position: Tensor) -> Tensor:
+        """Return amplitudes (n, R) with the transmitter at positions (n, 3) [m]."""
+        config, centre = self.config, self.centre.to(position.device)
+        transmitter, receiver = (normalise(x.to(centre), centre, 1.0) for x in (position, self.receiver_position))
+        direction = AngularGrid.hemisphere(config.elevations, config.azimuths).direction.flatten(0, 1).to(receiver)
+        ends = transmitter[:, None, None], receiver[:, None]
+        return torch.hypot(*received(field, config.reach, config.samples, *ends, direction).mean(dim=-1))
+
+    def _predict(self, position: Tensor) -> tuple[Tensor, None]:
+        config, n_receivers = self.config, len(self.receiver_names)
+        n_samples = config.azimuths * config.elevations * config.samples * max(n_receivers, 1)
+        some = position.split(max(1, MAX_SAMPLES_ON_CPU // n_samples))
+        amplitude = torch.cat([self._amplitude(self.field, part) for part in some])
+        return check_finite(100 * (amplitude.double() - 1)), None
+
+    def state(self) -> tuple[dict[str, Tensor], Header]:
+        self.check_fitted()
+        return self.field.state_dict() | {"centre": self.centre}, self._header()
+
+    @classmethod
+    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
+        model = cls._of_header(header)
+        expect(tensors, {"centre": (3,)})
+        model.centre = tensors.pop("centre").double()
+        model.field = restored(model._blank, tensors)
+        return model

@@ -45,7 +45,7 @@ from swiftwrf.models.base import FIXED_END
 from swiftwrf.models.mlp import SkipMLP, encode
 from swiftwrf.models.primitives import MAX_WIDTH_RAD, min_width
 from swiftwrf.rasterize import rasterize_magnitude
-from swiftwrf.runtime.session import State
+from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, PositiveInt, configuration
 
 SHAPES = ("log_scale", "quaternion", "opacity")  # of the Gaussians, in the order of the optimiser's first groups
@@ -320,8 +320,8 @@ class GaussianTraining(Training[nn.ModuleDict]):
             self.gaussians[name] = new
         self.pull = self.pull.new_zeros(len(row))
 
-    def _restore(self, saved: State) -> None:
-        n = len(saved.tensors["model.gaussians.mean"])
+    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
+        n = len(tensors["model.gaussians.mean"])
         self._take(torch.zeros(n, dtype=torch.int64, device=self.pull.device), n_old=0)
         self.average = self.averaged()
-        super()._restore(saved)
+        super()._restore(tensors, header)

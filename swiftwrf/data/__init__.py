@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.beamforming import PHASE
@@ -56,15 +57,14 @@ def load_spectra(
         Traceback (most recent call last):
         swiftwrf.errors.InputError: nowhere is not a folder or file; expected measurements (formats: ...)
     """
-    directions = None if grid is None else AngularGrid.of(grid)
     options = ReadOptions(
-        array,
-        beamformer,
-        directions,
-        every,
-        station,
-        subcarriers,
-        bandwidth,
+        array=array,
+        beamformer=beamformer,
+        grid=None if grid is None else AngularGrid.of(grid),
+        every=every,
+        station=station,
+        subcarriers=subcarriers,
+        bandwidth=bandwidth,
         drop_null=drop_null,
         drop_elements=drop_elements,
         round_trip=round_trip,
@@ -73,17 +73,8 @@ def load_spectra(
     return data.spectra(options.grid, options.beamformer or PHASE) if isinstance(data, Snapshots) else data
 
 
-@checked
-def load_snapshots(
-    path: str | Path,
-    *,
-    every: PositiveInt | None = None,
-    station: PositiveInt | None = None,
-    drop_null: bool = False,
-    drop_elements: tuple[int, ...] = (),
-    round_trip: bool = False,
-) -> Snapshots:
-    """Read array snapshots, with arguments as in `load_spectra`.
+def load_snapshots(path: str | Path, **options: Any) -> Snapshots:
+    """Read array snapshots, with `every`, `station`, `drop_null`, `drop_elements` and `round_trip` as in `load_spectra`.
 
     Raises:
         InputError: As `load_spectra`.
@@ -93,10 +84,7 @@ def load_snapshots(
         Traceback (most recent call last):
         swiftwrf.errors.InputError: nowhere is not a folder or file; ...
     """
-    options = ReadOptions(
-        every=every, station=station, drop_null=drop_null, drop_elements=drop_elements, round_trip=round_trip
-    )
-    data: Snapshots = read(path, options, SNAPSHOT_FORMATS)
+    data: Snapshots = read(path, ReadOptions(**options), SNAPSHOT_FORMATS)
     return data
 
 
@@ -147,13 +135,12 @@ def load_rssi(
         ...     load_rssi(file).receiver_names
         ('kitchen', 'hall')
     """
-    values = None if filler is None else tuple(map(float, filler))
     options = ReadOptions(
         columns=columns,
-        filler=values,
+        filler=filler,
         coordinates=coordinates,
         offset_by=offset_by,
-        transmitter=tuple(transmitter),
+        transmitter=transmitter,
         pool_by=pool_by,
         scale=scale,
         y_down=y_down,

@@ -42,11 +42,7 @@ def array_names(file: Path) -> set[str]:
 def read_arrays(file: Path, needed: Sequence[str], optional: Sequence[str] = (), kinds: str = NUMBERS) -> Arrays:
     """Return arrays of numbers from an npz archive, HDF5 or MATLAB file. Compounds of real and imaginary parts are complex.
 
-    Args:
-        file: The archive.
-        needed: Names of arrays.
-        optional: Names of arrays that may be missing.
-        kinds: NumPy kinds of the arrays in an npz archive. Defaults to numbers.
+    Arrays of an npz archive may be of other NumPy `kinds`.
 
     Raises:
         InputError: No such file, a broken one, an array that is missing or holds no numbers, or one that unpacks to more

@@ -141,14 +141,10 @@ def find_roles(
 
 
 def receiver_columns(table: pd.DataFrame, names: Sequence[str]) -> tuple[list[str], list[str], list[str]]:
-    """Return the columns of a wide table that hold the RSSI of receivers, others that look like it, and notes on these.
+    """Return those columns that hold the RSSI of receivers, others that look like it, and notes on these.
 
     Names of other quantities are left out. Of several columns whose names are nothing but received power, the most specific
     one counts. Other columns must be akin to columns of received power, by their names or by their values.
-
-    Args:
-        table: Columns.
-        names: Those without another role.
 
     Example:
         >>> table = pd.DataFrame({"AP1": [-60] * 9, "AP2": [-70] * 9, "SNR": [-3] * 9, "drift": [-20.5] * 9})
@@ -161,8 +157,10 @@ def receiver_columns(table: pd.DataFrame, names: Sequence[str]) -> tuple[list[st
     bare = [name for name in candidates(table, "rssi") if name in found]
     weaker = bare[1:]
     found = [name for name in found if name not in (*others, *weaker)]
-    powers = {name: _powers(table[name]) for name in found}
-    plausible = [name for name in found if _is_plausible(powers[name])] or found
+    values = {name: parsed(table[name])[0] for name in found}
+    powers = {name: v[np.isfinite(v) & ~np.isin(v, KNOWN_FILLERS)] for name, v in values.items()}
+    usual = {n: not len(p) or (np.median(p) <= MIN_REFERENCE_DBM and (p > 0).mean() < 0.02) for n, p in powers.items()}
+    plausible = [name for name in found if usual[name]] or found
     whole = [name for name in plausible if (powers[name] % 1 == 0).all()]
     reference = whole if len(whole) > 1 or set(whole) & set(bare) else plausible
     if len(table) < MIN_ROWS:  # e.g. one of a stream
@@ -179,22 +177,11 @@ def receiver_columns(table: pd.DataFrame, names: Sequence[str]) -> tuple[list[st
         )
     found = [name for name in found if name not in doubtful]
     families = pd.Series([_kinship(plain[name]) for name in found], dtype=object)
-    usual = families.value_counts()
-    if len(usual) > 1 and usual.iloc[0] >= max(3, 0.6 * len(found)):
-        odd = [name for name, family in zip(found, families, strict=True) if family != usual.index[0]]
+    sizes = families.value_counts()
+    if len(sizes) > 1 and sizes.iloc[0] >= max(3, 0.6 * len(found)):
+        odd = [name for name, family in zip(found, families, strict=True) if family != sizes.index[0]]
         notes.append(f"columns count as receivers though they are named unlike the others: {listed(odd)}")
     return found, [*others, *weaker, *doubtful], notes
-
-
-def _powers(column: pd.Series) -> Floats:
-    """Return the values of a column that may be received powers."""
-    values = parsed(column)[0]
-    return values[np.isfinite(values) & ~np.isin(values, KNOWN_FILLERS)]
-
-
-def _is_plausible(power: Floats) -> bool:
-    """Return True if values are received powers without a name that states it."""
-    return len(power) == 0 or bool(np.median(power) <= MIN_REFERENCE_DBM and (power > 0).mean() < 0.02)
 
 
 def _kinship(name: str) -> str:
@@ -209,14 +196,8 @@ def check_receiver_known(
 ) -> None:
     """Refuse a table with one column of RSSI beside names that may be those of its receivers.
 
-    Such names repeat. Several of them occur at one place and time, or they alternate from row to row.
-
-    Args:
-        label: Name of the table, for messages.
-        table: Its columns.
-        rssi: Column of RSSI.
-        others: Columns without a role.
-        place: Columns of position and time.
+    Such names repeat in one of the other columns. Several of them occur at one place and time, or they alternate from row to
+    row.
 
     Raises:
         InputError: The question whether the column contains the receivers.

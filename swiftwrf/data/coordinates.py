@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
+import pandas as pd
 import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from swiftwrf.data.cells import PIXELS, UNITS, unit_of
 from swiftwrf.errors import InputError
 
 Floats = NDArray[np.float64]
@@ -87,6 +89,24 @@ class PlanFrame(NamedTuple):
         return np.stack([x, -z, y] if self.up == "y" else [x, y, z], axis=1)
 
 
+def frame_of(label: object, table: pd.DataFrame, names: Sequence[str], frame: PlanFrame) -> tuple[PlanFrame, list[str]]:
+    """Return the frame of coordinates in two columns, with the scale and direction that they state, and notes on these."""
+    unit, stated = unit_of(table[names[0]]), stated_scale(table.attrs.get("preamble", ""))
+    scale = frame.scale or stated
+    if unit in PIXELS and scale is None:
+        raise InputError(f"{label}: columns {' and '.join(names)} are in pixels; give --scale PIXELS_PER_METRE")
+    in_pixels = unit in PIXELS or (frame.scale is None and stated is not None and not unit)
+    frame = PlanFrame(UNITS.get(unit) or scale or 1.0, frame.y_down or in_pixels, frame.up)
+    notes = []
+    if frame.scale != 1:
+        notes.append(f"columns {' and '.join(names)} have {frame.scale:.4g} {unit or 'units'} in a metre")
+    if frame.y_down:
+        notes.append(f"{names[1]} points down, so y is its negative")
+    if frame.up != "z":
+        notes.append(f"{frame.up} points up in the table, so its axes x, y, z are x, z, -y of the data")
+    return frame, notes
+
+
 class GeodeticOrigin(NamedTuple):
     """Point where local metres (x east, y north) touch the WGS84 ellipsoid, by azimuthal equidistant projection.
 
@@ -144,13 +164,10 @@ def degree_columns(origin: GeodeticOrigin | None, xy: Floats) -> dict[str, Float
 
 
 def without_fix(position: Floats) -> tuple[NDArray[np.bool_], list[str]]:
-    """Return which positions are no fix, and notes on them.
+    """Return which positions (n, 3) in any unit are no fix, and notes on them.
 
     An empty position is no fix. Neither is x = y = 0 if it is far from all others, if it occurs more often than any other
     position without being the neighbour of one, or if z is 0 there alone. The same holds for -1, 999 and 9999, if repeated.
-
-    Args:
-        position: Coordinates (n, 3) in any unit, nan where they are empty.
 
     Example:
         >>> without_fix(np.array([[50.0, 5.0, 1.0], [50.0, 6.0, 1.0], [np.nan, 5.0, 1.0], [0.0, 0.0, 0.0]]))[0]
@@ -185,11 +202,6 @@ def _is_apart(others: Floats, same: Floats) -> bool:
 
 def plain_degrees(label: object, names: tuple[str, str], xy: Floats) -> tuple[Floats, list[str]]:
     """Return longitudes and latitudes (n, 2) [deg] that may be in units of 1e-7 degrees or ddmm.mmmm, and a note on these.
-
-    Args:
-        label: Name of the table, for messages.
-        names: Names of both columns.
-        xy: Values of the columns of longitude and latitude, (n, 2).
 
     Raises:
         InputError: Values that may be ddmm.mmmm or metres.
@@ -233,9 +245,8 @@ def degrees_in(
         InputError: Values that are no degrees though the user states it, or that may be either.
 
     Example:
-        >>> degrees_in("walk.csv", ("x", "y"), np.array([[11.0, 48.0], [11.0, 48.001]]), False, None)
-        array([[48.   , 11.   ],
-               [48.001, 11.   ]])
+        >>> degrees_in("walk.csv", ("x", "y"), np.array([[11.0, 48.0], [11.0, 48.001]]), False, None)[1].tolist()
+        [48.001, 11.0]
     """
     columns = f"{label}: columns {names[0]} and {names[1]}"
     if asked == "metres":

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
-from swiftwrf.data.splits import choose_split
+from swiftwrf.data.splits import MIN_TRAINING, block_split, random_split
 from swiftwrf.errors import CONTENT_ERRORS, InputError, optional_module
 from swiftwrf.plotting import Displayed, extent
 from swiftwrf.positions import check_positions, to_tensor
@@ -182,7 +182,19 @@ class PositionedData(Labelled, Displayed):
         Raises:
             InputError: An unknown name, another seed than a whole number, or fewer than 10 training rows.
         """
-        train, test = choose_split(name, seed, self._position, self.named_splits, self.name)
+        made = {"random": random_split, "block": block_split}
+        if name in self.named_splits:
+            train, test = self.named_splits[name]
+        elif name in made:
+            train, test = made[name](self._position, seed)
+        else:
+            known = ", ".join(sorted({*self.named_splits, *made}))
+            raise InputError(f"{self.name} has no split {name!r}; choose one of {known}")
+        if len(train) < MIN_TRAINING:
+            raise InputError(
+                f"split {name!r} of {self.name} has {len(train)} training measurements, too few to fit anything; at least "
+                f"{MIN_TRAINING} are needed"
+            )
         return self.subset(train), self.subset(test)
 
     def to_frame(self) -> pd.DataFrame:
@@ -200,11 +212,8 @@ class PositionedData(Labelled, Displayed):
 
     def to_numpy(self) -> tuple[NDArray[np.float64], NDArray[Any]]:
         """Return positions X (n, 3) [m] and measurements y, as scikit-learn takes them; no copies where possible."""
-        return self._position.numpy(), self._measured().numpy()
-
-    def _measured(self) -> Tensor:
-        """Return what is measured at each position."""
-        raise NotImplementedError
+        measured: NDArray[Any] = next(iter(self.variables().values()))[1]
+        return self._position.numpy(), measured
 
     def __repr__(self) -> str:
         head = f"<{type(self).__name__} {self.name!r}: {self._summary()},"

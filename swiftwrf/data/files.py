@@ -29,9 +29,6 @@ MAX_TEXT_BYTES = 2**28  # a million rows of positions take a tenth of it
 MAX_PREAMBLE_LINES = 20  # before the header of a table
 MAX_MISSING_CELLS = 3  # at the end of all rows
 DECIMAL_COMMA = re.compile(r"^(\s*[+-]?\d+),(\d+\s*)$")
-PLAIN_TAGS = {
-    f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "timestamp", "seq", "map")
-}
 
 
 def sha256(file: Path) -> str:
@@ -42,11 +39,6 @@ def sha256(file: Path) -> str:
     """
     with refusing_unreadable(file), file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def sha256_of_all(digests: Iterable[tuple[str, str]]) -> str:
-    """Return one digest for many files, from pairs of their names and digests."""
-    return hashlib.sha256("".join(f"{digest}  {name}\n" for name, digest in digests).encode()).hexdigest()
 
 
 def digests(files: Iterable[Path], split_folder: Path | None = None) -> dict[str, str]:
@@ -105,15 +97,15 @@ def number(text: object) -> float:
 
 
 def read_yaml(file: Path) -> dict[str, Any]:
-    """Return a YAML mapping. Scalars stay text, so that a name such as `NA` or `2001-01-01` stays a name.
+    """Return a YAML mapping. Scalars stay text, so a name such as `NA` or `2001-01-01` stays a name, and no objects arise.
 
     Raises:
-        InputError: No such file, not YAML, not a mapping, a name twice, or a tag (YAML's way to create objects).
+        InputError: No such file, not YAML, not a mapping, or a name twice.
     """
     text = read_text(file)
     try:
         content = yaml.load(text, Loader=_PlainLoader)
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
+    except (yaml.YAMLError, RecursionError, TypeError, ValueError) as error:
         raise InputError(f"{file} is not valid YAML: {error or 'nested too deeply'}") from None
     if not isinstance(content, dict):
         raise InputError(f"{file} must hold names and values, got {type(content).__name__}")
@@ -121,16 +113,9 @@ def read_yaml(file: Path) -> dict[str, Any]:
 
 
 class _PlainLoader(yaml.BaseLoader):
-    """Loader of texts, lists and mappings, without tags and with each name once, of which YAML would keep the last."""
-
-    def construct_object(self, node: Any, deep: bool = False) -> Any:
-        if node.tag not in PLAIN_TAGS:
-            raise ValueError(f"the tag {node.tag} is not allowed")
-        return super().construct_object(node, deep)
+    """Loader of texts, lists and mappings that refuses a name given twice, of which YAML would keep the last."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
-        if not all(isinstance(key, yaml.ScalarNode) for key, _ in node.value):
-            raise ValueError("a name must be text")
         names = [key.value for key, _ in node.value]
         if len(set(names)) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
@@ -261,7 +246,9 @@ def _regular(label: object, lines: list[list[str]]) -> tuple[list[str], list[lis
     for row, line in enumerate(rows, start=1):
         if len(line) != len(names):
             raise InputError(f"{label} row {row} has {len(line)} values, but the header has {len(names)}")
-    if len(rows) > 1 and _is_second_header(rows[0], rows[1]):
+    filled = [column for column, cell in enumerate(rows[0]) if cell.strip()]
+    is_text = all(math.isnan(number(rows[0][c])) and not NO_VALUE.fullmatch(rows[0][c]) for c in filled)
+    if len(rows) > 1 and is_text and sum(not math.isnan(number(rows[1][c])) for c in filled) > 1:  # e.g. of units
         notes.append(f"row 1 is a second header and left out: {', '.join(filter(None, rows[0]))}")
         rows = rows[1:]
     nameless = [column for column, name in enumerate(names) if not name]
@@ -283,13 +270,6 @@ def _regular(label: object, lines: list[list[str]]) -> tuple[list[str], list[lis
 
 def _names_in(line: list[str]) -> list[str]:
     return [name.strip().removeprefix("#").strip() for name in line]
-
-
-def _is_second_header(row: list[str], below: list[str]) -> bool:
-    """Return True for a row of text alone above numbers, e.g. of units or names of networks."""
-    filled = [column for column, cell in enumerate(row) if cell.strip()]
-    is_text = all(math.isnan(number(row[column])) and not NO_VALUE.fullmatch(row[column]) for column in filled)
-    return is_text and sum(not math.isnan(number(below[column])) for column in filled) > 1
 
 
 def read_xyz(file: Path) -> NDArray[np.float64]:

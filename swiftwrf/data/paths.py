@@ -70,11 +70,6 @@ class PropagationPaths:
         return self.corner[..., 0].isfinite().sum(dim=1)
 
     @property
-    def power_db(self) -> Tensor:
-        """Sum of the powers of each link's paths, relative to the transmitted power, float64 (n,)."""
-        return 10 * torch.zeros(len(self.count)).double().index_add(0, self.owner, self.gain.abs().square()).log10()
-
-    @property
     def reached(self) -> PropagationPaths:
         """The links that have a path."""
         some = self.count > 0
@@ -91,12 +86,7 @@ class PropagationPaths:
         return point
 
     def channel(self, array: PlanarArray, rotation: Tensor | None = None) -> Tensor:
-        """Return the channel of an array at each receiver, complex128 (n, K).
-
-        Args:
-            array: The array.
-            rotation: Matrix that rotates array into world coordinates, (3, 3). Defaults to a level array.
-        """
+        """Return the channel of an array, level or rotated into world coordinates, at each receiver, complex128 (n, K)."""
         direction = self.direction if rotation is None else self.direction @ rotation
         return array.channel(direction, self.gain, self.owner, len(self.count))
 
@@ -114,13 +104,6 @@ class PropagationPaths:
         Raises:
             InputError: Several frequencies where the lengths of the paths are unknown, one frequency with a bandwidth, or a
                 bandwidth that no carrier has.
-
-        Example:
-            >>> ends = torch.zeros(1, 3).double(), torch.tensor([[3.0, 0, 0]]).double()
-            >>> one, back = torch.ones(1), torch.tensor([[-1.0, 0, 0]]).double()
-            >>> paths = PropagationPaths(*ends, one.long(), back, one.cdouble(), one.bool(), 2.4e9, length=3 * one.double())
-            >>> paths.subcarriers(PlanarArray.square(2, 2.4e9), 3, 40e6)[1].tolist()
-            [2380000000.0, 2400000000.0, 2420000000.0]
         """
         if not (bandwidth_hz == 0 if number == 1 else 1e3 <= bandwidth_hz < self.frequency_hz):
             raise InputError(
@@ -174,7 +157,7 @@ class PropagationPaths:
             InputError: An array for another carrier, spectra of too many pixels, or as `subcarriers`.
         """
         grid = grid or GRID
-        check_pixels(name, len(self.count), grid)
+        check_pixels(name, len(self.count), grid.shape)
         array, wavelength = array or PlanarArray.square(4, self.frequency_hz), LIGHT_SPEED / self.frequency_hz
         if abs(array.wavelength - wavelength) > 1e-3 * wavelength:
             raise InputError(

@@ -112,13 +112,9 @@ def end_of_scale(rssi: Floats) -> list[str]:
 
 
 def check_powers(label: object, rssi: Floats, receivers: Sequence[str], source: NDArray[np.int64]) -> None:
-    """Refuse RSSI (n, R) that is no received power.
+    """Refuse RSSI (n, R) [dBm] that is no received power.
 
-    Args:
-        label: Name of the table, for messages.
-        rssi: Values, (n, R) [dBm], nan where not detected.
-        receivers: R names.
-        source: Row of each value in the table, counted from 0, (n, R) or (n, 1).
+    The row of a value in the table, counted from 0, is its source (n, R) or (n, 1).
 
     Raises:
         InputError: The first such value, with its row and receiver.

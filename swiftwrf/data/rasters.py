@@ -6,16 +6,17 @@ longitude and latitude (WGS84).
 
 from __future__ import annotations
 
+import io
 import json
-import struct
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from xml.sax.saxutils import escape
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.errors import InputError
@@ -24,7 +25,6 @@ from swiftwrf.runtime.durable import write_bytes, write_text
 Floats = NDArray[np.floating]
 DEGREE_DECIMALS = 8  # of coordinates in GeoJSON: 1 mm
 SHORT, LONG, DOUBLE, ASCII = 3, 4, 12, 2  # types of TIFF values
-FORMATS = {SHORT: "H", LONG: "I", DOUBLE: "d"}
 USER_DEFINED, WGS84, METRE, DEGREE, AZIMUTHAL_EQUIDISTANT = 32767, 4326, 9001, 9102, 12  # codes of GeoTIFF 1.1
 
 
@@ -45,18 +45,8 @@ class Cells(NamedTuple):
 
 
 def write_geotiff(file: Path, bands: Mapping[str, Floats], cells: Cells) -> None:
-    """Write bands (rows, columns) by name as a GeoTIFF of float32, the northernmost row first.
-
-    Args:
-        file: File to write.
-        bands: Values by name of the band, rows from south to north, nan for no data.
-        cells: Places of the values.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
-    strips = [zlib.compress(np.ascontiguousarray(band[::-1], dtype="<f4").tobytes()) for band in bands.values()]
-    start = 8 + np.cumsum([0, *map(len, strips[:-1])])
+    """Write bands (rows, columns) by name as a GeoTIFF of float32. Their rows run from south to north, nan is no data."""
+    pixels = zlib.compress(np.stack([band[::-1] for band in bands.values()], axis=-1).astype("<f4").tobytes())
     west, north = cells.x[0] - cells.edge / 2, cells.y[-1] + cells.edge / 2
     names = "".join(  # GDAL escapes descriptions twice
         f'<Item name="DESCRIPTION" sample="{number}" role="description">{escape(escape(name))}</Item>'
@@ -64,30 +54,33 @@ def write_geotiff(file: Path, bands: Mapping[str, Floats], cells: Cells) -> None
     )
     keys, numbers = _geo_keys(cells.origin)
     n = len(bands)
-    tags: list[tuple[int, int, Sequence[float] | str]] = [
+    tags: list[tuple[int, int, Any]] = [
         (256, LONG, [len(cells.x)]),  # width
         (257, LONG, [len(cells.y)]),  # length
         (258, SHORT, [32] * n),  # bits of a sample
         (259, SHORT, [8]),  # compression: deflate
         (262, SHORT, [1]),  # photometric interpretation: black is zero
-        (273, LONG, start.tolist()),  # offsets of the strips
+        (273, LONG, [0]),  # offset of the only strip, after the directory
         (277, SHORT, [n]),  # samples of a pixel
         (278, LONG, [len(cells.y)]),  # rows of a strip
-        (279, LONG, [len(strip) for strip in strips]),  # bytes of the strips
-        (284, SHORT, [2]),  # planar configuration: one band after the other
+        (279, LONG, [len(pixels)]),  # bytes of the strip
+        (284, SHORT, [1]),  # planar configuration: the bands of a pixel follow each other
         (338, SHORT, [0] * (n - 1)),  # extra samples
         (339, SHORT, [3] * n),  # sample format: floating point
         (33550, DOUBLE, [cells.edge, cells.edge, 0.0]),  # scale of a pixel
         (33922, DOUBLE, [0.0, 0.0, 0.0, west, north, 0.0]),  # pixel 0, 0 and its place
         (34735, SHORT, keys),
         (34736, DOUBLE, numbers),
-        (42112, ASCII, f"<GDALMetadata>{names}</GDALMetadata>"),
+        (42112, ASCII, f"<GDALMetadata>{names}</GDALMetadata>".encode()),
         (42113, ASCII, "nan"),  # no data
     ]
-    body = b"".join(strips)
-    body += b"\0" * (len(body) % 2)
-    directory = _directory([tag for tag in tags if len(tag[2])], 8 + len(body))
-    write_bytes(file, struct.pack("<2sHI", b"II", 42, 8 + len(body)) + body + directory)
+    directory, stream = ImageFileDirectory_v2(), io.BytesIO()
+    for tag, kind, values in tags:
+        if len(values):
+            directory.tagtype[tag] = kind
+            directory[tag] = values
+    directory.save(stream)
+    write_bytes(file, stream.getvalue() + pixels)
 
 
 def _geo_keys(origin: GeodeticOrigin | None) -> tuple[list[int], list[float]]:
@@ -114,31 +107,10 @@ def _geo_keys(origin: GeodeticOrigin | None) -> tuple[list[int], list[float]]:
     return [1, 1, 1, len(entries), *(number for entry in entries for number in entry)], numbers
 
 
-def _directory(tags: Sequence[tuple[int, int, Sequence[float] | str]], start: int) -> bytes:
-    """Return a TIFF directory that begins at byte `start`, followed by the values that it does not hold itself."""
-    entries, beyond = struct.pack("<H", len(tags)), b""
-    place = start + 2 + 12 * len(tags) + 4
-    for tag, kind, values in tags:
-        if isinstance(values, str):
-            content, count = values.encode() + b"\0", len(values.encode()) + 1
-        else:
-            content, count = struct.pack(f"<{len(values)}{FORMATS[kind]}", *values), len(values)
-        if len(content) > 4:
-            inside = struct.pack("<I", place + len(beyond))
-            beyond += content + b"\0" * (len(content) % 2)
-        else:
-            inside = content.ljust(4, b"\0")
-        entries += struct.pack("<HHI", tag, kind, count) + inside
-    return entries + struct.pack("<I", 0) + beyond
-
-
 def write_geojson(file: Path, bands: Mapping[str, Floats], cells: Cells) -> None:
     """Write a GeoJSON collection (RFC 7946) with one square for each cell, whose properties are the values by band.
 
-    Args:
-        file: File to write.
-        bands: Values (rows, columns) by name, rows from south to north, nan for no data. They are written with 2 decimals.
-        cells: Places of the values.
+    Rows of the bands run from south to north, nan is no data. Values are written with 2 decimals.
 
     Raises:
         InputError: Cells in local metres.
@@ -171,9 +143,6 @@ def write_world_file(file: Path, cells: Cells) -> None:
     """Write the world file of an image of the cells, the northernmost row on top.
 
     It contains longitude and latitude (WGS84), exact in the middle of the map, or x and y [m] without an origin.
-
-    Raises:
-        OSError: The file cannot be written.
     """
     middle = np.array([(cells.x[0] + cells.x[-1]) / 2, (cells.y[0] + cells.y[-1]) / 2])
     place = middle + cells.edge * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, -1.0]])

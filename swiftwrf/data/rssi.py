@@ -13,15 +13,15 @@ import torch
 from torch import Tensor
 
 from swiftwrf.data.columns import Groups, numbered
-from swiftwrf.data.coordinates import Coordinates, Floors, GeodeticOrigin, Up
+from swiftwrf.data.coordinates import Floors, GeodeticOrigin
 from swiftwrf.data.dataset import Arrays, Numbers, PositionedData, position_coordinates, to_positions
 from swiftwrf.data.powers import check_powers
 from swiftwrf.data.splits import MIN_TRAINING, Validation, random_split, validation_for
-from swiftwrf.data.survey import read_survey
+from swiftwrf.data.survey import TableOptions, read_survey
 from swiftwrf.errors import InputError, listed
 from swiftwrf.plotting import MARK, Axes, plan
 from swiftwrf.positions import to_tensor
-from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, checked
+from swiftwrf.runtime.validation import NonNegativeInt, checked
 
 META = "meta.csv"  # file of the NeRF2 layout with a row for each measurement
 SURVEY = "survey.yml"  # file of the toolkit's own layout with properties of all measurements
@@ -138,35 +138,17 @@ class Rssi(PositionedData):
         cls,
         frame: pd.DataFrame,
         *,
-        columns: Mapping[str, str] | None = None,
-        filler: Numbers | None = None,
-        coordinates: Coordinates | None = None,
-        offset_by: str | None = None,
-        transmitter: Sequence[str] = (),
-        pool_by: str | None = None,
-        scale: PositiveFloat | None = None,
-        y_down: bool = False,
-        up: Up = "z",
-        window: PositiveFloat | None = None,
         receiver_position: Mapping[str, Sequence[float]] | None = None,
         name: str = "rssi",
+        **options: Any,
     ) -> Rssi:
         """Return the RSSI of a table: one column a receiver (wide) or one row a packet (long).
 
         Args:
             frame: Columns of positions [m] and RSSI [dBm], recognised by their names as in docs/formats.md.
-            columns: Names of columns that are not recognised, by role, as in `load_rssi`.
-            filler: Values that stand for not detected, [] for none. Defaults to those that are recognised.
-            coordinates: "degrees" or "metres". Defaults to the unit that is recognised.
-            offset_by: Column with the groups of rows between which RSSI has constant offsets.
-            transmitter: Columns with the position of the second end of the link where both ends move, as in `load_rssi`.
-            pool_by: Radios of one access point to pool, as in `load_rssi`.
-            scale: Units of x and y in a metre, as in `load_rssi`.
-            y_down: y points down, as in images.
-            up: Axis that points up.
-            window: Length [s] of the windows in which packets are joined, as in `load_rssi`.
             receiver_position: Positions [m] by name of the receiver; those of others are unknown.
             name: Name of the data set.
+            options: `columns`, `filler` and the others that `load_rssi` takes.
 
         Raises:
             InputError: A column that is missing or ambiguous, or a value that is no position or received power.
@@ -175,21 +157,7 @@ class Rssi(PositionedData):
             >>> Rssi.from_frame(pd.DataFrame({"x": [0, 1], "y": [0, 1], "z": [1, 1], "hall": [-50, -60]})).receiver_names
             ('hall',)
         """
-        values = None if filler is None else tuple(to_tensor("filler", filler, torch.float64, (None,)).tolist())
-        found = read_survey(
-            "the table",
-            frame,
-            columns=columns,
-            filler=values,
-            coordinates=coordinates,
-            offset_by=offset_by,
-            transmitter=tuple(transmitter),
-            pool_by=pool_by,
-            scale=scale,
-            y_down=y_down,
-            up=up,
-            window=window,
-        )
+        found = read_survey("the table", frame, TableOptions(**options))
         if receiver_position:
             places = [list(receiver_position.get(receiver, UNKNOWN)) for receiver in found["receiver_names"]]
             found["receiver_position"] = places
@@ -211,11 +179,7 @@ class Rssi(PositionedData):
         return ~self.rssi_dbm.isnan()
 
     def about(self, origin: GeodeticOrigin | None) -> Rssi:
-        """Return the data in local metres about another origin.
-
-        Args:
-            origin: Origin of the metres. With None, or if the data have none, nothing changes.
-        """
+        """Return the data in local metres about another origin. With None, or if the data have none, nothing changes."""
         if origin is None or self.origin is None or origin == self.origin:
             return self
         own = self.origin
@@ -356,9 +320,6 @@ class Rssi(PositionedData):
             "receiver_position": (("receiver", "axis"), self.receiver_position.numpy(), {"units": "m"}),
         }
 
-    def _measured(self) -> Tensor:
-        return self.rssi_dbm
-
     def _summary(self) -> str:
         share = float(self.detected.double().mean()) if len(self) else 0.0
         return f"{len(self)} rows at {len(self.receiver_names)} receivers, {share:.0%} detected"
@@ -397,12 +358,7 @@ class Offsets:
 
 @checked
 def receiver_row(names: Sequence[str], asked: str, owner: str) -> int:
-    """Return the index of a receiver.
-
-    Args:
-        names: Names of all receivers.
-        asked: Name, or number counted from 1.
-        owner: What has these receivers, for the message.
+    """Return the index of a receiver that is asked for by its name or its number from 1; the owner is for the message.
 
     Raises:
         InputError: An unknown receiver.

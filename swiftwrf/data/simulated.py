@@ -11,8 +11,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -46,25 +44,6 @@ PACKET_NOISE_DB = 2.0
 SENSITIVITY_DBM = -85.0  # of a simple receiver: weaker packets leave their cells empty
 
 
-class Rays(NamedTuple):
-    """Straight lines from receivers to the image sources of transmitters.
-
-    Args:
-        transmitter, receiver: Positions of both ends, (n, 3) [m].
-        vector: From receiver to image source, (n, 25, 3) [m].
-        length: Length of each path, (n, 25) [m].
-        n_reflections: Number of reflections of each path, (25,).
-        clear: Whether no box blocks the path, bool (n, 25).
-    """
-
-    transmitter: Tensor
-    receiver: Tensor
-    vector: Tensor
-    length: Tensor
-    n_reflections: Tensor
-    clear: Tensor
-
-
 @configuration
 class ShoeboxRoom:
     """A rectangular room with one corner at the origin.
@@ -91,37 +70,11 @@ class ShoeboxRoom:
     """frequency of the carrier [Hz]"""
 
     def paths(self, transmitter: Tensor, receiver: Tensor) -> PropagationPaths:
-        """Return the 25 paths with at most two reflections of each link, the direct path first.
-
-        Args:
-            transmitter: Positions, (n, 3) [m]. Both ends broadcast.
-            receiver: Positions, (n, 3) [m].
+        """Return the 25 paths with at most two reflections of each link between positions (n, 3) [m], the direct path first.
 
         Raises:
             InputError: A position outside the room, or both ends at one position.
         """
-        rays = self.rays(transmitter, receiver)
-        n, n_paths = rays.length.shape
-        return PropagationPaths(
-            transmitter=rays.transmitter,
-            receiver=rays.receiver,
-            count=torch.full((n,), n_paths),
-            direction=(rays.vector / rays.length[..., None]).flatten(0, 1),
-            gain=self.gain(rays).flatten(),
-            line_of_sight=rays.clear[:, 0],
-            frequency_hz=self.frequency_hz,
-            length=rays.length.flatten(),
-        )
-
-    def gain(self, rays: Rays) -> Tensor:
-        """Return the complex gain of each path at the carrier, (n, 25)."""
-        wavelength = LIGHT_SPEED / self.frequency_hz
-        amplitude = wavelength / (4 * math.pi * rays.length) * self.reflection**rays.n_reflections
-        amplitude = torch.where(rays.clear, amplitude, self.blockage * amplitude)
-        return amplitude * torch.polar(torch.ones_like(rays.length), -2 * math.pi / wavelength * rays.length)
-
-    def rays(self, transmitter: Tensor, receiver: Tensor) -> Rays:
-        """Return the geometry of the paths, which does not depend on the carrier; arguments and errors as `paths`."""
         transmitter, receiver = torch.broadcast_tensors(transmitter.double(), receiver.double())
         size = torch.tensor(self.size, dtype=torch.float64)
         for name, position in (("transmitter", transmitter), ("receiver", receiver)):
@@ -138,7 +91,20 @@ class ShoeboxRoom:
         if bool((length == 0).any()):
             raise InputError("transmitter and receiver stand at one place, so there is no direction between them")
         clear = ~self._blocked(receiver, ray, rooms)
-        return Rays(transmitter, receiver, ray, length, rooms.abs().sum(-1), clear)
+        wavelength = LIGHT_SPEED / self.frequency_hz
+        amplitude = wavelength / (4 * math.pi * length) * self.reflection ** rooms.abs().sum(-1)
+        amplitude = torch.where(clear, amplitude, self.blockage * amplitude)
+        gain = amplitude * torch.polar(torch.ones_like(length), -2 * math.pi / wavelength * length)
+        return PropagationPaths(
+            transmitter=transmitter,
+            receiver=receiver,
+            count=torch.full((len(length),), len(rooms)),
+            direction=(ray / length[..., None]).flatten(0, 1),
+            gain=gain.flatten(),
+            line_of_sight=clear[:, 0],
+            frequency_hz=self.frequency_hz,
+            length=length.flatten(),
+        )
 
     def _blocked(self, receiver: Tensor, ray: Tensor, rooms: Tensor) -> Tensor:
         """Return whether a box blocks each path, bool (n, 25)."""
@@ -162,12 +128,9 @@ class ShoeboxRoom:
 
 
 def _hits(segments: Sequence[tuple[Tensor, Tensor]], low: Point, high: Point) -> Tensor:
-    """Return whether segments pass through the box between the corners low and high, bool (...).
+    """Return whether segments pass through the box between two corners, bool (...).
 
-    Args:
-        segments: Start and step (...) along each axis; no step is 0.
-        low: Corner of lowest coordinates.
-        high: Opposite corner.
+    Segments are start and step (...) along each axis; no step is 0.
     """
     enter = torch.zeros_like(segments[0][0])
     leave = torch.ones_like(enter)
@@ -287,7 +250,11 @@ def rssi_room(n: PositiveInt = 600, seed: NonNegativeInt = 0) -> Rssi:
 
 def _power(position: Tensor, receiver: Tensor) -> Tensor:
     """Return the power gain of the coherent sum of all paths on each channel, (n, channels) [dB]."""
-    floors = [replace(FLOOR, frequency_hz=f) for f in CHANNELS_HZ]
-    rays = (FLOOR.rays(some, receiver) for some in position.split(BATCH_POSITIONS))
-    sums = torch.cat([torch.stack([floor.gain(part).sum(dim=1).abs() for floor in floors], dim=1) for part in rays])
-    return 20 * sums.clamp_min(1e-9).log10()
+    paths = PropagationPaths.joined([FLOOR.paths(some, receiver) for some in position.split(BATCH_POSITIONS)])
+    assert paths.length is not None
+    power = []
+    for frequency in CHANNELS_HZ:
+        turn = -math.tau / LIGHT_SPEED * (frequency - FLOOR.frequency_hz) * paths.length
+        gain = FLOOR.frequency_hz / frequency * paths.gain * torch.polar(torch.ones_like(turn), turn)
+        power.append(20 * gain.reshape(len(position), -1).sum(dim=1).abs().clamp_min(1e-9).log10())
+    return torch.stack(power, dim=1)

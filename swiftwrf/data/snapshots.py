@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -120,26 +120,15 @@ class Snapshots(PositionedData):
             InputError: An unknown beamformer, too few snapshots for it, or spectra of too many pixels.
         """
         grid = AngularGrid.of(grid or GRID)
-        check_pixels(self.name, len(self), grid)
-        same = (
-            "position",
-            "line_of_sight",
-            "index",
-            "named_splits",
-            "array",
-            "source",
-            "fixed_position",
-            "rotation",
-            "channel",
-            "frequency_hz",
-        )
+        check_pixels(self.name, len(self), grid.shape)
+        same = "position line_of_sight index named_splits array source fixed_position rotation channel frequency_hz"
         return Spectra(
             store=array_spectra(self.array, self.channel, grid, beamformer),
             grid=grid,
             moving="transmitter",
             name=self.name,
             notes=self.notes,
-            **{field: getattr(self, field) for field in same},
+            **{field: getattr(self, field) for field in same.split()},
         )
 
     def _columns(self) -> dict[str, Any]:
@@ -148,9 +137,6 @@ class Snapshots(PositionedData):
 
     def variables(self) -> Arrays:
         return {"channel": (("position", "snapshot", "element"), self.channel.numpy())}
-
-    def _measured(self) -> Tensor:
-        return self.channel
 
     def _summary(self) -> str:
         return f"{len(self)} channels of {self.channel.shape[1]} snapshots, {self.array.summary}"
@@ -174,26 +160,15 @@ def check_spacing(file: Path, array: PlanarArray) -> None:
         )
 
 
-class Measured(NamedTuple):
-    """Channel (n, S, K) without what is missing, its snapshots and elements among those of the source, and notes."""
+def measured(
+    source: Path, channel: Tensor, drop_null: bool = False, drop: Sequence[int] = ()
+) -> tuple[Tensor, Tensor, Tensor, tuple[str, ...]]:
+    """Return a channel (n, S, K) without what is missing, its snapshots and elements among those given, and notes.
 
-    channel: Tensor
-    snapshot: Tensor
-    element: Tensor
-    notes: tuple[str, ...]
+    Missing are values that are 0 or NaN. They become 0, which beamformers do not use.
 
-
-def measured(source: Path, channel: Tensor, drop_null: bool = False, drop: Sequence[int] = ()) -> Measured:
-    """Return a channel (n, S, K) with missing values as 0: those that are 0 or NaN. Beamformers do not use them.
-
-    Elements without any value are left out, so are snapshots if other rows have fewer of them. Null, guard and DC
-    subcarriers hold a constant or nothing: they are the same at every position and element.
-
-    Args:
-        source: File or folder, for messages.
-        channel: Complex channels.
-        drop_null: Leave out null subcarriers, too.
-        drop: Elements to leave out, counted from 0.
+    Elements to drop, counted from 0, and those without any value are left out. So are snapshots if other rows have fewer of
+    them. Null, guard and DC subcarriers hold a constant or nothing: they are the same at every position and element.
 
     Raises:
         InputError: A position without any value, fewer than 2 elements, or one to leave out that does not exist.
@@ -245,7 +220,7 @@ def measured(source: Path, channel: Tensor, drop_null: bool = False, drop: Seque
             )
     if some := int((missing & ~empty[..., None]).sum()):
         notes.append(f"{some} of {missing.numel()} values of single elements are 0 or NaN and not used")
-    return Measured(channel[:, kept], kept.nonzero()[:, 0], used.nonzero()[:, 0], tuple(notes))
+    return channel[:, kept], kept.nonzero()[:, 0], used.nonzero()[:, 0], tuple(notes)
 
 
 def round_trip_array(array: PlanarArray) -> tuple[PlanarArray, tuple[str, ...]]:

@@ -19,7 +19,7 @@ from swiftwrf.array.planar import PlanarArray, folded_angles
 from swiftwrf.choices import Moving
 from swiftwrf.data.dataset import Arrays, Numbers, PositionedData, to_positions, to_rotation
 from swiftwrf.data.splits import MIN_TRAINING
-from swiftwrf.data.store import BATCH_PIXELS, MAX_MEMORY_PIXELS, Store, stored, too_many
+from swiftwrf.data.store import BATCH_PIXELS, MAX_FILE_PIXELS, MAX_FINE_PIXELS, MAX_MEMORY_PIXELS, Store, stored
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import WINDOW
 from swiftwrf.plotting import Axes, mark_direction, polar_spectrum
@@ -239,9 +239,6 @@ class Spectra(PositionedData):
             "line_of_sight": (("position",), self.line_of_sight.numpy()),
         }
 
-    def _measured(self) -> Tensor:
-        return self.spectrum
-
     def _summary(self) -> str:
         rows, columns = self.grid.shape
         array = f", {self.array.summary}" if self.array else ""
@@ -316,26 +313,24 @@ def direction_of_link(
     return folded_angles(array, torch.stack(to_angles(towards @ rotation), dim=-1))
 
 
-def check_pixels(name: str, n: int, grid: AngularGrid) -> None:
-    """Raise InputError if there are more pixels than any measurement has.
+def check_pixels(name: str, n: int, shape: Sequence[int]) -> None:
+    """Refuse n spectra of a shape (rows, columns) with more pixels than any measurement has.
 
     Raises:
         InputError: The spectra exceed 2^34 pixels, or 2^29 pixels at more than 2^20 pixels each.
     """
-    if too_many((n, *grid.shape)):
+    each = math.prod(shape)
+    if n * each > MAX_FILE_PIXELS or (n * each > MAX_MEMORY_PIXELS and each > MAX_FINE_PIXELS):
         raise InputError(
-            f"{name} has {n} positions, whose spectra would have {n * math.prod(grid.shape):.3g} pixels; take "
-            "one measurement of several (every) or a coarser grid"
+            f"{name} has {n} positions, whose spectra would have {n * each:.3g} pixels; take one measurement of several "
+            "(every) or a coarser grid"
         )
 
 
 def coarsening(shape: Sequence[int], max_azimuths: int, least_rows: int = 1) -> int:
     """Return the smallest factor that divides both sizes and brings spectra to at most `max_azimuths` columns.
 
-    Args:
-        shape: Rows and columns of the spectra.
-        max_azimuths: Largest number of columns. 0 stands for all pixels.
-        least_rows: Smallest number of rows. If no factor leaves that many, the result is 1.
+    A maximum of 0 stands for all pixels. If no factor leaves `least_rows`, the result is 1.
     """
     least = math.ceil(shape[1] / max_azimuths) if max_azimuths else 1
     factors = range(least, shape[0] // least_rows + 1)

@@ -34,28 +34,24 @@ def split_names(folder: Path) -> list[str]:
 def read_splits(folder: Path, n: int, first: int) -> dict[str, tuple[Tensor, Tensor]]:
     """Return training and test rows of all splits in a folder, int64, in file order and counted from 0.
 
-    Args:
-        folder: Folder of `train_index[_NAME].txt` and `test_index[_NAME].txt`. Files without a name are the split random.
-        n: Number of measurements.
-        first: Number of the first measurement in the files: 1 for spectra, 0 for RSSI.
+    Files are `train_index[_NAME].txt` and `test_index[_NAME].txt`. The first of n measurements has the number `first`:
+    1 for spectra, 0 for RSSI.
 
     Raises:
         InputError: A missing file, a value that is no whole number, an index out of range, twice in a part or in both parts.
     """
-    return {name: _read_split(folder, name, n, first) for name in split_names(folder)}
-
-
-def _read_split(folder: Path, name: str, n: int, first: int) -> tuple[Tensor, Tensor]:
-    named = name != "random" or (folder / "train_index_random.txt").is_file()
-    suffix = f"_{name}" if named else ""
-    train, test = (_read_indices(folder / f"{part}_index{suffix}.txt", n, first) for part in ("train", "test"))
-    both = sorted(set(train) & set(test))
-    if both:
-        raise InputError(
-            f"split {name!r} in {folder} has index {both[0] + first} in both its training and its test part "
-            f"({len(both)} such); take them out of one"
-        )
-    return torch.tensor(train, dtype=torch.int64), torch.tensor(test, dtype=torch.int64)
+    splits = {}
+    for name in split_names(folder):
+        named = name != "random" or (folder / "train_index_random.txt").is_file()
+        suffix = f"_{name}" if named else ""
+        train, test = (_read_indices(folder / f"{part}_index{suffix}.txt", n, first) for part in ("train", "test"))
+        if both := sorted(set(train) & set(test)):
+            raise InputError(
+                f"split {name!r} in {folder} has index {both[0] + first} in both its training and its test part "
+                f"({len(both)} such); take them out of one"
+            )
+        splits[name] = torch.tensor(train, dtype=torch.int64), torch.tensor(test, dtype=torch.int64)
+    return splits
 
 
 def _read_indices(file: Path, n: int, first: int) -> list[int]:
@@ -87,9 +83,8 @@ def kept_splits(splits: dict[str, tuple[Tensor, Tensor]], kept: Tensor, n: int) 
         {'days': (tensor([0]), tensor([1]))}
     """
     number = torch.full((n,), -1).scatter(0, kept, torch.arange(len(kept)))
-    return {
-        name: (a[a >= 0], b[b >= 0]) for name, (a, b) in ((k, (number[x], number[y])) for k, (x, y) in splits.items())
-    }
+    parts = {name: (number[train], number[test]) for name, (train, test) in splits.items()}
+    return {name: (train[train >= 0], test[test >= 0]) for name, (train, test) in parts.items()}
 
 
 def places(position: Tensor, n_parts: int) -> Tensor:
@@ -199,23 +194,18 @@ def folds(
     if validation == "session":
         if session is None:
             raise InputError('validation="session" needs measurements with sessions, see docs/formats.md')
-        if len(session.unique()) > 1:
-            return _whole(session, number)
+        _, own, size = session.unique(return_inverse=True, return_counts=True)
+        if len(size) > 1:  # whole sessions in folds of nearly equal size
+            fold, filled = torch.zeros_like(size), torch.zeros(min(number, len(size)), dtype=torch.int64)
+            for which in size.argsort(descending=True, stable=True).tolist():
+                fold[which] = filled.argmin()
+                filled[fold[which]] += size[which]
+            return fold[own]
     if validation == "block":
         return slabs(position, number)
     place = places(position, number)
     order = torch.randperm(len(place.unique()), generator=torch.Generator().manual_seed(seed))
     return (order % number)[place]
-
-
-def _whole(session: Tensor, number: int) -> Tensor:
-    """Return folds of whole sessions, of nearly equal size."""
-    _, own, size = session.unique(return_inverse=True, return_counts=True)
-    fold, filled = torch.zeros_like(size), torch.zeros(min(number, len(size)), dtype=torch.int64)
-    for which in size.argsort(descending=True, stable=True).tolist():
-        fold[which] = filled.argmin()
-        filled[fold[which]] += size[which]
-    return fold[own]
 
 
 def validation_for(split: str) -> Validation:
@@ -227,10 +217,6 @@ def matching_validation(train: Tensor, test: Tensor) -> Validation:
     """Return the kind of folds whose held-out distances resemble those of the test positions.
 
     A distance is that to the nearest training position (C. Mila et al., Methods in Ecology and Evolution 13, 2022).
-
-    Args:
-        train: Training positions, (n, 3) [m].
-        test: Positions of the test rows, (m, 3) [m].
 
     Example:
         >>> line = torch.linspace(0, 99, 100)[:, None] * torch.tensor([1.0, 0.0, 0.0])
@@ -249,29 +235,3 @@ def matching_validation(train: Tensor, test: Tensor) -> Validation:
 
     kinds: tuple[Validation, Validation] = ("random", "block")
     return min(kinds, key=misfit)
-
-
-def choose_split(
-    name: str, seed: int, position: Tensor, named: dict[str, tuple[Tensor, Tensor]], data: str
-) -> tuple[Tensor, Tensor]:
-    """Return training and test rows of a split that came with the data, or of a seeded random or block split.
-
-    Raises:
-        InputError: An unknown name, or fewer than 10 training measurements.
-    """
-    if name in named:
-        train, test = named[name]
-    elif name == "random":
-        train, test = random_split(position, seed)
-    elif name == "block":
-        train, test = block_split(position, seed)
-    else:
-        raise InputError(
-            f"{data} has no split {name!r}; choose one of {', '.join(sorted({*named, 'random', 'block'}))}"
-        )
-    if len(train) < MIN_TRAINING:
-        raise InputError(
-            f"split {name!r} of {data} has {len(train)} training measurements, too few to fit anything; "
-            f"at least {MIN_TRAINING} are needed"
-        )
-    return train, test

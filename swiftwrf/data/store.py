@@ -119,12 +119,6 @@ class Store:
         return digest.hexdigest()
 
 
-def too_many(shape: tuple[int, int, int]) -> bool:
-    """Return True if spectra (n, H, W) have more pixels than any measurement has."""
-    pixels, each = math.prod(shape), math.prod(shape[1:])
-    return pixels > MAX_FILE_PIXELS or (pixels > MAX_MEMORY_PIXELS and each > MAX_FINE_PIXELS)
-
-
 def stored(
     shape: tuple[int, int, int], dtype: torch.dtype, key: Callable[[], str], make: Callable[[], Iterable[Tensor]]
 ) -> Store:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 import yaml
 from scipy.io import savemat
@@ -28,11 +30,7 @@ from swiftwrf.runtime.durable import replacing, write_bytes, write_text
 
 
 def write_spectra(data: Spectra, folder: Path) -> None:
-    """Write gateway_info.yml, tx_pos.csv or rx_pos.csv, spectrum.npz and the splits.
-
-    Args:
-        data: Spectra with known fixed end and orientation.
-        folder: Existing folder.
+    """Write gateway_info.yml, tx_pos.csv or rx_pos.csv, spectrum.npz and the splits into a folder.
 
     Raises:
         InputError: Both ends move, the orientation is unknown, or the layout does not have the grid.
@@ -48,41 +46,36 @@ def write_spectra(data: Spectra, folder: Path) -> None:
     if data.array is not None:
         gateway |= {"frequency_hz": data.array.frequency_hz, "element_position": data.array.element.tolist()}
     write_text(folder / "gateway_info.yml", yaml.safe_dump({"gateway1": gateway}, sort_keys=False))
-    write_text(folder / f"{'tx' if data.moving == 'transmitter' else 'rx'}_pos.csv", _csv("x,y,z", data.position))
+    write_text(
+        folder / f"{'tx' if data.moving == 'transmitter' else 'rx'}_pos.csv", _csv(["x", "y", "z"], data.position)
+    )
     with replacing(folder / "spectrum.npz") as temporary, zipfile.ZipFile(temporary, "w") as archive:
         with archive.open("spectrum.npy", "w", force_zip64=True) as stream:
             dtype, batches = data.store.exact()
             write_npy(stream, data.store.shape, dtype, batches)
         with archive.open("line_of_sight.npy", "w") as stream:
             np.save(stream, data.line_of_sight.numpy())
-    _write_splits(data.named_splits, folder, first=1)
+    write_splits(data.named_splits, folder, first=1)
 
 
 def write_rssi(data: Rssi, folder: Path) -> None:
-    """Write tx_pos.csv, gateway_rssi.csv, the splits, and what else is known of the measurements.
+    """Write tx_pos.csv, gateway_rssi.csv, the splits, and what else is known of the measurements, into a folder.
 
     That is meta.csv with sessions and times, gateway_position.yml with positions of receivers, and survey.yml with the
     origin of the coordinates, the floors, and whether the receiver moves.
 
     Measurements of exactly -100 dBm, which the layout uses for not detected, are written as -99.99.
-
-    Args:
-        data: RSSI, nan where not detected.
-        folder: Existing folder.
     """
     rssi = data.rssi_dbm.where(data.rssi_dbm != NOT_DETECTED_DBM, NOT_DETECTED_DBM + 0.01)
-    quoted = ",".join('"' + name.replace('"', '""') + '"' for name in data.receiver_names)
-    write_text(folder / "gateway_rssi.csv", _csv(quoted, rssi.nan_to_num(NOT_DETECTED_DBM)))
-    write_text(folder / "tx_pos.csv", _csv("x,y,z", data.transmitter_position))
+    write_text(folder / "gateway_rssi.csv", _csv(list(data.receiver_names), rssi.nan_to_num(NOT_DETECTED_DBM)))
+    write_text(folder / "tx_pos.csv", _csv(["x", "y", "z"], data.transmitter_position))
     if data.located:
         known = zip(data.receiver_names, data.receiver_position.tolist(), data.receiver_located.tolist(), strict=True)
         places = {name: position for name, position, is_located in known if is_located}
         write_text(folder / "gateway_position.yml", yaml.safe_dump(places, sort_keys=False, allow_unicode=True))
     of_rows = {"session": data.session, "time": data.time}
-    columns = {name: values.tolist() for name, values in of_rows.items() if values is not None}
-    if columns:
-        rows = (",".join(map(repr, row)) for row in zip(*columns.values(), strict=True))
-        write_text(folder / META, "\n".join([",".join(columns), *rows, ""]))
+    if columns := {name: values.numpy() for name, values in of_rows.items() if values is not None}:
+        write_text(folder / META, pd.DataFrame(columns).to_csv(index=False))
     survey: dict[str, Any] = {}
     if data.origin is not None:
         survey["origin"] = list(data.origin)
@@ -92,16 +85,11 @@ def write_rssi(data: Rssi, folder: Path) -> None:
         survey["receiver_moves"] = True
     if survey:
         write_text(folder / SURVEY, yaml.safe_dump(survey, sort_keys=False, allow_unicode=True))
-    _write_splits(data.named_splits, folder, first=0)
+    write_splits(data.named_splits, folder, first=0)
 
 
 def write_paths(paths: PropagationPaths, folder: Path) -> None:
-    """Write paths.npz.
-
-    Args:
-        paths: At least one path a link, with known corners.
-        folder: Existing folder.
-    """
+    """Write paths with known corners, at least one a link, as paths.npz."""
     stream = io.BytesIO()
     length: dict[str, Any] = {} if paths.length is None else {"length": paths.length.numpy()}
     np.savez_compressed(
@@ -119,13 +107,9 @@ def write_paths(paths: PropagationPaths, folder: Path) -> None:
 
 
 def write_deepmimo(paths: PropagationPaths, folder: Path) -> None:
-    """Write the folder of a DeepMIMO v4 scenario, which `load_spectra` reads.
+    """Write paths of known length from one transmitter as a folder of a DeepMIMO v4 scenario, which `load_spectra` reads.
 
     Interactions (`inter`) are 0 for direct paths and nan for others, whose kinds the paths do not contain.
-
-    Args:
-        paths: Paths of known length from one transmitter.
-        folder: Existing folder.
 
     Raises:
         InputError: Unknown lengths, or several transmitters.
@@ -154,30 +138,26 @@ def write_deepmimo(paths: PropagationPaths, folder: Path) -> None:
     empty = torch.full((len(paths.count), int(paths.count.max())), torch.nan, dtype=torch.float64)
     arrays = {name: empty.index_put(place, values.double()) for name, values in columns.items()}
     for name, values in (arrays | {"rx_pos": paths.receiver, "tx_pos": transmitter}).items():
-        with replacing(folder / f"{name}_{'t000_tx000_r001'}.npz") as temporary, temporary.open("wb") as stream:
+        with replacing(folder / f"{name}_t000_tx000_r001.npz") as temporary, temporary.open("wb") as stream:
             np.savez_compressed(stream, **{name: values.numpy()})
     params = {"rt_params": {"frequency": paths.frequency_hz, "raytracer_name": "SwiftWRF"}}
     write_text(folder / "params.json", json.dumps(params, indent=1) + "\n")
 
 
 def write_mat(data: Labelled, file: Path) -> None:
-    """Write coordinates and variables as a MATLAB file of version 5: arrays of one dimension as (n, 1), names as cells.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Write coordinates and variables as a MATLAB file of version 5: arrays of one dimension as (n, 1), names as cells."""
     arrays = {name: values for name, (_, values, *_) in (data.coordinates() | data.variables()).items()}
     arrays |= {name: values.astype(object) for name, values in arrays.items() if values.dtype.kind == "U"}  # to cells
     with replacing(file) as temporary, temporary.open("wb") as stream:
         savemat(stream, arrays, do_compression=True, oned_as="column")
 
 
-def _csv(header: str, values: Tensor) -> str:
-    rows = (",".join(f"{value!r}" for value in row) for row in values.tolist())
-    return "\n".join([header, *rows]) + "\n"
+def _csv(columns: list[str], values: Tensor) -> str:
+    return str(pd.DataFrame(values.numpy(), columns=columns).to_csv(index=False))
 
 
-def _write_splits(splits: dict[str, tuple[Tensor, Tensor]], folder: Path, first: int) -> None:
+def write_splits(splits: Mapping[str, tuple[Tensor, Tensor]], folder: Path, first: int) -> None:
+    """Write the rows of splits, of which row 0 gets the number `first`: 1 for spectra, 0 for RSSI."""
     for name, parts in splits.items():
         suffix = "" if name == "random" else f"_{name}"
         for part, rows in zip(("train", "test"), parts, strict=True):

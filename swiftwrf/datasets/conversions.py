@@ -17,7 +17,7 @@ from scipy.io import loadmat
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.powers import NOT_DETECTED_DBM
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.writing import write_paths, write_rssi
+from swiftwrf.data.writing import write_paths, write_rssi, write_splits
 from swiftwrf.errors import InputError
 
 Split = tuple[torch.Tensor, torch.Tensor]
@@ -50,9 +50,7 @@ def s23(raw: Path, out: Path) -> None:
     """Copy the spectra, which have the layout already, and add the split of the path's last part."""
     shutil.copytree(raw / "data_test200", out, dirs_exist_ok=True)
     count = len(list((out / "spectrum").glob("*.png")))
-    numbers = range(1, count + 1)
-    for part, rows in (("train", numbers[:S23_TRAINING]), ("test", numbers[S23_TRAINING:])):
-        (out / f"{part}_index_block.txt").write_text("".join(f"{row}\n" for row in rows))
+    write_splits({"block": _parts(np.arange(count) >= S23_TRAINING)}, out, first=1)
 
 
 class _TableUnpickler(pickle.Unpickler):
@@ -175,7 +173,7 @@ def lora(raw: Path, out: Path) -> None:
     )
     survey.to_csv(out / "survey.csv", index=False)
     (out / "receivers.csv").write_text("receiver,x,y,z\ngw_rssi,0,0,0\ned_rssi,0,0,0\n")
-    _write_split(out, "foot", len(parts[0]), len(table))
+    write_splits({"foot": _parts(np.arange(len(table)) >= len(parts[0]))}, out, first=0)
 
 
 def fingerprints(raw: Path, out: Path) -> None:
@@ -189,7 +187,7 @@ def fingerprints(raw: Path, out: Path) -> None:
     names = [f"WAP{number:03d}" for number in range(1, parts[0].shape[1] - 3)]
     table = pd.DataFrame(np.vstack(parts), columns=["x", "y", "z", "floor", *names])
     table.astype({"floor": int}).to_csv(out / "survey.csv", index=False)
-    _write_split(out, "published", len(parts[0]), len(table))
+    write_splits({"published": _parts(np.arange(len(table)) >= len(parts[0]))}, out, first=0)
 
 
 def wifi_room(raw: Path, out: Path, room: str) -> None:
@@ -213,12 +211,6 @@ def wifi_room(raw: Path, out: Path, room: str) -> None:
 def _write_rssi(rssi: Any, position: Any, names: Any, places: Any, splits: dict[str, Split], out: Path) -> None:
     data = Rssi(rssi, position, receiver_names=list(names), receiver_position=places, named_splits=splits)
     write_rssi(data, out)
-
-
-def _write_split(out: Path, name: str, first: int, count: int) -> None:
-    """Write a split whose first rows train."""
-    for part, rows in (("train", range(first)), ("test", range(first, count))):
-        (out / f"{part}_index_{name}.txt").write_text("".join(f"{row}\n" for row in rows))
 
 
 def _parts(is_test: Mask) -> Split:

@@ -30,7 +30,14 @@ from swiftwrf.array.beamforming import of_unit_power, unit
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.splits import FOLDS, MIN_TRAINING, slabs
-from swiftwrf.diagnostics.elements import NOISE, constant_phases, noisy_elements, unit_phasor
+from swiftwrf.diagnostics.elements import (
+    constant_phases,
+    in_noise,
+    noisy_elements,
+    rotation_matrix,
+    some_rows,
+    unit_phasor,
+)
 from swiftwrf.errors import InputError, ranges
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import checked
@@ -72,7 +79,7 @@ class Calibration:
         """Return the snapshots with corrected phases of the elements and orientation of the array."""
         correction = unit_phasor(-self.phase).to(torch.complex64)
         return replace(
-            snapshots, channel=snapshots.channel * correction, rotation=snapshots.rotation @ _matrix(self.turn)
+            snapshots, channel=snapshots.channel * correction, rotation=snapshots.rotation @ rotation_matrix(self.turn)
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -154,8 +161,8 @@ def calibrate(train: Snapshots) -> Calibration:
         mean = problem.direction.mean(dim=0).expand_as(problem.direction)
         cone = float(angular_distance(problem.direction, mean).median())
         reason = "phases change from position to position as no direct path explains"
-        if noise := noisy_elements(seen, problem.away @ _matrix(found.turn)):
-            reason = NOISE.format(listed=", ".join(map(str, noise)), option=" ".join(map(str, noise)))
+        if noise := noisy_elements(seen, problem.away @ rotation_matrix(found.turn)):
+            reason = in_noise(noise)
         elif cone < math.radians(20) and clear >= len(seen) / 2:
             reason = "measure positions in more directions from the array"
         raise InputError(f"{train.name} does not determine {' and '.join(open_ones)}; {reason}")
@@ -207,8 +214,7 @@ class _Problem:
 
     def scan(self) -> _Found:
         """Return the best of the scanned rotations, with its phases."""
-        n = len(self.direction)
-        few = self.subset(torch.linspace(0, n - 1, min(150, n)).round().long())
+        few = self.subset(some_rows(len(self.away), 150))
         # a cubic grid of a third of the beam of a 4 x 4 array within the largest rotation
         step = math.radians(9)
         line = torch.arange(-MAX_TURN, MAX_TURN + step / 2, step, dtype=torch.float64)
@@ -241,7 +247,7 @@ class _Problem:
         residual = self.strongest * self._response(found).conj()
         residual = (residual * residual.sum(1, keepdim=True).conj()).angle()
         n, k = residual.shape
-        turned = self.direction @ _matrix(found.turn)
+        turned = self.direction @ rotation_matrix(found.turn)
         axes = torch.eye(3, dtype=torch.float64).expand(n, 3, 3)
         slope = torch.linalg.cross(turned[:, None].expand(n, 3, 3), axes, dim=-1)  # of exp(-[t]) d at t = 0: d x t
         by_phase = torch.eye(k, dtype=torch.float64)[:, 1:].expand(n, k, k - 1)
@@ -264,7 +270,7 @@ class _Problem:
         return self._steering(found.turn) * unit_phasor(found.phase)
 
     def _steering(self, turn: Tensor) -> Tensor:
-        away = self.away @ _matrix(turn)
+        away = self.away @ rotation_matrix(turn)
         return unit_phasor(
             self.array.phase_at(away) if self.curved else self.array.phase(away / away.norm(dim=1, keepdim=True))
         )
@@ -293,11 +299,6 @@ class _Problem:
             out = fold == number
             after[out] = self.subset(out).shares(self.subset(~out).descend(found))
         return float(self.shares(nothing).mean()), float(after.mean())
-
-
-def _matrix(turn: Tensor) -> Tensor:
-    """Return the matrix of a rotation vector (3,)."""
-    return torch.from_numpy(Rotation.from_rotvec(turn.numpy()).as_matrix())
 
 
 def _degrees(std: Tensor) -> str:

@@ -10,10 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import torch
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
 from torch import Tensor
+from torch.nn import functional
 
 from swiftwrf.array.beamforming import unit
 from swiftwrf.array.planar import PlanarArray
@@ -32,9 +35,7 @@ ROUND_TRIP = (
 def other_readings(data: Snapshots, away: Tensor) -> Iterator[tuple[str, float, Snapshots]]:
     """Yield each error, its number of fitted parameters, and the snapshots as they would be read without it.
 
-    Args:
-        data: Snapshots.
-        away: Points (n, 3) [m] in array coordinates where direct paths begin.
+    Direct paths begin at points `away` (n, 3) [m] in array coordinates.
     """
     channel, array = data.channel, data.array
     for name, order in _element_orders(array).items():
@@ -84,7 +85,7 @@ def _ranks(values: Tensor, tolerance: float) -> Tensor:
     """Return the rank of each value among the distinct ones."""
     ordered, order = values.sort()
     rank = torch.empty_like(order)
-    rank[order] = torch.nn.functional.pad((ordered.diff() > tolerance).long().cumsum(0), (1, 0))
+    rank[order] = functional.pad((ordered.diff() > tolerance).long().cumsum(0), (1, 0))
     return rank
 
 
@@ -93,16 +94,21 @@ def wave_from(data: Snapshots, away: Tensor) -> Tensor:
 
     Waves are spheres if points lie in the near field and spheres fit the channels better.
     """
-    plane = unit_phasor(data.array.phase(away / away.norm(dim=1, keepdim=True).clamp_min(1e-12)))
+    plane = unit_phasor(data.array.phase(functional.normalize(away, dim=1)))
     if float(away.norm(dim=1).min()) > data.array.far_field_m:
         return plane
     curved = unit_phasor(data.array.phase_at(away))
     return max(plane, curved, key=lambda wave: float(_coherence(unit_channel(data) * wave[:, None].conj()).mean()))
 
 
+def residual_of(data: Snapshots, away: Tensor) -> Tensor:
+    """Return the residual phases (n, S, K) of channels beside waves from points `away` (n, 3) [m]."""
+    return unit_channel(data) * wave_from(data, away)[:, None].conj()
+
+
 def evidence(data: Snapshots, away: Tensor) -> Tensor:
     """Return the fraction (n,) of the power that arrives from points `away` (n, 3) [m], in excess of random phases."""
-    return excess(_coherence(unit_channel(data) * wave_from(data, away)[:, None].conj()), 1 / data.channel.shape[2])
+    return excess(_coherence(residual_of(data, away)), 1 / data.channel.shape[2])
 
 
 def excess(share: Tensor, chance: float) -> Tensor:
@@ -144,11 +150,16 @@ def best_order(data: Snapshots, away: Tensor) -> Tensor:
 
 def noisy_elements(data: Snapshots, away: Tensor) -> list[int]:
     """Return the elements whose phase follows no other element, counted from 0, if most others follow each other."""
-    residual = (unit_channel(data) * wave_from(data, away)[:, None].conj()).flatten(0, 1)
+    residual = residual_of(data, away).flatten(0, 1)
     coherence = (residual.T @ residual.conj() / len(residual)).abs().fill_diagonal_(0)
     others = coherence.sort(dim=1, descending=True).values[:, : max(1, len(coherence) // 2)].mean(dim=1)
     noise = others < 0.25
     return noise.nonzero()[:, 0].tolist() if bool((others[~noise] > 0.5).all()) and int((~noise).sum()) >= 2 else []
+
+
+def in_noise(elements: list[int]) -> str:
+    """Return in words that elements, counted from 0, hold noise."""
+    return NOISE.format(listed=", ".join(map(str, elements)), option=" ".join(map(str, elements)))
 
 
 def sloped(data: Snapshots, away: Tensor) -> Tensor:
@@ -176,7 +187,7 @@ def sloped(data: Snapshots, away: Tensor) -> Tensor:
 def flipping_elements(data: Snapshots, away: Tensor) -> tuple[list[int], Tensor]:
     """Return the elements whose phase changes by half a turn from measurement to measurement, and the evidence (n,).
 
-    Elements count from 1. Of two groups that flip against each other, the larger one counts as steady.
+    Elements count from 0. Of two groups that flip against each other, the larger one counts as steady.
     """
     channel, steering = unit_channel(data), wave_from(data, away)
     residual = channel * steering[:, None].conj()
@@ -196,7 +207,7 @@ def flipping_elements(data: Snapshots, away: Tensor) -> tuple[list[int], Tensor]
     cosine = (residual * unit_phasor(-reference)).real.abs().mean(dim=(0, 1))
     if bool((cosine[~steady] < 0.85).any()):  # phases that change by other angles; random ones have a mean of 0.64
         return [], torch.zeros(len(data))
-    return ((~steady).nonzero()[:, 0] + 1).tolist(), excess(mended.mean(dim=1), float(chance))
+    return (~steady).nonzero()[:, 0].tolist(), excess(mended.mean(dim=1), float(chance))
 
 
 def _without_flips(residual: Tensor) -> tuple[Tensor, Tensor]:
@@ -222,7 +233,7 @@ def constant_phases(data: Snapshots) -> Tensor:
 
 def uncalibrated(data: Snapshots, away: Tensor) -> Tensor:
     """Return the evidence (n,) for constant phases of the elements beside those of the direct paths."""
-    residual = unit_channel(data) * wave_from(data, away)[:, None].conj()
+    residual = residual_of(data, away)
     rows = residual.flatten(0, 1)
     phase = torch.linalg.eigh(rows.T @ rows.conj()).eigenvectors[:, -1]
     return excess(_coherence(residual * unit(phase).conj()), 1 / residual.shape[2])
@@ -230,10 +241,19 @@ def uncalibrated(data: Snapshots, away: Tensor) -> Tensor:
 
 def unit_channel(data: Snapshots) -> Tensor:
     """Return the phases of some snapshots of each position, complex128 (n, S, K)."""
-    few = data.channel[:, :: max(1, data.channel.shape[1] // 8)]
-    return unit(few)
+    return unit(data.channel[:, :: max(1, data.channel.shape[1] // 8)])
 
 
 def unit_phasor(phase: Tensor) -> Tensor:
     """Return exp(j phase) for phases [rad] of any shape."""
     return torch.polar(torch.ones_like(phase), phase)
+
+
+def rotation_matrix(turn: Any) -> Tensor:
+    """Return the matrix (3, 3) of a rotation vector (3,) [rad], a tensor or an array."""
+    return torch.from_numpy(Rotation.from_rotvec(turn).as_matrix())
+
+
+def some_rows(n: int, most: int) -> Tensor:
+    """Return the numbers of at most `most` of n rows, equally spaced."""
+    return torch.linspace(0, n - 1, min(most, n)).round().long()

@@ -17,7 +17,7 @@ sight that the error implies: peaks alone may agree by chance.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -41,7 +41,9 @@ from swiftwrf.diagnostics.elements import (
     excess,
     flipping_elements,
     other_readings,
+    rotation_matrix,
     sloped,
+    some_rows,
     uncalibrated,
 )
 from swiftwrf.errors import ranges
@@ -110,9 +112,7 @@ class FrameReport:
         peak_span_deg: Median angle between the peaks of two positions [deg].
         behind: Fraction of the lines of sight that lie behind the array. 0 for a linear array, which has no front.
         explanations: Errors with clearly more agreement than the declared frame, in words; several are not distinguished.
-        explained: Agreement with them.
         turn_deg: Constant rotation with more agreement, as a rotation vector in array coordinates [deg], or None.
-        positions: Number of positions used.
     """
 
     agreement: float
@@ -124,9 +124,7 @@ class FrameReport:
     peak_span_deg: float
     behind: float
     explanations: tuple[str, ...]
-    explained: float
     turn_deg: tuple[float, float, float] | None
-    positions: int
 
     @property
     def follows(self) -> bool:
@@ -137,16 +135,6 @@ class FrameReport:
     def fits(self) -> bool:
         """True if the declared frame explains most peaks, and no other frame does clearly better."""
         return self.follows and self.angle_deg <= self.limit_deg and self.elsewhere <= MAX_ELSEWHERE
-
-    @property
-    def narrow(self) -> bool:
-        """True if all lines of sight have nearly one direction, so that frames cannot be checked."""
-        return self.span_deg < 10
-
-    @property
-    def steady(self) -> bool:
-        """True if the spectra hardly differ, although the lines of sight do."""
-        return not self.narrow and self.peak_span_deg < self.span_deg / 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +153,7 @@ class _Frame:
 
     def towards(self) -> Tensor:
         """Return unit vectors of the line of sight in array coordinates, (n, 3)."""
-        return _unit(self.away())
+        return functional.normalize(self.away(), dim=1)
 
     def direction(self) -> Tensor:
         """Return `towards`, folded to the directions that the array distinguishes."""
@@ -215,13 +203,12 @@ class _Hypothesis:
         return float(self.evidence.mean()) - COST * self.free
 
 
-def check_frames(spectra: Spectra, snapshots: Snapshots | None = None, beamformer: str = PHASE) -> FrameReport | None:
+def check_frames(spectra: Spectra, snapshots: Snapshots | None = None) -> FrameReport | None:
     """Compare the peaks of the spectra with the lines of sight, in the declared frame and in others.
 
     Args:
         spectra: Spectra with known fixed end and orientation. Positions without line of sight are omitted.
         snapshots: Snapshots that the spectra were computed from, to try other orders of their elements and axes.
-        beamformer: Beamformer of those spectra.
 
     Returns:
         The report, or None with fewer than 20 such positions or an unknown frame.
@@ -234,7 +221,7 @@ def check_frames(spectra: Spectra, snapshots: Snapshots | None = None, beamforme
     rows = spectra.line_of_sight.nonzero()[:, 0]
     if len(rows) < MIN_CLEAR_POSITIONS or spectra.fixed_position is None or spectra.rotation is None:
         return None
-    rows = rows[torch.linspace(0, len(rows) - 1, min(300, len(rows))).round().long()]
+    rows = rows[some_rows(len(rows), 300)]
     sign = 1.0 if spectra.moving == "transmitter" else -1.0
     frame = _Frame(spectra.position[rows], spectra.fixed_position, spectra.rotation, sign, spectra.array)
     peak, direction = frame.peaks(spectra.store[rows], spectra.grid), frame.direction()
@@ -249,7 +236,10 @@ def check_frames(spectra: Spectra, snapshots: Snapshots | None = None, beamforme
     is_clear = best - declared >= (MIN_EVIDENCE if seen is None else MIN_POWER)
     explained = [name for name in names if is_clear and name != UNCALIBRATED and _reaches(tried[name])]
     turn = next((tried[name].turn for name in explained if tried[name].turn is not None), None)
-    angle_deg, limit_deg = _nearest(direction, peak).rad2deg(), _limit_deg(spectra)
+    angle_deg, limit_deg = _nearest(direction, peak).rad2deg(), 10.0
+    if spectra.array is not None:
+        pixel = math.degrees(max(spectra.grid.elevation_step, spectra.grid.azimuth_step))
+        limit_deg = min(limit_deg, math.degrees(spectra.array.resolution) + pixel / 2)
     return FrameReport(
         agreement=agreement,
         chance=chance,
@@ -260,21 +250,15 @@ def check_frames(spectra: Spectra, snapshots: Snapshots | None = None, beamforme
         peak_span_deg=_span_deg(peak[:, 0]),
         behind=0.0 if frame.linear else float((frame.away()[:, 2] < 0).double().mean()),
         explanations=tuple(name for name in explained if tried[name].turn is None),
-        explained=best if explained else declared,
         turn_deg=None if turn is None else tuple(np.degrees(turn).tolist()),
-        positions=len(rows),
     )
-
-
-def _limit_deg(spectra: Spectra) -> float:
-    """Return the median angle [deg] between peak and line of sight up to which they are in one frame."""
-    pixel = math.degrees(max(spectra.grid.elevation_step, spectra.grid.azimuth_step))
-    return 10.0 if spectra.array is None else min(10.0, math.degrees(spectra.array.resolution) + pixel / 2)
 
 
 def _evidence(away: Tensor, frame: _Frame, peak: Tensor, seen: Snapshots | None) -> Tensor:
     """Return the evidence (n,) for direct paths from points `away` (n, 3): power of snapshots, otherwise peaks."""
-    return _kernel(_nearest(frame.folded(_unit(away)), peak)) if seen is None else evidence(seen, away)
+    if seen is not None:
+        return evidence(seen, away)
+    return _kernel(_nearest(frame.folded(functional.normalize(away, dim=1)), peak))
 
 
 def _reaches(found: _Hypothesis) -> bool:
@@ -315,7 +299,7 @@ def _hypotheses(
         yield meaning, placed(position, free)
     turn = _constant_turn(frame, peak)
     if float(np.linalg.norm(turn)) >= MIN_TURN and _constant(turn, frame, peak):
-        found = at(away @ _matrix(turn), free=3)
+        found = at(away @ rotation_matrix(turn), free=3)
         yield "a constant rotation", replace(found, turn=turn)
     if seen is None:
         for meaning, peak_there in _grids(spectra, rows, frame):
@@ -324,7 +308,7 @@ def _hypotheses(
     for meaning, fitted, reading in other_readings(seen, away):
         yield meaning, at(away, fitted, reading)
     flipping, power = flipping_elements(seen, away)
-    elements = f"{'element' if len(flipping) == 1 else 'elements'} {ranges(flipping)}, counted from 1,"
+    elements = f"{'element' if len(flipping) == 1 else 'elements'} {ranges(flipping)}, counted from 0,"
     for meaning, excess_power in {
         f"the phase of {elements} jumps by half a turn from measurement to measurement": power,
         CONSTANT: constant_phases(seen),
@@ -336,12 +320,7 @@ def _hypotheses(
 
 
 def best_explanations(score: Mapping[str, float], tie: float) -> tuple[float, list[str]]:
-    """Return the highest score of the hypotheses, and the names of those that are not distinguished from the best.
-
-    Args:
-        score: Score of each hypothesis by its name.
-        tie: Difference in score of hypotheses that are not distinguished.
-    """
+    """Return the highest score of the hypotheses, and the names of those whose score differs by less than a tie."""
     best = max(score.values(), default=0.0)
     return best, [name for name, value in score.items() if value >= best - tie]
 
@@ -356,19 +335,11 @@ def mirror(position: Tensor, axis: int, offset: float) -> Tensor:
 def best_offset(coordinate: Tensor, score: Callable[[float], Any]) -> tuple[float, float]:
     """Return the offset of the mirror with the highest score, and the step of the scanned offsets.
 
-    Args:
-        coordinate: Coordinates (n,) along the mirrored axis, in whose range the mirror lies.
-        score: Score of an offset.
+    The mirror lies in the range of coordinates (n,).
     """
     low, high = 2 * float(coordinate.amin()), 2 * float(coordinate.amax())
     offsets = torch.linspace(low, high, 40).tolist()
     return max(offsets, key=score), (high - low) / 39
-
-
-def _unit(vector: Tensor) -> Tensor:
-    """Return vectors (n, 3), scaled to length 1."""
-    unit: Tensor = vector / vector.norm(dim=1, keepdim=True).clamp_min(1e-12)
-    return unit
 
 
 def _nearest(direction: Tensor, peak: Tensor) -> Tensor:
@@ -413,13 +384,7 @@ def _grids(spectra: Spectra, rows: Tensor, frame: _Frame) -> Iterator[tuple[str,
 def _labels(
     position: Tensor, time: Tensor | None, score: Callable[[Tensor], float]
 ) -> Iterator[tuple[str, Tensor, float]]:
-    """Yield each error of the order of positions, the positions (n, 3) of all rows without it, and its fitted parameters.
-
-    Args:
-        position: Positions (n, 3) of all rows.
-        time: Time of each row [s], if it is known.
-        score: Evidence for positions (n, 3) of all rows.
-    """
+    """Yield each error of the order of positions (n, 3), the positions without it, and its number of fitted parameters."""
     n = len(position)
     yield "positions are in reverse order", position.flip(0), 0
     mixed = "rows of positions or channels are in the order of text (1, 10, 11, ..., 2)"
@@ -459,17 +424,26 @@ def _frames(frame: _Frame) -> Iterator[tuple[str, _Frame]]:
         "the quaternion turns world into array coordinates; it must turn array into world",
         replace(frame, rotation=frame.rotation.T),
     )
+    for meaning, matrix in linear_errors("the array's is", "xyz").items():
+        yield meaning, frame.mapped(matrix)
     for names, swap in SWAPS.items():
-        yield f"{names} of the positions are swapped", frame.mapped(swap)
         yield f"{names} of positions and array are swapped against the orientation", frame.mapped(swap, both=True)
     for axis, matrix in MIRRORS.items():
-        yield f"{axis} of the positions has the wrong sign", frame.mapped(matrix)
         against = f"{axis} of positions and array has the wrong sign against the orientation"
         yield against, frame.mapped(matrix, both=True)
     for unit, scale in UNITS.items():
-        yield f"the positions are in {unit}, the array's is in metres", frame.mapped(scale * AXES)
         metres = f"the array's position is in {unit}, the others are in metres"
         yield metres, replace(frame, fixed=scale * frame.fixed)
+
+
+def linear_errors(other: str, varying: Collection[str]) -> dict[str, Tensor]:
+    """Return the matrices (3, 3) that mend errors of positions, by the error in words; they show in varying axes."""
+    shown = {names: swap for names, swap in SWAPS.items() if {names[0], names[-1]} <= {*varying}}
+    return {
+        **{f"{names} of the positions are swapped": swap for names, swap in shown.items()},
+        **{f"the positions are in {unit}, {other} in metres": scale * AXES for unit, scale in UNITS.items()},
+        **{f"{axis} of the positions has the wrong sign": MIRRORS[axis] for axis in "xyz" if axis in varying},
+    }
 
 
 def _mirrors(frame: _Frame, peak: Tensor) -> Iterator[tuple[str, _Frame]]:
@@ -524,8 +498,4 @@ def _refined(start: NDArray[np.float64], frame: _Frame, peak: Tensor) -> NDArray
 def _turned(frame: _Frame, peak: Tensor) -> Callable[[NDArray[np.float64]], float]:
     """Return the agreement as a function of the rotation vector."""
     towards = frame.towards()
-    return lambda turn: float(_kernel(_nearest(frame.folded(towards @ _matrix(turn)), peak)).mean())
-
-
-def _matrix(turn: NDArray[np.float64]) -> Tensor:
-    return torch.from_numpy(Rotation.from_rotvec(turn).as_matrix())
+    return lambda turn: float(_kernel(_nearest(frame.folded(towards @ rotation_matrix(turn)), peak)).mean())

@@ -15,7 +15,7 @@ from swiftwrf.data import Rssi, Snapshots, Spectra
 from swiftwrf.data.powers import has_frequent_edge
 from swiftwrf.data.splits import MAX_REPEATED, MIN_TRAINING, repeated_fraction
 from swiftwrf.diagnostics.calibration import calibrate
-from swiftwrf.diagnostics.elements import NOISE, noisy_elements
+from swiftwrf.diagnostics.elements import in_noise, noisy_elements, some_rows
 from swiftwrf.diagnostics.frames import MIN_CLEAR_POSITIONS, FrameReport, check_frames
 from swiftwrf.diagnostics.path_loss import check_path_loss
 from swiftwrf.errors import InputError, listed
@@ -30,6 +30,7 @@ SPARSE = 2.0  # wavelengths between neighbours, beyond which a search for a room
 MAX_END_OFFSET = 1e-3  # of normalised coordinates from the ends of their interval
 MAX_EXTENT_M = 1000.0  # beyond, coordinates may be millimetres or pixels
 MIN_GAIN = 0.1  # of a recommended calibration, in the fraction of the power along the line of sight
+MIN_SPAN_DEG = 10.0  # between lines of sight, to check frames
 MIN_BEHIND = 0.01  # share of the lines of sight behind the array that is reported
 Frame = Literal["unknown", "fits", "in part", "explained", "turned", "undecided"]
 MAX_LEVEL_DBM = 10.0  # at 1 m, which no usual transmitter reaches
@@ -108,10 +109,9 @@ def inspect(
     if snapshots is not None:
         _check_snapshots(snapshots, findings)
     _check_spectra(spectra, findings)
-    if _check_peaks(spectra, findings, snapshots, beamformer) != "explained" and snapshots is not None:
+    if _check_peaks(spectra, findings, snapshots) != "explained" and snapshots is not None:
         if noise := noisy_elements(snapshots, snapshots.away):
-            text = NOISE.format(listed=", ".join(map(str, noise)), option=" ".join(map(str, noise)))
-            findings.warn(f"E{text[1:]}.", noisy_elements=noise)
+            findings.warn(f"E{in_noise(noise)[1:]}.", noisy_elements=noise)
         _check_calibration(snapshots, findings)
     return findings
 
@@ -169,7 +169,7 @@ def _normalised(position: Tensor) -> str:
 
 def nearest(position: Tensor) -> tuple[Tensor, Tensor]:
     """Return rows of positions (n, 3), a subset of many, and the distance from each to the nearest other one [m]."""
-    some = torch.linspace(0, len(position) - 1, min(MAX_POSITIONS, len(position))).round().long()
+    some = some_rows(len(position), MAX_POSITIONS)
     apart = torch.cat([distance(position[rows], position) for rows in some.split(500)])
     apart[torch.arange(len(some)), some] = torch.inf
     return some, apart.amin(dim=1)
@@ -260,27 +260,23 @@ def _check_calibration(data: Snapshots, findings: Findings) -> None:
         findings.add(f"The array needs no calibration: {text}.", calibration=found.to_json())
 
 
-def _check_peaks(
-    data: Spectra, findings: Findings, snapshots: Snapshots | None = None, beamformer: str = PHASE
-) -> Frame:
-    """Report whether the peaks of the spectra follow the lines of sight, and return the result in a word.
-
-    Args:
-        data: Spectra.
-        findings: Findings to add to.
-        snapshots: Snapshots that the spectra were computed from.
-        beamformer: Beamformer of those spectra.
-    """
-    report = check_frames(data, snapshots, beamformer)
+def _check_peaks(data: Spectra, findings: Findings, snapshots: Snapshots | None) -> Frame:
+    """Report whether the peaks of the spectra follow the lines of sight, and return the result in a word."""
+    report = check_frames(data, snapshots)
     if report is None:
         findings.warn(
             "Frames cannot be checked: that needs the fixed end, the orientation and "
             f"{MIN_CLEAR_POSITIONS} positions with line of sight."
         )
         return "unknown"
-    frame, text = _error(data, report) or _without_error(report)
-    if frame != "explained":
-        _add_behind(data, report, findings)
+    frame, text = _in_words(data, report)
+    if frame != "explained" and report.behind >= MIN_BEHIND:
+        where = "of the positions lie" if data.moving == "transmitter" else "of the positions have the transmitter"
+        behind = f"{report.behind:.0%} {where} behind the array, and their directions are folded to its front"
+        if report.behind > 1 - MIN_BEHIND:
+            findings.add(f"{behind}.")
+        else:
+            findings.warn(f"{behind}: two places share one label.")
     linear = data.array is not None and data.array.axis is not None
     by = ", by the angle to the array's axis" if linear else ""
     add = findings.add if frame in ("fits", "in part") else findings.warn
@@ -297,8 +293,8 @@ def _check_peaks(
     return frame
 
 
-def _error(data: Spectra, report: FrameReport) -> tuple[Frame, str] | None:
-    """Return the error that explains the peaks, in words, or None."""
+def _in_words(data: Spectra, report: FrameReport) -> tuple[Frame, str]:
+    """Return the error that explains the peaks, or else how far they agree with the lines of sight, in words."""
     if not report.fits and (filled := _normalised(data.position)):
         return "explained", f". All coordinates fill {filled} exactly, so positions look normalised; give metres"
     if report.explanations:
@@ -310,19 +306,14 @@ def _error(data: Spectra, report: FrameReport) -> tuple[Frame, str] | None:
             f". A constant rotation of {angle:.0f} degrees about ({axis}) in array coordinates would mend most of it: "
             "is the orientation right?"
         )
-    return None
-
-
-def _without_error(report: FrameReport) -> tuple[Frame, str]:
-    """Return how far peaks and lines of sight agree in the declared frame, in words."""
     if report.fits:
         return "fits", " and follow it: positions, orientation and angles are in one frame"
-    if report.narrow:
+    if report.span_deg < MIN_SPAN_DEG:
         return "undecided", (
             f". All lines of sight have nearly one direction ({report.span_deg:.1f} degrees between two, median), so frames "
             "cannot be checked"
         )
-    if report.steady:
+    if report.peak_span_deg < report.span_deg / 4:
         return "undecided", (
             f". The spectra hardly differ: two peaks are {report.peak_span_deg:.1f} degrees apart, two lines of sight "
             f"{report.span_deg:.1f} degrees (medians)"
@@ -336,18 +327,6 @@ def _without_error(report: FrameReport) -> tuple[Frame, str]:
         " and do not follow it in any frame that was tried: unexplained, e.g. reflections are stronger, or the elements' "
         "phases are not calibrated"
     )
-
-
-def _add_behind(data: Spectra, report: FrameReport, findings: Findings) -> None:
-    """Report lines of sight behind a planar array, whose directions are folded to its front."""
-    if report.behind < MIN_BEHIND:
-        return
-    where = "of the positions lie" if data.moving == "transmitter" else "of the positions have the transmitter"
-    text = f"{report.behind:.0%} {where} behind the array, and their directions are folded to its front"
-    if report.behind > 1 - MIN_BEHIND:
-        findings.add(f"{text}.")
-    else:
-        findings.warn(f"{text}: two places share one label.")
 
 
 def _check_rssi(data: Rssi, findings: Findings) -> None:
@@ -372,12 +351,7 @@ def _check_rssi(data: Rssi, findings: Findings) -> None:
 
 
 def propose_offsets(data: Rssi, findings: Findings) -> None:
-    """Warn of a column whose values have constant offsets of RSSI.
-
-    Args:
-        data: RSSI with the groups of such a column.
-        findings: Where the warning is added.
-    """
+    """Warn of the column of the groups of RSSI if its values have constant offsets."""
     if data.groups is None or len(data.groups.code.unique()) < 2:
         return
     column = data.groups.column

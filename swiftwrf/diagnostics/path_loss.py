@@ -17,17 +17,8 @@ from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING
-from swiftwrf.diagnostics.frames import (
-    MIRRORS,
-    SWAPS,
-    UNITS,
-    best_explanations,
-    best_offset,
-    delay,
-    earlier,
-    mirror,
-    shifts,
-)
+from swiftwrf.diagnostics.elements import some_rows
+from swiftwrf.diagnostics.frames import best_explanations, best_offset, delay, earlier, linear_errors, mirror, shifts
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, log_distance
 
 MIN_EXPLAINED = 0.25  # of the variance, by an error that is named
@@ -71,9 +62,10 @@ def check_path_loss(data: Rssi) -> PathLossReport | None:
     model = fit_path_loss(log_distance(data.transmitter_position, data.receiver_position), data.rssi_dbm, shared=True)
     report = PathLossReport(_explained(data.transmitter_position, data), float(model.level), float(-model.slope / 10))
     data = data.columns(data.detected.sum(dim=0).argsort(descending=True, stable=True)[:20].tolist())
-    walk, rows = data, _some_rows(data, 2000)
+    walk, rows = data, some_rows(len(data), 2000)
     data, place = data.subset(rows), data.transmitter_position[rows]
-    found = {meaning: _explained(other, data) for meaning, other in _others(place)}
+    errors = linear_errors("the receivers'", _varying(place))
+    found = {meaning: _explained(place @ matrix, data) for meaning, matrix in errors.items()}
     fitted = {
         f"{axis} of the positions counts from the other side ({axis} = {offset:.1f} - {axis})": value
         for axis, offset, value in _mirrors(place, data)
@@ -90,24 +82,6 @@ def check_path_loss(data: Rssi) -> PathLossReport | None:
     if best >= max(MIN_EXPLAINED, 0.9 * attainable) and best - declared >= 0.1:
         return replace(report, explanation="; or if ".join(names))
     return replace(report, misplaced=attainable >= MIN_EXPLAINED and declared < attainable / 2)
-
-
-def _some_rows(data: Rssi, count: int) -> Tensor:
-    """Return the numbers of at most `count` rows, equally spaced."""
-    return torch.linspace(0, len(data) - 1, min(count, len(data))).round().long()
-
-
-def _others(place: Tensor) -> Iterator[tuple[str, Tensor]]:
-    """Yield the positions under each error that they can show."""
-    varying = _varying(place)
-    for names, swap in SWAPS.items():
-        if {names[0], names[-1]} <= varying:
-            yield f"{names} of the positions are swapped", place @ swap
-    for unit, scale in UNITS.items():
-        yield f"the positions are in {unit}, the receivers' in metres", place * scale
-    for axis, matrix in MIRRORS.items():
-        if axis in varying:
-            yield f"{axis} of the positions has the wrong sign", place @ matrix
 
 
 def _varying(place: Tensor) -> set[str]:
@@ -146,7 +120,7 @@ def _attainable(data: Rssi) -> float:
 
     The position of each receiver is that of a grid around the positions with the highest fraction, then of finer grids.
     """
-    data = data.subset(_some_rows(data, 400))
+    data = data.subset(some_rows(len(data), 400))
     residual = total = 0.0
     for rssi, detected in zip(data.rssi_dbm.T, data.detected.T, strict=True):
         if int(detected.sum()) < MIN_TRAINING:
@@ -159,11 +133,9 @@ def _attainable(data: Rssi) -> float:
 
 
 def _fitted_receiver(place: Tensor, level: Tensor) -> float:
-    """Return the sum of squares of centred RSSI (n,) that a path-loss model explains with a fitted position.
+    """Return the sum of squares of RSSI less its mean (n,) that a path-loss model explains with a fitted position.
 
-    Args:
-        place: Positions of the transmitter, (n, 3).
-        level: RSSI less its mean, (n,) [dB].
+    The transmitter is at positions (n, 3).
     """
     low, high = place.amin(dim=0), place.amax(dim=0)
     centre, reach = (low + high) / 2, high - low

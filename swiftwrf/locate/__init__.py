@@ -3,10 +3,9 @@
 from typing import TYPE_CHECKING
 
 from swiftwrf.locate.matched_field import MatchedField, MatchedFieldConfig
-from swiftwrf.locate.posterior import Posterior
+from swiftwrf.locate.posterior import Posterior, smoothed
 from swiftwrf.locate.region import Region
 from swiftwrf.locate.rssi import RssiLocator, RssiLocatorConfig
-from swiftwrf.locate.track import smoothed
 from swiftwrf.runtime.lazy import import_lazily
 
 if TYPE_CHECKING:

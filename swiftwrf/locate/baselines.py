@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import Self
 
 import numpy as np
 import torch
@@ -16,27 +16,15 @@ from torch import Tensor
 
 from swiftwrf.data import Rssi
 from swiftwrf.data.splits import Validation, folds
-from swiftwrf.locate.fingerprints import Fingerprints
 from swiftwrf.locate.rssi import RssiLocator
+from swiftwrf.locate.rssi_likelihood import Fingerprints
 from swiftwrf.rssi.baselines import fit_process
 from swiftwrf.runtime.registry import Registry
-from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
+from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, checked
 
 LEVELS = (0.5, 0.8, 0.95)  # probabilities of the credible regions
 BATCH_ROWS = 128  # rows of RSSI whose posteriors are in memory together
 UNDETECTED_BELOW_DB = 5.0  # below the weakest value, of what is not detected, for gp
-
-
-@configuration
-class LocalizerConfig:
-    """Options of all localizers."""
-
-    validation: Validation = "random"
-    """training rows held out to choose settings: single ones at random, or one region at a time"""
-    n_cells: PositiveInt = 4000
-    """number of candidate positions of a posterior"""
-    seed: NonNegativeInt = 0
-    """seed of everything random"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +49,9 @@ class Localizer(ABC):
     """Base class: `fit` to measured rows, then `locate` others.
 
     Args:
-        config: Options as one object. Defaults to `LocalizerConfig()`.
-        options: Single options, which replace those of `config`.
+        validation: Training rows held out to choose settings; see `RssiLocatorConfig`.
+        n_cells: Number of candidate positions of a posterior.
+        seed: Seed of everything random.
 
     Example:
         >>> import swiftwrf
@@ -71,10 +60,11 @@ class Localizer(ABC):
         torch.Size([12, 3])
     """
 
-    name: ClassVar[str]
-
-    def __init__(self, config: LocalizerConfig | None = None, **options: Any) -> None:
-        self.config = replace(config or LocalizerConfig(), **options)
+    @checked
+    def __init__(
+        self, *, validation: Validation = "random", n_cells: PositiveInt = 4000, seed: NonNegativeInt = 0
+    ) -> None:
+        self.validation, self.n_cells, self.seed = validation, n_cells, seed
 
     @abstractmethod
     def fit(self, train: Rssi) -> Self:
@@ -92,28 +82,22 @@ LOCALIZERS: Registry[Localizer] = Registry("localizer", "swiftwrf.localizers")
 class PosteriorLocalizer(Localizer):
     """The median of the posterior over positions, given the radio maps of all receivers."""
 
-    name = "posterior"
-
     locator: RssiLocator
     """locator, set by `fit`"""
 
     def fit(self, train: Rssi) -> Self:
-        config = self.config
-        locator = RssiLocator(validation=config.validation, n_cells=config.n_cells, seed=config.seed)
+        locator = RssiLocator(validation=self.validation, n_cells=self.n_cells, seed=self.seed)
         self.locator = locator.fit(train, progress=True)
         return self
 
     def locate(self, rssi: Tensor) -> Located:
-        parts = [located(self.locator, rows) for rows in rssi.split(BATCH_ROWS)]
+        parts = []
+        for rows in rssi.split(BATCH_ROWS):
+            posterior = self.locator.locate(rows)
+            radius = torch.stack([posterior.credible_radius(level) for level in LEVELS], dim=1)
+            parts.append((posterior.median, radius, posterior.ambiguous, posterior.floor_probability.amax(dim=1)))
         found = Located(*(torch.cat(values) for values in zip(*parts, strict=True)))
         return found if self.locator.region.floors else replace(found, floor_probability=None)
-
-
-def located(locator: RssiLocator, rssi: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return estimates, radii, ambiguity and the probability of the floor of some rows of RSSI (n, R) [dBm]."""
-    posterior = locator.locate(rssi)
-    radius = torch.stack([posterior.credible_radius(level) for level in LEVELS], dim=1)
-    return posterior.median, radius, posterior.ambiguous, posterior.floor_probability.amax(dim=1)
 
 
 @LOCALIZERS.register("knn")
@@ -123,15 +107,13 @@ class NearestFingerprints(Localizer):
     Distance of RSSI and k by cross-validation, see `Fingerprints`.
     """
 
-    name = "knn"
-
     fingerprints: Fingerprints
     """training rows, set by `fit`"""
 
     def fit(self, train: Rssi) -> Self:
-        fold = folds(train.transmitter_position, self.config.validation, self.config.seed, session=train.session)
+        fold = folds(train.transmitter_position, self.validation, self.seed, session=train.session)
         relative = train.derived(rssi_dbm=self._relative(train.rssi_dbm))
-        self.fingerprints = Fingerprints.fit(relative, fold, self.config.seed)
+        self.fingerprints = Fingerprints.fit(relative, fold, self.seed)
         return self
 
     def locate(self, rssi: Tensor) -> Located:
@@ -146,8 +128,6 @@ class NearestFingerprints(Localizer):
 class NearestDifferences(NearestFingerprints):
     """knn on the differences to the row's strongest value, which a constant offset of the device does not change."""
 
-    name = "knn_difference"
-
     def _relative(self, rssi: Tensor) -> Tensor:
         return rssi - rssi.nan_to_num(-torch.inf).amax(dim=1, keepdim=True)
 
@@ -155,8 +135,6 @@ class NearestDifferences(NearestFingerprints):
 @LOCALIZERS.register("nearest")
 class NearestFingerprint(NearestFingerprints):
     """The position of the single training row with the most similar RSSI, by Manhattan distance: the field's benchmark."""
-
-    name = "nearest"
 
     def fit(self, train: Rssi) -> Self:
         # rows without a detection are rows of the benchmark
@@ -172,8 +150,6 @@ class RegressedCoordinates(Localizer):
     C. K. I. Williams, 2006).
     """
 
-    name = "gp"
-
     def fit(self, train: Rssi) -> Self:
         train = train.subset(train.detected.any(dim=1))
         self._undetected = float(train.rssi_dbm[train.detected].min()) - UNDETECTED_BELOW_DB
@@ -183,7 +159,7 @@ class RegressedCoordinates(Localizer):
         kernel = ConstantKernel(1.0, (0.01, 100.0)) * length + WhiteKernel(0.1, (1e-4, 10.0))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)  # a bound that is reached is the answer
-            self._regressor = fit_process(kernel, x, position, self.config.seed, normalize=True)
+            self._regressor = fit_process(kernel, x, position, self.seed, normalize=True)
         return self
 
     def locate(self, rssi: Tensor) -> Located:
@@ -197,8 +173,6 @@ class RegressedCoordinates(Localizer):
 @LOCALIZERS.register("mean")
 class MeanPosition(Localizer):
     """The mean training position, whatever the RSSI."""
-
-    name = "mean"
 
     def fit(self, train: Rssi) -> Self:
         self._mean = train.transmitter_position.mean(dim=0)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,6 @@ MIN_ROWS = 20  # training rows that a receiver detected: five folds, of which fo
 ROW_FRACTIONS, RECEIVER_FRACTIONS = (0.1, 0.3), (0.25, 0.5)  # that are compared with everything
 STUDIED = ("posterior", "knn")
 Values = dict[str, Any]
-Keep = Callable[[str, Callable[[], tuple[Localizer, Values]]], Values]
 
 
 @dataclass(frozen=True)
@@ -264,7 +263,6 @@ def compare(
     seed: int = 0,
     n_cells: int = 4000,
     reference: str | None = None,
-    keep: Keep | None = None,
 ) -> LocateComparison:
     """Fit every localizer to the training rows of a split, and locate the test rows.
 
@@ -277,8 +275,6 @@ def compare(
         seed: Seed of everything random.
         n_cells: Number of candidate positions of the posterior.
         reference: Group whose offset is 0. Defaults to the most frequent one.
-        keep: Memo `keep(name, compute)`, which returns the values that it has under a name, or the second item of
-            `compute()`. The first item is the fitted localizer. Defaults to no memo.
 
     Raises:
         InputError: Receivers that move, unknown receivers or split, or too few rows that a receiver detected.
@@ -290,5 +286,4 @@ def compare(
         True
     """
     measured = LocateSplit.of(data.receivers(receivers), split, n_cells, seed, reference)
-    kept = keep or (lambda name, compute: compute()[1])
-    return LocateComparison(measured, {t: kept(t.name, partial(measured.fit, t)) for t in measured.trials()})
+    return LocateComparison(measured, {trial: measured.fit(trial)[1] for trial in measured.trials()})

@@ -29,10 +29,10 @@ from swiftwrf.locate.spectrum_likelihood import (
     PathWaves,
     PhaseLikelihood,
     SpectrumFeatures,
+    Student,
     gain_features,
     room_features,
 )
-from swiftwrf.locate.student import Student
 from swiftwrf.models.base import FieldModel
 from swiftwrf.models.geometry import GeometryModel
 from swiftwrf.models.geometry.channels import coherence, ends

@@ -16,15 +16,17 @@ from swiftwrf.data.powers import MAX_RSSI_DBM, MIN_RSSI_DBM, check_powers
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import FOLDS, Validation, folds
 from swiftwrf.errors import InputError, listed
-from swiftwrf.locate.fingerprints import METRICS, Fingerprints, Votes
 from swiftwrf.locate.posterior import Posterior, inflation, normalised, pooled_weights, read_inflation
 from swiftwrf.locate.region import Region, outside_mass
 from swiftwrf.locate.rssi_likelihood import (
+    METRICS,
     DetectionLikelihood,
     FingerprintLikelihood,
+    Fingerprints,
     Maps,
     RssiLikelihoods,
     ValueLikelihood,
+    Votes,
     maps_at,
 )
 from swiftwrf.metrics import NORMAL_80
@@ -78,12 +80,7 @@ class RssiLocator(Configured, Saved):
     receivers detect the transmitter at all, and the position of similar training rows. Held-out rows determine their
     distributions and weights. In a building with floors the candidate positions are on the floors.
 
-    Args:
-        config: Options as one object. Defaults to `RssiLocatorConfig()`.
-        options: Single options, which replace those of `config`.
-
-    Raises:
-        InputError: An unknown option, or a value outside its range.
+    The options are those of `RssiLocatorConfig`.
 
     Example:
         >>> import swiftwrf

@@ -9,10 +9,11 @@ J. Acoust. Soc. Am. 89, 1991). A measured channel gives both features directly, 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -23,7 +24,6 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.locate.student import Student, covariance
 from swiftwrf.models.geometry.channels import coherence, ends, field, waves
 from swiftwrf.models.geometry.fit import carrier_phases
 from swiftwrf.models.geometry.model import GeometryModel, kept_snapshots
@@ -31,6 +31,8 @@ from swiftwrf.models.geometry.path_gains import PathGains
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation, coarray_numbers, retrieve_phases
 
 CARRIER = torch.ones(1, dtype=torch.float64)  # frequency relative to the carrier
+DEGREES = (3.0, 5.0, 10.0, 30.0, math.inf)  # degrees of freedom of Student distributions that are compared
+SHRINKAGES = (0.05, 0.1, 0.2, 0.4, 0.7)  # of scale matrices to multiples of the identity, that are compared
 BOUNDS = (-10.0, 6.0)  # of the logarithms of variances: products of four of them stay within float32
 
 
@@ -124,6 +126,88 @@ def gain_features(array: PlanarArray, gains: PathGains) -> Features:
     return features
 
 
+@dataclass(frozen=True, eq=False)
+class Student:
+    """Multivariate Student distribution of F features.
+
+    Args:
+        scale: Scale matrix, float64 (F, F).
+        degrees: Degrees of freedom; infinite for a Gaussian.
+    """
+
+    scale: Tensor
+    degrees: float
+
+    @classmethod
+    def fit(cls, residual: Tensor, floor: float) -> Self:
+        """Fit to held-out residuals, with the shrinkage and degrees of freedom of the highest held-out density.
+
+        Args:
+            residual: Residuals (n, F).
+            floor: Smallest variance.
+        """
+        residual, shrinkage = residual.double(), torch.tensor(SHRINKAGES, dtype=torch.float64)
+        fold = torch.arange(len(residual)) % 5
+        density = torch.zeros(len(DEGREES), len(shrinkage), dtype=torch.float64)
+        for (row, degrees), number in itertools.product(enumerate(DEGREES), range(5)):
+            out = residual[fold == number]
+            scales = covariance(residual[fold != number], shrinkage, degrees, floor)
+            held_out = [cls(scale, degrees).log_likelihood(out).sum() for scale in scales]
+            density[row] += torch.stack(held_out)
+        best, column = divmod(int(density.argmax()), len(shrinkage))
+        return cls(covariance(residual, shrinkage[[column]], DEGREES[best], floor)[0], DEGREES[best])
+
+    @cached_property
+    def whitening(self) -> Tensor:
+        """Matrix W (F, F) with residuals @ W of unit scale, float32."""
+        matrix: Tensor = torch.linalg.inv(torch.linalg.cholesky(self.scale)).T.float()
+        return matrix
+
+    def log_density(self, distance: Tensor) -> Tensor:
+        """Return the log-density of squared whitened distances, without the determinants of scale and whitening.
+
+        Args:
+            distance: Squared distances, of any shape.
+        """
+        f = len(self.scale)
+        if math.isinf(self.degrees):
+            normal: Tensor = -distance / 2 - f / 2 * math.log(2 * math.pi)
+            return normal
+        half = (self.degrees + f) / 2
+        constant = math.lgamma(half) - math.lgamma(self.degrees / 2) - f / 2 * math.log(self.degrees * math.pi)
+        # in place: a search has millions of distances
+        density: Tensor = (distance / self.degrees).log1p_().mul_(-half).add_(constant)
+        return density
+
+    def log_likelihood(self, residual: Tensor) -> Tensor:
+        """Return the log-likelihoods (n,) of residuals (n, F), float64."""
+        root = torch.linalg.cholesky(self.scale)
+        white = torch.linalg.solve_triangular(root, residual.T, upper=False)
+        density: Tensor = self.log_density(white.square().sum(dim=0)) - root.diagonal().log().sum()
+        return density
+
+
+def covariance(residual: Tensor, shrinkage: Tensor, degrees: float, floor: float) -> Tensor:
+    """Return scale matrices (S, F, F) of residuals (n, F), shrunk to multiples of the identity.
+
+    Args:
+        residual: Residuals without gaps.
+        shrinkage: Weights of the identity, (S,).
+        degrees: Degrees of freedom, for which expectation maximisation weights the rows.
+        floor: Smallest variance.
+    """
+    n, f = residual.shape
+    weight, identity = residual.new_ones(len(shrinkage), 1, n), torch.eye(f, dtype=residual.dtype)
+    shrinkage = shrinkage[:, None, None]
+    for _ in range(1 if math.isinf(degrees) else 8):  # expectation and maximisation
+        scatter = (residual.T * weight) @ residual / n
+        mean = scatter.diagonal(dim1=1, dim2=2).mean(dim=1)[:, None, None]
+        scale: Tensor = (1 - shrinkage) * scatter + (shrinkage * mean + floor) * identity
+        white = torch.linalg.solve_triangular(torch.linalg.cholesky(scale), residual.T, upper=False)
+        weight = (degrees + f) / (degrees + white.square().sum(dim=1, keepdim=True))
+    return scale
+
+
 class CoarrayLikelihood:
     """Student likelihood of the co-array numbers, with the covariance of held-out residuals.
 
@@ -135,8 +219,7 @@ class CoarrayLikelihood:
 
     def __init__(self, features: Features, residual: Tensor, power: float) -> None:
         self.features = features
-        estimate = partial(covariance, floor=1e-6 * power)
-        self.distribution = Student.fit(residual, estimate, (0.05, 0.1, 0.2, 0.4, 0.7), n_folds=5)
+        self.distribution = Student.fit(residual, floor=1e-6 * power)
 
     def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
         """Return log-likelihoods (m,) of m observations at m candidates, up to a constant of each observation."""
@@ -168,7 +251,9 @@ class PhaseLikelihood:
             for planes in found.sequence
         ]
         self._variance = torch.stack([direct, *images])
-        self._isotropic = _isotropic(room)
+        element = room.array.element.double()
+        # correlation (K, K) of waves from all directions between the elements
+        self._isotropic = torch.sinc(2 * torch.cdist(element, element) / room.array.wavelength).to(torch.complex64)
 
     @classmethod
     def fit(
@@ -244,10 +329,3 @@ class ChannelLikelihood:
     def log_density(self, coherence: Tensor, channel: Tensor) -> Tensor:
         """Return the log-likelihoods of coherences of any shape with channels (n, F, K)."""
         return -math.prod(channel.shape[1:]) * ((1 - coherence).clamp_min(0) + self.floor).log()
-
-
-def _isotropic(room: GeometryModel) -> Tensor:
-    """Return the correlation (K, K) of waves from all directions between the array's elements."""
-    element = room.array.element.double()
-    apart = 2 * torch.cdist(element, element) / room.array.wavelength
-    return torch.sinc(apart).to(torch.complex64)

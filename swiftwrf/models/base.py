@@ -24,7 +24,7 @@ from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Axes, Displayed, extent
 from swiftwrf.positions import check_positions, to_tensor
 from swiftwrf.runtime.checkpoint import Header, Saved
-from swiftwrf.runtime.session import Record
+from swiftwrf.runtime.descent import Record
 from swiftwrf.runtime.threads import single_thread, to_device
 from swiftwrf.runtime.validation import (
     Configured,

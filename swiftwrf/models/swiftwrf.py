@@ -36,8 +36,8 @@ from swiftwrf.models.process import ProcessModel
 from swiftwrf.rasterize import rasterize_magnitude
 from swiftwrf.rasterize.reference import kernels
 from swiftwrf.runtime.checkpoint import Header, expect
+from swiftwrf.runtime.descent import Record
 from swiftwrf.runtime.progress import progress_bar
-from swiftwrf.runtime.session import Record
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
 

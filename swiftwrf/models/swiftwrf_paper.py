@@ -9,9 +9,8 @@ fine: the first steps fit the primitives alone, the others the network, with the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any, cast
 
 import torch
@@ -27,8 +26,7 @@ from swiftwrf.models.primitives import Primitives
 from swiftwrf.positions import frame, normalise
 from swiftwrf.rasterize import prepare, rasterize_magnitude
 from swiftwrf.runtime.checkpoint import Header, expect
-from swiftwrf.runtime.progress import progress_bar
-from swiftwrf.runtime.session import Descent, Record, Schedule, Session, warm_cosine
+from swiftwrf.runtime.descent import Descent, Record, warm_cosine
 from swiftwrf.runtime.validation import (
     Fraction,
     NonNegativeFloat,
@@ -110,22 +108,10 @@ class SwiftWRFPaper(FieldModel):
     field: DeformableGaussians
     """fitted Gaussians and network; the gradients of their parameters are off after a fit"""
 
-    def _fit(
-        self,
-        train: Spectra,
-        *,
-        device: torch.device = CPU,
-        checkpoint: Path | None = None,
-        on_record: Callable[[Record], None] | None = None,
-        progress: bool = False,
-        **_: Any,
-    ) -> None:
+    def _fit(self, train: Spectra, *, device: torch.device = CPU, **arguments: Any) -> None:
         work = train.at_most(self.config.max_azimuths)
-        optimisation = Optimisation(self.config, work, device)
-        with progress_bar(progress) as bar:
-            owner = fingerprint(work, asdict(self.config))
-            optimisation.run(Session(checkpoint, owner, bar, on_record))
-        self.field = optimisation.result.eval().requires_grad_(False)
+        owner = fingerprint(work, asdict(self.config))
+        self.field = Optimisation(self.config, work, device).run(owner, **arguments)
 
     def parameters(self) -> Iterable[Tensor]:
         return self.field.parameters()
@@ -237,7 +223,7 @@ class Optimisation(Descent[DeformableGaussians]):
             {"params": network, "peak": config.deformation_rate},
         ]
         name = f"final, {config.n_primitives} primitives, {steps} steps"
-        super().__init__(name, field, groups, Schedule(steps, config.check_every))
+        super().__init__(name, field, groups, steps=steps, check_every=config.check_every)
         self.position, self.spectrum = field.normalise(train.position.to(device)), train.spectrum.to(device)
         # everything random is sampled here, so that nothing is copied to the device between two evaluations
         batch = min(config.batch, len(train))
@@ -245,7 +231,7 @@ class Optimisation(Descent[DeformableGaussians]):
         self.noise = torch.randn(steps, batch, 3, generator=generator).to(device)
 
     def rate(self, step: int) -> float:
-        return warm_cosine(step, self.schedule.steps, warm_up=50, final=0.02)
+        return warm_cosine(step, self.steps, warm_up=50, final=0.02)
 
     def loss(self, rendered: Tensor, measured: Tensor) -> Tensor:
         """Return the loss of spectra; see `spectrum_loss`."""

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Annotated, Any
 
 import torch
-from annotated_types import Ge, Gt, Lt
+from annotated_types import Gt, Lt
 from scipy import stats
 from scipy.cluster.vq import kmeans2
 from torch import Tensor
@@ -16,7 +16,6 @@ from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.errors import InputError
-from swiftwrf.gp import Kernel
 from swiftwrf.metrics import psnr
 from swiftwrf.models.base import FieldModel
 from swiftwrf.models.geometry.images import PhaseObservations
@@ -27,10 +26,13 @@ from swiftwrf.models.process import ProcessModel
 from swiftwrf.online.scores import Alarm, Cusum, Scores, alarm_threshold, learnt, score
 from swiftwrf.positions import nearest
 from swiftwrf.rssi.model import RssiModel
-from swiftwrf.runtime.validation import checked, configuration
+from swiftwrf.runtime.validation import checked
 
 N_FOLDS = 5  # of the spectra after a change, and of the training spectra that give the reference
+N_REGIONS = 8  # of the positions that are tested separately, beside all positions together
+N_REFERENCE = 30  # measurements without alarm that calibrate the innovations if no reference is given
 MIN_MISSING = 3e-3  # missing coherence that counts as none, phases of 3 degrees
+FalseAlarmRate = Annotated[float, Gt(0), Lt(1)]  # false alarms a measurement, over all regions and receivers together
 
 
 def adapted(before: ProcessModel, after: Spectra) -> tuple[ProcessModel, float]:
@@ -66,23 +68,6 @@ def adapted(before: ProcessModel, after: Spectra) -> tuple[ProcessModel, float]:
     return before.aged(best).update(after), best
 
 
-@configuration
-class MonitorConfig:
-    """Options of a `Monitor`.
-
-    Example:
-        >>> Monitor(torch.rand(50, 3), config=MonitorConfig(false_alarm_rate=1e-3)).config.n_regions
-        8
-    """
-
-    false_alarm_rate: Annotated[float, Gt(0), Lt(1)] = 1e-4
-    """false alarms a measurement, over all regions and receivers together"""
-    n_regions: Annotated[int, Ge(1)] = 8
-    """number of regions of the positions that are tested separately, beside all positions together"""
-    n_reference: Annotated[int, Ge(10)] = 30
-    """number of measurements without alarm, which calibrate the innovations if no reference is given"""
-
-
 class Monitor:
     """Cumulative sums of innovations: of all positions and of each region; for RSSI of each receiver, up and down.
 
@@ -93,7 +78,11 @@ class Monitor:
         position: Positions around which the model was fitted, (n, 3) [m], which give the regions.
         receiver_names: Names of the receivers; none for spectra.
         reference: Innovations (n,) of spectra of the unchanged scene. Defaults to the first measurements.
-        config: Options.
+        false_alarm_rate: False alarms a measurement, over all regions and receivers together.
+        n_regions: Maximum number of regions.
+
+    Raises:
+        InputError: A rate outside (0, 1).
 
     Example:
         >>> import swiftwrf
@@ -106,37 +95,40 @@ class Monitor:
         []
     """
 
+    @checked
     def __init__(
         self,
         position: Tensor,
         receiver_names: Sequence[str] = (),
         reference: Tensor | None = None,
-        config: MonitorConfig | None = None,
+        false_alarm_rate: FalseAlarmRate = 1e-4,
+        n_regions: int = N_REGIONS,
     ) -> None:
-        self.config, self.receiver_names = config or MonitorConfig(), tuple(receiver_names)
-        n_regions = min(self.config.n_regions, max(1, len(position) // 10))
+        self.false_alarm_rate, self.receiver_names = false_alarm_rate, tuple(receiver_names)
+        n_regions = min(n_regions, max(1, len(position) // 10))
         self.centre = torch.from_numpy(kmeans2(position.double().numpy(), n_regions, seed=0, minit="++")[0])
         self.reference = torch.zeros(0, dtype=torch.float64) if reference is None else reference.double()
         self.cusum = Cusum.start((1 + n_regions) * (2 * len(self.receiver_names) or 1))
-        self.threshold = alarm_threshold(self.config.false_alarm_rate, len(self.cusum.value))
+        self.threshold = alarm_threshold(false_alarm_rate, len(self.cusum.value))
 
     @classmethod
     def of(
-        cls, model: FieldModel | RssiModel, train: Spectra | Rssi | None = None, config: MonitorConfig | None = None
+        cls, model: FieldModel | RssiModel, train: Spectra | Rssi | None = None, false_alarm_rate: FalseAlarmRate = 1e-4
     ) -> Monitor:
         """Return the monitor of a fitted model.
 
         Args:
             model: Fitted model.
             train: Its training data in their order. Spectra give the reference; see `held_out_scores`.
-            config: Options.
+            false_alarm_rate: False alarms a measurement.
         """
         if isinstance(model, RssiModel):
-            return cls(model.region(), model.receiver_names, None, config)
+            return cls(model.region(), model.receiver_names, None, false_alarm_rate)
+        reference = None
         if isinstance(train, Spectra):
             model.check_measurements(train)
-        reference = held_out_scores(model, train).innovation[:, 0] if isinstance(train, Spectra) else None
-        return cls(model.region(), (), reference, config)
+            reference = held_out_scores(model, train).innovation[:, 0]
+        return cls(model.region(), (), reference, false_alarm_rate)
 
     def observe(self, position: Tensor, innovation: Tensor) -> list[Alarm]:
         """Add the innovations of one measurement at a position (3,) [m], (1,) or (R,); return the alarms."""
@@ -144,7 +136,7 @@ class Monitor:
         if self.receiver_names:
             standard = value.clamp(-3.0, 3.0)  # single outliers raise no alarm
             standard = torch.cat([standard, -standard])
-        elif self.cusum.count == 0 and len(self.reference) < self.config.n_reference:
+        elif self.cusum.count == 0 and len(self.reference) < N_REFERENCE:
             self.reference = torch.cat([self.reference, value])
             return []
         else:
@@ -167,7 +159,7 @@ class Monitor:
             torch.tensor(values, dtype=torch.float64) for values in (state["reference"], state["centre"], sums["value"])
         )
         self.cusum = Cusum(value, torch.tensor(sums["since"]), int(sums["count"]))
-        self.threshold = alarm_threshold(self.config.false_alarm_rate, len(self.cusum.value))
+        self.threshold = alarm_threshold(self.false_alarm_rate, len(self.cusum.value))
 
     def describe(self, alarm: Alarm) -> str:
         """Return what changed and where, in words."""
@@ -199,74 +191,6 @@ def held_out_scores(model: FieldModel, train: Spectra) -> Scores:
     return Scores(*(getattr(joined, field.name)[back] for field in fields(joined)))
 
 
-class KernelMonitor:
-    """Choice of the kernel whenever a model has learnt 30 measurements and a tenth of its data more.
-
-    The kernel is chosen by all data before these measurements. It is kept if it predicts these measurements, each before it
-    is learnt, with an error that is lower by a paired t-test of the log errors. The level of the test is the false-alarm
-    rate times the number of measurements.
-
-    Args:
-        false_alarm_rate: Kernels per measurement that are kept though they are no better.
-
-    Example:
-        >>> import swiftwrf
-        >>> data = swiftwrf.rssi_room(n=61)
-        >>> model, new = RssiModel().fit(data.subset(torch.arange(60))), data.subset(torch.tensor([60]))
-        >>> KernelMonitor(1e-4).observe(model.update(new), new, score(model, new)) is None
-        True
-    """
-
-    def __init__(self, false_alarm_rate: float) -> None:
-        self.false_alarm_rate = false_alarm_rate
-        self.restart()
-
-    def restart(self) -> None:
-        """Begin with new measurements."""
-        self._new: list[Spectra | Rssi] = []
-        self._scores: list[Scores] = []
-
-    def observe(
-        self, model: ProcessModel | RssiModel, new: Spectra | Rssi, scores: Scores
-    ) -> ProcessModel | RssiModel | None:
-        """Add one measurement; return the model with another kernel if that predicts better.
-
-        Args:
-            model: Model that has learnt the measurement.
-            new: The measurement.
-            scores: Its scores before it was learnt.
-        """
-        self._new.append(new)
-        self._scores.append(scores)
-        count = len(self._new)
-        n = len(model.process.known if isinstance(model, ProcessModel) else model.anchor)
-        if count < max(30, 0.1 * (n - count)) or n - count < MIN_TRAINING:
-            return None
-        last, error = self._new, Scores.joined(self._scores).error
-        self.restart()
-        other = model.with_chosen_kernel(without=torch.arange(n - count, n))
-        if other.kernel == model.kernel:
-            return None
-        found = []
-        for one in last:
-            found.append(score(other, one))
-            other = learnt(other, one)
-        gain = error.log() - Scores.joined(found).error.log()
-        better = stats.ttest_1samp(gain, 0.0, nan_policy="omit", alternative="greater")
-        return other if better.pvalue < self.false_alarm_rate * count else None
-
-
-def described(old: Kernel, new: Kernel) -> str:
-    """Return how a kernel differs from an earlier one, in words.
-
-    Example:
-        >>> described(Kernel(1.0, matern12_weight=1.0), Kernel(0.5, matern12_weight=1.0, noise=0.1))
-        'correlation length 1 -> 0.5 m, noise 0.01 -> 0.1'
-    """
-    lengths = f"correlation length {old.correlation_length:.2g} -> {new.correlation_length:.2g} m"
-    return f"{lengths}, noise {old.noise:.2g} -> {new.noise:.2g}"
-
-
 @dataclass(frozen=True, eq=False)
 class Step:
     """One followed measurement.
@@ -296,17 +220,21 @@ class Follower:
     """A fitted model that learns measurements one by one.
 
     An alarm of the innovations adapts models of spectra to the change, if these can forget spectra, and restarts the test.
-    Kernel and noise are chosen again while the data grow (`KernelMonitor`).
+    Kernel and noise are chosen again whenever the model has learnt 30 measurements and a tenth of its data more, by all data
+    before these measurements. Others replace them if they predict these, each before it is learnt, with an error that is
+    lower by a paired t-test of the log errors. The level of the test is the false-alarm rate times their number.
+
     With a room and training spectra, a notice reports once if the room no longer explains the spectra. The planes of a
     geometry are refined whenever 10 positions are new; until then, its spectra wait.
 
     Args:
         model: Fitted model with `update`.
         train: Training data of the model in their order, which calibrate the test for spectra.
-        config: Options of the test.
+        false_alarm_rate: False alarms a measurement, over all regions and receivers together.
 
     Raises:
-        InputError: A model without `update`, or training spectra of another link than that of the model.
+        InputError: A model without `update`, training spectra of another link than that of the model, or a rate outside
+            (0, 1).
 
     Example:
         >>> import swiftwrf
@@ -320,18 +248,20 @@ class Follower:
 
     @checked
     def __init__(
-        self, model: FieldModel | RssiModel, train: Spectra | Rssi | None = None, config: MonitorConfig | None = None
+        self,
+        model: FieldModel | RssiModel,
+        train: Spectra | Rssi | None = None,
+        false_alarm_rate: FalseAlarmRate = 1e-4,
     ) -> None:
         self.model, self.count = model, 0
-        self.monitor = Monitor.of(model, train, config)
-        self._kernel = KernelMonitor(self.monitor.config.false_alarm_rate)
+        self.monitor = Monitor.of(model, train, false_alarm_rate)
+        self._unjudged: list[tuple[Spectra | Rssi, Scores]] = []  # measurements since the last choice of the kernel
         self.room: Monitor | None = None
         """test of the coherence of room and spectra; None without room or training spectra, and after its alarm"""
         self._found = model.room if isinstance(model, FieldModel) else None  # as it was before the test
         if self._found is not None and isinstance(train, Spectra):
             # furniture blocks paths in some regions, whose coherence is lower without any change
-            whole = replace(self.monitor.config, n_regions=1)
-            self.room = Monitor(train.position, (), unexplained(self._found, train), whole)
+            self.room = Monitor(train.position, (), unexplained(self._found, train), false_alarm_rate, n_regions=1)
         self._recent: list[Spectra] = []
         self.waiting: Spectra | None = None
         """spectra that a geometry has not learnt yet, for its next update"""
@@ -346,8 +276,15 @@ class Follower:
         scores = score(self.model, new)
         alarms = self.monitor.observe(scores.position[0], scores.innovation[0])
         words, correlation, notices = list(map(self.monitor.describe, alarms)), None, []
-        if isinstance(new, Spectra):
-            notices += self._check_room(new)
+        if (
+            isinstance(new, Spectra)
+            and self.room is not None
+            and self._found is not None
+            and (changes := self.room.observe(new.position[0], unexplained(self._found, new)))
+        ):
+            self.room = None
+            since = f"the room no longer explains the spectra since measurement {changes[0].since}"
+            notices.append(f"{since}; fit it again, also if an obstacle appeared")
         notices += self._learn(new)
         self.count += 1
         if isinstance(new, Spectra) and isinstance(self.model, ProcessModel):
@@ -355,7 +292,8 @@ class Follower:
             if alarms:
                 correlation = self._adapt(self.model, alarms[0])
         if correlation is None and isinstance(self.model, ProcessModel | RssiModel):
-            notices += self._choose_kernel(self.model, new, scores)
+            self._unjudged.append((new, scores))
+            notices += self._choose_kernel(self.model)
         return Step(scores, tuple(words), correlation, "; ".join(notices))
 
     def _learn(self, new: Spectra | Rssi) -> list[str]:
@@ -374,24 +312,28 @@ class Follower:
         self.waiting = None
         return notices
 
-    def _check_room(self, new: Spectra) -> list[str]:
-        """Return a notice if the room no longer explains the spectra, which ends the test."""
-        if self.room is None or self._found is None:
+    def _choose_kernel(self, model: ProcessModel | RssiModel) -> list[str]:
+        """Choose the kernel again if enough measurements are new; return a notice if another one predicts better."""
+        count, n = len(self._unjudged), len(model.process.known if isinstance(model, ProcessModel) else model.anchor)
+        if count < max(30, 0.1 * (n - count)) or n - count < MIN_TRAINING:
             return []
-        alarms = self.room.observe(new.position[0], unexplained(self._found, new))
-        if not alarms:
+        last, self._unjudged = self._unjudged, []
+        other = model.with_chosen_kernel(without=torch.arange(n - count, n))
+        old, new = model.kernel, other.kernel
+        if new == old:
             return []
-        self.room = None
-        since = f"the room no longer explains the spectra since measurement {alarms[0].since}"
-        return [f"{since}; fit it again, also if an obstacle appeared"]
-
-    def _choose_kernel(self, model: ProcessModel | RssiModel, new: Spectra | Rssi, scores: Scores) -> list[str]:
-        """Choose the kernel again; return a notice if another one predicts better."""
-        found = self._kernel.observe(model, new, scores)
-        if found is None:
+        found = []
+        for one, _ in last:
+            found.append(score(other, one))
+            other = learnt(other, one)
+        gain = Scores.joined([scores for _, scores in last]).error.log() - Scores.joined(found).error.log()
+        better = stats.ttest_1samp(gain, 0.0, nan_policy="omit", alternative="greater")
+        rate = self.monitor.false_alarm_rate
+        if not better.pvalue < rate * count:
             return []
-        self.model, self.monitor = found, Monitor.of(found, None, self.monitor.config)
-        change = described(model.kernel, found.kernel)
+        self.model, self.monitor = other, Monitor.of(other, None, rate)
+        lengths = f"correlation length {old.correlation_length:.2g} -> {new.correlation_length:.2g} m"
+        change = f"{lengths}, noise {old.noise:.2g} -> {new.noise:.2g}"
         return [f"kernel chosen again after {self.count} measurements: {change}"]
 
     def _adapt(self, model: ProcessModel, alarm: Alarm) -> float:
@@ -399,8 +341,8 @@ class Follower:
         n, learnt = min(alarm.at - alarm.since + 1, len(self._recent)), len(model.process.known)
         after = joined(self._recent[-n:])
         self.model, correlation = adapted(model.forget(torch.arange(learnt - n, learnt)), after)
-        self.monitor = Monitor.of(self.model, None, self.monitor.config)
-        self._kernel.restart()
+        self.monitor = Monitor.of(self.model, None, self.monitor.false_alarm_rate)
+        self._unjudged = []
         return correlation
 
     def state(self) -> dict[str, Any]:
@@ -414,7 +356,7 @@ class Follower:
         self.monitor.resume(state["monitor"])
         self.room = None
         if (known := state["room"]) is not None:
-            self.room = Monitor(self.model.region(), (), None, self.monitor.config)
+            self.room = Monitor(self.model.region(), (), None, self.monitor.false_alarm_rate)
             self.room.resume(known)
 
 

@@ -57,14 +57,6 @@ class Scores:
         """Return the scores of all parts in order."""
         return cls(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(cls)))
 
-    def running_error(self, window: int = 50) -> Tensor:
-        """Return the mean error of the last `window` measurements after each of them, (n,)."""
-        total = torch.nn.functional.pad(self.error.nan_to_num().cumsum(0), (1, 0))
-        count = torch.nn.functional.pad((~self.error.isnan()).double().cumsum(0), (1, 0))
-        end = torch.arange(1, len(self) + 1)
-        begin = (end - window).clamp_min(0)
-        return (total[end] - total[begin]) / (count[end] - count[begin])
-
 
 def score(model: FieldModel | RssiPredictor, new: Spectra | Rssi) -> Scores:
     """Return the scores of measurements that a model has not learnt.
@@ -218,12 +210,12 @@ class Cusum:
         """Return sums of 0."""
         return cls(torch.zeros(n_series, dtype=torch.float64), torch.zeros(n_series, dtype=torch.int64), 0)
 
-    def updated(self, series: Tensor, threshold: float, allowance: float = ALLOWANCE) -> tuple[Cusum, list[Alarm]]:
+    def updated(self, series: Tensor, threshold: float) -> tuple[Cusum, list[Alarm]]:
         """Return the sums with one more value of each series (C,), nan for none, and the alarms, largest sum first.
 
         A sum that raises an alarm starts again at 0.
         """
-        added = (self.value + (series.double() - allowance).nan_to_num(0.0)).clamp_min(0)
+        added = (self.value + (series.double() - ALLOWANCE).nan_to_num(0.0)).clamp_min(0)
         since = self.since.where(self.value > 0, self.count)
         over = (added > threshold).nonzero()[:, 0]
         over = over[added[over].argsort(descending=True)]

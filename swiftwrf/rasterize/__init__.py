@@ -11,7 +11,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from functools import cache, lru_cache
 from importlib.util import find_spec
 from typing import Annotated, Literal
@@ -23,7 +22,7 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.errors import InputError
 from swiftwrf.rasterize import cuda, operators, reference
-from swiftwrf.rasterize.magnitude import magnitude
+from swiftwrf.rasterize.operators import magnitude
 from swiftwrf.runtime.validation import check_value
 
 Backend = Literal["auto", "reference", "cpu", "cuda"]
@@ -59,8 +58,8 @@ def rasterize(
 
     Raises:
         InputError: Shapes, dtypes or devices do not match, `cutoff` lies outside (0, 1), or the backend is unavailable
-            for these tensors. On the CPU outside torch.compile also values that are not finite and zeros on the
-            diagonal of a Cholesky factor. On a GPU this check would wait for the device.
+            for these tensors. On the CPU also values that are not finite and zeros on the diagonal of a Cholesky factor.
+            On a GPU this check would wait for the device.
 
     Example:
         >>> import torch
@@ -116,23 +115,6 @@ def prepare(device: torch.device | str) -> None:
     rasterize(ones, torch.ones(1, 3, device=device), ones, AngularGrid(0.0, 1.0, 1, 0.0, 1), backend)
 
 
-def _constant(function: Callable[[torch.device], bool]) -> Callable[[torch.device], bool]:
-    """Let torch.compile evaluate the function instead of tracing it.
-
-    This imports torch's compiler, a third of the import time of the package, and is needed on GPUs only.
-    """
-    return torch.compiler.assume_constant_result(function) if torch.cuda.is_available() else function
-
-
-def _available(device: torch.device) -> bool:
-    return HAS_NUMBA if device.type == "cpu" else device.type == "cuda" and _cuda_available(device)
-
-
-@_constant
-def _cuda_available(device: torch.device) -> bool:
-    return _cuda_compiles(device)
-
-
 @cache
 def _cuda_compiles(device: torch.device) -> bool:
     try:
@@ -141,6 +123,10 @@ def _cuda_compiles(device: torch.device) -> bool:
         warnings.warn(f"rendering with the slow backend 'reference': {error}", stacklevel=2)
         return False
     return True
+
+
+def _available(device: torch.device) -> bool:
+    return HAS_NUMBA if device.type == "cpu" else device.type == "cuda" and _cuda_compiles(device)
 
 
 def _fast(mean: Tensor, cholesky: Tensor, weight: Tensor, backend: Backend, cutoff: float | None) -> bool:
@@ -179,7 +165,7 @@ def _check(mean: Tensor, cholesky: Tensor, weight: Tensor) -> None:
             )
     if not mean.is_floating_point():
         raise InputError(f"mean, cholesky and weight must be floating point, got {mean.dtype}")
-    if mean.device.type == "cpu" and not torch.compiler.is_compiling():
+    if mean.device.type == "cpu":
         for name, tensor in (("mean", mean), ("cholesky", cholesky), ("weight", weight)):
             if not torch.isfinite(tensor).all():
                 raise InputError(f"{name} contains a value that is not finite; its primitive would not be rendered")

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
 import torch
@@ -22,15 +19,13 @@ from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Offsets, Rssi
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.errors import InputError, listed
-from swiftwrf.gp import Kernel
-from swiftwrf.models.base import FieldConfig, check_checkpoint
+from swiftwrf.models.base import FieldConfig
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Displayed
 from swiftwrf.positions import check_positions, to_tensor
 from swiftwrf.rssi.detection import Detection
 from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation, receiver_floors
 from swiftwrf.runtime.checkpoint import Header, Saved
-from swiftwrf.runtime.session import Record
 from swiftwrf.runtime.threads import parallel_map, to_device
 from swiftwrf.runtime.validation import (
     Configured,
@@ -79,16 +74,7 @@ class RssiPredictor(Configured, Displayed, ABC):
 
     If the data have floors, `fit` removes the attenuation of those between transmitter and receiver, and `predict` adds it.
 
-    A subclass sets `name` and `config_type`, and implements `_fit` and `_predict`. Options are keyword arguments of the
-    constructor; `config_type` declares their ranges.
-
-    Args:
-        config: Options as one object. Defaults to those of the preset.
-        preset: "quick" for the defaults; "paper" for the published settings.
-        options: Single options, which replace those of `config`.
-
-    Raises:
-        InputError: An unknown option, or a value outside its range.
+    A subclass sets `name` and `config_type`, and implements `_fit` and `_predict`. The constructor is that of `Configured`.
 
     Example:
         >>> import swiftwrf
@@ -145,8 +131,6 @@ class RssiPredictor(Configured, Displayed, ABC):
         pool: Rssi | None = None,
         device: torch.device | str = "cpu",
         parallel: Map | None = None,
-        checkpoint: Path | None = None,
-        on_record: Callable[[Record], None] | None = None,
         progress: bool = False,
     ) -> Self:
         """Fit the predictor to measured RSSI and return it. A fit that fails leaves the predictor as it was.
@@ -158,17 +142,13 @@ class RssiPredictor(Configured, Displayed, ABC):
             device: Device to compute on. The fitted predictor is on the CPU.
             parallel: Function that maps a picklable fit over receivers as `map` does, e.g. on other machines. Defaults to
                 threads of this process.
-            checkpoint: File for the state of the training of a network. If it exists, the fit continues from it. Other
-                predictors write none.
-            on_record: Called with each evaluation of a network, e.g. stage and seconds.
             progress: Show a progress bar on a terminal.
 
         Raises:
-            InputError: Too few measurements, values that are not finite, a missing requirement, a pool of other rows, or a
-                checkpoint of another fit or in a folder that does not exist.
+            InputError: Too few measurements, values that are not finite, a missing requirement, or a pool of other rows.
             FitError: The fit diverged.
         """
-        pool, checkpoint = pool or train, check_checkpoint(checkpoint)
+        pool = pool or train
         check_training(train, pool)
         if lacking := self.lacking(train):
             raise InputError(lacking)
@@ -182,10 +162,10 @@ class RssiPredictor(Configured, Displayed, ABC):
             of_pool = replace(self.attenuation, receiver_floor=tuple(receiver_floors(pool).tolist()))
             shift = shift + of_pool.of(pool.transmitter_position)
             train, pool = self.attenuation.removed(train), of_pool.removed(pool)
-        others = {"parallel": parallel, "checkpoint": checkpoint, "on_record": on_record, "progress": progress}
         curve = Detection.estimate(pool.transmitter_position, pool.rssi_dbm + shift)
         self.detection = curve and curve.columns(columns_of(self.receiver_names, pool))
-        self._fit(train, pool=pool, shift=shift, curve=curve, device=to_device(device), **others)
+        others = {"device": to_device(device), "parallel": parallel, "progress": progress}
+        self._fit(train, pool=pool, shift=shift, curve=curve, **others)
         return self
 
     @checked
@@ -325,16 +305,7 @@ class RssiPredictor(Configured, Displayed, ABC):
 
 
 class SavedRssiPredictor(RssiPredictor, Saved):
-    """Base class of predictors with a field that one file stores.
-
-    Example:
-        >>> import swiftwrf
-        >>> issubclass(swiftwrf.RssiModel, SavedRssiPredictor), issubclass(swiftwrf.PairModel, SavedRssiPredictor)
-        (True, True)
-    """
-
-    kernel: Kernel
-    """kernel of the field, lengths in [m]"""
+    """Base class of predictors that one file stores."""
 
     def _header(self) -> Header:
         """Return the plain values that files of all these predictors contain."""
@@ -345,7 +316,6 @@ class SavedRssiPredictor(RssiPredictor, Saved):
             "attenuation": self.attenuation and asdict(self.attenuation),
             "receiver_names": self.receiver_names,
             "receiver_position": [None if math.isnan(at[0]) else at for at in self.receiver_position.tolist()],
-            "kernel": asdict(self.kernel),
         }
 
     @classmethod
@@ -360,7 +330,7 @@ class SavedRssiPredictor(RssiPredictor, Saved):
         predictor.origin = GeodeticOrigin(*map(float, header["origin"])) if header.get("origin") else None
         predictor.attenuation = FloorAttenuation.from_plain(header.get("attenuation"))
         predictor.offsets = Offsets(**header["offsets"]) if header.get("offsets") else None
-        predictor.kernel, predictor.detection = Kernel(**header["kernel"]), None
+        predictor.detection = None
         return predictor
 
 
@@ -384,12 +354,3 @@ def columns_of(receiver_names: Sequence[str], pool: Rssi) -> Tensor:
     """Return the columns of a pool that hold these receivers, int64 (R,)."""
     names = list(pool.receiver_names)
     return torch.tensor([names.index(name) for name in receiver_names])
-
-
-def fingerprint(config: Any, train: Rssi, pool: Rssi) -> str:
-    """Return a digest that identifies a fit by its configuration (a dataclass) and its measurements."""
-    digest = hashlib.sha256(json.dumps([type(config).__name__, asdict(config), train.receiver_names]).encode())
-    for data in (train, pool):
-        for tensor in (data.transmitter_position, data.receiver_position, data.rssi_dbm, data.session):
-            digest.update(b"" if tensor is None else tensor.contiguous().numpy().tobytes())
-    return digest.hexdigest()

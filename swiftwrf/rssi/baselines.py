@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from abc import abstractmethod
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,9 +25,9 @@ from swiftwrf.rssi.comparison import make_predictor
 from swiftwrf.rssi.detection import Detection
 from swiftwrf.rssi.mixing import mixing_weights
 from swiftwrf.rssi.pairs import PairPredictor
-from swiftwrf.rssi.path_loss import fit_path_losses, fit_shared_path_loss, log_distance
+from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, fit_path_losses, log_distance
 from swiftwrf.runtime.threads import parallel_map
-from swiftwrf.runtime.validation import Preset, configuration
+from swiftwrf.runtime.validation import configuration
 
 MAX_TREE_COLUMNS = 15  # of coordinates whose neighbours a tree finds
 NEIGHBOUR_COUNTS = (1, 3, 5, 8, 12, 20, 40, 80, 120)
@@ -63,10 +62,14 @@ class SharedPathLoss(RssiPredictor):
     requires_receiver_position = True
 
     def _fit(self, train: Rssi, *, pool: Rssi, shift: Tensor, curve: Detection | None, **_: Any) -> None:
-        self._receiver = train.receiver_position
+        self._receiver, rssi, located = train.receiver_position, pool.rssi_dbm, pool.receiver_located
         distance = log_distance(pool.transmitter_position, pool.receiver_position)
-        known = pool.receiver_located, train.receiver_located
-        self._path_loss = fit_shared_path_loss(distance, pool.rssi_dbm, *known)
+        own, others = (fit_path_loss(distance[:, kind], rssi[:, kind], shared=True) for kind in (located, ~located))
+        # without measurements of one kind, the model of the other kind; receivers of unknown position then have the mean
+        own, mean = own.where(~own.level.isnan(), fit_path_loss(distance, rssi, shared=True)), rssi.nanmean().reshape(1)
+        others = others.where(~others.level.isnan(), PathLoss(mean, torch.zeros_like(mean)))
+        here = train.receiver_located
+        self._path_loss = PathLoss(*(a.expand(len(here)).where(here, b) for a, b in zip(own, others, strict=True)))
 
     def _predict(self, position: Tensor) -> tuple[Tensor, None]:
         return self._path_loss(log_distance(position, self._receiver)), None
@@ -238,13 +241,6 @@ class BlendConfig(FieldConfig):
 
     members: tuple[str, ...] = ("swiftwrf", "gp", "knn", "mri_residual")
     """names of the predictors; those whose requirements the data do not meet are left out"""
-    member_preset: Preset = "quick"
-    """preset of the members"""
-
-    @classmethod
-    def paper(cls, **changes: Any) -> BlendConfig:
-        """Return a blend of members with published settings."""
-        return replace(cls(member_preset="paper"), **changes)
 
 
 class Blend(RssiPredictor):
@@ -267,7 +263,7 @@ class Blend(RssiPredictor):
             """Return a member, fitted to the kept rows (rows,)."""
             rows = kept.nonzero()[:, 0]
             options = {"validation": self.config.validation, "seed": self.config.seed}
-            unfitted = make_predictor(name, self.config.member_preset, **options)
+            unfitted = make_predictor(name, **options)
             return unfitted.fit(train.subset(rows), pool=pool.subset(rows), device=device, parallel=parallel)
 
         names = [name for name in self.config.members if not RSSI_PREDICTORS[name].lacking(train)]

@@ -251,13 +251,17 @@ def compare(
         fitted = time.perf_counter()
         prediction = predictor.predict_detected(test)
         seconds = {"fit": fitted - began, "predict": time.perf_counter() - fitted}
+        found = None  # shares of detected and of empty test cells that are predicted as such, if there are both kinds
         if rows is None:
-            predictors[name] = predictor
+            predictors[name], detected = predictor, test.detected
+            if predictor.detection is not None and not bool(detected.all()) and not test.receiver_moves:
+                above = predictor.predict_detection(test.transmitter_position) > 0.5
+                found = float(above[detected].double().mean()), float((~above)[~detected].double().mean())
         std = None if prediction.std is None else prediction.std[test.detected]
         error = (prediction.mean + offset - test.rssi_dbm)[test.detected].abs()
         values = {"predicted": prediction.mean[test.detected], "std": std, "median_db": float(error.quantile(0.5))}
         values["mean_db"] = float(error.mean())
-        return predictor, seconds | values | {"detection": _detection(predictor, test)}
+        return predictor, seconds | values | {"detection": found}
 
     keep = keep or (lambda name, compute: compute()[1])
     values = {name: keep(name, partial(compute, name)) for name in names}
@@ -273,15 +277,6 @@ def compare(
     by_rows = DataFrame.from_dict(keep("fewer rows", study) if parts else {}, orient="index")
     by_rows = by_rows.set_index(by_rows.index.astype(int)).rename_axis("n_train")
     return RssiComparison(train, test, values, left_out, predictors, by_rows)
-
-
-def _detection(predictor: RssiPredictor, test: Rssi) -> tuple[float, float] | None:
-    """Return the shares of detected and of empty test cells that are predicted as such; None if there is one kind only."""
-    detected = test.detected
-    if predictor.detection is None or bool(detected.all()) or test.receiver_moves:
-        return None
-    above = predictor.predict_detection(test.transmitter_position) > 0.5
-    return float(above[detected].double().mean()), float((~above)[~detected].double().mean())
 
 
 def pool_of(whole: Rssi, train: Rssi, test: Rssi, split: str, seed: int) -> Rssi:

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.models.primitives import Primitives
 from swiftwrf.rasterize import rasterize
-from swiftwrf.rasterize.magnitude import magnitude
+from swiftwrf.rasterize.operators import magnitude
 
 HEAD_GRID = AngularGrid.hemisphere(16, 16)
 N_DIRECTIONS = HEAD_GRID.shape[0] * HEAD_GRID.shape[1]

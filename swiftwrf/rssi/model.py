@@ -8,7 +8,7 @@ directivity_r a few harmonics of the direction from the receiver, and w_r the mi
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from typing import Any, ClassVar, Self
 
@@ -18,6 +18,7 @@ from torch import Tensor
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.errors import InputError
+from swiftwrf.gp import Kernel, subsample
 from swiftwrf.models.base import CPU
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Axes
@@ -30,7 +31,7 @@ from swiftwrf.rssi.mixing import check_comparable, comparable, interval_scale, m
 from swiftwrf.rssi.path_loss import N_HARMONICS, harmonics, log_distance
 from swiftwrf.rssi.posterior import FitState, RssiPosterior
 from swiftwrf.rssi.regression import Uncertainty, fit_receiver, held_out_std
-from swiftwrf.rssi.training import RssiTraining, prepare, representative_receivers
+from swiftwrf.rssi.training import MAX_KERNEL_RECEIVERS, RssiTraining, prepare
 from swiftwrf.runtime import checkpoint as files
 from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.progress import progress_bar
@@ -50,9 +51,7 @@ class RssiModel(SavedRssiPredictor):
     cell is an upper limit of the received power where the empty cells of a receiver are those of weak signals, see
     `RssiConfig.not_detected`. `predict` gives the power of all packets, `predict_detected` that of detected ones.
 
-    Args:
-        config: Options as one object. Defaults to `RssiConfig()`.
-        options: Single options, which replace those of `config`.
+    The options are those of `RssiConfig`.
 
     Example:
         >>> import swiftwrf
@@ -67,6 +66,8 @@ class RssiModel(SavedRssiPredictor):
     name = "swiftwrf"
     config_type = RssiConfig
 
+    kernel: Kernel
+    """kernel of the latent field, lengths in [m]"""
     n_primitives: int
     """primitives a receiver; 0 if there is no field"""
     mixing_weight: Tensor
@@ -135,7 +136,8 @@ class RssiModel(SavedRssiPredictor):
         The weights are those of all receivers: the few folds determine no weights for each of them. They follow from the
         receivers of the pool, so that a receiver's prediction is the same whichever others are fitted with it.
         """
-        some = representative_receivers(pool)
+        detecting = pool.detected.any(dim=0).nonzero()[:, 0]
+        some = pool.columns(subsample(detecting, rows=MAX_KERNEL_RECEIVERS)[0].tolist())
         if set(some.receiver_names) <= set(train.receiver_names):
             predictors = predictors[:, :, columns_of(some.receiver_names, train)]
         else:
@@ -347,7 +349,7 @@ class RssiModel(SavedRssiPredictor):
     def state(self) -> tuple[dict[str, Tensor], Header]:
         self.check_fitted()
         tensors = {name: getattr(self, name) for name in _shapes(0, 0)}
-        header = self._header() | {"n_primitives": self.n_primitives}
+        header = self._header() | {"kernel": asdict(self.kernel), "n_primitives": self.n_primitives}
         if self.detection is not None:
             tensors |= {"missed": self.detection.missed, "is_limit": self.detection.is_limit}
             header |= {"detection": [self.detection.limit, self.detection.width]}
@@ -355,13 +357,13 @@ class RssiModel(SavedRssiPredictor):
             of_field = self.detection_field.state()
             tensors, header = tensors | of_field[0], header | of_field[1]
         if self._posterior is not None:
-            tensors |= self._posterior.folded().state.tensors()
+            tensors |= {f"fit.{name}": value for name, value in vars(self._posterior.folded().state).items()}
         return tensors, header
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
         model = cls._of_header(header)
-        model.n_primitives = int(header["n_primitives"])
+        model.kernel, model.n_primitives = Kernel(**header["kernel"]), int(header["n_primitives"])
         shapes = _shapes(len(model.receiver_names), len(tensors["anchor"]))
         files.expect(tensors, shapes)
         for name in shapes:
@@ -379,8 +381,7 @@ class RssiModel(SavedRssiPredictor):
             model.detection = Detection(limit, width, tensors["missed"].double(), tensors["is_limit"].bool())
         model._posterior = None
         if "fit.dual" in tensors:
-            files.expect(tensors, FitState.shapes(len(model.receiver_names), len(tensors["anchor"])))
-            model._posterior = model._posterior_of(FitState.of(tensors))
+            model._posterior = model._posterior_of(FitState.of(tensors, n_receivers, len(tensors["anchor"])))
         model._precompute()
         return model
 

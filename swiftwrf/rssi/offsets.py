@@ -158,24 +158,20 @@ def estimate_offsets(train: Rssi, reference: str | None = None) -> Offsets:
         rows = rows[torch.randperm(len(rows), generator=generator)[:MAX_ROWS]]  # evenly spaced rows may be of one group
         if not len(rows):
             continue
-        weight = _residual_precision(kernel.covariance(position[rows]), apart[rows, r])
+        precision = torch.linalg.inv(kernel.covariance(position[rows]))
+        free = torch.stack([torch.ones_like(apart[rows, r]), apart[rows, r]], dim=1)
+        weighted = precision @ free  # level and slope over log10 distance are fitted with the offsets
+        weight = precision - weighted @ torch.linalg.pinv(free.T @ weighted, hermitian=True) @ weighted.T
         normal += member[rows].T @ weight @ member[rows]
         right += member[rows].T @ weight @ rssi[rows]
         total += float(rssi[rows] @ weight @ rssi[rows])
-    free = torch.tensor([name != chosen for name in groups.names])
-    precision = normal[free][:, free] + 0.05 * torch.eye(int(free.sum())).double()  # a standard deviation of 10 dB
+    others = torch.tensor([name != chosen for name in groups.names])
+    precision = (
+        normal[others][:, others] + 0.05 * torch.eye(int(others.sum())).double()
+    )  # a standard deviation of 10 dB
     offset = torch.zeros(len(groups.names), dtype=torch.float64)
-    offset[free] = torch.linalg.solve(precision, right[free])
+    offset[others] = torch.linalg.solve(precision, right[others])
     explained = float(right @ offset) / total if total > 0 else 0.0
     estimates = dict(zip(groups.names, offset.tolist(), strict=True))
     known = {name: db for name, db in estimates.items() if frequency[groups.names.index(name)] > 0 or name == chosen}
     return Offsets(groups.column, chosen, known, explained)
-
-
-def _residual_precision(covariance: Tensor, apart: Tensor) -> Tensor:
-    """Return the precision of noisy values with covariance (m, m) after a fit of level and slope over log10 distance."""
-    precision = torch.linalg.inv(covariance)
-    free = torch.stack([torch.ones_like(apart), apart], dim=1)
-    weighted = precision @ free
-    projected: Tensor = precision - weighted @ torch.linalg.pinv(free.T @ weighted, hermitian=True) @ weighted.T
-    return projected

@@ -10,7 +10,7 @@ known places are predicted, they depend on the place, by a ridge regression.
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from itertools import groupby
 from statistics import NormalDist
@@ -119,11 +119,6 @@ class PairPredictor(RssiPredictor):
     """Base class of predictors over pairs of positions of transmitter and receiver; all receivers are alike.
 
     A subclass implements `_fit_pairs` and `_at_pairs` instead of `_fit` and `_predict`.
-
-    Example:
-        >>> import swiftwrf
-        >>> issubclass(swiftwrf.PairModel, PairPredictor), PairPredictor.requires_receiver_position
-        (True, True)
     """
 
     config_type = PairConfig
@@ -254,6 +249,8 @@ class PairModel(PairPredictor, SavedRssiPredictor):
     name = "pairs"
     max_map_predictions = 60_000  # each needs a system of 64 equations
 
+    kernel: Kernel
+    """kernel of the field, lengths in [m]"""
     metric: Metric
     """how distances of both ends count"""
     path_loss: PairPathLoss
@@ -273,21 +270,15 @@ class PairModel(PairPredictor, SavedRssiPredictor):
         sample = order[:MAX_HELD_OUT]
         # one region only: none is left to predict it from
         fold = fold if len(fold.unique()) > 1 else torch.arange(len(fold)) % 2
-        held_out = self._residuals_without(rssi, fold, sample)
+        held_out = {}  # residuals of the path-loss model fitted without each fold of the sample
+        for number in fold[sample].unique().tolist():
+            kept = fold != number
+            held_out[number] = rssi - PairPathLoss.fit(pair[kept], rssi[kept], not self.config.new_places)(pair)
         choices = [choice for metric in METRICS for choice in self._judged(metric, fold, sample, held_out)]
         _, self.metric, self.kernel, score = min(choices, key=lambda choice: choice[0])
         scale = score.quantile(LEVEL)[None] / NormalDist().inv_cdf((1 + LEVEL) / 2)
         self.scale_db = scale.clamp_min(rounding_std(rssi) / self.kernel.noise**0.5)
         self._precompute()
-
-    def _residuals_without(self, rssi: Tensor, fold: Tensor, sample: Tensor) -> dict[int, Tensor]:
-        """Return the residuals (m,) of the path-loss model fitted without each fold of the sample."""
-        residual = {}
-        for number in fold[sample].unique().tolist():
-            kept = fold != number
-            fitted = PairPathLoss.fit(self.pair[kept], rssi[kept], not self.config.new_places)
-            residual[number] = rssi - fitted(self.pair)
-        return residual
 
     def _judged(
         self, metric: Metric, fold: Tensor, sample: Tensor, held_out: dict[int, Tensor]
@@ -339,12 +330,12 @@ class PairModel(PairPredictor, SavedRssiPredictor):
         own = {"pair": self.pair, "residual": self.residual, "scale_db": self.scale_db}
         loss = self.path_loss
         tensors = own | {"path_loss": loss.shared, "place": loss.place, "correction": loss.correction}
-        return tensors, self._header() | {"metric": self.metric}
+        return tensors, self._header() | {"kernel": asdict(self.kernel), "metric": self.metric}
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
         model = cls._of_header(header)
-        ratio, reciprocal = header["metric"]
+        model.kernel, (ratio, reciprocal) = Kernel(**header["kernel"]), header["metric"]
         model.metric = Metric(float(ratio), bool(reciprocal))
         n_pairs, n_places = len(tensors["pair"]), len(tensors["place"])
         shapes = {"pair": (n_pairs, 6), "residual": (n_pairs,), "scale_db": (1,)}

@@ -56,9 +56,7 @@ class RssiPaperModel(RssiModel):
 
     It cannot be updated. One of five folds is held out to calibrate the standard deviation.
 
-    Args:
-        config: Options as one object. Defaults to `RssiPaperConfig()`.
-        options: Single options, which replace those of `config`.
+    The options are those of `RssiPaperConfig`.
 
     Example:
         >>> import swiftwrf
@@ -100,29 +98,24 @@ class RssiPaperModel(RssiModel):
             fits = (parallel or map)(task, parts)
             results = list(bar.track(fits, total=len(parts), description="receivers"))
         held_out, white, rendered = (torch.cat(values) for values in zip(*results, strict=True))
-        self._calibrate(train, bins, prior_db, held_out.T)
-        per_receiver = torch.zeros(n_receivers, dtype=torch.float64)
+        per_receiver, covariance = torch.zeros(n_receivers).double(), torch.zeros(n_receivers, 2, 2).double()
+        out = ~bins.rssi.isnan() & (bins.fold == HELD_OUT_FOLD)[:, None]
+        predicted = held_out.T.double().where(out, torch.nan)[bins.bin_of_row]
+        check_comparable(predicted[None], train.rssi_dbm)
+        std = held_out_std(bins, self.kernel, prior_db, per_receiver, covariance)[bins.bin_of_row]
+        scale = interval_scale(predicted, std, train.rssi_dbm)
+        self.field_db = (scale * prior_db[0]).float()
+        self.noise_db = (scale * prior_db[1]).clamp_min(rounding_std(train.rssi_dbm)).float()
         self.n_primitives, self.mixing_weight = config.n_primitives, FIELD_ALONE[:, None].repeat(1, n_receivers)
         self.centre, self.anchor, self.rendered = bins.centre, bins.position.float(), rendered
         self.level = LEVEL_DBM + HeadTable(rendered)(per_receiver[None])[0][0]
         self.slope, self.middle = per_receiver, per_receiver.clone()
         self.detection_field = None
-        self.covariance = torch.zeros(n_receivers, 2, 2, dtype=torch.float64)
+        self.covariance = covariance
         self.directivity = torch.zeros(n_receivers, N_HARMONICS)
         dual = torch.linalg.solve_triangular(root.T, white.T.double() * prior_db[0], upper=True)
         self.coefficient, self._posterior = dual.float(), None
         self._precompute()
-
-    def _calibrate(self, train: Rssi, bins: Bins, prior_db: tuple[Tensor, Tensor], held_out: Tensor) -> None:
-        """Determine both standard deviations from predictions (n, R) of the bins, one fold of which was held out."""
-        out = ~bins.rssi.isnan() & (bins.fold == HELD_OUT_FOLD)[:, None]
-        predicted = held_out.double().where(out, torch.nan)
-        check_comparable(predicted[None, bins.bin_of_row], train.rssi_dbm)
-        none = torch.zeros(len(prior_db[0]), dtype=torch.float64)
-        std = held_out_std(bins, self.kernel, prior_db, none, none[:, None, None].repeat(1, 2, 2))
-        scale = interval_scale(predicted[bins.bin_of_row], std[bins.bin_of_row], train.rssi_dbm)
-        field_db, noise_db = (scale * db for db in prior_db)
-        self.field_db, self.noise_db = field_db.float(), noise_db.clamp_min(rounding_std(train.rssi_dbm)).float()
 
 
 @single_thread()
@@ -153,53 +146,41 @@ def learn_receivers(
     Raises:
         FitError: A loss that is not finite.
     """
-    kept = bins.fold != HELD_OUT_FOLD
-    held_out = _descend(some, bins, root, prior_db, kept, config, device)[0]
-    _, white, rendered = _descend(some, bins, root, prior_db, torch.ones_like(kept), config, device)
-    return held_out.T, white.T, rendered
-
-
-def _descend(
-    some: slice,
-    bins: Bins,
-    root: Tensor,
-    prior_db: tuple[Tensor, Tensor],
-    kept: Tensor,
-    config: RssiPaperConfig,
-    device: torch.device,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return predictions in all bins (n, R) [dBm], the normal numbers behind the field (n, R), and the rendered heads."""
-    generator = torch.Generator().manual_seed(config.seed)
-    names = bins.receiver_names[some]
-    heads = [Head(name, config.n_primitives, config.seed).to(device) for name in names]
+    names, root = bins.receiver_names[some], root.float().to(device)
     field_db, noise_db = (x[some].float().to(device) for x in prior_db)
     measured, count = (x[:, some].float().to(device) for x in (bins.rssi, bins.count))
-    root = root.float().to(device)
-    white = nn.Parameter(torch.zeros_like(measured))
     noise_db = noise_db / count.clamp_min(1).sqrt()
-    rows = kept.nonzero()[:, 0]
-    n_detected = (~measured[rows.to(device)].isnan()).sum(dim=0).clamp_min(1)
-    optimiser = torch.optim.Adam([*(p for head in heads for p in head.parameters()), white], lr=config.rate)
 
-    def predict(at: Tensor) -> Tensor:
-        return LEVEL_DBM + mean_magnitude(render(heads), field_db * (root[at] @ white))
+    def descend(rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return predictions in all bins (R, n) by the fit to some bins, the normal numbers (R, n), and the heads."""
+        generator = torch.Generator().manual_seed(config.seed)
+        heads = [Head(name, config.n_primitives, config.seed).to(device) for name in names]
+        white = nn.Parameter(torch.zeros_like(measured))
+        n_detected = (~measured[rows.to(device)].isnan()).sum(dim=0).clamp_min(1)
+        optimiser = torch.optim.Adam([*(p for head in heads for p in head.parameters()), white], lr=config.rate)
 
-    for step in range(config.steps):
-        batch = rows[torch.randint(len(rows), (min(config.batch, len(rows)),), generator=generator)].to(device)
-        detected = ~measured[batch].isnan()
-        error = ((predict(batch) - measured[batch]) / noise_db[batch]).where(detected, 0.0)
-        losses = functional.huber_loss(error, torch.zeros_like(error), delta=config.huber, reduction="none").sum(dim=0)
-        losses = losses / detected.sum(dim=0).clamp_min(1) + 0.5 * white.square().sum(dim=0) / n_detected
-        loss = losses.sum()
-        if not math.isfinite(loss.item()):
-            raise FitError(
-                f"the RSSI fit of {', '.join(names)} broke at step {step}: loss {loss.item():.3g}; try a rate "
-                f"below {config.rate:g}"
-            )
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.param_groups[0]["lr"] = config.rate * 0.5 * (1 + math.cos(math.pi * step / config.steps))
-        optimiser.step()
-    with torch.no_grad():
-        parts = torch.arange(len(root), device=device).split(config.batch)
-        return torch.cat([predict(at) for at in parts]).cpu(), white.detach().cpu(), render(heads).cpu()
+        def predict(at: Tensor) -> Tensor:
+            return LEVEL_DBM + mean_magnitude(render(heads), field_db * (root[at] @ white))
+
+        for step in range(config.steps):
+            batch = rows[torch.randint(len(rows), (min(config.batch, len(rows)),), generator=generator)].to(device)
+            detected = ~measured[batch].isnan()
+            error = ((predict(batch) - measured[batch]) / noise_db[batch]).where(detected, 0.0)
+            losses = functional.huber_loss(error, torch.zeros_like(error), delta=config.huber, reduction="none")
+            losses = losses.sum(dim=0) / detected.sum(dim=0).clamp_min(1)
+            loss = (losses + 0.5 * white.square().sum(dim=0) / n_detected).sum()
+            if not math.isfinite(loss.item()):
+                raise FitError(
+                    f"the RSSI fit of {', '.join(names)} broke at step {step}: loss {loss.item():.3g}; try a rate "
+                    f"below {config.rate:g}"
+                )
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.param_groups[0]["lr"] = config.rate * 0.5 * (1 + math.cos(math.pi * step / config.steps))
+            optimiser.step()
+        with torch.no_grad():
+            parts = torch.arange(len(root), device=device).split(config.batch)
+            return torch.cat([predict(at) for at in parts]).cpu().T, white.detach().cpu().T, render(heads).cpu()
+
+    held_out = descend((bins.fold != HELD_OUT_FOLD).nonzero()[:, 0])[0]
+    return held_out, *descend(torch.arange(len(bins.fold)))[1:]

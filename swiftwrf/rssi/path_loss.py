@@ -83,32 +83,6 @@ class PathLoss(NamedTuple):
         return PathLoss(self.level.where(usable, other.level), self.slope.where(usable, other.slope))
 
 
-def fit_shared_path_loss(distance: Tensor, rssi: Tensor, located: Tensor, applied: Tensor | None = None) -> PathLoss:
-    """Fit one path-loss model to all receivers of known position, and one level to all others.
-
-    Args:
-        distance: log10 of the distances [m], (n, P).
-        rssi: Measurements (n, P) [dBm], nan where not detected.
-        located: Whether the position of each receiver is known, bool (P,).
-        applied: The same for the R receivers that the model is for. Defaults to `located`.
-
-    Returns:
-        The model of each receiver, of shape (R,). Without measurements of one kind, that of the other kind. Receivers of
-        unknown position then have the mean level.
-
-    Example:
-        >>> distance, rssi = torch.tensor([[0.0, 0.0], [1.0, 0.0]]), torch.tensor([[-40.0, -70.0], [-60.0, -70.0]])
-        >>> fit_shared_path_loss(distance, rssi, torch.tensor([True, False])).slope
-        tensor([-20.,   0.])
-    """
-    own, others = (fit_path_loss(distance[:, kind], rssi[:, kind], shared=True) for kind in (located, ~located))
-    own = own.where(~own.level.isnan(), fit_path_loss(distance, rssi, shared=True))
-    mean = rssi.nanmean().reshape(1)
-    others = others.where(~others.level.isnan(), PathLoss(mean, torch.zeros_like(mean)))
-    is_located = located if applied is None else applied
-    return PathLoss(*(a.expand(len(is_located)).where(is_located, b) for a, b in zip(own, others, strict=True)))
-
-
 def fit_path_loss(distance: Tensor, rssi: Tensor, *, shared: bool = False) -> PathLoss:
     """Fit the path-loss model by least squares (Rappaport, "Wireless Communications", 2nd ed., 2002, section 4.9).
 

@@ -26,6 +26,7 @@ from swiftwrf.gp import Kernel
 from swiftwrf.rssi.head import HeadTable
 from swiftwrf.rssi.path_loss import N_HARMONICS, harmonics, log_distance
 from swiftwrf.rssi.regression import WEIGHT_TOLERANCE, coefficient_scale, regressors
+from swiftwrf.runtime.checkpoint import expect
 
 MAX_NEW_ROWS = 256  # beyond, the weights of new rows are fixed and the inverses are computed again
 TOLERANCE = WEIGHT_TOLERANCE / 100  # of these weights, so that the order of the rows does not matter
@@ -61,21 +62,13 @@ class FitState:
     field_variance: Tensor
     noise_variance: Tensor
 
-    def tensors(self) -> dict[str, Tensor]:
-        """Return the tensors by their names in files."""
-        return {f"fit.{field.name}": getattr(self, field.name) for field in fields(self)}
-
     @classmethod
-    def of(cls, tensors: dict[str, Tensor]) -> FitState:
-        """Return the state in a file."""
-        return cls(**{field.name: tensors[f"fit.{field.name}"].double() for field in fields(cls)})
-
-    @classmethod
-    def shapes(cls, n_receivers: int, n_bins: int) -> dict[str, tuple[int, ...]]:
-        """Return the shape of each tensor in a file."""
+    def of(cls, tensors: dict[str, Tensor], n_receivers: int, n_bins: int) -> FitState:
+        """Return the state in the tensors of a file, whose names begin with `fit.`."""
         rows = ("dual", "tangent", "variance", "measured")
         sizes = {field.name: (n_bins, n_receivers) if field.name in rows else (n_receivers,) for field in fields(cls)}
-        return {f"fit.{name}": size for name, size in sizes.items()}
+        expect(tensors, {f"fit.{name}": size for name, size in sizes.items()})
+        return cls(**{name: tensors[f"fit.{name}"].double() for name in sizes})
 
 
 @dataclass(frozen=True, eq=False)

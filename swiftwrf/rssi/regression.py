@@ -84,7 +84,10 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
                 middle = prior.level + prior.slope * loss.centre
                 prior, std[1], feature[:, 1] = PathLoss(middle, torch.zeros(1).double()), 0.0, 0.0
                 *found, factor = solved()
-            error[used] = fold_errors(factor, found[0], data.fold[used].to(device)).cpu()
+            precision, fold = torch.cholesky_inverse(factor), data.fold[used]
+            for number in fold.unique():
+                part = (fold == number).nonzero()[:, 0]
+                error[used[part]] = held_out_errors(precision, found[0], part.to(device)).cpu()
         except torch.linalg.LinAlgError as reason:  # type: ignore[attr-defined]
             raise FitError(
                 f"the RSSI fit of receiver {data.receiver_names[some][0]!r} broke ({reason}); are its values sane?"
@@ -217,16 +220,6 @@ def _site(mean: Tensor, variance: Tensor, limit: Tensor, noise: Tensor, censored
     concave = (second < 0) & (1 + second * variance > 1e-3)
     found = torch.stack([-second, first - mean * second]) / (1 + second * variance)
     return found.where(concave, 0.0)
-
-
-def fold_errors(factor: Tensor, dual: Tensor, fold: Tensor) -> Tensor:
-    """Return the errors (n,) [dB] of the predictions of each bin by all other folds (n,)."""
-    precision = torch.cholesky_inverse(factor)
-    error = torch.empty_like(dual)
-    for number in fold.unique():
-        part = (fold == number).nonzero()[:, 0]
-        error[part] = held_out_errors(precision, dual, part)
-    return error
 
 
 class Uncertainty:

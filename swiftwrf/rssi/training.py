@@ -153,7 +153,11 @@ def _limits(rssi: Tensor, loss: PathLosses, distance: Tensor, offset: Tensor) ->
 def binned(train: Rssi, config: RssiConfig) -> Bins:
     """Return the training rows by location bin, with the folds that the options state."""
     position, rssi, count, bin_of_row = bin_locations(train, config.max_locations)
-    session = _most_frequent(train.session, bin_of_row)
+    session = train.session
+    if session is not None:  # that most rows of each bin are of
+        _, own = session.unique(return_inverse=True)
+        times = torch.zeros(len(position), int(own.max()) + 1)
+        session = times.index_put((bin_of_row, own), torch.ones(()), accumulate=True).argmax(dim=1)
     centre = position.mean(dim=0)
     return Bins(
         receiver_names=tuple(map(str, train.receiver_names)),
@@ -174,21 +178,6 @@ def prior_std(variance: Tensor, kernel: Kernel | None) -> tuple[Tensor, Tensor]:
     """
     noise = 1.0 if kernel is None else kernel.noise / (1 + kernel.noise)
     return ((1 - noise) * variance).sqrt(), (noise * variance).sqrt()
-
-
-def representative_receivers(pool: Rssi) -> Rssi:
-    """Return the data of at most 12 receivers of the pool that detected the transmitter, evenly chosen."""
-    detecting = pool.detected.any(dim=0).nonzero()[:, 0]
-    return pool.columns(subsample(detecting, rows=MAX_KERNEL_RECEIVERS)[0].tolist())
-
-
-def _most_frequent(session: Tensor | None, bin_of_row: Tensor) -> Tensor | None:
-    """Return the session that most rows of each bin are of, int64 (n,)."""
-    if session is None:
-        return None
-    _, own = session.unique(return_inverse=True)
-    times = torch.zeros(int(bin_of_row.max()) + 1, int(own.max()) + 1)
-    return times.index_put((bin_of_row, own), torch.ones(()), accumulate=True).argmax(dim=1)
 
 
 def bin_locations(rows: Rssi, max_locations: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:

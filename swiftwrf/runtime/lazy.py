@@ -1,6 +1,6 @@
 """Packages whose members are imported at first use, so that importing the package loads neither torch nor SciPy.
 
-Type checkers and editors read the usual import statements, in a block `if TYPE_CHECKING`.
+Type checkers and editors read the usual import statements, in a block `if TYPE_CHECKING`, as `import name as name`.
 """
 
 from __future__ import annotations
@@ -35,12 +35,13 @@ class _LazyPackage(ModuleType):
 
 
 def import_lazily(package: str, members: Mapping[str, Sequence[str]]) -> None:
-    """Postpone the imports of a package until a name is read from it.
+    """Postpone the imports of a package until a name is read from it. `__all__` are the names that are no submodules.
 
     Args:
         package: `__name__` of the package.
         members: Names by the module that defines them; submodules by the package.
     """
     module = sys.modules[package]
-    module.__dict__["lazy"] = {name: source for source, names in members.items() for name in names}
+    lazy = {name: source for source, names in members.items() for name in names}
+    module.__dict__.update(lazy=lazy, __all__=sorted(name for name, source in lazy.items() if source != package))
     module.__class__ = _LazyPackage

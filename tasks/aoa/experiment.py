@@ -10,7 +10,7 @@ import torch
 from augment.turbo.choice import Suggestion, first_steps
 from augment.turbo.experiment import Experiment
 from augment.turbo.locating import Locating
-from augment.turbo.results import Results, rows_of
+from augment.turbo.results import Results
 from augment.turbo.synthesis import Evaluation, Synthesis, as_bytes
 from swiftwrf import Spectra, simulated_room
 from swiftwrf.choices import RAYTRACE, fraction_key
@@ -19,15 +19,14 @@ from swiftwrf.data.files import sha256
 from swiftwrf.data.raytraced import sionna
 from swiftwrf.metrics import angle_errors, covered
 from swiftwrf.runtime.steps import Step
-from tasks.aoa.options import AoaConfig
-from tasks.aoa.page import page
-from tasks.aoa.page.summary import answer_of
+from tasks.aoa.page import answer_of, page
+from tasks.configs import AoaConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
-from tasks.metrics import AoaMetrics
 from tasks.options import TableSource
 from tasks.page.page import reporting
 from tasks.page.records import Records
+from tasks.page.shared import write_suggestion
 from tasks.records import Row
 from tasks.source import located, reading
 from tasks.steps import run_steps
@@ -83,7 +82,7 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
         tables = {"errors": results.errors(), "synthesis": results.synthesis, "history": results.history}
         for name, rows in (tables | ({"positions": found} if (found := results.positions()) else {})).items():
             directory.write_csv(f"{name}.csv", rows)
-        metrics: AoaMetrics = {
+        metrics: Row = {
             "task": "aoa",
             "data": data.name,
             "split": config.split,
@@ -126,14 +125,10 @@ def _write_files(step: Step[Experiment], value: Row, test: Spectra, run: Run) ->
     """Write what the report shows of a step: suggested positions, or synthetic spectra of the first trained field model."""
     match step:
         case Suggestion():
-            name = f"suggested-mix{step.subset.key}"
-            tensors = {
-                key: torch.tensor(value[key], dtype=torch.float64) for key in ("measured", "position", "variance")
-            }
-            coordinates = dict(zip(("x_m", "y_m", "z_m"), tensors["position"].T, strict=True))
-            run.write_csv(f"{name}.csv", rows_of({}, coordinates | {"variance_left": tensors["variance"][1:]}))
-            names = {"measured": "measured", "suggested": "position", "left": "variance"}
-            run.write_npz(f"{name}.npz", {array: tensors[key].numpy() for array, key in names.items()})
+            measured, position, variance = (
+                torch.tensor(value[key], dtype=torch.float64) for key in ("measured", "position", "variance")
+            )
+            write_suggestion(run.path(f"suggested-mix{step.subset.key}"), measured, position, variance)
         case Synthesis(trains=True) if "refused" not in value and step.subset.repeat == 0:
             file = f"examples-mix{step.subset.key}.npz"
             if not run.path(file).exists():

@@ -2,23 +2,73 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import torch
+from torch import Tensor
+
+from augment.suggest import suggest_positions
 from swiftwrf import Rssi, rssi_room
+from swiftwrf.data.coordinates import degree_columns
+from swiftwrf.locate import RssiLocator
+from swiftwrf.locate.baselines import PosteriorLocalizer
 from swiftwrf.locate.comparison import LocateComparison, LocateSplit, Trial
+from swiftwrf.runtime.durable import write_npz
+from swiftwrf.runtime.steps import Step
+from tasks.configs import LocateConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
-from tasks.locate.options import LocateConfig
-from tasks.locate.page import page
-from tasks.locate.page.summary import answer
-from tasks.locate.steps import Localization
-from tasks.metrics import LocateMetrics, StudyMetrics
+from tasks.locate.page import SUGGESTED, answer, page
 from tasks.page.page import reporting
 from tasks.page.records import Records
+from tasks.page.shared import write_suggestion
+from tasks.records import LOCATOR, Row
 from tasks.source import measured_rssi, split_notes
 from tasks.steps import run_steps
 from tasks.terminal import console, terminal
 from tasks.workers import connected
+
+N_MAPS = 6  # test rows with a posterior map
+
+
+@dataclass(frozen=True)
+class Localization(Step[LocateSplit]):
+    """Fit a localizer and locate the test rows.
+
+    Args:
+        trial: The localizer and its part of the data.
+        suggest: Number of positions to suggest for the next measurements.
+    """
+
+    trial: Trial
+    suggest: int = 0
+
+    @property
+    def name(self) -> str:
+        return self.trial.name
+
+    @property
+    def title(self) -> str:
+        rows, receivers = self.trial.rows, self.trial.receivers
+        parts = [f"{rows:.0%} of the rows"] * (rows < 1) + [f"{receivers:.0%} of the receivers"] * (receivers < 1)
+        return f"{self.trial.localizer}, {' and '.join(parts)}" if parts else self.trial.localizer
+
+    def compute(self, context: LocateSplit, folder: Path) -> Row:
+        localizer, values = context.fit(self.trial)
+        if isinstance(localizer, PosteriorLocalizer) and self.trial.is_whole:
+            locator = localizer.locator
+            locator.save(folder / LOCATOR)
+            error = (values["estimate"] - values["truth"]).norm(dim=1)
+            write_npz(folder / "maps.npz", posterior_maps(locator, context.train, context.test, error))
+            if self.suggest:
+                found = suggest_positions(locator, context.train, self.suggest, context.seed)
+                degrees = degree_columns(context.train.origin, found.position.numpy())
+                measured = context.train.transmitter_position
+                write_suggestion(folder / SUGGESTED, measured, found.position, found.variance, degrees)
+        return values
 
 
 def run(config: LocateConfig, resume: Path | None = None) -> None:
@@ -64,7 +114,7 @@ def measurements(config: LocateConfig) -> Rssi:
     return (rssi_room(seed=config.seed) if measured is None else measured).receivers(config.rx)
 
 
-def _metrics(data: Rssi, result: LocateComparison) -> LocateMetrics:
+def _metrics(data: Rssi, result: LocateComparison) -> Row:
     """Return the content of metrics.json."""
     split = result.split
     train, offsets = split.train, split.train.offsets
@@ -90,7 +140,7 @@ def _metrics(data: Rssi, result: LocateComparison) -> LocateMetrics:
     }
 
 
-def _studies(result: LocateComparison, by: str) -> list[StudyMetrics]:
+def _studies(result: LocateComparison, by: str) -> list[Row]:
     return [
         {
             "localizer": trial.localizer,
@@ -100,3 +150,20 @@ def _studies(result: LocateComparison, by: str) -> list[StudyMetrics]:
         }
         for trial, error in result.studied(by)
     ]
+
+
+def posterior_maps(locator: RssiLocator, train: Rssi, test: Rssi, error: Tensor) -> dict[str, Any]:
+    """Return the posteriors in plan of six test rows, from the smallest error (n,) [m] to the largest."""
+    shown = error.argsort()[torch.linspace(0, len(error) - 1, min(N_MAPS, len(error))).round().long()]
+    posterior = locator.locate(test.rssi_dbm[shown])
+    plans = [posterior.in_plan(row) for row in range(len(posterior))]
+    return {
+        "x": plans[0].x,
+        "y": plans[0].y,
+        "density": np.stack([plan.values for plan in plans]).astype(np.float32),
+        "index": test.index[shown].numpy(),
+        "truth": test.transmitter_position[shown].numpy(),
+        "estimate": posterior.median.numpy(),
+        "radius_80_m": posterior.credible_radius(0.8).numpy(),
+        "training_position": train.transmitter_position.numpy(),
+    }

@@ -6,7 +6,6 @@ import io
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import matplotlib.style
@@ -18,11 +17,12 @@ from matplotlib.ticker import LogLocator
 from numpy.typing import ArrayLike
 from pandas import DataFrame
 
-from tasks.labels import OTHER_COLOURS, Label
+from tasks.labels import colour
 
 DASHES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (2, 1.5)), (0, (7, 2, 1.5, 2)))
 """Line styles of the curves of one panel, in their order."""
 MAX_CURVES = len(DASHES)  # of one panel
+Colours = Mapping[str, str]  # by name, those of `tasks.labels.colour` for other names
 RULE, LINES, PAPER = "#7f8794", "#e4e8ef", "#fffffe"  # marks of reference, grid, background
 THEMED = {"#000000": "currentColor", LINES: "var(--lines)", PAPER: "var(--paper)"}  # colours that follow the page's
 MARKERS = "osD^"  # of the series of a dot plot
@@ -44,42 +44,11 @@ STYLE: dict[str, Any] = {
 }
 
 
-@dataclass(frozen=True)
-class Palette:
-    """Colours of methods.
-
-    Args:
-        colours: Colours `#rrggbb` by name.
-
-    Example:
-        >>> Palette({"gp": "#d1620f"}).colour("gp")
-        '#d1620f'
-    """
-
-    colours: Mapping[str, str] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, labels: Mapping[str, Label]) -> Palette:
-        """Return the palette of labelled methods."""
-        return cls({name: label.colour for name, label in labels.items() if label.colour})
-
-    def colour(self, name: str) -> str:
-        """Return the colour of a method. A method without a label has a colour that follows from its name."""
-        return self.colours.get(name) or OTHER_COLOURS[sum(name.encode()) % len(OTHER_COLOURS)]
-
-
-def new_figure(rows: int, columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
-    """A figure of width x height inches in the style of the reports, and its axes row by row."""
+def panel(width: float, height: float) -> tuple[Figure, Axes]:
+    """Return a figure of width x height inches in the style of the reports, and its axes."""
     with matplotlib.style.context(STYLE):
         figure = Figure(figsize=(width, height), layout="constrained")
-        axes = figure.subplots(rows, columns, squeeze=False)
-    return figure, list(axes.flat)
-
-
-def panel(width: float, height: float) -> tuple[Figure, Axes]:
-    """Return a figure of width x height inches in the style of the reports, and its only axes."""
-    figure, (axes,) = new_figure(1, 1, width, height)
-    return figure, axes
+        return figure, figure.subplots()
 
 
 def colour_bar(axes: Axes, drawn: Any, label: str = "", extend: str = "neither", pad: float = 0.03) -> None:
@@ -121,62 +90,53 @@ def as_svg(figure: Figure, title: str | None = None) -> str:
 def for_page(svg: str, name: str) -> str:
     """Return the SVG as an element of a page, in the page's colours (light or dark), with unique identifiers."""
     element = svg[svg.index("<svg") :]
-    for colour, themed in THEMED.items():
-        element = element.replace(colour, themed)
+    for own, themed in THEMED.items():
+        element = element.replace(own, themed)
     element = element.replace("<svg", '<svg role="img"', 1)
     return re.sub(r'((?:id="|href="#|url\(#))', rf"\g<1>{name}-", element)
 
 
-def legend_below(figure: Figure, axes: Axes) -> None:
-    """One legend for all axes, from the entries of one of them."""
+def legend_below(axes: Axes) -> None:
+    """Draw one legend below a figure, no wider than it, from the entries of one of its axes."""
+    figure = axes.get_figure(root=True)
+    assert figure is not None  # axes outside of a figure have no legend
     handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=_columns(figure, labels), frameon=False)
+    widest = max(map(len, labels), default=0)
+    columns = max(1, int(figure.get_figwidth() / (0.6 + 0.08 * widest)))  # inches of a line, and of a letter
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
 
 
-def _columns(figure: Figure, labels: Sequence[str]) -> int:
-    """Return the number of columns of a legend no wider than its figure: a line, and 0.08 inches a letter."""
-    widest = max((len(label) for label in labels), default=0)
-    return max(1, int(figure.get_figwidth() / (0.6 + 0.08 * widest)))
-
-
-def cdf(axes: Axes, palette: Palette, errors: Mapping[str, ArrayLike], label: str, limit: float | None = None) -> None:
+def cdf(axes: Axes, colours: Colours, errors: Mapping[str, ArrayLike], label: str, limit: float | None = None) -> None:
     """Draw the empirical distribution of the errors of at most `MAX_CURVES` methods; the thin line is at the median."""
     _expect_few(errors)
     for dashes, (name, values) in zip(DASHES, errors.items(), strict=False):
-        style: dict[str, Any] = {"color": palette.colour(name), "linestyle": dashes, "linewidth": 1.6}
         if np.size(values):
+            style: dict[str, Any] = {"color": colour(colours, name), "linestyle": dashes, "linewidth": 1.6}
             axes.ecdf(np.asarray(values), label=name, **style)
     axes.axhline(0.5, color=RULE, linewidth=0.8)
     axes.set(xlabel=label, ylabel="fraction of test rows", ylim=(0, 1.02), xlim=(0, limit))
-    _named_below(axes)
+    legend_below(axes)
 
 
-def curves(axes: Axes, palette: Palette, lines: Mapping[str, tuple[ArrayLike, ArrayLike]], x: str, y: str) -> None:
+def curves(axes: Axes, colours: Colours, lines: Mapping[str, tuple[ArrayLike, ArrayLike]], x: str, y: str) -> None:
     """Draw one line for each of at most `MAX_CURVES` names."""
     _expect_few(lines)
     for dashes, (name, (xs, ys)) in zip(DASHES, lines.items(), strict=False):
-        axes.plot(
-            np.asarray(xs), np.asarray(ys), label=name, color=palette.colour(name), linestyle=dashes, linewidth=1.6
-        )
+        style: dict[str, Any] = {"color": colour(colours, name), "linestyle": dashes, "linewidth": 1.6}
+        axes.plot(np.asarray(xs), np.asarray(ys), label=name, **style)
     axes.set(xlabel=x, ylabel=y)
-    _named_below(axes)
+    legend_below(axes)
 
 
-def speed(axes: Axes, palette: Palette, points: Mapping[str, tuple[float, float]], x: str, y: str) -> None:
+def speed(axes: Axes, colours: Colours, points: Mapping[str, tuple[float, float]], x: str, y: str) -> None:
     """Draw the cost and the error of each method, costs on a logarithmic scale."""
     for marker, (name, (cost, error)) in zip("osD^vP", points.items(), strict=False):
-        axes.plot(max(cost, 1e-4), error, marker, color=palette.colour(name), label=name)
+        axes.plot(max(cost, 1e-4), error, marker, color=colour(colours, name), label=name)
     axes.set(xscale="log", xlabel=x, ylabel=y, ylim=(0, None))
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 3)))
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter("")
-    _named_below(axes)
-
-
-def _named_below(axes: Axes) -> None:
-    figure = axes.get_figure(root=True)
-    assert figure is not None  # axes outside of a figure have no legend
-    legend_below(figure, axes)
+    legend_below(axes)
 
 
 def _expect_few(lines: Mapping[str, Any]) -> None:
@@ -187,7 +147,7 @@ def _expect_few(lines: Mapping[str, Any]) -> None:
 def dots(
     rows: Sequence[str],
     values: Mapping[str, Sequence[tuple[float, float, float]]],
-    palette: Palette,
+    colours: Colours,
     label: str,
     zero: bool = False,
     log: bool = False,
@@ -197,7 +157,7 @@ def dots(
     Args:
         rows: Names of the rows.
         values: Value, low and high of each row for at most `MAX_CURVES` series. nan is left out.
-        palette: Colours of the series. A single series has one colour and no legend.
+        colours: Colours of the series. A single series has one colour and no legend.
         label: Label of the values.
         zero: Whether the line of zero is drawn.
         log: Whether the axis is logarithmic.
@@ -211,7 +171,7 @@ def dots(
         value, low, high = np.array(of_rows, dtype=float).reshape(-1, 3).T
         at = np.arange(len(rows)) + 0.2 * (number - (len(values) - 1) / 2)
         error = np.clip(np.nan_to_num([value - low, high - value]), 0, None)
-        style: dict[str, Any] = {"color": palette.colour(name), "fmt": marker, "markersize": 5, "elinewidth": 1.4}
+        style: dict[str, Any] = {"color": colour(colours, name), "fmt": marker, "markersize": 5, "elinewidth": 1.4}
         axes.errorbar(value, at, xerr=error, label=plain(name), **style)
     if zero:
         axes.axvline(0, color=RULE, linewidth=1)
@@ -226,7 +186,7 @@ def dots(
             axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.grid(axis="y", visible=False)
     if len(values) > 1:
-        legend_below(figure, axes)
+        legend_below(axes)
     return figure
 
 

@@ -15,7 +15,7 @@ from pandas import DataFrame
 from swiftwrf.runtime.durable import write_text
 from tasks.answer import NextStep
 from tasks.page.figures import as_svg, for_page
-from tasks.page.records import Metrics, Records
+from tasks.page.records import Records
 from tasks.preload import served_map
 from tasks.records import write_table
 
@@ -196,7 +196,7 @@ def write_page(folder: Path, page: Page) -> None:
     write_text(folder / "report.html", html)
 
 
-def reporting(page: Callable[[list[Records[Metrics]]], Page]) -> Callable[[Path, dict[str, Any]], None]:
+def reporting(page: Callable[[list[Records]], Page]) -> Callable[[Path, dict[str, Any]], None]:
     """Writes a run's report into its directory, from the records that lie there and its metrics, as this page shows it."""
 
     def report(folder: Path, metrics: dict[str, Any]) -> None:
@@ -230,7 +230,7 @@ def number(value: float | None, digits: int = 2) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def provenance(runs: Sequence[Records[Any]]) -> Section:
+def provenance(runs: Sequence[Records]) -> Section:
     """Command, code, versions, machine, input and time of each run."""
     tables = []
     for run in runs:

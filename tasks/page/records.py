@@ -5,24 +5,21 @@ from __future__ import annotations
 import re
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Generic, TypeVar, cast
+from typing import Any
 
 from numpy.typing import NDArray
 from pandas import DataFrame
 
 from swiftwrf import InputError
-from tasks.metrics import RunMetrics
 from tasks.records import read_json, read_npz, read_table
 
-Metrics = TypeVar("Metrics", bound=RunMetrics)
 
-
-def notes(run: Records[Any]) -> list[str]:
+def notes(run: Records) -> list[str]:
     """Return what the reader of the data found, in sentences; nothing for a run that did not keep it."""
     return [f"{note[0].upper()}{note[1:]}." for note in run.metrics.get("notes", [])]
 
 
-class Records(Generic[Metrics]):
+class Records:
     """The files of one run.
 
     Args:
@@ -41,7 +38,7 @@ class Records(Generic[Metrics]):
             if not file.is_file():
                 raise InputError(f"{folder} is no finished run: it has no metrics.json")
             metrics = read_json(file)
-        self.metrics = cast(Metrics, metrics)
+        self.metrics = metrics
         self._tables: dict[str, DataFrame] = {}
         self._arrays: dict[str, dict[str, NDArray[Any]]] = {}
 

@@ -5,20 +5,24 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pandas import DataFrame
+from torch import Tensor
 
 from swiftwrf.metrics import ErrorSummary, paired_difference
+from swiftwrf.runtime.durable import write_npz
 from tasks.answer import Answer, NextStep
 from tasks.environment import command
 from tasks.page import figures
-from tasks.page.figures import MAX_CURVES, Palette
+from tasks.page.figures import MAX_CURVES, Colours
 from tasks.page.page import Plot, Section, Summary, Table, number
 from tasks.page.records import Records
+from tasks.records import write_table
 
 MEASURED, SUGGESTED = "#3a7fd5", "#cf4a4a"
 MIN_REDUCTION = 0.1  # of the variance, below which more positions are not worth it
@@ -29,7 +33,7 @@ NONE = (np.nan, np.nan, np.nan)
 def errors_section(
     answer: Answer,
     errors: DataFrame,
-    palette: Palette,
+    colours: Colours,
     *,
     name: str,
     quantity: str,
@@ -42,7 +46,7 @@ def errors_section(
     Args:
         answer: Errors of the methods.
         errors: Errors in long form: `method`, the error in the last column, and what identifies a test row in the others.
-        palette: Colours of the methods.
+        colours: Colours of the methods.
         name: End of the name of the figure.
         quantity: Name of the errors.
         caption: What the cells beside the errors mean.
@@ -67,21 +71,37 @@ def errors_section(
     medians = [one.error["median"] for one in short if one.error["n"]]
     spread = max(medians, default=1.0) > 10 * min(medians, default=1.0) > 0
     names = [one.name for one in short]
-    dots = figures.dots(names, values, Palette({"error": MEASURED}), f"median {quantity} [{unit}]", log=spread)
+    dots = figures.dots(names, values, {"error": MEASURED}, f"median {quantity} [{unit}]", log=spread)
     figure, axes = figures.panel(5.1, 3.2)
     groups = {one: errors[errors["method"] == one].iloc[:, -1] for one in [*dict.fromkeys([answer.chosen, *names])]}
     limit = max((float(part.quantile(0.9)) for part in groups.values() if len(part)), default=1.0)
     shown = dict(list(groups.items())[:MAX_CURVES])
-    figures.cdf(axes, palette, shown, f"{quantity} [{unit}]", max(limit, 1e-3))
+    figures.cdf(axes, colours, shown, f"{quantity} [{unit}]", max(limit, 1e-3))
     cost, axes = figures.panel(5.1, 3.0 + 0.2 * len(short))
     points = {one.name: (sum(one.seconds), one.error["median"]) for one in short if one.error["n"]}
-    figures.speed(axes, palette, points, "seconds to fit and apply", f"median {quantity} [{unit}]")
+    figures.speed(axes, colours, points, "seconds to fit and apply", f"median {quantity} [{unit}]")
     text = (
         "Medians with 95 % intervals; the distribution of the errors, with a thin line at the median; the median against "
         f"the time that it takes{'; and the error against the number of measured positions' if panels else ''}."
     )
     plot = Plot(f"errors-{name}", [dots, figure, cost, *panels], text, errors)
     return Section("", list(paragraphs), [Table(columns, rows, caption, frozenset([answer.chosen]))], [plot])
+
+
+def by_method(errors: DataFrame) -> DataFrame:
+    """Return errors in long form, as in `errors_section`, with a row for each test row and a column for each method."""
+    *rows, error = errors.columns.drop("method")
+    found: DataFrame = errors.pivot_table(index=rows, columns="method", values=error)
+    return found
+
+
+def limits(run: Records, *texts: str) -> Section:
+    """Return the section on what a report does not show, with a sentence about simulated data."""
+    if run.metrics["data"] == "simulated-floor":
+        texts += (
+            "This floor is simulated. It shows that the software works, and not how accurate it is on measurements.",
+        )
+    return Section("What this does not show", list(texts))
 
 
 def difference(errors: DataFrame, own: str, other: str) -> str:
@@ -93,7 +113,7 @@ def difference(errors: DataFrame, own: str, other: str) -> str:
 
 
 def next_steps(
-    run: Records[Any], explore: str, predict: str, source: str, own: Sequence[NextStep] = (), model: str = ""
+    run: Records, explore: str, predict: str, source: str, own: Sequence[NextStep] = (), model: str = ""
 ) -> list[NextStep]:
     """Return what to do next with a run.
 
@@ -109,7 +129,7 @@ def next_steps(
     return [*steps, NextStep(predict, command("predict", model or run.path, source)), *own]
 
 
-def again(run: Records[Any], text: str, split: str) -> NextStep:
+def again(run: Records, text: str, split: str) -> NextStep:
     """Return the step to repeat a run on another split, into a new directory."""
     words = shlex.split(run.config["command"])
     for option in ("--out", "--split"):
@@ -122,8 +142,8 @@ def again(run: Records[Any], text: str, split: str) -> NextStep:
 
 def compared(
     answers: Mapping[str, Answer],
-    runs: Sequence[Records[Any]],
-    palette: Palette,
+    runs: Sequence[Records],
+    colours: Colours,
     quantity: str,
     steps: Sequence[NextStep] = (),
 ) -> Summary:
@@ -132,7 +152,7 @@ def compared(
     Args:
         answers: Answers by unique short names.
         runs: Their runs.
-        palette: Colours of the methods.
+        colours: Colours of the methods.
         quantity: Name of the errors.
         steps: What to do next. Defaults to a look at each run.
     """
@@ -146,7 +166,7 @@ def compared(
     values = {name: [interval(of[name]) if name in of else NONE for of in short] for name in methods[:MAX_CURVES]}
     medians = [of[name]["median"] for of in short for name in values if name in of]
     spread = max(medians, default=1.0) > 10 * min(medians, default=1.0) > 0
-    figure = figures.dots(names, values, palette, f"median {quantity} [{unit}]", log=spread)
+    figure = figures.dots(names, values, colours, f"median {quantity} [{unit}]", log=spread)
     caption = f"Median {quantity} of each run; whiskers: 95 % intervals."
     plot = Plot("summary", [figure], caption, figures.dots_data("run", names, values, unit.lower()))
     explore = [NextStep(f"Explore run {run.number}", command("view", run.path)) for run in runs]
@@ -169,14 +189,47 @@ def with_interval(error: ErrorSummary) -> str:
     return f"{number(error['median'])} [{number(error['low'])}, {number(error['high'])}]"
 
 
-def suggestion_plot(name: str, arrays: Mapping[str, NDArray[Any]], ylabel: str) -> Plot:
+def write_suggestion(
+    file: Path, measured: Tensor, position: Tensor, variance: Tensor, columns: Mapping[str, NDArray[Any]] | None = None
+) -> None:
+    """Write suggested positions as a table and, for the report, as arrays.
+
+    Args:
+        file: Both files without suffix.
+        measured: Measured positions (n, 3) [m].
+        position: Suggested positions (k, 3) [m].
+        variance: Relative variance after measuring at 0 to k positions, (1 + k,).
+        columns: Further columns of the table.
+    """
+    table = DataFrame(position.numpy(), columns=["x_m", "y_m", "z_m"]).assign(**(columns or {}))
+    table = table.assign(variance_left=variance[1:].numpy())
+    write_table(file.with_name(f"{file.name}.csv"), table.to_dict("records"))
+    arrays = {"measured": measured, "suggested": position, "left": variance}
+    write_npz(file.with_name(f"{file.name}.npz"), {name: values.numpy() for name, values in arrays.items()})
+
+
+def suggestion_section(
+    title: str,
+    arrays: Mapping[str, NDArray[Any]],
+    table: str,
+    name: str,
+    *,
+    what: str,
+    whole: str,
+    how: str,
+    label: str,
+) -> Section:
     """Return a plan of the suggested positions, and the expected variance after measuring there.
 
     Args:
-        name: Name of the plot.
-        arrays: `measured` (n, 3) and `suggested` (k, 3) positions [m], and `left`, the relative variance after measuring at
-            0 to k positions, (1 + k,).
-        ylabel: Label of the variance in percent.
+        title: Title of the section.
+        arrays: Arrays of `write_suggestion`.
+        table: Name of the files with the positions.
+        name: End of the name of the figure.
+        what: The variance that falls.
+        whole: What it is a fraction of.
+        how: How it is estimated.
+        label: Label of the variance in percent.
     """
     measured, suggested, left = (arrays[key] for key in ("measured", "suggested", "left"))
     first, plan = figures.panel(5, 4.2)
@@ -185,13 +238,17 @@ def suggestion_plot(name: str, arrays: Mapping[str, NDArray[Any]], ylabel: str) 
     for rank, (x, y) in enumerate(suggested[:MAX_NUMBERED, :2], start=1):
         plan.annotate(str(rank), (x, y), xytext=(3, 3), textcoords="offset points", fontsize=7)
     plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    figures.legend_below(first, plan)
+    figures.legend_below(plan)
     second, gain = figures.panel(4.6, 3.4)
     gain.plot(range(len(left)), 100 * left, color=SUGGESTED)
-    gain.set(xlabel="suggested positions measured", ylabel=ylabel, ylim=(0, None))
+    gain.set(xlabel="suggested positions measured", ylabel=label, ylim=(0, None))
+    text = (
+        f"Measuring at {len(suggested)} more positions ({table}.csv, the most useful first) would reduce {what} from "
+        f"{left[0]:.0%} to {left[-1]:.0%} of {whole}. {how} {worth(left)}"
+    )
     caption = "Suggested positions in plan, numbered by rank, and the expected variance over the region, averaged."
     data = DataFrame(suggested, columns=["x_m", "y_m", "z_m"]).assign(variance_left=left[1:])
-    return Plot(name, [first, second], caption, data)
+    return Section(title, [text], plots=[Plot(f"suggested-{name}", [first, second], caption, data)])
 
 
 def worth(left: NDArray[Any]) -> str:

@@ -4,4 +4,4 @@ import sys
 
 from tasks.command import run_command
 
-sys.exit(run_command("rssi", sys.argv[1:]))
+sys.exit(run_command("rssi", sys.argv[1:], "python -m tasks.rssi"))

@@ -15,17 +15,14 @@ from swiftwrf.metrics import summary
 from swiftwrf.rssi import LEVEL, PairModel, RssiComparison, RssiModel, RssiPredictor, compare
 from swiftwrf.rssi.comparison import compared, model_of
 from swiftwrf.rssi.maps import RssiMap
-from tasks.claim import MODEL
+from tasks.configs import RssiTaskConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
-from tasks.metrics import PredictorSeconds, RssiMetrics
 from tasks.page.maps import read_pixels
 from tasks.page.page import reporting
 from tasks.page.records import Records
-from tasks.records import Row
-from tasks.rssi.options import RssiTaskConfig
-from tasks.rssi.page import page
-from tasks.rssi.page.summary import answer
+from tasks.records import MODEL, Row
+from tasks.rssi.page import answer, page
 from tasks.source import measured_rssi, offset_notes, split_notes
 from tasks.terminal import console, terminal
 from tasks.workers import connected
@@ -111,10 +108,10 @@ def _read_floor_plan(config: RssiTaskConfig, data: Rssi) -> dict[str, Any]:
     return {"plan": pixels, "plan_extent": np.array(config.floor_extent or (0.0, width, -height, 0.0))}
 
 
-def _metrics(config: RssiTaskConfig, data: Rssi, result: RssiComparison, model: RssiModel | PairModel) -> RssiMetrics:
+def _metrics(config: RssiTaskConfig, data: Rssi, result: RssiComparison, model: RssiModel | PairModel) -> Row:
     """Return the content of metrics.json."""
     train = result.train
-    seconds: dict[str, PredictorSeconds] = {
+    seconds: dict[str, Row] = {
         name: {"fit": value["fit"], "predict": value["predict"]} for name, value in result.values.items()
     }
     notes = [*split_notes(train, result.test, config.split), *offset_notes(data, config.table), *data.notes]

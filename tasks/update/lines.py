@@ -16,13 +16,13 @@ import torch
 
 from swiftwrf import FieldModel, InputError, Rssi, Spectra
 from swiftwrf.data.files import refusing_unreadable, table_of
-from swiftwrf.data.survey import spelled_as
+from swiftwrf.data.receivers import spelled_as
 from swiftwrf.errors import CONTENT_ERRORS
 from swiftwrf.online import Step
 from swiftwrf.online.scores import LEVEL
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime.durable import strict
-from tasks.update.options import TABLE, UpdateConfig
+from tasks.configs import TABLE, UpdateConfig
 
 POLL_S = 0.2  # between two looks at a file that grows
 CHUNK_BYTES = 2**20

@@ -9,10 +9,10 @@ from pandas import DataFrame
 
 from swiftwrf.positions import nearest
 from tasks.answer import NextStep
-from tasks.claim import MODEL
 from tasks.environment import command
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table
+from tasks.records import MODEL
 from tasks.update.record import WINDOW, Record
 
 MAX_SURPRISING = 10

@@ -15,19 +15,19 @@ from swiftwrf.data import ReadOptions, Snapshots
 from swiftwrf.data.files import sha256
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
 from swiftwrf.errors import with_article
-from swiftwrf.online import Follower, MonitorConfig
+from swiftwrf.online import Follower
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime import checkpoint
 from swiftwrf.runtime.durable import write_json
-from tasks.claim import CONFIG, ENVIRONMENT, MODEL, Claim, begun
-from tasks.directory import new_directory, unchanged_environment
+from tasks.configs import UpdateConfig
+from tasks.directory import Claim, begun, new_directory, unchanged_environment
 from tasks.environment import environment, invocation
 from tasks.options import plain
 from tasks.page.page import write_page
+from tasks.records import CONFIG, ENVIRONMENT, MODEL
 from tasks.source import aligned, located, reading
 from tasks.terminal import console, terminal
 from tasks.update.lines import answer, check_source, lines, measurement
-from tasks.update.options import UpdateConfig
 from tasks.update.page import page
 from tasks.update.record import SUMMARY, Record
 
@@ -47,7 +47,7 @@ def run(config: UpdateConfig) -> None:
         model = _model(config.model)
         options = reading(config.spectra, config.table)
         new, train = _read(config.source, options, model), _training(config, options, model)
-        follower = Follower(model, train, MonitorConfig(false_alarm_rate=config.false_alarm_rate))
+        follower = Follower(model, train, config.false_alarm_rate)
         record = Record(config.source, _unit(model))
         for i, index in enumerate(new.index.tolist()):
             record.add(index, follower.step(new.subset(torch.tensor([i]))))
@@ -66,13 +66,13 @@ def run(config: UpdateConfig) -> None:
 def follow(config: UpdateConfig) -> None:
     """Print the answer to each line, then record it and replace the model; a line lost with a kill is answered again."""
     digests = {"model": sha256(Path(config.model))}
-    model, settings = _model(config.model), MonitorConfig(false_alarm_rate=config.false_alarm_rate)
+    model, rate = _model(config.model), config.false_alarm_rate
     check_source(config.source, model)
     if (train := _training(config, reading(config.spectra, config.table), model)) is not None:
         digests |= train.source
     with _followed(Path(config.out), digests) as folder:
         file = folder / MODEL
-        follower, place = _continued(file, settings) if file.exists() else (Follower(model, train, settings), (0, ""))
+        follower, place = _continued(file, rate) if file.exists() else (Follower(model, train, rate), (0, ""))
         record = Record(config.source, _unit(model))
         if (folder / SUMMARY).exists():
             record = Record.read(folder, follower.count)
@@ -112,9 +112,9 @@ def _followed(folder: Path, digests: dict[str, str]) -> Iterator[Path]:
         claim.release()
 
 
-def _continued(file: Path, settings: MonitorConfig) -> tuple[Follower, tuple[int, str]]:
+def _continued(file: Path, false_alarm_rate: float) -> tuple[Follower, tuple[int, str]]:
     """Return the follower in a file, and the place in its source: number and SHA-256 of the bytes that it learnt."""
-    follower = Follower(_model(str(file)), None, settings)
+    follower = Follower(_model(str(file)), None, false_alarm_rate)
     _, tensors, header = checkpoint.read(file, follower.model.kind)
     with checkpoint.refusing(f"{file} is no model that a followed source continues"):
         follower.resume(json.loads(header["provenance"]["followed"]))

@@ -21,7 +21,7 @@ from swiftwrf.rssi.maps import RssiMap
 from tasks.page import maps
 from tasks.page.maps import Corners, FloorPlan
 from tasks.records import as_table, read_npz, rounded
-from tasks.rssi.page.maps import MAX_WIDTH_DB
+from tasks.rssi.maps import MAX_WIDTH_DB
 from tasks.view.locating import RssiLocating
 
 RECEIVER_COLOURS, N_RECEIVER_COLOURS = "tab20", 20

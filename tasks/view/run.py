@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from swiftwrf import InputError
+from tasks.configs import ViewConfig
 from tasks.view.followed import FollowedView
-from tasks.view.options import ViewConfig
 from tasks.view.rssi import RssiView
 from tasks.view.sources import open_source
 from tasks.view.spectra import SpectraView

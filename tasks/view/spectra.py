@@ -21,7 +21,7 @@ from swiftwrf.data.spectra import direction_of_link
 from swiftwrf.errors import with_article
 from swiftwrf.locate import MatchedField
 from swiftwrf.positions import distance
-from tasks.aoa.page.room import MARGIN, extent
+from tasks.aoa.room import MARGIN, extent
 from tasks.page.maps import inside
 from tasks.view.locating import Located
 

@@ -10,8 +10,8 @@ from nicegui import events, run, ui
 from numpy.typing import NDArray
 
 from swiftwrf import AngularGrid, Spectra
-from tasks.aoa.page.room import FIXED, MEASURED, in_plan
-from tasks.aoa.page.synthesis import MAX_DIFFERENCE
+from tasks.aoa.room import FIXED, MEASURED, in_plan
+from tasks.aoa.synthesis import MAX_DIFFERENCE
 from tasks.page.maps import colour_image
 from tasks.view.charts import (
     Data,

@@ -9,7 +9,7 @@ from hard_cases import random_scene
 
 from swiftwrf import AngularGrid
 from swiftwrf.rasterize import cuda, operators, reference
-from swiftwrf.rasterize.magnitude import magnitude
+from swiftwrf.rasterize.operators import magnitude
 
 
 def with_gradients(field, inputs):

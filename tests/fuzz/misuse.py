@@ -39,7 +39,7 @@ from swiftwrf.array.planar import PlanarArray
 from swiftwrf.locate import Posterior
 from swiftwrf.models.coarray import project
 from swiftwrf.models.geometry import Plane
-from swiftwrf.online import Follower, MonitorConfig
+from swiftwrf.online import Follower
 from swiftwrf.positions import MAX_COORDINATE_M
 from swiftwrf.rssi.base import RssiPredictor
 
@@ -206,7 +206,7 @@ MODELS: dict[str, Call] = {
     },
     **{
         f"rssi.fit({name}=x)": lambda x, name=name: RssiModel(n_primitives=0).fit(rssi(), **{name: x})
-        for name in ("pool", "device", "checkpoint")
+        for name in ("pool", "device")
     },
     **{
         f"{name}.{method}(x)": lambda x, name=name, method=method: getattr(fitted(name), method)(x)
@@ -227,7 +227,7 @@ MODELS: dict[str, Call] = {
     "Follower(x)": Follower,
     "Follower(gp, x)": lambda x: Follower(fitted("gp"), x),
     "step(x)": lambda x: Follower(rssi_model()).step(x),
-    "MonitorConfig(false_alarm_rate=x)": lambda x: MonitorConfig(false_alarm_rate=x),
+    "Follower(false_alarm_rate=x)": lambda x: Follower(rssi_model(), None, x),
 }
 LOCATORS: dict[str, Call] = {
     "RssiLocator(x)": RssiLocator,

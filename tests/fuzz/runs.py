@@ -38,10 +38,9 @@ from swiftwrf import (
 from swiftwrf.errors import MAX_LENGTH
 from swiftwrf.online import Follower
 from swiftwrf.runtime.durable import write_json
-from tasks.aoa.options import AoaConfig
-from tasks.aoa.page.room import in_plan
+from tasks.aoa.room import in_plan
 from tasks.command import run_command
-from tasks.locate.options import LocateConfig
+from tasks.configs import AoaConfig, LocateConfig
 from tasks.options import plain
 from tasks.page.maps import FloorPlan
 from tasks.update import lines

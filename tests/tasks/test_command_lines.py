@@ -64,8 +64,8 @@ def test_command_lines_end_in_a_sentence(tmp_path, capsys, monkeypatch, task, ar
 
 
 def test_sixty_shares_without_out(tmp_path, monkeypatch):
+    from tasks.configs import RssiTaskConfig
     from tasks.directory import Run
-    from tasks.rssi.options import RssiTaskConfig
 
     monkeypatch.chdir(tmp_path)
     label = "mix" + "_".join(f"0.{i}" for i in range(60)) + "/../" + "\u00e4" * 200

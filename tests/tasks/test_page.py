@@ -14,12 +14,11 @@ from swiftwrf import AngularGrid, Rssi, Spectra, plotting
 from swiftwrf.diagnostics.inspection import Findings
 from tasks import labels
 from tasks.answer import NextStep
-from tasks.aoa.page.records import CHOSEN, LOWER_REFERENCE, UPPER_REFERENCE
-from tasks.aoa.page.synthesis import SCALES, spectra
-from tasks.inspect.page import page as inspection
-from tasks.locate.page.drawing import posteriors
+from tasks.aoa.records import CHOSEN, LOWER_REFERENCE, UPPER_REFERENCE
+from tasks.aoa.synthesis import SCALES, spectra
+from tasks.inspect import page as inspection
+from tasks.locate.page import posteriors
 from tasks.page import figures
-from tasks.page.figures import Palette
 from tasks.page.maps import colour_image
 from tasks.page.page import Number, Page, Plot, Section, Summary, write_page
 from tasks.page.shared import again
@@ -27,9 +26,9 @@ from tasks.records import read_table
 
 
 def plot(name: str = "line", width: float = 6.0) -> Plot:
-    figure, axes = figures.new_figure(1, 1, width, 2)
-    axes[0].plot([0, 1], [1, 2], color=figures.RULE)
-    axes[0].set(xlabel="x <m>")
+    figure, axes = figures.panel(width, 2)
+    axes.plot([0, 1], [1, 2], color=figures.RULE)
+    axes.set(xlabel="x <m>")
     return Plot(name, [figure], "A line.", DataFrame({"x": [0, 1], "method": ["=a", "b"]}))
 
 
@@ -81,11 +80,11 @@ def test_figures_take_the_colours_of_the_page(tmp_path):
 def test_curves_of_a_panel_differ_by_dashes_and_have_their_names_below():
     figure, axes = figures.panel(4, 3)
     values, names = np.linspace(0, 1, 50), ["network, measured", "peak", "mean", "gp"]
-    figures.cdf(axes, Palette(), {name: factor * values for factor, name in enumerate(names, 1)}, "error", limit=4)
+    figures.cdf(axes, {}, {name: factor * values for factor, name in enumerate(names, 1)}, "error", limit=4)
     assert len({str(line._dash_pattern) + str(line.get_linestyle()) for line in axes.get_lines()[:4]}) == 4
     assert [text.get_text() for text in figure.legends[0].get_texts()] == names
     with pytest.raises(ValueError, match="at most 4 curves"):
-        figures.cdf(axes, Palette(), dict.fromkeys("abcde", values), "error")
+        figures.cdf(axes, {}, dict.fromkeys("abcde", values), "error")
 
 
 @pytest.mark.parametrize("command", ["swiftwrf rssi --out 'a b' --rx 1", "swiftwrf rssi --rx 1 --split=random --json"])
@@ -142,8 +141,8 @@ def test_figures_of_constant_empty_and_single_values(values):
     position = torch.tensor(np.outer(np.arange(n), [0.2, 0.0, 0.0])) + torch.tensor([0.0, 0.0, 1.0])  # a regular grid
     drawn = []
     for draw in (
-        lambda axes: figures.cdf(axes, Palette(), {"a": values}, "error"),
-        lambda axes: figures.curves(axes, Palette(), {"a": (values, values)}, "x", "y"),
+        lambda axes: figures.cdf(axes, {}, {"a": values}, "error"),
+        lambda axes: figures.curves(axes, {}, {"a": (values, values)}, "x", "y"),
         lambda axes: plotting.plan(position, torch.tensor(values), "value", axes),
         lambda axes: plotting.plan_map((0, 1, 0, 1), values[None] if n else np.zeros((1, 1)), "v", axes),
     ):
@@ -151,7 +150,7 @@ def test_figures_of_constant_empty_and_single_values(values):
         draw(axes)
         drawn.append(figure)
     rows = [str(i) for i in range(n)]
-    drawn += [figures.dots(rows, {"a": [(x, x, x) for x in values]}, Palette(), "v", log=log) for log in (False, True)]
+    drawn += [figures.dots(rows, {"a": [(x, x, x) for x in values]}, {}, "v", log=log) for log in (False, True)]
     drawn.append(spectra(dict.fromkeys(SCALES, np.full((9, 36), values.mean() if n else 0.0)), "constant"))
     drawn.append(plotting.polar_spectrum(torch.zeros(9, 36), AngularGrid.hemisphere(9, 36)).figure)
     if n:  # data sets have at least one row

@@ -5,20 +5,17 @@ import logging
 import os
 import re
 from dataclasses import fields, is_dataclass
-from importlib import import_module
 from unittest import mock
 
 import pytest
 
 from swiftwrf import InputError
-from tasks.aoa.options import AoaConfig
+from tasks import configs
 from tasks.command import COMMANDS, main
 from tasks.command_line import _defaults, command_line, execute, file_options, parse
+from tasks.configs import AoaConfig, InspectConfig, ReportConfig, RssiTaskConfig
 from tasks.directory import digest
-from tasks.inspect.options import InspectConfig
 from tasks.options import OffsetSource, Output, by_name, plain
-from tasks.report.options import ReportConfig
-from tasks.rssi.options import RssiTaskConfig
 
 SOURCE = ("--data", "x", "--array", "4", "2", "0.06", "2.4e9", "--drop-null")
 
@@ -33,7 +30,7 @@ def test_help_has_groups_names_examples_and_one_default_an_option(name, capsys, 
     assert all(option.count("(default") + option.count("(required)") <= 1 for option in options)
     assert "default: None" not in text
     assert f"Example: swiftwrf {name} " in text
-    config_type = getattr(import_module(f"tasks.{name}.options"), COMMANDS[name].options)
+    config_type = getattr(configs, COMMANDS[name].options)
     listed = [match[1] for option in options if (match := re.match(r"--([a-z-]+)", option))]
     assert {"config", "verbose"} <= {*listed}
     groups = [option.name for option in fields(config_type) if is_dataclass(option.default)]
@@ -164,7 +161,7 @@ def test_resume_changes_no_result(tmp_path, given, capsys):
     values = plain(RssiTaskConfig(("1",), scheduler="tcp://old:1"))
     (folder / "config.json").write_text(json.dumps({"task": "rssi", "config": values}))
     (folder / "environment.json").write_text(json.dumps({"config_sha256": digest(values)}))
-    with mock.patch("tasks.resume.run.run_task") as task:
+    with mock.patch("tasks.resume.run_task") as task:
         assert main(["resume", str(folder), "--json"]) == 0
         assert main(["resume", str(folder), "--scheduler", "tcp://new:1"]) == 0
         with pytest.raises(SystemExit, match="2"):

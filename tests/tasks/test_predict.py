@@ -17,8 +17,8 @@ from swiftwrf import AngularGrid, InputError, RssiModel, load, make_model, rssi_
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
 from swiftwrf.runtime.checkpoint import read, write
-from tasks.aoa.page.records import FractionRecords
-from tasks.aoa.page.summary import steps
+from tasks.aoa.page import steps
+from tasks.aoa.records import FractionRecords
 from tasks.page.records import Records
 
 GRID = AngularGrid.hemisphere(8, 32)

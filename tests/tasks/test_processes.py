@@ -19,8 +19,8 @@ from sums import STEPS, Exit, Kill, KillOnce, Refusal, Sum, results
 from swiftwrf import AngularGrid, FitError, InputError, simulated_room
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.runtime.threads import set_threads
-from tasks.aoa.options import AoaConfig
 from tasks.command import COMMANDS
+from tasks.configs import AoaConfig
 from tasks.directory import Run
 from tasks.environment import number_of_processes
 from tasks.preload import SERVED
@@ -100,7 +100,7 @@ def test_a_run_that_lost_a_process_continues_with_the_results_that_it_kept(tmp_p
 SCRIPT = """
 import sys, torch
 from sums import Sum
-from tasks.aoa.options import AoaConfig
+from tasks.configs import AoaConfig
 from tasks.directory import Run
 from tasks.steps import run_steps
 

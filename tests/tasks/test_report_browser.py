@@ -8,7 +8,7 @@ import quick
 from test_view_browser import PROGRAMS, THEMES, WIDTHS, chromium, looks
 
 from swiftwrf.data.writing import write_spectra
-from tasks.report.run import merge
+from tasks.report import merge
 
 missing = [name for name in ("selenium",) if find_spec(name) is None]
 missing += [name for name in PROGRAMS if not shutil.which(name)]

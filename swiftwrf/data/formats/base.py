@@ -5,17 +5,16 @@ from __future__ import annotations
 import logging
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data.coordinates import Coordinates, Up
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.spectra import Spectra
+from swiftwrf.data.survey import TableOptions
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.registry import Registry
 from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, configuration
@@ -29,7 +28,7 @@ Data = TypeVar("Data", bound=Spectra | Snapshots | Rssi)
 
 
 @configuration
-class ReadOptions:
+class ReadOptions(TableOptions):
     """Options of reading that files leave open: the arguments of `load_spectra` and `load_rssi`.
 
     A reader names those that it takes, and others are refused.
@@ -49,16 +48,6 @@ class ReadOptions:
     drop_null: bool = False
     drop_elements: tuple[int, ...] = ()
     round_trip: bool = False
-    columns: Mapping[str, str] | None = None
-    filler: tuple[float, ...] | None = None
-    coordinates: Coordinates | None = None
-    offset_by: str | None = None
-    transmitter: tuple[str, ...] = ()
-    pool_by: str | None = None
-    scale: PositiveFloat | None = None
-    y_down: bool = False
-    up: Up = "z"
-    window: PositiveFloat | None = None
 
     @property
     def given(self) -> dict[str, Any]:

@@ -210,16 +210,14 @@ def holds_captures(path: Path) -> bool:
 
 def _captures(path: Path) -> list[Path]:
     """Return the captures in a folder, or the file itself if it is one."""
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
-    return [file for file in files if _is_capture(file)]
-
-
-def _is_capture(file: Path) -> bool:
-    if file.suffix not in (*TOOLS, ".csv") or not file.is_file():
-        return False
-    with file.open("rb") as stream:
-        start = stream.read(4096)
-    return TOOLS[file.suffix].recognises(start) if file.suffix in TOOLS else b"CSI_DATA" in start
+    found = []
+    for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+        if file.suffix in (*TOOLS, ".csv") and file.is_file():
+            with file.open("rb") as stream:
+                start = stream.read(4096)
+            if TOOLS[file.suffix].recognises(start) if file.suffix in TOOLS else b"CSI_DATA" in start:
+                found.append(file)
+    return found
 
 
 def _read_description(file: Path) -> Arrays:
@@ -239,11 +237,7 @@ def _read_description(file: Path) -> Arrays:
 
 
 def _files(table: Path, frame: pd.DataFrame) -> list[Path]:
-    """Return the captures that a table of positions names.
-
-    Raises:
-        InputError: No column of files, a file twice, or one that is missing or of another kind.
-    """
+    """Return the captures that a table of positions names, each once."""
     if "file" not in frame.columns:
         raise InputError(f"{table} has no column file; there are {listed(frame.columns)}: {NEEDED}")
     files = [table.parent / name for name in text_of(frame["file"])]

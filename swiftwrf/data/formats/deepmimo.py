@@ -31,7 +31,7 @@ from swiftwrf.data.archives import read_arrays
 from swiftwrf.data.files import check_carrier, digests, read_text
 from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format, ReadOptions
 from swiftwrf.data.paths import PropagationPaths
-from swiftwrf.data.spectra import GRID, Spectra, check_pixels
+from swiftwrf.data.spectra import Spectra
 from swiftwrf.errors import InputError
 from swiftwrf.positions import check_positions
 
@@ -77,7 +77,6 @@ class DeepMimo(Format[Spectra]):
             raise InputError(f"{path} has no receiver with a path for pair {pair}")
         notes = [] if reached.all() else [f"receivers without a path are left out: {int((~reached).sum())}"]
         index, receiver, known = index[reached], receiver[reached], known[reached]
-        check_pixels(str(path), len(receiver), options.grid or GRID)
         table = {key: values[reached] for key, values in table.items()}
         paths, found = _paths(path, table, known, receiver, transmitter, frequency, tracer)
         return paths.spectra(
@@ -193,15 +192,8 @@ def _from_horizon(
 ) -> bool:
     """Return True if elevations count from the horizon, and refuse other conventions than those of docs/formats.md.
 
-    Direct paths come from the transmitter, which reveals the convention. With few of them negative angles do.
-
-    Args:
-        folder: Source, for the message.
-        azimuth: Azimuths of the paths, (n, paths) [deg].
-        zenith: Zenith angles of the paths, (n, paths) [deg].
-        direct: True for direct paths, (n, paths).
-        known: True for paths that exist, (n, paths).
-        away: Vectors from the receivers to the transmitter, (n, 3).
+    Direct paths come from the transmitter, `away` (n, 3) from the receivers. They reveal the convention of angles (n, paths)
+    [deg]. With few of them negative angles do.
 
     Raises:
         InputError: Angles that point the other way, or another frame.

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from swiftwrf.array.angles import AngularGrid, ArrayPose
+from swiftwrf.array.angles import ArrayPose
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.choices import Moving
 from swiftwrf.data.archives import array_header, array_names, read_arrays, read_rows, refusing_broken
@@ -38,12 +38,11 @@ from swiftwrf.data.files import (
     read_xyz,
     read_yaml,
     sha256,
-    sha256_of_all,
 )
 from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format, ReadOptions
 from swiftwrf.data.spectra import Spectra, check_pixels
 from swiftwrf.data.splits import read_splits
-from swiftwrf.data.store import BATCH_PIXELS, MAX_FINE_PIXELS, MAX_MEMORY_PIXELS, Store, stored, too_many
+from swiftwrf.data.store import BATCH_PIXELS, Store, stored
 from swiftwrf.errors import InputError
 from swiftwrf.positions import check_positions, to_tensor
 
@@ -59,7 +58,12 @@ class Nerf2(Format[Spectra]):
 
     def read(self, path: Path, options: ReadOptions) -> Spectra:
         described = path / "gateway_info.yml"
-        gateway = _read_gateway(described)
+        gateways = [value for value in read_yaml(described).values() if isinstance(value, dict)]
+        if len(gateways) != 1:
+            raise InputError(
+                f"{described} must describe one gateway with its position and orientation, got {len(gateways)}"
+            )
+        (gateway,) = gateways
         pose = _read_pose(described, gateway)
         array = _read_array(described, gateway)
         if options.array is not None and array is not None and array != options.array:
@@ -84,15 +88,6 @@ class Nerf2(Format[Spectra]):
             named_splits=read_splits(path, len(position), first=1),
             source=digests([described, tables[0]], path) | read,
         )
-
-
-def _read_gateway(file: Path) -> dict[str, Any]:
-    content = read_yaml(file)
-    gateways = [value for value in content.values() if isinstance(value, dict)]
-    if len(gateways) != 1:
-        raise InputError(f"{file} must describe one gateway with its position and orientation, got {len(gateways)}")
-    gateway: dict[str, Any] = gateways[0]
-    return gateway
 
 
 def _read_pose(file: Path, gateway: dict[str, Any]) -> ArrayPose:
@@ -152,7 +147,7 @@ def _read_values(file: Path, n: int, digest: str) -> Store:
             f"{file}: spectra have {shape[1]} elevations and {shape[2]} azimuths; these look swapped, so give "
             "spectrum.transpose(0, 2, 1)"
         )
-    check_pixels(str(file), n, AngularGrid.hemisphere(*shape[1:]))
+    check_pixels(str(file), n, shape[1:])
     kept = {1: torch.uint8, 2: torch.float16}.get(kind.itemsize, torch.float32)
     if kind.kind == "u" and kept == torch.float16:
         kept = torch.float32  # 16 bits in full
@@ -189,20 +184,19 @@ def _read_images(folder: Path, n: int) -> tuple[Store, str]:
         raise InputError(f"{folder} holds {found} images, but there are {n} positions; each position needs its image")
     files = [folder / f"{number:05d}.png" for number in range(1, n + 1)]
     shape: tuple[int, int] | None = None
-    digests = []
+    digest = hashlib.sha256()
     for file in files:
         if not file.is_file():
             raise InputError(f"{file} is missing; images are numbered from 00001.png without gaps")
         content = read_bytes(file)
-        digests.append((file.name, hashlib.sha256(content).hexdigest()))
+        digest.update(f"{hashlib.sha256(content).hexdigest()}  {file.name}\n".encode())
         shape = _check_size(file, content, n, shape)
     assert shape is not None
-    digest = sha256_of_all(digests)
 
     def batches() -> Iterator[Tensor]:
         return (torch.from_numpy(_decode(file, read_bytes(file)).copy())[None] for file in files)
 
-    return stored((n, *shape), torch.uint8, lambda: digest, batches), digest
+    return stored((n, *shape), torch.uint8, digest.hexdigest, batches), digest.hexdigest()
 
 
 def _opened(content: bytes) -> Image.Image:
@@ -223,11 +217,7 @@ def _check_size(file: Path, content: bytes, n: int, shape: tuple[int, int] | Non
             f"{file} has {rows} x {columns} pixels; a spectrum has 4 columns a row "
             "(elevations to 90, azimuths to 360 degrees), e.g. 90 x 360"
         )
-    if too_many((n, rows, columns)):
-        raise InputError(
-            f"{file} has {rows} x {columns} pixels, with {n} images {n * rows * columns:.3g}; average them down to "
-            f"at most {MAX_MEMORY_PIXELS:.3g} in all or {MAX_FINE_PIXELS:.3g} each"
-        )
+    check_pixels(str(file), n, (rows, columns))
     if shape is not None and (rows, columns) != shape:
         raise InputError(
             f"{file} has {rows} x {columns} pixels, the first image {shape[0]} x {shape[1]}; all spectra must have one shape"

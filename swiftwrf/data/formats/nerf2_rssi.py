@@ -22,13 +22,13 @@ from torch import Tensor
 
 from swiftwrf.data.cells import column_of_numbers, seconds, text_of
 from swiftwrf.data.columns import column_of, numbered
-from swiftwrf.data.coordinates import Floors, GeodeticOrigin, without_fix
+from swiftwrf.data.coordinates import Floors, GeodeticOrigin, PlanFrame, without_fix
 from swiftwrf.data.files import digests, numbers, read_table, read_xyz, read_yaml
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
 from swiftwrf.data.powers import NOT_DETECTED_DBM, find_fillers, without_fillers
+from swiftwrf.data.receivers import read_receivers, unknown_positions
 from swiftwrf.data.rssi import META, SURVEY, Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
-from swiftwrf.data.survey import read_receivers, unknown_positions
 from swiftwrf.errors import InputError, listed
 
 TABLES = ("gateway_rssi.csv", "rssi.csv")
@@ -129,11 +129,7 @@ def _properties(file: Path) -> dict[str, Any]:
 
 
 def _one_of(path: Path, names: tuple[str, ...]) -> Path:
-    """Return the only file with one of these names.
-
-    Raises:
-        InputError: None of them, or several.
-    """
+    """Return the only file with one of these names, and refuse none or several."""
     found = [path / name for name in names if (path / name).is_file()]
     if len(found) > 1:
         raise InputError(f"{path} holds {' and '.join(file.name for file in found)}; keep one of them")
@@ -147,7 +143,7 @@ def _receiver_positions(file: Path | None, names: list[str]) -> tuple[Tensor | N
     if file is None:
         return None, []
     if file.suffix == ".csv":
-        return read_receivers(file, names)
+        return read_receivers(file, names, None, PlanFrame())
     content = {name: value for name, value in read_yaml(file).items() if value not in ("", "~", "null", "none")}
     unknown = [name for name in names if name not in content]
     if len(unknown) == len(names):

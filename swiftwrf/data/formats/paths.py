@@ -17,12 +17,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.archives import array_names, read_arrays
 from swiftwrf.data.files import check_carrier, digests
 from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format, ReadOptions
 from swiftwrf.data.paths import PropagationPaths
-from swiftwrf.data.spectra import GRID, Spectra, check_pixels
+from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import read_splits
 from swiftwrf.errors import InputError
 from swiftwrf.positions import check_positions, to_tensor
@@ -53,7 +52,7 @@ class PathArchive(Format[Spectra]):
 
     def read(self, path: Path, options: ReadOptions) -> Spectra:
         file = path if path.is_file() else path / "paths.npz"
-        paths = read_paths(file, options.grid or GRID)
+        paths = read_paths(file)
         return paths.spectra(
             file.parent.resolve().name,
             options.array,
@@ -65,17 +64,13 @@ class PathArchive(Format[Spectra]):
         )
 
 
-def read_paths(source: Path, grid: AngularGrid = GRID) -> PropagationPaths:
+def read_paths(source: Path) -> PropagationPaths:
     """Return the paths in a paths.npz, or in a folder with one.
-
-    Args:
-        source: File or folder.
-        grid: Directions of the spectra that are computed from them, for a check of the size.
 
     Raises:
         InputError: No paths, arrays that do not match, or values that are not usable.
     """
-    arrays = _read(source / "paths.npz" if source.is_dir() else source, grid)
+    arrays = _read(source / "paths.npz" if source.is_dir() else source)
     receiver, count = arrays["receiver_position"], arrays["path_count"]
     offset = arrays["last_point"] - receiver.repeat_interleave(count, dim=0)
     return PropagationPaths(
@@ -90,7 +85,7 @@ def read_paths(source: Path, grid: AngularGrid = GRID) -> PropagationPaths:
     )
 
 
-def _read(file: Path, grid: AngularGrid) -> dict[str, Tensor]:
+def _read(file: Path) -> dict[str, Tensor]:
     """Return the checked arrays by name."""
     if not file.is_file():
         raise InputError(f"{file} does not exist; expected ray paths")
@@ -103,7 +98,6 @@ def _read(file: Path, grid: AngularGrid) -> dict[str, Tensor]:
     n = len(count)
     if n == 0 or int(count.min()) < 1:
         raise InputError(f"{file}: every receiver needs at least one path; leave out those without")
-    check_pixels(str(file), n, grid)
     sizes = {"n": n, "P": sum(count.tolist())}
     tensors = {}
     for name, symbols in (SHAPES | dict.fromkeys({LENGTH} & {*arrays}, ("P",))).items():

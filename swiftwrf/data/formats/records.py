@@ -221,11 +221,7 @@ def _description(path: Path) -> tuple[Path, dict[str, Any]] | None:
 def _read_station(
     file: Path, content: dict[str, Any], number: int | None, assigned: bool
 ) -> tuple[str, dict[str, Any], list[int]]:
-    """Return name, array with position and rotation, and antennas of its elements, of the array with that number from 1.
-
-    Raises:
-        InputError: Several arrays and no number, a number that is too large, or an incomplete description.
-    """
+    """Return name, array with position and rotation, and antennas of its elements, of the array with that number from 1."""
     antennas = content["antennas"]
     names = [str(antenna.get("name", "")) for antenna in antennas]
     if (number is None and len(antennas) > 1) or not 1 <= (number or 1) <= len(antennas):

@@ -53,9 +53,6 @@ def snapshots_of(
         files: Files that were read, in the folder of the splits.
         name: Name of the data set. Defaults to that of the folder.
         notes: What the user has to know about the arrays.
-
-    Raises:
-        InputError: An array that is invalid, or arrays that do not match.
     """
     # scalars and vectors as such, which MATLAB stores as matrices
     vectors = {name: arrays[name] for name in VECTORS if name in arrays and arrays[name].ndim == 2}

@@ -15,7 +15,7 @@ from swiftwrf.data.formats.captures import holds_captures
 from swiftwrf.data.formats.nerf2_rssi import FILES as NERF2_FILES
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
-from swiftwrf.data.survey import has_positions, read_survey
+from swiftwrf.data.survey import TableOptions, has_positions, read_survey
 from swiftwrf.errors import InputError, listed
 
 RECEIVERS = "receivers.csv"  # beside the table: receiver,x,y,z
@@ -28,9 +28,7 @@ MAX_COORDINATES = 6  # columns of a table of positions: x, y, z, floor, building
 class SurveyTable(Format[Rssi]):
     """Table of a walk test; positions of receivers are unknown unless receivers.csv beside it contains them."""
 
-    takes = frozenset(
-        {"columns", "filler", "coordinates", "offset_by", "transmitter", "pool_by", "scale", "y_down", "up", "window"}
-    )
+    takes = frozenset(TableOptions.__dataclass_fields__)
 
     def recognises(self, path: Path) -> bool:
         return bool(_tables(path))
@@ -40,7 +38,7 @@ class SurveyTable(Format[Rssi]):
         receivers = file.with_name(RECEIVERS)
         stated = receivers if receivers.is_file() else None
         splits = read_splits(file.parent, len(table), first=0)
-        found = read_survey(file, table, **options.given, receivers=stated, keeps_rows=bool(splits))
+        found = read_survey(file, table, options, stated, keeps_rows=bool(splits))
         data = Rssi(**found, name=file.stem)
         if data.receiver_moves and bool(data.receiver_position.isnan().any()):
             raise InputError(

@@ -107,13 +107,7 @@ class Scene:
         return scene
 
     def plot(self, fixed: Tensor | None = None, position: Tensor | None = None, ax: Axes | None = None) -> Axes:
-        """Draw the surfaces seen from above, coloured by material, and return the axes.
-
-        Args:
-            fixed: Position of the fixed end, (3,) [m].
-            position: Positions of the moving end, (n, 3) [m].
-            ax: Axes to draw into. Defaults to those of a new figure.
-        """
+        """Draw the surfaces seen from above by material, the fixed end (3,) and positions (n, 3) of the moving one."""
         ax = plan_axes(ax)
         every = np.concatenate([surface.vertex[:, :2] for surface in self.surfaces])
         materials = list(dict.fromkeys(surface.material.name for surface in self.surfaces))
@@ -236,16 +230,7 @@ class Tracing:
 def trace(
     scene: Scene, fixed: Tensor, position: Tensor, moving: Moving, tracing: Tracing, progress: bool = True
 ) -> PropagationPaths:
-    """Return all paths between the fixed end and each position of the moving one, shortest first.
-
-    Args:
-        scene: Scene to trace in.
-        fixed: Position of the fixed end, (3,) [m].
-        position: Positions of the moving end, (n, 3) [m].
-        moving: The end that moves: "transmitter" or "receiver".
-        tracing: Kinds and numbers of interactions.
-        progress: Show a progress bar on a terminal.
-    """
+    """Return all paths between the fixed end (3,) [m] and each position (n, 3) [m] of the moving one, shortest first."""
     found: list[PropagationPaths] = []
     with progress_bar(progress) as bar:
         task = bar.add_task("positions traced", total=len(position))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Annotated
 
 import torch
@@ -25,7 +25,6 @@ from swiftwrf.models.geometry.planes import (
     RoomEstimate,
     advantage,
     correlation_score,
-    log_explained,
     offset_covariance,
     refine,
     refine_all,
@@ -33,7 +32,6 @@ from swiftwrf.models.geometry.planes import (
     sign_alternatives,
 )
 from swiftwrf.models.geometry.search import (
-    MAX_SCORE_RATIO,
     N_STARTS,
     PERFECT_SCORE,
     SIGNS,
@@ -48,7 +46,6 @@ from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, configuration
 
 FURTHER_SIGNIFICANCE = 4.0  # standard errors for a plane of any orientation, of which far more are tried
-MAX_MISSING_RATIO = 1.4  # of the missing coherence of new spectra and of those of a search, geometric means
 N_FINAL = 400  # positions of the last moves of a search; fewer do not separate planes from aliases in furnished rooms
 
 
@@ -91,121 +88,31 @@ def search_room(train: Spectra, config: GeometryConfig, progress: bool = False) 
     Raises:
         InputError: Fewer than 10 different positions, or spectra that the array cannot have produced.
     """
-    evidence = _Evidence.of(train, config)
+    observed, _ = observe(train, config)
+    used, _ = _evenly(train, config.max_spectra)
+    assert used.fixed_position is not None
+    assert used.array is not None
+    scene, few = observed.around(used.fixed_position), config.n_search_positions
+    fold = folds(scene.moving, config.validation, config.seed)
+    held, kept = (scene.subset(rows.nonzero()[:, 0]) for rows in (fold == 0, fold != 0))
+    some, more = (_some(scene, most, config.seed) for most in (few, max(few, N_FINAL)))
     with progress_bar(progress) as bar:
         task = bar.add_task("finding the room", total=N_STARTS + len(SIGNS) + 1)
-        some = _some(evidence.kept, config.n_search_positions, config.seed)
-        rooms = find_rooms(some, config.search_distance_m, config.beam_width, tick=lambda: bar.advance(task))
+        searched = _some(kept, few, config.seed)
+        rooms = find_rooms(searched, config.search_distance_m, config.beam_width, tick=lambda: bar.advance(task))
         improved = []
         for signs, room in rooms:
-            improved.append(Search(evidence.more, config.search_distance_m, signs).improve(room))
+            improved.append(Search(more, config.search_distance_m, signs).improve(room))
             bar.advance(task)
-        found, (signs, searched) = min(zip(improved, rooms, strict=True), key=lambda item: float(item[0].score))
-        score = evidence.held_out_score(searched)
-        return _completed(refine(evidence.scene, found), signs, score, evidence, config)
-
-
-@single_thread()
-def extend_room(room: PlaneSet, train: Spectra, is_new: Tensor, config: GeometryConfig) -> RoomEstimate | None:
-    """Estimate a room from more spectra than its search had, without another search if the room explains the new ones.
-
-    A wrong room explains the spectra of its search better than others, because its planes are fitted to them.
-
-    Args:
-        room: Planes that the search found.
-        train: All spectra.
-        is_new: Whether the search did not use a spectrum, (n,).
-        config: Options of the search.
-
-    Returns:
-        The room, with the planes that all spectra together resolve, or None if it does not explain the new spectra or its
-        search had fewer than 50.
-
-    Raises:
-        InputError: As `search_room`.
-    """
-    evidence = _Evidence.of(train, config)
-    room, scene = room.shifted(-evidence.origin), evidence.scene
-    new = is_new[evidence.rows]
-    explained = log_explained(room.coherence(scene))
-    excess = explained[~new].mean() - explained[new].mean()
-    if int((~new).sum()) < 50 or not room.normal.shape[1] or not float(excess) < math.log(MAX_MISSING_RATIO):
-        return None
-    planes = room.by_side()
-    signs = max(SIGNS, key=lambda row: sum(float(row[side]) * gain > 0 for side, (_, gain) in planes.items()))
-    score, room = evidence.held_out_score(room), refine(scene, room)
-    on_sides = PlaneSet.on_sides(room.by_side())
-    improved = refine(scene, Search(evidence.more, config.search_distance_m, signs).improve(on_sides))
-    # a phase alias explains new spectra nearly as well as others, but all positions together less than the right room
-    if float(improved.score) < MAX_SCORE_RATIO * float(room.score):
-        room = improved
-    return _completed(room, signs, score, evidence, config)
-
-
-@dataclass(frozen=True, eq=False)
-class _Evidence:
-    """Observed phases of training spectra, and the parts of them that the stages of a search use.
-
-    Args:
-        train: Training spectra, at most `max_spectra`.
-        observed: Phases in world coordinates.
-        scene: Phases in coordinates around the fixed end.
-        rows: Number of each position's spectrum among all training spectra.
-        fold: Fold of each position.
-        some: Positions of the search.
-        more: Positions of its last moves.
-    """
-
-    train: Spectra
-    observed: PhaseObservations
-    scene: PhaseObservations
-    rows: Tensor
-    fold: Tensor
-    some: PhaseObservations
-    more: PhaseObservations
-
-    @classmethod
-    def of(cls, train: Spectra, config: GeometryConfig) -> _Evidence:
-        observed, rows = observe(train, config)
-        assert train.fixed_position is not None
-        scene = observed.around(train.fixed_position)
-        fold = folds(scene.moving, config.validation, config.seed)
-        used, _ = _evenly(train, config.max_spectra)
-        some, more = (
-            _some(scene, most, config.seed)
-            for most in (config.n_search_positions, max(config.n_search_positions, N_FINAL))
-        )
-        return cls(used, observed, scene, rows, fold, some, more)
-
-    @property
-    def origin(self) -> Tensor:
-        """Origin of the scene's coordinates (3,) [m]."""
-        assert self.train.fixed_position is not None
-        return self.train.fixed_position
-
-    @property
-    def kept(self) -> PhaseObservations:
-        """Positions outside the first fold."""
-        return self.scene.subset((self.fold != 0).nonzero()[:, 0])
-
-    def held_out_score(self, room: PlaneSet) -> float:
-        """Return the score of a room at the positions of the first fold, refined on the others."""
-        assert self.train.array is not None
-        held = self.scene.subset((self.fold == 0).nonzero()[:, 0])
-        return correlation_score(held, refine(self.kept, room), self.train.array)
-
-
-def _completed(
-    room: PlaneSet, signs: Tensor, score: float, evidence: _Evidence, config: GeometryConfig
-) -> RoomEstimate:
-    """Return the estimate that follows from planes that were found: weak and further planes, order and uncertainty."""
-    scene, some, splits = evidence.scene, evidence.some, split(evidence.scene, evidence.fold)
-    room = _pruned(_without_aliases(room, scene, config), scene, splits, config)
-    room = _with_weak_planes(room, scene, some, splits, signs, config)
-    room = _with_further_planes(room, scene, some, splits, config)
-    room = _with_order(room, splits, config)
-    final = refine(evidence.observed, room.shifted(evidence.origin))
-    return assess(evidence.train, evidence.observed, final, score, config.search_distance_m, config.certainty)
+        room, (signs, start) = min(zip(improved, rooms, strict=True), key=lambda item: float(item[0].score))
+        score = correlation_score(held, refine(kept, start), used.array)
+        splits = split(scene, fold)
+        room = _pruned(_without_aliases(refine(scene, room), scene, config), scene, splits, config)
+        room = _with_weak_planes(room, scene, some, splits, signs, config)
+        room = _with_further_planes(room, scene, some, splits, config)
+        room = _with_order(room, splits, config)
+    final = refine(observed, room.shifted(used.fixed_position))
+    return assess(used, observed, final, score, config.search_distance_m, config.certainty)
 
 
 @single_thread()

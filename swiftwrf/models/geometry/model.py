@@ -11,12 +11,12 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import LIGHT_SPEED
-from swiftwrf.data.spectra import Spectra, check_training, fingerprint
+from swiftwrf.data.spectra import Spectra, fingerprint
 from swiftwrf.data.splits import folds
 from swiftwrf.errors import InputError
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, bounding_box
 from swiftwrf.models.geometry.channels import Channels, field, waves
-from swiftwrf.models.geometry.fit import GeometryConfig, extend_room, observe, search_room, update_room
+from swiftwrf.models.geometry.fit import GeometryConfig, observe, search_room, update_room
 from swiftwrf.models.geometry.furniture import Furniture, find_furniture, fit_furniture
 from swiftwrf.models.geometry.images import PhaseObservations, PlaneSet, images
 from swiftwrf.models.geometry.planes import Plane, RoomEstimate, plane_set, refine
@@ -141,39 +141,6 @@ class GeometryModel(Linked, FieldModel):
     def _update(self, new: Spectra) -> None:
         if self.planes:
             self.estimate, self.fingerprint = update_room(self.estimate, self.tensors(), new, self.config), ""
-
-    def extended(self, train: Spectra, is_new: Tensor) -> Self | None:
-        """Return the room fitted to more spectra than its search had, without another search.
-
-        Args:
-            train: Training spectra.
-            is_new: Whether the search did not use a spectrum, (n,).
-
-        Returns:
-            The fitted model. None if the search had fewer than 50 spectra, or if the room does not explain the new ones as
-            well as those of its search: then only another search helps.
-
-        Raises:
-            InputError: As `fit`.
-
-        Example:
-            >>> import swiftwrf
-            >>> data = swiftwrf.simulated_room(n=60)
-            >>> floor = Plane((0.0, 0.0, -1.0), offset_m=0.0, gain=-0.6)
-            >>> found_in_few = GeometryModel.of_planes(data.subset(torch.arange(20)), [floor])
-            >>> found_in_few.extended(data, is_new=torch.arange(60) >= 20) is None
-            True
-        """
-        check_training(train)
-        self.link.check(train)
-        estimate = extend_room(self.tensors(), train, is_new, self.config)
-        if estimate is None:
-            return None
-        model = copy(self)
-        model.grid, model.bounds = train.grid, bounding_box(train.position)
-        model.estimate, model.fingerprint = estimate, fingerprint(train)
-        model._furnish(train)
-        return model
 
     @single_thread()
     def refined_on(self, scene: PhaseObservations) -> Self:

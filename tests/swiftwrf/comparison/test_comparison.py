@@ -14,9 +14,8 @@ from torch.nn import functional
 from swiftwrf import AngularGrid, FitError, InputError, Spectra, load, make_model, rssi_room, simulated_room
 from swiftwrf.comparison import DcganConfig, NeRF2Config, NeRF2Rssi, VaeConfig, WrfGsConfig, wrfgs
 from swiftwrf.comparison.base import Training, draw_parameters
-from swiftwrf.comparison.convolution import double, halve, stages
+from swiftwrf.comparison.generative import double, halve, stages
 from swiftwrf.comparison.nerf2 import FIRST_PHASE, PATH_GAIN, Field, integrate, received
-from swiftwrf.comparison.vae import divergence
 from swiftwrf.comparison.wrfgs import on_sphere
 from swiftwrf.data.store import Store
 from swiftwrf.metrics import psnr
@@ -54,7 +53,7 @@ def training(config, data):
     """The training of a model's network, and the model."""
     (name,) = (name for name in PUBLISHED if isinstance(config, FIELD_MODELS[name].config_type))
     found = []
-    with mock.patch.object(Training, "trained", lambda self, *_, **__: found.append(self) or self.result):
+    with mock.patch.object(Training, "run", lambda self, *_, **__: found.append(self) or self.result):
         model = FIELD_MODELS[name](config).fit(data)
     return found[0], model
 
@@ -228,12 +227,6 @@ def test_convolutions_refuse_specks(room):
         fit(room.coarsen(5), "vae")
 
 
-def test_divergence_is_that_of_normal_distributions(generator):
-    a, b = (tuple(torch.randn(2, 3, 4, generator=generator)) for _ in range(2))
-    p, q = (torch.distributions.Normal(mean, (0.5 * log_variance).exp()) for mean, log_variance in (a, b))
-    torch.testing.assert_close(divergence(a, b), torch.distributions.kl_divergence(p, q).sum(dim=-1))
-
-
 # growing
 
 
@@ -347,10 +340,6 @@ def test_one_field_for_all_receivers(tmp_path):
     transmitter, receiver = ((at - centre).float() for at in (position[7:8], train.receiver_position[2:]))
     signal = received(model.field, config.reach, config.samples, transmitter, receiver, rays).mean(dim=1)
     torch.testing.assert_close(predicted[7, 2].float(), 100 * (torch.hypot(*signal) - 1))
-    with pytest.raises(KeyboardInterrupt):
-        NeRF2Rssi(PUBLISHED_RSSI).fit(train, checkpoint=tmp_path / "state", on_record=interrupt)
-    again = NeRF2Rssi(PUBLISHED_RSSI).fit(train, checkpoint=tmp_path / "state")
-    assert torch.equal(again.predict(position).mean, predicted)
 
 
 @pytest.mark.parametrize("name", ["nerf2", "wrfgs"])
@@ -359,13 +348,6 @@ def test_any_resolution(room, name):
     model = fit(room, name)
     coarse, fine = (model.synthesize(room.position[:3], grid) for grid in (None, AngularGrid.hemisphere(30, 120)))
     torch.testing.assert_close(fine[:, 1::2, ::2], coarse, atol=1e-5, rtol=1e-4)
-
-
-def test_the_compiled_field_is_the_field(room, monkeypatch):
-    honest = torch.nn.Module.compile
-    monkeypatch.setattr(torch.nn.Module, "compile", lambda self: honest(self, backend="eager"))  # no minute of C++
-    plain, compiled = (training(replace(PUBLISHED["nerf2"], compiled=c), room)[0].objective() for c in (False, True))
-    torch.testing.assert_close(plain, compiled)
 
 
 @pytest.fixture(scope="module")

@@ -52,7 +52,10 @@ def _positions(row):
 WRONG = {
     "no pose": (lambda f: (f / "gateway_info.yml").unlink(), "gateway_info.yml is missing"),
     "pose is no yaml": (_write("gateway_info.yml", "a: [1"), "not valid YAML"),
-    "pose runs code": (_write("gateway_info.yml", "a: !!python/object/apply:os.getcwd []"), "not valid YAML"),
+    "pose runs code": (
+        _write("gateway_info.yml", "a: !!python/object/apply:os.getcwd []"),
+        "must describe one gateway",
+    ),
     "quaternion": (
         _write("gateway_info.yml", "g:\n  position: [0, 0, 0]\n  orientation: [0, 0, 1, 1]\n"),
         "unit quaternion",

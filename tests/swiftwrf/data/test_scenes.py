@@ -24,7 +24,7 @@ from swiftwrf.data.raytraced.trace import _first
 from swiftwrf.data.simulated import ShoeboxRoom
 from swiftwrf.models.geometry import Plane
 from swiftwrf.models.raytrace import RaytraceModel, surfaces
-from tasks.scenes.run import draw_positions
+from tasks.scenes import draw_positions
 
 FREQUENCY = 2.4e9
 WAVELENGTH = LIGHT_SPEED / FREQUENCY

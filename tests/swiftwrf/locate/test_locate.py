@@ -12,10 +12,9 @@ from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.data.coordinates import Floors
 from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.locate import MatchedField, Posterior, Region, RssiLocator
-from swiftwrf.locate.fingerprints import METRICS, Fingerprints
 from swiftwrf.locate.posterior import normalised, pooled_weights
 from swiftwrf.locate.region import Cells, best_cells, refined
-from swiftwrf.locate.rssi_likelihood import DetectionLikelihood, ValueLikelihood
+from swiftwrf.locate.rssi_likelihood import METRICS, DetectionLikelihood, Fingerprints, ValueLikelihood
 from swiftwrf.locate.spectrum_likelihood import BOUNDS, CoarrayLikelihood, PathWaves, PhaseLikelihood, SpectrumFeatures
 from swiftwrf.models.geometry import GeometryModel, Plane
 from swiftwrf.models.geometry.path_gains import PathGains
@@ -215,7 +214,7 @@ def test_the_order_of_receivers_changes_nothing(floor):
 def test_rssi_is_located_better_than_by_fingerprints(floor):
     _, test, locator = floor
     found = (locator.locate(test.rssi_dbm).median - test.transmitter_position).norm(dim=1)
-    nearest = (locator.likelihoods.fingerprints.fingerprints.estimate(test.rssi_dbm) - test.transmitter_position).norm(
+    nearest = (locator.likelihoods.fingerprints.fingerprints.votes(test.rssi_dbm)[2] - test.transmitter_position).norm(
         dim=1
     )
     assert found.median() < nearest.median()

@@ -7,7 +7,8 @@ import torch
 from quick import command
 
 from swiftwrf import InputError, Rssi, rssi_room
-from swiftwrf.locate import Posterior, RssiLocator, smoothed, track
+from swiftwrf.locate import Posterior, RssiLocator, smoothed
+from swiftwrf.locate import posterior as module
 from swiftwrf.locate.posterior import normalised
 
 STEP_M, NOISE_M = 0.4, 1.5
@@ -71,8 +72,8 @@ def test_the_time_between_observations_widens_the_step():
 def test_products_in_chunks_are_the_same(monkeypatch):
     posterior = gaussian(line(), walk(n=5)[1])
     whole = smoothed(posterior, None, 1.0)
-    monkeypatch.setattr(track, "MAX_KEPT_PAIRS", 0)
-    monkeypatch.setattr(track, "CHUNK", 1000)
+    monkeypatch.setattr(module, "MAX_KEPT_PAIRS", 0)
+    monkeypatch.setattr(module, "CHUNK", 1000)
     assert smoothed(posterior, None, 1.0).weight.allclose(whole.weight, atol=1e-6)
 
 

@@ -19,7 +19,7 @@ from swiftwrf.models.geometry.channels import coherence, field, waves
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.geometry.furniture import Furniture
 from swiftwrf.models.geometry.images import PlaneSet
-from tasks.aoa.page.room import furniture_panels
+from tasks.aoa.room import furniture_panels
 
 WALLS = built_in_walls(0.9)
 

@@ -16,7 +16,6 @@ from swiftwrf.data.store import Store
 from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.metrics import psnr
 from swiftwrf.models.geometry import GeometryConfig, GeometryModel, Plane, path_gains
-from swiftwrf.models.geometry import fit as geometry_fit
 from swiftwrf.models.geometry.fit import _pruned, _with_weak_planes, _without_aliases, observe, split
 from swiftwrf.models.geometry.hybrid import HybridModel
 from swiftwrf.models.geometry.images import SIDES, PhaseObservations, PlaneSet, field
@@ -257,21 +256,6 @@ def test_scores_of_combinations_are_those_of_their_rooms():
     some = torch.tensor([0, 5, 7])
     few = waves.subset(some).first(2).scores(scene.subset(some), direct[some])
     torch.testing.assert_close(few, waves.subset(some).scores(scene.subset(some), direct[some])[:, :2, :2, :, :2, :2])
-
-
-def test_a_room_of_a_search_is_extended_to_more_spectra_unless_it_does_not_explain_them(monkeypatch):
-    """A wall at a phase alias moves to its place, and a room fitted to too few spectra is refused."""
-    data = simulated_room(n=70, grid=AngularGrid.hemisphere(12, 48))
-    is_new = torch.arange(70) >= 52
-    observed, _ = observe(data.subset((~is_new).nonzero()[:, 0]))
-    walls = [*zip(SIDES.tolist(), (0.0, 6.166, 0.0, 5.0, 0.0, 3.0), (-0.7,) * 4 + (-0.6,) * 2, strict=True)]
-    start = GeometryModel.of_planes(data, [Plane(tuple(n), offset, gain) for n, offset, gain in walls])
-    start.config = GeometryConfig(max_extra_planes=0)
-    room = start.refined_on(observed).extended(data, is_new)
-    assert [plane.offset_m for plane in room.planes] == pytest.approx([0, 6, 0, 5, 0, 3], abs=0.01)
-    assert start.extended(data, torch.arange(70) >= 49) is None
-    monkeypatch.setattr(geometry_fit, "MAX_MISSING_RATIO", 0.1)
-    assert room.extended(data, is_new) is None
 
 
 @pytest.mark.long

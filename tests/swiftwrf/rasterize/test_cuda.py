@@ -27,7 +27,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from swiftwrf import AngularGrid, InputError, rasterize
 from swiftwrf.rasterize import cuda, operators, reference
-from swiftwrf.rasterize.magnitude import magnitude
+from swiftwrf.rasterize.operators import magnitude
 
 SHIM = Path(__file__).parents[2] / "cuda_shim"
 rasterize_package = sys.modules[rasterize.__module__]
@@ -319,32 +319,6 @@ def test_a_primitive_that_is_not_a_number_shows():
     mean, cholesky, weight = (x.detach() for x in random_scene(4, 1))
     mean[0, 1, 0] = float("nan")
     assert operators.field(mean, cholesky, weight, AngularGrid.hemisphere(17, 33), 1e-4).isnan().any()
-
-
-def test_operators_are_registered_properly(device):
-    """PyTorch checks its operators itself."""
-    inputs = [x.detach().to(device).requires_grad_() for x in random_scene(4, 2)]
-    torch.library.opcheck(operators._field, (*inputs, 0.1, 0.2, 5, 0.0, 9, 1e-4))
-    grad = torch.ones(2, 2, 5, 9, device=device)
-    torch.library.opcheck(operators._gradients, (grad, *(x.detach() for x in inputs), 0.1, 0.2, 5, 0.0, 9, None))
-
-
-def test_compiles_into_a_full_graph(device):
-    """Magnitude and gradient of a compiled function against the same one run eagerly."""
-    grid = AngularGrid.hemisphere(7, 12)
-    inputs = [x.detach().to(device).requires_grad_() for x in random_scene(4, 2)]
-
-    def render(*tensors):
-        return magnitude(operators.field(*tensors, grid, 1e-4))
-
-    compiled = torch.compile(render, fullgraph=True, backend="aot_eager" if device == "cpu" else "inductor")
-    torch.testing.assert_close(compiled(*inputs), render(*inputs))
-    for a, b in zip(
-        torch.autograd.grad(compiled(*inputs).sum(), inputs),
-        torch.autograd.grad(render(*inputs).sum(), inputs),
-        strict=True,
-    ):
-        torch.testing.assert_close(a, b)
 
 
 @pytest.mark.long

@@ -13,8 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from swiftwrf import AngularGrid, InputError, rasterize
-from swiftwrf.rasterize import operators
-from swiftwrf.rasterize.magnitude import magnitude
+from swiftwrf.rasterize.operators import magnitude
 
 WITH_TESTS = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}  # where other processes find the random scenes
 
@@ -97,18 +96,6 @@ def test_nothing_to_render(backend, batch, n):
     rendered = rasterize(mean, cholesky, weight, GRID, backend)
     assert rendered.shape == (batch, 2, *GRID.shape)
     assert not rendered.any()
-
-
-def test_operators_are_registered_properly():
-    mean, cholesky, weight = random_scene(n=4, batch=2)
-    options = (0.1, 0.2, 10, 0.0, 20, 1e-4)
-    torch.library.opcheck(operators._field, (mean, cholesky, weight, *options))
-
-
-def test_torch_compile_traces_the_whole_function():
-    inputs = random_scene(n=4, batch=2)
-    compiled = torch.compile(lambda *x: rasterize(*x, GRID), fullgraph=True, backend="aot_eager")
-    assert torch.equal(compiled(*inputs), rasterize(*inputs, GRID))
 
 
 def test_without_numba_the_reference_renders_and_default_fits_need_none():

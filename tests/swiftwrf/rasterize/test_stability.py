@@ -9,7 +9,7 @@ from hard_cases import HARD_CASES, random_scene
 
 from swiftwrf import AngularGrid, InputError, rasterize
 from swiftwrf.metrics import ssim
-from swiftwrf.rasterize.magnitude import magnitude
+from swiftwrf.rasterize.operators import magnitude
 
 REFUSED = {
     "a pixel that is not a number": "spectrum of training spectrum 3 is not finite; mend or leave it out",

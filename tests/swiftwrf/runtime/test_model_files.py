@@ -133,7 +133,7 @@ def test_a_damaged_state_of_a_fit_is_refused(room, tmp_path):
     state = tmp_path / "state"
     SwiftWRFPaper(**TINY).fit(room, checkpoint=state)
     kind, tensors, header = read(state, "fit state")
-    for change in ({"losses": None}, {"records": 3}, {"step": "x"}, {"fingerprint": 1}):
+    for change in ({"seconds": None}, {"records": 3}, {"step": "x"}, {"fingerprint": 1}):
         write(state, kind, tensors, header | change)
         with pytest.raises(InputError):
             SwiftWRFPaper(**TINY).fit(room, checkpoint=state)

@@ -35,8 +35,8 @@ from swiftwrf.metrics import angle_errors
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import model as geometry
 from tasks.aoa import experiment
-from tasks.aoa.page.records import palette
-from tasks.page.figures import Palette
+from tasks.aoa.records import palette
+from tasks.labels import colour
 
 
 @pytest.fixture
@@ -426,7 +426,7 @@ def test_whole_run(small, registered, tmp_path):
     html = (out / "report.html").read_text()
     assert "Where to measure next" in html
     assert "<dt>northern</dt><dd>Always due north</dd>" in html
-    assert palette([Condition("northern", "measured")]).colour("northern") == Palette().colour("northern")
+    assert colour(palette([Condition("northern", "measured")]), "northern") == colour({}, "northern")
     assert "What to do next" in html
     assert "What this does not show" in html
     assert "<svg" in html
@@ -473,7 +473,8 @@ def test_a_new_field_model_is_in_help_and_colours(monkeypatch, capsys):
         run("--help")
     assert "dark: No power anywhere" in " ".join(capsys.readouterr().out.replace("│", " ").split())
     colours = palette([Condition("aann_kernel", "measured + synthetic", "dark")])
-    assert colours.colour("dark") == colours.colour("network, measured + synthetic (dark)") == Palette().colour("dark")
+    names = ("dark", "network, measured + synthetic (dark)")
+    assert {colour(colours, name) for name in names} == {colour({}, "dark")}
 
 
 def test_labels_of_synthetic_spectra_are_those_of_their_positions(small, tmp_path, monkeypatch):

@@ -19,7 +19,6 @@ from augment import Fold, cross_validation
 from augment.cross_validation import LOCATOR
 from augment.estimators import ESTIMATORS
 from augment.turbo.condition import LOCATED, NETWORKS
-from augment.turbo.experiment import Experiment
 from augment.turbo.locating import containing_level
 from swiftwrf import MatchedField, load, make_model
 from swiftwrf.locate import Posterior, matched_field
@@ -31,7 +30,6 @@ from tasks.aoa import experiment
 
 PLANES = {(0.0, 0.0, -1.0): 0.0, (1.0, 0.0, 0.0): 5.0, (0.0, 1.0, 0.0): 4.0}  # outward normal to offset [m]
 FIT = MatchedField.fit
-LEFT_OUT = {LOCATED, f"{LOCATOR}, all measured"}
 ON_SNAPSHOTS = {
     "music",
     "esprit",
@@ -103,24 +101,23 @@ def finished(closed_form, tmp_path_factory):
 
 def test_methods_and_positions_have_their_keys(closed_form, finished):
     mix = mix_of(finished)
-    assert set(mix["methods"]) >= LEFT_OUT
+    assert LOCATED in mix["methods"]
     assert set(mix["left_out"]) == ON_SNAPSHOTS
     errors = pd.read_csv(finished / "errors.csv")
     positions = pd.read_csv(finished / "positions.csv")
     test = closed_form.split()[1]
-    for name in LEFT_OUT:
-        own, at = errors[errors.method == name], positions[positions.method == name]
-        assert own["index"].tolist() == at["index"].tolist() == test.index.tolist()
-        truth, found = (at[[f"{what}_{axis}_m" for axis in "xyz"]].to_numpy() for what in ("truth", "estimate"))
-        np.testing.assert_allclose(truth, test.position, rtol=1e-9)
-        np.testing.assert_allclose(at["error_m"], np.linalg.norm(found - truth, axis=1), rtol=1e-9)
-        assert (at["covered"] == (at["containing_level"] < 0.8)).all()
-        located = mix["locating"][name]
-        assert located["position_error_m"]["median"] == pytest.approx(at["error_m"].median())
-        assert located["coverage_80"] == pytest.approx(at["covered"].mean())
-        assert len(located["weights"]) >= 1
-        assert set(located["seconds"]) == {"room", "fit", "locate"}
-        assert mix["methods"][name]["great_circle_deg"]["median"] == pytest.approx(own["great_circle_deg"].median())
+    own, at = errors[errors.method == LOCATED], positions[positions.method == LOCATED]
+    assert own["index"].tolist() == at["index"].tolist() == test.index.tolist()
+    truth, found = (at[[f"{what}_{axis}_m" for axis in "xyz"]].to_numpy() for what in ("truth", "estimate"))
+    np.testing.assert_allclose(truth, test.position, rtol=1e-9)
+    np.testing.assert_allclose(at["error_m"], np.linalg.norm(found - truth, axis=1), rtol=1e-9)
+    assert (at["covered"] == (at["containing_level"] < 0.8)).all()
+    located = mix["locating"][LOCATED]
+    assert located["position_error_m"]["median"] == pytest.approx(at["error_m"].median())
+    assert located["coverage_80"] == pytest.approx(at["covered"].mean())
+    assert len(located["weights"]) >= 1
+    assert set(located["seconds"]) == {"room", "fit", "locate"}
+    assert mix["methods"][LOCATED]["great_circle_deg"]["median"] == pytest.approx(own["great_circle_deg"].median())
 
 
 def test_a_known_room_without_noise_is_located(finished):
@@ -169,10 +166,10 @@ def test_without_array_or_planes_it_is_left_out_with_one_sentence(closed_form, t
         assert command("aoa", "--mix", 0.6, "--extra", 0, "--out", tmp_path / "run") == 0
     console = " ".join(capsys.readouterr().err.split())
     mix = mix_of(tmp_path / "run")
-    assert not LEFT_OUT & set(mix["methods"])
+    assert LOCATED not in mix["methods"]
     assert mix["locating"] == {}
-    assert set(mix["left_out"]) == LEFT_OUT | ON_SNAPSHOTS
-    (reason,) = {mix["left_out"][name] for name in LEFT_OUT}
+    assert set(mix["left_out"]) == {LOCATED} | ON_SNAPSHOTS
+    reason = mix["left_out"][LOCATED]
     if missing == "array":
         assert console.count(f"{LOCATOR} is left out") == 1
         assert f"{LOCATOR} is left out: {reason}" in console
@@ -185,17 +182,6 @@ def test_without_array_or_planes_it_is_left_out_with_one_sentence(closed_form, t
     html = (tmp_path / "run" / "report.html").read_text()
     assert ("Where was it?" in html) == (missing == "planes")  # which states that none was found
     assert reason in html
-
-
-def test_fractions_and_repeats_share_the_search_in_all_spectra(closed_form, tmp_path):
-    with quickly(closed_form):
-        data = Experiment(*closed_form.split(), (0.5, 1.0), extra=0, repeats=2)
-        subsets = data.subsets
-        own = {subset: [condition.result_name for condition in data.located_by(subset)] for subset in subsets}
-    everything = [f"{LOCATOR}_all_measured-r{repeat}" for repeat in (0, 0, 1, 1)]
-    assert own[subsets[0]] == [f"{LOCATOR}_measured-mix0.5-r0"]
-    assert own[subsets[1]] == [f"{LOCATOR}_measured-mix1-r0", *everything]
-    assert own[subsets[3]] == [f"{LOCATOR}_measured-mix1-r1"]
 
 
 def test_the_estimator_is_chosen_by_held_out_errors_alone(closed_form):

@@ -15,10 +15,9 @@ from augment.turbo.synthesis import Evaluation
 from swiftwrf import simulated_room
 from swiftwrf.metrics import median_interval, paired_change
 from swiftwrf.metrics import summary as error_summary
-from tasks.aoa.options import AoaConfig
-from tasks.aoa.page import first_screen
-from tasks.aoa.page.records import FractionRecords
-from tasks.aoa.page.summary import answer, comparison
+from tasks.aoa.page import answer, comparison, first_screen
+from tasks.aoa.records import FractionRecords
+from tasks.configs import AoaConfig
 from tasks.page.records import Records
 
 MEASURED = Condition("aann_kernel", "measured", measured_fraction=0.3)

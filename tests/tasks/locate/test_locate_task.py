@@ -18,9 +18,9 @@ from swiftwrf.data.writing import write_spectra
 from swiftwrf.locate import MatchedField
 from swiftwrf.locate.baselines import LEVELS, LOCALIZERS, RegressedCoordinates
 from swiftwrf.locate.comparison import LocateSplit, Trial, compare
-from tasks.claim import LOCATOR as MODEL
 from tasks.labels import LOCALIZERS as LABELS
-from tasks.predict.observations import read_rssi
+from tasks.predict import read_rssi
+from tasks.records import LOCATOR as MODEL
 from tasks.source import aligned
 
 GRID = AngularGrid.hemisphere(8, 32)
@@ -245,11 +245,11 @@ def test_other_rows_are_refused(locate_run, matched, tmp_path, capsys):
 def test_no_receiver_detected(locate_run, tmp_path, capsys):
     data = rssi_room(n=20)
     data.rssi_dbm[:] = torch.nan
-    with mock.patch("tasks.predict.observations.read_rssi", return_value=(data, True)):
+    with mock.patch("tasks.predict.read_rssi", return_value=(data, True)):
         assert quick.command("predict", locate_run / MODEL, "walk", "--out", tmp_path / "out.csv") == 2
     assert "no receiver of" in said(capsys)
     data.rssi_dbm[3] = -70.0
-    with mock.patch("tasks.predict.observations.read_rssi", return_value=(data, True)):
+    with mock.patch("tasks.predict.read_rssi", return_value=(data, True)):
         assert quick.command("predict", locate_run / MODEL, "walk", "--out", tmp_path / "out.csv") == 0
     assert "left out: 19" in capsys.readouterr().err
     assert pd.read_csv(tmp_path / "out.csv")["index"].tolist() == [3]
@@ -258,7 +258,7 @@ def test_no_receiver_detected(locate_run, tmp_path, capsys):
 def test_receivers_that_moved_are_refused(locate_run, tmp_path, capsys):
     data = rssi_room(n=20)
     moved = replace(data, receiver_position=data.receiver_position + torch.tensor([0.0, 2.0, 0.0]))
-    with mock.patch("tasks.predict.observations.read_rssi", return_value=(moved, True)):
+    with mock.patch("tasks.predict.read_rssi", return_value=(moved, True)):
         assert quick.command("predict", locate_run / MODEL, "walk", "--out", tmp_path / "out.csv") == 2
     assert "receiver01 2 m away from its position" in said(capsys)
 

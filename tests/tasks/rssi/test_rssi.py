@@ -30,10 +30,10 @@ from swiftwrf.rssi.baselines import NEIGHBOUR_COUNTS, Blend, BlendConfig
 from swiftwrf.rssi.comparison import make_predictor, pool_of
 from swiftwrf.runtime import registry
 from tasks.labels import PREDICTORS as LABELS
-from tasks.report.run import merge
+from tasks.report import merge
 from tasks.rssi import experiment
-from tasks.rssi.page.maps import Maps
-from tasks.rssi.page.summary import where_next
+from tasks.rssi.maps import Maps
+from tasks.rssi.page import where_next
 
 
 @pytest.mark.parametrize("name", [n for n in RSSI_PREDICTORS if n.startswith(("mri", "gp"))])

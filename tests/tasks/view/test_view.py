@@ -23,8 +23,8 @@ from PIL import Image
 from swiftwrf import AngularGrid, InputError, PairModel, Rssi, RssiModel, load, load_rssi, rssi_room
 from swiftwrf.locate import MatchedField, RssiLocator
 from swiftwrf.online import Follower
-from tasks.convert.outputs import saved_model
-from tasks.locate.options import LocateConfig
+from tasks.configs import LocateConfig
+from tasks.convert import saved_model
 from tasks.options import plain
 from tasks.page.maps import FloorPlan, colour_image
 from tasks.update.record import Record

@@ -51,7 +51,7 @@ def serve():
 
     def start(source: Path) -> str:
         inherited = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
-        command = [sys.executable, "-m", "tasks.view", str(source), "--port", "0"]
+        command = [sys.executable, "-m", "tasks", "view", str(source), "--port", "0"]
         process = subprocess.Popen(command, cwd=ROOT, env=inherited, stdout=subprocess.PIPE, text=True)
         processes.append(process)
         line = process.stdout.readline()

@@ -1,0 +1,177 @@
+"""Receivers of RSSI: the spelling of their names, radios of one access point, and tables of positions."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from swiftwrf.data.cells import column_of_numbers
+from swiftwrf.data.columns import GEODETIC, column_of
+from swiftwrf.data.coordinates import GeodeticOrigin, PlanFrame, frame_of
+from swiftwrf.data.files import read_table
+from swiftwrf.errors import InputError, listed
+from swiftwrf.positions import check_positions
+
+Floats = NDArray[np.float64]
+MAC = "mac"  # pools radios by the first five bytes of their addresses
+ADDRESS = re.compile(r"((?:[0-9a-f]{2}[:-]?){4}[0-9a-f]{2})[:-]?[0-9a-f]{2}", re.IGNORECASE)
+MAX_FROM_ORIGIN_DEG = 2.0  # of receivers in degrees
+
+
+def plain_receiver(name: str) -> str:
+    """Return the name of a receiver without what people write differently: case, separators, and zeros before a number.
+
+    Example:
+        >>> plain_receiver("CB-99-D5-23-7D-12"), plain_receiver("AP 01"), plain_receiver("007")
+        ('cb99d5237d12', 'ap 1', '7')
+    """
+    words = re.split(r"[\s:._-]+", name.strip().lower())
+    plain = "".join(words)
+    return plain if re.fullmatch("[0-9a-f]{12}", plain) else re.sub(r"(?<!\d)0+(?=\d)", "", " ".join(words))
+
+
+def spelled_as(names: Sequence[str], known: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return names in the spelling of those that are known, and a note on those that differ in it.
+
+    Example:
+        >>> spelled_as(["AA-BB-CC-DD-EE-01", "hall"], ["aa:bb:cc:dd:ee:01", "office"])[0]
+        ['aa:bb:cc:dd:ee:01', 'hall']
+    """
+    plain = pd.Series(list(known), index=[plain_receiver(name) for name in known], dtype=object)
+    plain = plain[~plain.index.duplicated(keep=False)]
+    mine = pd.Series([plain_receiver(name) for name in names], dtype=object)
+    once = ~mine.duplicated(keep=False)
+    found = [
+        plain[key] if name not in known and single and key in plain.index else name
+        for name, key, single in zip(names, mine, once, strict=True)
+    ]
+    other = [f"{name} is {as_known}" for name, as_known in zip(names, found, strict=True) if name != as_known]
+    return found, [f"receivers are matched whose names are spelled differently: {listed(other)}"] * bool(other)
+
+
+def pool_names(names: Sequence[str], by: str) -> list[str]:
+    """Return the access point of each radio; a radio that does not match is one of its own.
+
+    `by` is "mac" for the first five bytes of an address, else a regular expression whose group is the access point.
+
+    Raises:
+        InputError: An expression that is broken, has no group, or matches no radio.
+
+    Example:
+        >>> pool_names(["a4:56:cc:00:10:b0", "a4:56:cc:00:10:b1", "lab"], "mac")
+        ['a4:56:cc:00:10', 'a4:56:cc:00:10', 'lab']
+        >>> pool_names(["hall-2G", "hall-5G"], "(.*)-.G")
+        ['hall', 'hall']
+    """
+    try:
+        pattern = ADDRESS if by == MAC else re.compile(by)
+    except re.error as error:
+        raise InputError(f"pool_by {by!r} is no column and no regular expression ({error})") from None
+    if pattern.groups != 1:
+        raise InputError(f"pool_by takes {MAC}, a column, or a regular expression with one group, got {by!r}")
+    found = [pattern.fullmatch(name) for name in names]
+    if not any(found):
+        raise InputError(f"pool_by {by!r} matches no receiver; there are {listed(names)}")
+    return [name if match is None else match.group(1) for name, match in zip(names, found, strict=True)]
+
+
+def pooled(rssi: Floats, pools: Sequence[str]) -> tuple[list[str], Floats]:
+    """Return P access points in order of their first radio, and their RSSI (n, P) [dBm] from that of R radios (n, R).
+
+    It is the mean power of those radios of the access point that detected the transmitter.
+
+    Example:
+        >>> pooled(np.array([[-50.0, -50.0], [-60.0, np.nan]]), ["hall", "hall"])
+        (['hall'], array([[-50.],
+               [-60.]]))
+    """
+    names = list(dict.fromkeys(pools))
+    member = np.array([[pool == name for name in names] for pool in pools], dtype=np.float64)
+    detected = ~np.isnan(rssi)
+    power = np.where(detected, 10 ** (np.nan_to_num(rssi) / 10), 0.0) @ member
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return names, 10 * np.log10(power / (detected @ member))
+
+
+def read_receivers(
+    file: Path, names: Sequence[str], origin: GeodeticOrigin | None, frame: PlanFrame
+) -> tuple[Tensor, list[str]]:
+    """Return the positions of receivers, float64 (R, 3) [m], nan where the table lacks one, and a note on these.
+
+    Args:
+        file: Table of positions with names of receivers, or without names in the order of the receivers.
+        names: R names.
+        origin: Origin of the measurements, if their positions were in degrees; then these are, too.
+        frame: Axes of the measurements, which the receivers share unless their columns state another unit.
+
+    Raises:
+        InputError: A name twice, no position of any receiver, or a position that is not usable.
+    """
+    table = read_table(file)
+    label = column_of(table, "receiver", {}) or ("name" if "name" in table.columns else None)
+    if label is None and len(table) != len(names):
+        raise InputError(f"{file} has {len(table)} rows and no column of names, but there are {len(names)} receivers")
+    listed_names = list(names) if label is None else table[label].astype(str).str.strip().tolist()
+    if len(set(listed_names)) < len(listed_names):
+        raise InputError(f"{file} must have each receiver once, got {listed(listed_names)}")
+    listed_names, notes = spelled_as(listed_names, names)
+    position = _positions(file, table, origin, frame, "receiver,x,y,z")
+    given = np.flatnonzero(~np.isnan(position[:, :2]).all(axis=1))
+    position, listed_names = position[given], [listed_names[row] for row in given]
+    place = dict(zip(listed_names, check_positions(position, f"positions of {file}").tolist(), strict=True))
+    unknown = [name for name in names if name not in place]
+    if len(unknown) == len(names):
+        raise InputError(f"{file} has none of the receivers ({listed(names)}); there are {listed(listed_names)}")
+    found = torch.tensor([place.get(name, [float("nan")] * 3) for name in names], dtype=torch.float64)
+    return found, [*notes, *unknown_positions(unknown)]
+
+
+def unknown_positions(names: list[str]) -> list[str]:
+    """Return a note on receivers of unknown position, or none."""
+    return [f"the position of these receivers is unknown, so they have no path-loss model: {listed(names)}"] * bool(
+        names
+    )
+
+
+def read_places(file: Path, origin: GeodeticOrigin | None, frame: PlanFrame) -> Tensor:
+    """Return the positions in a table with columns x, y, z or longitude, latitude, altitude, float64 (n, 3) [m].
+
+    Without a column of heights, z is 0. Origin and axes are those of `read_receivers`.
+
+    Raises:
+        InputError: A column that is missing, or a position that is not usable.
+    """
+    return check_positions(_positions(file, read_table(file), origin, frame, "x,y,z"), f"positions of {file}")
+
+
+def _positions(file: Path, table: pd.DataFrame, origin: GeodeticOrigin | None, frame: PlanFrame, header: str) -> Floats:
+    """Return the positions (n, 3) [m] in a table, nan where a cell is empty."""
+    columns = [column_of(table, axis, {}) or column_of(table, GEODETIC[axis], {}) for axis in "xy"]
+    both = [name for name in columns if name is not None]
+    if len(both) < 2:
+        raise InputError(f"{file} must start with the header {header}, got {','.join(map(str, table.columns))}")
+    height = column_of(table, "z", {})
+    values = [column_of_numbers(file, table, name) for name in both]
+    position = np.column_stack([*values, column_of_numbers(file, table, height) if height else np.zeros(len(table))])
+    known = ~np.isnan(position[:, :2]).all(axis=1)
+    xy = position[known, :2]
+    if origin is None:
+        if column_of(table, "longitude", {}) in both and (np.abs(xy) <= (180, 90)).all():
+            raise InputError(
+                f"{file} holds longitudes and latitudes, but the measurements are in metres; give one unit"
+            )
+        return frame_of(file, table, both, frame)[0].to_world(position)
+    if not (np.abs(xy - (origin.longitude, origin.latitude)) <= MAX_FROM_ORIGIN_DEG).all():
+        raise InputError(
+            f"{file}: receivers must be in degrees as the measurements are, within {MAX_FROM_ORIGIN_DEG:g} degrees of "
+            f"{origin}"
+        )
+    position[known, :2] = origin.to_metres(xy[:, ::-1])
+    return position

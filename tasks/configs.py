@@ -1,0 +1,486 @@
+"""Options of each command, and their checks. Importable without torch."""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePath
+from typing import Annotated, Literal
+
+import tyro
+from annotated_types import Ge, Gt, Le, Lt
+
+from swiftwrf.choices import (
+    AUTO,
+    CARRIERS_HZ,
+    FIELD_MODELS,
+    MAX_SUGGESTIONS,
+    RAYTRACE,
+    ROOMS,
+    RSSI_PREDICTORS,
+    SCENE_FILE,
+    Moving,
+    NotDetected,
+    check_scene,
+    fraction_key,
+)
+from swiftwrf.errors import InputError
+from swiftwrf.runtime.validation import Fraction, NonNegativeInt, PositiveFloat, PositiveInt, Preset
+from tasks import labels
+from tasks.options import (
+    SEEDS,
+    Answered,
+    OffsetSource,
+    Options,
+    Output,
+    Seed,
+    SpectraSource,
+    TableSource,
+    choice,
+    given,
+    options,
+)
+from tasks.records import CONFIG, PARTIAL, Row, read_json
+
+MAP_FILES = (".tif", ".geojson", ".png")  # suffixes of files that hold a map only
+FILES = (".csv", ".mat", *MAP_FILES)  # other names are directories
+TABLE = ".csv"  # suffix of a followed table; other followed files are JSON lines
+
+
+@options
+class AoaConfig(Options):
+    """Angle of arrival with few measured spectra: turbo learning against its references and baselines.
+
+    Without --data the built-in simulated room is used. swiftwrf resume DIR.partial continues an interrupted run.
+
+    Example: swiftwrf aoa --mix 0.3 --data DIR --split block
+    """
+
+    mix: tuple[float, ...] = ()
+    """measured fractions in (0, 1]: 0.3 keeps 30 % of the training spectra and synthesizes the others. Required, except with
+    --preset paper"""
+    data: str | None = None
+    """folder or file of spectra, ray paths or array snapshots, or name of a public data set, see docs/formats.md"""
+    split: str = "random"
+    """a split that comes with the data, or a seeded one: random or block"""
+    synthesizer: Annotated[
+        tuple[str, ...],
+        choice(
+            f"field models of the synthetic spectra; {AUTO} chooses the one that predicts held-out measured spectra best",
+            FIELD_MODELS,
+            labels.FIELD_MODELS,
+            AUTO,
+        ),
+    ] = (AUTO,)
+    scene: str | None = None
+    """room of tasks.scenes or Mitsuba scene (FILE.xml) for --synthesizer raytrace, in the coordinates of the data (default:
+    the room that it estimates from the spectra)"""
+    extra: NonNegativeInt | None = None
+    """number of extra synthetic positions in the region of the measured ones (default: 3000 if cross-validation on the
+    measured spectra shows a gain, else none; none with --preset paper)"""
+    suggest: Annotated[int, Ge(0), Le(MAX_SUGGESTIONS)] = 0
+    """number of positions to suggest for the next measurements, those that reduce the uncertainty over the region most"""
+    moving: Moving | None = None
+    """which end moves in the built-in room (default: transmitter)"""
+    preset: Preset = "quick"
+    """quick: sized for a CPU; paper: the paper's model, network and measured fractions, and a long training, for a GPU"""
+    repeats: PositiveInt = 1
+    """runs with different measured spectra and networks, pooled"""
+    scheduler: str | None = None
+    """address of a Dask scheduler whose workers compute the steps of the run (extra: cluster)"""
+    processes: PositiveInt | None = None
+    """processes of this machine that compute the steps, a gigabyte of memory each (default: one a thread, at most 4; one on
+    a GPU)"""
+    seed: Seed = 0
+    """seed of everything random"""
+    out: str | None = None
+    """directory of the run; must not exist (default: a new one under runs/aoa)"""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """device to compute on"""
+    output: Output = Output()
+    spectra: SpectraSource = SpectraSource()
+
+    def __post_init__(self) -> None:
+        if self.preset == "paper":
+            # the paper's training sets contain synthetic spectra at the withheld positions alone
+            object.__setattr__(self, "mix", self.mix or (0.1, 0.3, 0.5, 0.7))
+            object.__setattr__(self, "extra", self.extra or 0)
+
+    def check(self) -> None:
+        super().check()
+        if not self.synthesizer:
+            raise InputError("--synthesizer takes at least one name")
+        if AUTO in self.synthesizer and len(self.synthesizer) > 1:
+            raise InputError(f"--synthesizer takes {AUTO} or names, not both: {' '.join(self.synthesizer)}")
+        for name in self.synthesizer:
+            if name != AUTO:
+                FIELD_MODELS.check(name)
+        if self.scene is not None:
+            if RAYTRACE not in self.synthesizer:
+                raise InputError(
+                    f"--scene is for synthesizer {RAYTRACE}; add it to --synthesizer, or leave --scene out"
+                )
+            check_scene(self.scene, "--scene ")
+        if self.moving is not None and self.data is not None:
+            raise InputError("--moving is for the built-in room; with --data the data determine which end moves")
+        given_mix = " ".join(map(fraction_key, self.mix))
+        if not self.mix or not all(0 < fraction <= 1 for fraction in self.mix):
+            raise InputError(f"--mix takes measured fractions in (0, 1], got {given_mix or 'none'}")
+        if len(set(self.mix)) < len(self.mix):
+            raise InputError(f"--mix names a fraction twice: {given_mix}")
+        if self.data is None and (names := given(self.spectra)):
+            raise InputError(f"--{names[0]} is an option of the reader; give it with --data")
+        if self.processes is not None and self.scheduler is not None:
+            raise InputError("--processes and --scheduler exclude each other; leave out one")
+        if self.seed + self.repeats > SEEDS:
+            raise InputError(f"--seed {self.seed} leaves no seeds for {self.repeats} repeats; choose a smaller one")
+
+
+@options
+class RssiTaskConfig(Options):
+    """RSSI of a moving transmitter at fixed receivers, against baselines.
+
+    Without --data the built-in simulated floor is used. swiftwrf resume DIR.partial continues an interrupted run.
+
+    Example: swiftwrf rssi --rx 6 --data DIR
+    """
+
+    rx: tuple[str, ...]
+    """receivers: names, numbers counted from 1, or all"""
+    data: str | None = None
+    """survey table (CSV or Parquet), folder with tx_pos.csv, gateway_rssi.csv and gateway_position.yml (NeRF2 layout), or
+    name of a public data set, see docs/formats.md"""
+    split: str = "random"
+    """a split that comes with the data, or a seeded one: random, block, or place (a fifth of the receivers is held out)"""
+    also: tuple[str, ...] = ()
+    """predictors that are compared only when named: nerf2 and blend take minutes; pairs and knn_pairs are for data with both
+    ends moving, where they are compared anyway"""
+    not_detected: NotDetected = "auto"
+    """meaning of an empty cell: weak, the signal was below the limit of detection; unknown, it is ignored; auto decides for
+    each receiver by the data"""
+    validation: Literal["auto", "random", "block", "session"] = "auto"
+    """folds of the training rows that choose all settings; auto takes those that are like the test rows"""
+    preset: Preset = "quick"
+    """of SwiftWRF and NeRF2: quick, or paper for the published head and field"""
+    floor_plan: str | None = None
+    """an image to draw behind the maps, PNG or JPEG"""
+    floor_extent: tuple[float, float, float, float] | None = None
+    """x0 x1 y0 y1 of that image [m] (default: as pixels of the image are the positions in the table)"""
+    scheduler: str | None = None
+    """address of a Dask scheduler whose workers fit groups of receivers (extra: cluster)"""
+    seed: Seed = 0
+    """seed of everything random"""
+    out: str | None = None
+    """directory of the run; must not exist (default: a new one under runs/rssi)"""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """where to compute; RSSI models are small, so auto is the CPU"""
+    output: Output = Output()
+    table: OffsetSource = OffsetSource()
+
+    def check(self) -> None:
+        super().check()
+        for name in self.also:
+            RSSI_PREDICTORS.check(name)
+        self.table.check_used(self.data)
+        if self.floor_plan is None and self.floor_extent is not None:
+            raise InputError("--floor-extent needs --floor-plan FILE")
+        if self.floor_extent is not None:
+            x0, x1, y0, y1 = self.floor_extent
+            if not (x0 < x1 and y0 < y1):
+                raise InputError(
+                    f"--floor-extent must be x0 x1 y0 y1 with x0 < x1 and y0 < y1, got {self.floor_extent}"
+                )
+
+
+@options
+class LocateConfig(Options):
+    """Compare localizers on a split of measured RSSI, by default of the built-in simulated floor, and report their errors.
+
+    swiftwrf resume DIR.partial continues an interrupted run. Positions of new rows: swiftwrf predict.
+
+    Example: swiftwrf locate --rx all --data DIR
+    """
+
+    data: str | None = None
+    """survey table (CSV or Parquet), folder in NeRF2 layout, or name of a public data set"""
+    rx: tuple[str, ...] = ("all",)
+    """receivers: names, numbers counted from 1, or all"""
+    split: str = "random"
+    """a split that comes with the data, or a seeded one: random or block"""
+    cells: Annotated[int, Ge(10), Le(1_000_000)] = 4000
+    """number of candidate positions of the posterior"""
+    suggest: Annotated[int, Ge(0), Le(MAX_SUGGESTIONS)] = 0
+    """number of positions to measure next that are suggested: where position errors are large and radio maps uncertain"""
+    scheduler: str | None = None
+    """address of a Dask scheduler whose workers compute the steps (extra: cluster)"""
+    seed: Seed = 0
+    """seed of everything random"""
+    out: str | None = None
+    """directory of the run (default: a new one under runs/locate); must not exist"""
+    output: Output = Output()
+    table: OffsetSource = OffsetSource()
+
+    def check(self) -> None:
+        super().check()
+        self.table.check_used(self.data)
+
+
+@options
+class PredictConfig(Options):
+    """Apply a saved model to new measurements or positions, and write a table.
+
+    An estimator gives the directions of spectra, and a locator the positions of transmitters. A field model gives spectra,
+    and an RSSI model powers, at the positions of a table.
+
+    Example: swiftwrf predict runs/aoa/first DIR
+
+    Example: swiftwrf predict runs/rssi/first/model.safetensors positions.csv --out predicted.csv
+    """
+
+    model: Annotated[str, tyro.conf.Positional]
+    """file of a model, or directory of a run: then the estimator that cross-validation chose, the locator or the RSSI
+    model"""
+    source: Annotated[str, tyro.conf.Positional]
+    """measurements of any format that tasks.aoa or tasks.rssi takes, RSSI without positions included; a .npy file (n,
+    elevations, azimuths) of magnitudes in [0, 1]; or, for a field or RSSI model, a table of positions: x, y, z [m], or
+    latitude, longitude, altitude"""
+    track: float | None = None
+    """rows of SOURCE are a walk: smooths its positions by this typical speed [m/s]. Rows without times are 1 s apart"""
+    ignore_receivers: bool = False
+    """leave out receivers in SOURCE that the locator does not have (default: refuse them)"""
+    out: str | None = None
+    """table to write; of a field or RSSI model also .mat; must not exist (default: a new predicted-TIME.csv)"""
+    output: Answered = Answered()
+    spectra: SpectraSource = SpectraSource()
+    table: TableSource = TableSource()
+
+
+@options
+class ReportConfig(Options):
+    """One report over several finished runs of one task.
+
+    Example: swiftwrf report runs/rssi/first runs/rssi/second --out runs/report
+    """
+
+    runs: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """directories of the runs"""
+    out: str | None = None
+    """directory of the report; must not exist (default: a new one under runs/report)"""
+    output: Output = Output()
+
+
+@options
+class InspectConfig(Options):
+    """Inspect measurements of any known format: counts, extents, neighbours, frames, calibration, suspicious columns.
+
+    Example: swiftwrf inspect DIR
+    """
+
+    source: Annotated[str, tyro.conf.Positional]
+    """folder or file of measurements, or name of a public data set"""
+    out: str | None = None
+    """directory of the page; must not exist (default: a new one under runs/inspect)"""
+    output: Output = Output()
+    spectra: SpectraSource = SpectraSource()
+    table: TableSource = TableSource()
+
+
+@options
+class ConvertConfig(Options):
+    """Convert measurements and RSSI maps: OUT is a directory in the toolkit's own layout, or a file.
+
+    SOURCE is measurements of any known format (see docs/formats.md), the directory of a run of tasks.rssi or tasks.locate,
+    or a saved RSSI model.
+
+    Example: swiftwrf convert DIR converted --calibrate
+
+    Example: swiftwrf convert runs/rssi/first map.tif
+    """
+
+    source: Annotated[str, tyro.conf.Positional]
+    """folder or file of measurements, name of a public data set, directory of a run, or saved RSSI
+    model"""
+    out: Annotated[str, tyro.conf.Positional]
+    """directory to write, or file: .csv, .mat, and of RSSI maps .tif (GeoTIFF), .geojson, .png (with a world file); must
+    not exist"""
+    calibrate: bool = False
+    """whether to estimate the elements' phases and the array's orientation from the training positions of array snapshots,
+    and to correct them"""
+    split: str | None = None
+    """with --calibrate: split whose training part is used (default: random); it is written beside the spectra"""
+    seed: Seed = 0
+    """seed of that split"""
+    deepmimo: bool = False
+    """write ray paths (paths.npz) as a folder of DeepMIMO v4"""
+    rx: tuple[str, ...] = ()
+    """receivers of the map, names or numbers counted from 1 (default: all); a .png shows the strongest of them"""
+    cell: PositiveFloat | None = None
+    """edge of the map's cells [m] (default: 1/120 of the longer side)"""
+    height: float | None = None
+    """height of the transmitter on the map [m] (default: the median of the training positions)"""
+    output: Answered = Answered()
+    spectra: SpectraSource = SpectraSource()
+    table: TableSource = TableSource()
+
+    @property
+    def suffix(self) -> str:
+        """Suffix of the file to write, empty for a directory."""
+        suffix = PurePath(self.out).suffix.lower()
+        return suffix if suffix in FILES else ""
+
+    def check(self) -> None:
+        super().check()
+        if (self.split is not None or self.seed) and not self.calibrate:
+            raise InputError("--split and --seed are of the calibration; give --calibrate, too")
+        if self.deepmimo and self.suffix:
+            raise InputError(f"--deepmimo writes a folder; give a directory instead of {self.out}")
+        if self.calibrate and (self.suffix or self.deepmimo):
+            raise InputError("--calibrate writes a directory in the toolkit's own layout; give another OUT")
+
+
+@options
+class UpdateConfig(Options):
+    """Update a fitted model with new measurements. Each is predicted before the model learns it, and tested for a change.
+
+    With --follow the measurements come one by one, a JSON object a line: {"position": [x, y, z], "rssi_dbm": {"NAME": -60}}
+    or {"position": [x, y, z], "spectrum": [[...], ...]}; or rows of RSSI in a CSV table, which has a column a receiver. The
+    model in --out is replaced after each line.
+
+    Example: swiftwrf update model.safetensors DIR --out updated
+    """
+
+    model: Annotated[str, tyro.conf.Positional]
+    """file of a fitted model of spectra or RSSI"""
+    source: Annotated[str, tyro.conf.Positional]
+    """measurements of any known format in the order in which they were taken; with --follow a .ndjson or .csv file
+    that grows, or - for standard input"""
+    out: str
+    """directory to write; must not exist. With --follow, one that exists is continued"""
+    data: str | None = None
+    """training measurements of the model in their order, which calibrate the test for changes of spectra, and show what
+    stands in a room"""
+    false_alarm_rate: Annotated[float, Gt(0), Lt(1)] = 1e-4
+    """false alarms a measurement"""
+    follow: bool = False
+    """take measurements line by line as they come, and print a line for each"""
+    output: Output = Output()
+    spectra: SpectraSource = SpectraSource()
+    table: TableSource = TableSource()
+
+    def check(self) -> None:
+        super().check()
+        if self.follow and self.source != "-" and not self.source.lower().endswith((".ndjson", ".jsonl", TABLE)):
+            raise InputError(f"--follow takes .ndjson or .jsonl or {TABLE} files or -, got {self.source}")
+        if self.follow and (self.output.open or self.output.json):
+            raise InputError("--follow prints JSON lines and writes no page; leave out --open and --json")
+
+
+@options
+class ResumeConfig(Options):
+    """Continue an interrupted run of aoa, rssi or locate with its options.
+
+    Example: swiftwrf resume runs/aoa/first.partial
+    """
+
+    run: Annotated[str, tyro.conf.Positional]
+    """directory of the run, DIR.partial"""
+    scheduler: str | None = None
+    """address of a Dask scheduler whose workers compute the steps (extra: cluster)"""
+    processes: PositiveInt | None = None
+    """processes of this machine that compute the steps of aoa (default: one a thread, at most 4; one on a GPU)"""
+    output: Output = Output()
+
+    def check(self) -> None:
+        super().check()
+        self.saved()
+
+    def saved(self) -> Row:
+        """Return the content of the run's configuration file: task, command and config.
+
+        Raises:
+            InputError: There is no interrupted run, or it stopped before it wrote its configuration.
+        """
+        folder = Path(self.run)
+        if not folder.name.endswith(PARTIAL) or not folder.is_dir():
+            raise InputError(f"{folder} is no interrupted run; expected a directory *{PARTIAL} with a {CONFIG}")
+        if not (folder / CONFIG).exists():
+            raise InputError(
+                f"{folder} was stopped before its {CONFIG} was written, so it holds nothing to go on with; start the run "
+                "again"
+            )
+        content = read_json(folder / CONFIG)
+        if content.get("task") not in ("aoa", "rssi", "locate") or not isinstance(content.get("config"), dict):
+            raise InputError(f"{folder} is a run of the unknown task {content.get('task')!a}; restore its {CONFIG}")
+        return content
+
+
+@options
+class ScenesConfig(Options):
+    """Ray paths in a room with furniture or in a scene file of Mitsuba, traced by Sionna RT (extra: raytrace).
+
+    The directory holds paths.npz, which --data of the tasks reads, and scene.svg, a plan of the room and the positions.
+
+    Example: swiftwrf scenes --room office --moving receiver --positions 1000 --out office
+    """
+
+    room: Annotated[
+        str,
+        tyro.conf.arg(
+            help="a Mitsuba scene with radio materials (FILE.xml), or a built-in room: "
+            + "; ".join(f"{name}: {summary}" for name, summary in ROOMS.items())
+        ),
+    ]
+    moving: Moving
+    """which end moves; the array lies level at the receiver"""
+    positions: Annotated[int, Ge(2), Le(100_000)]
+    """number of random positions in the region, none of them in furniture"""
+    out: str
+    """directory to write; must not exist"""
+    frequency: Annotated[float, Ge(CARRIERS_HZ[0]), Le(CARRIERS_HZ[1])] = 2.4e9
+    """carrier [Hz]; ITU-R P.2040 knows most materials from 1 GHz on"""
+    order: Annotated[int, Ge(0), Le(8)] = 3
+    """largest number of reflections (and other interactions) of a path"""
+    scattering: Fraction = 0.0
+    """fraction of the reflected amplitude that surfaces scatter, 0 to 1"""
+    diffraction: bool = False
+    """whether to trace paths diffracted at one edge"""
+    fixed: tuple[float, float, float] | None = None
+    """position of the fixed end [m] (default: that of the room)"""
+    region: tuple[float, float, float, float, float, float] | None = None
+    """region of the moving end: opposite corners x y z x y z [m] (default: that of the room)"""
+    seed: Seed = 0
+    """seed of positions, rays and scattered phases"""
+    output: Output = Output()
+
+    def check(self) -> None:
+        super().check()
+        if self.order == 0 and (self.scattering or self.diffraction):
+            raise InputError(
+                "--order 0 leaves the direct path alone; scattering and diffraction need at least --order 1"
+            )
+        check_scene(self.room)
+        if not self.room.endswith(SCENE_FILE):
+            return
+        if self.fixed is None or self.region is None:
+            raise InputError(
+                f"{self.room} does not contain the positions of the ends; give --fixed X Y Z and --region X Y Z X Y Z"
+            )
+
+
+@options
+class ViewConfig(Options):
+    """A page to explore a fitted model: drag the moving end and see its spectrum, or hover over a map of RSSI.
+
+    Needs the optional extra: pip install 'swiftwrf-tasks[view]'. Ctrl-C ends it.
+
+    Example: swiftwrf view runs/aoa/first
+    """
+
+    source: Annotated[str, tyro.conf.Positional]
+    """directory of a run of tasks.aoa, tasks.rssi, tasks.locate or tasks.update, or a saved model; an update that is being
+    followed is shown as it grows"""
+    port: Annotated[int, Ge(0), Le(65535)] = 8080
+    """port of the page; 0 takes any free port"""
+    host: str = "127.0.0.1"
+    """address to listen on; with an address of the network, others can see the page and change the floor plan, without a
+    password"""
+    open: bool = False
+    """open the page in the browser"""

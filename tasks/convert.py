@@ -1,0 +1,214 @@
+"""Conversion of measurements to the toolkit's own layout or to files, and of RSSI models to maps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from os.path import isfile  # unlike Path.is_file, it is False for names that are too long
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from swiftwrf import FieldModel, InputError, RssiModel, load
+from swiftwrf.array.beamforming import PHASE
+from swiftwrf.data import ReadOptions, Rssi, Snapshots, Spectra
+from swiftwrf.data.dataset import Labelled
+from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
+from swiftwrf.data.formats.paths import read_paths
+from swiftwrf.data.rasters import Cells, write_geojson, write_geotiff, write_world_file
+from swiftwrf.data.writing import write_deepmimo, write_mat, write_rssi, write_spectra
+from swiftwrf.diagnostics.calibration import Calibration, calibrate
+from swiftwrf.errors import with_article
+from swiftwrf.locate import RssiLocator
+from swiftwrf.rssi.base import RssiPredictor
+from swiftwrf.rssi.maps import RssiMap
+from swiftwrf.runtime.checkpoint import Saved
+from swiftwrf.runtime.durable import replacing, write_json
+from tasks.configs import FILES, MAP_FILES, ConvertConfig
+from tasks.directory import check_new_file, model_file, new_directory
+from tasks.environment import command, invocation
+from tasks.options import plain
+from tasks.page.maps import colour_image
+from tasks.records import CONFIG, rounded, write_table
+from tasks.source import located, reading
+from tasks.terminal import console, terminal
+
+
+def run(config: ConvertConfig) -> None:
+    """Read measurements or a model, and write a directory or a file.
+
+    Raises:
+        InputError: A source that cannot be read, calibrated or written as OUT asks.
+    """
+    source = Path(config.source)
+    if config.deepmimo:
+        with new_directory(Path(config.out), "a directory") as folder:
+            paths = read_paths(source)
+            write_deepmimo(paths, folder)
+        _answer(config, f"{len(paths.count)} receivers with {len(paths.gain)} paths")
+    elif (model := saved_model(source)) is not None or config.suffix:
+        _write_new_file(config, model)
+    else:
+        _write_directory(config)
+
+
+def _answer(config: ConvertConfig, written: str) -> None:
+    terminal.page({"written": written, "out": config.out}, f"{written}: {config.out}")
+
+
+def _write_new_file(config: ConvertConfig, model: RssiModel | None) -> None:
+    out = Path(config.out)
+    if not config.suffix:
+        raise InputError(
+            f"{config.source} is a model, of which files are written: {', '.join(FILES)}; got {config.out}"
+        )
+    if model is None and (config.rx or config.cell is not None or config.height is not None):
+        raise InputError(
+            f"--rx, --cell and --height are for maps of RSSI models, but {config.source} holds measurements"
+        )
+    if model is not None and (options := reading(config.spectra, config.table).given):
+        raise InputError(f"{config.source} is a model; --{next(iter(options)).replace('_', '-')} is for measurements")
+    check_new_file(out)
+    data = (
+        _spectra_or_rssi(_read(config), reading(config.spectra, config.table))
+        if model is None
+        else map_of(model, config)
+    )
+    _answer(config, write_file(data, out))
+
+
+def _read(config: ConvertConfig) -> Spectra | Snapshots | Rssi:
+    data: Spectra | Snapshots | Rssi = read(
+        located(config.source), reading(config.spectra, config.table), SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS
+    )
+    return data
+
+
+def _spectra_or_rssi(data: Spectra | Snapshots | Rssi, options: ReadOptions) -> Spectra | Rssi:
+    return data.spectra(options.grid, options.beamformer or PHASE) if isinstance(data, Snapshots) else data
+
+
+def _write_directory(config: ConvertConfig) -> None:
+    options = reading(config.spectra, config.table)
+    with new_directory(Path(config.out), "a directory") as folder:
+        data = _read(config)
+        found = None
+        if config.calibrate:
+            data, found = _calibrated(data, config)
+        for note in data.notes:
+            console.print(f"{data.name}: {note}")
+        written = _write(data, options, folder)
+        record = {
+            "command": invocation("convert"),
+            "options": plain(config),
+            "source_sha256": data.source,
+            "notes": data.notes,
+            "calibration": found.to_json() if found else None,
+        }
+        write_json(folder / "conversion.json", record)
+    _answer(config, written)
+
+
+def _calibrated(data: Spectra | Snapshots | Rssi, config: ConvertConfig) -> tuple[Snapshots, Calibration]:
+    if not isinstance(data, Snapshots):
+        raise InputError("--calibrate takes array snapshots; spectra and RSSI do not hold the elements' phases")
+    name = config.split or "random"
+    train, test = data.split(name, config.seed)
+    found = calibrate(train)
+    phase, turn = float(found.phase_std.rad2deg().max()), float(found.turn.rad2deg().norm())
+    console.print(
+        f"calibrated on {found.clear} training positions: phases to {phase:.1f} deg, rotated by {turn:.1f} deg (+- "
+        f"{float(found.turn_std.rad2deg().max()):.1f}); at held-out positions, {found.after:.0%} of the received power "
+        f"arrives along the line of sight, {found.before:.0%} without calibration"
+    )
+    rows = torch.searchsorted(data.index, train.index), torch.searchsorted(data.index, test.index)
+    return replace(found.apply(data), named_splits={**data.named_splits, name: rows}), found
+
+
+def _write(data: Spectra | Snapshots | Rssi, options: ReadOptions, folder: Path) -> str:
+    spectra = _spectra_or_rssi(data, options)
+    if isinstance(spectra, Rssi):
+        write_rssi(spectra, folder)
+        return f"{len(spectra)} rows of RSSI at {len(spectra.receiver_names)} receivers"
+    write_spectra(spectra, folder)
+    return f"{len(spectra)} spectra of {spectra.grid.shape[0]} x {spectra.grid.shape[1]} pixels"
+
+
+WORLD_FILE = ".pgw"  # suffix beside a .png
+
+
+def saved_model(source: Path) -> RssiModel | None:
+    """Return the RSSI model in a file or in the directory of a run; None if the source is no model.
+
+    Raises:
+        InputError: A run without an RSSI model, or a model of which no map is written.
+    """
+    kept = model_file(source)
+    if kept is None and isfile(source / CONFIG):
+        raise InputError(f"{source} is a run without an RSSI model; name one of its models, {source}/....safetensors")
+    file = kept or source
+    if file.suffix != ".safetensors":
+        return None
+    model: Saved = load(file)
+    model = model.model if isinstance(model, RssiLocator) else model
+    if isinstance(model, RssiPredictor) and not isinstance(model, RssiModel):
+        raise InputError(
+            f"{file} holds {with_article(model.kind)}, of which no file is written; the report of its run shows its maps, "
+            "and in Python its method predict gives RSSI at any position"
+        )
+    if isinstance(model, FieldModel):
+        raise InputError(
+            f"{file} predicts spectra at positions, not a map; use {command('predict', str(file), 'POSITIONS')}"
+        )
+    if not isinstance(model, RssiModel):
+        raise InputError(f"{file} holds {with_article(model.kind)}, which predicts neither spectra nor RSSI")
+    return model
+
+
+def map_of(model: RssiModel, config: ConvertConfig) -> RssiMap:
+    """Return the map of an RSSI model.
+
+    Raises:
+        InputError: An unknown receiver.
+    """
+    found = RssiMap.predict(model, config.cell, config.height)
+    return found.receivers(config.rx) if config.rx else found
+
+
+def write_file(data: Labelled, file: Path) -> str:
+    """Write a file by its suffix, and return a description of it.
+
+    Raises:
+        InputError: A suffix of maps for other data, or a map in local metres as GeoJSON.
+    """
+    if file.suffix.lower() in MAP_FILES:
+        if not isinstance(data, RssiMap):
+            raise InputError(f"{file.name} holds a map of RSSI, but the source is none; write .csv or .mat")
+        return _write_map(data, file)
+    if file.suffix.lower() == ".mat":
+        write_mat(data, file)
+        return f"{' and '.join(data.variables())}, with coordinates"
+    table = data.to_frame()
+    if table.index.name:
+        table = table.reset_index()
+    write_table(file, rounded(table.to_dict("records")))
+    return f"{len(table)} rows"
+
+
+def _write_map(data: RssiMap, file: Path) -> str:
+    cells = Cells(data.x, data.y, data.cell, data.origin)
+    bands = dict(zip(data.receiver_names, data.mean, strict=True))
+    described = f"map of {len(cells.y)} x {len(cells.x)} cells of {data.cell:.3g} m"
+    match file.suffix.lower():
+        case ".tif":
+            write_geotiff(file, bands, cells)
+            return f"{described}, a band a receiver"
+        case ".geojson":
+            write_geojson(file, bands, cells)
+            return described
+    strongest = data.mean.max(axis=0)
+    low, high = np.percentile(strongest, (1, 99)).tolist()
+    with replacing(file) as temporary:
+        colour_image(strongest[::-1], "viridis", low, max(high, low + 1)).save(temporary, "PNG")
+    write_world_file(file.with_suffix(WORLD_FILE), cells)
+    return f"{described}, strongest RSSI from {low:.0f} dBm (dark) to {high:.0f} dBm (bright)"

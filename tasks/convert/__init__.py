@@ -1,1 +1,0 @@
-"""Convert measurements of any known format to the toolkit's own layout."""

@@ -1,0 +1,244 @@
+"""Inspection of measurements before a model is fitted: findings, and a page with figures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.patches import Circle
+from pandas import DataFrame
+from torch import Tensor
+
+from swiftwrf.array.angles import angular_distance, to_direction
+from swiftwrf.array.beamforming import PHASE
+from swiftwrf.data import Rssi, Snapshots, Spectra
+from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
+from swiftwrf.diagnostics.inspection import Findings, inspect, nearest, propose_offsets
+from swiftwrf.rssi import fit_path_loss, log_distance
+from swiftwrf.runtime.durable import write_json
+from tasks.answer import NextStep
+from tasks.configs import InspectConfig
+from tasks.directory import new_directory
+from tasks.environment import command, stamp
+from tasks.page import figures
+from tasks.page.page import Number, Page, Plot, Section, Summary, Table, write_page
+from tasks.source import located, reading
+from tasks.summarise import fingerprinting
+from tasks.terminal import terminal
+
+
+def run(config: InspectConfig) -> None:
+    """Print the findings, and write a page and inspect.json.
+
+    Raises:
+        InputError: Measurements that cannot be read.
+    """
+    source, options = located(config.source), reading(config.spectra, config.table)
+    out = Path(config.out) if config.out else Path("runs") / "inspect" / stamp()
+    with new_directory(out, "an inspection") as folder:
+        data = read(source, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS)
+        kind = "RSSI" if isinstance(data, Rssi) else "array snapshots" if isinstance(data, Snapshots) else "spectra"
+        findings = inspect(data, grid=options.grid, beamformer=options.beamformer or PHASE)
+        for column in data.labels if isinstance(data, Rssi) else ():
+            propose_offsets(read(source, replace(options, offset_by=column), RSSI_FORMATS), findings)
+        content = {
+            "source": config.source,
+            "kind": kind,
+            "findings": [{"level": finding.level, "text": finding.text} for finding in findings.sentences],
+            "numbers": findings.numbers,
+        }
+        write_json(folder / "inspect.json", content)
+        write_page(folder, page(findings, kind, str(config.source)))
+    terminal.page(content, f"{config.source}: {kind}\n{findings}", out / "report.html")
+
+
+AXES = {"x": "#cf4a4a", "y": "#2a9165", "normal": "#3a7fd5"}
+DOTS, NONE = "#3a7fd5", "#7f8794"  # with line of sight, without
+MAX_DOTS = 2000
+MAX_RECEIVERS = 30  # in a figure
+MIN_BINS_M = 1e-3  # of the bins of distances together
+PLAN = (
+    "From above and from the side: positions with (blue) and without line of sight (grey); arrows: the array's axes x "
+    "(red), y (green) and its normal (blue)."
+)
+DIRECTIONS = (
+    "Lines of sight and peaks of the spectra as the array receives them, coloured by the azimuth of the line of "
+    "sight: one picture where frames and calibration are right."
+)
+
+
+def page(findings: Findings, kind: str, source: str) -> Page:
+    """Return the page: findings and figures of what was read from a source."""
+    data, warnings = findings.data, findings.warnings
+    rows = [[finding.level, finding.text] for finding in findings.sentences]
+    table = Table(["level", "finding"], rows, strong=frozenset(["warning"]), long=True)
+    if isinstance(data, Rssi):
+        position, task = data.transmitter_position, ("rssi", "--rx", "all")
+        plots = [_floor(data), *([_against_distance(data)] if data.located else []), _detected(data)]
+    else:
+        position, task = data.position, ("aoa", "--mix", "0.3")
+        plots = [_plan(data), _directions(data), *([_neighbours(data)] if len(data) > 1 else [])]
+    extent = " x ".join(f"{side:.2f}" for side in (position.amax(dim=0) - position.amin(dim=0)).tolist())
+    numbers = [
+        Number(str(len(warnings)), "warning" if len(warnings) == 1 else "warnings"),
+        Number(str(len(data)), f"measurements, read as {kind}"),
+        Number(f"{extent} m", "extent of the positions, x by y by z"),
+    ]
+    mend = [NextStep("Correct the warnings and inspect again", command("inspect", source))] if warnings else []
+    steps = [*mend, NextStep("Go on", command(*task, "--data", source))]
+    conclusion = ["Nothing looks wrong. Errors that the files alone do not reveal remain possible."]
+    if warnings:
+        conclusion = [
+            f"{len(warnings)} {'warning' if len(warnings) == 1 else 'warnings'}: correct the data first.",
+            *warnings,
+        ]
+    if isinstance(data, Spectra) and (text := _fingerprinting(data)):
+        conclusion.append(text)
+    return Page(
+        f"Inspection: {data.name}",
+        Summary(numbers, plots[:1], conclusion, steps),
+        [Section("Findings", tables=[table]), Section("Figures", plots=plots[1:])],
+    )
+
+
+def _fingerprinting(data: Spectra) -> str:
+    """Return the warning of `fingerprinting`, from the spread of the lines of sight and the errors of the peaks."""
+    rows = data.line_of_sight.nonzero()[:MAX_DOTS, 0]
+    if not len(rows):
+        return ""
+    line, peak = (to_direction(*angles.unbind(-1)) for angles in (data.label[rows], data.peak_direction(rows)))
+    mean = torch.nn.functional.normalize(line.mean(dim=0), dim=0)
+    spread, error = angular_distance(mean.expand_as(line), line), angular_distance(peak, line)
+    return fingerprinting(*(float(angle.nanmedian().rad2deg()) for angle in (spread, error)))
+
+
+def _places(position: Tensor, **columns: Tensor) -> DataFrame:
+    """Return a table with one row a position."""
+    own = {name: values.numpy() for name, values in columns.items()}
+    return DataFrame(position.numpy(), columns=["x_m", "y_m", "z_m"]).assign(**own)
+
+
+def _plan(data: Spectra) -> Plot:
+    marker, panels = "^" if data.moving == "transmitter" else "*", []
+    for a, b in ((0, 1), (0, 2)):
+        span = (data.position.amax(dim=0) - data.position.amin(dim=0))[[a, b]].clamp_min(1e-3)
+        figure, ax = figures.panel(3.8, 0.6 + 3 * float((span[1] / span[0]).clamp(0.4, 1.2)))
+        for free, colour in ((False, NONE), (True, DOTS)):
+            place = data.position[data.line_of_sight == free]
+            ax.plot(place[:, a], place[:, b], ".", markersize=3, color=colour)
+        ax.set(xlabel=f"{'xyz'[a]} [m]", ylabel=f"{'xyz'[b]} [m]")
+        ax.set_aspect("equal", adjustable="datalim")
+        if data.fixed_position is not None:
+            ax.plot(*data.fixed_position[[a, b]].tolist(), marker, color="black", markersize=7)
+        _draw_axes(ax, data, a, b)
+        panels.append(figure)
+    return Plot("plan", panels, PLAN, _places(data.position, line_of_sight=data.line_of_sight))
+
+
+def _draw_axes(ax: Axes, data: Spectra, a: int, b: int) -> None:
+    """Draw the axes at the array, or at the centre of the positions if it moves."""
+    if data.rotation is None:
+        return
+    still = data.moving == "transmitter" and data.fixed_position is not None
+    origin = data.fixed_position if still else data.position.mean(dim=0)
+    assert origin is not None
+    length = 0.25 * float((data.position.amax(dim=0) - data.position.amin(dim=0)).max() or 1.0)
+    for (name, colour), axis in zip(AXES.items(), data.rotation.T, strict=True):
+        dx, dy = (length * axis[[a, b]]).tolist()
+        if np.hypot(dx, dy) < 0.2 * length:  # towards the viewer
+            continue
+        ax.annotate(
+            name,
+            xy=(float(origin[a]), float(origin[b])),
+            xytext=(float(origin[a]) + dx, float(origin[b]) + dy),
+            color=colour,
+            fontsize=8,
+            arrowprops={"arrowstyle": "<-", "color": colour},
+        )
+
+
+def _directions(data: Spectra) -> Plot:
+    rows = data.line_of_sight.nonzero()[:MAX_DOTS, 0]
+    peak = to_direction(*data.peak_direction(rows).unbind(-1))
+    line = to_direction(*data.label[rows].unbind(-1))
+    panels = []
+    for title, direction in {"line of sight": line, "peak": peak}.items():
+        figure, ax = figures.panel(3.6, 3.4)
+        ax.scatter(direction[:, 0], direction[:, 1], s=6, c=data.label[rows, 0].rad2deg(), cmap="hsv", vmin=0, vmax=360)
+        ax.add_patch(Circle((0, 0), 1, fill=False, color=figures.RULE))  # the array's horizon
+        ax.set(xlim=(-1.05, 1.05), ylim=(-1.05, 1.05), aspect="equal", title=title, xlabel="array x", ylabel="array y")
+        panels.append(figure)
+    apart = angular_distance(peak, line).rad2deg()
+    figure, ax = figures.panel(3.8, 3.4)
+    ax.hist(apart.numpy(), bins=45, range=(0, 90), color=DOTS)
+    ax.set(xlabel="peak to line of sight [deg]", ylabel="spectra")
+    azimuth, elevation = data.label[rows].rad2deg().unbind(-1)
+    table = _places(data.position[rows], azimuth_deg=azimuth, elevation_deg=elevation, peak_from_line_deg=apart)
+    return Plot("directions", [*panels, figure], DIRECTIONS, table)
+
+
+def _neighbours(data: Spectra) -> Plot:
+    figure, ax = figures.panel(6, 3)
+    rows, apart = nearest(data.position)
+    low, high = (float(end) for end in apart.aminmax())  # all are equal on a regular grid, up to rounding
+    ax.hist(apart.numpy(), bins=40, range=(low, max(high, low + MIN_BINS_M)), color=DOTS)
+    if data.array is not None:
+        ax.axvline(data.array.wavelength / 2, color="#cf4a4a")
+    ax.set(xlabel="nearest other position [m]", ylabel="positions")
+    caption = "Distance to the nearest other position."
+    if data.array is not None:
+        caption += " The line is half a wavelength."
+    return Plot("neighbours", [figure], caption, _places(data.position[rows], nearest_m=apart))
+
+
+def _floor(data: Rssi) -> Plot:
+    figure, ax = figures.panel(6.8, 4.8)
+    place = data.transmitter_position
+    strongest = data.rssi_dbm.nan_to_num(-torch.inf).amax(dim=1)
+    drawn = ax.scatter(
+        place[:, 0], place[:, 1], s=8, c=strongest.where(strongest.isfinite(), torch.nan), cmap="viridis"
+    )
+    figures.colour_bar(ax, drawn, "strongest RSSI [dBm]")
+    places = zip(data.receiver_names, data.receiver_position.tolist(), data.receiver_located.tolist(), strict=True)
+    for name, at, is_located in places:
+        if is_located:
+            ax.plot(*at[:2], "x", color="#cf4a4a", markersize=8, markeredgewidth=2)
+            ax.annotate(figures.short(name), at[:2], fontsize=7, xytext=(3, 3), textcoords="offset points")
+    ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    caption = "Positions, coloured by the strongest RSSI; crosses: receivers, where they are known."
+    return Plot("plan", [figure], caption, _places(place, strongest_dbm=strongest))
+
+
+def _against_distance(data: Rssi) -> Plot:
+    figure, ax = figures.panel(6, 3.6)
+    located = data.receiver_located
+    log10, rssi = log_distance(data.transmitter_position, data.receiver_position[located]), data.rssi_dbm[:, located]
+    ax.plot((10**log10).flatten(), rssi.flatten(), ".", markersize=2, color=DOTS, alpha=0.5)
+    model, ends = fit_path_loss(log10, rssi, shared=True), torch.stack(log10[~rssi.isnan()].aminmax())
+    ax.plot(10**ends, model.level + model.slope * ends, color="black", linewidth=1.5)
+    ax.set(xlabel="distance from the receiver [m]", ylabel="RSSI [dBm]", xscale="log")
+    row, column = (~rssi.isnan()).nonzero(as_tuple=True)
+    table = DataFrame(
+        {
+            "receiver": np.array(data.receiver_names)[located.numpy()][column.numpy()],
+            "distance_m": (10 ** log10[row, column]).numpy(),
+            "rssi_dbm": rssi[row, column].numpy(),
+        }
+    )
+    caption = "RSSI against the distance from the receiver. The line is a path-loss model of all receivers."
+    return Plot("path-loss", [figure], caption, table)
+
+
+def _detected(data: Rssi) -> Plot:
+    fraction = (~data.rssi_dbm.isnan()).double().mean(dim=0)
+    order = fraction.argsort(descending=True)[:MAX_RECEIVERS].tolist()
+    names = [figures.short(data.receiver_names[i]) for i in order]
+    figure, ax = figures.panel(max(4.0, 0.3 * len(order) + 2), 3)
+    ax.bar(np.arange(len(order)), fraction[order].numpy(), color=DOTS)
+    ax.set(xticks=range(len(order)), xticklabels=names, ylabel="fraction of rows", ylim=(0, 1))
+    ax.tick_params(axis="x", labelrotation=60)
+    table = DataFrame({"receiver": data.receiver_names, "fraction_detected": fraction.numpy()})
+    return Plot("detected", [figure], "Fraction of the rows in which each receiver detected the transmitter.", table)

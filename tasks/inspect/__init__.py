@@ -1,1 +1,0 @@
-"""Inspect measurements before a model is fitted."""

@@ -1,0 +1,278 @@
+"""The report of one localization run or several."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from numpy.typing import NDArray
+from pandas import DataFrame, concat
+from scipy.stats import binomtest
+
+from swiftwrf.locate.baselines import LOCALIZERS
+from swiftwrf.plotting import corners_of
+from tasks import labels
+from tasks.answer import Answer, Method, NextStep
+from tasks.page import figures
+from tasks.page.figures import DASHES, MAX_CURVES
+from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of
+from tasks.page.records import Records, notes
+from tasks.page.shared import (
+    again,
+    by_method,
+    compared,
+    difference,
+    errors_section,
+    limits,
+    next_steps,
+    suggestion_section,
+)
+from tasks.summarise import comparison_sentence, coverage_warning
+
+OWN = "posterior"  # the localizer that all others are compared with
+NEIGHBOURS = ("knn", "knn_difference")
+LEVEL = 0.8  # probability of the credible regions in the summary
+SUGGESTED = "suggested"  # name of the files with suggested positions
+MAX_VECTOR_LINES = 300  # more lines become an image, so that the page stays small
+TRUTH, ESTIMATE = "#cf4a4a", "#ffffff"
+COLUMNS = ["index", "place", "method", "position_error_m"]  # of the errors of methods
+COLOURS = labels.colours(labels.LOCALIZERS)
+
+
+def page(runs: list[Records]) -> Page:
+    """Return the page of these runs."""
+    sections = [
+        sections_of("Where was it?", runs, lambda run: _posteriors(run, several=len(runs) > 1)),
+        sections_of("Errors", runs, _errors, labels.meanings(LOCALIZERS, labels.LOCALIZERS)),
+        sections_of("How sure is it?", runs, lambda run: Section("", plots=[_calibration(run), *_studies(run)])),
+        _limits(runs[0]),
+    ]
+    if any(run.holds(SUGGESTED) for run in runs):
+        sections.insert(3, sections_of("Where to measure next", runs, _suggestion))
+    names = ", ".join(dict.fromkeys(run.place for run in runs))
+    if len(runs) == 1:
+        first = _summary(runs[0])
+    else:
+        answers = {f"{run.number}: {run.place}": answer(run) for run in runs}
+        first = compared(answers, runs, COLOURS, "position error")
+    return Page(f"Localization: {names}", first, sections, [provenance(runs)])
+
+
+def _summary(run: Records) -> Summary:
+    """Return the first screen of one run."""
+    error = {name: entry["position_error_m"]["median"] for name, entry in run.metrics["overall"].items()}
+    nearest, found = min(NEIGHBOURS, key=lambda name: error[name]), answer(run)
+    numbers = [
+        Number(f"{error[OWN]:.2f} m", "median position error of the posterior"),
+        Number(f"{error[nearest]:.2f} m", f"that of {nearest}, the best nearest-neighbour fingerprinting"),
+        Number(f"{run.metrics['calibration'][str(LEVEL)]:.0%}", f"of the true positions in their {LEVEL:.0%} region"),
+    ]
+    return Summary(numbers, [_overview(run, "summary")], found.conclusion, found.next_steps, notes=notes(run))
+
+
+def _errors(run: Records) -> Section:
+    n_undetected = run.metrics["n_undetected"]
+    return errors_section(
+        answer(run),
+        run.table("errors")[COLUMNS],
+        COLOURS,
+        name=run.file_name,
+        quantity="position error",
+        caption=f"Column of {OWN}: difference of the mean errors on the same rows, with its 95 % bootstrap interval.",
+        paragraphs=[f"Test rows that no receiver detected are left out: {n_undetected}."] if n_undetected else [],
+    )
+
+
+def _suggestion(run: Records) -> Section | None:
+    if not run.holds(SUGGESTED):
+        return None
+    return suggestion_section(
+        "",
+        run.arrays(SUGGESTED),
+        SUGGESTED,
+        run.file_name,
+        what="the variance of the radio maps",
+        whole="the field's variance",
+        how="The mean over the region is weighted by the expected squared position error. Errors are those of simulated "
+        "rows under the fitted maps.",
+        label="weighted variance left [%]",
+    )
+
+
+def _overview(run: Records, name: str) -> Plot:
+    errors = run.table("errors")
+    figure, plan = figures.panel(5.4, 4.2)
+    own = errors[errors["method"] == OWN]
+    truth, estimate = own[["truth_x_m", "truth_y_m"]].to_numpy(), own[["x_m", "y_m"]].to_numpy()
+    value = own["position_error_m"].to_numpy()
+    many = len(own) >= MAX_VECTOR_LINES
+    style: dict[str, Any] = {"cmap": "viridis", "clim": (0, float(np.quantile(value, 0.95)) or 1.0)}
+    lines = LineCollection(np.stack([truth, estimate], axis=1).tolist(), linewidths=1, rasterized=many, **style)
+    lines.set_array(value)
+    plan.add_collection(lines)
+    dots = plan.scatter(truth[:, 0], truth[:, 1], c=value, s=8, cmap=style["cmap"], rasterized=many, zorder=3)
+    dots.set_clim(*style["clim"])
+    plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    plan.autoscale()
+    figures.colour_bar(plan, lines, "position error [m]", extend="max")
+    caption = (
+        "Errors of the posterior in plan: a line from each true position (dot) to its estimate, coloured by the error."
+    )
+    columns = ["method", "index", "position_error_m", "truth_x_m", "truth_y_m", "x_m", "y_m"]
+    return Plot(name, [figure], caption, errors[columns])
+
+
+def _calibration(run: Records) -> Plot:
+    """Return measured against nominal coverage, with its 95 % interval (Wilson)."""
+    rows, n = [], run.metrics["n_test"]
+    for level, value in run.metrics["calibration"].items():
+        interval = binomtest(round(value * n), n).proportion_ci(method="wilson")
+        rows.append((float(level), value, float(interval.low), float(interval.high)))
+    data = DataFrame(rows, columns=["nominal", "measured", "low", "high"])
+    figure, axes = figures.panel(5, 3.2)
+    axes.plot([0, 1], [0, 1], color=figures.RULE, linewidth=1)
+    _with_bars(axes, OWN, data, "nominal", "measured")
+    axes.set(xlim=(0, 1), ylim=(0, 1))
+    axes.set(xlabel="probability of the credible region", ylabel="fraction of test positions inside")
+    weights = ", ".join(f"{name} {weight:.2f}" for name, weight in run.metrics["weights"].items())
+    caption = (
+        "Fraction of the true positions inside the posterior's credible regions (dots; bars: 95 % interval) against their "
+        "probability. On the line the posterior is calibrated, below it the regions are too small. Weights of the "
+        f"likelihoods, which maximise the density at held-out training positions: {weights}."
+    )
+    return Plot(f"calibration-{run.file_name}", [figure], caption, data)
+
+
+def _studies(run: Records) -> list[Plot]:
+    """Return the median error against the numbers of training rows and of receivers, as far as they were varied."""
+    tables, panels = [], []
+    for found, x, label in (
+        (run.metrics["by_rows"], "n_train", "training rows"),
+        (run.metrics["by_receivers"], "n_receivers", "receivers"),
+    ):
+        if not found:
+            continue
+        table = DataFrame([{**study, **study["position_error_m"]} for study in found]).drop(columns="position_error_m")
+        figure, ax = figures.panel(3.6, 3.2)
+        names = list(table["localizer"].unique())[:MAX_CURVES]
+        for dashes, name in zip(DASHES, names, strict=False):
+            _with_bars(ax, str(name), table[table["localizer"] == name].sort_values(x), x, "median", line=dashes)
+        ax.set(xlabel=label, ylabel="median position error [m]", ylim=(0, None))
+        figures.legend_below(ax)
+        tables.append(table)
+        panels.append(figure)
+    if not panels:
+        return []
+    caption = (
+        "Median position error (bars: 95 % interval) of localizers fitted to a random part of the training rows, and with a "
+        "random part of the receivers."
+    )
+    return [Plot(f"studies-{run.file_name}", panels, caption, concat(tables).drop_duplicates())]
+
+
+def _with_bars(axes: Axes, name: str, data: DataFrame, x: str, y: str, line: Any = "") -> None:
+    """Draw a localizer's values with their intervals, columns low and high."""
+    bars = np.clip([data[y] - data["low"], data["high"] - data[y]], 0, None)
+    style: dict[str, Any] = {
+        "color": labels.colour(COLOURS, name),
+        "linestyle": line,
+        "linewidth": 1.4,
+        "elinewidth": 0.8,
+    }
+    axes.errorbar(data[x], data[y], yerr=bars, marker="o", markersize=4, label=name, **style)
+
+
+def _posteriors(run: Records, several: bool) -> Section:
+    maps = run.arrays("maps")
+    index, ys, xs = (a.ravel() for a in np.meshgrid(maps["index"], maps["y"], maps["x"], indexing="ij"))
+    density = maps["density"].ravel()
+    data = DataFrame({"index": index, "x_m": xs.round(3), "y_m": ys.round(3), "relative_density": density.round(4)})
+    caption = (
+        "Posteriors of six test rows in plan, from the smallest error to the largest, each relative to its largest mass. "
+        "Cross: true position; dot: estimate; circle: 80 % credible region; small dots: training positions."
+    )
+    plot = Plot(f"posteriors-{run.file_name}", posteriors(maps), caption, data[np.isfinite(density)])
+    return Section("", plots=[plot, *([_overview(run, f"overview-{run.file_name}")] if several else [])])
+
+
+def posteriors(maps: Mapping[str, NDArray[Any]]) -> list[Figure]:
+    """Draw the posteriors of some test rows in plan, a panel each."""
+    shape = float(np.clip(np.ptp(maps["y"]) / max(np.ptp(maps["x"]), 1e-9), 0.4, 1.6))
+    extent = corners_of(maps["x"], maps["y"])
+    panels = []
+    for i in range(len(maps["density"])):
+        figure, ax = figures.panel(3.8, 0.6 + 2.8 * shape)
+        truth, estimate = maps["truth"][i], maps["estimate"][i]
+        drawn = ax.imshow(maps["density"][i], origin="lower", extent=extent, cmap="magma", vmin=0, vmax=1)
+        ax.plot(*maps["training_position"].T[:2], ".", color="#888888", markersize=1, rasterized=True)
+        ax.add_patch(Circle(estimate[:2], maps["radius_80_m"][i], fill=False, color=ESTIMATE, linewidth=1))
+        ax.plot(*estimate[:2], "o", color=ESTIMATE, markeredgecolor="#000001", markersize=5)
+        ax.plot(*truth[:2], "x", color=TRUTH, markersize=8, markeredgewidth=2)
+        error = float(np.linalg.norm(estimate - truth))
+        ax.set_title(f"row {maps['index'][i]}: {error:.2f} m", fontsize=9)
+        ax.set(xlabel="x [m]", ylabel="y [m]", xlim=extent[:2], ylim=extent[2:])
+        ax.grid(visible=False)
+        figures.colour_bar(ax, drawn, "posterior over its maximum")
+        panels.append(figure)
+    return panels
+
+
+def _limits(run: Records) -> Section:
+    return limits(
+        run,
+        "Rows that no receiver detected have no position. They are left out of the errors.",
+        "Candidate positions lie in and around the training positions. A transmitter elsewhere is located at their edge.",
+        "Intervals of medians treat test rows as independent. Along a walked path they are not, and the intervals are too "
+        "narrow.",
+        "Training and test rows are of one device and one time, unless the split separates these. Another device has "
+        "another offset, which --offset-by COLUMN estimates if the table names devices.",
+    )
+
+
+def answer(run: Records) -> Answer:
+    """Return the answer of a run."""
+    errors, methods = by_method(run.table("errors")[COLUMNS]), []
+    for name, entry in run.metrics["overall"].items():
+        cells = {"median in plan [m]": number(entry["horizontal_error_m"]["median"])}
+        cells |= {"floors right": f"{entry['floor_hit_rate']:.1%}"} if "floor_hit_rate" in entry else {}
+        cells |= {f"{OWN} minus it [m]": difference(errors, OWN, name)}
+        seconds = entry["seconds"]["fit"], entry["seconds"]["predict"]
+        methods.append(Method(name, entry["position_error_m"], name == "mean", seconds, cells))
+    return Answer("m", methods, OWN, conclusion(run), _steps(run), NEIGHBOURS)
+
+
+def conclusion(run: Records) -> list[str]:
+    """Return the position error, how sure it is, and how the posterior compares with the best other localizer."""
+    error = {name: entry["position_error_m"] for name, entry in run.metrics["overall"].items()}
+    best = min((name for name in error if name != OWN), key=lambda name: error[name]["median"])
+    own, receivers, n_test = error[OWN], run.metrics["n_receivers"], run.metrics["n_test"]
+    return [
+        f"Positions are found within {own['median']:.2f} m (median error; 90 % within {own['p90']:.1f} m).",
+        f"The median's 95 % interval is {own['low']:.2f} to {own['high']:.2f} m, and "
+        f"{run.metrics['calibration'][str(LEVEL)]:.0%} of the true positions lie in the {LEVEL:.0%} region that comes with "
+        f"each estimate. Tested on {n_test} rows, fitted to {run.metrics['n_train']} rows at {receivers} "
+        f"{'receiver' if receivers == 1 else 'receivers'}; {run.scene}.",
+        comparison_sentence(
+            by_method(run.table("errors")[COLUMNS]),
+            OWN,
+            best,
+            name="the posterior",
+            unit="m",
+            rows="rows",
+            n_test=n_test,
+        ),
+    ]
+
+
+def _steps(run: Records) -> list[NextStep]:
+    own, coverage = [], run.metrics["calibration"][str(LEVEL)]
+    if warning := coverage_warning("credible regions", coverage, LEVEL, run.metrics["n_test"]):
+        own.append(NextStep(warning))
+    if run.metrics["split"] == "random":
+        own.append(again(run, "Test a region where nothing was measured", "block"))
+    return next_steps(run, "Explore posteriors and maps", "Locate new observations", "SOURCE", own)

@@ -1,1 +1,0 @@
-"""Answers of a saved model to new measurements or positions: directions, positions, spectra or RSSI."""

@@ -1,1 +1,0 @@
-"""One report over several finished runs of one task."""

@@ -1,0 +1,200 @@
+"""Maps of the RSSI report: prediction and uncertainty of a receiver, and of the best server."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from pandas import DataFrame
+
+from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
+from swiftwrf.plotting import corners_of
+from swiftwrf.rssi import LEVEL
+from tasks.page import figures, maps
+from tasks.page.page import Plot
+from tasks.page.records import Records
+
+MAX_MAPS = 24  # receivers with a map in the report; all are in the tables
+MAX_VECTOR_DOTS = 300  # more dots become an image: the page would grow to megabytes
+MAX_WIDTH_DB = 30.0  # end of the scale of interval widths of the page
+MIN_RATIO = 1.2  # of the widest interval inside to the median one, for which the widths are drawn
+COVERED_DBM, CERTAINTY = -75.0, 0.9  # coverage of the summary
+RECEIVER = "#cf4a4a"
+WIDTH_PER_STD = 2 * NormalDist().inv_cdf((1 + LEVEL) / 2)
+HATCHED = (
+    "Hatched like /: outside the measured positions, where predictions are extrapolated; like \\: a packet is more likely "
+    "lost than received."
+)
+
+
+@dataclass(frozen=True)
+class Maps:
+    """Maps of one floor of a run.
+
+    Args:
+        run: Records of the run.
+        floor: Number of the floor; 0 in data without floors.
+    """
+
+    run: Records
+    floor: int = 0
+
+    @classmethod
+    def of_floors(cls, run: Records) -> list[Maps]:
+        """Return the maps of each floor that was measured, from below."""
+        return [cls(run, int(floor)) for floor in np.unique(run.arrays("maps")["floor_of_row"])]
+
+    @cached_property
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Content of `maps.npz` for this floor."""
+        found = dict(self.run.arrays("maps"))
+        rows = found["floor_of_row"] == self.floor
+        found |= {name: found[name][self.floor] for name in ("predicted", "width", "detection")}
+        return found | {name: found[name][rows] for name in ("measured_position", "measured")}
+
+    def titled(self, title: str) -> str:
+        """Return a title with the name of the floor, if there are several."""
+        return f"{title}, {self.arrays['floor_names'][self.floor]}" if self.suffix else title
+
+    @property
+    def place(self) -> str:
+        """Name of what the maps cover, in sentences."""
+        return f"floor {self.arrays['floor_names'][self.floor]}" if self.suffix else "the measured area"
+
+    @property
+    def suffix(self) -> str:
+        """End of the names of files of this floor, if there are several."""
+        return "" if len(self.arrays["floor_names"]) == 1 else f"-{self.floor}"
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the receivers."""
+        return [str(name) for name in self.arrays["receiver_names"]]
+
+    @cached_property
+    def best(self) -> dict[str, NDArray[Any]]:
+        """Prediction [dBm], width of its interval [dB] and detection at the receiver of the highest one in each cell."""
+        server = self.arrays["predicted"].argmax(axis=0)[None]
+        kinds = ("predicted", "width", "detection")
+        return {kind: np.take_along_axis(self.arrays[kind], server, 0)[0] for kind in kinds}
+
+    @cached_property
+    def inside(self) -> NDArray[np.bool_]:
+        """True for each cell inside the measured positions, (H, W)."""
+        at = np.stack(np.meshgrid(self.arrays["x"], self.arrays["y"]), axis=-1)
+        return maps.inside(at, self.arrays["measured_position"])
+
+    @property
+    def covered(self) -> float:
+        """Fraction of the cells inside where a measurement at the best server is above `COVERED_DBM` with `CERTAINTY`."""
+        lower = self.best["predicted"] - NormalDist().inv_cdf(CERTAINTY) * self.best["width"] / WIDTH_PER_STD
+        return float((lower >= COVERED_DBM)[self.inside].mean()) if self.inside.any() else float("nan")
+
+    @property
+    def most_detected(self) -> list[int]:
+        """Receivers with a map, those that detected most rows, ascending."""
+        detected = (~np.isnan(self.arrays["measured"])).sum(axis=0)
+        return sorted(np.argsort(-detected, kind="stable")[:MAX_MAPS].tolist())
+
+    def summary(self) -> Plot:
+        """Return map and uncertainty of the only receiver, or of the best server."""
+        several = len(self.names) > 1
+        receiver = None if several else 0
+        title = self.titled("best server" if several else self.names[0])
+        kinds = ("predicted", "width") if self.varies else ("predicted",)
+        panels = [self._panel(self.best, kind, title, receiver, 4.6 if self.varies else 5.4) for kind in kinds]
+        width = np.median(self.best["width"][self.inside]) if self.inside.any() else np.median(self.best["width"])
+        widths = f"width of the {LEVEL:.0%} interval of a measurement"
+        widths = f", and the {widths}" if self.varies else f"; the {widths} is about {width:.0f} dB everywhere"
+        caption = f"Predicted RSSI{widths}. {HATCHED}" + (
+            " The best server is the receiver with the highest prediction; crosses mark receivers."
+            if several
+            else " Dots: training measurements in the colours of the map, hollow where nothing was received; the cross "
+            "marks the receiver."
+        )
+        return Plot(
+            f"summary{self.suffix}", panels, caption, self._cells({k: v[None] for k, v in self.best.items()}, [title])
+        )
+
+    def by_receiver(self, kind: str) -> Plot:
+        """Return maps of the receivers that detected most rows.
+
+        Args:
+            kind: "predicted", or "width" for that of the intervals.
+        """
+        shown = self.most_detected
+        names, fields = [self.names[i] for i in shown], ("predicted", "width", "detection")
+        data = self._cells({name: self.arrays[name][shown] for name in fields}, names)
+        values = [{name: self.arrays[name][i] for name in fields} for i in shown]
+        panels = [
+            self._panel(each, kind, self.titled(self.names[i]), i, 3.6) for each, i in zip(values, shown, strict=True)
+        ]
+        what = "Predicted RSSI" if kind == "predicted" else f"Width of the {LEVEL:.0%} interval"
+        caption = f"{what} at each receiver. {HATCHED} Hollow dots: nothing was received. A cross marks the receiver."
+        name = "map" if kind == "predicted" else "width"
+        return Plot(f"{name}-{self.run.file_name}{self.suffix}", panels, caption, data)
+
+    def _panel(
+        self, fields: dict[str, NDArray[Any]], kind: str, title: str, receiver: int | None, width: float = 4.6
+    ) -> Figure:
+        """Draw one map, with the measurements of a receiver, or with all receivers for None."""
+        a, values = self.arrays, fields[kind]
+        x0, x1, y0, y1 = corners_of(a["x"], a["y"])
+        shape = (y1 - y0) / (x1 - x0)
+        figure, ax = figures.panel(width, 0.8 + (width - 1.2) * float(np.clip(shape, 0.4, 1.6)))
+        limits, colours = (self._widths, "magma") if kind == "width" else (self._limits, "viridis")
+        if kind == "predicted" and receiver is None:
+            limits = (float(values.min()), float(values.max()))
+        plan = (a["plan"], tuple(a["plan_extent"].tolist())) if "plan" in a else None
+        known, silent = a["measured_position"], fields["detection"] < 0.5
+        drawn = maps.draw(
+            ax, a["x"], a["y"], values, colours=colours, limits=limits, known=known, silent=silent, plan=plan
+        )
+        if receiver is not None and kind == "predicted":
+            detected = ~np.isnan(a["measured"][:, receiver])
+            many = len(detected) >= MAX_VECTOR_DOTS
+            ax.plot(*known[~detected, :2].T, "o", markersize=3, markerfacecolor="none", color="white", rasterized=many)
+            style: dict[str, Any] = {"cmap": colours, "vmin": limits[0], "vmax": limits[1], "zorder": 3}
+            style |= {"edgecolors": "white", "linewidths": 0.4, "rasterized": many}
+            ax.scatter(known[detected, 0], known[detected, 1], s=9, c=a["measured"][detected, receiver], **style)
+        for number, at in enumerate(a["receiver"]):
+            if receiver in (None, number) and np.isfinite(at).all():
+                for size, colour in ((4.5, "#fffffd"), (2.0, RECEIVER)):
+                    ax.plot(*at[:2], "x", color=colour, markersize=8, markeredgewidth=size, zorder=4)
+        ax.set_title(figures.short(title), fontsize=9)
+        label = "interval width [dB]" if kind == "width" else "predicted RSSI [dBm]"
+        figures.colour_bar(ax, drawn, label, "both")
+        return figure
+
+    @property
+    def varies(self) -> bool:
+        """True if the widths of the intervals inside the measured positions differ so much that a map shows it."""
+        known = self.best["width"][self.inside]
+        return bool(len(known)) and float(known.max()) >= MIN_RATIO * float(np.median(known))
+
+    @cached_property
+    def _widths(self) -> tuple[float, float]:
+        low, high = np.quantile(self.arrays["width"], (0.01, 0.99)).tolist()
+        return float(np.floor(low)), float(np.ceil(high))
+
+    @cached_property
+    def _limits(self) -> tuple[float, float]:
+        low, high = np.nanpercentile(self.arrays["measured"], (1, 99)).tolist()
+        return low, high
+
+    def _cells(self, fields: dict[str, NDArray[Any]], receivers: list[str]) -> DataFrame:
+        """Return one row for each cell and receiver."""
+        a = self.arrays
+        names, ys, xs = (each.ravel() for each in np.meshgrid(receivers, a["y"], a["x"], indexing="ij"))
+        origin = GeodeticOrigin(*a["origin"].tolist()) if "origin" in a else None
+        degrees = {name: value.round(7) for name, value in degree_columns(origin, np.stack([xs, ys], axis=1)).items()}
+        columns = {"receiver": names, "x_m": xs.round(3), "y_m": ys.round(3)} | degrees
+        named = {"predicted": "predicted_dbm", "width": "width_db", "detection": "detection"}
+        columns |= {named[name]: values.ravel().round(2) for name, values in fields.items()}
+        columns["inside"] = np.tile(self.inside.ravel(), len(receivers))
+        return DataFrame(columns)

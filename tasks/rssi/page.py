@@ -1,0 +1,269 @@
+"""The report of one RSSI run or several."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from swiftwrf.choices import RSSI_PREDICTORS
+from swiftwrf.metrics import paired_difference
+from tasks.answer import Answer, Method, NextStep
+from tasks.labels import PREDICTORS, colour, colours, meanings
+from tasks.page import figures
+from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of
+from tasks.page.records import Records, notes
+from tasks.page.shared import again, by_method, compared, difference, errors_section, limits, next_steps
+from tasks.rssi.maps import CERTAINTY, COVERED_DBM, MAX_VECTOR_DOTS, MIN_RATIO, Maps
+from tasks.summarise import comparison_sentence, coverage_warning
+
+COLUMNS = ["index", "receiver", "method", "abs_error_db"]  # of the errors of methods
+COLOURS = colours(PREDICTORS)
+REFERENCES = ("mean", "mri_pooled")  # which explain no place
+WIDTH_OF_80_PERCENT = 2.563  # of an interval, in standard deviations of a normal distribution
+MIN_REPEATS = 10  # of measurements at one place
+MAX_RATIO_TO_SCATTER = 1.3  # of an interval to the one of repeated measurements, which then explain it
+MAX_RECEIVERS = 40  # of the figure of differences; all are in its table
+
+
+def page(runs: list[Records]) -> Page:
+    """Return the page of these runs."""
+    sections = [
+        sections_of("Errors", runs, _errors, meanings(RSSI_PREDICTORS, PREDICTORS)),
+        sections_of("Where the errors are", runs, lambda run: Section("", plots=[_where(run)])),
+        _limits(runs[0]),
+    ]
+    details = [provenance(runs)]
+    if len(runs) > 1 or any(len(Maps(run).names) > 1 for run in runs):
+        sections.insert(0, sections_of("Maps", runs, partial(_maps, kind="predicted")))
+        by_receiver = sections_of("Errors by receiver", runs, lambda run: Section("", plots=_differences(run)))
+        details[:0] = [by_receiver, sections_of("Widths of the intervals", runs, partial(_maps, kind="width"))]
+    names = ", ".join(dict.fromkeys(run.place for run in runs))
+    if len(runs) == 1:
+        first = _summary(runs[0])
+    else:
+        answers = {f"{run.number}: {run.place}": answer(run) for run in runs}
+        first = compared(answers, runs, COLOURS, "absolute error")
+    return Page(f"RSSI: {names}", first, sections, details)
+
+
+def _summary(run: Records) -> Summary:
+    """Return the first screen of one run."""
+    found, floors, interval = answer(run), Maps.of_floors(run), run.metrics["interval"]
+    error = {name: entry["abs_error_db"] for name, entry in run.metrics["overall"].items()}
+    best = best_baseline(run)
+    numbers = [
+        *(Number(f"{maps.covered:.0%}", f"of {maps.place} above {COVERED_DBM:g} dBm") for maps in floors),
+        Number(f"{error[found.chosen]['median']:.2f} dB", f"median absolute error of {found.chosen}"),
+        Number(f"{error[best]['median']:.2f} dB", f"that of {best}, the best other method"),
+        Number(f"{interval['coverage']:.0%}", f"of the test measurements in their {interval['nominal']:.0%} interval"),
+    ]
+    plots = [maps.summary() for maps in floors]
+    return Summary(numbers, plots, found.conclusion, found.next_steps, notes=notes(run))
+
+
+def _maps(run: Records, kind: str) -> Section:
+    return Section("", plots=[maps.by_receiver(kind) for maps in Maps.of_floors(run)])
+
+
+def _errors(run: Records) -> Section:
+    caption = (
+        f"Column of {model_of(run)}: difference of the mean absolute errors on the same pairs, with its 95 % bootstrap "
+        "interval over test rows. Detection: mean of the fractions of detected and of empty test cells that are predicted "
+        "as such; 0.5 is chance."
+    )
+    return errors_section(
+        answer(run),
+        run.table("errors")[COLUMNS],
+        COLOURS,
+        name=run.file_name,
+        quantity="absolute error",
+        caption=caption,
+        paragraphs=[f"Left out: {reason}." for reason in run.metrics["left_out"].values()],
+        panels=_by_rows(run),
+    )
+
+
+def _limits(run: Records) -> Section:
+    return limits(
+        run,
+        "Single packets scatter about the mean of their position. BLE packets of unknown channel scatter by 2 to 3 dB. No "
+        "predictor of the mean has a lower error than this scatter.",
+        "Errors are those of detected values. How well empty cells are predicted is a number of its own, and where a packet "
+        "is more likely lost than received the maps are hatched.",
+        "Intervals of medians treat pairs as independent. Along a walked path they are not, and the intervals are too "
+        "narrow. The bootstrap of the paired table samples whole test rows, which corrects this in part.",
+        "The paper's table (2.91 dB for SwiftWRF, 6.74 dB for MRI) is of other data. Compare methods in this report only.",
+    )
+
+
+def answer(run: Records) -> Answer:
+    """Return the answer of a run."""
+    own, errors, methods = model_of(run), by_method(run.table("errors")[COLUMNS]), []
+    scored = any(entry.get("detection") for entry in run.metrics["overall"].values())
+    for name, entry in run.metrics["overall"].items():
+        detection = entry.get("detection")
+        cells = {f"{own} minus it [dB]": difference(errors, own, name)}
+        cells |= {"detection": number(None if detection is None else sum(detection) / 2)} if scored else {}
+        seconds = entry["seconds"]["fit"], entry["seconds"]["predict"]
+        methods.append(Method(name, entry["abs_error_db"], name in REFERENCES and name != own, seconds, cells))
+    return Answer("dB", methods, own, conclusion(run), steps(run), (best_baseline(run),))
+
+
+def model_of(run: Records) -> str:
+    """Return the predictor that all others are compared with, whose maps and intervals the run contains."""
+    return str(run.metrics["model"])
+
+
+def best_baseline(run: Records) -> str:
+    """Return the name of the baseline with the lowest median error."""
+    error: dict[str, float] = {
+        name: float(entry["abs_error_db"]["median"]) for name, entry in run.metrics["overall"].items()
+    }
+    return min((name for name in error if name != model_of(run)), key=error.__getitem__)
+
+
+def conclusion(run: Records) -> list[str]:
+    """Return coverage and error, how sure they are, and how the model compares with the best baseline."""
+    best, n_test, interval = best_baseline(run), run.metrics["n_test"], run.metrics["interval"]
+    own, floors, names = model_of(run), Maps.of_floors(run), list(run.metrics["receivers"])
+    who = f"one of {len(names)} receivers" if len(names) > 1 else names[0]
+    covered = [f"{maps.covered:.0%} of {maps.place}" for maps in floors]
+    error = run.metrics["overall"][own]["abs_error_db"]
+    sure = (
+        f"90 % of the errors are below {error['p90']:.1f} dB, and {interval['coverage']:.0%} of the measurements lie in "
+        f"their {interval['nominal']:.0%} intervals. Tested on {error['n']} measurements, fitted to "
+        f"{run.metrics['n_train']} rows ({run.scene})."
+    )
+    errors = by_method(run.table("errors")[COLUMNS])
+    compared = comparison_sentence(errors, own, best, name=own, unit="dB", rows="pairs", n_test=n_test)
+    return [
+        f"{', '.join(covered)} {'has' if len(covered) == 1 else 'have'} {who} above {COVERED_DBM:g} dBm with "
+        f"{CERTAINTY:.0%} certainty; predictions are within {error['median']:.1f} dB (median error).",
+        sure,
+        compared,
+    ]
+
+
+def steps(run: Records) -> list[NextStep]:
+    """Return what to do next."""
+    interval = run.metrics["interval"]
+    pairs = model_of(run) == "pairs"  # its maps depend on both ends, and the page shows one
+    own = [NextStep(where_next(run))]
+    if unknown := int(np.isnan(run.arrays("maps")["receiver"]).any(axis=1).sum()):
+        text = (
+            f"Give the positions of the {unknown} access points that are unknown, in `receivers.csv` beside the table"
+        )
+        own.insert(0, NextStep(text, "receiver,x,y,z"))
+    # the receivers of a row are not independent
+    n_test = min(run.metrics["n_test"], run.metrics["overall"][model_of(run)]["abs_error_db"]["n"])
+    if warning := coverage_warning("intervals", interval["coverage"], interval["nominal"], n_test):
+        own.append(NextStep(warning))
+    if pairs and run.metrics["split"] != "place":
+        own.append(again(run, "Test receivers at positions where they measured nothing", "place"))
+    elif run.metrics["split"] == "random":
+        own.append(again(run, "Test a region where nothing was measured", "block"))
+    explore = "" if pairs else "Explore maps and coverage"
+    return next_steps(run, explore, "Predict at other positions, with intervals", "positions.csv", own)
+
+
+def where_next(run: Records) -> str:
+    """Return where to measure next, inside the measured positions, or that more positions hardly help."""
+    most = int(np.bincount(run.arrays("maps")["floor_of_row"]).argmax())
+    maps, known = Maps(run, most).arrays, Maps(run, most).inside
+    width = maps["width"].mean(axis=0)
+    if not known.any():
+        return "Measure in a second dimension: the measured positions lie on a line."
+    typical = float(np.median(width[known]))
+    row, column = np.unravel_index(np.argmax(np.where(known, width, -np.inf)), width.shape)
+    if width[row, column] < MIN_RATIO * typical:
+        scatter = scatter_of_repeats(run)
+        reason = "and the model explains no more"
+        if scatter is not None and typical < MAX_RATIO_TO_SCATTER * scatter:
+            reason = "which is the scatter of repeated measurements at one place"
+        elif scatter is not None:
+            reason += f", though repeated measurements at one place lie within {scatter:.0f} dB"
+        return (
+            f"More positions inside the measured area are not worth it: the 80 % interval is about {typical:.0f} dB wide "
+            f"everywhere in it, {reason}."
+        )
+    return (
+        f"Measure around x = {maps['x'][column]:.1f} m, y = {maps['y'][row]:.1f} m: inside the measured area the 80 % "
+        f"interval is widest there, {width[row, column]:.0f} dB instead of {typical:.0f} dB."
+    )
+
+
+def scatter_of_repeats(run: Records) -> float | None:
+    """Return the width of the 80 % interval of repeated measurements at one place [dB], None if there are too few."""
+    same = run.table("predictions").groupby(["x", "y", "z", "receiver"])["measured"]
+    repeats = same.count() - 1
+    n = int(repeats.clip(lower=0).sum())
+    return float(WIDTH_OF_80_PERCENT * np.sqrt((same.var() * repeats).sum() / n)) if n >= MIN_REPEATS else None
+
+
+def _by_rows(run: Records) -> list[Figure]:
+    """Return the errors by the number of training rows, none if the rows are too few for parts of them."""
+    found = run.metrics["by_rows"]
+    if len(found) < 2:
+        return []
+    names = list(next(iter(found.values())))
+    figure, axes = figures.panel(5.6, 3.2)
+    lines = {name: ([int(n) for n in found], [row[name] for row in found.values()]) for name in names}
+    figures.curves(axes, COLOURS, lines, "training rows", "mean absolute error [dB]")
+    axes.set_ylim(0, None)
+    return [figure]
+
+
+def _differences(run: Records) -> list[Plot]:
+    """Return the difference of the model's error from the best baseline's at each receiver, none for one receiver."""
+    if len(run.metrics["receivers"]) < 2:
+        return []
+    own, best, errors = model_of(run), best_baseline(run), by_method(run.table("errors")[COLUMNS])
+    found = {}
+    for name in run.metrics["receivers"]:
+        at_receiver = errors[errors.index.get_level_values("receiver") == name].dropna(subset=[own, best])
+        if len(at_receiver):
+            found[name] = paired_difference(at_receiver, own, best)
+    names = sorted(found, key=lambda name: found[name][0])
+    shown, values = names[:MAX_RECEIVERS], {own: [found[name] for name in names]}
+    label = f"{own} minus {best}, mean absolute error [dB]"
+    figure = figures.dots(shown, {own: values[own][: len(shown)]}, COLOURS, label, zero=True)
+    caption = (
+        f"Difference of the mean absolute error of {own} from that of {best}, the best baseline, at each receiver on "
+        f"the same pairs; whiskers: 95 % intervals. Below zero {own} is better."
+    )
+    data = figures.dots_data("receiver", names, values, "db")
+    return [Plot(f"difference-{run.file_name}", [figure], caption, data)]
+
+
+def _where(run: Records) -> Plot:
+    """Return predicted against measured RSSI, and the error against distances."""
+    errors = run.table("errors")
+    own = errors[errors["method"] == model_of(run)]
+    own_colour, many = colour(COLOURS, model_of(run)), len(own) >= MAX_VECTOR_DOTS
+    columns = {
+        "from_receiver_m": "distance from the receiver [m]",
+        "from_training_m": "distance from training positions [m]",
+    }
+    columns = {column: label for column, label in columns.items() if own[column].notna().any()}
+    first, ax = figures.panel(4, 3.4)
+    ax.plot(own["measured_dbm"], own["predicted_dbm"], ".", markersize=2, color=own_colour, rasterized=many)
+    ends = [own["measured_dbm"].min(), own["measured_dbm"].max()]
+    ax.plot(ends, ends, color=figures.RULE, linewidth=1)
+    ax.set(xlabel="measured [dBm]", ylabel="predicted [dBm]")
+    panels = [first]
+    for column, label in columns.items():
+        panel, ax = figures.panel(4, 3.4)
+        ordered = own.sort_values(column)
+        ax.plot(ordered[column], ordered["abs_error_db"], ".", markersize=2, color=figures.RULE, rasterized=many)
+        median = ordered["abs_error_db"].rolling(max(len(ordered) // 5, 1), center=True).median()
+        ax.plot(ordered[column], median, color=own_colour, linewidth=2)
+        ax.set(xlabel=label, ylabel="absolute error [dB]")
+        panels.append(panel)
+    caption = (
+        "Predicted against measured RSSI, and the absolute error (dots; line: running median) against the distance from the "
+        "receiver, if its position is known, and from the nearest training position. All receivers."
+    )
+    data = own[["receiver", "index", "measured_dbm", "predicted_dbm", "abs_error_db", *columns]]
+    return Plot(f"where-{run.file_name}", panels, caption, data)

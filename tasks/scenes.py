@@ -1,0 +1,116 @@
+"""Trace ray paths in a furnished room or a scene file, and write them as `load_spectra` reads them."""
+
+from __future__ import annotations
+
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from swiftwrf import InputError
+from swiftwrf.data.files import sha256
+from swiftwrf.data.raytraced import ROOMS, FurnishedRoom, Scene, Tracing, trace
+from swiftwrf.data.writing import write_paths
+from swiftwrf.runtime.durable import write_json
+from tasks.configs import ScenesConfig
+from tasks.directory import new_directory
+from tasks.environment import invocation
+from tasks.options import plain
+from tasks.page import figures
+from tasks.terminal import console, terminal
+
+PLAN = "scene.svg"  # the room and the positions, seen from above
+MAX_ATTEMPTS = 100  # draws of all positions before the region counts as full
+
+
+def run(config: ScenesConfig) -> None:
+    """Draw positions, trace the paths to them, and write paths, record and plan.
+
+    Raises:
+        InputError: An option that makes no sense, no such room or scene, positions outside of it, a material that has no
+            constants at the carrier, or no Sionna RT or LLVM.
+    """
+    room, fixed, region = where(config)
+    with new_directory(Path(config.out), "a scene") as folder:
+        position = draw_positions(room, region, config.positions, config.seed)
+        if room is None:
+            scene = Scene.read(Path(config.room), config.frequency, config.scattering)
+        else:
+            scene = Scene(room.surfaces(), config.frequency, config.scattering)
+        began = time.perf_counter()
+        tracing = Tracing(config.order, config.scattering > 0, config.diffraction, config.seed)
+        paths = trace(scene, fixed, position, config.moving, tracing)
+        seconds = time.perf_counter() - began
+        without = int((paths.count == 0).sum())
+        if without == len(position):
+            raise InputError(
+                f"no path reaches any of the {len(position)} positions; is the fixed end inside the scene?"
+            )
+        if without:
+            console.print(f"positions that no path reaches are left out: {without}")
+            paths = paths.reached
+        write_paths(paths, folder)
+        each = float(paths.count.double().mean())
+        record = {
+            "command": invocation("scenes"),
+            "options": plain(config),
+            "source_sha256": {Path(config.room).name: sha256(Path(config.room))} if room is None else {},
+            "fixed": fixed.tolist(),
+            "region": region.tolist(),
+            "surfaces": {s.name: s.material.name for s in scene.surfaces},
+            "positions": len(paths.count),
+            "line_of_sight": int(paths.line_of_sight.sum()),
+            "paths_per_position": each,
+            "seconds": seconds,
+            "sionna_rt": version("sionna-rt"),
+        }
+        write_json(folder / "scene.json", record)
+        figure, axes = figures.panel(8, 5)
+        ends = (paths.transmitter, paths.receiver)
+        moving, still = ends if config.moving == "transmitter" else ends[::-1]
+        scene.plot(still[0], moving, axes)
+        (folder / PLAN).write_text(figures.as_svg(figure, f"Plan of {Path(config.room).stem}"), encoding="utf-8")
+    text = f"{len(paths.count)} positions with {each:.0f} paths each, traced in {seconds:.0f} s: {config.out}"
+    terminal.page(record, text, Path(config.out) / PLAN)
+
+
+def where(config: ScenesConfig) -> tuple[FurnishedRoom | None, Tensor, Tensor]:
+    """Return the room, the position of the fixed end (3,) and the region of the moving one (2, 3) [m].
+
+    Raises:
+        InputError: Either is outside the room, or the fixed end is in its furniture.
+    """
+    room = ROOMS.get(config.room)
+    corners = (config.region[:3], config.region[3:]) if config.region else room.region if room else ()
+    region = torch.tensor(corners, dtype=torch.float64).sort(dim=0).values
+    fixed = torch.tensor(config.fixed or (room.fixed if room else ()), dtype=torch.float64)
+    if room is None:
+        return None, fixed, region
+    size = " x ".join(f"{side:g}" for side in room.size)
+    if not bool(room.free(fixed[None])):
+        raise InputError(f"--fixed {_listed(fixed)} is outside the room of {size} m, at a wall, or in furniture")
+    if not bool(((region >= 0) & (region <= torch.tensor(room.size))).all()):
+        raise InputError(f"--region {_listed(region.flatten())} is not inside the room of {size} m")
+    return room, fixed, region
+
+
+def _listed(numbers: Tensor) -> str:
+    return " ".join(f"{x:g}" for x in numbers.tolist())
+
+
+def draw_positions(room: FurnishedRoom | None, region: Tensor, count: int, seed: int) -> Tensor:
+    """Return random positions in the region, away from walls and furniture, float64 (count, 3) [m].
+
+    Raises:
+        InputError: Furniture takes (nearly) all of the region.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    found = torch.empty(0, 3, dtype=torch.float64)
+    for _ in range(MAX_ATTEMPTS):
+        drawn = region[0] + (region[1] - region[0]) * torch.rand(count, 3, dtype=torch.float64, generator=generator)
+        found = torch.cat([found, drawn if room is None else drawn[room.free(drawn)]])
+        if len(found) >= count:
+            return found[:count]
+    raise InputError(f"only {len(found)} of {count} positions are free of walls and furniture; choose another --region")
