@@ -2,7 +2,6 @@
 
 import sys
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pandas as pd
 import pytest
@@ -11,14 +10,12 @@ import torch
 from quick import said
 
 from augment.suggest import suggest, suggest_positions
-from augment.turbo.choice import Suggestion
-from augment.turbo.condition import MeasuredSubset
 from swiftwrf import AngularGrid, InputError, make_model, rssi_room, simulated_room
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import choose_kernel, most_informative
 from swiftwrf.locate import RssiLocator
 from swiftwrf.metrics import psnr
-from tasks.aoa.experiment import _write_files
+from tasks.page.shared import write_suggestion
 
 
 def test_suggestions_lie_in_the_region_and_lower_the_variance(room):
@@ -33,18 +30,13 @@ def test_suggestions_lie_in_the_region_and_lower_the_variance(room):
     )  # not where it is known
 
 
-def test_suggested_positions_keep_the_digits_of_maps(room):
+def test_suggested_positions_keep_the_digits_of_maps(room, tmp_path):
     """Coordinates on a map have more digits than single precision."""
     measured = replace(room, position=room.position.double() + torch.tensor([712345.678, 5412345.678, 0]).double())
-    found, kept = suggest(measured, 3), {}
-    directory = SimpleNamespace(
-        write_csv=lambda name, rows: kept.update({name: rows}), write_npz=lambda name, arrays: None
-    )
-    positions = {"measured": measured.position.tolist(), "position": found.position.tolist()}
-    value = positions | {"variance": found.variance.tolist()}
-    _write_files(Suggestion(MeasuredSubset(0.5)), value, measured, directory)
-    rows = kept["suggested-mix0.5.csv"]
-    assert [[row["x_m"], row["y_m"], row["z_m"]] for row in rows] == found.position.tolist()
+    found = suggest(measured, 3)
+    write_suggestion(tmp_path / "suggested", measured.position, found.position, found.variance)
+    table = pd.read_csv(tmp_path / "suggested.csv", float_precision="round_trip")
+    assert table[["x_m", "y_m", "z_m"]].to_numpy().tolist() == found.position.tolist()
 
 
 def test_measuring_at_suggested_positions_beats_random_ones():

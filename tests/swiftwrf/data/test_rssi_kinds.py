@@ -320,7 +320,7 @@ def test_positions_measured_again_differ_by_the_error_of_positioning():
 @pytest.mark.parametrize(("task", "options"), [("rssi", ()), ("locate", FEW_CELLS)])
 def test_notes_and_a_split_that_tests_look_up_are_in_every_report(tmp_path, task, options, capsys):
     floor = Floor.made(5, n=30)
-    order, filled = floor.random.permutation(60), floor.some(0.4)
+    order, filled = floor.random.permutation(60), floor.some(0.2)
     table = pd.concat([floor.table(np.where(filled, -107, floor.rssi))] * 2, ignore_index=True)
     (tmp_path / "walk").mkdir()
     table.to_csv(tmp_path / "walk" / "walk.csv", index=False)

@@ -274,16 +274,6 @@ def test_a_kernel_of_few_spectra_is_chosen_again(name):
     assert error[60:].mean() < 0.97 * stale.error[60:].mean()
 
 
-def test_a_kernel_of_rssi_is_that_of_a_fit_to_all_rows():
-    data = rssi_room(n=170)
-    model = RssiModel().fit(data.subset(torch.arange(15))).update(data.subset(torch.arange(15, 170)))
-    chosen, fitted = model.with_chosen_kernel(), RssiModel().fit(data)
-    assert model.kernel.correlation_length != pytest.approx(fitted.kernel.correlation_length, rel=1e-2)
-    assert chosen.kernel.correlation_length == pytest.approx(fitted.kernel.correlation_length, rel=1e-5)
-    position = data.transmitter_position[:20] + 0.3
-    torch.testing.assert_close(chosen.predict(position).mean, fitted.predict(position).mean, atol=1e-2, rtol=0)
-
-
 def test_a_kernel_of_enough_spectra_stays():
     data = coarse(170, 0)
     model = make_model("coarray").fit(data.subset(torch.arange(80)))

@@ -392,16 +392,6 @@ def test_a_rarely_detected_receiver_does_not_stop_the_others(n_detected, validat
     assert (prediction.mean[:, 1] - truth).abs().max() < 30
 
 
-def test_a_receiver_detected_in_one_slab_only():
-    data = rssi_room(n=200).columns([0, 5])
-    slab = data.transmitter_position[:, 0] < 4
-    data.rssi_dbm[~slab, 0] = torch.nan
-    model = fit_rssi(data, RssiConfig(validation="block"))
-    prediction = model.predict(data.transmitter_position)
-    assert prediction.mean.isfinite().all()
-    assert prediction.std.max() < 23
-
-
 def test_measurements_on_a_receiver_give_finite_predictions():
     data = with_field(n=40)
     data.transmitter_position.copy_(data.receiver_position[0])

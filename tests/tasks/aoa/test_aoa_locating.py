@@ -69,7 +69,7 @@ def quickly(data, planes=PLANES):
             mock.patch.object(experiment, "simulated_room", return_value=data),
             sketched(),
             mock.patch.object(MatchedField, "fit", fit_once),
-            mock.patch("swiftwrf.locate.student.DEGREES", (5.0,)),
+            mock.patch("swiftwrf.locate.spectrum_likelihood.DEGREES", (5.0,)),
             mock.patch("swiftwrf.models.geometry.path_gains.PRIORS", {"tight": PRIORS["tight"]}),
             mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
             *(
