@@ -157,7 +157,8 @@ def choose_model(
                     structure, searching = _structure(unfitted, measured.subset(_without(fold, *blind)), fitted, device)
                     spent += searching
                 for number in blind:
-                    train, test = _split(measured, fold, number)
+                    rows, *_ = subsample((fold == number).nonzero()[:, 0], rows=1000)  # more do not change the choice
+                    train, test = measured.subset(_without(fold, number)), measured.subset(rows)
                     began = time.perf_counter()
                     model = copy(unfitted).fit(train, like=structure, device=device)
                     predicted = model.synthesize(test.position).cpu()
@@ -206,10 +207,3 @@ def _structure(
 def _without(fold: Tensor, *numbers: int) -> Tensor:
     """Return the rows outside the folds of these numbers."""
     return (~torch.isin(fold, torch.tensor(numbers))).nonzero()[:, 0]
-
-
-def _split(measured: Spectra, fold: Tensor, number: int) -> tuple[Spectra, Spectra]:
-    """Return training and test spectra of one fold."""
-    test = (fold == number).nonzero()[:, 0]
-    test, *_ = subsample(test, rows=1000)  # more do not change the choice
-    return measured.subset(_without(fold, number)), measured.subset(test)

@@ -73,11 +73,7 @@ class Mixed:
         return {"measured": len(self) - synthetic, "withheld": synthetic - extra, "extra": extra}
 
     def select(self, rows: Tensor) -> Tensor:
-        """Return some spectra, float32 (m, H, W).
-
-        Args:
-            rows: Row numbers (m,) in any order.
-        """
+        """Return spectra by their row numbers (m,) in any order, float32 (m, H, W)."""
         ends = torch.tensor([len(store) for store in self.stores]).cumsum(0)
         number = torch.bucketize(rows, ends, right=True)
         selected = torch.empty(len(rows), *self.grid.shape)
@@ -86,11 +82,7 @@ class Mixed:
         return selected
 
     def add(self, positions: SyntheticPositions, synthetic: Tensor) -> Mixed:
-        """Return the training set with synthetic spectra appended.
-
-        Args:
-            positions: Positions and labels of the synthetic spectra.
-            synthetic: Spectra (n, H, W): magnitudes, or bytes where 255 stands for 1.
+        """Return the training set with spectra (n, H, W) at synthetic positions appended: magnitudes, or bytes (255 is 1).
 
         Raises:
             InputError: The number of spectra is not that of the positions.

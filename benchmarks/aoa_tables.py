@@ -8,11 +8,10 @@ from record import RESULTS, load, markdown
 
 from augment.turbo.condition import FULL_NETWORK, LOCATED, MEASURED_NETWORK, Condition, conditions_of
 from augment.turbo.condition import headline as chosen
-from augment.turbo.results import MixMetrics
 from swiftwrf.metrics import ChangeMetrics
 
 
-def aoa_shares() -> list[tuple[str, MixMetrics, dict[str, Any]]]:
+def aoa_shares() -> list[tuple[str, dict[str, Any], dict[str, Any]]]:
     """Return key, metrics and whole result of every measured fraction of every scene, sorted by file name and fraction.
 
     Of several runs with the same fraction the newest one counts.
@@ -31,7 +30,7 @@ def aoa_shares() -> list[tuple[str, MixMetrics, dict[str, Any]]]:
     ]
 
 
-def turbo_condition(mix: MixMetrics) -> Condition:
+def turbo_condition(mix: dict[str, Any]) -> Condition:
     """Return the network's condition with synthetic spectra that a user would choose."""
     return chosen(conditions_of(mix["methods"]).values())
 

@@ -14,21 +14,13 @@ MAX_USABLE, MAX_REFERENCES = 4, 2  # rows of the short table
 
 @dataclass(frozen=True)
 class Method:
-    """Errors of one method.
+    """Errors of one method."""
 
-    Args:
-        name: Name of the method in all results.
-        error: Summary of its errors.
-        is_reference: Whether others are measured by it, rather than that a user would take it.
-        seconds: Seconds to fit it, and to apply it to the test rows.
-        cells: Further cells of its row in the report, by column.
-    """
-
-    name: str
-    error: ErrorSummary
-    is_reference: bool = False
-    seconds: tuple[float, ...] = ()
-    cells: Mapping[str, str] = field(default_factory=dict)
+    name: str  # name of the method in all results
+    error: ErrorSummary  # summary of its errors
+    is_reference: bool = False  # whether others are measured by it, rather than that a user would take it
+    seconds: tuple[float, ...] = ()  # seconds to fit it, and to apply it to the test rows
+    cells: Mapping[str, str] = field(default_factory=dict)  # further cells of its row in the report, by column
 
 
 @dataclass(frozen=True)
@@ -43,14 +35,6 @@ class NextStep:
 class Answer:
     """The answer of a run.
 
-    Args:
-        unit: Unit of the errors.
-        methods: Errors of all methods, which are sorted by their medians.
-        chosen: Name of the method to take.
-        conclusion: Sentences: what the user asked, how sure it is, how it compares.
-        next_steps: What to do next.
-        shown: Names of the methods that the short table has in any case.
-
     Example:
         >>> error = {"median": 1.0, "low": 0.5, "high": 2.0, "mean": 1.5, "p90": 3.0, "n": 9}
         >>> answer = Answer("m", [Method("mean", error, is_reference=True), Method("knn", error)], "knn", [], [])
@@ -58,12 +42,12 @@ class Answer:
         [['knn'], ['mean']]
     """
 
-    unit: str
-    methods: Sequence[Method]
-    chosen: str
-    conclusion: Sequence[str]
-    next_steps: Sequence[NextStep]
-    shown: Sequence[str] = ()
+    unit: str  # unit of the errors
+    methods: Sequence[Method]  # errors of all methods, which are sorted by their medians
+    chosen: str  # name of the method to take
+    conclusion: Sequence[str]  # sentences: what the user asked, how sure it is, how it compares
+    next_steps: Sequence[NextStep]  # what to do next
+    shown: Sequence[str] = ()  # names of the methods that the short table has in any case
 
     def __post_init__(self) -> None:
         ordered = sorted(self.methods, key=lambda one: (not one.error["n"], one.error["median"]))

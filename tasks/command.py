@@ -16,19 +16,11 @@ from typing import Any, NamedTuple
 
 
 class Command(NamedTuple):
-    """A command of the console script.
+    """A command of the console script."""
 
-    Args:
-        summary: One line for the help.
-        options: Dataclass of the options, in `tasks.configs`.
-        module: Module with `run(config)`, or `run(config, resume)` if its runs can be resumed.
-        preloaded: Modules that processes of a run load while the run itself begins.
-    """
-
-    summary: str
-    options: str
-    module: str
-    preloaded: tuple[str, ...] = ()
+    summary: str  # one line for the help
+    options: str  # dataclass of the options, in `tasks.configs`
+    module: str  # module with `run(config)`, or `run(config, resume)` if its runs can be resumed
 
 
 COMMANDS = {
@@ -36,7 +28,6 @@ COMMANDS = {
         "estimate angles of arrival with few measured spectra, and report the errors",
         "AoaConfig",
         "tasks.aoa.experiment",
-        ("augment.turbo.choice", "torchvision", "torch._dynamo"),
     ),
     "rssi": Command("predict RSSI maps of receivers, and report the errors", "RssiTaskConfig", "tasks.rssi.experiment"),
     "locate": Command(
@@ -57,11 +48,12 @@ COMMANDS = {
 }
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the console script.
+# modules that processes of a run load while the run itself begins
+PRELOADED = {"aoa": ("augment.turbo.choice", "torchvision", "torch._dynamo")}
 
-    Args:
-        arguments: Command and its options. Defaults to those of the process.
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the console script with a command and its options, by default those of the process, and return its exit code.
 
     Returns:
         Exit code; see `tasks.command_line.command_line`.
@@ -91,13 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run_command(name: str, options: Sequence[str], program: str) -> int:
-    """Run one command and return its exit code.
-
-    Args:
-        name: Key of `COMMANDS`.
-        options: Options of the command line.
-        program: Name of the program in the help.
-    """
+    """Run a command of `COMMANDS`, under the name of its program in the help, and return its exit code."""
     if "OMP_WAIT_POLICY" not in os.environ:
         # threads that share a loop wait busily for milliseconds by default, which makes the steps of a network up to eight
         # times slower if other work uses the same cores; libgomp reads the variable when torch is loaded
@@ -112,6 +98,5 @@ def run_task(name: str, config: Any, *folder: Path) -> None:
     """Run a command with checked options, or continue its run in a directory."""
     from tasks.preload import preload
 
-    command = COMMANDS[name]
-    preload(command.preloaded if getattr(config, "processes", None) != 1 else ())
-    import_module(command.module).run(config, *folder)
+    preload(PRELOADED.get(name, ()) if getattr(config, "processes", None) != 1 else ())
+    import_module(COMMANDS[name].module).run(config, *folder)

@@ -83,13 +83,7 @@ def _no_access(error: OSError) -> str:
 
 
 def execute(program: str, config_type: type[Config], task: Callable[[Config], None], arguments: Sequence[str]) -> None:
-    """Parse a command line and run the task.
-
-    Args:
-        program: Name of the command in the help.
-        config_type: Dataclass of the options. Its docstring is the description in the help.
-        task: Function of the configuration.
-        arguments: Options of the command line.
+    """Parse the command line of a program and run the task with its configuration; see `parse`.
 
     Raises:
         InputError: Wrong options, or the error of the task.

@@ -33,6 +33,8 @@ from tasks.records import CONFIG, rounded, write_table
 from tasks.source import located, reading
 from tasks.terminal import console, terminal
 
+WORLD_FILE = ".pgw"  # suffix beside a .png
+
 
 def run(config: ConvertConfig) -> None:
     """Read measurements or a model, and write a directory or a file.
@@ -69,12 +71,11 @@ def _write_new_file(config: ConvertConfig, model: RssiModel | None) -> None:
     if model is not None and (options := reading(config.spectra, config.table).given):
         raise InputError(f"{config.source} is a model; --{next(iter(options)).replace('_', '-')} is for measurements")
     check_new_file(out)
-    data = (
-        _spectra_or_rssi(_read(config), reading(config.spectra, config.table))
-        if model is None
-        else map_of(model, config)
-    )
-    _answer(config, write_file(data, out))
+    if model is None:
+        _answer(config, write_file(_spectra_or_rssi(_read(config), reading(config.spectra, config.table)), out))
+    else:
+        found = RssiMap.predict(model, config.cell, config.height)
+        _answer(config, write_file(found.receivers(config.rx) if config.rx else found, out))
 
 
 def _read(config: ConvertConfig) -> Spectra | Snapshots | Rssi:
@@ -134,9 +135,6 @@ def _write(data: Spectra | Snapshots | Rssi, options: ReadOptions, folder: Path)
     return f"{len(spectra)} spectra of {spectra.grid.shape[0]} x {spectra.grid.shape[1]} pixels"
 
 
-WORLD_FILE = ".pgw"  # suffix beside a .png
-
-
 def saved_model(source: Path) -> RssiModel | None:
     """Return the RSSI model in a file or in the directory of a run; None if the source is no model.
 
@@ -163,16 +161,6 @@ def saved_model(source: Path) -> RssiModel | None:
     if not isinstance(model, RssiModel):
         raise InputError(f"{file} holds {with_article(model.kind)}, which predicts neither spectra nor RSSI")
     return model
-
-
-def map_of(model: RssiModel, config: ConvertConfig) -> RssiMap:
-    """Return the map of an RSSI model.
-
-    Raises:
-        InputError: An unknown receiver.
-    """
-    found = RssiMap.predict(model, config.cell, config.height)
-    return found.receivers(config.rx) if config.rx else found
 
 
 def write_file(data: Labelled, file: Path) -> str:

@@ -22,16 +22,19 @@ import torch
 from filelock import FileLock, Timeout
 
 from swiftwrf import InputError
-from swiftwrf.runtime.durable import rename, strict, write_json, write_npz
+from swiftwrf.runtime.durable import rename, strict, write_json
 from swiftwrf.runtime.steps import STEPS
 from swiftwrf.runtime.threads import set_threads
 from tasks.environment import environment, invocation, now, number_of_processes, stamp
 from tasks.options import plain
-from tasks.records import CONFIG, ENVIRONMENT, LOCATOR, MODEL, PARTIAL, Row, read_json, write_table
+from tasks.records import CONFIG, ENVIRONMENT, LOCATOR, MODEL, PARTIAL, Row, read_json
 from tasks.terminal import terminal
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # errors of file systems without locks
 LOCK = "lock"
+
+
+MAX_LABEL = 60  # characters of the label in the name of a directory under runs/
 
 
 def model_file(folder: Path) -> Path | None:
@@ -109,9 +112,6 @@ class Claim:
     def release(self) -> None:
         """Let other processes claim the directory."""
         self._lock.release()
-
-
-MAX_LABEL = 60  # characters of the label in the name of a directory under runs/
 
 
 def _versions(environment: Row) -> dict[str, str]:
@@ -260,14 +260,6 @@ class Run:
     def write_json(self, name: str, content: Any) -> None:
         """Write strict JSON: nan and infinity become null."""
         write_json(self.path(name), content)
-
-    def write_csv(self, name: str, rows: Iterable[Row]) -> None:
-        """Write a table with the keys of the rows as columns."""
-        write_table(self.path(name), rows)
-
-    def write_npz(self, name: str, arrays: Mapping[str, Any]) -> None:
-        """Write arrays by name."""
-        write_npz(self.path(name), arrays)
 
     def step(
         self, name: str, title: str, compute: Callable[[], Row], described: Callable[[Row], str] = lambda value: ""

@@ -25,9 +25,15 @@ from tasks.directory import new_directory
 from tasks.environment import command, stamp
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table, write_page
+from tasks.page.shared import fingerprinting
 from tasks.source import located, reading
-from tasks.summarise import fingerprinting
 from tasks.terminal import terminal
+
+AXES = {"x": "#cf4a4a", "y": "#2a9165", "normal": "#3a7fd5"}
+DOTS, NONE = "#3a7fd5", "#7f8794"  # with line of sight, without
+MAX_DOTS = 2000
+MAX_RECEIVERS = 30  # in a figure
+MIN_BINS_M = 1e-3  # of the bins of distances together
 
 
 def run(config: InspectConfig) -> None:
@@ -53,21 +59,6 @@ def run(config: InspectConfig) -> None:
         write_json(folder / "inspect.json", content)
         write_page(folder, page(findings, kind, str(config.source)))
     terminal.page(content, f"{config.source}: {kind}\n{findings}", out / "report.html")
-
-
-AXES = {"x": "#cf4a4a", "y": "#2a9165", "normal": "#3a7fd5"}
-DOTS, NONE = "#3a7fd5", "#7f8794"  # with line of sight, without
-MAX_DOTS = 2000
-MAX_RECEIVERS = 30  # in a figure
-MIN_BINS_M = 1e-3  # of the bins of distances together
-PLAN = (
-    "From above and from the side: positions with (blue) and without line of sight (grey); arrows: the array's axes x "
-    "(red), y (green) and its normal (blue)."
-)
-DIRECTIONS = (
-    "Lines of sight and peaks of the spectra as the array receives them, coloured by the azimuth of the line of "
-    "sight: one picture where frames and calibration are right."
-)
 
 
 def page(findings: Findings, kind: str, source: str) -> Page:
@@ -135,7 +126,11 @@ def _plan(data: Spectra) -> Plot:
             ax.plot(*data.fixed_position[[a, b]].tolist(), marker, color="black", markersize=7)
         _draw_axes(ax, data, a, b)
         panels.append(figure)
-    return Plot("plan", panels, PLAN, _places(data.position, line_of_sight=data.line_of_sight))
+    caption = (
+        "From above and from the side: positions with (blue) and without line of sight (grey); arrows: the array's axes x "
+        "(red), y (green) and its normal (blue)."
+    )
+    return Plot("plan", panels, caption, _places(data.position, line_of_sight=data.line_of_sight))
 
 
 def _draw_axes(ax: Axes, data: Spectra, a: int, b: int) -> None:
@@ -177,7 +172,11 @@ def _directions(data: Spectra) -> Plot:
     ax.set(xlabel="peak to line of sight [deg]", ylabel="spectra")
     azimuth, elevation = data.label[rows].rad2deg().unbind(-1)
     table = _places(data.position[rows], azimuth_deg=azimuth, elevation_deg=elevation, peak_from_line_deg=apart)
-    return Plot("directions", [*panels, figure], DIRECTIONS, table)
+    caption = (
+        "Lines of sight and peaks of the spectra as the array receives them, coloured by the azimuth of the line of "
+        "sight: one picture where frames and calibration are right."
+    )
+    return Plot("directions", [*panels, figure], caption, table)
 
 
 def _neighbours(data: Spectra) -> Plot:

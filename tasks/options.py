@@ -132,14 +132,7 @@ def plain(config: Any) -> dict[str, Any]:
 
 
 def choice(meaning: str, registry: Registry[Any] | None, known: Mapping[str, labels.Label], default: str) -> Any:
-    """Return the annotation of an option that takes names of a registry. Its help lists the names.
-
-    Args:
-        meaning: Meaning of the option.
-        registry: Registry of the names. None if `known` has all of them.
-        known: Labels by name. Names of other packages have the first line of their docstring.
-        default: Default that the help shows.
-    """
+    """Return the annotation of an option that takes names of a registry, or of `known`. Its help lists the names."""
 
     def entries(_: str) -> str:
         if registry is None:
@@ -187,19 +180,16 @@ class SpectraSource:
         if self.beamformer is not None and self.beamformer not in labels.BEAMFORMERS:
             raise InputError(f"unknown beamformer {self.beamformer!r}; choose from {', '.join(labels.BEAMFORMERS)}")
         if self.array is not None:
-            self._check_array(*self.array)
+            *sides, spacing, frequency = self.array
+            rows, columns = (int(side) for side in (sides[0], sides[-1]))
+            if not (1 <= min(rows, columns) <= max(rows, columns) <= MAX_SIDE and max(rows, columns) >= 2):
+                raise InputError(f"--array takes 2 to {MAX_SIDE} elements a side, got {rows} x {columns}")
+            if min(spacing, frequency) <= 0:
+                raise InputError(
+                    f"--array takes a spacing [m] and a carrier [Hz] above 0, got {spacing:g} and {frequency:g}"
+                )
         if self.grid is not None and min(self.grid) < 2:
             raise InputError(f"--grid takes numbers of elevations and azimuths, each at least 2, got {self.grid}")
-
-    def _check_array(self, *array: float) -> None:
-        *sides, spacing, frequency = array
-        rows, columns = (int(side) for side in (sides[0], sides[-1]))
-        if not (1 <= min(rows, columns) <= max(rows, columns) <= MAX_SIDE and max(rows, columns) >= 2):
-            raise InputError(f"--array takes 2 to {MAX_SIDE} elements a side, got {rows} x {columns}")
-        if min(spacing, frequency) <= 0:
-            raise InputError(
-                f"--array takes a spacing [m] and a carrier [Hz] above 0, got {spacing:g} and {frequency:g}"
-            )
 
 
 @options

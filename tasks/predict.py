@@ -18,7 +18,6 @@ from swiftwrf.data import ReadOptions
 from swiftwrf.data.coordinates import Floors, PlanFrame, degree_columns
 from swiftwrf.data.files import SUFFIXES, read_table
 from swiftwrf.data.formats import RSSI_FORMATS, read
-from swiftwrf.data.store import Store
 from swiftwrf.data.receivers import read_places
 from swiftwrf.data.survey import has_positions
 from swiftwrf.errors import with_article
@@ -40,6 +39,11 @@ from tasks.terminal import console, terminal
 MEDIANS = {"great_circle_deg": "degrees", "position_error_m": "m"}  # columns of errors and their units
 
 
+Columns = dict[str, Any]  # of tensors, and arrays of names
+MAX_STEP_S = 1000.0  # between rows of a walk
+MAX_TRACKED = 20_000_000  # candidate positions of a walk that are in memory together
+
+
 def run(config: PredictConfig) -> None:
     """Write one row for each measurement or position, with truth and error where they are known.
 
@@ -51,15 +55,10 @@ def run(config: PredictConfig) -> None:
     check_new_file(out, "--out ")
     file = saved_file(Path(config.model))
     model = load(file)
-    read = (
-        None
-        if isinstance(model, FieldModel | RssiPredictor)
-        else "RSSI"
-        if isinstance(model, RssiLocator)
-        else "spectra"
-    )
+    at_positions = isinstance(model, FieldModel | RssiPredictor)
     for kinds, options in (("RSSI", config.table), ("spectra", config.spectra)):
-        if kinds != read and (unused := given(options)):
+        is_read = not at_positions and isinstance(model, RssiLocator) == (kinds == "RSSI")
+        if not is_read and (unused := given(options)):
             raise InputError(f"--{unused[0]} is for reading {kinds}, and {file} holds {with_article(model.kind)}")
     if config.track is not None and not isinstance(model, RssiLocator | MatchedField):
         raise InputError(
@@ -110,11 +109,6 @@ def saved_file(model: Path) -> Path:
     return chosen
 
 
-Columns = dict[str, Any]  # of tensors, and arrays of names
-MAX_STEP_S = 1000.0  # between rows of a walk
-MAX_TRACKED = 20_000_000  # candidate positions of a walk that are in memory together
-
-
 def positions_of_rssi(locator: RssiLocator, config: PredictConfig) -> Columns:
     """Return positions with their uncertainty, and truth and error where rows have positions.
 
@@ -123,7 +117,7 @@ def positions_of_rssi(locator: RssiLocator, config: PredictConfig) -> Columns:
     """
     source, options = config.source, reading(config.spectra, config.table)
     offsets = locator.model.offsets
-    if offsets is not None and has_column(source, offsets.column):
+    if offsets is not None and _is_table(source) and offsets.column in read_table(Path(source)).columns:
         options = replace(options, offset_by=offsets.column)
     data, is_known = read_rssi(source, options)
     origin = locator.model.origin
@@ -156,8 +150,8 @@ def read_rssi(source: str, options: ReadOptions) -> tuple[Rssi, bool]:
     Raises:
         InputError: RSSI that cannot be read.
     """
-    file = Path(source)
-    if file.is_file() and file.suffix.lower() in SUFFIXES:
+    if _is_table(source):
+        file = Path(source)
         frame = read_table(file)
         if not has_positions(frame, options.columns or {}):
             somewhere = frame.assign(x=0.0, y=0.0, z=0.0)
@@ -167,10 +161,8 @@ def read_rssi(source: str, options: ReadOptions) -> tuple[Rssi, bool]:
     return read(located(source), options, RSSI_FORMATS), True
 
 
-def has_column(source: str, name: str) -> bool:
-    """Return True if a source is a table that has a column of this name."""
-    file = Path(source)
-    return file.is_file() and file.suffix.lower() in SUFFIXES and name in read_table(file).columns
+def _is_table(source: str) -> bool:
+    return Path(source).is_file() and Path(source).suffix.lower() in SUFFIXES
 
 
 def directions(estimator: SavedEstimator, config: PredictConfig) -> Columns:
@@ -195,7 +187,7 @@ def positions_of_spectra(locator: MatchedField, config: PredictConfig) -> Column
         raise InputError(f"{config.source} has spectra of another array than those that {config.model} was fitted to")
     found: list[Tensor] = []
     index = torch.arange(len(store)) if known is None else known.index
-    batches: Iterable[Tensor] = _batches(store)
+    batches: Iterable[Tensor] = (part for batch in store.batches() for part in batch.split(BATCH_ROWS))
     if known is not None and known.channel is not None:
         batches = known.channel.split(BATCH_ROWS) if locator.n_snapshots else batches
     posteriors: Iterable[Posterior] = map(locator.locate, batches)
@@ -208,10 +200,6 @@ def positions_of_spectra(locator: MatchedField, config: PredictConfig) -> Column
 
     columns = _located(map(with_direction, posteriors), index, None if known is None else known.position)
     return columns | _directions(torch.cat(found), known)
-
-
-def _batches(store: Store) -> Iterable[Tensor]:
-    return (part for batch in store.batches() for part in batch.split(BATCH_ROWS))
 
 
 def _directions(estimate: Tensor, known: Spectra | None) -> Columns:

@@ -20,7 +20,7 @@ from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
 from swiftwrf.data.store import Store
 from swiftwrf.datasets import DATA_SETS, fetch
 from swiftwrf.errors import listed
-from tasks.options import OffsetSource, SpectraSource, TableSource
+from tasks.options import OffsetSource, SpectraSource, TableSource, by_name
 from tasks.terminal import console
 
 BATCH_ROWS = 1024  # of an array that is read
@@ -28,28 +28,16 @@ BATCH_ROWS = 1024  # of an array that is read
 
 def reading(spectra: SpectraSource, table: TableSource) -> ReadOptions:
     """Return the options of a command line for reading."""
-    offset_by = table.offset_by if isinstance(table, OffsetSource) else None
+    options = by_name(spectra) | by_name(table)
     return ReadOptions(
-        array=_array(spectra),
-        beamformer=spectra.beamformer,
-        grid=AngularGrid.hemisphere(*spectra.grid) if spectra.grid else None,
-        every=spectra.every,
-        station=spectra.station,
-        subcarriers=spectra.subcarriers,
-        bandwidth=spectra.bandwidth,
-        drop_null=spectra.drop_null,
-        drop_elements=spectra.drop_elements,
-        round_trip=spectra.round_trip,
-        columns=table.column_names,
-        filler=table.fillers,
-        coordinates=table.coordinates,
-        transmitter=table.transmitter,
-        pool_by=table.pool_by,
-        scale=table.scale,
-        y_down=table.y_down,
-        up=table.up,
-        window=table.window,
-        offset_by=offset_by and offset_by.partition("=")[0],
+        **options
+        | {
+            "array": _array(spectra),
+            "grid": AngularGrid.hemisphere(*spectra.grid) if spectra.grid else None,
+            "columns": table.column_names,
+            "filler": table.fillers,
+            "offset_by": (options.get("offset_by") or "").partition("=")[0] or None,
+        }
     )
 
 
@@ -112,13 +100,7 @@ def split_notes(train: Rssi, test: Rssi, split: str) -> list[str]:
 
 
 def observed_spectra(source: str, options: ReadOptions, grid: AngularGrid, model: str) -> tuple[Store, Spectra | None]:
-    """Read the spectra that a fitted model is applied to.
-
-    Args:
-        source: Measurements of any format, or a .npy file of spectra of unknown positions.
-        options: Options of reading.
-        grid: Directions of the spectra that the model was fitted to.
-        model: What the model is, for messages.
+    """Read the spectra that a fitted model is applied to: measurements of any format, or a .npy file.
 
     Returns:
         Spectra, and the measurements that they belong to if positions are known.

@@ -42,13 +42,10 @@ CONTINUE = "go on with swiftwrf resume DIR.partial here, with --scheduler ADDRES
 
 
 class Workers:
-    """Processes of an executor that compute as this process would.
+    """Processes of an executor that compute as this process would, on a device of the same type.
 
-    Args:
-        executor: Executor that makes the calls.
-        hold: Function that makes an object available to all calls and returns what stands for it.
-        slots: Function that returns the number of processes. It raises FitError if all are lost.
-        device: Device that every process must have.
+    `hold` makes an object available to all calls and returns what stands for it. `slots` returns the number of processes and
+    raises FitError if all are lost.
     """
 
     def __init__(

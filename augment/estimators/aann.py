@@ -46,8 +46,6 @@ class AANNConfig(EstimatorConfig):
     """peak learning rate of AdamW, one cycle"""
     max_azimuths: NonNegativeInt = 60
     """larger spectra are averaged down for the network; 0 keeps all pixels"""
-    circular: bool = False
-    """pad the azimuth circularly instead of with zeros"""
 
     @classmethod
     def for_scene(cls, n_spectra: int, preset: Preset, **options: Any) -> Self:
@@ -83,7 +81,7 @@ class AANN(SavedEstimator):
         """Make the network with its initial weights."""
         with torch.random.fork_rng(devices=[]):  # torchvision uses the global generator
             torch.manual_seed(self.config.seed)
-            network = backbone(self.config.circular, device.type == "cpu")
+            network = backbone(device.type == "cpu")
         self._network = network.to(device).to(memory_format=torch.channels_last)
         self._device = device
 

@@ -2,27 +2,11 @@
 
 from __future__ import annotations
 
-from typing import cast
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 FEATURES = 2048  # of a spectrum, behind the last convolution
-
-
-class CircularConv(nn.Module):
-    """A convolution that wraps around in azimuth and pads with zeros in elevation."""
-
-    def __init__(self, inner: nn.Conv2d) -> None:
-        super().__init__()
-        self.columns = inner.kernel_size[1] // 2
-        inner.padding = (inner.kernel_size[0] // 2, 0)
-        self.inner = inner
-
-    def forward(self, x: Tensor) -> Tensor:
-        wrapped = functional.pad(x, (self.columns, self.columns, 0, 0), mode="circular")
-        return cast(Tensor, self.inner(wrapped))
 
 
 class Pointwise(nn.Module):
@@ -69,12 +53,10 @@ class Neighbours(nn.Module):
         return functional.linear(torch.cat(neighbours, dim=-1), weight).permute(0, 3, 1, 2)
 
 
-def backbone(circular: bool, products: bool) -> nn.Module:
-    """ResNet-50 with one input channel and the head.
+def backbone(products: bool) -> nn.Module:
+    """Return ResNet-50 with one input channel and the head.
 
-    Args:
-        circular: pads the azimuth circularly.
-        products: computes its pointwise convolutions, two thirds of all, as matrix products, and those over few pixels.
+    With `products`, its pointwise convolutions, two thirds of all, are matrix products, and those over few pixels, too.
     """
     from torchvision.models import resnet50  # takes two seconds, which only a training needs
 
@@ -86,12 +68,6 @@ def backbone(circular: bool, products: bool) -> nn.Module:
     nn.init.zeros_(last.bias)
     for module in list(network.modules()):
         for name, child in module.named_children():
-            if not isinstance(child, nn.Conv2d):
-                continue
-            if products and child.kernel_size == (1, 1):
-                setattr(module, name, Pointwise(child))
-            elif circular and child.padding != (0, 0):
-                setattr(module, name, CircularConv(child))
-            elif products:
-                setattr(module, name, Neighbours(child))
+            if products and isinstance(child, nn.Conv2d):
+                setattr(module, name, (Pointwise if child.kernel_size == (1, 1) else Neighbours)(child))
     return network

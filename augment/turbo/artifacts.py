@@ -16,26 +16,12 @@ N_LAYERS = 3  # of heights between which furniture is shown
 
 
 def model_file(folder: Path, name: str, key: str) -> Path:
-    """Return the file of a run's fitted field model.
-
-    Args:
-        folder: Directory of the run.
-        name: Name of the field model.
-        key: Measured fraction in file names.
-    """
+    """Return the file of a run's fitted field model, by its name and the measured fraction in file names."""
     return folder / f"{name}-mix{key}.safetensors"
 
 
 def save_artifacts(model: FieldModel, key: str, measured: Spectra, test: Spectra, folder: Path) -> None:
-    """Save a fitted field model and its room.
-
-    Args:
-        model: Field model fitted to `measured`. Models that store the measured spectra are not saved.
-        key: Measured fraction in file names.
-        measured: Measured spectra.
-        test: Test spectra.
-        folder: Directory of the run.
-    """
+    """Save a field model fitted to the measured spectra, and its room. Models that store these spectra are not saved."""
     mix = f"mix{key}"
     if not isinstance(model, MemoryModel):
         model.save(model_file(folder, model.name, key))

@@ -11,7 +11,6 @@ import torch
 from augment.choose import Fold, ModelChoice, choose_model
 from augment.cross_validation import (
     STAND_IN,
-    CrossValidationMetrics,
     cross_validate,
     located_errors,
     located_folds,
@@ -54,15 +53,12 @@ def _first_steps(experiment: Experiment, subset: MeasuredSubset) -> list[Step[Ex
 
 @dataclass(frozen=True)
 class CrossValidation(Step[Experiment]):
-    """Compare field models on held-out measured spectra, and determine whether turbo learning helps.
+    """Compare field models on held-out measured spectra, and determine whether turbo learning helps."""
 
-    Args:
-        subset: Measured spectra.
-        compared: Names of the field models. Empty for all that are fast and whose requirements the data meet.
-    """
-
-    subset: MeasuredSubset
-    compared: tuple[str, ...]
+    subset: MeasuredSubset  # measured spectra
+    compared: tuple[
+        str, ...
+    ]  # names of the field models. Empty for all that are fast and whose requirements the data meet
 
     title = "comparing field models"
 
@@ -84,7 +80,9 @@ class CrossValidation(Step[Experiment]):
         trained = [name for name in self.compared if name in choice.folds] or [choice.name]
         validation = {name: cross_validate(choice.folds[name], experiment.n_synthetic, seed) for name in trained}
         first = validation[trained[0]]
-        turbo = self._turbo(experiment, trained[0], first.metrics)
+        number = experiment.n_extra(first.metrics)
+        training: Training = "measured + synthetic + extra" if number else "measured + synthetic"
+        turbo = Condition(STAND_IN, training, trained[0], number)
         errors = {Condition(STAND_IN, "measured").method: first.measured_only}
         errors |= {turbo.method: first.turbo} if first.turbo else {}
         folds = choice.folds[trained[0]]
@@ -93,17 +91,17 @@ class CrossValidation(Step[Experiment]):
                 errors[Condition(name, "measured").method] = [
                     measured_errors(fold, experiment.make_estimator(name, self.subset)) for fold in folds
                 ]
-        with_room = self._with_room(experiment, measured, choice)
+        kept = {}  # rooms of folds, and the numbers of their spectra in the data set
+        for number, fold in located_folds(self._with_room(experiment, measured, choice)).items():
+            file = f"{STEPS}/{self.name}-room{number}.safetensors"
+            assert fold.model.room is not None
+            fold.model.room.save(folder / file)
+            kept[number] = {"file": file, "train": fold.train.index, "test": fold.test.index}
         return {
-            "choice": {
-                "name": choice.name,
-                "psnr_db": choice.psnr_db,
-                "seconds": choice.seconds,
-                "left_out": choice.left_out,
-            },
+            "choice": {name: value for name, value in vars(choice).items() if name != "folds"},
             "cross_validation": {name: entry.metrics for name, entry in validation.items()},
             "errors": errors,
-            "folds": {number: self._keep(fold, number, folder) for number, fold in located_folds(with_room).items()},
+            "folds": kept,
         }
 
     def _with_room(self, experiment: Experiment, measured: Spectra, choice: ModelChoice) -> list[Fold]:
@@ -116,20 +114,6 @@ class CrossValidation(Step[Experiment]):
             return choose_model(measured, (ROOM_MODEL,), seed=seed, device=experiment.device).folds[ROOM_MODEL]
         except InputError:
             return []
-
-    def _keep(self, fold: Fold, number: int, folder: Path) -> Row:
-        """Keep the room of a fold. Return its file, and the numbers of the spectra in the data set."""
-        file = f"{STEPS}/{self.name}-room{number}.safetensors"
-        assert fold.model.room is not None
-        fold.model.room.save(folder / file)
-        return {"file": file, "train": fold.train.index, "test": fold.test.index}
-
-    def _turbo(self, experiment: Experiment, synthesizer: str, validation: CrossValidationMetrics) -> Condition:
-        """Return the condition of the stand-in with all spectra of a field model."""
-        number = experiment.n_extra(validation)
-        return Condition(
-            STAND_IN, "measured + synthetic + extra" if number else "measured + synthetic", synthesizer, number
-        )
 
     def then(self, experiment: Experiment, value: Row) -> Sequence[Step[Experiment]]:
         named = [name for name in experiment.models if name != AUTO]
@@ -145,12 +129,7 @@ class CrossValidation(Step[Experiment]):
 class FoldLocating(Step[Experiment]):
     """Locate held-out measured spectra of a fold, for the choice of the estimator.
 
-    Args:
-        compared: Comparison of field models that has the fold.
-        number: Number of the fold.
-        room_file: File of the fold's room.
-        train: Training spectra of the fold, by their numbers in the data set.
-        test: Test spectra of the fold, in the same way.
+    Training and test spectra of the fold are given by their numbers in the data set.
     """
 
     compared: CrossValidation
@@ -178,11 +157,7 @@ class FoldLocating(Step[Experiment]):
 
 @dataclass(frozen=True)
 class Suggestion(Step[Experiment]):
-    """Suggest positions for the next measurements.
-
-    Args:
-        subset: Measured spectra.
-    """
+    """Suggest positions for the next measurements."""
 
     subset: MeasuredSubset
 

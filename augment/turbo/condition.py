@@ -25,12 +25,7 @@ Value = TypeVar("Value")
 
 @dataclass(frozen=True)
 class MeasuredSubset:
-    """A random part of the training spectra that counts as measured.
-
-    Args:
-        measured_fraction: Fraction of the training spectra, in (0, 1].
-        repeat: Number of the repeat, which has its own seed.
-    """
+    """A random fraction (0, 1] of the training spectra that counts as measured. Each repeat has its own seed."""
 
     measured_fraction: float
     repeat: int = 0
@@ -141,13 +136,7 @@ def conditions_of(methods: Mapping[str, Mapping[str, Any]]) -> dict[str, Conditi
 
 
 def chosen_file(folder: Path, measured_fraction: str, condition: Condition | None) -> Path | None:
-    """Return the file of a chosen condition in the directory of a run, or None if there is none.
-
-    Args:
-        folder: Directory of the run.
-        measured_fraction: Measured fraction in file names.
-        condition: Condition that cross-validation chose, if any.
-    """
+    """Return the file of the condition that cross-validation chose, in the directory of a run, or None if there is none."""
     if condition is None:
         return None
     alone = condition.estimator == STAND_IN and condition.training == "measured"
@@ -174,10 +163,6 @@ def reference_of(conditions: Mapping[str, Condition], error: Mapping[str, float]
 
     A gain by synthetic spectra is relative to it. It is chosen by its error on test spectra, which favours it: the gain is
     not overestimated. Matched-field processing is left out, because it is no regression from spectra to directions.
-
-    Args:
-        conditions: Condition of each method.
-        error: Error of each method.
 
     Example:
         >>> conditions = {c.method: c for c in (Condition("peak", "measured"), Condition("kernel_regression", "measured"))}

@@ -15,7 +15,7 @@ from augment.estimators import Estimator
 from augment.turbo.choice import first_steps
 from augment.turbo.condition import Condition, Row, chosen_file, conditions_of
 from augment.turbo.experiment import ROOM_MODEL, Experiment
-from augment.turbo.results import MixMetrics, Results
+from augment.turbo.results import Results
 from augment.turbo.synthesis import Evaluation
 from swiftwrf.choices import AUTO, fraction_key
 from swiftwrf.data import Spectra
@@ -47,14 +47,15 @@ class TurboResult:
         ('kernel_regression, measured', 'KernelRegression')
     """
 
-    def __init__(self, results: Results, metrics: MixMetrics, best: Estimator | MatchedField | None) -> None:
+    def __init__(self, results: Results, metrics: Row, best: Estimator | MatchedField | None) -> None:
         self.errors, self.positions = DataFrame(results.errors()), DataFrame(results.positions())
         self.metrics, self.best, self.left_out = metrics, best, results.notes
 
     @property
     def choice(self) -> EstimatorChoiceMetrics | None:
         """Choice of the estimator by cross-validation; `choice["name"]` is its method. None if nothing was compared."""
-        return self.metrics["estimator_choice"]
+        found: EstimatorChoiceMetrics | None = self.metrics["estimator_choice"]
+        return found
 
     def summary(self) -> DataFrame:
         """Return a row for each method, the smallest median first.

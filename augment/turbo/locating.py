@@ -30,17 +30,11 @@ BATCH_SPECTRA = 256  # spectra located at a time: a posterior has a thousand can
 
 @dataclass(frozen=True)
 class Locating(Step[Experiment]):
-    """Locate the moving end from the test spectra by the room that was found.
+    """Locate the moving end from the test spectra by the room that was found."""
 
-    Args:
-        subset: Measured spectra.
-        room_file: File of the room in the run's directory.
-        room_seconds: Time of the search for the room [s], which counts as part of the training.
-    """
-
-    subset: MeasuredSubset
-    room_file: str
-    room_seconds: float = 0.0
+    subset: MeasuredSubset  # measured spectra
+    room_file: str  # file of the room in the run's directory
+    room_seconds: float = 0.0  # time of the search for the room [s], which counts as part of the training
 
     title = LOCATED
 
@@ -102,11 +96,7 @@ def located(locator: MatchedField, test: Spectra) -> dict[str, Tensor]:
 
 
 def containing_level(posterior: Posterior, truth: Tensor) -> Tensor:
-    """Return the smallest level whose credible region, a ball around the median, contains the true position, (n,).
-
-    Args:
-        posterior: Posterior over positions for each of n observations.
-        truth: True positions (n, 3) [m].
+    """Return the smallest level (n,) whose credible region, a ball around the median, contains the position (n, 3) [m].
 
     Example:
         >>> at = torch.tensor([[[0.0, 0, 0], [1.0, 0, 0]]], dtype=torch.float64)
@@ -125,14 +115,7 @@ def containing_level(posterior: Posterior, truth: Tensor) -> Tensor:
 def examples(
     locator: MatchedField, measured: Spectra, test: Spectra, found: dict[str, Tensor]
 ) -> dict[str, NDArray[Any]]:
-    """Return the room and the posteriors of six test spectra, from the smallest to the largest position error.
-
-    Args:
-        locator: Fitted locator.
-        measured: Measured spectra.
-        test: Test spectra.
-        found: Result of `located` for all test spectra.
-    """
+    """Return the room and the posteriors of six located test spectra, from the smallest position error to the largest."""
     order = (found["position"] - test.position).norm(dim=1).argsort()
     chosen = order[[round(q * (len(order) - 1)) for q in EXAMPLE_QUANTILES]]
     posterior = locator.locate(test.subset(chosen))

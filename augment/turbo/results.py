@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal, TypedDict, get_args
 
 import numpy as np
 import torch
@@ -15,7 +14,6 @@ from torch import Tensor
 from augment.cross_validation import (
     LOCATOR,
     STAND_IN,
-    CrossValidationMetrics,
     EstimatorChoiceMetrics,
     choose_estimator,
 )
@@ -25,98 +23,15 @@ from augment.turbo.experiment import ROOM_MODEL, Experiment
 from augment.turbo.locating import LEVEL, NO_PLANE, Locating
 from augment.turbo.synthesis import Evaluation, RoomSearch, Synthesis
 from swiftwrf.choices import AUTO, fraction_key
-from swiftwrf.metrics import ChangeMetrics, ErrorSummary, angle_errors, paired_change, summary
+from swiftwrf.metrics import ErrorSummary, angle_errors, paired_change, summary
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.runtime.steps import Step
 
-Angle = Literal["azimuth_deg", "elevation_deg", "great_circle_deg"]
-Score = Literal["psnr_db", "ssim", "l1"]
-ANGLES: tuple[Angle, ...] = get_args(Angle)
-SCORES: tuple[Score, ...] = get_args(Score)
-
-
-class SynthesisMetrics(TypedDict):
-    """Quality of one field model at the test positions; seconds to `fit` and to `synthesize`, means of the repeats."""
-
-    psnr_db: ErrorSummary
-    ssim: ErrorSummary
-    l1: ErrorSummary
-    seconds: dict[str, float]
-
-
-class MethodMetrics(TypedDict):
-    """Errors of one condition; seconds to `train` and to `estimate`, means of the repeats.
-
-    `changes`, of conditions with synthetic spectra, is the change of the angular error by the method that it is compared to:
-    the same estimator on measured spectra, and the best one on measured spectra. Its interval is paired over test positions.
-    """
-
-    estimator: str
-    training: str
-    synthesizer: str
-    n_synthetic: int
-    azimuth_deg: ErrorSummary
-    elevation_deg: ErrorSummary
-    great_circle_deg: ErrorSummary
-    changes: dict[str, ChangeMetrics]
-    seconds: dict[str, float]
-
-
-class ChoiceMetrics(TypedDict):
-    """Chosen field model; trimmed mean PSNR [dB] and seconds of each candidate; reasons why others could not be fitted."""
-
-    name: str
-    psnr_db: dict[str, float]
-    seconds: dict[str, float]
-    left_out: dict[str, str]
-
-
-class LocatingMetrics(TypedDict):
-    """Metrics of located test positions.
-
-    Position error [m], fraction of the test positions inside their 80 % credible region, fraction of ambiguous spectra, and
-    weights of the likelihoods (first repeat). Seconds, means of the repeats, are those to find the `room`, to `fit` the
-    locator and to `locate` all test spectra.
-    """
-
-    position_error_m: ErrorSummary
-    coverage_80: float
-    ambiguous: float
-    weights: list[float]
-    seconds: dict[str, float]
-
-
-class MixMetrics(TypedDict):
-    """Metrics of one measured fraction.
-
-    `choice`, `cross_validation` (by field model) and `estimator_choice` are of the first repeat. `counts` are spectra by
-    origin in each training set. Seconds are those to `fit` and `synthesize` of the trained field models and to `train` all
-    networks.
-
-    The method on measured spectra with the smallest test error, without matched-field processing, is the `reference`. Values
-    of `locating` are by method. Values of `left_out` are reasons why a method is missing.
-    """
-
-    n_measured: int
-    counts: dict[str, dict[str, int]]
-    choice: ChoiceMetrics | None
-    cross_validation: dict[str, CrossValidationMetrics] | None
-    estimator_choice: EstimatorChoiceMetrics | None
-    synthesis: dict[str, SynthesisMetrics]
-    methods: dict[str, MethodMetrics]
-    reference: str
-    locating: dict[str, LocatingMetrics]
-    left_out: dict[str, str]
-    seconds: dict[str, float]
+ANGLES = ("azimuth_deg", "elevation_deg", "great_circle_deg")
 
 
 class Results:
-    """Results of the steps, collected one by one.
-
-    Args:
-        experiment: Data and options that the steps share.
-        on_note: Called with each new sentence about a method that is missing.
-    """
+    """Results of the steps, collected one by one; `on_note` is called with each sentence about a method that is missing."""
 
     def __init__(self, experiment: Experiment, on_note: Callable[[str], object] | None = None) -> None:
         self.experiment, self.test = experiment, experiment.test
@@ -223,15 +138,30 @@ class Results:
         self.synthesis_seconds.append(key | value["seconds"] | {"trains": step.trains})
         self.history += [key | row for row in value["history"]]
 
-    def summary(self, fraction: float) -> MixMetrics:
-        """Return the numbers of metrics.json for one measured fraction."""
+    def summary(self, fraction: float) -> Row:
+        """Return the numbers of metrics.json for one measured fraction.
+
+        Returns:
+            n_measured: Number of measured spectra.
+            counts: Spectra by origin in each training set.
+            choice: Chosen field model, trimmed mean PSNR [dB] and seconds of each candidate, and reasons why others could
+                not be fitted. This and the next two are of the first repeat, None without a comparison.
+            cross_validation: `CrossValidationMetrics` by field model.
+            estimator_choice: `EstimatorChoiceMetrics`.
+            synthesis: Quality of each field model at the test positions, and its mean seconds to `fit` and `synthesize`.
+            methods: Condition, errors, mean seconds and `changes` of each method. These are changes of the angular error by
+                synthetic spectra, by the method that it is compared to: the same estimator on measured spectra, and the
+                reference. Their intervals are paired over test positions.
+            reference: Method with the smallest test error on measured spectra, without matched-field processing.
+            locating: Position error [m], fractions of test positions in their 80 % region and of ambiguous spectra,
+                weights of the likelihoods (first repeat) and mean seconds of each method that locates.
+            left_out: Reasons why methods are missing.
+            seconds: Those to `fit` and `synthesize` of the trained field models, and to `train` all networks.
+        """
         chosen = self.chosen.get(fraction_key(fraction), {})
         evaluated = [(c, value) for c, value in self.evaluated if c.measured_fraction == fraction]
-        synthesis, fits = (
-            DataFrame([row for row in rows if row["measured_fraction"] == fraction])
-            for rows in (self.synthesis, self.synthesis_seconds)
-        )
-        trained = fits[fits["trains"]]
+        scores, fits = _of_fraction(self.synthesis, fraction), _of_fraction(self.synthesis_seconds, fraction)
+        spent, trained = averaged(fits, "synthesizer", ("fit", "synthesize")), fits[fits["trains"]]
         methods, reference = self._method_metrics(fraction)
         return {
             "n_measured": round(fraction * len(self.experiment.train)),
@@ -239,7 +169,10 @@ class Results:
             "choice": chosen.get("choice"),
             "cross_validation": chosen.get("cross_validation"),
             "estimator_choice": self._estimator_choice(fraction),
-            "synthesis": _synthesis_metrics(synthesis, fits),
+            "synthesis": {
+                name: {**entry, "seconds": spent[name]}
+                for name, entry in summaries(scores, "synthesizer", ("psnr_db", "ssim", "l1")).items()
+            },
             "methods": methods,
             "reference": reference,
             "locating": self._locating_metrics(fraction),
@@ -272,8 +205,8 @@ class Results:
 
     def _better(self, fraction: float, choice: EstimatorChoiceMetrics) -> dict[str, str]:
         """Return the methods that are significantly better than the chosen one on the test spectra, and why not chosen."""
-        errors = DataFrame([row for row in self.errors() if row["measured_fraction"] == fraction])
-        error = {method: by_repeat(part, "great_circle_deg") for method, part in errors.groupby("method")}
+        errors = _of_fraction(self.errors(), fraction).groupby("method")
+        error = {method: by_repeat(part, "great_circle_deg") for method, part in errors}
         reasons = {}
         for condition, _ in self.pooled:
             if condition.measured_fraction != fraction or condition.training == "all measured":
@@ -297,35 +230,34 @@ class Results:
             return method
         return next((c.method for c in own if c.is_turbo and c.estimator == STAND_IN), method)
 
-    def _method_metrics(self, fraction: float) -> tuple[dict[str, MethodMetrics], str]:
+    def _method_metrics(self, fraction: float) -> tuple[dict[str, Row], str]:
         """Return the metrics of each method, and the reference of changes."""
         own = [(condition, value) for condition, value in self.pooled if condition.measured_fraction == fraction]
         conditions = {condition.method: condition for condition, _ in reversed(own)}  # of the first repeat
-        errors = DataFrame([row for row in self.errors() if row["measured_fraction"] == fraction])
-        seconds = averaged(
-            DataFrame([c.columns | value["seconds"] for c, value in own]), "method", ("train", "estimate")
-        )
+        errors = _of_fraction(self.errors(), fraction)
+        times = DataFrame([c.columns | value["seconds"] for c, value in own])
+        seconds = averaged(times, "method", ("train", "estimate"))
         found = summaries(errors, "method", ANGLES)
         reference = reference_of(
             conditions, {name: entry["great_circle_deg"]["median"] for name, entry in found.items()}
         )
-        changes = _changes(errors, conditions, reference)
-        metrics = {
-            method: {**conditions[method].description, **entry, "changes": changes[method], "seconds": seconds[method]}
-            for method, entry in found.items()
-        }
-        return metrics, reference  # type: ignore[return-value]
+        error = {method: by_repeat(part, "great_circle_deg") for method, part in errors.groupby("method")}
+        metrics = {}
+        for method, entry in found.items():
+            condition = conditions[method]
+            others = dict.fromkeys((condition.measured_only.method, reference)) if condition.is_turbo else ()
+            changes = {other: paired_change(error[other], error[method]) for other in others if other in conditions}
+            metrics[method] = {**condition.description, **entry, "changes": changes, "seconds": seconds[method]}
+        return metrics, reference
 
-    def _locating_metrics(self, fraction: float) -> dict[str, LocatingMetrics]:
-        rows = DataFrame([row for row in self.positions() if row["measured_fraction"] == fraction])
+    def _locating_metrics(self, fraction: float) -> dict[str, Row]:
+        rows = _of_fraction(self.positions(), fraction)
         if not len(rows):
             return {}
-        located = [(c, value["located"]) for c, value in self.evaluated if "located" in value]
-        own = [(c, found) for c, found in located if c.measured_fraction == fraction]
+        own = [(c, v["located"]) for c, v in self.evaluated if "located" in v and c.measured_fraction == fraction]
         weights = {c.method: found["weights"] for c, found in reversed(own)}  # of the first repeat
-        seconds = averaged(
-            DataFrame([c.columns | found["seconds"] for c, found in own]), "method", ("room", "fit", "locate")
-        )
+        times = DataFrame([c.columns | found["seconds"] for c, found in own])
+        seconds = averaged(times, "method", ("room", "fit", "locate"))
         shares = averaged(rows, "method", ("covered", "ambiguous"))
         return {
             method: {
@@ -339,29 +271,9 @@ class Results:
         }
 
 
-def _changes(
-    errors: DataFrame, conditions: dict[str, Condition], reference: str
-) -> dict[str, dict[str, ChangeMetrics]]:
-    """Return the changes of the angular error by synthetic spectra of each method, by the method that it is compared to."""
-    error = {method: by_repeat(part, "great_circle_deg") for method, part in errors.groupby("method")}
-    compared = {
-        method: [other for other in dict.fromkeys((condition.measured_only.method, reference)) if other in conditions]
-        if condition.is_turbo
-        else []
-        for method, condition in conditions.items()
-    }
-    return {
-        method: {other: paired_change(error[other], error[method]) for other in others}
-        for method, others in compared.items()
-    }
-
-
-def _synthesis_metrics(scores: DataFrame, seconds: DataFrame) -> dict[str, SynthesisMetrics]:
-    spent = averaged(seconds, "synthesizer", ("fit", "synthesize"))
-    return {
-        name: {**entry, "seconds": spent[name]}  # type: ignore[typeddict-item]
-        for name, entry in summaries(scores, "synthesizer", SCORES).items()
-    }
+def _of_fraction(rows: list[Row], fraction: float) -> DataFrame:
+    """Return the rows of a measured fraction as a table."""
+    return DataFrame([row for row in rows if row["measured_fraction"] == fraction])
 
 
 def rows_of(key: Row, columns: dict[str, Tensor]) -> list[Row]:
@@ -371,13 +283,7 @@ def rows_of(key: Row, columns: dict[str, Tensor]) -> list[Row]:
 
 
 def summaries(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dict[str, ErrorSummary]]:
-    """Return a summary of each column over all test rows and repeats, for each value of `by`.
-
-    Args:
-        table: A row for each value of `by`, `repeat` and `index`, the test row.
-        by: Column of names.
-        columns: Columns of errors.
-    """
+    """Return a summary of columns of errors over all test rows (`index`) and repeats, for each value of `by`."""
     return {
         str(name): {column: repeated_summary(by_repeat(part, column)) for column in columns}
         for name, part in table.groupby(by, sort=False)

@@ -6,9 +6,7 @@ plane (0) to its normal (90 degrees). Angles are in radians inside the package a
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated
@@ -20,7 +18,7 @@ from torch import Tensor
 
 from swiftwrf.errors import InputError
 from swiftwrf.positions import to_tensor
-from swiftwrf.runtime.validation import checked, configuration
+from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, checked, configuration
 
 MAX_GRID_PIXELS = 2**24  # of one spectrum
 Size = Annotated[int, Ge(2), Le(MAX_GRID_PIXELS)]
@@ -46,43 +44,16 @@ class AngularGrid:
     """
 
     elevation_start: float
-    elevation_step: float
-    n_elevation: int
+    elevation_step: PositiveFloat
+    n_elevation: PositiveInt
     azimuth_start: float
-    n_azimuth: int
+    n_azimuth: PositiveInt
 
     def check(self) -> None:
-        """Refuse no pixels, too many of them, and angles that are not finite."""
-        sizes, angles = (
-            (self.n_elevation, self.n_azimuth),
-            (self.elevation_start, self.elevation_step, self.azimuth_start),
-        )
-        if min(sizes) < 1 or math.prod(sizes) > MAX_GRID_PIXELS:
-            raise InputError(
-                f"a grid has whole numbers of rows and columns and at most {MAX_GRID_PIXELS} pixels, got {sizes}"
-            )
-        if not all(map(math.isfinite, angles)) or self.elevation_step <= 0:
-            raise InputError(f"a grid needs finite angles and a step above 0, got {angles} [rad]")
-
-    @classmethod
-    def degrees(cls, elevation: Sequence[float], azimuth: Sequence[float]) -> AngularGrid:
-        """Return the grid of the given angles in degrees, e.g. `degrees(elevation=range(1, 91), azimuth=range(360))`.
-
-        Raises:
-            InputError: No finite numbers, uneven spacing, descending order, or azimuths that do not cover the circle once.
-        """
-        rows, columns = (
-            to_tensor(name, angles, torch.float64, (None,), missing=True).tolist()
-            for name, angles in (("elevation", elevation), ("azimuth", azimuth))
-        )
-        row_step = _even_step(rows, "elevation")
-        column_step = _even_step(columns, "azimuth")
-        if abs(column_step * len(columns) - 360) > 1e-6 * 360:
-            raise InputError(
-                f"azimuths must go once round the circle, but {len(columns)} columns of {column_step:g} degrees make "
-                f"{column_step * len(columns):g} degrees; give evenly spaced azimuths over 360 degrees"
-            )
-        return cls(math.radians(rows[0]), math.radians(row_step), len(rows), math.radians(columns[0]), len(columns))
+        """Refuse too many pixels, and angles that are not finite."""
+        angles = self.elevation_start, self.elevation_step, self.azimuth_start
+        if math.prod(self.shape) > MAX_GRID_PIXELS or not all(map(math.isfinite, angles)):
+            raise InputError(f"a grid has finite angles [rad] and at most {MAX_GRID_PIXELS} pixels, got {self}")
 
     @classmethod
     @checked
@@ -92,11 +63,8 @@ class AngularGrid:
         Raises:
             InputError: A size that is no whole number from 2 on, or too many pixels.
         """
-        step = 90 / n_elevation
-        return cls.degrees(
-            elevation=[step * (row + 1) for row in range(n_elevation)],
-            azimuth=[360 / n_azimuth * column for column in range(n_azimuth)],
-        )
+        step = math.radians(90 / n_elevation)
+        return cls(step, step, n_elevation, 0.0, n_azimuth)
 
     @classmethod
     def of(cls, grid: AngularGrid | tuple[int, int]) -> AngularGrid:
@@ -147,15 +115,6 @@ class AngularGrid:
         pixel = spectrum.flatten(1).argmax(dim=1).cpu()
         angles = torch.stack([self.azimuth[pixel % self.n_azimuth], self.elevation[pixel // self.n_azimuth]], dim=-1)
         return angles.to(spectrum.device)
-
-
-def _even_step(values: list[float], name: str) -> float:
-    if len(values) < 2:
-        raise InputError(f"a grid needs at least 2 {name}s, got {len(values)}")
-    step = (values[-1] - values[0]) / (len(values) - 1)
-    if not step > 0 or not all(abs(b - a - step) <= 1e-6 * step for a, b in itertools.pairwise(values)):
-        raise InputError(f"{name}s must ascend in even steps, got {values[:3]} ... {values[-1]} [degrees]")
-    return step
 
 
 def to_direction(azimuth: Tensor, elevation: Tensor) -> Tensor:

@@ -187,19 +187,13 @@ def _axes(array: PlanarArray) -> Tensor:
     return torch.eye(2, dtype=torch.float64) if array.axis is None else array.axis[:2, None].double()
 
 
-def _signal(matrix: Tensor) -> Tensor:
-    """Return the eigenvector of the largest eigenvalue of each covariance, (n, K)."""
-    largest: Tensor = torch.linalg.eigh(matrix).eigenvectors[..., -1]
-    return largest
-
-
 def _music(array: PlanarArray, matrix: Tensor) -> Tensor:
-    signal = _signal(matrix)
+    signal = torch.linalg.eigh(matrix).eigenvectors[..., -1]
     return _maximum(array, signal[..., None] @ signal[:, None].conj())
 
 
 def _esprit(array: PlanarArray, matrix: Tensor) -> Tensor:
-    signal = _signal(matrix)
+    signal = torch.linalg.eigh(matrix).eigenvectors[..., -1]
     shift, groups = _shifts(array)
     turned = [(signal[:, b].conj() * signal[:, a]).sum(-1).angle() for a, b in groups]
     cosine: Tensor = torch.stack(turned, dim=-1) / math.tau @ torch.linalg.inv(shift).T

@@ -57,20 +57,10 @@ def load_spectra(
         Traceback (most recent call last):
         swiftwrf.errors.InputError: nowhere is not a folder or file; expected measurements (formats: ...)
     """
-    options = ReadOptions(
-        array=array,
-        beamformer=beamformer,
-        grid=None if grid is None else AngularGrid.of(grid),
-        every=every,
-        station=station,
-        subcarriers=subcarriers,
-        bandwidth=bandwidth,
-        drop_null=drop_null,
-        drop_elements=drop_elements,
-        round_trip=round_trip,
-    )
-    data = read(path, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS)
-    return data.spectra(options.grid, options.beamformer or PHASE) if isinstance(data, Snapshots) else data
+    options = locals().copy()
+    source, directions = options.pop("path"), None if grid is None else AngularGrid.of(grid)
+    data = read(source, ReadOptions(**options | {"grid": directions}), SPECTRA_FORMATS, SNAPSHOT_FORMATS)
+    return data.spectra(directions, beamformer or PHASE) if isinstance(data, Snapshots) else data
 
 
 def load_snapshots(path: str | Path, **options: Any) -> Snapshots:
@@ -135,19 +125,8 @@ def load_rssi(
         ...     load_rssi(file).receiver_names
         ('kitchen', 'hall')
     """
-    options = ReadOptions(
-        columns=columns,
-        filler=filler,
-        coordinates=coordinates,
-        offset_by=offset_by,
-        transmitter=transmitter,
-        pool_by=pool_by,
-        scale=scale,
-        y_down=y_down,
-        up=up,
-        window=window,
-    )
-    data: Rssi = read(path, options, RSSI_FORMATS)
+    options = locals().copy()
+    data: Rssi = read(options.pop("path"), ReadOptions(**options), RSSI_FORMATS)
     return data
 
 

@@ -194,19 +194,10 @@ def _in_hdf5(content: Any, name: str) -> Stored:
     owner, key = content, name
     if is_own(content, name, h5py.Group) and {"type", "value"} <= set(content[name]):  # as Octave saves variables
         owner, key = content[name], "value"
-    own = is_own(owner, key, h5py.Dataset)
-    dtype = _number_type(owner[key].dtype) if own and not (owner[key].is_virtual or owner[key].external) else None
-    if dtype is None:
+    own = is_own(owner, key, h5py.Dataset) and not (owner[key].is_virtual or owner[key].external)
+    dtype: Any = owner[key].dtype if own else np.dtype(object)
+    if dtype.names == ("real", "imag") and dtype[0] == dtype[1] and dtype[0].kind == "f" and dtype.itemsize in (8, 16):
+        dtype = np.dtype(f"{dtype[0].byteorder}c{dtype.itemsize}")  # as MATLAB saves complex numbers
+    if dtype.kind not in NUMBERS:
         raise ValueError(f"{name} is no array of numbers in this file")
     return math.prod(owner[key].shape) * dtype.itemsize, lambda: np.asarray(owner[key][()]).view(dtype)
-
-
-def _number_type(dtype: np.dtype[Any]) -> np.dtype[Any] | None:
-    """Return the type of numbers in HDF5: complex for compounds of real and imaginary parts, None for anything else."""
-    if dtype.kind in NUMBERS:
-        return dtype
-    if dtype.names not in (("real", "imag"), ("r", "i")) or dtype.itemsize not in (8, 16):
-        return None
-    part = dtype[0]
-    is_complex = part == dtype[1] and part.kind == "f" and 2 * part.itemsize == dtype.itemsize
-    return np.dtype(f"{part.byteorder}c{dtype.itemsize}") if is_complex else None

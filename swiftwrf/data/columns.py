@@ -5,13 +5,10 @@ from __future__ import annotations
 import fnmatch
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from swiftwrf.data.cells import parsed, plain_name, text_of
 from swiftwrf.data.powers import KNOWN_FILLERS, MIN_RSSI_DBM
@@ -245,47 +242,3 @@ def is_coordinate(name: str) -> bool:
         for role in (*GEODETIC, "z", *GEODETIC.values())
         for pattern in ROLES[role]
     )
-
-
-def numbered(names: Tensor | Sequence[str | int]) -> Tensor:
-    """Return the number of each name in the order of first occurrence, int64 (n,); numbers of a tensor stay.
-
-    Example:
-        >>> numbered(["out", "back", "out"])
-        tensor([0, 1, 0])
-    """
-    if isinstance(names, Tensor):
-        return names.long()
-    return torch.from_numpy(pd.factorize(np.asarray(names, dtype=object))[0].astype(np.int64))
-
-
-@dataclass(frozen=True, eq=False)
-class Groups:
-    """Groups of rows between which RSSI has constant offsets, e.g. devices or channels.
-
-    Args:
-        column: Name of the column with the groups' names.
-        names: Names of the groups.
-        code: Group of each row, int64 (n,).
-    """
-
-    column: str
-    names: tuple[str, ...]
-    code: Tensor
-
-    @classmethod
-    def of(cls, column: str, values: Sequence[str]) -> Groups:
-        """Return the groups of n rows by their values in a column."""
-        code, names = pd.factorize(np.asarray(values, dtype=object), sort=True)
-        return cls(column, tuple(map(str, names)), torch.from_numpy(code.astype(np.int64)))
-
-    def __len__(self) -> int:
-        return len(self.code)
-
-    def subset(self, rows: Tensor) -> Groups:
-        """Return the groups of the given rows."""
-        return replace(self, code=self.code[rows])
-
-    def labels(self) -> list[str]:
-        """Return the name of each row's group."""
-        return [self.names[code] for code in self.code.tolist()]

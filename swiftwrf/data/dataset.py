@@ -158,7 +158,9 @@ class PositionedData(Labelled, Displayed):
         number = torch.from_numpy(found.copy())
         values = {field: getattr(self, field) for field in self.row_fields}
         kept: dict[str, Any] = {
-            f: v[number] if isinstance(v, Tensor) else v.subset(number) for f, v in values.items() if v is not None
+            f: v[number] if isinstance(v, Tensor) else v.iloc[found] if isinstance(v, pd.Series) else v.subset(number)
+            for f, v in values.items()
+            if v is not None
         }
         return self.derived(**kept, named_splits={})
 

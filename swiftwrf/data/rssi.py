@@ -12,7 +12,6 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from swiftwrf.data.columns import Groups, numbered
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin
 from swiftwrf.data.dataset import Arrays, Numbers, PositionedData, position_coordinates, to_positions
 from swiftwrf.data.powers import check_powers
@@ -41,7 +40,7 @@ class Rssi(PositionedData):
         receiver_position: Positions of the receivers, (R, 3) [m], nan where unknown. Defaults to nan for all.
         receiver_names: Names of the receivers. Defaults to receiver1, receiver2, ...
         origin: Latitude and longitude of x = y = 0, if the positions were projected from degrees.
-        groups: Groups of rows between which RSSI has constant offsets.
+        groups: Name of each row's group, e.g. a device, between which RSSI has constant offsets; named as their column.
         offsets: Offsets that were removed from the RSSI.
         labels: Names of columns of the table that distinguish groups of rows.
         floors: Floors of the building, by height.
@@ -67,7 +66,7 @@ class Rssi(PositionedData):
     receiver_position: Tensor
     receiver_names: tuple[str, ...]
     origin: GeodeticOrigin | None
-    groups: Groups | None
+    groups: pd.Series | None
     offsets: Offsets | None
     labels: tuple[str, ...]
     floors: Floors | None
@@ -87,7 +86,7 @@ class Rssi(PositionedData):
         receiver_position: Numbers | None = None,
         receiver_names: Sequence[str] | None = None,
         origin: GeodeticOrigin | None = None,
-        groups: Groups | None = None,
+        groups: pd.Series | None = None,
         offsets: Offsets | None = None,
         labels: tuple[str, ...] = (),
         floors: Floors | None = None,
@@ -112,6 +111,8 @@ class Rssi(PositionedData):
             raise InputError(
                 f"{name} has {count} receivers, but the names {listed(names)}; give each receiver one of its own"
             )
+        if session is not None and not isinstance(session, Tensor):
+            session = torch.from_numpy(pd.factorize(np.asarray(session, dtype=object))[0])
         places = torch.full((count, 3), torch.nan) if receiver_position is None else receiver_position
         super().__init__(
             name,
@@ -121,13 +122,13 @@ class Rssi(PositionedData):
             receiver_position=to_positions("receiver_position", places, (count, 3), missing=True),
             receiver_names=names,
             origin=origin,
-            groups=groups,
+            groups=None if groups is None else groups.astype("category"),
             offsets=offsets,
             labels=labels,
             floors=floors,
             receiver_moves=receiver_moves,
             plan_scale=plan_scale,
-            session=None if session is None else numbered(session),
+            session=None if session is None else session.long(),
             time=None if time is None else to_tensor("time", time, torch.float64, (None,), missing=True),
         )
         check_powers(name, rssi.numpy(), names, self.index.numpy()[:, None])
@@ -343,7 +344,7 @@ class Offsets:
 
     def of(self, data: Rssi) -> Tensor:
         """Return the offset of each row, float64 (n,) [dB]; 0 for a group without an estimate, or without groups."""
-        labels = data.groups.labels() if data.groups else [self.reference] * len(data)
+        labels = [self.reference] * len(data) if data.groups is None else data.groups.tolist()
         return torch.tensor([self.offset_db.get(label, 0.0) for label in labels], dtype=torch.float64)
 
     def removed(self, data: Rssi) -> Rssi:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -123,21 +122,12 @@ class ShoeboxRoom:
         segments = [(s.contiguous(), d.contiguous()) for s, d in zip(start.unbind(-1), step.unbind(-1), strict=True)]
         blocked = torch.zeros(ray.shape[:2], dtype=torch.bool)
         for low, high in self.boxes:
-            blocked |= _hits(segments, low, high).any(dim=-1)
+            enter, leave = torch.zeros_like(segments[0][0]), torch.ones_like(segments[0][0])  # fractions of a segment
+            for (start, step), near, far in zip(segments, low, high, strict=True):
+                a, b = (near - start) / step, (far - start) / step
+                enter, leave = torch.maximum(enter, torch.minimum(a, b)), torch.minimum(leave, torch.maximum(a, b))
+            blocked |= (enter < leave).any(dim=-1)
         return blocked
-
-
-def _hits(segments: Sequence[tuple[Tensor, Tensor]], low: Point, high: Point) -> Tensor:
-    """Return whether segments pass through the box between two corners, bool (...).
-
-    Segments are start and step (...) along each axis; no step is 0.
-    """
-    enter = torch.zeros_like(segments[0][0])
-    leave = torch.ones_like(enter)
-    for (start, step), near, far in zip(segments, low, high, strict=True):
-        a, b = (near - start) / step, (far - start) / step
-        enter, leave = torch.maximum(enter, torch.minimum(a, b)), torch.minimum(leave, torch.maximum(a, b))
-    return enter < leave
 
 
 @checked

@@ -102,7 +102,15 @@ class Spectra(PositionedData):
         if position is None or (spectra is None) == (store is None):
             raise InputError("Spectra takes spectra and their positions: Spectra(spectra, position, ...)")
         position = to_positions("position", position)
-        store = _checked_store(spectra) if store is None else store
+        if store is None:
+            is_bytes = getattr(spectra, "dtype", None) in (torch.uint8, "uint8")
+            values = to_tensor("spectra", spectra, torch.uint8 if is_bytes else torch.float32, (None, None, None))
+            low, high = (0.0, 1.0) if is_bytes or not values.numel() else map(float, values.aminmax())
+            if low < -1e-6 or high > 1 + 1e-6:  # from rounding
+                raise InputError(
+                    f"spectra are magnitudes in [0, 1], got {low:.4g} to {high:.4g}; divide them by the largest"
+                )
+            store = Store(values if is_bytes else values.clamp(0, 1))
         grid = grid or AngularGrid.hemisphere(*store.shape[1:])
         if grid.shape != store.shape[1:]:
             raise InputError(f"spectra of shape {store.shape} do not fit a grid of {grid.shape} directions")
@@ -271,16 +279,6 @@ def direction_coordinates(grid: AngularGrid) -> Arrays:
     """
     angles = zip(DIRECTION, (grid.elevation, grid.azimuth), strict=True)
     return {name: ((name,), angle.rad2deg().numpy(), {"units": "degree"}) for name, angle in angles}
-
-
-def _checked_store(spectra: Numbers) -> Store:
-    """Return magnitudes in [0, 1] as float32, or bytes, in memory."""
-    is_bytes = getattr(spectra, "dtype", None) in (torch.uint8, "uint8")
-    values = to_tensor("spectra", spectra, torch.uint8 if is_bytes else torch.float32, (None, None, None))
-    low, high = (0.0, 1.0) if is_bytes or not values.numel() else (float(end) for end in values.aminmax())
-    if low < -1e-6 or high > 1 + 1e-6:  # from rounding
-        raise InputError(f"spectra are magnitudes in [0, 1], got {low:.4g} to {high:.4g}; divide them by the largest")
-    return Store(values if is_bytes else values.clamp(0, 1))
 
 
 def array_spectra(array: PlanarArray, channel: Tensor, grid: AngularGrid, beamformer: str = PHASE) -> Store:

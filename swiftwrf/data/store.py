@@ -147,7 +147,10 @@ def stored(
     if (found := _mapped(file, shape, dtype)) is None:
         with refusing_unwritable(file.parent):
             file.parent.mkdir(parents=True, exist_ok=True)
-            _prune(file.parent)
+            for other in file.parent.glob("*spectra-*"):  # without use for a month, or unfinished by killed processes
+                with suppress(OSError):  # another process may be faster
+                    if time.time() - other.stat().st_mtime > 30 * 86_400:
+                        other.unlink()
             _write(file, shape, dtype, make)
         found = _mapped(file, shape, dtype)
     assert found is not None
@@ -190,11 +193,3 @@ def write_npy(
     for batch in batches:
         stream.write(batch.contiguous().numpy().data)
         advance(len(batch))
-
-
-def _prune(folder: Path) -> None:
-    """Remove files that were not used for a month, and unfinished files of processes that were killed."""
-    for file in folder.glob("*spectra-*"):
-        with suppress(OSError):  # another process may be faster
-            if time.time() - file.stat().st_mtime > 30 * 86_400:
-                file.unlink()

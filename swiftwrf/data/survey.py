@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from swiftwrf.data.cells import CLOCK_ONLY, UNITS, column_of_numbers, parsed, plain_name, seconds, text_of, unit_of
 from swiftwrf.data.columns import (
     GEODETIC,
-    Groups,
     candidates,
     check_receiver_known,
     column_of,
@@ -177,7 +176,7 @@ def read_survey(
         "receiver_position": places,
         "receiver_names": names,
         "origin": origin,
-        "groups": Groups.of(offset_by, group.to_numpy()[origins].tolist()) if offset_by else None,
+        "groups": group.iloc[origins].rename(offset_by) if offset_by else None,
         "labels": labels,
         "floors": floors,
         "receiver_moves": moves,

@@ -11,7 +11,6 @@ import secrets
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Literal
 from urllib.parse import quote
@@ -24,7 +23,6 @@ from swiftwrf.errors import InputError, optional_module
 from swiftwrf.runtime.durable import cache_folder, refusing_unwritable, rename, write_text
 
 FOLDER = "SWIFTWRF_DATA"  # environment variable with a folder of converted data sets
-CHECKSUMS = Path(__file__).parent / "checksums"
 
 
 @dataclass(frozen=True)
@@ -66,123 +64,16 @@ class DataSet:
         return f"https://raw.githubusercontent.com/{quote(self.repository)}/{self.commit}/"
 
 
-def _newrf(room: str) -> DataSet:
-    return DataSet(
-        "spectra",
-        f"Ray paths in a {room}, 2.412 GHz, traced with MATLAB's image method; the receiver moves",
-        "LuHaofan/NeWRF",
-        "78feb38471f766f17764a28e8518a05697944107",
-        "MIT",
-        "H. Lu, C. Vattheuer, B. Mirzasoleiman, O. Abari, NeWRF, ICML 2024",
-        conversions.newrf,
-        CHECKSUMS / f"newrf-{room}.txt",
-    )
+def _read_sets(folder: Path) -> dict[str, DataSet]:
+    """Return the data sets by name: sets.csv describes them, checksums/NAME.txt lists their raw files."""
+    sets = {}
+    for name, row in pd.read_csv(folder / "sets.csv", index_col="name").to_dict("index").items():
+        convert, checksums = getattr(conversions, row.pop("convert")), f"{str(name).replace('/', '-')}.txt"
+        sets[str(name)] = DataSet(**row, convert=convert, checksums=folder / "checksums" / checksums)
+    return sets
 
 
-def _wifi_room(room: str) -> DataSet:
-    return DataSet(
-        "rssi",
-        f"Wi-Fi RSSI of a phone in a {room.replace('-', ' ')}, means of at least 10 packets a point",
-        "Fx386483710/WiFi_RSS_RTT_Dataset_for_Model_Selection",
-        "48e41763ff1dc37aed1746be82f8d073531d9b82",
-        "MIT",
-        "X. Feng, K. A. Nguyen, Z. Luo, WiFi RSS & RTT dataset, doi 10.5281/zenodo.11558792, 2024",
-        partial(conversions.wifi_room, room=room),
-        CHECKSUMS / f"wifi-rooms-{room}.txt",
-    )
-
-
-FINGERPRINTS = {  # sets of J. Torres-Sospedra's collection: content, and its citation
-    "dsi1": ("Wi-Fi, one floor, 230 places", "A. Moreira, I. Silva, doi 10.5281/zenodo.3778646, 2020"),
-    "dsi2": ("Wi-Fi, one floor, 230 places, means", "A. Moreira, I. Silva, doi 10.5281/zenodo.3778646, 2020"),
-    "lib1": ("Wi-Fi, two floors of a library, one month", "G. M. Mendoza-Silva et al., Data 3, 3, 2018"),
-    "lib2": ("Wi-Fi, two floors of a library, another month", "G. M. Mendoza-Silva et al., Data 3, 3, 2018"),
-    "tut1": ("Wi-Fi, four floors", "S. Shrestha, J. Talvitie, E. S. Lohan, ICL-GNSS 2013"),
-    "tut2": ("Wi-Fi, three floors", "S. Shrestha, J. Talvitie, E. S. Lohan, ICL-GNSS 2013"),
-    "tut3": ("Wi-Fi, five floors, crowdsourced", "E. S. Lohan et al., Data 2, 32, 2017"),
-    "tut4": ("Wi-Fi, five floors, crowdsourced, parts of tut3 exchanged", "E. S. Lohan et al., Data 2, 32, 2017"),
-    "tut5": ("Wi-Fi, three floors", "P. Richter, E. S. Lohan, J. Talvitie, WLAN RSS database, Zenodo, 2018"),
-    "tut6": ("Wi-Fi, four floors", "E. S. Lohan, Additional TAU datasets for Wi-Fi fingerprinting, Zenodo, 2020"),
-    "tut7": ("Wi-Fi, three floors", "E. S. Lohan, Additional TAU datasets for Wi-Fi fingerprinting, Zenodo, 2020"),
-    "uji1": ("Wi-Fi, UJIIndoorLoc, three buildings of up to five floors", "J. Torres-Sospedra et al., IPIN 2014"),
-    "ujib1": ("BLE, one room of University Jaume I", "G. M. Mendoza-Silva et al., Data 4, 12, 2019"),
-}
-
-
-def _fingerprints(name: str) -> DataSet:
-    content, citation = FINGERPRINTS[name]
-    return DataSet(
-        "rssi",
-        content,
-        "darwinquezada/SURIMI",
-        # the tables of BLE are in an earlier commit only
-        "bac90d1e715108a34fc5fea4979e4f9fd1ad6b5c" if name == "ujib1" else "d8fa76a3502b1697a5b03aa4639bf1991b0f6c3c",
-        "CC BY 4.0",
-        citation,
-        conversions.fingerprints,
-        CHECKSUMS / f"ts-{name}.txt",
-    )
-
-
-DATA_SETS = {
-    "s23-200": DataSet(
-        "spectra",
-        "Measured spectra of a moving RFID tag at 4 x 4 antennas, 915 MHz: the first 200 of the NeRF2 data set s23",
-        "wenchaozheng/WRF-GS",
-        "2123040698664552b10071d8b708028c77c939ac",
-        "MIT (NeRF2)",
-        "X. Zhao, Z. An, Q. Pan, L. Yang, NeRF2: Neural Radio-Frequency Radiance Fields, MobiCom 2023",
-        conversions.s23,
-        CHECKSUMS / "s23-200.txt",
-    ),
-    "newrf-bedroom": _newrf("bedroom"),
-    "newrf-office": _newrf("office"),
-    "newrf-conference": _newrf("conference"),
-    "tetam-tracks": DataSet(
-        "rssi",
-        "BLE RSSI at twelve receivers, the beacon carried along nine paths through an office floor",
-        "philotuxo/Position-Annotated-BLE-RSSI-Dataset",
-        "77474b69dc7d73fc5b07b74d7b4b65f3235a663e",
-        "CC0 1.0",
-        "F. S. Danis, A. T. Naskali, A. T. Cemgil, C. Ersoy, Pervasive and Mobile Computing 81, 2022",
-        conversions.tetam_tracks,
-        CHECKSUMS / "tetam-tracks.txt",
-    ),
-    "kolak": DataSet(
-        "rssi",
-        "BLE RSSI at six anchors in a flat, the tag carried by a robot",
-        "marckolak/ble-rss-fingerprints-calib2021",
-        "0a69aaa7006909d3f8f9f3a14fcba9405d404fa5",
-        "CC BY 4.0",
-        "M. Kolakowski, Automated Calibration of RSS Fingerprinting Based Systems, Sensors 21, 6270, 2021",
-        conversions.kolak,
-        CHECKSUMS / "kolak.txt",
-    ),
-    "dcm-rssi": DataSet(
-        "rssi",
-        "Wi-Fi RSSI of a robot for 92 positions of the router in a room of 5 x 6 m",
-        "wenhaol/DCM-RSSI",
-        "86d2d21bb7d33569cefd75912f369156d86e42c1",
-        "MIT",
-        "Y. Yang et al., Integrating Online Learning and Connectivity Maintenance, IROS 2024",
-        conversions.dcm,
-        CHECKSUMS / "dcm-rssi.txt",
-    ),
-    "lora-campus": DataSet(
-        "rssi",
-        "LoRa RSSI over 3 km of a campus, one gateway, on foot and by car",
-        "oliveiraleo/LoRa-RSSI-dataset-outdoor",
-        "4c3cd274f8b94c01f7e8edbb9d466709de6f5cbd",
-        "CC BY-NC-SA 4.0 (not for commercial use)",
-        "L. Oliveira, L. Chaves, E. Silva, Explorando o RSSI na Geração de Chaves para LoRaWAN, SBSeg 2023",
-        conversions.lora,
-        CHECKSUMS / "lora-campus.txt",
-    ),
-    "wifi-rooms/office": _wifi_room("office"),
-    "wifi-rooms/lecture-theatre": _wifi_room("lecture-theatre"),
-    "wifi-rooms/corridor": _wifi_room("corridor"),
-    **{f"ts-{name}": _fingerprints(name) for name in FINGERPRINTS},
-}
+DATA_SETS = _read_sets(Path(__file__).parent)
 
 
 def catalogue() -> pd.DataFrame:

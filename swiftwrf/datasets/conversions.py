@@ -41,7 +41,7 @@ WIFI_GRID_M = 0.6
 # x and y in cells of the grid, and the columns of their RSSI: AP1 is never received in the corridor
 WIFI_ACCESS_POINTS: dict[str, tuple[list[float], list[float], list[int]]] = {
     "office": ([1, 11, 15, 20, 25], [5, -1, 6, -1, 5], [1, 2, 3, 4, 5]),
-    "lecture-theatre": ([3, 10, 18.8, 3, 19], [9, 9, 9, 21, 21], [1, 2, 3, 4, 5]),
+    "lecture_theatre": ([3, 10, 18.8, 3, 19], [9, 9, 9, 21, 21], [1, 2, 3, 4, 5]),
     "corridor": ([2, 17, 38, 48], [7.5, 6.8, 9, 5], [2, 3, 4, 5]),
 }
 
@@ -190,12 +190,14 @@ def fingerprints(raw: Path, out: Path) -> None:
     write_splits({"published": _parts(np.arange(len(table)) >= len(parts[0]))}, out, first=0)
 
 
-def wifi_room(raw: Path, out: Path, room: str) -> None:
+def wifi_room(raw: Path, out: Path) -> None:
     """Write the mean RSSI of the packets at each point; points with fewer than 10 detected packets count as undetected."""
+    (file,) = raw.glob("data/database_*_train.csv")
+    room = file.stem.removeprefix("database_").removesuffix("_train")
     xs, ys, columns = WIFI_ACCESS_POINTS[room]
     means: list[pd.DataFrame] = []
     for part in ("train", "test"):
-        table = pd.read_csv(raw / f"data/database_{room.replace('-', '_')}_{part}.csv")
+        table = pd.read_csv(raw / f"data/database_{room}_{part}.csv")
         rssi = table[[f"AP{number} RSS(dBm)" for number in columns]]
         grouped = rssi.where(rssi != -200).groupby([table["X"], table["Y"]])
         means.append(grouped.mean().where(grouped.count() >= 10))

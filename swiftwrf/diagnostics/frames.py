@@ -298,7 +298,7 @@ def _hypotheses(
     for meaning, position, free in _labels(spectra.position, time, lambda position: placed(position).score):
         yield meaning, placed(position, free)
     turn = _constant_turn(frame, peak)
-    if float(np.linalg.norm(turn)) >= MIN_TURN and _constant(turn, frame, peak):
+    if turn is not None:
         found = at(away @ rotation_matrix(turn), free=3)
         yield "a constant rotation", replace(found, turn=turn)
     if seen is None:
@@ -461,41 +461,37 @@ def _mirrors(frame: _Frame, peak: Tensor) -> Iterator[tuple[str, _Frame]]:
         )
 
 
-def _constant_turn(frame: _Frame, peak: Tensor) -> NDArray[np.float64]:
-    """Return the rotation of the array with most agreement, a rotation vector in array coordinates [rad].
+def _constant_turn(frame: _Frame, peak: Tensor) -> NDArray[np.float64] | None:
+    """Return the rotation vector of the array with most agreement [rad] if it is large and the same in halves of positions.
 
     A linear array does not determine its rotation, so it keeps the declared one.
     """
     if frame.linear:
-        return np.zeros(3)
+        return None
     scanned = Rotation.random(4000, rng=np.random.default_rng(0))
     turns = Rotation.concatenate([Rotation.identity(), scanned])
     matrices, towards = torch.from_numpy(turns.as_matrix()).float(), frame.towards().float()
     score = torch.cat(
         [_kernel(_nearest(frame.folded(towards @ m), peak.float())).mean(-1) for m in matrices.split(200)]
     )
-    starts = [np.zeros(3), *(turns[int(i)].as_rotvec() for i in score.topk(3).indices)]
-    return max((_refined(start, frame, peak) for start in starts), key=_turned(frame, peak))
-
-
-def _constant(turn: NDArray[np.float64], frame: _Frame, peak: Tensor) -> bool:
-    """Return True if both halves of the positions have the same rotation."""
+    turn = _refined([np.zeros(3), *(turns[int(i)].as_rotvec() for i in score.topk(3).indices)], frame, peak)
+    if float(np.linalg.norm(turn)) < MIN_TURN:
+        return None
     half = slabs(frame.position, 2)
-    found = [_refined(turn, replace(frame, position=frame.position[half == h]), peak[half == h]) for h in (0, 1)]
-    first, second = (Rotation.from_rotvec(each) for each in found)
-    return float((first.inv() * second).magnitude()) <= MIN_TURN
+    parts = [_refined([turn], replace(frame, position=frame.position[half == h]), peak[half == h]) for h in (0, 1)]
+    first, second = (Rotation.from_rotvec(part) for part in parts)
+    return turn if float((first.inv() * second).magnitude()) <= MIN_TURN else None
 
 
-def _refined(start: NDArray[np.float64], frame: _Frame, peak: Tensor) -> NDArray[np.float64]:
-    """Return the rotation vector with most agreement near a start."""
-    score = _turned(frame, peak)
-    options = {"xatol": 1e-4, "fatol": 1e-6, "initial_simplex": np.vstack([start, start + 0.1 * np.eye(3)])}
-    found: NDArray[np.float64] = minimize(lambda turn: -score(turn), start, method="Nelder-Mead", options=options).x
-    shortest: NDArray[np.float64] = Rotation.from_rotvec(found).as_rotvec()
-    return shortest
+def _refined(starts: list[NDArray[np.float64]], frame: _Frame, peak: Tensor) -> NDArray[np.float64]:
+    """Return the rotation vector with most agreement near some."""
+    towards, found = frame.towards(), []
 
+    def score(turn: NDArray[np.float64]) -> float:
+        return float(_kernel(_nearest(frame.folded(towards @ rotation_matrix(turn)), peak)).mean())
 
-def _turned(frame: _Frame, peak: Tensor) -> Callable[[NDArray[np.float64]], float]:
-    """Return the agreement as a function of the rotation vector."""
-    towards = frame.towards()
-    return lambda turn: float(_kernel(_nearest(frame.folded(towards @ rotation_matrix(turn)), peak)).mean())
+    for start in starts:
+        options = {"xatol": 1e-4, "fatol": 1e-6, "initial_simplex": np.vstack([start, start + 0.1 * np.eye(3)])}
+        best = minimize(lambda turn: -score(turn), start, method="Nelder-Mead", options=options).x
+        found.append(Rotation.from_rotvec(best).as_rotvec())  # the shortest
+    return max(found, key=score)

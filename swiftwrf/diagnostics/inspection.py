@@ -352,9 +352,9 @@ def _check_rssi(data: Rssi, findings: Findings) -> None:
 
 def propose_offsets(data: Rssi, findings: Findings) -> None:
     """Warn of the column of the groups of RSSI if its values have constant offsets."""
-    if data.groups is None or len(data.groups.code.unique()) < 2:
+    if data.groups is None or data.groups.nunique() < 2:
         return
-    column = data.groups.column
+    column = data.groups.name
     offsets = estimate_offsets(data)
     spread = max(offsets.offset_db.values()) - min(offsets.offset_db.values())
     if offsets.explained < MIN_EXPLAINED or spread < MIN_SPREAD_DB:

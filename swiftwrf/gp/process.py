@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from copy import copy
-from dataclasses import asdict, astuple, dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
+from annotated_types import Ge, Gt, Lt
 from scipy.optimize import brentq
 from torch import Tensor
 from torch.nn import functional
@@ -17,12 +18,14 @@ from torch.nn import functional
 from swiftwrf.errors import InputError
 from swiftwrf.positions import Neighbours, distance
 from swiftwrf.runtime.checkpoint import Header, expect
+from swiftwrf.runtime.validation import Fraction, configuration
 
 MAX_EXACT = 2000  # positions up to which a process is exact; time and memory grow with their cube and square
+Scale = Annotated[float, Gt(0), Lt(math.inf)]
 N_NEIGHBOURS = 64  # positions that a local prediction conditions on; farther ones hardly change the mean
 
 
-@dataclass(frozen=True)
+@configuration
 class Kernel:
     """Covariance of a field at two positions by their distance r: a rough long-range and a smooth short-range part.
 
@@ -46,30 +49,17 @@ class Kernel:
         tensor([[0.3679]])
     """
 
-    matern12_length: float = 0.5
-    matern32_length: float = 0.1
-    matern12_weight: float = 0.6
-    noise: float = 1e-2
-    vertical: float = 1.0
-
-    def __post_init__(self) -> None:
-        finite = all(map(math.isfinite, astuple(self)))
-        positive = min(self.matern12_length, self.matern32_length, self.vertical) > 0
-        if not (finite and positive and 0 <= self.matern12_weight <= 1 and self.noise >= 0):
-            raise InputError(
-                f"a kernel needs lengths and a vertical factor above 0, a weight in [0, 1] and a noise from 0, got {self}"
-            )
+    matern12_length: Scale = 0.5
+    matern32_length: Scale = 0.1
+    matern12_weight: Fraction = 0.6
+    noise: Annotated[float, Ge(0), Lt(math.inf)] = 1e-2
+    vertical: Scale = 1.0
 
     @property
     def correlation_length(self) -> float:
         """Distance at which the covariance has fallen to 1/e, in the unit of the positions."""
         longest = max(self.matern12_length, self.matern32_length)
         return float(brentq(lambda r: float(self.at(torch.tensor(r).double())) - 1 / math.e, 0.0, 2 * longest))
-
-    def scaled(self, factor: float) -> Kernel:
-        """Return the equivalent kernel for positions that are multiplied by `factor`."""
-        lengths = {name: factor * getattr(self, name) for name in ("matern12_length", "matern32_length")}
-        return replace(self, **lengths)
 
     def __call__(self, a: Tensor, b: Tensor) -> Tensor:
         """Return k between positions (n, 3) and (m, 3), (n, m)."""

@@ -13,14 +13,5 @@ if TYPE_CHECKING:
 
 import_lazily(__name__, {"swiftwrf.locate.comparison": ("LocateComparison", "compare")})  # imports scikit-learn
 
-__all__ = [
-    "LocateComparison",
-    "MatchedField",
-    "MatchedFieldConfig",
-    "Posterior",
-    "Region",
-    "RssiLocator",
-    "RssiLocatorConfig",
-    "compare",
-    "smoothed",
-]
+__all__ = ["LocateComparison", "MatchedField", "MatchedFieldConfig", "Posterior", "Region", "RssiLocator"]
+__all__ += ["RssiLocatorConfig", "compare", "smoothed"]

@@ -378,7 +378,12 @@ def smoothed(posterior: Posterior, time: Tensor | None, speed_m_s: float) -> Pos
     n, m = posterior.log_weight.shape
     if m * m > MAX_PAIRS:
         raise InputError(f"a walk is smoothed on at most {math.isqrt(MAX_PAIRS)} candidate positions, got {m}")
-    std = (speed_m_s * _intervals(time, n)).square().add(posterior.resolution_m**2 / 6).sqrt().clamp_min(1e-6).tolist()
+    time = torch.arange(n).double() if time is None else torch.as_tensor(time, dtype=torch.float64)
+    if time.shape != (n,) or not bool(time.isfinite().all()):
+        raise InputError(f"expected {n} finite times [s], one for each observation, got shape {tuple(time.shape)}")
+    if len(back := (time.diff() < 0).nonzero()[:, 0]):
+        raise InputError(f"observations of a walk must be in the order of time; number {int(back[0]) + 2} is earlier")
+    std = (speed_m_s * time.diff()).square().add(posterior.resolution_m**2 / 6).sqrt().clamp_min(1e-6).tolist()
     # the error of the distances is that of float32 relative to the region, not to the origin of the coordinates
     position = (posterior.position - posterior.position.reshape(-1, 3).mean(dim=0)).float().expand(n, -1, -1)
     own = posterior.log_weight
@@ -404,20 +409,6 @@ def smoothed(posterior: Posterior, time: Tensor | None, speed_m_s: float) -> Pos
         after[i] = step(position[i], position[i + 1], std[i], own[i + 1] + after[i + 1])
     # the inflation belongs to posteriors of single observations
     return replace(posterior, log_weight=normalised(own + before + after), inflation=1.0)
-
-
-def _intervals(time: Tensor | None, n: int) -> Tensor:
-    """Return the times between consecutive observations (n - 1,) [s]."""
-    if time is None:
-        return torch.ones(max(n - 1, 0), dtype=torch.float64)
-    time = torch.as_tensor(time, dtype=torch.float64)
-    if time.shape != (n,) or not bool(time.isfinite().all()):
-        raise InputError(f"expected {n} finite times [s], one for each observation, got shape {tuple(time.shape)}")
-    interval = time.diff()
-    back = (interval < 0).nonzero()[:, 0]
-    if len(back):
-        raise InputError(f"observations of a walk must be in the order of time; number {int(back[0]) + 2} is earlier")
-    return interval
 
 
 def _square(to: Tensor, start: Tensor) -> Tensor:

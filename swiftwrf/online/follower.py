@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import torch
@@ -23,7 +23,7 @@ from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.phase_retrieval import correlations, retrieve_phases
 from swiftwrf.models.link import Link
 from swiftwrf.models.process import ProcessModel
-from swiftwrf.online.scores import Alarm, Cusum, Scores, alarm_threshold, learnt, score
+from swiftwrf.online.scores import ALLOWANCE, Alarm, Scores, alarm_threshold, learnt, score
 from swiftwrf.positions import nearest
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.runtime.validation import checked
@@ -69,7 +69,9 @@ def adapted(before: ProcessModel, after: Spectra) -> tuple[ProcessModel, float]:
 
 
 class Monitor:
-    """Cumulative sums of innovations: of all positions and of each region; for RSSI of each receiver, up and down.
+    """One-sided cumulative sums of innovations: of all positions and of each region; for RSSI of each receiver, up and down.
+
+    A sum over its threshold is an alarm (E. S. Page, Biometrika 41, 1954).
 
     Innovations of spectra are replaced by normal scores, their rank among those of a reference. Innovations of RSSI are
     standard normal if the standard deviations of the model are right.
@@ -108,8 +110,10 @@ class Monitor:
         n_regions = min(n_regions, max(1, len(position) // 10))
         self.centre = torch.from_numpy(kmeans2(position.double().numpy(), n_regions, seed=0, minit="++")[0])
         self.reference = torch.zeros(0, dtype=torch.float64) if reference is None else reference.double()
-        self.cusum = Cusum.start((1 + n_regions) * (2 * len(self.receiver_names) or 1))
-        self.threshold = alarm_threshold(false_alarm_rate, len(self.cusum.value))
+        n_series = (1 + n_regions) * (2 * len(self.receiver_names) or 1)
+        self.value, self.count = torch.zeros(n_series, dtype=torch.float64), 0
+        self.since = torch.zeros(n_series, dtype=torch.int64)
+        self.threshold = alarm_threshold(false_alarm_rate, n_series)
 
     @classmethod
     def of(
@@ -119,7 +123,7 @@ class Monitor:
 
         Args:
             model: Fitted model.
-            train: Its training data in their order. Spectra give the reference; see `held_out_scores`.
+            train: Its training data in their order. Spectra give the reference.
             false_alarm_rate: False alarms a measurement.
         """
         if isinstance(model, RssiModel):
@@ -127,7 +131,10 @@ class Monitor:
         reference = None
         if isinstance(train, Spectra):
             model.check_measurements(train)
-            reference = held_out_scores(model, train).innovation[:, 0]
+            reference = score(model, train).innovation[:, 0]
+            if isinstance(model, ProcessModel):  # it can forget spectra: each fifth is predicted without itself
+                for rows in torch.randperm(len(train), generator=torch.Generator().manual_seed(0)).chunk(N_FOLDS):
+                    reference[rows] = score(model.forget(rows), train.subset(rows)).innovation[:, 0]
         return cls(model.region(), (), reference, false_alarm_rate)
 
     def observe(self, position: Tensor, innovation: Tensor) -> list[Alarm]:
@@ -136,7 +143,7 @@ class Monitor:
         if self.receiver_names:
             standard = value.clamp(-3.0, 3.0)  # single outliers raise no alarm
             standard = torch.cat([standard, -standard])
-        elif self.cusum.count == 0 and len(self.reference) < N_REFERENCE:
+        elif self.count == 0 and len(self.reference) < N_REFERENCE:
             self.reference = torch.cat([self.reference, value])
             return []
         else:
@@ -144,22 +151,34 @@ class Monitor:
             standard = torch.special.ndtri(rank / (len(self.reference) + 1))[None]
         series = torch.full((1 + len(self.centre), len(standard)), torch.nan, dtype=torch.float64)
         series[[0, 1 + int(nearest(position[None], self.centre, 1)[1])]] = standard
-        self.cusum, alarms = self.cusum.updated(series.flatten(), self.threshold)
+        return self.add(series.flatten())
+
+    def add(self, series: Tensor) -> list[Alarm]:
+        """Add one more value of each series (C,), nan for none, to its sum; return the alarms, largest sum first.
+
+        A sum that raises an alarm starts again at 0.
+        """
+        added = (self.value + (series.double() - ALLOWANCE).nan_to_num(0.0)).clamp_min(0)
+        self.since = self.since.where(self.value > 0, self.count)
+        over = (added > self.threshold).nonzero()[:, 0]
+        over = over[added[over].argsort(descending=True)]
+        alarms = [Alarm(int(c), self.count, int(self.since[c])) for c in over]
+        self.value, self.count = added.where(added <= self.threshold, 0.0), self.count + 1
         return alarms
 
     def state(self) -> dict[str, Any]:
         """Return reference, regions and sums as plain values."""
-        sums = {"value": self.cusum.value.tolist(), "since": self.cusum.since.tolist(), "count": self.cusum.count}
+        sums = {"value": self.value.tolist(), "since": self.since.tolist(), "count": self.count}
         return {"reference": self.reference.tolist(), "centre": self.centre.tolist(), "cusum": sums}
 
     def resume(self, state: dict[str, Any]) -> None:
         """Continue with the reference, regions and sums of a `state`."""
         sums = state["cusum"]
-        self.reference, self.centre, value = (
+        self.reference, self.centre, self.value = (
             torch.tensor(values, dtype=torch.float64) for values in (state["reference"], state["centre"], sums["value"])
         )
-        self.cusum = Cusum(value, torch.tensor(sums["since"]), int(sums["count"]))
-        self.threshold = alarm_threshold(self.false_alarm_rate, len(self.cusum.value))
+        self.since, self.count = torch.tensor(sums["since"]), int(sums["count"])
+        self.threshold = alarm_threshold(self.false_alarm_rate, len(self.value))
 
     def describe(self, alarm: Alarm) -> str:
         """Return what changed and where, in words."""
@@ -171,24 +190,6 @@ class Monitor:
             return f"spectra {where}"
         change = "stronger" if column < len(self.receiver_names) else "weaker"
         return f"{self.receiver_names[column % len(self.receiver_names)]} {change} {where}"
-
-
-def held_out_scores(model: FieldModel, train: Spectra) -> Scores:
-    """Return the scores of training spectra, each fifth of them predicted without itself if the model can forget spectra.
-
-    Args:
-        model: Fitted model.
-        train: Its training spectra in their order.
-    """
-    if not isinstance(model, ProcessModel):
-        return score(model, train)
-    parts, order = [], []
-    for rows in torch.randperm(len(train), generator=torch.Generator().manual_seed(0)).chunk(N_FOLDS):
-        parts.append(score(model.forget(rows), train.subset(rows)))
-        order.append(rows)
-    back = torch.cat(order).argsort()
-    joined = Scores.joined(parts)
-    return Scores(*(getattr(joined, field.name)[back] for field in fields(joined)))
 
 
 @dataclass(frozen=True, eq=False)

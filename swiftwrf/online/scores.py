@@ -58,6 +58,7 @@ class Scores:
         return cls(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(cls)))
 
 
+@torch.no_grad()
 def score(model: FieldModel | RssiPredictor, new: Spectra | Rssi) -> Scores:
     """Return the scores of measurements that a model has not learnt.
 
@@ -70,38 +71,28 @@ def score(model: FieldModel | RssiPredictor, new: Spectra | Rssi) -> Scores:
         >>> score(swiftwrf.make_model("coarray").fit(train), test).innovation.shape
         torch.Size([10, 1])
     """
-    with torch.no_grad():
-        if isinstance(model, RssiPredictor):
-            assert isinstance(new, Rssi)
-            model.check_measurements(new)
-            return _of_rssi(model, new)
+    model.check_measurements(new)  # type: ignore[arg-type]  # measurements of the model's kind
+    if isinstance(model, RssiPredictor):
+        assert isinstance(new, Rssi)
+        position, measured = new.transmitter_position, new.rssi_dbm
+        predicted = model.predict(position)
+        miss = measured - predicted.mean
+        error, innovation = miss.abs().nanmean(dim=1), torch.full_like(miss, torch.nan)
+        if predicted.std is not None:
+            innovation = miss / predicted.std
+    else:
         assert isinstance(new, Spectra)
-        model.check_measurements(new)
-        return _of_spectra(model, new)
-
-
-def _of_spectra(model: FieldModel, new: Spectra) -> Scores:
-    predicted, measured = model.predict(new.position), new.store[:].to(model.device)
-    error = (measured - predicted.mean).square().mean(dim=(1, 2)).sqrt().double()
-    expected = torch.ones_like(error)
-    if isinstance(model, ProcessModel):
-        expected = model.expected_error(new.position)
-    covered = torch.full_like(error, torch.nan)
+        position, measured = new.position, new.store[:].to(model.device)
+        predicted = model.predict(position)
+        miss = measured - predicted.mean
+        error = miss.square().mean(dim=(1, 2)).sqrt().double()
+        expected = model.expected_error(position) if isinstance(model, ProcessModel) else torch.ones_like(error)
+        innovation = (error / expected)[:, None]
+    covered = torch.full_like(miss, torch.nan)
     if predicted.std is not None:
-        low, high = predicted.interval(LEVEL)
-        covered = ((low <= measured) & (measured <= high)).double().mean(dim=(1, 2))
-    return Scores(new.position, error.cpu(), (error / expected)[:, None].cpu(), covered.cpu())
-
-
-def _of_rssi(model: RssiPredictor, new: Rssi) -> Scores:
-    predicted, measured = model.predict(new.transmitter_position), new.rssi_dbm
-    miss = measured - predicted.mean
-    innovation, covered = torch.full_like(miss, torch.nan), torch.full_like(miss, torch.nan)
-    if predicted.std is not None:
-        innovation = miss / predicted.std
         low, high = predicted.interval(LEVEL)
         covered = ((low <= measured) & (measured <= high)).double().where(~miss.isnan(), torch.nan)
-    return Scores(new.transmitter_position, miss.abs().nanmean(dim=1), innovation, covered.nanmean(dim=1))
+    return Scores(position, error.cpu(), innovation.cpu(), covered.flatten(1).nanmean(dim=1).cpu())
 
 
 def learnt(model: Model, new: Spectra | Rssi) -> Model:
@@ -182,42 +173,3 @@ class Alarm:
     series: int
     at: int
     since: int
-
-
-@dataclass(frozen=True, eq=False)
-class Cusum:
-    """One-sided cumulative sums (E. S. Page, Biometrika 41, 1954) of C series.
-
-    Args:
-        value: Cumulative sums (C,).
-        since: Number of the first measurement of each sum, int64 (C,).
-        count: Number of measurements so far.
-
-    Example:
-        >>> test = Cusum.start(1)
-        >>> for value in (0.0, 2.0, 2.0, 2.0, 2.0):
-        ...     test, alarms = test.updated(torch.tensor([value]), threshold=5.0)
-        >>> alarms
-        [Alarm(series=0, at=4, since=1)]
-    """
-
-    value: Tensor
-    since: Tensor
-    count: int
-
-    @classmethod
-    def start(cls, n_series: int) -> Cusum:
-        """Return sums of 0."""
-        return cls(torch.zeros(n_series, dtype=torch.float64), torch.zeros(n_series, dtype=torch.int64), 0)
-
-    def updated(self, series: Tensor, threshold: float) -> tuple[Cusum, list[Alarm]]:
-        """Return the sums with one more value of each series (C,), nan for none, and the alarms, largest sum first.
-
-        A sum that raises an alarm starts again at 0.
-        """
-        added = (self.value + (series.double() - ALLOWANCE).nan_to_num(0.0)).clamp_min(0)
-        since = self.since.where(self.value > 0, self.count)
-        over = (added > threshold).nonzero()[:, 0]
-        over = over[added[over].argsort(descending=True)]
-        alarms = [Alarm(int(c), self.count, int(since[c])) for c in over]
-        return Cusum(added.where(added <= threshold, 0.0), since, self.count + 1), alarms

@@ -243,7 +243,6 @@ def render_backward(grad, mean, cholesky, weight, origin, step, shape, reach2, b
             d_weight[b, i, 1] = d_im
 
 
-@threads_kept()
 def _threads() -> int:
     """Give numba as many threads as torch has, and return their number. Numba starts its threads at the first call."""
     number: int = min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
@@ -259,16 +258,17 @@ def _inputs(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, c
     return *(tensor.detach().contiguous().numpy() for tensor in tensors), origin, step, grid.shape, np.float32(squared)
 
 
+@threads_kept()
 def field(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None) -> Tensor:
     """Return real and imaginary part of the field, (B, 2, n_elevation, n_azimuth); see `operators.field`."""
     rendered = weight.new_empty(mean.shape[0], 2, *grid.shape)
     threads = _threads()
     n_bands = 1 if mean.shape[0] >= threads else min(threads, grid.n_elevation)
-    with threads_kept():
-        render(*_inputs(mean, cholesky, weight, grid, cutoff), n_bands, rendered.flatten(2).numpy())
+    render(*_inputs(mean, cholesky, weight, grid, cutoff), n_bands, rendered.flatten(2).numpy())
     return rendered
 
 
+@threads_kept()
 def field_gradients(
     grad: Tensor, mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -278,8 +278,7 @@ def field_gradients(
     threads = _threads()
     block = max(1, n if batch >= threads else -(-n // threads))
     incoming = grad.detach().contiguous().flatten(2).numpy()
-    with threads_kept():
-        inputs = _inputs(mean, cholesky, weight, grid, cutoff)
-        render_backward(incoming, *inputs, block, *(derivative.numpy() for derivative in derivatives))
+    inputs = _inputs(mean, cholesky, weight, grid, cutoff)
+    render_backward(incoming, *inputs, block, *(derivative.numpy() for derivative in derivatives))
     d_mean, d_cholesky, d_weight = derivatives
     return d_mean, d_cholesky if cholesky.dim() == 3 else d_cholesky.sum(0), d_weight

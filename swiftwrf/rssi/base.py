@@ -149,7 +149,14 @@ class RssiPredictor(Configured, Displayed, ABC):
             FitError: The fit diverged.
         """
         pool = pool or train
-        check_training(train, pool)
+        if (detected := int(train.detected.sum())) < MIN_TRAINING:
+            names = ", ".join(train.receiver_names)
+            raise InputError(
+                f"{names}: detected in {detected} training rows in all; at least {MIN_TRAINING} are needed"
+            )
+        more = set(train.receiver_names) <= set(pool.receiver_names)
+        if not more or not torch.equal(pool.transmitter_position, train.transmitter_position):
+            raise InputError("the pool must hold the same rows as the training part, at the same receivers and more")
         if lacking := self.lacking(train):
             raise InputError(lacking)
         self.receiver_names, self.receiver_position = tuple(map(str, train.receiver_names)), train.receiver_position
@@ -332,22 +339,6 @@ class SavedRssiPredictor(RssiPredictor, Saved):
         predictor.offsets = Offsets(**header["offsets"]) if header.get("offsets") else None
         predictor.detection = None
         return predictor
-
-
-@checked
-def check_training(train: Rssi, pool: Rssi) -> None:
-    """Refuse data that nothing can be fitted to.
-
-    Raises:
-        InputError: No RSSI, fewer than 10 measurements in all, or a pool of other rows.
-    """
-    detected = int(train.detected.sum())
-    if detected < MIN_TRAINING:
-        names = ", ".join(train.receiver_names)
-        raise InputError(f"{names}: detected in {detected} training rows in all; at least {MIN_TRAINING} are needed")
-    more = set(train.receiver_names) <= set(pool.receiver_names)
-    if not more or not torch.equal(pool.transmitter_position, train.transmitter_position):
-        raise InputError("the pool must hold the same rows as the training part, at the same receivers and more")
 
 
 def columns_of(receiver_names: Sequence[str], pool: Rssi) -> Tensor:

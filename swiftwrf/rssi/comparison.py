@@ -137,7 +137,7 @@ class RssiComparison:
         low, high = prediction.interval(LEVEL)
         values = {"measured": test.rssi_dbm[row, column], "predicted": prediction.mean, "low": low, "high": high}
         found = DataFrame(test.transmitter_position[row].numpy().round(3), columns=["x", "y", "z"])
-        group = {"group": test.groups.subset(row).labels()} if test.groups else {}
+        group = {} if test.groups is None else {"group": test.groups.iloc[row.tolist()].tolist()}
         found = found.assign(receiver=self._receiver, **group)
         found = found.assign(**{name: value.numpy().round(2) for name, value in values.items()})
         return found.assign(**degree_columns(test.origin, test.transmitter_position[row].numpy()))

@@ -71,7 +71,7 @@ class RssiModel(SavedRssiPredictor):
     n_primitives: int
     """primitives a receiver; 0 if there is no field"""
     mixing_weight: Tensor
-    """weights (4, R) of the field and the three simpler predictors, contained in the tensors below, equal in all columns"""
+    """weights (4,) of the field and the three simpler predictors at all receivers, contained in the tensors below"""
     centre: Tensor
     """centre of the measured positions, float64 (3,) [m]"""
     level: Tensor
@@ -104,7 +104,7 @@ class RssiModel(SavedRssiPredictor):
         found = self._receivers(training, **arguments)
         held_out = _held_out_predictors(training, found)
         weight = self._mixing_weights(train, pool, training, held_out[0], (shift, curve), **arguments)
-        self._assemble(train, training, found, held_out, weight[:, None].repeat(1, len(training.receiver_names)))
+        self._assemble(train, training, found, held_out, weight)
 
     def _receivers(
         self,
@@ -157,25 +157,22 @@ class RssiModel(SavedRssiPredictor):
         held_out: tuple[Tensor, Tensor],
         weight: Tensor,
     ) -> None:
-        """Mix the fits of all receivers with the simpler predictors by weights (4, R), and calibrate the deviation."""
+        """Mix the fits of all receivers with the simpler predictors by weights (4,), and calibrate the deviation."""
         predictors, std = held_out
         check_comparable(predictors[:, training.bin_of_row], train.rssi_dbm)
-        predicted = (weight[:, None] * predictors).where(weight[:, None] > 0, 0.0).sum(dim=0)
+        predicted = torch.einsum("k,knr->nr", weight[weight > 0], predictors[weight > 0])
         of_row = training.bin_of_row
         scale = interval_scale(predicted[of_row], std[of_row], train.rssi_dbm)
 
         def mixed(own: Tensor, baselines: Tensor) -> Tensor:
-            return (weight * torch.cat([own[None], baselines])).sum(dim=0)
+            return weight @ torch.cat([own[None], baselines])
 
         self.n_primitives, self.kernel, self.mixing_weight = training.n_primitives, training.kernel, weight
-        self.centre, self.middle, self.detection = (
-            training.centre,
-            training.path_loss.centre,
-            training.path_loss.detection,
-        )
+        self.centre, loss = training.centre, training.path_loss
+        self.middle, self.detection = loss.centre, loss.detection
         self.level = mixed(found["level"], training.baselines.level)
         self.slope = mixed(found["slope"], training.baselines.slope)
-        self.directivity = (weight[0][:, None] * found["directivity"]).float()
+        self.directivity = (weight[0] * found["directivity"]).float()
         self.anchor, self.coefficient = training.position.float(), found["coefficient"].T.float().contiguous()
         self.rendered = found["rendered"]
         self.detection_field = None
@@ -200,7 +197,7 @@ class RssiModel(SavedRssiPredictor):
         noise_db = (scale * training.noise_db).clamp_min(rounding_std(train.rssi_dbm))
         self.field_db, self.noise_db = (scale * training.field_db).float(), noise_db.float()
         # only two predictors have the receiver's path loss
-        self.covariance = (weight[:2].sum(dim=0) * scale).square()[:, None, None] * found["covariance"]
+        self.covariance = (weight[:2].sum() * scale).square()[:, None, None] * found["covariance"]
         self._precompute()
 
     @property
@@ -402,7 +399,7 @@ def _shapes(n_receivers: int, n_anchors: int) -> dict[str, tuple[int, ...]]:
     per_receiver = dict.fromkeys(("level", "slope", "middle", "field_db", "noise_db"), (n_receivers,))
     return per_receiver | {
         "covariance": (n_receivers, 2, 2),
-        "mixing_weight": (4, n_receivers),
+        "mixing_weight": (4,),
         "centre": (3,),
         "directivity": (n_receivers, N_HARMONICS),
         "anchor": (n_anchors, 3),

@@ -137,21 +137,22 @@ def estimate_offsets(train: Rssi, reference: str | None = None) -> Offsets:
     groups = train.groups
     if groups is None:
         raise InputError(f"{train.name} has no groups; read it with offset_by")
-    frequency = groups.code.bincount(minlength=len(groups.names))
+    names, code = groups.cat.categories.tolist(), torch.tensor(groups.cat.codes.to_numpy()).long()
+    frequency = code.bincount(minlength=len(names))
     if int((frequency > 0).sum()) < 2:
         raise InputError(
-            f"column {groups.column} has one value in the training rows, so there are no offsets to estimate"
+            f"column {groups.name} has one value in the training rows, so there are no offsets to estimate"
         )
-    chosen = groups.names[int(frequency.argmax())] if reference is None else reference
-    if chosen not in groups.names:
-        raise InputError(f"column {groups.column} has no value {chosen!r}; there are {listed(groups.names)}")
+    chosen = names[int(frequency.argmax())] if reference is None else reference
+    if chosen not in names:
+        raise InputError(f"column {groups.name} has no value {chosen!r}; there are {listed(names)}")
     position = train.transmitter_position
     extent = float((position.amax(dim=0) - position.amin(dim=0)).max()) or 1.0
     kernel = Kernel(0.25 * extent, matern12_weight=1.0, noise=1.0)  # fading is as large as shadowing
     apart = log_distance(position, train.receiver_position)
-    member = torch.nn.functional.one_hot(groups.code, len(groups.names)).double()
-    normal = torch.zeros(len(groups.names), len(groups.names), dtype=torch.float64)
-    right, total = torch.zeros(len(groups.names), dtype=torch.float64), 0.0
+    member = torch.nn.functional.one_hot(code, len(names)).double()
+    normal = torch.zeros(len(names), len(names), dtype=torch.float64)
+    right, total = torch.zeros(len(names), dtype=torch.float64), 0.0
     generator = torch.Generator().manual_seed(0)
     for r, rssi in enumerate(train.rssi_dbm.T):
         rows = (~rssi.isnan()).nonzero()[:, 0]
@@ -165,13 +166,13 @@ def estimate_offsets(train: Rssi, reference: str | None = None) -> Offsets:
         normal += member[rows].T @ weight @ member[rows]
         right += member[rows].T @ weight @ rssi[rows]
         total += float(rssi[rows] @ weight @ rssi[rows])
-    others = torch.tensor([name != chosen for name in groups.names])
+    others = torch.tensor([name != chosen for name in names])
     precision = (
         normal[others][:, others] + 0.05 * torch.eye(int(others.sum())).double()
     )  # a standard deviation of 10 dB
-    offset = torch.zeros(len(groups.names), dtype=torch.float64)
+    offset = torch.zeros(len(names), dtype=torch.float64)
     offset[others] = torch.linalg.solve(precision, right[others])
     explained = float(right @ offset) / total if total > 0 else 0.0
-    estimates = dict(zip(groups.names, offset.tolist(), strict=True))
-    known = {name: db for name, db in estimates.items() if frequency[groups.names.index(name)] > 0 or name == chosen}
-    return Offsets(groups.column, chosen, known, explained)
+    estimates = dict(zip(names, offset.tolist(), strict=True))
+    known = {name: db for name, db in estimates.items() if frequency[names.index(name)] > 0 or name == chosen}
+    return Offsets(str(groups.name), chosen, known, explained)

@@ -12,7 +12,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from itertools import groupby
 from statistics import NormalDist
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -300,12 +299,10 @@ class PairModel(PairPredictor, SavedRssiPredictor):
             k for k in candidates(metric.coordinates(self.pair), RELATIVE_NOISE_VARIANCES) if k.matern12_weight == 1
         ]
         judged = []
-        for length, alike in groupby(
-            sorted(kernels, key=lambda kernel: kernel.matern12_length), key=lambda kernel: kernel.matern12_length
-        ):
+        for length in sorted({kernel.matern12_length for kernel in kernels}):
             shape = Kernel(length, matern12_weight=1.0)
             covariance, cross = shape.at(r_between), shape.at(r_across)
-            for kernel in alike:
+            for kernel in (kernel for kernel in kernels if kernel.matern12_length == length):
                 weight, variance = local_weights(covariance, cross, kernel.noise)
                 error = (truth - (weight * values).sum(dim=1)).abs()
                 score = error / (variance + kernel.noise).sqrt()

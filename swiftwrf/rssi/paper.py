@@ -106,7 +106,7 @@ class RssiPaperModel(RssiModel):
         scale = interval_scale(predicted, std, train.rssi_dbm)
         self.field_db = (scale * prior_db[0]).float()
         self.noise_db = (scale * prior_db[1]).clamp_min(rounding_std(train.rssi_dbm)).float()
-        self.n_primitives, self.mixing_weight = config.n_primitives, FIELD_ALONE[:, None].repeat(1, n_receivers)
+        self.n_primitives, self.mixing_weight = config.n_primitives, FIELD_ALONE.clone()
         self.centre, self.anchor, self.rendered = bins.centre, bins.position.float(), rendered
         self.level = LEVEL_DBM + HeadTable(rendered)(per_receiver[None])[0][0]
         self.slope, self.middle = per_receiver, per_receiver.clone()

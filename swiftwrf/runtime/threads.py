@@ -55,7 +55,10 @@ def _linear_algebra() -> ThreadpoolController:
 
 _torch_threads = _Shared(torch.get_num_threads, torch.set_num_threads)
 _one_blas_thread = _Shared(lambda: _linear_algebra().limit(limits=1), lambda limits: limits.restore_original_limits())
-_workers: ContextVar[int | None] = ContextVar("workers", default=None)  # of `parallel_map` inside `single_thread`
+_threads = torch.get_num_threads()
+# of `parallel_map`: all threads that torch has at the start, also where processes of a run share them, because an idle
+# process leaves its own to the others; 1 inside
+_workers: ContextVar[int] = ContextVar("workers", default=_threads)
 
 
 def to_device(device: torch.device | str) -> torch.device:
@@ -118,22 +121,18 @@ def threads_kept() -> Iterator[None]:
 def single_thread() -> Iterator[None]:
     """Use one thread for many small operations of tensors and arrays; also a decorator.
 
-    `parallel_map` inside still uses all threads.
+    `parallel_map` inside still uses several.
 
     Threads synchronise after every operation. If an operation takes microseconds and other work shares the machine, most
     of the time is spent waiting: up to ten times the time of one thread.
     """
-    token = _workers.set(_workers.get() or torch.get_num_threads())
-    try:
-        with threads_kept(), _one_blas_thread.used():
-            torch.set_num_threads(1)
-            yield
-    finally:
-        _workers.reset(token)
+    with threads_kept(), _one_blas_thread.used():
+        torch.set_num_threads(1)
+        yield
 
 
 def parallel_map(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """Return the function of each item, computed in as many threads as torch has, with one thread inside each call.
+    """Return the function of each item, computed in as many threads as torch had at the start, with one inside each call.
 
     The threads synchronise once, so other work on the machine slows them little. Results are those of one thread.
 
@@ -141,6 +140,5 @@ def parallel_map(function: Callable[[Item], Result], items: Iterable[Item]) -> l
         >>> parallel_map(abs, [-1, 2])
         [1, 2]
     """
-    workers = _workers.get() or torch.get_num_threads()
-    with single_thread(), ThreadPoolExecutor(workers) as threads:
+    with single_thread(), ThreadPoolExecutor(_workers.get(), initializer=_workers.set, initargs=(1,)) as threads:
         return list(threads.map(function, items))

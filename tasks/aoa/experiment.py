@@ -18,6 +18,7 @@ from swiftwrf.data import load_spectra
 from swiftwrf.data.files import sha256
 from swiftwrf.data.raytraced import sionna
 from swiftwrf.metrics import angle_errors, covered
+from swiftwrf.runtime.durable import write_npz
 from swiftwrf.runtime.steps import Step
 from tasks.aoa.page import answer_of, page
 from tasks.configs import AoaConfig
@@ -27,7 +28,7 @@ from tasks.options import TableSource
 from tasks.page.page import reporting
 from tasks.page.records import Records
 from tasks.page.shared import write_suggestion
-from tasks.records import Row
+from tasks.records import Row, write_table
 from tasks.source import located, reading
 from tasks.steps import run_steps
 from tasks.terminal import console, terminal
@@ -81,7 +82,7 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
                 _write_files(step, value, experiment.test, directory)
         tables = {"errors": results.errors(), "synthesis": results.synthesis, "history": results.history}
         for name, rows in (tables | ({"positions": found} if (found := results.positions()) else {})).items():
-            directory.write_csv(f"{name}.csv", rows)
+            write_table(directory.path(f"{name}.csv"), rows)
         metrics: Row = {
             "task": "aoa",
             "data": data.name,
@@ -130,9 +131,9 @@ def _write_files(step: Step[Experiment], value: Row, test: Spectra, run: Run) ->
             )
             write_suggestion(run.path(f"suggested-mix{step.subset.key}"), measured, position, variance)
         case Synthesis(trains=True) if "refused" not in value and step.subset.repeat == 0:
-            file = f"examples-mix{step.subset.key}.npz"
-            if not run.path(file).exists():
-                run.write_npz(file, _examples(step, torch.tensor(value["scores"]["psnr_db"]), test, run.folder))
+            file = run.path(f"examples-mix{step.subset.key}.npz")
+            if not file.exists():
+                write_npz(file, _examples(step, torch.tensor(value["scores"]["psnr_db"]), test, run.folder))
 
 
 def _examples(step: Synthesis, score: torch.Tensor, test: Spectra, folder: Path) -> Row:

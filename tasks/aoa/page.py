@@ -12,12 +12,11 @@ from tasks import labels
 from tasks.answer import Answer, Method, NextStep
 from tasks.aoa.records import FractionRecords, palette
 from tasks.aoa.room import choice_section, located_plan, locating_section, room_section
-from tasks.aoa.synthesis import example_pair, synthesis_section
+from tasks.aoa.synthesis import example_pair, examples_plot
 from tasks.environment import command
 from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of
 from tasks.page.records import Records, notes
-from tasks.page.shared import again, compared, errors_section, next_steps, suggestion_section, worth
-from tasks.summarise import fingerprinting
+from tasks.page.shared import again, compared, errors_section, fingerprinting, next_steps, suggestion_section, worth
 
 BASELINES = ("peak", "constant")  # others must beat them
 
@@ -28,7 +27,7 @@ def page(runs: list[Records]) -> Page:
     sections = [
         sections_of("Errors", fractions, _errors, _terms()),
         sections_of("Where was it?", fractions, _positions),
-        sections_of("Spectra", fractions, synthesis_section),
+        sections_of("Spectra", fractions, lambda fraction: Section("", plots=[examples_plot(fraction)])),
         _limits(runs[0]),
     ]
     more = sections_of("Measure or synthesize more?", fractions, _more)
@@ -232,8 +231,8 @@ def comparison(fraction: FractionRecords) -> str:
     """Return the changes of the learner's error by synthetic spectra, and whether they are significant."""
     method, best = fraction.turbo_method, fraction.mix["reference"]
     parts = [
-        f"{change_text(change)} against `{other}`"
-        f"{', the best one without them' if other == best else ''} ({judgement(change)})"
+        f"{change_text(change)} against `{other}`{', the best one without them' if other == best else ''} "
+        f"({'a gain' if change['high'] < 0 else 'a loss' if change['low'] > 0 else 'not significant'})"
         for other, change in fraction.mix["methods"][method]["changes"].items()
     ]
     return f"Synthetic spectra change the median error of `{method}` by {' and '.join(parts)}."
@@ -247,18 +246,6 @@ def change_text(change: ChangeMetrics) -> str:
         '-49% [-60%, -30%]'
     """
     return f"{change['change']:+.0%} [{change['low']:+.0%}, {change['high']:+.0%}]"
-
-
-def judgement(change: ChangeMetrics) -> str:
-    """Return whether a change is a gain, a loss or not significant, by its interval.
-
-    Example:
-        >>> judgement({"median_deg": 1.0, "change": -0.17, "low": -0.4, "high": 0.1})
-        'not significant'
-    """
-    if change["high"] < 0:
-        return "a gain"
-    return "a loss" if change["low"] > 0 else "not significant"
 
 
 def steps(fraction: FractionRecords) -> list[NextStep]:

@@ -11,8 +11,7 @@ from typing import Any
 from numpy.typing import NDArray
 from pandas import DataFrame
 
-from augment.turbo.condition import Condition, chosen_file, conditions_of, headline
-from augment.turbo.results import MixMetrics
+from augment.turbo.condition import Condition, Row, chosen_file, conditions_of, headline
 from swiftwrf.choices import AUTO, fraction_key
 from tasks import labels
 from tasks.page.records import Records
@@ -23,12 +22,7 @@ LOWER_REFERENCE, UPPER_REFERENCE, CHOSEN = "#cf4a4a", "#2a9165", "#3a7fd5"
 
 @dataclass(frozen=True)
 class FractionRecords:
-    """One measured fraction of one run.
-
-    Args:
-        run: Records of the run.
-        key: Measured fraction in metrics.json and in file names.
-    """
+    """One measured fraction, by its key in metrics.json and in file names, of one run."""
 
     run: Records
     key: str
@@ -39,9 +33,9 @@ class FractionRecords:
         return [cls(run, key) for key in run.metrics["mixes"]]
 
     @cached_property
-    def mix(self) -> MixMetrics:
+    def mix(self) -> Row:
         """Metrics of the measured fraction."""
-        found: MixMetrics = self.run.metrics["mixes"][self.key]
+        found: Row = self.run.metrics["mixes"][self.key]
         return found
 
     @cached_property
@@ -67,12 +61,12 @@ class FractionRecords:
 
     def table(self, name: str) -> DataFrame:
         """Return the rows of a table of the run, e.g. `errors`, with this measured fraction."""
-        return of_fraction(self.run.table(name), self.key)
+        table = self.run.table(name)
+        return table[[fraction_key(float(text)) == self.key for text in table["measured_fraction"]]]
 
     def arrays(self, kind: str) -> dict[str, NDArray[Any]]:
         """Return the arrays of one kind, e.g. `located`, that the run left; none if it left no such file."""
-        name = f"{kind}-mix{self.key}"
-        return self.run.arrays(name) if self.run.holds(name) else {}
+        return self.run.arrays(f"{kind}-mix{self.key}")
 
     def synthesizers(self, methods: Iterable[str]) -> list[str]:
         """Return the field models behind these methods, that of the first repeat where repeats chose differently."""
@@ -105,11 +99,6 @@ class FractionRecords:
     def palette(self) -> dict[str, str]:
         """Colours of its field models and conditions."""
         return palette(self.conditions.values())
-
-
-def of_fraction(table: DataFrame, key: str) -> DataFrame:
-    """Return the rows of a measured fraction."""
-    return table[[fraction_key(float(text)) == key for text in table["measured_fraction"]]]
 
 
 def palette(conditions: Iterable[Condition]) -> dict[str, str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +16,7 @@ from swiftwrf import AngularGrid
 from swiftwrf.plotting import polar_spectrum
 from tasks.aoa.records import FractionRecords
 from tasks.page.figures import LABEL, STYLE, colour_bar, plain
-from tasks.page.page import Plot, Section, Table, number
+from tasks.page.page import Plot, Table, number
 
 MAX_DIFFERENCE = 0.5  # of a magnitude in [0, 1]: end of the scale of standard deviations of one spectrum
 TRUTH, PEAK = "#ffffff", "#cf4a4a"
@@ -32,13 +31,7 @@ SCALES = {
 
 @dataclass(frozen=True)
 class Example:
-    """A test spectrum and its prediction.
-
-    Args:
-        title: Row and quality.
-        images: Values (n_elevation, n_azimuth) by kind, as `spectra` takes them.
-        truth: True direction [deg]. None if it is unknown.
-    """
+    """A test spectrum and its prediction: title, values (n_elevation, n_azimuth) by kind, true direction if known."""
 
     title: str
     images: dict[str, NDArray[Any]]
@@ -61,11 +54,6 @@ def examples(fraction: FractionRecords) -> list[Example]:
             truth = (float(label["truth_azimuth_deg"]), float(label["truth_elevation_deg"]))
         found.append(Example(f"row {index}, PSNR {stored['psnr_db'][row]:.1f} dB", images, truth))
     return found
-
-
-def synthesis_section(fraction: FractionRecords) -> Section:
-    """Return measured spectra and their predictions."""
-    return Section("", plots=[_examples(fraction)])
 
 
 def quality_table(fraction: FractionRecords) -> Table:
@@ -98,9 +86,11 @@ def example_pair(fraction: FractionRecords) -> tuple[list[Figure], str]:
     return [spectra(pair, f"spectrum {example.title}", example.truth)], caption
 
 
-def _examples(fraction: FractionRecords) -> Plot:
+def examples_plot(fraction: FractionRecords) -> Plot:
+    """Return measured spectra and their predictions."""
     stored, found = fraction.arrays("examples"), examples(fraction)
-    most = scale_of([image for one in found for kind, image in one.images.items() if SCALES[kind][0] != "viridis"])
+    small = [image.ravel() for one in found for kind, image in one.images.items() if SCALES[kind][0] != "viridis"]
+    most = max(float(np.quantile(np.abs(np.concatenate(small)), 0.99)), 1e-3)  # end of a scale that shows them
     text = (
         f"Spectra at positions without a measurement, by {stored.get('synthesizer', 'swiftwrf')}, from the best to the "
         "worst by PSNR (quantiles 1, 0.5, 0). The array's normal is in the middle; cross: true direction, ring: peak. "
@@ -110,11 +100,6 @@ def _examples(fraction: FractionRecords) -> Plot:
         text += f" Intervals of 80 % cover {float(stored['coverage']):.0%} of the pixels of all test spectra."
     panels = [spectra(one.images, one.title, one.truth, most) for one in found]
     return Plot(f"spectra-{fraction.file_name}", panels, text, _pixels(stored))
-
-
-def scale_of(images: Sequence[NDArray[Any]]) -> float:
-    """Return the 99 % quantile of magnitudes, the end of a scale that shows them."""
-    return max(float(np.quantile(np.abs(np.concatenate([image.ravel() for image in images])), 0.99)), 1e-3)
 
 
 def _pixels(example: dict[str, NDArray[Any]]) -> DataFrame:

@@ -25,7 +25,7 @@ from tasks.locate.page import SUGGESTED, answer, page
 from tasks.page.page import reporting
 from tasks.page.records import Records
 from tasks.page.shared import write_suggestion
-from tasks.records import LOCATOR, Row
+from tasks.records import LOCATOR, Row, write_table
 from tasks.source import measured_rssi, split_notes
 from tasks.steps import run_steps
 from tasks.terminal import console, terminal
@@ -36,12 +36,7 @@ N_MAPS = 6  # test rows with a posterior map
 
 @dataclass(frozen=True)
 class Localization(Step[LocateSplit]):
-    """Fit a localizer and locate the test rows.
-
-    Args:
-        trial: The localizer and its part of the data.
-        suggest: Number of positions to suggest for the next measurements.
-    """
+    """Fit the localizer of a trial and locate the test rows; suggest a number of positions for the next measurements."""
 
     trial: Trial
     suggest: int = 0
@@ -99,7 +94,7 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
                 assert isinstance(step, Localization)
                 values[step.trial] = value
         result = LocateComparison(measured, values)
-        directory.write_csv("errors.csv", result.errors.to_dict("records"))
+        write_table(directory.path("errors.csv"), result.errors.to_dict("records"))
         final = directory.finish(_metrics(data, result), reporting(page))
     terminal.answer(answer(Records(final)), final / "report.html")
 

@@ -26,13 +26,14 @@ from tasks.page.shared import (
     again,
     by_method,
     compared,
+    comparison_sentence,
+    coverage_warning,
     difference,
     errors_section,
     limits,
     next_steps,
     suggestion_section,
 )
-from tasks.summarise import comparison_sentence, coverage_warning
 
 OWN = "posterior"  # the localizer that all others are compared with
 NEIGHBOURS = ("knn", "knn_difference")
@@ -42,6 +43,14 @@ MAX_VECTOR_LINES = 300  # more lines become an image, so that the page stays sma
 TRUTH, ESTIMATE = "#cf4a4a", "#ffffff"
 COLUMNS = ["index", "place", "method", "position_error_m"]  # of the errors of methods
 COLOURS = labels.colours(labels.LOCALIZERS)
+LIMITS = (
+    "Rows that no receiver detected have no position. They are left out of the errors.",
+    "Candidate positions lie in and around the training positions. A transmitter elsewhere is located at their edge.",
+    "Intervals of medians treat test rows as independent. Along a walked path they are not, and the intervals are too "
+    "narrow.",
+    "Training and test rows are of one device and one time, unless the split separates these. Another device has "
+    "another offset, which --offset-by COLUMN estimates if the table names devices.",
+)
 
 
 def page(runs: list[Records]) -> Page:
@@ -50,9 +59,9 @@ def page(runs: list[Records]) -> Page:
         sections_of("Where was it?", runs, lambda run: _posteriors(run, several=len(runs) > 1)),
         sections_of("Errors", runs, _errors, labels.meanings(LOCALIZERS, labels.LOCALIZERS)),
         sections_of("How sure is it?", runs, lambda run: Section("", plots=[_calibration(run), *_studies(run)])),
-        _limits(runs[0]),
+        limits(runs[0], *LIMITS),
     ]
-    if any(run.holds(SUGGESTED) for run in runs):
+    if any(run.arrays(SUGGESTED) for run in runs):
         sections.insert(3, sections_of("Where to measure next", runs, _suggestion))
     names = ", ".join(dict.fromkeys(run.place for run in runs))
     if len(runs) == 1:
@@ -89,11 +98,11 @@ def _errors(run: Records) -> Section:
 
 
 def _suggestion(run: Records) -> Section | None:
-    if not run.holds(SUGGESTED):
+    if not (arrays := run.arrays(SUGGESTED)):
         return None
     return suggestion_section(
         "",
-        run.arrays(SUGGESTED),
+        arrays,
         SUGGESTED,
         run.file_name,
         what="the variance of the radio maps",
@@ -220,18 +229,6 @@ def posteriors(maps: Mapping[str, NDArray[Any]]) -> list[Figure]:
         figures.colour_bar(ax, drawn, "posterior over its maximum")
         panels.append(figure)
     return panels
-
-
-def _limits(run: Records) -> Section:
-    return limits(
-        run,
-        "Rows that no receiver detected have no position. They are left out of the errors.",
-        "Candidate positions lie in and around the training positions. A transmitter elsewhere is located at their edge.",
-        "Intervals of medians treat test rows as independent. Along a walked path they are not, and the intervals are too "
-        "narrow.",
-        "Training and test rows are of one device and one time, unless the split separates these. Another device has "
-        "another offset, which --offset-by COLUMN estimates if the table names devices.",
-    )
 
 
 def answer(run: Records) -> Answer:

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.axes import Axes
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, UnidentifiedImageError
 from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
 from swiftwrf import InputError
-from swiftwrf.plotting import corners_of, hatch
 from swiftwrf.positions import MAX_COORDINATE_M
 from swiftwrf.runtime.checkpoint import refusing
 from swiftwrf.runtime.durable import write_npz
@@ -50,47 +48,6 @@ def inside(position: ArrayLike, known: ArrayLike) -> NDArray[np.bool_]:
         return np.asarray(tree.query(at)[0] <= MIN_REACH * max(float(apart.max()), 1e-6))
 
 
-def draw(
-    axes: Axes,
-    x: NDArray[Any],
-    y: NDArray[Any],
-    values: NDArray[Any],
-    *,
-    colours: str,
-    limits: tuple[float, float],
-    known: ArrayLike,
-    silent: NDArray[np.bool_] | None = None,
-    plan: tuple[NDArray[Any], Corners] | None = None,
-) -> Any:
-    """Draw a map with hatching where it is extrapolated or silent; return the image for a colour bar.
-
-    Args:
-        axes: Axes to draw in.
-        x: Centres of the columns (W,) [m].
-        y: Centres of the rows (H,) [m].
-        values: Values (H, W).
-        colours: Name of a matplotlib colour map.
-        limits: Values of the first and the last colour.
-        known: Measured positions (n, 2 or 3) [m].
-        silent: Cells where a detection is less likely than not, (H, W), hatched the other way.
-        plan: Image of the floor and its corners x0, x1, y0, y1 [m], drawn below.
-    """
-    extent = corners_of(x, y)
-    if plan is not None:
-        axes.imshow(plan[0], extent=plan[1], aspect="equal", zorder=0)
-    low, high = limits
-    alpha = 0.75 if plan is not None else 1.0
-    drawn = axes.imshow(
-        values, origin="lower", extent=extent, cmap=colours, vmin=low, vmax=high, alpha=alpha, zorder=1, aspect="equal"
-    )
-    hatch(axes, x, y, ~inside(np.stack(np.meshgrid(x, y), axis=-1), known))
-    if silent is not None:
-        hatch(axes, x, y, silent, "\\\\\\\\")
-    axes.set(xlabel="x [m]", ylabel="y [m]")
-    axes.grid(visible=False)
-    return drawn
-
-
 def colour_image(values: NDArray[np.floating], colours: str, low: float = 0.0, high: float = 1.0) -> Image.Image:
     """Return an image of values (rows, columns), the first row on top; nan is transparent.
 
@@ -112,11 +69,7 @@ def colour_image(values: NDArray[np.floating], colours: str, low: float = 0.0, h
 
 @dataclass(frozen=True, eq=False)
 class FloorPlan:
-    """An image of a floor and its place.
-
-    Args:
-        pixels: Image (height, width, 3), the first row on top.
-        corners: Positions x0, x1, y0, y1 [m] of its edges.
+    """An image of a floor, (height, width, 3) with the first row on top, and the edges x0, x1, y0, y1 [m] of its place.
 
     Raises:
         InputError: No pixels, or edges that are not in order or beyond 1e9 m.
@@ -177,11 +130,7 @@ class FloorPlan:
 
 
 def read_pixels(file: str | Path | BinaryIO, name: str) -> NDArray[np.uint8]:
-    """Return the pixels (height, width, 3) of a PNG or JPEG image.
-
-    Args:
-        file: File or its name.
-        name: Name of the image in errors.
+    """Return the pixels (height, width, 3) of a PNG or JPEG image, whose name stands in errors.
 
     Raises:
         InputError: No readable image, or one of more than `MAX_PLAN_PIXELS`.

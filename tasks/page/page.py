@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 from jinja2 import Environment, PackageLoader
 from markupsafe import Markup, escape
@@ -22,17 +22,6 @@ from tasks.records import write_table
 HALF = 92  # letters of a table that fit into half of the page
 WIDE = 7.5  # [inches] figures that are wider take the whole width of the page, others half
 MAX_SECTIONS = 5  # of a page, whose navigation has the details, too
-
-
-class HasScene(Protocol):
-    """Records of a run, or of a part of it."""
-
-    @property
-    def scene(self) -> str:
-        """Name among those of a report."""
-
-
-Named = TypeVar("Named", bound=HasScene)
 
 
 @dataclass(frozen=True)
@@ -54,19 +43,12 @@ class Table:
 
 @dataclass(frozen=True)
 class Plot:
-    """A figure and what it shows.
+    """A figure and what it shows."""
 
-    Args:
-        name: Name of its files without suffix.
-        panels: Figures, which stand side by side where the page is wide enough, and below each other elsewhere.
-        caption: A sentence or two.
-        data: Numbers that it shows.
-    """
-
-    name: str
-    panels: Sequence[Figure]
-    caption: str
-    data: DataFrame
+    name: str  # name of its files without suffix
+    panels: Sequence[Figure]  # figures, side by side where the page is wide enough
+    caption: str  # A sentence or two
+    data: DataFrame  # numbers that it shows
 
     @property
     def widths(self) -> list[float]:
@@ -131,14 +113,7 @@ class Summary:
 
 @dataclass(frozen=True)
 class Page:
-    """A report.
-
-    Args:
-        title: Title.
-        summary: First screen.
-        sections: Sections in the navigation, at most `MAX_SECTIONS`.
-        details: Sections of secondary interest, folded.
-    """
+    """A report: first screen, at most `MAX_SECTIONS` sections in the navigation, and folded sections as details."""
 
     title: str
     summary: Summary
@@ -206,23 +181,16 @@ def reporting(page: Callable[[list[Records]], Page]) -> Callable[[Path, dict[str
 
 
 def sections_of(
-    title: str,
-    runs: Sequence[Named],
-    section: Callable[[Named], Section | None],
-    terms: dict[str, str] | None = None,
+    title: str, runs: Sequence[Any], section: Callable[[Any], Section | None], terms: dict[str, str] | None = None
 ) -> Section:
-    """Return one section over all runs. Several runs have a part each, under the run's name.
+    """Return one section, with the meanings of its names, over all runs or parts of runs that have something to show.
 
-    Args:
-        title: Title of the section.
-        runs: Records, or parts of them, with a `scene`.
-        section: Content for one of them. None if there is nothing to show.
-        terms: Meanings of the names in the section.
+    Several runs have a part each, under the run's `scene`.
     """
-    found = [(run, part) for run in runs if (part := section(run)) is not None]
-    if len(runs) == 1:
-        return replace(found[0][1], title=title, terms=terms or {}) if found else Section(title, terms=terms or {})
-    return Section(title, parts=[replace(part, title=run.scene) for run, part in found], terms=terms or {})
+    found = [replace(part, title=run.scene) for run in runs if (part := section(run)) is not None]
+    if len(runs) == 1 and found:
+        return replace(found[0], title=title, terms=terms or {})
+    return Section(title, parts=found, terms=terms or {})
 
 
 def number(value: float | None, digits: int = 2) -> str:

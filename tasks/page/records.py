@@ -43,11 +43,6 @@ class Records:
         self._arrays: dict[str, dict[str, NDArray[Any]]] = {}
 
     @property
-    def label(self) -> str:
-        """Suffix of titles that distinguishes the run in a report over several runs, empty for one run."""
-        return f", run {self.number}" if self.number else ""
-
-    @property
     def place(self) -> str:
         """The data and their split in words."""
         data = self.metrics["data"]
@@ -56,7 +51,7 @@ class Records:
     @property
     def scene(self) -> str:
         """The data and their split in words, and which run it is where there are several."""
-        return self.place + self.label
+        return self.place + (f", run {self.number}" if self.number else "")
 
     @property
     def file_name(self) -> str:
@@ -80,14 +75,11 @@ class Records:
             self._tables[name] = read_table(self.folder / f"{name}.csv")
         return self._tables[name]
 
-    def holds(self, name: str) -> bool:
-        """Return True if the run saved arrays of that name."""
-        return (self.folder / f"{name}.npz").is_file()
-
     def arrays(self, name: str) -> dict[str, NDArray[Any]]:
-        """Arrays that the run left, by their names, e.g. `maps`."""
+        """Return the arrays that the run saved in a file, e.g. `maps`, by their names; none without that file."""
         if name not in self._arrays:
-            self._arrays[name] = read_npz(self.folder / f"{name}.npz")
+            file = self.folder / f"{name}.npz"
+            self._arrays[name] = read_npz(file) if file.is_file() else {}
         return self._arrays[name]
 
     @property

@@ -27,6 +27,9 @@ from tasks.records import write_table
 MEASURED, SUGGESTED = "#3a7fd5", "#cf4a4a"
 MIN_REDUCTION = 0.1  # of the variance, below which more positions are not worth it
 MAX_NUMBERED = 30  # suggestions with their rank beside them; more would hide each other
+MAX_COVERAGE_ERROR = 0.05  # difference from the nominal coverage below which intervals count as calibrated
+MIN_RELEVANT = 0.02  # difference of mean errors, relative to them, below which methods are equal in practice
+MAX_SPREAD = 0.5  # of labels about their mean direction, relative to the error of the peaks, for a warning
 NONE = (np.nan, np.nan, np.nan)
 
 
@@ -115,16 +118,7 @@ def difference(errors: DataFrame, own: str, other: str) -> str:
 def next_steps(
     run: Records, explore: str, predict: str, source: str, own: Sequence[NextStep] = (), model: str = ""
 ) -> list[NextStep]:
-    """Return what to do next with a run.
-
-    Args:
-        run: Records of the run.
-        explore: What the page of `view` shows. Empty if it does not show the run.
-        predict: What `predict` does.
-        source: Its source.
-        own: Steps of the task.
-        model: Model to predict by. Defaults to that of the run.
-    """
+    """Return what to do next with a run: explore it, predict a source by its model, and the steps of its task."""
     steps = [NextStep(explore, command("view", run.path))] if explore else []
     return [*steps, NextStep(predict, command("predict", model or run.path, source)), *own]
 
@@ -147,14 +141,9 @@ def compared(
     quantity: str,
     steps: Sequence[NextStep] = (),
 ) -> Summary:
-    """Return the first screen of several answers: the methods of their short tables, a column each.
+    """Return the first screen of several answers, by unique short names: the methods of their short tables, a column each.
 
-    Args:
-        answers: Answers by unique short names.
-        runs: Their runs.
-        colours: Colours of the methods.
-        quantity: Name of the errors.
-        steps: What to do next. Defaults to a look at each run.
+    The next steps are by default a look at each run.
     """
     unit, names = next(iter(answers.values())).unit, list(answers)
     short = [{one.name: one.error for block in answer.short() for one in block} for answer in answers.values()]
@@ -192,14 +181,9 @@ def with_interval(error: ErrorSummary) -> str:
 def write_suggestion(
     file: Path, measured: Tensor, position: Tensor, variance: Tensor, columns: Mapping[str, NDArray[Any]] | None = None
 ) -> None:
-    """Write suggested positions as a table and, for the report, as arrays.
+    """Write suggested positions as a table, with further columns, and as arrays for the report, in files of one name.
 
-    Args:
-        file: Both files without suffix.
-        measured: Measured positions (n, 3) [m].
-        position: Suggested positions (k, 3) [m].
-        variance: Relative variance after measuring at 0 to k positions, (1 + k,).
-        columns: Further columns of the table.
+    The variance (1 + k,) is the relative one after measuring at 0 to k of the positions (k, 3) [m].
     """
     table = DataFrame(position.numpy(), columns=["x_m", "y_m", "z_m"]).assign(**(columns or {}))
     table = table.assign(variance_left=variance[1:].numpy())
@@ -252,10 +236,7 @@ def suggestion_section(
 
 
 def worth(left: NDArray[Any]) -> str:
-    """Return whether the suggested positions are worth measuring.
-
-    Args:
-        left: Relative variance after measuring at 0 to k positions, (1 + k,).
+    """Return whether suggested positions are worth measuring, by the relative variance after 0 to k of them, (1 + k,).
 
     Example:
         >>> import numpy as np
@@ -265,3 +246,63 @@ def worth(left: NDArray[Any]) -> str:
     if left[-1] > (1 - MIN_REDUCTION) * left[0]:
         return "This is not worth it: the variance hardly falls."
     return "This is worth it where the variance falls most: begin with the first positions."
+
+
+def comparison_sentence(
+    errors: DataFrame, method: str, other: str, *, name: str, unit: str, rows: str, n_test: int
+) -> str:
+    """Return one sentence that compares the mean errors of a method, under its name there, with those of another one.
+
+    The errors are those of `by_method`; their rows have a word, e.g. pairs.
+    """
+    mean, low, high = paired_difference(errors, method, other)
+    if math.isnan(low):
+        return f"{n_test} test rows are too few to compare {name} with {other}."
+    interval = f"{mean:+.2f} {unit} [{low:+.2f}, {high:+.2f}]"
+    if max(abs(low), abs(high)) < MIN_RELEVANT * float(errors[other].mean()):
+        return f"On the same {rows} {name} and {other} are equal in practice: mean errors differ by {interval}."
+    if high < 0:
+        return f"On the same {rows} {name}'s mean error is lower than that of {other}: {interval}."
+    if low > 0:
+        return (
+            f"On the same {rows} {other} has the lower mean error: {name}'s differs by {interval}. {other} is the best of "
+            "several on these rows, which favours it."
+        )
+    return f"On the same {rows} the errors of {name} and {other} do not differ significantly: {interval}."
+
+
+def coverage_warning(name: str, coverage: float, nominal: float, n_test: int) -> str:
+    """Return a warning if intervals or regions cover significantly more or less than they should, else nothing.
+
+    Their name is in the plural, and test rows are independent.
+
+    Example:
+        >>> coverage_warning("intervals", 0.87, 0.8, n_test=100)
+        ''
+        >>> coverage_warning("intervals", 0.6, 0.8, n_test=100)
+        'The 80 % intervals contain 60 % of the test values: they are too narrow here.'
+    """
+    two_deviations = 2 * math.sqrt(nominal * (1 - nominal) / n_test)
+    if abs(coverage - nominal) <= max(MAX_COVERAGE_ERROR, two_deviations):
+        return ""
+    size = "narrow" if coverage < nominal else "wide"
+    return (
+        f"The {100 * nominal:.0f} % {name} contain {100 * coverage:.0f} % of the test values: they are too {size} here."
+    )
+
+
+def fingerprinting(constant_deg: float, peak_deg: float) -> str:
+    """Return a warning if spectra are labels of positions rather than of directions, else nothing.
+
+    Median errors [deg] of the mean direction of the labels, which is their spread, and of the strongest direction decide.
+
+    Example:
+        >>> fingerprinting(26.0, 2.4)
+        ''
+    """
+    if not constant_deg < MAX_SPREAD * peak_deg:
+        return ""
+    return (
+        f"This is fingerprinting along a path rather than estimation of angles: directions lie within {constant_deg:.1f} "
+        f"degrees of their mean (median), and peaks are {peak_deg:.0f} degrees off."
+    )

@@ -15,13 +15,14 @@ from swiftwrf.metrics import summary
 from swiftwrf.rssi import LEVEL, PairModel, RssiComparison, RssiModel, RssiPredictor, compare
 from swiftwrf.rssi.comparison import compared, model_of
 from swiftwrf.rssi.maps import RssiMap
+from swiftwrf.runtime.durable import write_npz
 from tasks.configs import RssiTaskConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
 from tasks.page.maps import read_pixels
 from tasks.page.page import reporting
 from tasks.page.records import Records
-from tasks.records import MODEL, Row
+from tasks.records import MODEL, Row, write_table
 from tasks.rssi.page import answer, page
 from tasks.source import measured_rssi, offset_notes, split_notes
 from tasks.terminal import console, terminal
@@ -37,7 +38,8 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         InputError: A configuration that the data cannot meet or that contradicts itself.
     """
     device = choose_device("cpu" if config.device == "auto" else config.device)
-    whole = _load(config)
+    measured = measured_rssi(config.data, config.table)
+    whole = rssi_room(seed=config.seed) if measured is None else measured
     data = whole.receivers(config.rx)
     plan = _read_floor_plan(config, data)
     for note in data.notes:
@@ -83,18 +85,13 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
                 progress=True,
             )
         directory.computed_on(cluster.machines if cluster else ())
-        directory.write_csv("errors.csv", result.errors.to_dict("records"))
-        directory.write_csv("predictions.csv", result.predictions.to_dict("records"))
+        write_table(directory.path("errors.csv"), result.errors.to_dict("records"))
+        write_table(directory.path("predictions.csv"), result.predictions.to_dict("records"))
         model = load(directory.path(MODEL))
         assert isinstance(model, RssiModel | PairModel)
-        directory.write_npz("maps.npz", _maps(model, result.train) | plan)
+        write_npz(directory.path("maps.npz"), _maps(model, result.train) | plan)
         final = directory.finish(_metrics(config, data, result, model), reporting(page))
     terminal.answer(answer(Records(final)), final / "report.html")
-
-
-def _load(config: RssiTaskConfig) -> Rssi:
-    measured = measured_rssi(config.data, config.table)
-    return rssi_room(seed=config.seed) if measured is None else measured
 
 
 def _read_floor_plan(config: RssiTaskConfig, data: Rssi) -> dict[str, Any]:

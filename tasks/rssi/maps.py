@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pandas import DataFrame
 
 from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
-from swiftwrf.plotting import corners_of
+from swiftwrf.plotting import corners_of, hatch
 from swiftwrf.rssi import LEVEL
 from tasks.page import figures, maps
 from tasks.page.page import Plot
@@ -34,12 +34,7 @@ HATCHED = (
 
 @dataclass(frozen=True)
 class Maps:
-    """Maps of one floor of a run.
-
-    Args:
-        run: Records of the run.
-        floor: Number of the floor; 0 in data without floors.
-    """
+    """Maps of one floor of a run, by its number; 0 in data without floors."""
 
     run: Records
     floor: int = 0
@@ -95,12 +90,6 @@ class Maps:
         lower = self.best["predicted"] - NormalDist().inv_cdf(CERTAINTY) * self.best["width"] / WIDTH_PER_STD
         return float((lower >= COVERED_DBM)[self.inside].mean()) if self.inside.any() else float("nan")
 
-    @property
-    def most_detected(self) -> list[int]:
-        """Receivers with a map, those that detected most rows, ascending."""
-        detected = (~np.isnan(self.arrays["measured"])).sum(axis=0)
-        return sorted(np.argsort(-detected, kind="stable")[:MAX_MAPS].tolist())
-
     def summary(self) -> Plot:
         """Return map and uncertainty of the only receiver, or of the best server."""
         several = len(self.names) > 1
@@ -122,12 +111,9 @@ class Maps:
         )
 
     def by_receiver(self, kind: str) -> Plot:
-        """Return maps of the receivers that detected most rows.
-
-        Args:
-            kind: "predicted", or "width" for that of the intervals.
-        """
-        shown = self.most_detected
+        """Return maps of the receivers that detected most rows: "predicted", or "width" for that of the intervals."""
+        detected = (~np.isnan(self.arrays["measured"])).sum(axis=0)
+        shown = sorted(np.argsort(-detected, kind="stable")[:MAX_MAPS].tolist())
         names, fields = [self.names[i] for i in shown], ("predicted", "width", "detection")
         data = self._cells({name: self.arrays[name][shown] for name in fields}, names)
         values = [{name: self.arrays[name][i] for name in fields} for i in shown]
@@ -150,17 +136,23 @@ class Maps:
         limits, colours = (self._widths, "magma") if kind == "width" else (self._limits, "viridis")
         if kind == "predicted" and receiver is None:
             limits = (float(values.min()), float(values.max()))
-        plan = (a["plan"], tuple(a["plan_extent"].tolist())) if "plan" in a else None
-        known, silent = a["measured_position"], fields["detection"] < 0.5
-        drawn = maps.draw(
-            ax, a["x"], a["y"], values, colours=colours, limits=limits, known=known, silent=silent, plan=plan
+        style: dict[str, Any] = {"cmap": colours, "vmin": limits[0], "vmax": limits[1]}
+        if "plan" in a:
+            ax.imshow(a["plan"], extent=tuple(a["plan_extent"].tolist()), aspect="equal", zorder=0)
+        opacity = 0.75 if "plan" in a else 1.0
+        drawn = ax.imshow(
+            values, origin="lower", extent=(x0, x1, y0, y1), alpha=opacity, zorder=1, aspect="equal", **style
         )
+        hatch(ax, a["x"], a["y"], ~self.inside)
+        hatch(ax, a["x"], a["y"], fields["detection"] < 0.5, "\\\\\\\\")
+        ax.set(xlabel="x [m]", ylabel="y [m]")
+        ax.grid(visible=False)
+        known = a["measured_position"]
         if receiver is not None and kind == "predicted":
             detected = ~np.isnan(a["measured"][:, receiver])
             many = len(detected) >= MAX_VECTOR_DOTS
             ax.plot(*known[~detected, :2].T, "o", markersize=3, markerfacecolor="none", color="white", rasterized=many)
-            style: dict[str, Any] = {"cmap": colours, "vmin": limits[0], "vmax": limits[1], "zorder": 3}
-            style |= {"edgecolors": "white", "linewidths": 0.4, "rasterized": many}
+            style |= {"zorder": 3, "edgecolors": "white", "linewidths": 0.4, "rasterized": many}
             ax.scatter(known[detected, 0], known[detected, 1], s=9, c=a["measured"][detected, receiver], **style)
         for number, at in enumerate(a["receiver"]):
             if receiver in (None, number) and np.isfinite(at).all():

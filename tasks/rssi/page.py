@@ -14,9 +14,18 @@ from tasks.labels import PREDICTORS, colour, colours, meanings
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of
 from tasks.page.records import Records, notes
-from tasks.page.shared import again, by_method, compared, difference, errors_section, limits, next_steps
+from tasks.page.shared import (
+    again,
+    by_method,
+    compared,
+    comparison_sentence,
+    coverage_warning,
+    difference,
+    errors_section,
+    limits,
+    next_steps,
+)
 from tasks.rssi.maps import CERTAINTY, COVERED_DBM, MAX_VECTOR_DOTS, MIN_RATIO, Maps
-from tasks.summarise import comparison_sentence, coverage_warning
 
 COLUMNS = ["index", "receiver", "method", "abs_error_db"]  # of the errors of methods
 COLOURS = colours(PREDICTORS)
@@ -25,6 +34,15 @@ WIDTH_OF_80_PERCENT = 2.563  # of an interval, in standard deviations of a norma
 MIN_REPEATS = 10  # of measurements at one place
 MAX_RATIO_TO_SCATTER = 1.3  # of an interval to the one of repeated measurements, which then explain it
 MAX_RECEIVERS = 40  # of the figure of differences; all are in its table
+LIMITS = (
+    "Single packets scatter about the mean of their position. BLE packets of unknown channel scatter by 2 to 3 dB. No "
+    "predictor of the mean has a lower error than this scatter.",
+    "Errors are those of detected values. How well empty cells are predicted is a number of its own, and where a packet "
+    "is more likely lost than received the maps are hatched.",
+    "Intervals of medians treat pairs as independent. Along a walked path they are not, and the intervals are too "
+    "narrow. The bootstrap of the paired table samples whole test rows, which corrects this in part.",
+    "The paper's table (2.91 dB for SwiftWRF, 6.74 dB for MRI) is of other data. Compare methods in this report only.",
+)
 
 
 def page(runs: list[Records]) -> Page:
@@ -32,7 +50,7 @@ def page(runs: list[Records]) -> Page:
     sections = [
         sections_of("Errors", runs, _errors, meanings(RSSI_PREDICTORS, PREDICTORS)),
         sections_of("Where the errors are", runs, lambda run: Section("", plots=[_where(run)])),
-        _limits(runs[0]),
+        limits(runs[0], *LIMITS),
     ]
     details = [provenance(runs)]
     if len(runs) > 1 or any(len(Maps(run).names) > 1 for run in runs):
@@ -82,19 +100,6 @@ def _errors(run: Records) -> Section:
         caption=caption,
         paragraphs=[f"Left out: {reason}." for reason in run.metrics["left_out"].values()],
         panels=_by_rows(run),
-    )
-
-
-def _limits(run: Records) -> Section:
-    return limits(
-        run,
-        "Single packets scatter about the mean of their position. BLE packets of unknown channel scatter by 2 to 3 dB. No "
-        "predictor of the mean has a lower error than this scatter.",
-        "Errors are those of detected values. How well empty cells are predicted is a number of its own, and where a packet "
-        "is more likely lost than received the maps are hatched.",
-        "Intervals of medians treat pairs as independent. Along a walked path they are not, and the intervals are too "
-        "narrow. The bootstrap of the paired table samples whole test rows, which corrects this in part.",
-        "The paper's table (2.91 dB for SwiftWRF, 6.74 dB for MRI) is of other data. Compare methods in this report only.",
     )
 
 

@@ -186,11 +186,7 @@ def _of_receivers(position: list[list[float]], value: dict[str, float | None], m
 def answer(number: int, new: Rssi | Spectra, before: FieldModel | RssiModel, step: Step) -> str:
     """Return the answer to a line: what was predicted and observed, the interval, and alarms, as JSON in ASCII.
 
-    Args:
-        number: Number of the measurement, counted from 1.
-        new: The measurement.
-        before: Model that had not learnt it.
-        step: Its scores.
+    Measurements are counted from 1, and the model before had not learnt this one.
     """
     found: dict[str, Any] = {"measurement": number, "position": step.scores.position[0]}
     if isinstance(new, Rssi):

@@ -9,12 +9,18 @@ from pathlib import Path
 
 import pandas as pd
 import torch
+from pandas import DataFrame
 from torch import Tensor
 
 from swiftwrf import InputError
 from swiftwrf.online import Step
+from swiftwrf.positions import nearest
 from swiftwrf.runtime.durable import write_json, write_text
-from tasks.records import Row, as_table, read_json
+from tasks.answer import NextStep
+from tasks.environment import command
+from tasks.page import figures
+from tasks.page.page import Number, Page, Plot, Section, Summary, Table
+from tasks.records import MODEL, Row, as_table, read_json
 
 TABLE, SUMMARY = "measurements.csv", "update.json"
 COLUMNS = (
@@ -32,45 +38,35 @@ COLUMNS = (
 )
 WORDS = ("alarm", "notice")  # columns of text
 TYPES = dict.fromkeys(COLUMNS, float) | {"index": int} | dict.fromkeys(WORDS, str)
-MEANS = ("error", "covered")  # columns whose means are kept
 WINDOW = 30  # measurements of the running error
+
+
+MAX_SURPRISING = 10
+N_NEIGHBOURS = 5  # measurements whose mean innovation a map shows at each position
+BLUE, RED = "#4477aa", "#ee6677"
 
 
 @dataclass(eq=False)
 class Record:
-    """Measurements that a model learnt one after the other. Adding one and the summary take a constant time.
+    """Measurements that a model learnt one after the other."""
 
-    Args:
-        source: Where the measurements come from.
-        unit: Unit of the errors, in brackets.
-        rows: A row of `measurements.csv` for each measurement.
-    """
+    source: str  # where the measurements come from
+    unit: str  # unit of the errors, in brackets
+    rows: list[Row] = field(default_factory=list)  # A row of `measurements.csv` for each measurement
 
-    source: str
-    unit: str
-    rows: list[Row] = field(default_factory=list)
-    alarms: list[tuple[int, str]] = field(default_factory=list, init=False)
-    """number of the measurement that raised each alarm, and the change in words"""
-    notices: list[tuple[int, str]] = field(default_factory=list, init=False)
-    """number of the measurement after which the model changed beside its data, and how, in words"""
-    _sums: dict[str, tuple[float, int]] = field(default_factory=lambda: dict.fromkeys(MEANS, (0.0, 0)), init=False)
+    @property
+    def alarms(self) -> list[tuple[int, str]]:
+        """Number of the measurement that raised each alarm, and the change in words."""
+        return [(number, row["alarm"]) for number, row in enumerate(self.rows) if row["alarm"]]
 
-    def __post_init__(self) -> None:
-        for number, row in enumerate(self.rows):
-            self._count(number, row)
-
-    def _count(self, number: int, row: Row) -> None:
-        """Add a row to the alarms, notices and sums."""
-        self.alarms += [(number, row["alarm"])] if row["alarm"] else []
-        self.notices += [(number, row["notice"])] if row["notice"] else []
-        for name, (total, n) in self._sums.items():
-            if not math.isnan(row[name]):
-                self._sums[name] = (total + row[name], n + 1)
+    @property
+    def notices(self) -> list[tuple[int, str]]:
+        """Number of the measurement after which the model changed beside its data, and how, in words."""
+        return [(number, row["notice"]) for number, row in enumerate(self.rows) if row["notice"]]
 
     def mean(self, name: str) -> float:
-        """Return the mean of a column of `MEANS`, nan without numbers."""
-        total, n = self._sums[name]
-        return total / n if n else float("nan")
+        """Return the mean of a column, nan without numbers."""
+        return float(self.column(name).nanmean())
 
     @classmethod
     def read(cls, folder: Path, count: int | None = None) -> Record:
@@ -101,7 +97,6 @@ class Record:
             "correlation": step.correlation,
             "notice": " ".join(step.notice.split()),
         }
-        self._count(len(self.rows), row)
         self.rows.append(row)
         return row
 
@@ -166,3 +161,56 @@ def _rows(table: Path) -> list[Row]:
         return list(rows[list(COLUMNS)].fillna(dict.fromkeys(WORDS, "")).to_dict("records"))
     except (OSError, ValueError, KeyError, OverflowError) as error:
         raise InputError(f"{table} is not the table of an update ({error}); restore it") from None
+
+
+def page(record: Record, name: str, folder: Path) -> Page:
+    """Return the page of a record, with the name of its data, of an update in a directory."""
+    numbers = [
+        Number(str(len(record.rows)), "measurements learnt"),
+        Number(f"{record.mean('error'):.3g}{record.unit}", "mean error before each was learnt"),
+        Number(str(len(record.alarms)), "changes detected"),
+    ]
+    if math.isfinite(covered := record.mean("covered")):
+        numbers.append(Number(f"{covered:.0%}", "of the values inside their 80 % interval"))
+    step = NextStep(
+        "Continue with the updated model", command("update", str(folder / MODEL), "SOURCE", "--out", "NEXT")
+    )
+    summary = Summary(numbers, [error_plot(record)], record.sentences(), [step])
+    order = record.column("innovation").nan_to_num().argsort(descending=True)[:MAX_SURPRISING].tolist()
+    cells = [
+        [
+            str(record.rows[i]["index"]),
+            *(f"{record.rows[i][key]:.3g}" for key in ("x_m", "y_m", "z_m", "error", "innovation")),
+        ]
+        for i in order
+    ]
+    columns = ["measurement", "x [m]", "y [m]", "z [m]", f"error{record.unit}", "innovation"]
+    table = Table(columns, cells, "Measurements with the largest innovations.")
+    return Page(f"Update: {name}", summary, [Section("Surprising measurements", [], [table], [map_plot(record)])])
+
+
+def error_plot(record: Record) -> Plot:
+    """Return the errors over time, and the alarms."""
+    figure, axes = figures.panel(7.4, 3.2)
+    error, running = record.column("error"), record.column("running_error")
+    axes.plot(error, ".", markersize=3, color=figures.RULE)
+    axes.plot(running, color=BLUE)
+    for number, _ in record.alarms:
+        axes.axvline(number, color=RED, linewidth=1)
+    axes.set(xlabel="measurement", ylabel=f"error{record.unit}", ylim=(0, None))
+    caption = f"Error of each measurement before it was learnt, mean of the last {WINDOW} (blue), and alarms (red)."
+    return Plot("error", [figure], caption, DataFrame({"error": error, "running_error": running}))
+
+
+def map_plot(record: Record) -> Plot:
+    """Return the positions from above with their innovations."""
+    figure, axes = figures.panel(6.8, 5)
+    position = record.column("x_m", "y_m", "z_m")
+    _, near = nearest(position, position, min(N_NEIGHBOURS, len(position)))
+    surprise = record.column("innovation")[near].nanmean(dim=1)
+    drawn = axes.scatter(position[:, 0], position[:, 1], s=10, c=surprise, cmap="viridis", vmin=0)
+    figures.colour_bar(axes, drawn, f"mean innovation of the {N_NEIGHBOURS} nearest measurements")
+    caption = "Positions from above, coloured by their innovations."
+    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    table = DataFrame(position.numpy(), columns=["x_m", "y_m", "z_m"]).assign(innovation=surprise.numpy())
+    return Plot("changes", [figure], caption, table)

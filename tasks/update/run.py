@@ -28,8 +28,7 @@ from tasks.records import CONFIG, ENVIRONMENT, MODEL
 from tasks.source import aligned, located, reading
 from tasks.terminal import console, terminal
 from tasks.update.lines import answer, check_source, lines, measurement
-from tasks.update.page import page
-from tasks.update.record import SUMMARY, Record
+from tasks.update.record import SUMMARY, Record, page
 
 WAITING = "waiting"  # tensor of the spectra that a geometry has not learnt yet
 

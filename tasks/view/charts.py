@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import cache
 from typing import Any
 
@@ -28,7 +28,6 @@ CROSS = "path://M0 2L2 0L8 6L14 0L16 2L10 8L16 14L14 16L8 10L2 16L0 14L6 8Z"
 BAR = "bar"  # name of the colour bar
 N_STOPS = 17  # of a colour bar
 DISC_PX = 240
-PLAN_LEFT, PLAN_RIGHT, PLAN_TOP = 50, 12, 10  # pixels around a plan
 PLAN_MARGIN = 0.04  # of the longer side
 MIN_PLAN_ASPECT = 0.4  # a path along one axis needs room to drag across it
 PICTURE = """(params, api) => {
@@ -120,14 +119,9 @@ def circle(centre: ArrayLike, radius: float) -> Values:
 
 
 def colour_bar(colours: str, limits: tuple[float, float], label: str, layer: str, extend: str = "neither") -> Option:
-    """Return a colour bar.
+    """Return a colour bar of a matplotlib colour map for the values of a layer, with quantity and unit.
 
-    Args:
-        colours: Name of a matplotlib colour map.
-        limits: Values of its first and its last colour.
-        label: Quantity and unit.
-        layer: Name of the layer whose values it colours.
-        extend: Ends that stand for all values beyond, "neither", "max" or "both".
+    Ends that stand for all values beyond are "neither", "max" or "both".
     """
     low, high = (f"{value:.3g}" for value in limits)
     ends = [f"{'≥ ' * (extend != 'neither')}{high}  {label}", f"{'≤ ' * (extend == 'both')}{low}"]
@@ -201,29 +195,10 @@ def _nearest_direction(grid: AngularGrid) -> NDArray[np.integer]:
     return np.where(elevation < 0, -1, row.clip(0, grid.n_elevation - 1) * grid.n_azimuth + column)
 
 
-def plan(corners: Sequence[float], layers: list[Option], bottom: int) -> Option:
-    """Return the options of a chart of positions in plan, edges x0, x1, y0, y1 [m], with room below for a colour bar."""
-    x0, x1, y0, y1 = corners
-    box = {"left": PLAN_LEFT, "right": PLAN_RIGHT, "top": PLAN_TOP, "bottom": bottom, "outerBoundsMode": "none"}
-    axes = {"xAxis": axis(x0, x1, "x [m]"), "yAxis": axis(y0, y1, "y [m]", gap=34)}
-    return {
-        "animation": False,
-        "grid": box,
-        **axes,
-        "series": [layer | {"z": 2 + number} for number, layer in enumerate(layers)],
-    }
-
-
 def spectrum(polar: bool, colours: str, high: float, extend: str, peak: str, sight: str) -> Option:
-    """Return the options of a chart of a spectrum with a ring in one colour and a cross in another.
+    """Return the options of a chart of a spectrum up to a value, with a ring at the peak and a cross at the line of sight.
 
-    Args:
-        polar: Whether directions are (angle to the normal, azimuth) in polar coordinates, else (azimuth, elevation) [deg].
-        colours: Name of a matplotlib colour map.
-        high: Value of its last colour.
-        extend: Ends of the colour bar that stand for all values beyond, "neither" or "max".
-        peak: Colour of the ring.
-        sight: Colour of the cross.
+    In polar coordinates directions are (angle to the normal, azimuth), else (azimuth, elevation) [deg].
     """
     system = "polar" if polar else "cartesian2d"
     layers = [pictures("spectrum", system), rings("peak", peak, 14, system), crosses("sight", sight, system)]

@@ -3,52 +3,45 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from threading import Lock
+from typing import NamedTuple
 
 from swiftwrf import InputError
 from tasks.page.figures import as_svg, for_page
 from tasks.records import Row
-from tasks.update.page import error_plot, map_plot
-from tasks.update.record import SUMMARY, TABLE, Record
+from tasks.update.record import SUMMARY, TABLE, Record, error_plot, map_plot
 
 LAST_ROWS = 20
 Version = tuple[tuple[int, int], ...]  # time of change [ns] and size of each file
 
 
-@dataclass(frozen=True, eq=False)
-class Snapshot:
-    """A record at one moment.
+class Snapshot(NamedTuple):
+    """Results in sentences, the last rows, newest first, and figures as SVG by name; no figures without measurements."""
 
-    Args:
-        version: Version of the files.
-        sentences: Results.
-        rows: The last rows, newest first.
-        figures: Running error and map of changes as SVG, by their names; none without measurements.
-    """
-
-    version: Version
     sentences: list[str]
     rows: list[Row]
     figures: dict[str, str]
 
 
+@dataclass(frozen=True)
 class FollowedView:
     """Directory of an update, which may still grow.
-
-    Args:
-        folder: The directory.
 
     Raises:
         InputError: It holds no record.
     """
 
-    def __init__(self, folder: Path) -> None:
-        if not (folder / SUMMARY).exists():
-            raise InputError(f"{folder} holds no record of an update: it has no {SUMMARY}")
-        self.title, self.folder = folder.name, folder
-        self._last: Snapshot | None = None
-        self._lock = Lock()
+    folder: Path
+
+    def __post_init__(self) -> None:
+        if not (self.folder / SUMMARY).exists():
+            raise InputError(f"{self.folder} holds no record of an update: it has no {SUMMARY}")
+
+    @property
+    def title(self) -> str:
+        """Title of the page."""
+        return self.folder.name
 
     @property
     def version(self) -> Version:
@@ -56,23 +49,17 @@ class FollowedView:
         found = [file.stat() for name in (TABLE, SUMMARY) if (file := self.folder / name).exists()]
         return tuple((stat.st_mtime_ns, stat.st_size) for stat in found)
 
-    def snapshot(self) -> Snapshot:
-        """Return the record as it is now; several visitors share it.
 
-        Raises:
-            InputError: The record is damaged.
-        """
-        with self._lock:
-            version = self.version
-            if self._last is None or self._last.version != version:
-                self._last = _read(self.folder, version)
-            return self._last
+@lru_cache(maxsize=1)
+def snapshot(view: FollowedView, version: Version) -> Snapshot:
+    """Return the record at a version of its files; several visitors share it.
 
-
-def _read(folder: Path, version: Version) -> Snapshot:
-    record = Record.read(folder)
+    Raises:
+        InputError: The record is damaged.
+    """
+    record = Record.read(view.folder)
     if not record.rows:
-        return Snapshot(version, ["no measurement yet"], [], {})
+        return Snapshot(["no measurement yet"], [], {})
     plots = {"error": error_plot(record), "changes": map_plot(record)}
     svg = {name: for_page(as_svg(plot.panels[0], plot.caption), name) for name, plot in plots.items()}
-    return Snapshot(version, record.sentences(), record.rows[: -LAST_ROWS - 1 : -1], svg)
+    return Snapshot(record.sentences(), record.rows[: -LAST_ROWS - 1 : -1], svg)

@@ -7,7 +7,7 @@ from nicegui import run, ui
 from swiftwrf import InputError
 from tasks.environment import command
 from tasks.records import Row, rounded
-from tasks.view.followed import FollowedView, Version
+from tasks.view.followed import FollowedView, Version, snapshot
 from tasks.view.page import NewestOnly, header
 
 PERIOD_S = 1.0  # between two looks at the files
@@ -49,14 +49,15 @@ class FollowedPage:
 
     async def _show(self) -> None:
         """Show the record, whose files have changed."""
+        version = self._view.version
         try:
-            found = await run.io_bound(self._view.snapshot)
+            found = await run.io_bound(snapshot, self._view, version)
         except InputError as error:
             self._sentences.set_text(str(error))
             return
         if found is None:  # the server is being ended
             return
-        self._shown = found.version
+        self._shown = version
         self._sentences.set_text("\n".join(found.sentences))
         for name, box in self._figures.items():
             box.set_content(found.figures.get(name, ""))

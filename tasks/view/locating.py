@@ -23,21 +23,13 @@ N_DRAWS = 16  # simulated rows at each of them
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """Posterior over the position of one observation.
+    """Posterior over the position of one observation."""
 
-    Args:
-        density: Posterior mass in plan, relative to the largest.
-        median: Geometric median [m], (3,).
-        radius: Radii [m] of the credible regions of `LEVELS` around the median.
-        truth: Measured position [m], (3,).
-        ambiguous: True where a second position is likely.
-    """
-
-    density: PlanMap
-    median: NDArray[np.floating]
-    radius: tuple[float, ...]
-    truth: NDArray[np.floating]
-    ambiguous: bool
+    density: PlanMap  # posterior mass in plan, relative to the largest
+    median: NDArray[np.floating]  # geometric median [m], (3,)
+    radius: tuple[float, ...]  # radii [m] of the credible regions of `LEVELS` around the median
+    truth: NDArray[np.floating]  # measured position [m], (3,)
+    ambiguous: bool  # true where a second position is likely
 
     @classmethod
     def of(cls, posterior: Posterior, truth: Tensor) -> Located:
@@ -61,12 +53,7 @@ class Located:
 
 
 class RssiLocating:
-    """A locator, the rows to choose from, and the expected error over the floor.
-
-    Args:
-        locator: Fitted locator.
-        rows: Measured rows at the receivers of the locator. Rows that no receiver detected are left out.
-        in_training: Whether the locator was fitted to each row, bool (n,).
+    """A locator, the rows that it detects and whether it was fitted to each of them, and the expected error over the floor.
 
     Example:
         >>> import swiftwrf

@@ -19,19 +19,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from swiftwrf import InputError
 from tasks.page.maps import Corners
-from tasks.view.charts import (
-    PLAN_LEFT,
-    PLAN_RIGHT,
-    PLAN_TOP,
-    Data,
-    Option,
-    circle,
-    crosses,
-    lines,
-    paths,
-    plan,
-    points,
-)
+from tasks.view.charts import Data, Option, axis, circle, crosses, lines, paths, points
 from tasks.view.locating import Located
 
 MAX_UPLOAD_BYTES, MAX_FRAME_BYTES = 2**25, 2**12  # of an image, and of the form around it
@@ -66,9 +54,6 @@ class NewestOnly:
     """Queue of one: runs one request at a time, then the newest of those that arrived in the meantime.
 
     A slow model therefore follows the pointer instead of trailing behind it.
-
-    Args:
-        handle: Coroutine function of a request's arguments.
     """
 
     def __init__(self, handle: Callable[..., Awaitable[None]]) -> None:
@@ -105,13 +90,7 @@ def header(title: str, notes: list[str]) -> ui.row:
 
 
 class Chart:
-    """A chart whose layers change one by one.
-
-    Args:
-        name: Identifier of the element on the page.
-        options: Options of ECharts.
-        style: Size of the element, as CSS.
-    """
+    """A chart whose layers change one by one, in an element with an identifier and a size as CSS."""
 
     def __init__(self, name: str, options: Option, style: str) -> None:
         # SVG follows the colours of the page and keeps pixels sharp
@@ -126,16 +105,7 @@ class Chart:
 
 
 class PlanChart(Chart):
-    """A chart of positions, to scale, that reports the position of the pointer.
-
-    Args:
-        name: Identifier of the element on the page.
-        corners: Edges x0, x1, y0, y1 [m].
-        layers: Layers from the lowest to the highest.
-        max_px: Maximum width and height.
-        pointed: Called with kind of the event, pressed buttons, x and y [m].
-        has_bar: Whether there is a colour bar below.
-    """
+    """A chart of positions, to scale, that calls `pointed` with kind of the event, pressed buttons, x and y [m]."""
 
     def __init__(
         self,
@@ -147,13 +117,19 @@ class PlanChart(Chart):
         has_bar: bool = False,
     ) -> None:
         self.corners, (x0, x1, y0, y1) = corners, corners
-        bottom, ratio = 80 if has_bar else 40, (y1 - y0) / (x1 - x0)
+        left, right, top, bottom = 50, 12, 10, 80 if has_bar else 40  # pixels around the plan
+        ratio = (y1 - y0) / (x1 - x0)
         width = min(max_px[0], max_px[1] / ratio)
-        style = (
-            f"width: 100%; height: calc((100cqw - {PLAN_LEFT + PLAN_RIGHT}px) * {ratio:.5f} + {PLAN_TOP + bottom}px)"
-        )
+        style = f"width: 100%; height: calc((100cqw - {left + right}px) * {ratio:.5f} + {top + bottom}px)"
+        options = {
+            "animation": False,
+            "grid": {"left": left, "right": right, "top": top, "bottom": bottom, "outerBoundsMode": "none"},
+            "xAxis": axis(x0, x1, "x [m]"),
+            "yAxis": axis(y0, y1, "y [m]", gap=34),
+            "series": [layer | {"z": 2 + number} for number, layer in enumerate(layers)],
+        }
         with ui.element().style(f"width: {width:.0f}px; max-width: 100%; container-type: inline-size"):
-            super().__init__(name, plan(corners, layers, bottom), style)
+            super().__init__(name, options, style)
         self.element.classes("drag")
 
         def inside(event: events.GenericEventArguments) -> None:
@@ -250,15 +226,7 @@ def free_port(host: str, port: int) -> int:
 
 
 def serve(title: str, build: Callable[[], object], host: str, port: int, show: bool = False) -> None:
-    """Serve one page and nothing else of this machine, until the process is interrupted.
-
-    Args:
-        title: Title of the page.
-        build: Builds the page for one visitor.
-        host: Address to listen on.
-        port: Port to listen on.
-        show: Whether the browser opens the page.
-    """
+    """Serve one page, built for each visitor, and nothing else of this machine, until the process is interrupted."""
 
     async def announce() -> None:
         """Print the address once the server answers."""

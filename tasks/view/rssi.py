@@ -56,72 +56,41 @@ def rows_of_model(model: RssiModel) -> Rssi:
 
 @dataclass(frozen=True)
 class MapSelection:
-    """The map that a visitor has selected.
+    """The map that a visitor has selected."""
 
-    Args:
-        kind: Predicted RSSI, width of its interval, cells above the threshold, receiver with the highest prediction,
-            posterior over the position of a measured row, or expected position error.
-        receiver: Number of the receiver, counted from 0. Maps of all receivers ignore it.
-        height: Height of the transmitter [m].
-        threshold: Threshold of the coverage [dBm].
-        certainty: Required probability that a measurement exceeds the threshold, in (0, 1).
-        row: Row whose posterior is shown, counted from 0.
-        at_least: Number of receivers of the coverage; 0 for that of the selected receiver.
-    """
-
-    kind: MapKind
-    receiver: int
-    height: float
-    threshold: float = -75.0
-    certainty: float = 0.9
-    row: int = 0
-    at_least: int = 0
+    kind: MapKind  # what the map shows
+    receiver: int  # number of the receiver, counted from 0. Maps of all receivers ignore it
+    height: float  # height of the transmitter [m]
+    threshold: float = -75.0  # threshold of the coverage [dBm]
+    certainty: float = 0.9  # required probability that a measurement exceeds the threshold, in (0, 1)
+    row: int = 0  # row whose posterior is shown, counted from 0
+    at_least: int = 0  # number of receivers of the coverage; 0 for that of the selected receiver
 
 
 @dataclass(frozen=True)
 class ColouredMap:
-    """Values of a map and their colours.
+    """Values of a map and their colours."""
 
-    Args:
-        values: Values (len(y), len(x)), nan where the map is transparent.
-        colours: Name of a matplotlib colour map.
-        low: Value of its first colour.
-        high: Value of its last colour.
-        label: Unit. Empty if the colours stand for names.
-        extend: Ends of the scale that stand for all values beyond, "neither", "max" or "both".
-        corners: Edges x0, x1, y0, y1 [m] of the picture. Defaults to those of the map.
-    """
-
-    values: Values
-    colours: str
-    low: float
-    high: float
-    label: str
-    extend: str = "neither"
-    corners: Corners | None = None
+    values: Values  # values (len(y), len(x)), nan where the map is transparent
+    colours: str  # name of a matplotlib colour map
+    low: float  # value of its first colour
+    high: float  # value of its last colour
+    label: str  # unit. Empty if the colours stand for names
+    extend: str = "neither"  # ends of the scale that stand for all values beyond, "neither", "max" or "both"
+    corners: Corners | None = None  # edges x0, x1, y0, y1 [m] of the picture. Defaults to those of the map
 
 
 @dataclass(eq=False)
 class RssiView:
-    """A fitted RSSI model and the floor where it was measured.
+    """A fitted RSSI model and the floor where it was measured."""
 
-    Args:
-        title: Title of the page.
-        model: Fitted model.
-        rows: Measured rows.
-        plan: Image of the floor. None if there is none.
-        locating: Locator and the rows that it locates. None if there is no locator.
-        notes: Remarks on the data, a sentence each.
-        folder: Directory of the run, where a floor plan is saved. None for a saved model.
-    """
-
-    title: str
-    model: RssiModel
-    rows: Rssi
-    plan: FloorPlan | None = None
-    locating: RssiLocating | None = None
-    notes: list[str] = field(default_factory=list)
-    folder: Path | None = None
+    title: str  # title of the page
+    model: RssiModel  # fitted model
+    rows: Rssi  # measured rows
+    plan: FloorPlan | None = None  # image of the floor. None if there is none
+    locating: RssiLocating | None = None  # locator and the rows that it locates. None if there is no locator
+    notes: list[str] = field(default_factory=list)  # remarks on the data, a sentence each
+    folder: Path | None = None  # directory of the run, where a floor plan is saved. None for a saved model
     _last: RssiMap | None = field(default=None, init=False, repr=False)
 
     @property
@@ -329,11 +298,7 @@ def probability_above(rssi: Prediction, selection: MapSelection) -> Tensor:
 
 
 def at_least(probability: Tensor, number: int) -> Tensor:
-    """Return the probability that at least a number of receivers exceed the threshold, independent of each other.
-
-    Args:
-        probability: Probability of each receiver, (R, ...).
-        number: Number of receivers, at least 1.
+    """Return the probability that at least a number of receivers exceed the threshold, from those of each one, (R, ...).
 
     Example:
         >>> at_least(torch.tensor([0.5, 0.5]), 1)

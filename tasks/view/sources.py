@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,7 +13,7 @@ import torch
 from augment import withhold
 from augment.cross_validation import LOCATOR as MATCHED_FIELD
 from augment.turbo.artifacts import model_file
-from swiftwrf import FieldModel, InputError, Rssi, RssiModel, Spectra, load
+from swiftwrf import FieldModel, InputError, RssiModel, load
 from swiftwrf.choices import fraction_key
 from swiftwrf.errors import with_article
 from swiftwrf.locate import RssiLocator
@@ -33,8 +33,6 @@ from tasks.view.spectra import LoadedModel, SpectraView
 
 EXPECTED = "give the directory of a run of aoa, rssi, locate or update, or a saved model of spectra or RSSI"
 Kind = TypeVar("Kind", bound=Saved)
-Config = TypeVar("Config", AoaConfig, LocateConfig)
-Data = TypeVar("Data", Spectra, Rssi)
 
 
 def open_source(source: Path) -> SpectraView | RssiView | FollowedView:
@@ -98,17 +96,16 @@ def _planes(model: FieldModel) -> list[dict[str, Any]]:
     return planes
 
 
-def _measured(folder: Path, config: Config, read: Callable[[Config], Data]) -> tuple[Data, Data]:
-    """Read the measurements of a run again; return all, and the training part.
+def _training_part(folder: Path, config: Any, data: Any) -> Any:
+    """Return the training part of the measurements of a run, which were read again.
 
     Raises:
-        InputError: They cannot be read, or their checksums differ from those in the records of the run.
+        InputError: Their checksums differ from those in the records of the run.
     """
-    data = read(config)
     recorded = read_json(folder / ENVIRONMENT).get("input_sha256", {})  # may contain more: a scene to trace in
     if {name: recorded.get(name) for name in data.source} != data.source:
         raise InputError("they have changed since the run")
-    return data, data.split(config.split, config.seed)[0]
+    return data.split(config.split, config.seed)[0]
 
 
 def _aoa_run(folder: Path, content: Row) -> SpectraView:
@@ -116,7 +113,8 @@ def _aoa_run(folder: Path, content: Row) -> SpectraView:
         config, models = parse(AoaConfig, [], "tasks.view", content["config"], folder), []
         data = train = None
         try:
-            data, train = _measured(folder, config, spectra_of)
+            found = spectra_of(config)
+            data, train = found, _training_part(folder, config, found)
             notes = list(data.notes)
         except InputError as error:
             notes = [f"The measured spectra are not shown: {error}."]
@@ -151,7 +149,8 @@ def _locate_run(folder: Path, content: Row) -> RssiView:
     with refusing(f"the records in {folder} are not those of a run"):
         config = parse(LocateConfig, [], "tasks.view", content["config"], folder)
         try:
-            data, train = _measured(folder, config, rssi_of)
+            data = rssi_of(config)
+            train = _training_part(folder, config, data)
             locating = RssiLocating(locator, data, torch.isin(data.index, train.index))
         except InputError as error:
             notes = [f"The measured rows are not shown, but the training rows in the locator: {error}."]

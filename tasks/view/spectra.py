@@ -32,21 +32,13 @@ Direction = tuple[float, float]  # azimuth, elevation [deg]
 
 @dataclass(frozen=True, eq=False)
 class LoadedModel:
-    """A fitted model on the page.
+    """A fitted model on the page."""
 
-    Args:
-        title: Name on the page.
-        model: Field model.
-        planes: Planes of the room as in `geometry-mix*.json`. Defaults to those of the model.
-        in_training: Whether each measured spectrum trained the model, (n,). None if that is unknown.
-        locator_file: Matched field that was fitted to the same spectra. None if there is none.
-    """
-
-    title: str
-    model: FieldModel
-    planes: list[dict[str, Any]]
-    in_training: NDArray[np.bool_] | None = None
-    locator_file: Path | None = None
+    title: str  # name on the page
+    model: FieldModel  # field model
+    planes: list[dict[str, Any]]  # planes of the room as in `geometry-mix*.json`. Defaults to those of the model
+    in_training: NDArray[np.bool_] | None = None  # whether each measured spectrum trained the model, (n,), if known
+    locator_file: Path | None = None  # matched field that was fitted to the same spectra. None if there is none
 
     @cached_property
     def locator(self) -> MatchedField:
@@ -82,37 +74,20 @@ def _seconds(model: FieldModel, position: Tensor, grid: AngularGrid) -> float:
 
 @dataclass(frozen=True)
 class PredictedSpectrum:
-    """A spectrum predicted at one position of the moving end.
+    """A spectrum predicted at one position of the moving end."""
 
-    Args:
-        position: Position of the moving end [m], (3,).
-        grid: Directions of the spectrum.
-        mean: Magnitudes, (n_elevation, n_azimuth).
-        std: Standard deviation of a measured spectrum, of the same shape. None if the model has none.
-        peak: Direction of the largest magnitude.
-        line_of_sight: Direction of the transmitter. None if the fixed end is unknown.
-        seconds: Time of the prediction.
-    """
-
-    position: NDArray[np.floating]
-    grid: AngularGrid
-    mean: NDArray[np.floating]
-    std: NDArray[np.floating] | None
-    peak: Direction
-    line_of_sight: Direction | None
-    seconds: float
+    position: NDArray[np.floating]  # position of the moving end [m], (3,)
+    grid: AngularGrid  # directions of the spectrum
+    mean: NDArray[np.floating]  # magnitudes, (n_elevation, n_azimuth)
+    std: NDArray[np.floating] | None  # standard deviation of a measured spectrum, if the model has one
+    peak: Direction  # direction of the largest magnitude
+    line_of_sight: Direction | None  # direction of the transmitter. None if the fixed end is unknown
+    seconds: float  # time of the prediction
 
 
 @dataclass(frozen=True, eq=False)
 class SpectraView:
-    """Fitted models and the measured spectra, as far as they are known.
-
-    Args:
-        title: Title of the page.
-        models: Models to choose from, at least one.
-        data: Measured spectra. None if they are unknown.
-        notes: Remarks on the data, a sentence each.
-    """
+    """Fitted models, at least one, and the measured spectra, as far as they are known."""
 
     title: str
     models: list[LoadedModel]

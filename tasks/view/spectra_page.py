@@ -52,15 +52,7 @@ HELP = "Drag in the plan, or click it and use the arrow keys (Shift: ten times a
 
 
 class SpectrumChart:
-    """One spectrum and the directions marked in it.
-
-    Args:
-        title: Title above the chart.
-        name: Identifier of the element on the page.
-        colours: Name of a matplotlib colour map.
-        high: Value of its last colour.
-        extend: Ends of the colour bar that stand for all values beyond.
-    """
+    """One spectrum, coloured up to its highest value, and the directions marked in it."""
 
     def __init__(
         self, title: str, name: str, colours: str = "viridis", high: float = 1.0, extend: str = "neither"

@@ -172,8 +172,6 @@ ARRAYS: dict[str, Call] = {
     "grid(x, 2)": lambda x: PlanarArray.grid(x, 2, 0.1, 1e9),
     "grid(spacing=x)": lambda x: PlanarArray.grid(2, 2, x, 1e9),
     "AngularGrid.hemisphere(x, 4)": lambda x: AngularGrid.hemisphere(x, 4),
-    "AngularGrid.degrees(x, azimuth)": lambda x: AngularGrid.degrees(x, range(0, 360, 90)),
-    "AngularGrid.degrees(elevation, x)": lambda x: AngularGrid.degrees(range(1, 90), x),
     "AngularGrid(x, ...)": lambda x: AngularGrid(x, 0.1, 4, 0.0, 8),
     "AngularGrid(n_azimuth=x)": lambda x: AngularGrid(0.0, 0.1, 4, 0.0, x),
     "ArrayPose(x)": lambda x: ArrayPose(x, QUATERNION),

@@ -46,7 +46,7 @@ from tasks.page.maps import FloorPlan
 from tasks.update import lines
 from tasks.update.record import TABLE, Record
 from tasks.view.charts import around, picture, points
-from tasks.view.followed import FollowedView
+from tasks.view.followed import FollowedView, snapshot
 from tasks.view.rssi import MapSelection, RssiView
 from tasks.view.sources import open_source
 
@@ -95,7 +95,7 @@ def show(folder: Path) -> None:
     with mock.patch("swiftwrf.rssi.maps.CELLS", 9), mock.patch("tasks.view.followed.as_svg", return_value="<svg"):
         view = open_source(folder)
         if isinstance(view, FollowedView):
-            view.snapshot()
+            snapshot(view, view.version)
         elif isinstance(view, RssiView):
             _show_rssi(view)
         else:
@@ -179,7 +179,7 @@ def followed(model: FieldModel | RssiModel, content: bytes, folder: Path, source
         redirect_stderr(said),
     ):
         source = source if source == "-" else str(folder / source)
-        code = run_command("update", [str(file), source, "--follow", "--out", str(out)])
+        code = run_command("update", [str(file), source, "--follow", "--out", str(out)], "swiftwrf update")
     errors, learnt = said.getvalue().splitlines(), [json.loads(line) for line in answers.getvalue().splitlines()]
     assert all(line.startswith(ERROR) and len(line) <= MAX_LENGTH + len(ERROR) for line in errors), errors
     if code == 2 and len(errors) == 1 and not learnt:

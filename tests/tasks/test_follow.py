@@ -59,7 +59,9 @@ def follow(monkeypatch, capsys, tmp_path):
     def run(model, source="-", content=b"", out=tmp_path / "out", options=(), stop=stopped):
         monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(content)))
         monkeypatch.setattr(followed_lines, "time", SimpleNamespace(sleep=stop))
-        code = run_command("update", [str(model), str(source), "--follow", "--out", str(out), *options])
+        code = run_command(
+            "update", [str(model), str(source), "--follow", "--out", str(out), *options], "swiftwrf update"
+        )
         said = capsys.readouterr()
         return code, [json.loads(text) for text in said.out.splitlines()], said.err
 
@@ -219,7 +221,12 @@ def test_spectra_that_wait_are_learnt_by_the_next_start(follow, tmp_path):
 def test_an_update_of_a_room_states_the_spectra_that_it_has_not_learnt(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("tasks.update.run._read", lambda *_: room().subset(torch.arange(40, 43)))
     geometry().save(tmp_path / "room.safetensors")
-    assert run_command("update", [str(tmp_path / "room.safetensors"), "x", "--out", str(tmp_path / "out")]) == 0
+    assert (
+        run_command(
+            "update", [str(tmp_path / "room.safetensors"), "x", "--out", str(tmp_path / "out")], "swiftwrf update"
+        )
+        == 0
+    )
     assert "3 spectra are not learnt" in capsys.readouterr().out
 
 
@@ -351,7 +358,7 @@ def test_names_of_public_data_sets_are_sources(model, tmp_path, monkeypatch, cap
     monkeypatch.setenv("SWIFTWRF_DATA", str(folder.parent))
     source, data = ("tetam-tracks", folder) if kind == "source" else (folder, "tetam-tracks")
     options = [str(model), str(source), "--data", str(data), "--out", str(tmp_path / "out")]
-    assert run_command("update", options) == 0
+    assert run_command("update", options, "swiftwrf update") == 0
     assert "10 measurements learnt" in capsys.readouterr().out
 
 

@@ -19,7 +19,7 @@ from sums import STEPS, Exit, Kill, KillOnce, Refusal, Sum, results
 from swiftwrf import AngularGrid, FitError, InputError, simulated_room
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.runtime.threads import set_threads
-from tasks.command import COMMANDS
+from tasks.command import PRELOADED
 from tasks.configs import AoaConfig
 from tasks.directory import Run
 from tasks.environment import number_of_processes
@@ -43,7 +43,7 @@ def test_processes_give_the_results_of_one_process_in_the_same_order(tmp_path):
 
 @pytest.mark.skipif(not SERVED, reason="processes are forks of a server on Linux alone")
 def test_processes_begin_with_the_modules_that_a_command_preloads():
-    assert set(map(import_module, COMMANDS["aoa"].preloaded)) <= set(sys.modules.values())
+    assert set(map(import_module, PRELOADED["aoa"])) <= set(sys.modules.values())
     code = """if __name__ == "__main__":
         from tasks.preload import preload, process_context
         preload(["colorsys"])

@@ -19,7 +19,6 @@ import json
 import math
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -210,20 +209,9 @@ def _from_horizon(
     horizon = offset(_direction(azimuth, 90 - zenith))
     if min(declared, horizon) <= MAX_ANGLE_OFFSET_DEG:
         return horizon < declared
-    others: dict[str, Any] = {
-        "the angles are directions of propagation; give those from the receiver against the arriving path": (
-            azimuth + 180,
-            180 - zenith,
-        ),
-        "x and y are swapped in the angles or in the positions": (90 - azimuth, zenith),
-        "aoa_az turns clockwise; give it counter-clockwise from x": (-azimuth, zenith),
-    }
-    offsets = {meaning: offset(_direction(*angles)) for meaning, angles in others.items()}
-    meaning = min(offsets, key=lambda meaning: offsets[meaning])
-    fits = offsets[meaning] <= MAX_ANGLE_OFFSET_DEG
-    reason = f"it would fit if {meaning}" if fits else "positions and angles are in different frames or units"
     raise InputError(
-        f"{folder}: direct paths come from {declared:.0f} degrees beside the transmitter (median); {reason}"
+        f"{folder}: direct paths come from {declared:.0f} degrees beside the transmitter (median); positions and angles are "
+        "in different frames or units, or angles do not point from the receiver against the arriving path"
     )
 
 

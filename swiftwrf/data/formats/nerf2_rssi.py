@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.data.cells import column_of_numbers, seconds, text_of
-from swiftwrf.data.columns import column_of, numbered
+from swiftwrf.data.columns import column_of
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin, PlanFrame, without_fix
 from swiftwrf.data.files import digests, numbers, read_table, read_xyz, read_yaml
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
@@ -84,7 +84,7 @@ class Nerf2Rssi(Format[Rssi]):
             source=digests([file for file in stated if file], path),
             notes=(*notes, *missing, *unknown, *units),
             **properties,
-            **{name: values[row] for name, values in of_rows.items()},
+            **{name: values[~omitted] for name, values in of_rows.items()},
         )
 
 
@@ -95,10 +95,9 @@ def _of_rows(file: Path, n: int) -> tuple[dict[str, Any], list[str]]:
     found: dict[str, Any] = {}
     notes: list[str] = []
     if session is not None:
-        found["session"] = numbered(text_of(frame[session]).tolist())
+        found["session"] = text_of(frame[session]).to_numpy()
     if time is not None:
-        values, notes = seconds(frame[time])
-        found["time"] = torch.from_numpy(values)
+        found["time"], notes = seconds(frame[time])
     if found and len(frame) != n:
         raise InputError(f"{file} has {len(frame)} rows, the RSSI {n}; they must match")
     return found, notes

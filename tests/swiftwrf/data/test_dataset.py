@@ -26,7 +26,6 @@ from swiftwrf import (
 from swiftwrf.array import planar
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data import load_snapshots
-from swiftwrf.data.columns import Groups
 from swiftwrf.data.formats import SPECTRA_FORMATS
 from swiftwrf.data.raytraced import Tracing
 from swiftwrf.data.rssi import Offsets
@@ -208,7 +207,7 @@ def test_data_hold_no_gradient():
 
 def test_corrected_rssi_may_leave_the_range_of_received_powers():
     offsets = Offsets("device", "a", {"b": -60.0}, 0.5)
-    data = Rssi([[-20.0], [-20.0]], torch.rand(2, 3), groups=Groups.of("device", ["a", "b"]))
+    data = Rssi([[-20.0], [-20.0]], torch.rand(2, 3), groups=pd.Series(["a", "b"], name="device"))
     assert offsets.removed(data).subset([1]).rssi_dbm.tolist() == [[40.0]]
 
 

@@ -298,7 +298,7 @@ def test_wifi_rooms(tmp_path):
         table.loc[:2, "AP3 RSS(dBm)"] = -200.0  # nine packets are left
         write(tmp_path / "raw", {f"data/database_corridor_{part}.csv": table.assign(X=x, Y=3).to_csv(index=False)})
     (tmp_path / "out").mkdir()
-    conversions.wifi_room(tmp_path / "raw", tmp_path / "out", "corridor")
+    conversions.wifi_room(tmp_path / "raw", tmp_path / "out")
     data = load_rssi(tmp_path / "out")
     assert data.detected.tolist() == [[True, False, True, True]] * 2
     assert float(data.rssi_dbm[1, 3]) == pytest.approx(table["AP5 RSS(dBm)"].mean(), abs=0.006)

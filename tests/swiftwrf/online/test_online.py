@@ -22,7 +22,7 @@ from swiftwrf.data.simulated import ShoeboxRoom, rssi_room, simulated_room
 from swiftwrf.data.writing import write_rssi
 from swiftwrf.metrics import psnr
 from swiftwrf.models.geometry.planes import Plane
-from swiftwrf.online import Cusum, Follower, Monitor, adapted, alarm_threshold, prequential, score
+from swiftwrf.online import Follower, Monitor, adapted, alarm_threshold, prequential, score
 from swiftwrf.online.follower import unexplained
 from tasks.command import main
 from tasks.update.record import Record
@@ -69,9 +69,10 @@ def test_thresholds_have_the_run_length_of_simulated_series(generator):
 
 
 def test_sums_restart_after_an_alarm_and_skip_missing_values():
-    test = Cusum.start(2)
+    test = Monitor(torch.rand(5, 3))  # all positions, and one region
+    test.threshold = 2.5
     for z in ([torch.nan, 0.0], [2.0, 0.0], [torch.nan, 0.0], [2.0, 0.0]):
-        test, alarms = test.updated(torch.tensor(z), threshold=2.5)
+        alarms = test.add(torch.tensor(z))
     assert [(alarm.series, alarm.at, alarm.since) for alarm in alarms] == [(0, 3, 1)]
     assert test.value.tolist() == [0.0, 0.0]
 

@@ -112,7 +112,7 @@ def test_aann_learns_a_toy():
     for i in range(16):
         spectrum[i, 4:10, 16 * (i % 4) : 16 * (i % 4) + 8] = 1
     train = labelled(spectrum, label, AngularGrid.hemisphere(16, 64))
-    network = AANN(steps=30, batch=8, rate=1e-3, max_azimuths=0, circular=True).fit(train)
+    network = AANN(steps=30, batch=8, rate=1e-3, max_azimuths=0).fit(train)
     constant = Constant().fit(train)
     errors = [angle_errors(e.predict(spectrum), label)["great_circle"].mean() for e in (network, constant)]
     assert errors[0] < 0.5 * errors[1]
@@ -129,14 +129,6 @@ def test_every_spectrum_counts_alike_in_the_batch_norms():
     torch.testing.assert_close(
         network._network.bn1.running_mean / spread, first.mean(dim=(0, 2, 3)) / spread, atol=0.02, rtol=0
     )
-
-
-def test_circular_padding_makes_rolled_spectra_alike():
-    from augment.estimators.resnet import CircularConv
-
-    convolution = CircularConv(torch.nn.Conv2d(1, 3, 5, padding=2))
-    x = torch.rand(1, 1, 9, 12)
-    torch.testing.assert_close(convolution(x).roll(4, dims=-1), convolution(x.roll(4, dims=-1)))
 
 
 def test_the_headline_is_of_the_network_that_is_kept():
@@ -223,8 +215,7 @@ def test_what_all_distances_have_in_common_does_not_move_an_estimate():
     assert np.abs(clean - new).mean() < 0.5 * np.abs(new).mean()
 
 
-@pytest.mark.parametrize("circular", [False, True])
-def test_pointwise_convolutions_are_matrix_products(circular):
+def test_pointwise_convolutions_are_matrix_products():
     """Both agree in value and gradient for equal weights."""
     from augment.estimators.resnet import Pointwise, backbone
 
@@ -232,7 +223,7 @@ def test_pointwise_convolutions_are_matrix_products(circular):
     found = {}
     for products in (False, True):
         torch.manual_seed(0)
-        network = backbone(circular, products).double()
+        network = backbone(products).double()
         torch.nn.init.normal_(network.fc[2].weight)
         x = spectrum.clone().requires_grad_()
         value = network(x)
