@@ -326,6 +326,7 @@ def test_refusals_say_what_is_missing(change, message):
         fit(replace(mirror_room(SIX, n=12), **change))
 
 
+@pytest.mark.usefixtures("short_searches")
 def test_the_same_seed_finds_the_same_room(noisy):
     few = noisy.subset(torch.arange(12))
     one, other = (GeometryModel(GLANCE).fit(few).to_json() for _ in range(2))
