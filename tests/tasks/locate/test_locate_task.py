@@ -67,8 +67,7 @@ def test_a_comparison_without_a_folder_has_the_errors_of_the_command(locate_run)
 
 def test_localizers_describe_themselves():
     assert list(LOCALIZERS) == ["posterior", "knn", "knn_difference", "nearest", "gp", "mean"]
-    for name, localizer in LOCALIZERS.items():
-        assert localizer.name == name
+    for name in LOCALIZERS:
         assert LOCALIZERS.summary(name)
         assert LABELS[name].colour
 
