@@ -1,7 +1,5 @@
 """Field models and RSSI predictors in their smallest size, so that a fit takes a second or less."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import fields, replace
