@@ -32,8 +32,6 @@ from tasks.terminal import terminal
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # errors of file systems without locks
 LOCK = "lock"
-
-
 MAX_LABEL = 60  # characters of the label in the name of a directory under runs/
 
 

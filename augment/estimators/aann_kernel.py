@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from augment import Mixed
 from augment.estimators.aann import AANN, AANNConfig, halved
 from augment.estimators.base import ESTIMATORS
-from augment.estimators.nadaraya_watson import NadarayaWatson, coarse_pixels, kept_rows
+from augment.estimators.kernel_regression import NadarayaWatson, coarse_pixels, kept_rows
 from augment.estimators.resnet import FEATURES
 from swiftwrf import InputError
 from swiftwrf.array.angles import to_angles

@@ -1,21 +1,157 @@
-"""Kernel regression from coarse spectra to directions."""
+"""Kernel regression with Nadaraya-Watson weights, width and penalty by cross-validation.
+
+A prediction is the mean of dual coefficients, weighted by a Gaussian kernel whose weights sum to one. With the targets as
+dual coefficients it is the estimator of Nadaraya (1964) and Watson (1964). The dual coefficients here reproduce the targets
+up to a penalty, as those of a normalised radial basis function network do (Moody and Darken 1989).
+
+Measurement noise and model error add a nearly constant offset to the squared distances between a measured spectrum and all
+synthetic ones, which multiplies every Gaussian kernel value by the same factor. Normalising each kernel row cancels that
+factor.
+"""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.special import softmax
+from sklearn.metrics.pairwise import euclidean_distances
+from sklearn.model_selection import KFold
+from threadpoolctl import threadpool_limits
 from torch import Tensor
+from torch.nn import functional
 
 from augment import Mixed
 from augment.estimators.base import ESTIMATORS, SavedEstimator
-from augment.estimators.nadaraya_watson import NadarayaWatson, coarse_pixels, kept_rows
+from swiftwrf import InputError
 from swiftwrf.array.angles import to_angles, to_direction
-from swiftwrf.runtime.checkpoint import Header
+from swiftwrf.data.spectra import coarsening
+from swiftwrf.runtime.checkpoint import Header, expect
 
+WIDTH_CANDIDATES = (10.0, 20.0, 40.0, 80.0)  # gamma times the median squared distance
+PENALTY_CANDIDATES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
+MAX_CHOICE_ROWS = 600  # rows of the cross-validation; with fewer rows it chooses too large a penalty
+MAX_ROWS = 4000  # training rows; the time of a fit grows with their cube
+MAX_AZIMUTHS = 60  # columns of coarse spectra; the beams of an array are wider than one of them
 BATCH_SPECTRA = 512  # spectra that are loaded at a time
+
+
+def kept_rows(n: int, seed: int) -> NDArray[np.int64]:
+    """Return the row numbers, of n rows in random order, that a regression is fitted to."""
+    return np.random.default_rng(seed).permutation(n)[:MAX_ROWS]
+
+
+def coarse_pixels(spectrum: Tensor) -> Tensor:
+    """Return spectra (n, H, W) averaged to at most 60 azimuths, as features (n, p)."""
+    return functional.avg_pool2d(spectrum[:, None], coarsening(spectrum.shape[1:], MAX_AZIMUTHS)).flatten(1)
+
+
+@dataclass(frozen=True, eq=False)
+class NadarayaWatson:
+    """A fitted regression: the prediction is the mean of dual coefficients, weighted by the normalised kernel.
+
+    Example:
+        >>> x = np.linspace(0, 1, 20)[:, None]
+        >>> bool(np.abs(NadarayaWatson.fit(x, x, seed=0)(x) - x).max() < 0.05)
+        True
+    """
+
+    known: NDArray[Any]  # features of the training rows, (n, p)
+    dual: NDArray[Any]  # dual coefficients of the training rows, (n, k)
+    gamma: float  # inverse squared width of the kernel exp(-gamma |a - b|^2)
+
+    @classmethod
+    def fit(cls, feature: NDArray[Any], target: NDArray[Any], seed: int) -> NadarayaWatson:
+        """Fit a regression from features (n, p) to values (n, k).
+
+        Args:
+            feature: Features of at least two rows. The first 600 rows choose width and penalty.
+            target: Values of these rows.
+            seed: Seed of the folds.
+        """
+        distance = euclidean_distances(feature, squared=True)
+        some = slice(MAX_CHOICE_ROWS)
+        gamma, alpha = choose(distance[some, some], target[some], seed)
+        return cls(feature, _dual_coefficients(np.exp(-gamma * distance), target, alpha), gamma)
+
+    def __call__(self, feature: NDArray[Any]) -> NDArray[Any]:
+        """Return the predicted values (m, k) of features (m, p)."""
+        distance = euclidean_distances(feature, self.known, squared=True)
+        values: NDArray[Any] = _normalised_kernel(distance, self.gamma) @ self.dual
+        return values
+
+    def state(self) -> tuple[dict[str, Tensor], Header]:
+        """Return tensors in single precision, and plain values."""
+        arrays = {"known": self.known, "dual": self.dual}
+        return {name: torch.from_numpy(array.astype(np.float32)) for name, array in arrays.items()}, {
+            "gamma": self.gamma
+        }
+
+    @classmethod
+    def from_state(cls, tensors: dict[str, Tensor], header: Header, features: int, values: int) -> NadarayaWatson:
+        """Return the regression that `state` describes.
+
+        Args:
+            tensors: Tensors by name; other names are ignored.
+            header: Plain values.
+            features: Number p of features.
+            values: Number k of values.
+
+        Raises:
+            InputError: Shapes or values that do not fit together.
+        """
+        expect(tensors, {"known": (n := len(tensors["known"]), features), "dual": (n, values)})
+        gamma = float(header["gamma"])
+        if not (gamma > 0 and math.isfinite(gamma)):
+            raise InputError(f"gamma must be positive and finite, got {gamma}")
+        return cls(tensors["known"].double().numpy(), tensors["dual"].double().numpy(), gamma)
+
+
+def choose(distance: NDArray[Any], target: NDArray[Any], seed: int) -> tuple[float, float]:
+    """Return the width gamma and the penalty alpha with the least mean absolute error on held-out rows.
+
+    Args:
+        distance: Squared distances between the rows, (n, n), in double precision. In single precision products of small
+            kernel values are denormal numbers, which take ten times as long.
+        target: Values of the rows, (n, k).
+        seed: Seed of the folds.
+    """
+    width = 1 / max(float(np.median(distance[~np.eye(len(distance), dtype=bool)])), 1e-9)
+    folds = KFold(min(5, len(distance)), shuffle=True, random_state=seed)
+    errors: dict[tuple[float, float], float] = {}
+    with threadpool_limits(1):  # many small problems: several threads would mostly wait for each other
+        for gamma in (factor * width for factor in WIDTH_CANDIDATES):
+            kernel = np.exp(-gamma * distance)
+            for kept, out in folds.split(kernel):
+                known, weight = kernel[np.ix_(kept, kept)], _normalised_kernel(distance[np.ix_(out, kept)], gamma)
+                for alpha in PENALTY_CANDIDATES:
+                    predicted = weight @ _dual_coefficients(known, target[kept], alpha)
+                    error = float(np.abs(predicted - target[out]).mean())
+                    errors[gamma, alpha] = errors.get((gamma, alpha), 0.0) + error
+    return min(errors, key=errors.__getitem__)
+
+
+def _normalised_kernel(distance: NDArray[Any], gamma: float) -> NDArray[Any]:
+    """Return the kernel (m, n) divided by its row sums, from squared distances (m, n) to the training rows."""
+    weight: NDArray[Any] = softmax(-gamma * distance, axis=1)
+    return weight
+
+
+def _dual_coefficients(kernel: NDArray[Any], target: NDArray[Any], alpha: float) -> NDArray[Any]:
+    """Return dual coefficients (n, k) whose row-normalised kernel average reproduces the targets.
+
+    With K, the kernel (n, n) divided by its row sums, they are (1 + alpha) (K + alpha)^-1 times the targets. A small penalty
+    interpolates the targets, a large one gives the targets themselves, and constant targets are reproduced exactly.
+    """
+    sums = kernel.sum(axis=1)
+    factor = cho_factor(kernel + np.diag(alpha * sums), lower=True, overwrite_a=True, check_finite=False)
+    dual: NDArray[Any] = cho_solve(factor, sums[:, None] * target, check_finite=False)
+    return (1 + alpha) * dual
 
 
 @ESTIMATORS.register("kernel_regression")

@@ -48,24 +48,15 @@ class MeasuredSubset:
 class Condition:
     """One estimator on one training set.
 
-    Args:
-        estimator: Name of the estimator.
-        training: Training set: the measured spectra, these and synthetic ones at the withheld positions, these and synthetic
-            ones at extra positions, or all training spectra as measured.
-        synthesizer: Name of the field model of the synthetic spectra, empty without any.
-        n_synthetic: Number of extra synthetic positions.
-        measured_fraction: Fraction of the training spectra that is measured.
-        repeat: Number of the repeat.
-
     Example:
         >>> Condition("kernel_regression", "measured + synthetic", "hybrid").method
         'kernel_regression, measured + synthetic (hybrid)'
     """
 
     estimator: str
-    training: Training
-    synthesizer: str = ""
-    n_synthetic: int = 0
+    training: Training  # measured spectra, synthetic ones at the withheld and at extra positions, or all as measured
+    synthesizer: str = ""  # field model of the synthetic spectra, empty without any
+    n_synthetic: int = 0  # number of extra synthetic positions
     measured_fraction: float = 1.0
     repeat: int = 0
 
@@ -180,11 +171,9 @@ def pooled(results: list[tuple[Condition, Value]], auto: bool) -> list[tuple[Con
     repeats chose differently, the choices of all repeats become one condition. The network is trained with extra positions
     or without them, other estimators both ways.
 
-    Args:
-        results: Results by condition.
-        auto: Whether the repeats choose their field model. Their choices then become one condition, "measured + synthetic
-            (auto)". Otherwise a condition with extra positions contains the result without them of those repeats that were
-            advised against them.
+    With `auto` the repeats choose their field model, and their choices become one condition, "measured + synthetic (auto)".
+    Otherwise a condition with extra positions contains the result without them of those repeats that were advised against
+    them.
     """
     trainings: dict[tuple[float, str], dict[int, set[tuple[str, str]]]] = {}
     for condition, _ in results:

@@ -31,25 +31,6 @@ DEFAULT_EXTRA = 3000  # extra synthetic positions where cross-validation recomme
 class Experiment:
     """Data and options that all steps of turbo learning share.
 
-    Args:
-        train: Training spectra of the split.
-        test: Test spectra of the split.
-        fractions: Fractions of the training spectra that count as measured, in (0, 1].
-        models: Names of the field models whose spectra train estimators, or "auto" alone.
-        estimators: Names of the estimators that are evaluated beside kernel regression. Defaults to all, with the network of
-            the preset.
-        compared: Names of the fast field models that are evaluated, too; with "geometry" the room is searched, and
-            matched-field processing locates by it. Defaults to all whose requirements the data meet.
-        own_models: Field models that are in no registry, by name.
-        own_estimators: Estimators that are in no registry, by name. They are evaluated, too.
-        extra: Largest number of extra synthetic positions. Defaults to 3,000 where cross-validation recommends some.
-        preset: Sizes of models and network.
-        repeats: Number of repeats, each with its own measured spectra and seed.
-        seed: Seed of everything random.
-        scene: Scene of the field model `raytrace`.
-        suggest: Number of positions to measure next that are suggested.
-        device: Device to compute on.
-
     Raises:
         InputError: No test spectra, fewer pixels than SSIM needs, a fraction that leaves too few spectra, an unknown
             name, or data that lack what a model or `extra` needs.
@@ -57,18 +38,20 @@ class Experiment:
 
     train: Spectra
     test: Spectra
-    fractions: tuple[float, ...] = (0.3,)
-    models: tuple[str, ...] = (AUTO,)
-    estimators: tuple[str, ...] | None = None
+    fractions: tuple[float, ...] = (0.3,)  # of the training spectra that count as measured, in (0, 1]
+    models: tuple[str, ...] = (AUTO,)  # field models whose spectra train estimators, or "auto" alone
+    estimators: tuple[str, ...] | None = None  # beside kernel regression; None for all, with the network of the preset
+    # fast field models that are evaluated, too, None for all whose requirements the data meet; with "geometry" the room is
+    # searched, and matched-field processing locates by it
     compared: tuple[str, ...] | None = None
-    own_models: Mapping[str, FieldModel] = field(default_factory=dict)
-    own_estimators: Mapping[str, Estimator] = field(default_factory=dict)
-    extra: int | None = None
-    preset: Preset = "quick"
-    repeats: int = 1
+    own_models: Mapping[str, FieldModel] = field(default_factory=dict)  # that are in no registry
+    own_estimators: Mapping[str, Estimator] = field(default_factory=dict)  # that are in no registry, and evaluated, too
+    extra: int | None = None  # most extra synthetic positions; None for 3,000 where cross-validation recommends some
+    preset: Preset = "quick"  # sizes of models and network
+    repeats: int = 1  # each with its own measured spectra and seed
     seed: int = 0
-    scene: str | None = None
-    suggest: int = 0
+    scene: str | None = None  # of the field model `raytrace`
+    suggest: int = 0  # number of positions to measure next that are suggested
     device: torch.device | str = "cpu"
 
     def __post_init__(self) -> None:

@@ -25,8 +25,7 @@ from tasks.configs import AoaConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
 from tasks.options import TableSource
-from tasks.page.page import reporting
-from tasks.page.records import Records
+from tasks.page.page import finish
 from tasks.page.shared import write_suggestion
 from tasks.records import Row, write_table
 from tasks.source import located, reading
@@ -99,8 +98,7 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
             "line_of_sight_share": float(test.line_of_sight.float().mean()),
             "mixes": {fraction_key(fraction): results.summary(fraction) for fraction in config.mix},
         }
-        final = directory.finish(metrics, reporting(page))
-    terminal.answer(answer_of(Records(final)), final / "report.html")
+        finish(directory, metrics, page, answer_of)
 
 
 def measurements(config: AoaConfig) -> Spectra:

@@ -12,7 +12,7 @@ from tasks import labels
 from tasks.answer import Answer, Method, NextStep
 from tasks.aoa.records import FractionRecords, palette
 from tasks.aoa.room import choice_section, located_plan, locating_section, room_section
-from tasks.aoa.synthesis import example_pair, examples_plot
+from tasks.aoa.synthesis import examples, examples_plot, spectra
 from tasks.environment import command
 from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of
 from tasks.page.records import Records, notes
@@ -62,7 +62,13 @@ def first_screen(fraction: FractionRecords) -> Summary:
             f"{quality:.1f} dB", f"median PSNR of the spectra that {synthesizer} predicts where nothing was measured"
         ),
     ]
-    panels, caption = example_pair(fraction)
+    found_examples = examples(fraction)
+    example = found_examples[len(found_examples) // 2]
+    pair = {kind: example.images[kind] for kind in ("measured", "predicted")}
+    panels = [spectra(pair, f"spectrum {example.title}", example.truth)]
+    caption = (
+        "A spectrum at a position without a measurement, measured and predicted (cross: true direction, ring: peak)."
+    )
     if fraction.arrays("located"):
         panels.insert(0, located_plan(fraction))
         caption = (

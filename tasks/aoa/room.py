@@ -21,6 +21,7 @@ from tasks.aoa.records import FractionRecords
 from tasks.aoa.synthesis import quality_table
 from tasks.page import figures
 from tasks.page.page import Plot, Section, Table, number
+from tasks.page.shared import with_interval
 from tasks.records import read_json
 
 MARGIN = 0.5  # [m] around the room in a plan
@@ -262,17 +263,11 @@ def locating_section(fraction: FractionRecords) -> Section | None:
     located = fraction.mix["locating"]
     if not located:
         return None
-    rows = [
-        [
-            method,
-            f"{number(100 * own['position_error_m']['median'], 1)} [{number(100 * own['position_error_m']['low'], 1)}, "
-            f"{number(100 * own['position_error_m']['high'], 1)}]",
-            number(100 * own["position_error_m"]["p90"], 1),
-            f"{own['coverage_80']:.0%}",
-            f"{own['ambiguous']:.0%}",
-        ]
-        for method, own in located.items()
-    ]
+    rows = []
+    for method, own in located.items():
+        error_cm = {name: 100 * value for name, value in own["position_error_m"].items()}
+        shares = [f"{own['coverage_80']:.0%}", f"{own['ambiguous']:.0%}"]
+        rows.append([method, with_interval(error_cm, 1), number(error_cm["p90"], 1), *shares])
     columns = ["method", "median [cm]", "90 % [cm]", "in 80 % region", "ambiguous"]
     caption = (
         "Median distance between true and estimated position with its 95 % interval. Regions are balls around the estimate. "

@@ -17,6 +17,7 @@ from swiftwrf.plotting import polar_spectrum
 from tasks.aoa.records import FractionRecords
 from tasks.page.figures import LABEL, STYLE, colour_bar, plain
 from tasks.page.page import Plot, Table, number
+from tasks.page.shared import with_interval
 
 MAX_DIFFERENCE = 0.5  # of a magnitude in [0, 1]: end of the scale of standard deviations of one spectrum
 TRUTH, PEAK = "#ffffff", "#cf4a4a"
@@ -60,11 +61,11 @@ def quality_table(fraction: FractionRecords) -> Table:
     """Return the quality of the spectra of each field model at held-out and at test positions."""
     choice, rows = fraction.mix["choice"], []
     for name, scores in sorted(fraction.mix["synthesis"].items(), key=lambda item: -item[1]["psnr_db"]["median"]):
-        db = scores["psnr_db"]
-        interval = f"{number(db['median'], 1)} [{number(db['low'], 1)}, {number(db['high'], 1)}]"
         held_out = number(choice["psnr_db"].get(name), 1) if choice else ""
         quality = (number(scores["ssim"]["median"], 3), number(scores["l1"]["mean"], 4))
-        rows.append([name, held_out, interval, *quality, number(scores["seconds"]["fit"], 1)])
+        rows.append(
+            [name, held_out, with_interval(scores["psnr_db"], 1), *quality, number(scores["seconds"]["fit"], 1)]
+        )
     caption = (
         "PSNR (10 log10(1 / MSE)): mean without the extreme tenths over held-out measured spectra, by which the field model "
         "is chosen, and median over the test spectra with its 95 % interval. Median SSIM (7 x 7 uniform window, data range "
@@ -75,24 +76,13 @@ def quality_table(fraction: FractionRecords) -> Table:
     return Table(columns, rows, caption, chosen)
 
 
-def example_pair(fraction: FractionRecords) -> tuple[list[Figure], str]:
-    """Return a measured and the predicted spectrum of one test position, and their caption."""
-    found = examples(fraction)
-    example = found[len(found) // 2]
-    pair = {kind: example.images[kind] for kind in ("measured", "predicted")}
-    caption = (
-        "A spectrum at a position without a measurement, measured and predicted (cross: true direction, ring: peak)."
-    )
-    return [spectra(pair, f"spectrum {example.title}", example.truth)], caption
-
-
 def examples_plot(fraction: FractionRecords) -> Plot:
     """Return measured spectra and their predictions."""
     stored, found = fraction.arrays("examples"), examples(fraction)
     small = [image.ravel() for one in found for kind, image in one.images.items() if SCALES[kind][0] != "viridis"]
     most = max(float(np.quantile(np.abs(np.concatenate(small)), 0.99)), 1e-3)  # end of a scale that shows them
     text = (
-        f"Spectra at positions without a measurement, by {stored.get('synthesizer', 'swiftwrf')}, from the best to the "
+        f"Spectra at positions without a measurement, by {stored['synthesizer']}, from the best to the "
         "worst by PSNR (quantiles 1, 0.5, 0). The array's normal is in the middle; cross: true direction, ring: peak. "
         f"Differences and standard deviations have a scale up to {most:.2g}, which 99 % of them are below."
     )
@@ -121,13 +111,9 @@ def spectra(
 ) -> Figure:
     """Return a panel with one hemisphere for each image, two in a row.
 
-    Azimuth runs counter-clockwise from the right. Magnitudes have the scale of `SCALES`.
-
-    Args:
-        images: Values (n_elevation, n_azimuth) of a hemisphere whose last row is the zenith, by kind: keys of `SCALES`.
-        title: Title of the panel.
-        truth: True direction, a cross. The ring is the peak of each magnitude.
-        most: End of the scale of differences and standard deviations.
+    Azimuth runs counter-clockwise from the right. Images (n_elevation, n_azimuth), whose last row is the zenith, are by
+    kind, with the scale of `SCALES`. `most` ends that of differences and standard deviations. A cross marks the true
+    direction, a ring the peak.
     """
     n_rows = -(-len(images) // 2)
     with matplotlib.style.context(STYLE):

@@ -22,8 +22,7 @@ from tasks.configs import LocateConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
 from tasks.locate.page import SUGGESTED, answer, page
-from tasks.page.page import reporting
-from tasks.page.records import Records
+from tasks.page.page import finish
 from tasks.page.shared import write_suggestion
 from tasks.records import LOCATOR, Row, write_table
 from tasks.source import measured_rssi, split_notes
@@ -95,8 +94,7 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
                 values[step.trial] = value
         result = LocateComparison(measured, values)
         write_table(directory.path("errors.csv"), result.errors.to_dict("records"))
-        final = directory.finish(_metrics(data, result), reporting(page))
-    terminal.answer(answer(Records(final)), final / "report.html")
+        finish(directory, _metrics(data, result), page, answer)
 
 
 def measurements(config: LocateConfig) -> Rssi:

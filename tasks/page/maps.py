@@ -26,13 +26,9 @@ Corners = tuple[float, float, float, float]  # x0, x1, y0, y1 [m]
 
 
 def inside(position: ArrayLike, known: ArrayLike) -> NDArray[np.bool_]:
-    """Return whether positions lie inside the convex hull of known ones, in plan.
+    """Return whether positions (..., 2 or 3) [m] lie inside the convex hull of known ones (n, 2 or 3), in plan.
 
     Known positions on a line have no hull. There a position is inside if it lies near one of them.
-
-    Args:
-        position: Positions (..., 2 or 3) [m].
-        known: Known positions (n, 2 or 3) [m].
 
     Example:
         >>> inside([[0.5, 0.2], [2.0, 0.2]], [[0, 0], [1, 0], [0, 1], [1, 1]]).tolist()
@@ -51,11 +47,7 @@ def inside(position: ArrayLike, known: ArrayLike) -> NDArray[np.bool_]:
 def colour_image(values: NDArray[np.floating], colours: str, low: float = 0.0, high: float = 1.0) -> Image.Image:
     """Return an image of values (rows, columns), the first row on top; nan is transparent.
 
-    Args:
-        values: Values of the pixels.
-        colours: Name of a matplotlib colour map.
-        low: Value of its first colour.
-        high: Value of its last colour.
+    `low` and `high` have the first and the last colour of a matplotlib colour map.
     """
     scaled = (values - low) * (TRANSPARENT - 1) / (high - low or 1.0)
     image = Image.fromarray(
@@ -89,12 +81,9 @@ class FloorPlan:
 
     @classmethod
     def scaled(cls, pixels: NDArray[np.uint8], metres_per_pixel: float, origin: tuple[float, float]) -> FloorPlan:
-        """Return an image at the place that its scale and its origin determine.
+        """Return an image (height, width, 3) at the place that the length of a pixel [m] and the origin determine.
 
-        Args:
-            pixels: Image (height, width, 3).
-            metres_per_pixel: Length of a pixel [m].
-            origin: Pixel at x = y = 0, counted to the right and down from the upper left corner.
+        The origin is the pixel at x = y = 0, counted to the right and down from the upper left corner.
 
         Raises:
             InputError: A scale that is not positive, or edges beyond 1e9 m.

@@ -13,11 +13,13 @@ from matplotlib.figure import Figure
 from pandas import DataFrame
 
 from swiftwrf.runtime.durable import write_text
-from tasks.answer import NextStep
+from tasks.answer import Answer, NextStep
+from tasks.directory import Run
 from tasks.page.figures import as_svg, for_page
 from tasks.page.records import Records
 from tasks.preload import served_map
 from tasks.records import write_table
+from tasks.terminal import terminal
 
 HALF = 92  # letters of a table that fit into half of the page
 WIDE = 7.5  # [inches] figures that are wider take the whole width of the page, others half
@@ -171,13 +173,12 @@ def write_page(folder: Path, page: Page) -> None:
     write_text(folder / "report.html", html)
 
 
-def reporting(page: Callable[[list[Records]], Page]) -> Callable[[Path, dict[str, Any]], None]:
-    """Writes a run's report into its directory, from the records that lie there and its metrics, as this page shows it."""
-
-    def report(folder: Path, metrics: dict[str, Any]) -> None:
-        write_page(folder, page([Records(folder, metrics)]))
-
-    return report
+def finish(
+    run: Run, metrics: dict[str, Any], page: Callable[[list[Records]], Page], answer: Callable[[Records], Answer]
+) -> None:
+    """Finish a run with its metrics and its report, and show its answer."""
+    final = run.finish(metrics, lambda folder, values: write_page(folder, page([Records(folder, values)])))
+    terminal.answer(answer(Records(final)), final / "report.html")
 
 
 def sections_of(

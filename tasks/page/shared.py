@@ -168,14 +168,15 @@ def interval(error: ErrorSummary) -> tuple[float, float, float]:
     return error["median"], error["low"], error["high"]
 
 
-def with_interval(error: ErrorSummary) -> str:
+def with_interval(error: Mapping[str, Any], digits: int = 2) -> str:
     """Return the median and its interval as text.
 
     Example:
         >>> with_interval({"median": 1.0, "low": 0.5, "high": 2.0})
         '1.00 [0.50, 2.00]'
     """
-    return f"{number(error['median'])} [{number(error['low'])}, {number(error['high'])}]"
+    median, low, high = (number(error[name], digits) for name in ("median", "low", "high"))
+    return f"{median} [{low}, {high}]"
 
 
 def write_suggestion(
@@ -203,17 +204,10 @@ def suggestion_section(
     how: str,
     label: str,
 ) -> Section:
-    """Return a plan of the suggested positions, and the expected variance after measuring there.
+    """Return a plan of suggested positions, from arrays of `write_suggestion`, and the variance after measuring there.
 
-    Args:
-        title: Title of the section.
-        arrays: Arrays of `write_suggestion`.
-        table: Name of the files with the positions.
-        name: End of the name of the figure.
-        what: The variance that falls.
-        whole: What it is a fraction of.
-        how: How it is estimated.
-        label: Label of the variance in percent.
+    The text names the table, what falls, the whole that it is a fraction of, and how it is estimated. The axis of the
+    variance [%] has the label.
     """
     measured, suggested, left = (arrays[key] for key in ("measured", "suggested", "left"))
     first, plan = figures.panel(5, 4.2)

@@ -20,8 +20,7 @@ from tasks.configs import RssiTaskConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
 from tasks.page.maps import read_pixels
-from tasks.page.page import reporting
-from tasks.page.records import Records
+from tasks.page.page import finish
 from tasks.records import MODEL, Row, write_table
 from tasks.rssi.page import answer, page
 from tasks.source import measured_rssi, offset_notes, split_notes
@@ -90,8 +89,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         model = load(directory.path(MODEL))
         assert isinstance(model, RssiModel | PairModel)
         write_npz(directory.path("maps.npz"), _maps(model, result.train) | plan)
-        final = directory.finish(_metrics(config, data, result, model), reporting(page))
-    terminal.answer(answer(Records(final)), final / "report.html")
+        finish(directory, _metrics(config, data, result, model), page, answer)
 
 
 def _read_floor_plan(config: RssiTaskConfig, data: Rssi) -> dict[str, Any]:

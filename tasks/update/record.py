@@ -38,9 +38,8 @@ COLUMNS = (
 )
 WORDS = ("alarm", "notice")  # columns of text
 TYPES = dict.fromkeys(COLUMNS, float) | {"index": int} | dict.fromkeys(WORDS, str)
+MEANS = ("error", "covered")  # columns whose means are kept
 WINDOW = 30  # measurements of the running error
-
-
 MAX_SURPRISING = 10
 N_NEIGHBOURS = 5  # measurements whose mean innovation a map shows at each position
 BLUE, RED = "#4477aa", "#ee6677"
@@ -48,25 +47,34 @@ BLUE, RED = "#4477aa", "#ee6677"
 
 @dataclass(eq=False)
 class Record:
-    """Measurements that a model learnt one after the other."""
+    """Measurements that a model learnt one after the other. Adding one and the summary take a constant time."""
 
     source: str  # where the measurements come from
     unit: str  # unit of the errors, in brackets
-    rows: list[Row] = field(default_factory=list)  # A row of `measurements.csv` for each measurement
+    rows: list[Row] = field(default_factory=list)  # a row of `measurements.csv` for each measurement
 
-    @property
-    def alarms(self) -> list[tuple[int, str]]:
-        """Number of the measurement that raised each alarm, and the change in words."""
-        return [(number, row["alarm"]) for number, row in enumerate(self.rows) if row["alarm"]]
+    alarms: list[tuple[int, str]] = field(default_factory=list, init=False)
+    """number of the measurement that raised each alarm, and the change in words"""
+    notices: list[tuple[int, str]] = field(default_factory=list, init=False)
+    """number of the measurement after which the model changed beside its data, and how, in words"""
+    _sums: dict[str, tuple[float, int]] = field(default_factory=lambda: dict.fromkeys(MEANS, (0.0, 0)), init=False)
 
-    @property
-    def notices(self) -> list[tuple[int, str]]:
-        """Number of the measurement after which the model changed beside its data, and how, in words."""
-        return [(number, row["notice"]) for number, row in enumerate(self.rows) if row["notice"]]
+    def __post_init__(self) -> None:
+        for number, row in enumerate(self.rows):
+            self._count(number, row)
+
+    def _count(self, number: int, row: Row) -> None:
+        """Add a row to the alarms, notices and sums."""
+        self.alarms += [(number, row["alarm"])] if row["alarm"] else []
+        self.notices += [(number, row["notice"])] if row["notice"] else []
+        for name, (total, n) in self._sums.items():
+            if not math.isnan(row[name]):
+                self._sums[name] = (total + row[name], n + 1)
 
     def mean(self, name: str) -> float:
-        """Return the mean of a column, nan without numbers."""
-        return float(self.column(name).nanmean())
+        """Return the mean of a column of `MEANS`, nan without numbers."""
+        total, n = self._sums[name]
+        return total / n if n else float("nan")
 
     @classmethod
     def read(cls, folder: Path, count: int | None = None) -> Record:
@@ -97,6 +105,7 @@ class Record:
             "correlation": step.correlation,
             "notice": " ".join(step.notice.split()),
         }
+        self._count(len(self.rows), row)
         self.rows.append(row)
         return row
 
