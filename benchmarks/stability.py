@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
-from hard_cases import HARD_CASES, field_errors, magnitude_errors
+from hard_cases import GRADIENT_TOLERANCE, HARD_CASES, VALUE_TOLERANCE, field_errors, magnitude_errors
 from record import options, write_result
-from tolerances import GRADIENT_TOLERANCE, VALUE_TOLERANCE
 from torch import Tensor
 
 from swiftwrf import AngularGrid, FieldModel, FitError, InputError, Spectra, SwiftWRF, rasterize, simulated_room

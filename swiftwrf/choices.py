@@ -64,11 +64,7 @@ ROOMS = {  # what stands in the rooms of data/raytraced/rooms.yml
 
 
 def check_scene(name: str, prefix: str = "") -> None:
-    """Refuse a name that is neither a built-in room nor a scene file.
-
-    Args:
-        name: Name of a room, or a path that ends in `.xml`.
-        prefix: Text before the name in the message, e.g. the option.
+    """Refuse a name that is neither a built-in room nor a scene file; the message names it after the prefix.
 
     Raises:
         InputError: No such room or file.

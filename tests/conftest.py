@@ -1,13 +1,10 @@
 """Fixtures of several tests: toy scenes, and the measured data if available."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from unittest import mock
 
-import jaxtyping
 import pytest
 import small
 import torch
@@ -17,6 +14,7 @@ from PIL import Image
 from swiftwrf import AngularGrid, InputError, Spectra, make_model, simulated_room
 from swiftwrf.data.raytraced import sionna
 from swiftwrf.data.writing import write_spectra
+from swiftwrf.models.geometry import search, uncertainty
 
 collect_ignore = ["cuda_shim"]  # programs of tests, which have no examples
 torch.set_num_threads(1)  # tests run side by side, and mocks reach steps that are computed in this process alone
@@ -32,14 +30,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.skip(reason="needs an NVIDIA GPU"))
         if item.get_closest_marker("data") and not os.environ.get("SWIFTWRF_DATA"):
             item.add_marker(pytest.mark.skip(reason="needs the measured data: set SWIFTWRF_DATA to their folder"))
-
-
-@pytest.fixture
-def without_annotation_checks() -> Iterator[None]:
-    """Leaves wrong arguments to the checks of the product, which users meet."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
@@ -91,6 +81,18 @@ def glances() -> Iterator[None]:
     """Short searches for rooms during a test."""
     with small.glances():
         yield
+
+
+@pytest.fixture
+def short_searches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shorten the search for rooms, not its stages."""
+    for module, values in (
+        (search, {"SIGNS": search.SIGNS[:1], "MAX_MOVES": 1, "N_REFINED": 2, "MAX_ALTERNATIVES": {2: 5, 3: 2}}),
+        (uncertainty, {"MAX_PERIODS": 1, "N_COARSE": 2, "N_FINE": 1, "N_WHOLE": 1}),
+        (search, {"N_HORIZONTAL_NORMALS": 20, "N_SPHERE_NORMALS": 20}),
+    ):
+        for name, value in values.items():
+            monkeypatch.setattr(module, name, value)
 
 
 @pytest.fixture

@@ -1,9 +1,9 @@
-"""Hard cases of the rasterizer with the rule that each follows, and how far a backend is from the definition in float64.
+"""Scenes of the rasterizer: random ones, hard cases with the rule that each follows, and tolerances of all backends.
 
-The tests hold every backend to `tolerances.py`.
+Tolerances are relative to the definition in float64: those of values to the sum of |weight|, those of gradients are relative
+L2, and both are multiplied by a case's `slack`. Without a cutoff, float32 rounding determines them. With one, the cutoff
+determines those of values.
 """
-
-from __future__ import annotations
 
 import math
 from collections.abc import Callable
@@ -13,13 +13,41 @@ import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
+from swiftwrf.models.primitives import MIN_WIDTH_PIXELS
 from swiftwrf.rasterize import reference
 from swiftwrf.rasterize.operators import magnitude
 
+VALUE_TOLERANCE = {None: 5e-6, 1e-4: 3e-4}
+GRADIENT_TOLERANCE = {None: 1e-5, 1e-4: 1e-5}
 Inputs = tuple[Tensor, Tensor, Tensor]  # mean, Cholesky factor, weight
 Draw = Callable[[Tensor, Tensor, Tensor, AngularGrid, float | None], Tensor]
 STEP = math.radians(90 / 16)  # about two pixels of the small grid
+GRID = AngularGrid.hemisphere(30, 120)
 SMALL = AngularGrid.hemisphere(17, 33)  # no multiple of any tile
+
+
+def random_scene(
+    n: int = 40,
+    batch: int = 3,
+    seed: int = 0,
+    per_position: bool = False,
+    dtype: torch.dtype = torch.float32,
+    grid: AngularGrid = GRID,
+) -> list[Tensor]:
+    """Return mean, Cholesky factor and weight of random sheared primitives, which require gradients.
+
+    Widths are from the smallest one to a radian. Some means lie beyond both edges or whole turns away.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    mean = torch.rand(batch, n, 2, generator=generator) * torch.tensor([6 * math.pi, 2.2]) - torch.tensor(
+        [2 * math.pi, 0.3]
+    )
+    shape = (batch, n, 3) if per_position else (n, 3)
+    floor = MIN_WIDTH_PIXELS * torch.tensor([grid.azimuth_step, 0.0, grid.elevation_step])
+    cholesky = torch.exp(torch.rand(shape, generator=generator) * 4 - 4) + floor
+    cholesky[..., 1] *= torch.randn(shape[:-1], generator=generator)
+    weight = torch.randn(batch, n, 2, generator=generator)
+    return [x.to(dtype).requires_grad_() for x in (mean, cholesky, weight)]
 
 
 @dataclass(frozen=True)

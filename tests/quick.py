@@ -3,67 +3,41 @@
 As a program it is the command line of a task, for tests that kill it: `python tests/quick.py aoa --mix 0.5 --out DIR`.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
+from functools import cache
+from importlib import import_module
 from pathlib import Path
 from unittest import mock
 
 from matplotlib.figure import Figure
-from small import known_planes, small_published, small_swiftwrf
+from small import glances, known_planes, small_published, small_swiftwrf, with_defaults
 
+from augment import cross_validation
 from augment.estimators import ESTIMATORS
 from augment.estimators.baselines import Constant
 from augment.turbo.condition import NETWORKS
-from swiftwrf import AngularGrid, RssiModel, rssi_room, simulated_room
+from swiftwrf import AngularGrid, MatchedField, Rssi, RssiModel, Spectra, rssi_room, simulated_room
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.errors import MAX_LENGTH
+from swiftwrf.locate import MatchedFieldConfig
 from swiftwrf.rssi import RssiConfig
 from swiftwrf.runtime.validation import configuration
+from tasks import configs
 from tasks.aoa import experiment as aoa
 from tasks.aoa import synthesis
 from tasks.aoa.records import FractionRecords
+from tasks.command import COMMANDS
 from tasks.command_line import command_line
-from tasks.configs import (
-    AoaConfig,
-    ConvertConfig,
-    InspectConfig,
-    LocateConfig,
-    PredictConfig,
-    ReportConfig,
-    ResumeConfig,
-    RssiTaskConfig,
-    ScenesConfig,
-    UpdateConfig,
-    ViewConfig,
-)
-from tasks.convert import run as convert
-from tasks.inspect import run as inspect
 from tasks.locate import experiment as locate
-from tasks.predict import run as predict
-from tasks.report import run as report
-from tasks.resume import run as resume
 from tasks.rssi import experiment as rssi
-from tasks.scenes import run as scenes
-from tasks.update.run import run as update
-from tasks.view.run import run as view
 
 TASKS = {
-    "aoa": (AoaConfig, aoa.run),
-    "rssi": (RssiTaskConfig, rssi.run),
-    "locate": (LocateConfig, locate.run),
-    "report": (ReportConfig, report),
-    "resume": (ResumeConfig, resume),
-    "convert": (ConvertConfig, convert),
-    "predict": (PredictConfig, predict),
-    "inspect": (InspectConfig, inspect),
-    "view": (ViewConfig, view),
-    "scenes": (ScenesConfig, scenes),
-    "update": (UpdateConfig, update),
+    name: (getattr(configs, command.options), import_module(command.module).run) for name, command in COMMANDS.items()
 }
+FEW_CELLS = MatchedFieldConfig(max_cells=2000, n_best=40, n_background=20, n_rounds=1, n_calibration=16)
 FOR_LIFE = ExitStack()
 PREDICTORS_KEPT = ("swiftwrf", "mean", "mri_pooled", "mri_receiver")
 
@@ -110,31 +84,53 @@ def one_example() -> Iterator[None]:
 
 
 @contextmanager
-def quick(drawn: bool = False) -> Iterator[None]:
-    """Few spectra, few steps, few methods, no planes; figures of the report are drawn if asked for."""
-    spectra = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
-    floor = rssi_room(n=40)
+def cheap() -> Iterator[None]:
+    """Small parts for runs and examples on any data: glances for rooms, few cells, few predictors, no network."""
     with (
-        small_published(),
-        small_swiftwrf(),
-        known_planes(),
-        mock.patch.object(aoa, "simulated_room", return_value=spectra),
-        mock.patch.object(rssi, "rssi_room", return_value=floor),
-        mock.patch.object(locate, "rssi_room", return_value=rssi_room(n=80)),
+        glances(),
+        mock.patch.object(MatchedField, "config_type", with_defaults(FEW_CELLS)),
+        mock.patch.object(cross_validation, "FOLD_LOCATOR", FEW_CELLS),
         mock.patch.object(RssiModel, "config_type", QuickRssiConfig),
         mock.patch("swiftwrf.rssi.maps.CELLS", 8),
-        one_example() if drawn else sketched(),
         mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
         mock.patch.object(RSSI_PREDICTORS, "_registered", {name: RSSI_PREDICTORS[name] for name in PREDICTORS_KEPT}),
     ):
         yield
 
 
+@cache
+def toys() -> tuple[Spectra, Rssi, Rssi]:
+    """The data of tasks that are given none: for angles, for maps of RSSI and for positions."""
+    return simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32)), rssi_room(n=40), rssi_room(n=80)
+
+
+@contextmanager
+def quick(drawn: bool = False) -> Iterator[None]:
+    """Few spectra, few steps, few methods, no planes; figures of the report are drawn if asked for."""
+    spectra, floor, located = toys()
+    with (
+        cheap(),
+        small_published(),
+        small_swiftwrf(),
+        known_planes(),
+        mock.patch.object(aoa, "simulated_room", return_value=spectra),
+        mock.patch.object(rssi, "rssi_room", return_value=floor),
+        mock.patch.object(locate, "rssi_room", return_value=located),
+        one_example() if drawn else sketched(),
+    ):
+        yield
+
+
+def command(task: str, *arguments: object) -> int:
+    """A task's command line; its exit code."""
+    config, function = TASKS[task]
+    return command_line(f"tasks.{task}", config, function, [str(a) for a in arguments])
+
+
 def run(task: str, *arguments: object, drawn: bool = False) -> int:
     """A task's command line on the toy; its exit code."""
-    config, function = TASKS[task]
     with quick(drawn):
-        return command_line(f"tasks.{task}", config, function, [str(a) for a in arguments])
+        return command(task, *arguments)
 
 
 @contextmanager

@@ -1,7 +1,5 @@
 """Spectra of rooms in closed form: planes that mirror, each with a gain of its own, and phase noise at every element."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -14,7 +12,8 @@ from swiftwrf.choices import Moving
 from swiftwrf.data.simulated import ShoeboxRoom
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.store import Store
-from swiftwrf.models.geometry.images import PhaseObservations, PlaneSet
+from swiftwrf.models.geometry.images import SIDES, PhaseObservations, PlaneSet
+from swiftwrf.models.geometry.planes import Plane
 
 Normal = tuple[float, float, float]
 GRID = AngularGrid.hemisphere(10, 40)
@@ -73,6 +72,13 @@ def mirror_room(
         fixed_position=fixed,
         rotation=rotation,
     )
+
+
+def built_in_walls(gain: float = -0.6) -> list[Plane]:
+    """Return the planes of the built-in room, all of one gain."""
+    x, y, z = ShoeboxRoom().size
+    sides = zip(SIDES.tolist(), (0.0, x, 0.0, y, 0.0, z), strict=True)
+    return [Plane(tuple(normal), offset, gain) for normal, offset in sides]
 
 
 def room_with_box(centre: tuple[float, float], side_m: float = 0.6, height_m: float = 1.8) -> ShoeboxRoom:

@@ -1,7 +1,5 @@
 """Small made files of the formats that others use, each with one thing changed where a test asks for it."""
 
-from __future__ import annotations
-
 import json
 import math
 import struct
@@ -73,7 +71,7 @@ def write_snapshots(
 
 
 def write_paths(folder: Path, n: int = 12, **changes: object) -> Path:
-    """paths.npz of one path a receiver, some arrays replaced."""
+    """paths.npz of one path a receiver, some arrays replaced or (None) left out."""
     arrays = {
         "transmitter_position": np.tile([0.0, 0.0, 2.0], (n, 1)),
         "receiver_position": np.stack([np.arange(1.0, n + 1), np.zeros(n), np.ones(n)], axis=1),
@@ -83,7 +81,8 @@ def write_paths(folder: Path, n: int = 12, **changes: object) -> Path:
         "line_of_sight": np.ones(n, dtype=bool),
         "frequency_hz": np.float64(2.4e9),
     } | changes
-    np.savez(folder / "paths.npz", **arrays)
+    folder.mkdir(exist_ok=True)
+    np.savez(folder / "paths.npz", **{name: value for name, value in arrays.items() if value is not None})
     return folder
 
 

@@ -1,7 +1,5 @@
 """Field models and RSSI predictors in their smallest size, so that a fit takes a second or less."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import fields, replace
@@ -9,15 +7,11 @@ from typing import Any, get_type_hints
 from unittest import mock
 
 from swiftwrf import Spectra
-from swiftwrf.comparison import (
-    Config,
-    DcganConfig,
-    NeRF2Config,
-    NeRF2Rssi,
-    NeRF2RssiConfig,
-    VaeConfig,
-    WrfGsConfig,
-)
+from swiftwrf.comparison import NeRF2Rssi
+from swiftwrf.comparison.base import Config
+from swiftwrf.comparison.generative import DcganConfig, VaeConfig
+from swiftwrf.comparison.nerf2 import NeRF2Config, NeRF2RssiConfig
+from swiftwrf.comparison.wrfgs import WrfGsConfig
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import GeometryConfig, GeometryModel
 from swiftwrf.models.geometry.fit import search_room

@@ -1,7 +1,5 @@
 """Steps that add numbers, for tests of processes: children import them by this name."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

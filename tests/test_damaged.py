@@ -1,7 +1,5 @@
 """Measurements that are damaged, foreign, or ask for more than they hold."""
 
-from __future__ import annotations
-
 import io
 import resource
 import zipfile
@@ -16,13 +14,6 @@ from samples import write_nerf2, write_nerf2_rssi, write_paths
 from swiftwrf import InputError, load_rssi, load_spectra
 
 N = 12
-
-
-def paths(folder, **changes):
-    """A folder with ray paths, some of their arrays replaced."""
-    folder.mkdir(exist_ok=True)
-    write_paths(folder, **changes)
-    return folder
 
 
 @pytest.mark.parametrize(
@@ -40,19 +31,25 @@ def paths(folder, **changes):
         ({"path_count": np.full(N, 2**62)}, "must have shape"),
         ({"gain": np.array(["a"] * N)}, "plain numbers"),
         ({"transmitter_position": np.ones((N, 3), dtype=complex)}, "complex"),
+        ({"gain": None}, "lacks gain"),
+        ({"gain": np.ones(5, np.complex64)}, "gain must have shape"),
+        ({"gain": np.full(N, np.nan, np.complex64)}, "gain must be finite"),
+        ({"path_count": np.arange(N, dtype=np.int32)}, "at least one path"),
+        ({"frequency_hz": np.float64(-1)}, "frequency_hz"),
+        ({"last_point": np.array([object()] * N)}, "plain numbers"),
     ],
 )
 def test_paths_that_say_nothing_are_refused(tmp_path, changes, says):
     with pytest.raises(InputError, match=says):
-        load_spectra(paths(tmp_path / "p", **changes))
+        load_spectra(write_paths(tmp_path / "p", **changes))
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32, np.uint64, ">i4"])
 def test_paths_in_other_precisions(tmp_path, dtype):
-    usual = load_spectra(paths(tmp_path / "a"))
+    usual = load_spectra(write_paths(tmp_path / "a"))
     single = np.tile([0.0, 0.0, 2.0], (N, 1)).astype(np.float32)
     other = load_spectra(
-        paths(tmp_path / "b", path_count=np.ones(N, dtype=dtype), transmitter_position=single, last_point=single)
+        write_paths(tmp_path / "b", path_count=np.ones(N, dtype=dtype), transmitter_position=single, last_point=single)
     )
     torch.testing.assert_close(other.spectrum, usual.spectrum)
     torch.testing.assert_close(other.label, usual.label)

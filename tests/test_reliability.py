@@ -1,22 +1,22 @@
 """Nothing lost, nothing silently wrong: runs that are interrupted, resumed, started twice, or whose input changes."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
 import shutil
 import subprocess
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
 import pytest
 import quick
 import torch
+from PIL import Image
 from quick import run, said
 
-from swiftwrf import InputError
+from swiftwrf import InputError, rssi_room
 from swiftwrf.runtime import durable
 from tasks import environment
 from tasks.command import main
@@ -106,20 +106,34 @@ def test_the_console_script_finds_the_task_of_a_run(stopped):
     assert (stopped.with_name("run") / "report.html").exists()
 
 
-def test_resume_refuses_another_configuration(stopped, capsys):
-    file = stopped / "config.json"
-    content = json.loads(file.read_text())
-    content["config"]["seed"] = 1
-    file.write_text(json.dumps(content))
+@pytest.mark.parametrize(
+    ("file", "keys", "value", "says"),
+    [
+        ("config.json", ("config", "seed"), 1, "not what the run began with"),
+        ("environment.json", ("packages", "torch"), "0.1", "began with torch 0.1; go on with these"),
+        (
+            "environment.json",
+            ("packages", "swiftwrf-tasks"),
+            "0.0.1",
+            "began with swiftwrf-tasks 0.0.1; go on with these",
+        ),
+        ("environment.json", ("commit",), "0123456789ab", "began with commit 0123456789ab; go on with these"),
+        ("environment.json", ("packages",), 3, "began with other libraries"),
+    ],
+)
+def test_resume_refuses_another_configuration_and_other_versions(stopped, capsys, file, keys, value, says):
+    """A library or this project in another version computes other numbers."""
+    content = json.loads((stopped / file).read_text())
+    place = content if len(keys) == 1 else content[keys[0]]
+    place[keys[-1]] = value
+    (stopped / file).write_text(json.dumps(content))
     assert run("resume", stopped) == 2
-    assert "not what the run began with" in said(capsys)
+    assert says in said(capsys)
     assert (stopped / "steps" / "mean.json").exists()
 
 
 def test_resume_refuses_changed_data(tmp_path, monkeypatch, capsys):
     """Every file that is read counts: here a floor plan."""
-    from PIL import Image
-
     plan = tmp_path / "plan.png"
     Image.new("RGB", (4, 4)).save(plan)
     with monkeypatch.context() as patch:
@@ -130,25 +144,6 @@ def test_resume_refuses_changed_data(tmp_path, monkeypatch, capsys):
     assert run("resume", tmp_path / "run.partial") == 2
     assert "changed since" in said(capsys)
     assert (tmp_path / "run.partial" / "steps" / "mean.json").exists()
-
-
-def test_resume_refuses_other_versions(stopped, capsys):
-    """A library or this project in another version computes other numbers."""
-    file = stopped / "environment.json"
-    content = json.loads(file.read_text())
-    file.write_text(json.dumps(content | {"packages": content["packages"] | {"torch": "0.1"}}))
-    assert run("resume", stopped) == 2
-    assert "began with torch 0.1; go on with these" in said(capsys)
-    file.write_text(json.dumps(content | {"packages": content["packages"] | {"swiftwrf-tasks": "0.0.1"}}))
-    assert run("resume", stopped) == 2
-    assert "began with swiftwrf-tasks 0.0.1; go on with these" in said(capsys)
-    file.write_text(json.dumps(content | {"commit": "0123456789ab"}))
-    assert run("resume", stopped) == 2
-    assert "began with commit 0123456789ab; go on with these" in said(capsys)
-    file.write_text(json.dumps(content | {"packages": 3}))
-    assert run("resume", stopped) == 2
-    assert "began with other libraries" in said(capsys)
-    assert (stopped / "steps" / "mean.json").exists()
 
 
 def test_report_says_where_a_run_went_on(stopped):
@@ -303,10 +298,6 @@ def test_the_commit_is_that_of_this_project_and_names_every_change(tmp_path, mon
 
 @pytest.mark.filterwarnings("error:constrained_layout")
 def test_a_receiver_may_have_any_name(tmp_path, monkeypatch):
-    from dataclasses import replace
-
-    from swiftwrf import rssi_room
-
     floor, names = rssi_room(n=40), ("NA", "$x^{$", "=cmd()", "12:34:56", "7", "<b>", "x" * 300)
     with quick.quick(drawn=True):
         monkeypatch.setattr(
@@ -322,9 +313,9 @@ def test_a_receiver_may_have_any_name(tmp_path, monkeypatch):
 
 def test_files_reach_the_disk_before_they_get_their_name(tmp_path, monkeypatch):
     done: list[tuple[str, str]] = []
-    fsync, replace = os.fsync, os.replace
+    fsync, rename = os.fsync, os.replace
     monkeypatch.setattr(os, "fsync", lambda fd: (done.append(("sync", os.readlink(f"/proc/self/fd/{fd}"))), fsync(fd)))
-    monkeypatch.setattr(os, "replace", lambda a, b: (done.append(("rename", str(b))), replace(a, b)))
+    monkeypatch.setattr(os, "replace", lambda a, b: (done.append(("rename", str(b))), rename(a, b)))
     durable.write_text(tmp_path / "a", "text")
     assert [kind for kind, _ in done] == ["sync", "rename", "sync"]
     assert done[0][1] != str(tmp_path / "a")

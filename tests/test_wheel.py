@@ -1,7 +1,5 @@
 """A wheel installs in a clean environment and runs in a directory that contains a `tasks.py`."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -10,6 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from samples import write_survey
 
 ROOT = Path(__file__).parent.parent
 
@@ -40,7 +39,13 @@ def test_a_wheel_runs_beside_a_module_called_tasks(tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
     (empty / "tasks.py").write_text("raise RuntimeError('the module of the user')\n")
-    run = [str(tmp_path / "clean" / "bin" / "swiftwrf"), "rssi", "--rx", "6", "--out", "map"]
+    run = [
+        str(tmp_path / "clean" / "bin" / "swiftwrf"),
+        "inspect",
+        str(write_survey(tmp_path / "walk")),
+        "--out",
+        "page",
+    ]
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     subprocess.run(run, cwd=empty, env=environment, check=True)
-    assert (empty / "map" / "report.html").is_file()
+    assert (empty / "page" / "report.html").is_file()

@@ -1,7 +1,5 @@
 """Wording of docstrings, comments and documents: the field's words, imperative first lines, short sentences, examples."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import inspect

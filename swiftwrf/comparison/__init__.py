@@ -1,9 +1,7 @@
 """Methods of comparison, implemented from their publications."""
 
-from swiftwrf.comparison.base import Config
-from swiftwrf.comparison.generative import Dcgan, DcganConfig, Vae, VaeConfig
-from swiftwrf.comparison.nerf2 import NeRF2, NeRF2Config, NeRF2Rssi, NeRF2RssiConfig
-from swiftwrf.comparison.wrfgs import WrfGs, WrfGsConfig
+from swiftwrf.comparison.generative import Dcgan, Vae
+from swiftwrf.comparison.nerf2 import NeRF2, NeRF2Rssi
+from swiftwrf.comparison.wrfgs import WrfGs
 
-__all__ = ["Config", "Dcgan", "DcganConfig", "NeRF2", "NeRF2Config", "NeRF2Rssi", "NeRF2RssiConfig", "Vae"]
-__all__ += ["VaeConfig", "WrfGs", "WrfGsConfig"]
+__all__ = ["Dcgan", "NeRF2", "NeRF2Rssi", "Vae", "WrfGs"]

@@ -29,13 +29,7 @@ Depth = Annotated[int, Ge(1), Le(64)]
 
 @configuration
 class Config:
-    """Training of a method. The defaults of each method are its quick preset, `paper()` its publication.
-
-    Example:
-        >>> from swiftwrf.comparison import VaeConfig
-        >>> VaeConfig().steps, isinstance(VaeConfig.paper(), Config)
-        (1000, True)
-    """
+    """Training of a method. The defaults of each method are its quick preset, `paper()` its publication."""
 
     published: ClassVar[dict[str, Any]] = {}
     """options of the publication"""

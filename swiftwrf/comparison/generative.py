@@ -144,12 +144,7 @@ class Convolutional(TrainedModel):
 
 @configuration
 class VaeConfig(ConvolutionalConfig):
-    """Options of `Vae`.
-
-    Example:
-        >>> Vae(VaeConfig(latent=8)).config.latent
-        8
-    """
+    """Options of `Vae`."""
 
     published: ClassVar[dict[str, Any]] = {
         "latent": 64,
@@ -229,12 +224,7 @@ def normal(raw: Tensor) -> Normal:
 
 @configuration
 class DcganConfig(ConvolutionalConfig):
-    """Options of `Dcgan`.
-
-    Example:
-        >>> Dcgan(DcganConfig(steps=200), l1_weight=10.0).config.l1_weight
-        10.0
-    """
+    """Options of `Dcgan`."""
 
     published: ClassVar[dict[str, Any]] = {
         "noise": 100,

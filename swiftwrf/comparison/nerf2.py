@@ -92,12 +92,7 @@ class FieldConfig(Config):
 
 @configuration
 class NeRF2Config(FieldConfig):
-    """Options of `NeRF2`.
-
-    Example:
-        >>> NeRF2(NeRF2Config(width=32), rays=128).config.rays
-        128
-    """
+    """Options of `NeRF2`."""
 
     published = FieldConfig.published | {"batch": 8192, "rays": 1, "shared_rays": False}
 
@@ -112,12 +107,7 @@ class NeRF2Config(FieldConfig):
 
 @configuration
 class NeRF2RssiConfig(FieldConfig):
-    """Options of `NeRF2Rssi`; a batch consists of transmitter positions.
-
-    Example:
-        >>> NeRF2Rssi(NeRF2RssiConfig(weight_decay=1e-4)).config.weight_decay
-        0.0001
-    """
+    """Options of `NeRF2Rssi`; a batch consists of transmitter positions."""
 
     published = FieldConfig.published | {"azimuths": 36, "elevations": 9, "batch": 8}
 

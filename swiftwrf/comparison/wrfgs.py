@@ -62,12 +62,7 @@ MIN_OPACITY, RESET_OPACITY = 0.005, 0.01
 
 @configuration
 class WrfGsConfig(Config):
-    """Options of `WrfGs`.
-
-    Example:
-        >>> WrfGs(WrfGsConfig(n_gaussians=100)).config.n_gaussians
-        100
-    """
+    """Options of `WrfGs`."""
 
     published: ClassVar[dict[str, Any]] = {
         "n_gaussians": 20_000,
@@ -239,11 +234,7 @@ class GaussianTraining(Training[nn.ModuleDict]):
     """Training of shapes, opacities and network.
 
     Densification doubles Gaussians with a large gradient and removes those of low opacity (B. Kerbl et al., section 5.2).
-
-    Args:
-        owner: Model of the network.
-        network: Initialised network, on its device.
-        train: Training spectra.
+    The network is initialised, on its device.
     """
 
     def __init__(self, owner: WrfGs, network: nn.ModuleDict, train: Spectra) -> None:

@@ -17,14 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from swiftwrf.data.cells import CLOCK_ONLY, UNITS, column_of_numbers, parsed, plain_name, seconds, text_of, unit_of
-from swiftwrf.data.columns import (
-    GEODETIC,
-    candidates,
-    check_receiver_known,
-    column_of,
-    find_roles,
-    receiver_columns,
-)
+from swiftwrf.data.columns import GEODETIC, candidates, check_receiver_known, column_of, find_roles, receiver_columns
 from swiftwrf.data.coordinates import (
     STOREY_M,
     Coordinates,
@@ -86,11 +79,7 @@ def has_positions(table: pd.DataFrame, columns: Mapping[str, str]) -> bool:
 
 
 def read_survey(
-    label: object,
-    table: pd.DataFrame,
-    options: TableOptions,
-    receivers: Path | None = None,
-    keeps_rows: bool = False,
+    label: object, table: pd.DataFrame, options: TableOptions, receivers: Path | None = None, keeps_rows: bool = False
 ) -> dict[str, Any]:
     """Return the arguments of `Rssi` that a survey table determines: RSSI, positions, receivers and what rows are of.
 

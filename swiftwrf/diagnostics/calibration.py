@@ -131,7 +131,9 @@ def calibrate(train: Snapshots) -> Calibration:
             f"the phases between the elements of {train.name} hardly depend on the position, so they do not contain the "
             "direction of the line of sight"
         )
-    problem = _Problem.of(seen)
+    received = of_unit_power(unit(seen.channel))
+    strongest = torch.linalg.eigh(received).eigenvectors[..., -1]
+    problem = _Problem(seen.array, seen.position, seen.away, received, strongest)
     found = problem.descend(start := problem.scan())
     if float(problem.away.norm(dim=1).min()) < seen.array.far_field_m:
         curved = replace(problem, curved=True)
@@ -152,12 +154,14 @@ def calibrate(train: Snapshots) -> Calibration:
     phase_std, turn_std = problem.standard_errors(found)
     wide, loose = turn_std.max() > math.radians(3), (phase_std > math.radians(30)).nonzero()[:, 0].tolist()
     if wide or loose:
-        open_ones = (
-            [f"the rotation about its {'xyz'[int(turn_std.argmax())]} axis ({_degrees(turn_std)})"] if wide else []
-        )
-        open_ones += (
-            [f"the phases of elements {ranges(loose)}, counted from 0 ({_degrees(phase_std)})"] if loose else []
-        )
+        turn_deg, phase_deg = (math.degrees(float(std.max())) for std in (turn_std, phase_std))
+        open_ones = []
+        if wide:
+            axis = "xyz"[int(turn_std.argmax())]
+            open_ones.append(f"the rotation about its {axis} axis (standard error {turn_deg:.1f} degrees)")
+        if loose:
+            error = f"standard error {phase_deg:.1f} degrees"
+            open_ones.append(f"the phases of elements {ranges(loose)}, counted from 0 ({error})")
         mean = problem.direction.mean(dim=0).expand_as(problem.direction)
         cone = float(angular_distance(problem.direction, mean).median())
         reason = "phases change from position to position as no direct path explains"
@@ -195,12 +199,6 @@ class _Problem:
     covariance: Tensor
     strongest: Tensor
     curved: bool = False
-
-    @classmethod
-    def of(cls, data: Snapshots) -> _Problem:
-        received = of_unit_power(unit(data.channel))
-        strongest = torch.linalg.eigh(received).eigenvectors[..., -1]
-        return cls(data.array, data.position, data.away, received, strongest)
 
     @property
     def direction(self) -> Tensor:
@@ -299,8 +297,3 @@ class _Problem:
             out = fold == number
             after[out] = self.subset(out).shares(self.subset(~out).descend(found))
         return float(self.shares(nothing).mean()), float(after.mean())
-
-
-def _degrees(std: Tensor) -> str:
-    """Return the largest of standard errors [rad] in words."""
-    return f"standard error {math.degrees(float(std.max())):.1f} degrees"

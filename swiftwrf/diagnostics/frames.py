@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import minimize
+from scipy.optimize import minimize, minimize_scalar
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn import functional
@@ -69,32 +69,13 @@ SLOPE = "phases grow with the element's number, by another slope in each snapsho
 AXES = torch.eye(3, dtype=torch.float64)
 SWAPS = {"x and y": AXES[[1, 0, 2]], "y and z": AXES[[0, 2, 1]], "x and z": AXES[[2, 1, 0]]}
 MIRRORS = {axis: AXES - 2 * torch.outer(unit, unit) for axis, unit in zip("xyz", AXES, strict=True)}
-# maps from x, y of the line of sight to those of the peaks; of spectra, and of spectra that are computed from snapshots
-AZIMUTH_ERRORS = {
-    ("azimuths of the spectra turn clockwise (or the array's y axis is reversed)", "the array's y axis is reversed"): (
-        (1, 0),
-        (0, -1),
-    ),
-    (
-        "azimuths of the spectra turn clockwise from -x (or the array's x axis is reversed)",
-        "the array's x axis is reversed",
-    ): ((-1, 0), (0, 1)),
-    (
-        "azimuths of the spectra are half a turn off (or phases have the wrong sign)",
-        "phases have the wrong sign (or the array is half a turn off)",
-    ): ((-1, 0), (0, -1)),
-    ("azimuths of the spectra count from y instead of x", "the array is a quarter turn off, its x axis at y"): (
-        (0, 1),
-        (-1, 0),
-    ),
-    ("azimuths of the spectra count from -y instead of x", "the array is a quarter turn off, its x axis at -y"): (
-        (0, -1),
-        (1, 0),
-    ),
-    (
-        "azimuths turn clockwise from y, as on a compass (or the array's x and y are swapped)",
-        "the array's x and y are swapped",
-    ): ((0, 1), (1, 0)),
+AZIMUTH_ERRORS = {  # maps from x, y of the line of sight to those of the peaks
+    "azimuths of the spectra turn clockwise (or the array's y axis is reversed)": ((1, 0), (0, -1)),
+    "azimuths of the spectra turn clockwise from -x (or the array's x axis is reversed)": ((-1, 0), (0, 1)),
+    "azimuths of the spectra are half a turn off (or the array is, or phases have the wrong sign)": ((-1, 0), (0, -1)),
+    "azimuths of the spectra count from y instead of x (or the array's x axis is at y)": ((0, 1), (-1, 0)),
+    "azimuths of the spectra count from -y instead of x (or the array's x axis is at -y)": ((0, -1), (1, 0)),
+    "azimuths turn clockwise from y, as on a compass (or the array's x and y are swapped)": ((0, 1), (1, 0)),
 }
 
 
@@ -286,11 +267,15 @@ def _hypotheses(
 
     for meaning, other in _frames(frame):
         yield meaning, at(other.away())
-    for meanings, matrix in AZIMUTH_ERRORS.items():
+    for meaning, matrix in AZIMUTH_ERRORS.items():
         turned = torch.cat([away[:, :2] @ torch.tensor(matrix).double().T, away[:, 2:]], dim=1)
-        yield meanings[seen is not None], at(turned)
-    for meaning, other in _mirrors(frame, peak):
-        yield meaning, at(other.away(), free=1)
+        yield meaning, at(turned)
+    for axis in "xyz":
+        offset, mirrored = best_mirror(
+            frame.position, frame.fixed[None], axis, lambda p: _agreement(replace(frame, position=p).direction(), peak)
+        )
+        meaning = f"{axis} of the positions counts from the other side (near {axis} = {offset:.1f} - {axis})"
+        yield meaning, at(replace(frame, position=mirrored).away(), free=1)
 
     def placed(position: Tensor, free: float = 0) -> _Hypothesis:
         return at(replace(frame, position=position[rows]).away(), free)
@@ -325,21 +310,27 @@ def best_explanations(score: Mapping[str, float], tie: float) -> tuple[float, li
     return best, [name for name, value in score.items() if value >= best - tie]
 
 
-def mirror(position: Tensor, axis: int, offset: float) -> Tensor:
-    """Return positions (n, 3) with coordinate x of an axis replaced by offset - x."""
-    mirrored = position.clone()
-    mirrored[:, axis] = offset - position[:, axis]
-    return mirrored
+def best_mirror(
+    position: Tensor, others: Tensor, axis: str, score: Callable[[Tensor], Any], refined: bool = False
+) -> tuple[float, Tensor]:
+    """Return the offset c [m] of the mirror c - x along an axis with the highest score, and the positions (n, 3) in it.
 
-
-def best_offset(coordinate: Tensor, score: Callable[[float], Any]) -> tuple[float, float]:
-    """Return the offset of the mirror with the highest score, and the step of the scanned offsets.
-
-    The mirror lies in the range of coordinates (n,).
+    The mirror lies in the range of the positions and of others (m, 3). Offsets are scanned, and then refined if asked for.
     """
-    low, high = 2 * float(coordinate.amin()), 2 * float(coordinate.amax())
-    offsets = torch.linspace(low, high, 40).tolist()
-    return max(offsets, key=score), (high - low) / 39
+    number = "xyz".index(axis)
+
+    def mirrored(offset: float) -> Tensor:
+        found = position.clone()
+        found[:, number] = offset - position[:, number]
+        return found
+
+    every = 2 * torch.cat([position, others])[:, number]
+    low, high = float(every.amin()), float(every.amax())
+    offset = max(torch.linspace(low, high, 40).tolist(), key=lambda offset: score(mirrored(offset)))
+    if refined:
+        near = offset - (high - low) / 39, offset + (high - low) / 39
+        offset = float(minimize_scalar(lambda c: -score(mirrored(float(c))), bounds=near, method="bounded").x)
+    return offset, mirrored(offset)
 
 
 def _nearest(direction: Tensor, peak: Tensor) -> Tensor:
@@ -444,21 +435,6 @@ def linear_errors(other: str, varying: Collection[str]) -> dict[str, Tensor]:
         **{f"the positions are in {unit}, {other} in metres": scale * AXES for unit, scale in UNITS.items()},
         **{f"{axis} of the positions has the wrong sign": MIRRORS[axis] for axis in "xyz" if axis in varying},
     }
-
-
-def _mirrors(frame: _Frame, peak: Tensor) -> Iterator[tuple[str, _Frame]]:
-    """Yield the frame for the mirror c - x of each axis with most agreement."""
-    every = torch.cat([frame.position, frame.fixed[None]])
-    for number, axis in enumerate("xyz"):
-
-        def mirrored(offset: float, number: int = number) -> _Frame:
-            return replace(frame, position=mirror(frame.position, number, offset))
-
-        offset, _ = best_offset(every[:, number], lambda offset: _agreement(mirrored(offset).direction(), peak))
-        yield (
-            f"{axis} of the positions counts from the other side (near {axis} = {offset:.1f} - {axis})",
-            mirrored(offset),
-        )
 
 
 def _constant_turn(frame: _Frame, peak: Tensor) -> NDArray[np.float64] | None:

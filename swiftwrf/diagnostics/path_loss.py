@@ -8,17 +8,15 @@ cannot show are not tried, e.g. swaps with an axis along which all positions are
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
-from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.diagnostics.elements import some_rows
-from swiftwrf.diagnostics.frames import best_explanations, best_offset, delay, earlier, linear_errors, mirror, shifts
+from swiftwrf.diagnostics.frames import best_explanations, best_mirror, delay, earlier, linear_errors, shifts
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, log_distance
 
 MIN_EXPLAINED = 0.25  # of the variance, by an error that is named
@@ -64,12 +62,15 @@ def check_path_loss(data: Rssi) -> PathLossReport | None:
     data = data.columns(data.detected.sum(dim=0).argsort(descending=True, stable=True)[:20].tolist())
     walk, rows = data, some_rows(len(data), 2000)
     data, place = data.subset(rows), data.transmitter_position[rows]
-    errors = linear_errors("the receivers'", _varying(place))
+    extent = place.amax(dim=0) - place.amin(dim=0)
+    varying = [axis for axis, size in zip("xyz", extent.tolist(), strict=True) if size > 1e-6]
+    errors = linear_errors("the receivers'", varying)
     found = {meaning: _explained(place @ matrix, data) for meaning, matrix in errors.items()}
-    fitted = {
-        f"{axis} of the positions counts from the other side ({axis} = {offset:.1f} - {axis})": value
-        for axis, offset, value in _mirrors(place, data)
-    }
+    fitted, located = dict[str, float](), data.receiver_position[data.receiver_located]
+    for axis in varying:
+        offset, mirrored = best_mirror(place, located, axis, lambda p: _explained(p, data), refined=True)
+        meaning = f"{axis} of the positions counts from the other side ({axis} = {offset:.1f} - {axis})"
+        fitted[meaning] = _explained(mirrored, data)
     delays = {late: _explained(earlier(walk.transmitter_position, late)[rows], data) for late in shifts(len(walk))}
     if delays:
         late = max(delays, key=delays.__getitem__)
@@ -82,28 +83,6 @@ def check_path_loss(data: Rssi) -> PathLossReport | None:
     if best >= max(MIN_EXPLAINED, 0.9 * attainable) and best - declared >= 0.1:
         return replace(report, explanation="; or if ".join(names))
     return replace(report, misplaced=attainable >= MIN_EXPLAINED and declared < attainable / 2)
-
-
-def _varying(place: Tensor) -> set[str]:
-    """Return the axes along which positions (n, 3) differ."""
-    extent = place.amax(dim=0) - place.amin(dim=0)
-    return {axis for axis, size in zip("xyz", extent.tolist(), strict=True) if size > 1e-6}
-
-
-def _mirrors(place: Tensor, data: Rssi) -> Iterator[tuple[str, float, float]]:
-    """Yield each axis, the offset c [m] of the mirror c - x that explains most, and the fraction that it explains."""
-    every = torch.cat([place, data.receiver_position[data.receiver_located]])
-    varying = _varying(place)
-    for number, axis in enumerate("xyz"):
-        if axis not in varying:
-            continue
-
-        def explained(offset: float, number: int = number) -> float:
-            return _explained(mirror(place, number, offset), data)
-
-        start, step = best_offset(every[:, number], explained)
-        result = minimize_scalar(lambda c: -explained(float(c)), bounds=(start - step, start + step), method="bounded")
-        yield axis, float(result.x), -float(result.fun)
 
 
 def _explained(position: Tensor, data: Rssi) -> float:

@@ -91,11 +91,7 @@ def _local_errors(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> C
 def choose_rank(position: Tensor, spectrum: Tensor | Store, fold: Tensor, kernel: Kernel) -> int:
     """Return the number of principal components whose omitted variance is negligible beside the error at held-out positions.
 
-    Args:
-        position: Positions of the training spectra (n, 3) [m].
-        spectrum: Training spectra (n, H, W).
-        fold: Number of the group that each is held out with, (n,).
-        kernel: Chosen kernel.
+    The arguments are those of `choose_kernel`, and the kernel that it chose.
 
     Example:
         >>> import swiftwrf

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from swiftwrf.locate.matched_field import MatchedField, MatchedFieldConfig
 from swiftwrf.locate.posterior import Posterior, smoothed
 from swiftwrf.locate.region import Region
-from swiftwrf.locate.rssi import RssiLocator, RssiLocatorConfig
+from swiftwrf.locate.rssi import RssiLocator
 from swiftwrf.runtime.lazy import import_lazily
 
 if TYPE_CHECKING:
@@ -14,4 +14,4 @@ if TYPE_CHECKING:
 import_lazily(__name__, {"swiftwrf.locate.comparison": ("LocateComparison", "compare")})  # imports scikit-learn
 
 __all__ = ["LocateComparison", "MatchedField", "MatchedFieldConfig", "Posterior", "Region", "RssiLocator"]
-__all__ += ["RssiLocatorConfig", "compare", "smoothed"]
+__all__ += ["compare", "smoothed"]

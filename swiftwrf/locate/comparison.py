@@ -76,14 +76,9 @@ class LocateSplit:
 
     @classmethod
     def of(cls, data: Rssi, split: str, n_cells: int, seed: int, reference: str | None = None) -> LocateSplit:
-        """Return a split of RSSI.
+        """Return a split of RSSI; the arguments are those of `compare`.
 
-        Args:
-            data: RSSI. Offsets between its groups, if it has any, are estimated from training rows and removed.
-            split: Name of the split.
-            n_cells: Number of candidate positions of the posterior.
-            seed: Seed of everything random.
-            reference: Group whose offset is 0. Defaults to the most frequent one.
+        Offsets between groups, if there are any, are estimated from training rows and removed.
 
         Raises:
             InputError: Receivers that move, no such split, or too few rows in which a receiver detected the transmitter.

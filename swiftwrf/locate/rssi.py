@@ -43,12 +43,7 @@ MAX_HELD_OUT = 2000  # rows that determine the distributions
 
 @configuration
 class RssiLocatorConfig:
-    """Options of the locator.
-
-    Example:
-        >>> RssiLocator(RssiLocatorConfig(validation="block"), n_cells=500).config.validation
-        'block'
-    """
+    """Options of the locator."""
 
     validation: Validation = "random"
     """training rows held out to calibrate: single ones at random, or one region at a time"""

@@ -190,13 +190,7 @@ class Fingerprints:
 
     @classmethod
     def fit(cls, train: Rssi, fold: Tensor, seed: int = 0) -> Self:
-        """Return fingerprints with the metric and k of the lowest mean error at held-out rows.
-
-        Args:
-            train: Training rows.
-            fold: Fold of each row (n,).
-            seed: Seed of the choice of held-out rows.
-        """
+        """Return fingerprints with the metric and k of the lowest mean error at rows of held-out folds (n,)."""
         detected = train.detected.any(dim=1)
         train, fold = train.subset(detected), fold[detected]
         order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))

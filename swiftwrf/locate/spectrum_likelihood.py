@@ -140,12 +140,7 @@ class Student:
 
     @classmethod
     def fit(cls, residual: Tensor, floor: float) -> Self:
-        """Fit to held-out residuals, with the shrinkage and degrees of freedom of the highest held-out density.
-
-        Args:
-            residual: Residuals (n, F).
-            floor: Smallest variance.
-        """
+        """Fit to residuals (n, F) and a smallest variance, with shrinkage and degrees of the highest held-out density."""
         residual, shrinkage = residual.double(), torch.tensor(SHRINKAGES, dtype=torch.float64)
         fold = torch.arange(len(residual)) % 5
         density = torch.zeros(len(DEGREES), len(shrinkage), dtype=torch.float64)

@@ -119,13 +119,7 @@ class Monitor:
     def of(
         cls, model: FieldModel | RssiModel, train: Spectra | Rssi | None = None, false_alarm_rate: FalseAlarmRate = 1e-4
     ) -> Monitor:
-        """Return the monitor of a fitted model.
-
-        Args:
-            model: Fitted model.
-            train: Its training data in their order. Spectra give the reference.
-            false_alarm_rate: False alarms a measurement.
-        """
+        """Return the monitor of a fitted model. Its training spectra, in their order, give the reference."""
         if isinstance(model, RssiModel):
             return cls(model.region(), model.receiver_names, None, false_alarm_rate)
         reference = None

@@ -163,11 +163,6 @@ class Alarm:
         series: Number of the series.
         at: Number of the measurement that raised the alarm, counted from 0.
         since: Number of the first measurement of the cumulative sum: the estimated beginning of the change.
-
-    Example:
-        >>> alarm = Alarm(series=0, at=14, since=9)
-        >>> alarm.at - alarm.since
-        5
     """
 
     series: int

@@ -71,10 +71,7 @@ def architectures() -> list[int]:
 
 
 def target(capability: int) -> str:
-    """Return the compilation target for a GPU: machine code, or portable PTX if the GPU is newer than NVRTC.
-
-    Args:
-        capability: Ten times the compute capability of the GPU.
+    """Return the target for ten times a compute capability: machine code, or portable PTX if it is newer than NVRTC.
 
     Raises:
         CudaUnavailable: The GPU is too old.
@@ -89,12 +86,7 @@ def target(capability: int) -> str:
 
 
 def compile_source(source: str, target: str, *options: str) -> tuple[bytes, str]:
-    """Compile CUDA C++. Needs neither a GPU nor a driver.
-
-    Args:
-        source: CUDA C++ source.
-        target: Architecture such as "sm_90" for a CUBIN or "compute_90" for PTX.
-        options: Further options of NVRTC.
+    """Compile CUDA C++ for a target such as "sm_90" or "compute_90". Needs neither a GPU nor a driver.
 
     Returns:
         The CUBIN or PTX, and the compiler's log.
@@ -123,9 +115,6 @@ def compile_source(source: str, target: str, *options: str) -> tuple[bytes, str]
 class Kernels:
     """The compiled kernels of `rasterize.cu`, loaded on one GPU.
 
-    Args:
-        device: GPU to load the kernels on.
-
     Raises:
         CudaUnavailable: `cuda.bindings`, NVRTC or the driver is missing, or the GPU is too old.
     """
@@ -145,14 +134,7 @@ class Kernels:
         self._function = cache(partial(_call, self._driver.cuModuleGetFunction, self._module))
 
     def launch(self, kernel: str, blocks: int, threads: int, *arguments: Tensor | int | np.ndarray | None) -> None:
-        """Queue a kernel on torch's current stream of the device, without waiting for it.
-
-        Args:
-            kernel: Name of the kernel.
-            blocks: Number of blocks.
-            threads: Number of threads of a block.
-            arguments: Arguments of the kernel; see `packed`.
-        """
+        """Queue a kernel on torch's current stream, in blocks of a number of threads, without waiting for it."""
         values = packed(*arguments)
         pointers = np.array([value.ctypes.data for value in values], np.uint64)
         with torch.cuda.device(self._device):

@@ -5,10 +5,10 @@ from swiftwrf.rssi.comparison import RssiComparison, compare
 from swiftwrf.rssi.mixing import LEVEL
 from swiftwrf.rssi.model import RssiModel, fit_rssi
 from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation, estimate_offsets
-from swiftwrf.rssi.pairs import PairConfig, PairModel
-from swiftwrf.rssi.paper import RssiPaperConfig, RssiPaperModel
+from swiftwrf.rssi.pairs import PairModel
+from swiftwrf.rssi.paper import RssiPaperModel
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, log_distance
 
-__all__ = ["LEVEL", "FloorAttenuation", "Map", "PairConfig", "PairModel", "PathLoss", "RssiComparison", "RssiConfig"]
-__all__ += ["RssiModel", "RssiPaperConfig", "RssiPaperModel", "RssiPredictor", "compare", "estimate_floor_attenuation"]
+__all__ = ["LEVEL", "FloorAttenuation", "Map", "PairModel", "PathLoss", "RssiComparison", "RssiConfig"]
+__all__ += ["RssiModel", "RssiPaperModel", "RssiPredictor", "compare", "estimate_floor_attenuation"]
 __all__ += ["estimate_offsets", "fit_path_loss", "fit_rssi", "log_distance"]

@@ -183,14 +183,8 @@ def fit_process(
 ) -> GaussianProcessRegressor:
     """Return a Gaussian process fitted to coordinates (n, d) and values (n,) or (n, c).
 
-    The parameters of the kernel maximise the marginal likelihood of 500 rows. The process is conditioned on 1500 rows.
-
-    Args:
-        kernel: Kernel with start values and bounds.
-        x: Coordinates.
-        y: Values.
-        seed: Seed of the rows.
-        normalize: Scale values to mean 0 and variance 1.
+    The parameters of the kernel maximise the marginal likelihood of 500 random rows, from its values and within its bounds.
+    The process is conditioned on 1500 rows. With `normalize`, values are scaled to mean 0 and variance 1.
     """
     order = np.random.default_rng(seed).permutation(len(y))
     tuned, kept = order[:MAX_TUNING_ROWS], order[:MAX_GP_ROWS]

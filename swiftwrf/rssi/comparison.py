@@ -282,12 +282,7 @@ def compare(
 def pool_of(whole: Rssi, train: Rssi, test: Rssi, split: str, seed: int) -> Rssi:
     """Return the training rows at every receiver, without those that a split by place holds out.
 
-    Args:
-        whole: RSSI at all receivers.
-        train: Training rows at the compared receivers.
-        test: Test rows at the compared receivers.
-        split: Name of the split.
-        seed: Seed of the split.
+    `train` and `test` are the parts of the split at the compared receivers.
     """
     if split != PLACE or PLACE in whole.named_splits:
         return whole.split(split, seed)[0]

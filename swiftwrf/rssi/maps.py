@@ -100,10 +100,7 @@ class RssiMap(Labelled, Displayed):
         return cls(x, y, z, cell, mean, std, detection, model.receiver_names, model.origin)
 
     def receivers(self, asked: Sequence[str]) -> RssiMap:
-        """Return the map of some receivers.
-
-        Args:
-            asked: Names, or numbers counted from 1.
+        """Return the map of receivers by their names, or by numbers counted from 1.
 
         Raises:
             InputError: An unknown receiver.

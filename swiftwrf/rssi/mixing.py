@@ -31,11 +31,7 @@ def comparable(held_out: Tensor, measured: Tensor) -> Tensor:
 
 
 def check_comparable(held_out: Tensor, measured: Tensor) -> None:
-    """Refuse held-out predictions (predictors, rows, R) that cannot be compared with any measurement (rows, R).
-
-    Raises:
-        InputError: As described.
-    """
+    """Raise InputError if held-out predictions (predictors, rows, R) cannot be compared with any measurement (rows, R)."""
     if not comparable(held_out, measured).any():
         raise InputError(
             "no rows can be held out to estimate the error of the model: all measurements are in one part of the "

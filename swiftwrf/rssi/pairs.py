@@ -40,12 +40,7 @@ MAX_HELD_OUT = 500  # pairs that choose the kernel; more do not change it
 
 @configuration
 class PairConfig(FieldConfig):
-    """Options of models over pairs of positions.
-
-    Example:
-        >>> PairModel(PairConfig(new_places=False)).config.new_places
-        False
-    """
+    """Options of models over pairs of positions."""
 
     new_places: bool = True
     """fit for receivers at positions without a measurement, with one path-loss model; otherwise for new positions of the

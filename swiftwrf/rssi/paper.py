@@ -36,12 +36,7 @@ HELD_OUT_FOLD = 0  # the only fold that is held out: a fit costs minutes
 
 @configuration
 class RssiPaperConfig(RssiConfig):
-    """Options of `RssiPaperModel`.
-
-    Example:
-        >>> RssiPaperConfig(steps=100).n_primitives
-        50
-    """
+    """Options of `RssiPaperModel`."""
 
     steps: PositiveInt = 600
     """gradient steps"""
@@ -129,15 +124,9 @@ def learn_receivers(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Fit some receivers twice: without one fold, and with all.
 
-    The receivers share the steps, which saves time, but no parameter, loss or moment: each is fitted as if alone.
-
-    Args:
-        some: The receivers.
-        bins: Training rows by location bin.
-        root: Cholesky factor of the covariance of the latent field in the n bins, (n, n).
-        prior_db: Standard deviations of latent field and noise, each (R,) [dB].
-        config: Options.
-        device: Device to compute on.
+    The receivers share the steps, which saves time, but no parameter, loss or moment: each is fitted as if alone. `root` is
+    the Cholesky factor of the covariance of the latent field in the n bins, (n, n), and `prior_db` are the standard
+    deviations of latent field and noise, each (R,) [dB].
 
     Returns:
         Predictions of the fit without the fold (R, n) [dBm], the standard normal numbers behind the field (R, n), and the

@@ -219,15 +219,9 @@ def fit_path_losses(
 def _maximise(
     distance: Tensor, crossed: Tensor, rssi: Tensor, shift: Tensor, detection: Detection | None, repeats: float
 ) -> dict[str, Tensor]:
-    """Fit the path loss of receivers of one kind; see `fit_path_losses`.
+    """Fit the path loss of receivers of one kind, at log10 distances (n, R) [m]; see `fit_path_losses`.
 
-    Args:
-        distance: log10 of the distances [m], (n, R).
-        crossed: Number of floors between both ends, (n, R).
-        rssi: Measurements (n, R) [dBm], nan where not detected.
-        shift: See `fit_path_losses`.
-        detection: Curve of detection of these receivers.
-        repeats: Number of rows that count as one.
+    Rows count as one for each `repeats` of them.
 
     Returns:
         The fields of `PathLosses` by name, and the share `unexplained` (R,) of empty cells where a value was expected.

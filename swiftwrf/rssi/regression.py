@@ -31,13 +31,7 @@ MAX_VARIANCE_POSITIONS = 200  # measured positions that determine where the fiel
 
 @single_thread()  # several threads add up sums in another order
 def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: torch.device) -> dict[str, Tensor]:
-    """Fit one receiver.
-
-    Args:
-        some: The receiver, as a slice of length 1.
-        data: Training data.
-        config: Options.
-        device: Device to compute on.
+    """Fit one receiver, which a slice of length 1 selects.
 
     Returns:
         Tensors by name, with R = 1.

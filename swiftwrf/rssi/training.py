@@ -87,13 +87,7 @@ def prepare(
 ) -> RssiTraining:
     """Average the rows by location bin, fit the path-loss models and choose the kernel.
 
-    Args:
-        train: See `RssiModel.fit`.
-        pool: See `RssiModel.fit`.
-        config: Options.
-        shift: Received power less RSSI of the pool, by floors and offsets that were removed, (rows, P) [dB].
-        curve: Curve of detection of the pool; None if every cell has a value.
-        like: Training data of the same pool whose kernel is taken. Defaults to a choice on held-out rows.
+    The arguments are those of `RssiPredictor._fit`. With `like`, training data of the same pool, their kernel is taken.
     """
     bins = binned(train, config)
     rssi, fold, every = bins.rssi, bins.fold, bin_locations(pool, config.max_locations)[1]

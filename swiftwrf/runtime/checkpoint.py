@@ -28,14 +28,7 @@ Header = dict[str, Any]  # values that JSON can store
 
 
 def write(path: str | Path, kind: str, tensors: dict[str, Tensor], header: Header) -> None:
-    """Write a file atomically: an interrupted write leaves the old file.
-
-    Args:
-        path: File to write.
-        kind: Kind of the content; `read` refuses another kind.
-        tensors: Tensors by name.
-        header: Values that JSON can store.
-    """
+    """Write a file atomically: an interrupted write leaves the old file. `read` refuses another kind of content."""
     metadata = {"kind": kind, "format": str(FORMAT), "header": json.dumps(header)}
     content = save({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, metadata)
     write_bytes(Path(path), content)

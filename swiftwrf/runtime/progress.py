@@ -37,11 +37,7 @@ class _Forwarded(Progress):
 
 @contextmanager
 def forwarding(listener: Callable[[float], None]) -> Iterator[None]:
-    """Forward the fractions of all progress bars to a listener during the context, in place of showing them.
-
-    Args:
-        listener: Function of the fraction that is done of the current work, in [0, 1].
-    """
+    """Forward the fractions of current work, in [0, 1], to a listener during the context, in place of showing bars."""
     global _listener
     outer, _listener = _listener, listener
     try:

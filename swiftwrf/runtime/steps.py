@@ -46,12 +46,9 @@ class Step(ABC, Generic[Context]):
 def walk(
     steps: Iterable[Step[Context]], context: Context, compute: Callable[[Step[Context]], dict[str, Any]]
 ) -> Iterator[tuple[Step[Context], dict[str, Any]]]:
-    """Yield each step with its result, followed by the steps that follow from it.
+    """Yield each step with its computed result, followed by the steps that follow from it.
 
-    Args:
-        steps: The first steps.
-        context: Data and configuration that all steps share.
-        compute: Returns the result of a step. Steps with one name have one result.
+    Steps with one name have one result.
     """
     for step in steps:
         value = compute(step)

@@ -1,22 +1,21 @@
-"""Suggested positions to measure next."""
+"""Suggested positions to measure next, for directions and for locating."""
 
-from __future__ import annotations
-
+import sys
 from dataclasses import replace
-from types import SimpleNamespace
 
+import pandas as pd
 import pytest
+import quick
 import torch
+from quick import said
 
-from augment.suggest import suggest
-from augment.turbo.choice import Suggestion
-from augment.turbo.condition import MeasuredSubset
-from swiftwrf import AngularGrid, InputError, make_model, simulated_room
+from augment.suggest import suggest, suggest_positions
+from swiftwrf import AngularGrid, InputError, make_model, rssi_room, simulated_room
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import choose_kernel, most_informative
+from swiftwrf.locate import RssiLocator
 from swiftwrf.metrics import psnr
-from tasks.aoa.experiment import _write_files
-from tasks.records import read_table
+from tasks.page.shared import write_suggestion
 
 
 def test_suggestions_lie_in_the_region_and_lower_the_variance(room):
@@ -34,12 +33,10 @@ def test_suggestions_lie_in_the_region_and_lower_the_variance(room):
 def test_suggested_positions_keep_the_digits_of_maps(room, tmp_path):
     """Coordinates on a map have more digits than single precision."""
     measured = replace(room, position=room.position.double() + torch.tensor([712345.678, 5412345.678, 0]).double())
-    found, directory = suggest(measured, 3), SimpleNamespace(path=tmp_path.joinpath)
-    positions = {"measured": measured.position.tolist(), "position": found.position.tolist()}
-    value = positions | {"variance": found.variance.tolist()}
-    _write_files(Suggestion(MeasuredSubset(0.5)), value, measured, directory)
-    table = read_table(tmp_path / "suggested-mix0.5.csv")
-    assert table[["x_m", "y_m", "z_m"]].to_numpy() == pytest.approx(found.position.numpy(), rel=1e-12)
+    found = suggest(measured, 3)
+    write_suggestion(tmp_path / "suggested", measured.position, found.position, found.variance)
+    table = pd.read_csv(tmp_path / "suggested.csv", float_precision="round_trip")
+    assert table[["x_m", "y_m", "z_m"]].to_numpy().tolist() == found.position.tolist()
 
 
 def test_measuring_at_suggested_positions_beats_random_ones():
@@ -65,3 +62,68 @@ def test_measuring_at_suggested_positions_beats_random_ones():
 def test_refuses_other_counts(room, count):
     with pytest.raises(InputError, match="between 1 and 500"):
         suggest(room, count)
+
+
+@pytest.fixture(scope="module")
+def located():
+    train = rssi_room(n=60)
+    return RssiLocator(n_cells=300).fit(train), train
+
+
+def test_suggested_cells_lower_the_variance(located):
+    locator, train = located
+    found = suggest_positions(locator, train, 6, seed=2)
+    assert torch.cdist(found.position, locator.cells.position).amin(dim=1).max() < 1e-6
+    assert len(found.position.unique(dim=0)) == 6
+    assert (found.variance.diff() <= 0).all()
+    assert found.position.equal(suggest_positions(locator, train, 6, seed=2).position)
+
+
+def test_positions_are_suggested_where_errors_are_large(located, monkeypatch):
+    locator, train = located
+    middle = locator.cells.position[:, 0].mean()
+
+    def errors(locator, position, generator):
+        return 0.01 + 10.0 * (position[:, 0] > middle)
+
+    monkeypatch.setattr(sys.modules["augment.suggest"], "_expected_errors", errors)
+    assert (suggest_positions(locator, train, 5).position[:, 0] > middle - 1).all()
+
+
+def test_weights_are_those_of_the_definition(located):
+    locator, train = located
+    kernel, known, candidate = locator.model.kernel, train.transmitter_position, locator.cells.position[:40]
+    weight = torch.rand(40, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    chosen, left = most_informative(kernel, known, candidate, 1, weight)
+
+    def mean(known):
+        cross = kernel(candidate, known)
+        return (
+            weight @ (1 - (cross * torch.linalg.solve(kernel.covariance(known), cross.T).T).sum(dim=1)) / weight.sum()
+        )
+
+    after = torch.stack([mean(torch.cat([known, one[None]])) for one in candidate])
+    assert left[0].allclose(mean(known), atol=1e-6)
+    assert left[1].allclose(after.min(), atol=1e-4)
+    assert after[chosen[0]].allclose(after.min(), atol=1e-4)
+
+
+def test_other_numbers_of_a_locator_are_refused(located):
+    locator, train = located
+    with pytest.raises(InputError, match="between 1 and 500"):
+        suggest_positions(locator, train, 0)
+    with pytest.raises(InputError, match="more cells"):
+        suggest_positions(RssiLocator(n_cells=50).fit(train), train, 500)
+    with pytest.raises(InputError, match="other receivers"):
+        suggest_positions(locator, train.columns([0, 1]), 3)
+
+
+def test_suggestions_of_a_run(tmp_path, capsys):
+    assert quick.run("locate", "--cells", 200, "--suggest", 4, "--out", tmp_path / "run") == 0
+    table = pd.read_csv(tmp_path / "run" / "suggested.csv")
+    assert list(table.columns) == ["x_m", "y_m", "z_m", "variance_left"]
+    assert len(table) == 4
+    assert "Where to measure next" in (tmp_path / "run" / "report.html").read_text()
+    capsys.readouterr()
+    assert quick.run("locate", "--suggest", 501) == 2
+    assert "--suggest must be a whole number at least 0 and at most 500" in said(capsys)

@@ -1,7 +1,5 @@
 """Turbo learning in one call equals the command, and takes field models and estimators of one's own."""
 
-from __future__ import annotations
-
 import pandas as pd
 import pytest
 import torch

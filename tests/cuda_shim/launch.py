@@ -5,7 +5,7 @@ from types import SimpleNamespace
 from unittest import mock
 
 import torch
-from scenes import random_scene
+from hard_cases import random_scene
 
 from swiftwrf import AngularGrid
 from swiftwrf.rasterize import cuda, operators, reference

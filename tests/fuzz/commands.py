@@ -3,8 +3,6 @@
 Those that are mistyped start no long run: whatever is valid among them meets an `--out` that is taken, or fails its check.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json
@@ -72,12 +70,7 @@ def command_lines(draw: random.Random, folder: Path, count: int) -> Iterator[tup
 
 
 SAVED = {
-    "rssi": {
-        "rx": ["1", "receiver06"],
-        "split": "block",
-        "seed": 7,
-        "data": None,
-    },
+    "rssi": {"rx": ["1", "receiver06"], "split": "block", "seed": 7, "data": None},
     "aoa": {"mix": [0.5, 1.0], "synthesizer": ["idw"], "extra": 7, "seed": 3},
     "convert": {"source": "data", "out": "new", "cell": 0.5, "rx": ["1"], "columns": ["x=lon"], "filler": [100.0]},
     "update": {"model": "model", "source": "data", "out": "new", "false_alarm_rate": 0.001, "follow": False},

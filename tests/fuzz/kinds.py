@@ -4,8 +4,6 @@ A format or a kind of model joins by a sample here (a test fails for one without
 `commands.py`.
 """
 
-from __future__ import annotations
-
 import functools
 import random
 from collections.abc import Callable
@@ -16,8 +14,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from samples import snapshots as made_snapshots
 from samples import (
+    snapshots,
     survey_rows,
     write_captures,
     write_deepmimo,
@@ -64,6 +62,7 @@ from swiftwrf.rssi import PairModel, RssiPaperModel
 
 N = 12
 GRID = AngularGrid.hemisphere(8, 32)
+SNAPSHOTS = snapshots(n=N, count=2, side=2)
 TINY = SwiftWRFPaper(n_primitives=3, steps=12, check_every=6).config
 Reader = Callable[[Path], object]
 Attempt = Callable[[random.Random, Path], object]
@@ -81,21 +80,9 @@ def rssi_nerf2(folder: Path) -> None:
     (folder / "test_index.txt").write_text("10\n11\n")
 
 
-def snapshot_arrays(folder: Path) -> None:
-    write_snapshots(folder, data=made_snapshots(n=N, count=2, side=2))
-
-
-def snapshots_hdf5(folder: Path) -> None:
-    write_snapshots(folder, "snapshots.h5", data=made_snapshots(n=N, count=2, side=2))
-
-
 def captures(folder: Path, **form: Any) -> None:
     pytest.importorskip("csiread", reason="needs the extra csi")
     write_captures(folder, n=3, **form)
-
-
-def spectra_array(folder: Path) -> None:
-    write_spectra(_room(), folder)
 
 
 def survey_parquet(folder: Path) -> None:
@@ -103,69 +90,63 @@ def survey_parquet(folder: Path) -> None:
     pd.DataFrame(rows, columns=header).to_parquet(folder / "walk.parquet")
 
 
-def rssi_survey(folder: Path) -> None:
-    write_survey(folder)
-    (folder / "receivers.csv").write_text("receiver,x,y,z\n" + "".join(f"{r},1,1,2\n" for r in survey_rows()[0][3:]))
-
-
+@functools.cache
 def _room() -> Spectra:
     return simulated_room(n=12, grid=GRID)
 
 
-def model_swiftwrf(folder: Path) -> None:
-    fit(_room(), n_primitives=3).save(folder / "model")
+@functools.cache
+def _floor() -> Rssi:
+    return rssi_room(n=40).receivers(["1", "2"])
 
 
-def model_swiftwrf_paper(folder: Path) -> None:
-    SwiftWRFPaper(TINY).fit(_room()).save(folder / "model")
+def _of_the_floor() -> GeometryModel:
+    return GeometryModel.of_planes(_room(), [FLOOR])
 
 
-def model_of(name: str, folder: Path) -> None:
-    make_model(name).fit(_room()).save(folder / "model")
+def _hybrid() -> HybridModel:
+    model = HybridModel().fit(_room(), like=_of_the_floor())
+    model.path_gains = fit_path_gains(_of_the_floor(), observe(_room())[0], Kernel())
+    return model
 
 
-def model_coarray(folder: Path) -> None:
-    CoarrayModel().fit(_room()).save(folder / "model")
+def _matched_field() -> MatchedField:
+    room = simulated_room(n=20, grid=GRID)
+    locator = MatchedField(spacing=0.5, n_best=20, n_background=10, n_split=4)
+    return locator.fit(room, room=GeometryModel.of_planes(room, [FLOOR]))
 
 
-def model_geometry(folder: Path) -> None:
-    GeometryModel.of_planes(_room(), [FLOOR]).save(folder / "model")
+MODELS: dict[str, Callable[[], Any]] = {
+    "swiftwrf model": lambda: fit(_room(), n_primitives=3),
+    "swiftwrf_paper model": lambda: SwiftWRFPaper(TINY).fit(_room()),
+    "co-array model": lambda: CoarrayModel().fit(_room()),
+    "geometry model": _of_the_floor,
+    "hybrid model": _hybrid,
+    "pixel Gaussian process": lambda: make_model("gp").fit(_room()),
+    "inverse-distance model": lambda: make_model("idw").fit(_room()),
+    "nearest-spectrum model": lambda: make_model("nearest").fit(_room()),
+    "rssi model": lambda: fit_rssi(_floor()),
+    "rssi paper model": lambda: RssiPaperModel(steps=2).fit(_floor()),
+    "nerf2 model": lambda: FIELD_MODELS["nerf2"](PUBLISHED["nerf2"]).fit(_room()),
+    "wrf-gs model": lambda: FIELD_MODELS["wrfgs"](PUBLISHED["wrfgs"]).fit(_room()),
+    "nerf2 rssi model": lambda: NeRF2Rssi(PUBLISHED_RSSI).fit(_floor()),
+    "vae model": lambda: FIELD_MODELS["vae"](PUBLISHED["vae"]).fit(_room()),
+    "dcgan model": lambda: FIELD_MODELS["dcgan"](PUBLISHED["dcgan"]).fit(_room()),
+    "rssi pair model": lambda: PairModel(new_places=False).fit(_floor()),
+    "kernel regression": lambda: KernelRegression().fit(Mixed.measured(_room())),
+    "RSSI locator": lambda: RssiLocator(n_cells=200).fit(rssi_room(n=40)),
+    "matched-field locator": _matched_field,
+}
 
 
-def model_hybrid(folder: Path) -> None:
-    geometry = GeometryModel.of_planes(_room(), [FLOOR])
-    model = HybridModel().fit(_room(), like=geometry)
-    model.path_gains = fit_path_gains(geometry, observe(_room())[0], Kernel())
-    model.save(folder / "model")
+def save(name: str, folder: Path) -> None:
+    """Save a model of this kind."""
+    MODELS[name]().save(folder / "model")
 
 
-def model_published(name: str, folder: Path) -> None:
-    FIELD_MODELS[name](PUBLISHED[name]).fit(_room()).save(folder / "model")
-
-
-def model_nerf2_rssi(folder: Path) -> None:
-    train = rssi_room(n=40).receivers(["1", "2"])
-    NeRF2Rssi(PUBLISHED_RSSI).fit(train).save(folder / "model")
-
-
-def model_rssi(folder: Path) -> None:
-    fit_rssi(rssi_room(n=40).receivers(["1", "2"])).save(folder / "model")
-
-
-def model_rssi_paper(folder: Path) -> None:
-    RssiPaperModel(steps=2).fit(rssi_room(n=40).receivers(["1", "2"])).save(folder / "model")
-
-
-def model_pairs(folder: Path) -> None:
-    PairModel(new_places=False).fit(rssi_room(n=30).receivers(["1", "2"])).save(folder / "model")
-
-
-def model_kernel_regression(folder: Path) -> None:
-    KernelRegression().fit(Mixed.measured(_room())).save(folder / "model")
-
-
-def state_of_a_fit(folder: Path) -> None:
-    go_on(folder)
+def rssi_survey(folder: Path) -> None:
+    write_survey(folder)
+    (folder / "receivers.csv").write_text("receiver,x,y,z\n" + "".join(f"{r},1,1,2\n" for r in survey_rows()[0][3:]))
 
 
 def read_spectra(folder: Path) -> Spectra:
@@ -213,18 +194,7 @@ def read_estimator(folder: Path) -> torch.Tensor:
 
 def go_on(folder: Path) -> SwiftWRFPaper:
     """A fit from its state."""
-    return SwiftWRFPaper(TINY).fit(_few(), checkpoint=folder / "state")
-
-
-def model_rssi_locator(folder: Path) -> None:
-    train = rssi_room(n=40)
-    RssiLocator(n_cells=200).fit(train).save(folder / "model")
-
-
-def model_matched_field(folder: Path) -> None:
-    room = simulated_room(n=20, grid=GRID)
-    locator = MatchedField(spacing=0.5, n_best=20, n_background=10, n_split=4)
-    locator.fit(room, room=GeometryModel.of_planes(room, [FLOOR])).save(folder / "model")
+    return SwiftWRFPaper(TINY).fit(_room(), checkpoint=folder / "state")
 
 
 def read_locator(folder: Path) -> torch.Tensor:
@@ -238,45 +208,25 @@ def read_locator(folder: Path) -> torch.Tensor:
     return posterior.median
 
 
-@functools.cache
-def _few() -> Spectra:
-    return _room()
-
-
 KINDS: dict[str, tuple[Callable[[Path], object], Reader]] = {
     "format of spectra nerf2": (spectra_nerf2, read_spectra),
     "format of spectra paths": (write_paths, read_spectra),
     "format of spectra deepmimo": (functools.partial(write_deepmimo, n=N), read_snapshots),
-    "format of array snapshots snapshots": (snapshot_arrays, read_snapshots),
+    "format of array snapshots snapshots": (functools.partial(write_snapshots, data=SNAPSHOTS), read_snapshots),
     "format of array snapshots espargos": (write_espargos, read_snapshots),
     "format of array snapshots dichasus": (functools.partial(write_dichasus, offsets=True), read_first_station),
     "format of array snapshots captures": (captures, read_snapshots),
     "captures in pcap": (functools.partial(captures, suffix=".pcap", tones=64), read_snapshots),
-    "spectra as an array": (spectra_array, read_spectra),
-    "snapshots in HDF5": (snapshots_hdf5, read_snapshots),
+    "spectra as an array": (lambda folder: write_spectra(_room(), folder), read_spectra),
+    "snapshots in HDF5": (functools.partial(write_snapshots, name="snapshots.h5", data=SNAPSHOTS), read_snapshots),
     "format of RSSI nerf2": (rssi_nerf2, read_rssi),
     "survey in Parquet": (survey_parquet, read_rssi),
     "format of RSSI survey": (rssi_survey, read_rssi),
-    "swiftwrf model": (model_swiftwrf, read_model),
-    "swiftwrf_paper model": (model_swiftwrf_paper, read_model),
-    "co-array model": (model_coarray, read_model),
-    "geometry model": (model_geometry, read_model),
-    "hybrid model": (model_hybrid, read_model),
-    "pixel Gaussian process": (functools.partial(model_of, "gp"), read_model),
-    "inverse-distance model": (functools.partial(model_of, "idw"), read_model),
-    "nearest-spectrum model": (functools.partial(model_of, "nearest"), read_model),
-    "rssi model": (model_rssi, read_model),
-    "rssi paper model": (model_rssi_paper, read_model),
-    "nerf2 model": (functools.partial(model_published, "nerf2"), read_model),
-    "wrf-gs model": (functools.partial(model_published, "wrfgs"), read_model),
-    "nerf2 rssi model": (model_nerf2_rssi, read_model),
-    "vae model": (functools.partial(model_published, "vae"), read_model),
-    "dcgan model": (functools.partial(model_published, "dcgan"), read_model),
-    "kernel regression": (model_kernel_regression, read_estimator),
-    "rssi pair model": (model_pairs, read_model),
-    "RSSI locator": (model_rssi_locator, read_locator),
-    "matched-field locator": (model_matched_field, read_locator),
-    "fit state": (state_of_a_fit, go_on),
+    **{name: (functools.partial(save, name), read_model) for name in MODELS},
+    "kernel regression": (functools.partial(save, "kernel regression"), read_estimator),
+    "RSSI locator": (functools.partial(save, "RSSI locator"), read_locator),
+    "matched-field locator": (functools.partial(save, "matched-field locator"), read_locator),
+    "fit state": (go_on, go_on),
     "run of aoa on the page": (runs.run_of_aoa, runs.show),
     "run of rssi on the page": (runs.run_of_rssi, runs.show),
     "run of locate on the page": (runs.run_of_locate, runs.show),

@@ -1,7 +1,5 @@
 """Calls of the public interface with values of the wrong type, shape or size: plausible results, or one sentence."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable
 from functools import cache

@@ -1,7 +1,5 @@
 """Seeded mutations of files: bytes as a broken disk leaves them, and tokens as people and hostile tools write them."""
 
-from __future__ import annotations
-
 import random
 import re
 from pathlib import Path

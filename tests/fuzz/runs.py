@@ -1,7 +1,5 @@
 """Runs as the page opens them, and sources that a model follows."""
 
-from __future__ import annotations
-
 import csv
 import functools
 import io
@@ -176,6 +174,7 @@ def followed(model: FieldModel | RssiModel, content: bytes, folder: Path, source
         mock.patch.object(sys, "stdin", io.TextIOWrapper(io.BytesIO(content))),
         mock.patch.object(lines, "time", SimpleNamespace(sleep=mock.Mock(side_effect=KeyboardInterrupt))),
         mock.patch("tasks.update.run.environment", return_value={}),  # asks git
+        mock.patch("tasks.page.page.as_svg", return_value="<svg></svg>"),
         redirect_stdout(answers),
         redirect_stderr(said),
     ):

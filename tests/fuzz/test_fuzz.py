@@ -4,8 +4,6 @@
 more, and 200 command lines.
 """
 
-from __future__ import annotations
-
 import inspect
 import random
 import shutil
@@ -89,7 +87,6 @@ def test_mutations(kind, seeds, tmp_path):
     assert ends["refused"] > 0
 
 
-@pytest.mark.usefixtures("without_annotation_checks")
 @few_or_many(3, -(-5_000 // len(ATTEMPTS)))
 @pytest.mark.parametrize("kind", ATTEMPTS)
 def test_attempts(kind, seeds, tmp_path):

@@ -1,7 +1,5 @@
 """Constant, empty, collinear and badly scaled data: finite predictions with a standard deviation, or one sentence."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
@@ -22,7 +20,7 @@ from swiftwrf import (
 )
 from swiftwrf.data.store import Store
 from swiftwrf.models import FIELD_MODELS
-from swiftwrf.models.geometry import search, uncertainty
+from swiftwrf.models.geometry import search
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.rssi.mixing import rounding_std
 from swiftwrf.rssi.pairs import PairPathLoss
@@ -96,18 +94,6 @@ def rssi(case):
     return replace(floor, transmitter_position=PLACES[case](floor.transmitter_position), receiver_position=receiver)
 
 
-@pytest.fixture
-def _short_searches(monkeypatch):
-    """Shorten the search for rooms, not its stages."""
-    for module, values in (
-        (search, {"SIGNS": search.SIGNS[:1], "MAX_MOVES": 1, "N_REFINED": 2, "MAX_ALTERNATIVES": {2: 5, 3: 2}}),
-        (uncertainty, {"MAX_PERIODS": 1, "N_COARSE": 2, "N_FINE": 1, "N_WHOLE": 1}),
-        (search, {"N_HORIZONTAL_NORMALS": 20, "N_SPHERE_NORMALS": 20}),
-    ):
-        for name, value in values.items():
-            monkeypatch.setattr(module, name, value)
-
-
 def check(fit, position, bounds):
     """Check predictions at positions and far beyond them."""
     try:
@@ -125,7 +111,7 @@ def check(fit, position, bounds):
         assert high.max() <= bounds[1]
 
 
-@pytest.mark.usefixtures("_short_searches")
+@pytest.mark.usefixtures("short_searches")
 @pytest.mark.parametrize(("name", "case"), [(name, case) for name in MODELS for case in CASES.get(name, ALL)])
 def test_field_models_of_hard_data(name, case):
     data = spectra(case)
@@ -149,7 +135,7 @@ def test_rssi_locators_of_hard_data(case):
     assert posterior.median.isfinite().all()
 
 
-@pytest.mark.usefixtures("_short_searches")
+@pytest.mark.usefixtures("short_searches")
 @pytest.mark.parametrize("case", ["scale 1000", "constant"])
 def test_matched_field_locators_of_hard_data(case):
     data = spectra(case)

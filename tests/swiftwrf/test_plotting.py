@@ -1,7 +1,5 @@
 """Figures, tables and texts of objects in notebooks: what they contain."""
 
-from __future__ import annotations
-
 import math
 
 import matplotlib

@@ -1,7 +1,5 @@
 """Runs on a Dask cluster: the numbers of this machine, whoever dies; one sentence where nothing can go on."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket
@@ -11,7 +9,6 @@ import time
 from pathlib import Path
 
 import dask
-import fields
 import pytest
 import torch
 from quick import run, said
@@ -19,7 +16,7 @@ from sums import STEPS, Kill, KillOnce, Sum, results
 from test_interrupts import RSSI, same_results
 from test_rssi_model import with_field
 
-from swiftwrf import AngularGrid, FitError, InputError, fit_rssi, simulated_room
+from swiftwrf import FitError, InputError, fit_rssi
 from swiftwrf.runtime.threads import set_threads
 from tasks import workers
 from tasks.steps import _compute_away
@@ -78,24 +75,6 @@ def test_a_run_has_the_same_numbers(local, tmp_path):
         file.name for file in (tmp_path / "here").iterdir()
     }
     assert "workers" in (tmp_path / "there" / "report.html").read_text()
-
-
-def test_a_study_has_the_same_rows(local, tmp_path, monkeypatch, small_published):
-    data = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
-    written = []
-    monkeypatch.setattr(fields, "scenes", lambda config: [("room", data, "random")])
-    monkeypatch.setattr(fields, "COMPARED", ("mean", "nearest", "vae"))
-    monkeypatch.setattr(fields, "kept", lambda name, key: [])
-    monkeypatch.setattr(fields, "load", lambda name: {})
-    monkeypatch.setattr(fields, "write_result", lambda name, content: written.append(content["rows"]))
-    monkeypatch.setattr(fields, "draw", lambda rows: None)
-    for address in (None, local.scheduler_address):
-        work = tmp_path / ("here" if address is None else "there")
-        fields.main(fields.Config("comparison", parts=("scenes",), work=work, scheduler=address))
-        assert not list(work.rglob("*.state"))
-    here, there = written
-    assert [row["method"] for row in there] == ["mean", "nearest", "vae"]
-    assert [row["psnr_db"] for row in there] == [row["psnr_db"] for row in here]
 
 
 def test_workers_take_the_threads_of_the_run(cluster):

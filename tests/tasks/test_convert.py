@@ -1,7 +1,5 @@
 """tasks.convert: what any reader reads comes back as it was from the toolkit's own layout."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace
@@ -12,14 +10,7 @@ import pytest
 import quick
 import torch
 from quick import said
-from samples import (
-    snapshots,
-    write_deepmimo,
-    write_dichasus,
-    write_espargos,
-    write_snapshots,
-    write_survey,
-)
+from samples import snapshots, write_deepmimo, write_dichasus, write_espargos, write_snapshots, write_survey
 from test_calibration import spoilt
 
 from swiftwrf import AngularGrid, InputError, load_rssi, load_spectra, simulated_room

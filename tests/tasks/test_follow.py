@@ -1,7 +1,5 @@
 """The command `update --follow`: directories that it continues, places in a source, and lines that are no measurements."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

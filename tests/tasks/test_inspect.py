@@ -1,13 +1,10 @@
 """tasks.inspect on valid measurements: findings and page. Wrong ones are in test_wrong_conventions.py."""
 
-from __future__ import annotations
-
 import json
 
 import pytest
 import quick
 import torch
-from quick import said
 from samples import WAVELENGTH, snapshots, write_snapshots, write_survey
 
 from swiftwrf import AngularGrid, simulated_room
@@ -74,12 +71,3 @@ def test_more_positions_than_are_looked_at(tmp_path, capsys, monkeypatch):
     write_spectra(room.subset(torch.arange(15).repeat(2)), tmp_path / "source")
     assert run(tmp_path / "source", "--out", tmp_path / "page") == 0
     assert "30 positions occur more than once" in capsys.readouterr().out
-
-
-def test_refusals_leave_nothing(tmp_path, capsys):
-    assert run("/nowhere", "--out", tmp_path / "page") == 2
-    assert "is not a folder or file" in said(capsys)
-    write_survey(tmp_path / "walk")
-    assert run(tmp_path / "walk", "--station", 1, "--out", tmp_path / "page") == 2
-    assert "takes no station" in said(capsys)
-    assert [file.name for file in tmp_path.iterdir()] == ["walk"]

@@ -1,7 +1,5 @@
 """Runs that are killed, run into a full disk or into each other: nothing finished is lost, and the numbers are the same."""
 
-from __future__ import annotations
-
 import json
 import os
 import random
@@ -13,6 +11,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+import quick
 
 pytestmark = pytest.mark.long
 HERE = Path(__file__).parents[1]
@@ -82,23 +81,20 @@ def kill_until_done(folder, asked, whole, draw, kills):
         if (partial / "config.json").exists():
             arguments = ("resume", partial)
     if not out.exists():
-        code, said = finished(start(folder, *arguments))
-        assert code == 0, said
+        assert quick.run(*arguments) == 0
     same_results(asked[0], whole, out)
     return hit
 
 
 def whole_run(folder, asked):
-    folder.mkdir(parents=True)
-    code, said = finished(start(folder, *asked, "--out", folder / "whole"))
-    assert code == 0, said
+    assert quick.run(*asked, "--out", folder / "whole") == 0
     return folder / "whole"
 
 
 @pytest.mark.parametrize("asked", [pytest.param(AOA, marks=pytest.mark.fuzz), RSSI], ids=["aoa", "rssi"])
 def test_a_killed_run_goes_on_to_the_same_tables(tmp_path, asked):
-    whole = whole_run(tmp_path / "a", asked)
-    assert kill_until_done(tmp_path / "a", asked, whole, random.Random(1), 2) <= 2
+    whole = whole_run(tmp_path, asked)
+    assert kill_until_done(tmp_path, asked, whole, random.Random(1), 2) <= 2
 
 
 def fill_disk(folder, asked, whole, most_bytes):
@@ -109,15 +105,13 @@ def fill_disk(folder, asked, whole, most_bytes):
     assert "no space left" in said, said
     assert not (folder / "cut").exists()
     has_begun = (folder / "cut.partial" / "config.json").exists()
-    again = ("resume", folder / "cut.partial") if has_begun else (*asked, "--out", folder / "cut")
-    code, said = finished(start(folder, *again))
-    assert code == 0, said
+    assert quick.run(*(("resume", folder / "cut.partial") if has_begun else (*asked, "--out", folder / "cut"))) == 0
     same_results(asked[0], whole, folder / "cut")
 
 
 @pytest.mark.fuzz
 def test_a_full_disk_ends_in_a_sentence_and_the_run_goes_on(tmp_path):
-    whole = whole_run(tmp_path / "a", RSSI)
+    whole = whole_run(tmp_path, RSSI)
     fill_disk(tmp_path / "b", RSSI, whole, 3000)
 
 

@@ -1,7 +1,5 @@
 """Tables, data sets, MATLAB files, maps and DeepMIMO folders are read back by the programs that they are for."""
 
-from __future__ import annotations
-
 import io
 import json
 import sys
@@ -16,7 +14,7 @@ import pytest
 import torch
 from PIL import Image
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
-from quick import said
+from quick import command, said
 from samples import FREQUENCY, snapshots
 from scipy.io import loadmat
 from sklearn.neighbors import KNeighborsRegressor
@@ -27,16 +25,13 @@ from swiftwrf.data.rasters import Cells, write_geojson, write_geotiff, write_wor
 from swiftwrf.data.simulated import ShoeboxRoom
 from swiftwrf.data.writing import write_deepmimo, write_mat, write_paths, write_rssi, write_spectra
 from swiftwrf.rssi.maps import RssiMap
-from tasks.command_line import command_line
-from tasks.configs import ConvertConfig
-from tasks.convert import run as convert
 
 GRID = AngularGrid.hemisphere(8, 32)
 ORIGIN = GeodeticOrigin(48.1, 11.6)
 
 
 def run(*arguments):
-    return command_line("tasks.convert", ConvertConfig, convert, [str(a) for a in arguments])
+    return command("convert", *arguments)
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,5 @@
 """The page of a report: what it holds, where its figures and their numbers lie, light and dark."""
 
-from __future__ import annotations
-
 import ast
 import re
 from pathlib import Path
@@ -22,7 +20,7 @@ from tasks.inspect import page as inspection
 from tasks.locate.page import posteriors
 from tasks.page import figures
 from tasks.page.maps import colour_image
-from tasks.page.page import Number, Page, Plot, Section, Summary, Table, write_page
+from tasks.page.page import Number, Page, Plot, Section, Summary, write_page
 from tasks.page.shared import again
 from tasks.records import read_table
 
@@ -77,14 +75,6 @@ def test_figures_take_the_colours_of_the_page(tmp_path):
         assert colour not in drawn
         assert colour in file
     assert figures.RULE in drawn
-
-
-def test_what_is_wide_takes_the_whole_page():
-    assert plot(width=12).wide
-    assert not plot(width=6).wide
-    assert not Table(["a", "b"], [["x", "y"]]).wide
-    assert Table(["a", "b"], [["x" * 60, "y" * 60]]).wide
-    assert Table(["a", "b"], [["x", "y"]], long=True).wide
 
 
 def test_curves_of_a_panel_differ_by_dashes_and_have_their_names_below():

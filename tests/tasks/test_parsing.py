@@ -1,7 +1,5 @@
 """Help, files of options and messages of every command."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os

@@ -1,7 +1,5 @@
 """Models are kept, come back as they were, and are applied to new spectra, rows and positions."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """DICHASUS and ESPARGOS: records without TensorFlow, arrays seen from the front, offsets, and what is refused."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

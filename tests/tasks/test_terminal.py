@@ -1,7 +1,5 @@
 """Output of commands: results while computing, the answer as a table or as JSON, the browser, and how to resume."""
 
-from __future__ import annotations
-
 import io
 import json
 import re

@@ -1,7 +1,5 @@
 """Updates equal a fit to all data with the same kernel; what is forgotten, aged, saved and refused."""
 
-from __future__ import annotations
-
 from copy import copy
 from dataclasses import replace
 from functools import cache

@@ -19,6 +19,7 @@ import json
 import math
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -67,17 +68,15 @@ class DeepMimo(Format[Spectra]):
         frequency, tracer = _params(path / "params.json")
         table, receiver, transmitter = _tables(path, pair)
         files = [path / f"{key}_{pair}.npz" for key in (*table, "rx_pos", "tx_pos")]
-        stride = options.every or 1
-        index = np.arange(0, len(receiver), stride)
-        table, receiver = {key: values[::stride] for key, values in table.items()}, receiver[::stride]
         known = np.isfinite(np.stack([table[key] for key in KEYS])).all(axis=0) & (table["power"] > -math.inf)
-        reached = known.any(axis=1)
+        index = np.arange(0, len(receiver), options.every or 1)
+        reached = known[index].any(axis=1)
         if not reached.any():
             raise InputError(f"{path} has no receiver with a path for pair {pair}")
         notes = [] if reached.all() else [f"receivers without a path are left out: {int((~reached).sum())}"]
-        index, receiver, known = index[reached], receiver[reached], known[reached]
-        table = {key: values[reached] for key, values in table.items()}
-        paths, found = _paths(path, table, known, receiver, transmitter, frequency, tracer)
+        index = index[reached]
+        table = {key: values[index] for key, values in table.items()}
+        paths, found = _paths(path, table, known[index], receiver[index], transmitter, frequency, tracer)
         return paths.spectra(
             path.resolve().name,
             options.array,
@@ -209,9 +208,20 @@ def _from_horizon(
     horizon = offset(_direction(azimuth, 90 - zenith))
     if min(declared, horizon) <= MAX_ANGLE_OFFSET_DEG:
         return horizon < declared
+    others: dict[str, Any] = {
+        "the angles are directions of propagation; give those from the receiver against the arriving path": (
+            azimuth + 180,
+            180 - zenith,
+        ),
+        "x and y are swapped in the angles or in the positions": (90 - azimuth, zenith),
+        "aoa_az turns clockwise; give it counter-clockwise from x": (-azimuth, zenith),
+    }
+    offsets = {meaning: offset(_direction(*angles)) for meaning, angles in others.items()}
+    meaning = min(offsets, key=lambda meaning: offsets[meaning])
+    fits = offsets[meaning] <= MAX_ANGLE_OFFSET_DEG
+    reason = f"it would fit if {meaning}" if fits else "positions and angles are in different frames or units"
     raise InputError(
-        f"{folder}: direct paths come from {declared:.0f} degrees beside the transmitter (median); positions and angles are "
-        "in different frames or units, or angles do not point from the receiver against the arriving path"
+        f"{folder}: direct paths come from {declared:.0f} degrees beside the transmitter (median); {reason}"
     )
 
 

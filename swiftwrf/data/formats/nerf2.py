@@ -29,16 +29,7 @@ from swiftwrf.array.angles import ArrayPose
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.choices import Moving
 from swiftwrf.data.archives import array_header, array_names, read_arrays, read_rows, refusing_broken
-from swiftwrf.data.files import (
-    check_carrier,
-    digests,
-    number,
-    numbers,
-    read_bytes,
-    read_xyz,
-    read_yaml,
-    sha256,
-)
+from swiftwrf.data.files import check_carrier, digests, number, numbers, read_bytes, read_xyz, read_yaml, sha256
 from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format, ReadOptions
 from swiftwrf.data.spectra import Spectra, check_pixels
 from swiftwrf.data.splits import read_splits

@@ -14,17 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 Point = tuple[float, float, float]
-THICKNESS_M = {  # of panels, walls and sheets by material
-    "brick": 0.12,
-    "carpet_tile": 0.02,
-    "ceiling_board": 0.02,
-    "chipboard": 0.02,
-    "concrete": 0.2,
-    "glass": 0.008,
-    "metal": 0.001,
-    "plasterboard": 0.025,
-    "wood": 0.02,
-}
+CONTENT = yaml.safe_load(Path(__file__).with_name("rooms.yml").read_text(encoding="utf-8"))
 FACES = [  # of a box, corners counted as x y z bits, counter-clockwise from outside
     (0, 1, 3, 2),
     (4, 6, 7, 5),
@@ -142,7 +132,7 @@ class FurnishedRoom:
             boxes = [box(piece.low, piece.high) for piece in self.furniture if piece.material == material]
             meshes[f"furniture-{material}"] = (material, boxes)
         return [
-            Surface.joined(name, Material(material, THICKNESS_M.get(material, 0.1)), parts)
+            Surface.joined(name, Material(material, CONTENT["thickness_m"].get(material, 0.1)), parts)
             for name, (material, parts) in meshes.items()
         ]
 
@@ -156,9 +146,7 @@ class FurnishedRoom:
         return free
 
 
-def _read_rooms(file: Path) -> dict[str, FurnishedRoom]:
-    content = yaml.safe_load(file.read_text(encoding="utf-8"))
-
+def _rooms() -> dict[str, FurnishedRoom]:
     def boxes(entry: Any) -> list[Box]:
         if isinstance(entry, list):
             material, low, high = entry
@@ -167,7 +155,7 @@ def _read_rooms(file: Path) -> dict[str, FurnishedRoom]:
             Box(material, (x + low[0], y + low[1], low[2]), (x + high[0], y + high[1], high[2]))
             for piece, places in entry.items()
             for x, y in places
-            for material, low, high in content["pieces"][piece]
+            for material, low, high in CONTENT["pieces"][piece]
         ]
 
     def room(values: dict[str, Any]) -> FurnishedRoom:
@@ -176,7 +164,7 @@ def _read_rooms(file: Path) -> dict[str, FurnishedRoom]:
         region: Any = tuple(map(tuple, values["region"]))
         return FurnishedRoom(**(values | points | {"furniture": furniture, "region": region}))
 
-    return {name: room(values) for name, values in content["rooms"].items()}
+    return {name: room(values) for name, values in CONTENT["rooms"].items()}
 
 
-ROOMS = _read_rooms(Path(__file__).with_name("rooms.yml"))
+ROOMS = _rooms()

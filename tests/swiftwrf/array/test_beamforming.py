@@ -1,7 +1,5 @@
 """Beamformers against their definitions, written out."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

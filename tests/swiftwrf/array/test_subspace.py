@@ -1,7 +1,5 @@
 """MUSIC, ESPRIT and maximum likelihood on simulated snapshots: against the Cramér-Rao bound and another implementation."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The methods of comparison: what is published of them, the physics that they draw, and that they fit as SwiftWRF does."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache
@@ -14,18 +12,11 @@ from small import PUBLISHED, PUBLISHED_RSSI
 from torch.nn import functional
 
 from swiftwrf import AngularGrid, FitError, InputError, Spectra, load, make_model, rssi_room, simulated_room
-from swiftwrf.comparison import (
-    DcganConfig,
-    NeRF2Config,
-    NeRF2Rssi,
-    VaeConfig,
-    WrfGsConfig,
-    wrfgs,
-)
+from swiftwrf.comparison import NeRF2Rssi, wrfgs
 from swiftwrf.comparison.base import Training, draw_parameters
-from swiftwrf.comparison.generative import double, halve, stages
-from swiftwrf.comparison.nerf2 import FIRST_PHASE, PATH_GAIN, Field, integrate, received
-from swiftwrf.comparison.wrfgs import on_sphere
+from swiftwrf.comparison.generative import DcganConfig, VaeConfig, double, halve, stages
+from swiftwrf.comparison.nerf2 import FIRST_PHASE, PATH_GAIN, Field, NeRF2Config, integrate, received
+from swiftwrf.comparison.wrfgs import WrfGsConfig, on_sphere
 from swiftwrf.data.store import Store
 from swiftwrf.metrics import psnr
 from swiftwrf.models import FIELD_MODELS
@@ -359,12 +350,6 @@ def test_any_resolution(room, name):
     torch.testing.assert_close(fine[:, 1::2, ::2], coarse, atol=1e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize("name", ["nerf2", "wrfgs"])
-def test_rays_need_to_know_where_they_start(room, name):
-    with pytest.raises(InputError, match="needs the fixed end"):
-        fit(replace(room, fixed_position=None), name)
-
-
 @pytest.fixture(scope="module")
 def fitted(room):
     """A fitted model of each name, once."""
@@ -373,8 +358,7 @@ def fitted(room):
 
 @every
 @pytest.mark.parametrize(
-    "change",
-    [{"options": {"width": 10**9}}, {"options": {"bands": 10**6}}, {"grid": None}, {"moving": "both"}],
+    "change", [{"options": {"width": 10**9}}, {"options": {"bands": 10**6}}, {"grid": None}, {"moving": "both"}]
 )
 def test_damaged_models_are_refused(fitted, tmp_path, name, change):
     fitted(name).save(tmp_path / "model")

@@ -1,7 +1,5 @@
 """Captures of CSI tools: channels, element order and directions from bytes made here, and everything that is refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -30,10 +28,9 @@ def test_channels_are_those_written(tmp_path):
     assert data.position.numpy() == pytest.approx(plane_waves(N, 3, 30)[0])
 
 
-@pytest.mark.parametrize("beamformer", ["phase", "bartlett", "capon"])
-def test_the_direction_is_found(tmp_path, beamformer):
+def test_the_direction_is_found(tmp_path):
     write_captures(tmp_path, n=N)
-    spectra = load_spectra(tmp_path, grid=(30, 120), beamformer=beamformer)
+    spectra = load_spectra(tmp_path, grid=(30, 120))
     axis = spectra.array.axis
     strongest = spectra.spectrum.flatten(1).argmax(dim=1)
     found = spectra.grid.direction.reshape(-1, 3)[strongest].double()
@@ -210,17 +207,8 @@ def test_nexmon_packets_of_one_frame_make_a_channel(tmp_path):
         [nexmon_payload(csi, core, number) for core, csi in enumerate(written[1, number].T)] for number in range(2)
     )
     other_stream = nexmon_payload(written[0, 0, :, 0], core=0, number=0, stream=1)
-    payloads = [
-        b"other traffic",
-        first[0],
-        first[2],
-        other_stream,
-        first[1],
-        second[0],
-        second[0],
-        *second[1:],
-        first[0],
-    ]
+    payloads = [b"other traffic", first[0], first[2], other_stream, first[1], second[0], second[0]]
+    payloads += [*second[1:], first[0]]
     (tmp_path / "walk1.pcap").write_bytes(pcap(payloads))
     data = load_snapshots(tmp_path)
     torch.testing.assert_close(data.channel, usual.channel)
@@ -237,10 +225,7 @@ NEXMON_CHANGES = {
     "no channel": (lambda content: pcap([b"\x11\x11"]), "64, 128 or 256 subcarriers"),
     "unknown chip": (lambda content: nexmon(np.ones((1, 64, 3)), chip=9), "chip 9 is none of 4358, 4366c0"),
     "one antenna": (lambda content: nexmon(np.ones((1, 64, 1)), chip=101), "43455c0 .* has one antenna"),
-    "two bandwidths": (
-        lambda content: content + nexmon(np.ones((1, 128, 3)))[24:],
-        "packets have several bandwidths",
-    ),
+    "two bandwidths": (lambda content: content + nexmon(np.ones((1, 128, 3)))[24:], "packets have several bandwidths"),
     "another bandwidth than others": (lambda content: nexmon(np.ones((1, 128, 3))), "different numbers of subcarriers"),
     "four cores": (lambda content: nexmon(np.ones((2, 64, 4))), "no packet .* 3 elements .* 2 have others"),
 }

@@ -1,6 +1,4 @@
-"""Readers of spectra: what they read, and everything they refuse."""
-
-from __future__ import annotations
+"""Readers of spectra and of RSSI in the NeRF2 layout: what they read, and everything they refuse."""
 
 import math
 
@@ -8,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from samples import write_nerf2
+from samples import write_nerf2, write_nerf2_rssi, write_paths
 
-from swiftwrf import InputError, load_spectra, simulated_room
+from swiftwrf import InputError, load_rssi, load_spectra, rssi_room
 from swiftwrf.data.spectra import coarsening
 from swiftwrf.data.splits import block_split, random_split, slabs, split_names
 
@@ -118,30 +116,8 @@ def test_refuses_few_training_spectra_and_unknown_splits(nerf2):
         data.split("radnom")
 
 
-def test_refuses_what_is_no_folder(tmp_path):
-    with pytest.raises(InputError, match="is not a folder"):
-        load_spectra(tmp_path / "nothing")
-
-
-def paths_file(folder, **changes):
-    """Paths of five receivers, one of them with two paths, with some arrays replaced or (None) left out."""
-    arrays = {
-        "transmitter_position": np.tile([0.0, 0.0, 2.0], (5, 1)),
-        "receiver_position": np.stack([np.arange(1.0, 6.0), np.zeros(5), np.ones(5)], axis=1),
-        "path_count": np.array([1, 1, 2, 1, 1], dtype=np.int32),
-        "last_point": np.tile([0.0, 0.0, 2.0], (6, 1)),
-        "gain": np.ones(6, dtype=np.complex64),
-        "line_of_sight": np.ones(5, dtype=bool),
-        "frequency_hz": np.float64(2.4e9),
-    }
-    arrays = {name: value for name, value in {**arrays, **changes}.items() if value is not None}
-    folder.mkdir(exist_ok=True)
-    np.savez(folder / "paths.npz", **arrays)
-    return folder
-
-
 def test_spectrum_of_one_path_peaks_where_it_comes_from(tmp_path):
-    data = load_spectra(paths_file(tmp_path / "paths"))
+    data = load_spectra(write_paths(tmp_path / "paths"))
     assert data.moving == "receiver"
     row, column = divmod(int(data.spectrum[0].argmax()), 360)
     assert (column, row + 1) == (180, 45)  # from -x, as far up as away
@@ -150,30 +126,14 @@ def test_spectrum_of_one_path_peaks_where_it_comes_from(tmp_path):
 
 
 def test_the_end_with_more_positions_moves(tmp_path):
-    still = np.tile([3.0, 0.0, 1.0], (5, 1))
-    moves = np.stack([np.arange(5.0), np.ones(5), np.ones(5)], axis=1)
-    data = load_spectra(paths_file(tmp_path / "p", receiver_position=still, transmitter_position=moves))
+    still = np.tile([3.0, 0.0, 1.0], (N, 1))
+    moves = np.stack([np.arange(1.0 * N), np.ones(N), np.ones(N)], axis=1)
+    data = load_spectra(write_paths(tmp_path / "p", receiver_position=still, transmitter_position=moves))
     assert data.moving == "transmitter"
 
 
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
-        ({"gain": None}, "lacks gain"),
-        ({"gain": np.ones(5, np.complex64)}, "gain must have shape"),
-        ({"gain": np.full(6, np.nan, np.complex64)}, "gain must be finite"),
-        ({"path_count": np.array([0, 2, 2, 1, 1], np.int32)}, "at least one path"),
-        ({"frequency_hz": np.float64(-1)}, "frequency_hz"),
-        ({"last_point": np.array([object()] * 6)}, "plain numbers"),
-    ],
-)
-def test_refuses_paths(tmp_path, changes, says):
-    with pytest.raises(InputError, match=says):
-        load_spectra(paths_file(tmp_path / "paths", **changes))
-
-
 def test_refuses_a_broken_archive(tmp_path):
-    paths_file(tmp_path / "paths")
+    write_paths(tmp_path / "paths")
     file = tmp_path / "paths" / "paths.npz"
     file.write_bytes(file.read_bytes()[:100])
     with pytest.raises(InputError, match="not an npz archive"):
@@ -247,6 +207,99 @@ def test_measured_spectra_have_the_published_labels(measured_data):
     }
 
 
-def test_a_subset_without_rows():
-    """With everything measured nothing is withheld."""
-    assert len(simulated_room(n=20).subset(torch.empty(0, dtype=torch.int64))) == 0
+# RSSI
+
+
+ROWS = 15
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A well-formed folder: three receivers, the third detected only in the last five rows."""
+    rows = [f"{-50 - i},{-60 - i},{-70 if i >= ROWS - 5 else -100}" for i in range(ROWS)]
+    return write_nerf2_rssi(tmp_path, "a,b,c", "a: [0, 0, 1]\nb: [5, 0, 1]\nc: [0, 5, 1]\n", rows)
+
+
+def test_reads_and_marks_what_was_not_heard(folder):
+    data = load_rssi(folder)
+    assert data.receiver_names == ("a", "b", "c")
+    assert data.rssi_dbm[0, :2].tolist() == [-50, -60]
+    assert data.rssi_dbm.isnan().sum(dim=0).tolist() == [0, 0, 10]
+    assert data.receiver_position[1].tolist() == [5, 0, 1]
+
+
+def test_receivers_by_number_name_and_all(folder):
+    data = load_rssi(folder)
+    assert data.receivers(["2"]).receiver_names == ("b",)
+    assert data.receivers(["b", "1"]).receiver_names == ("b", "a")
+    with pytest.raises(InputError, match="there are 1 a, 2 b, 3 c"):
+        data.receivers(["4"])
+    every = data.receivers(["all"])
+    assert every.receiver_names == ("a", "b")
+    assert every.notes[-1] == "receivers that detected fewer than 10 rows are left out: c"
+    with pytest.raises(InputError, match=r"'c'.*5 rows"):
+        data.receivers(["c"])
+    with pytest.raises(InputError, match="detected the transmitter in 10 rows"):
+        data.columns([2]).receivers(["all"])
+    with pytest.raises(InputError, match="once"):
+        data.receivers(["a", "1"])
+
+
+def _rssi(value):
+    return _write("gateway_rssi.csv", "a,b,c\n" + f"{value},-60,-70\n" + "-50,-60,-70\n" * (ROWS - 1))
+
+
+WRONG_RSSI = {
+    "too strong": (_rssi(31), "row 1, receiver a: 31 dBm"),
+    "too weak": (_rssi(-151), "row 1, receiver a: -151 dBm"),
+    "text": (_rssi("loud"), "row 1, column a: 'loud' is not a number"),
+    "short row": (_rssi("-50,-60"), "row 1 has 4 values"),
+    "two of one name": (_write("gateway_rssi.csv", "a,a,c\n-1,-2,-3\n"), "'a' twice"),
+    "another number of rows": (_write("gateway_rssi.csv", "a,b,c\n-50,-60,-70\n"), "has 1 rows, tx_pos.csv 15"),
+    "empty": (_write("gateway_rssi.csv", ""), "is empty"),
+    "no receiver with a place": (_write("gateway_position.yml", "d: [0, 0, 1]\n"), "no position of the receivers"),
+    "two places of one name": (_write("gateway_position.yml", "a: [0, 0, 1]\na: [1, 1, 1]\n"), "'a' twice"),
+    "place of two numbers": (_write("gateway_position.yml", "a: [0, 0]\nb: [1, 1]\nc: [1, 2]\n"), "3 finite numbers"),
+    "nan positions": (_write("tx_pos.csv", "x,y,z\n" + "nan,1,1\n" * ROWS), "needs 3 finite numbers"),
+    "origin": (_write("survey.yml", "origin: [91, 0]"), "latitude and longitude"),
+    "floors": (_write("survey.yml", "floors: {up: 4, down: 1}"), "ascending"),
+    "one number of floors": (_write("survey.yml", "floors: 3"), "names with ascending heights"),
+    "moving receiver": (_write("survey.yml", "receiver_moves: perhaps"), "true or false"),
+    "unknown property": (_write("survey.yml", "storeys: 3"), "states storeys"),
+    "index out of range": (
+        lambda f: [_write(f"{part}_index.txt", text)(f) for part, text in (("train", "0\n"), ("test", "15\n"))],
+        "expected 0 to 14",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG_RSSI)
+def test_refuses_rssi(folder, name):
+    spoil, says = WRONG_RSSI[name]
+    spoil(folder)
+    with pytest.raises(InputError, match=says):
+        load_rssi(folder)
+
+
+def test_room_is_seeded_and_looks_like_ble():
+    a, b = rssi_room(n=80, seed=1), rssi_room(n=80, seed=1)
+    assert torch.equal(a.rssi_dbm.nan_to_num(), b.rssi_dbm.nan_to_num())
+    heard = ~a.rssi_dbm.isnan()
+    assert 0.05 < 1 - heard.double().mean() < 0.4
+    assert a.rssi_dbm[heard].min() > -105
+    assert a.rssi_dbm[heard].max() < -20
+    distance = torch.cdist(a.transmitter_position, a.receiver_position)[heard]
+    near = distance < 4
+    assert a.rssi_dbm[heard][near].median() > a.rssi_dbm[heard][distance > 12].median() + 8
+
+
+@pytest.mark.data
+def test_measured_rssi(measured_data):
+    data = load_rssi(measured_data / "tetam-tracks")
+    assert data.rssi_dbm.shape == (1534, 12)
+    assert int((~data.rssi_dbm.isnan()).sum()) == 15731
+    assert {name: (len(a), len(b)) for name, (a, b) in data.named_splits.items()} == {
+        "random": (1227, 307),
+        "spatial": (1217, 317),
+        "block": (1120, 414),
+    }

@@ -1,7 +1,5 @@
 """Data sets from arrays and tables: what they compute, print and refuse; readers from other packages."""
 
-from __future__ import annotations
-
 import errno
 import importlib
 import math
@@ -37,11 +35,7 @@ from swiftwrf.runtime import durable
 
 ROOM = simulated_room(n=24, grid=AngularGrid.hemisphere(9, 36))
 FACING_X = ArrayPose((0.1, 2.4, 1.2), (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)))
-CONVERTED = {
-    "tensors": lambda t: t,
-    "arrays": lambda t: t.numpy(),
-    "lists": lambda t: t.tolist(),
-}
+CONVERTED = {"tensors": lambda t: t, "arrays": lambda t: t.numpy(), "lists": lambda t: t.tolist()}
 
 
 @pytest.mark.parametrize("kind", CONVERTED)
@@ -87,124 +81,97 @@ def test_snapshots_from_arrays():
 
 
 NAN_POSITION = ROOM.position.where(torch.arange(24)[:, None] != 3, torch.nan)
+FOUR = PlanarArray.square(2, 1e9)
+
+
+def of_spectra(values=ROOM.spectrum, position=ROOM.position, **options):
+    return lambda: Spectra(values, position, **options)
+
+
+def of_room(**changes):
+    return lambda: replace(ROOM, **changes)
+
+
+def of_snapshots(channel, **options):
+    return lambda: Snapshots(channel, torch.rand(5, 3), array=FOUR, **options)
+
+
+def of_rssi(values, position=((0, 0, 0),), **options):
+    return lambda: Rssi(values, position, **options)
+
+
 WRONG = {
-    "other number of positions": (lambda: Spectra(ROOM.spectrum, ROOM.position[:5]), "5 positions, but store has 24"),
-    "flat spectra": (lambda: Spectra(ROOM.spectrum[0], ROOM.position), r"spectra must have shape \(n, n, n\)"),
-    "decibels": (lambda: Spectra(-20 * ROOM.spectrum, ROOM.position), r"magnitudes in \[0, 1\]"),
-    "a spectrum is nan": (lambda: Spectra(ROOM.spectrum * torch.nan, ROOM.position), "spectra must be finite; row 0"),
-    "a position is nan": (lambda: Spectra(ROOM.spectrum, NAN_POSITION), "position must be finite; row 3"),
-    "positions in a plane": (
-        lambda: Spectra(ROOM.spectrum, ROOM.position[:, :2]),
-        r"position must have shape \(n, 3\)",
-    ),
-    "text": (lambda: Spectra(ROOM.spectrum, [["a", "b", "c"]] * 24), "position must be numbers"),
-    "labels of others": (lambda: replace(ROOM, label=ROOM.label[:7]), "label has 7 rows"),
-    "labels of one angle": (
-        lambda: Spectra(ROOM.spectrum, ROOM.position, label=ROOM.label[:, 0]),
-        "label must have shape",
-    ),
-    "visibility of others": (lambda: replace(ROOM, line_of_sight=torch.ones(3)), "line_of_sight has 3 rows"),
-    "another end": (
-        lambda: Spectra(ROOM.spectrum, ROOM.position, moving="reciever"),
-        "moving must be 'transmitter' or",
-    ),
-    "another grid": (
-        lambda: Spectra(ROOM.spectrum, ROOM.position, grid=AngularGrid.hemisphere(9, 30)),
-        "do not fit a grid",
-    ),
-    "pose twice": (
-        lambda: Spectra(ROOM.spectrum, ROOM.position, pose=FACING_X, fixed_position=(0, 0, 0)),
-        "leave them out",
-    ),
+    "other number of positions": (of_spectra(position=ROOM.position[:5]), "5 positions, but store has 24"),
+    "flat spectra": (of_spectra(ROOM.spectrum[0]), r"spectra must have shape \(n, n, n\)"),
+    "decibels": (of_spectra(-20 * ROOM.spectrum), r"magnitudes in \[0, 1\]"),
+    "a spectrum is nan": (of_spectra(ROOM.spectrum * torch.nan), "spectra must be finite; row 0"),
+    "a position is nan": (of_spectra(position=NAN_POSITION), "position must be finite; row 3"),
+    "positions in a plane": (of_spectra(position=ROOM.position[:, :2]), r"position must have shape \(n, 3\)"),
+    "text": (of_spectra(position=[["a", "b", "c"]] * 24), "position must be numbers"),
+    "labels of others": (of_room(label=ROOM.label[:7]), "label has 7 rows"),
+    "labels of one angle": (of_spectra(label=ROOM.label[:, 0]), "label must have shape"),
+    "visibility of others": (of_room(line_of_sight=torch.ones(3)), "line_of_sight has 3 rows"),
+    "another end": (of_spectra(moving="reciever"), "moving must be 'transmitter' or"),
+    "another grid": (of_spectra(grid=AngularGrid.hemisphere(9, 30)), "do not fit a grid"),
+    "pose twice": (of_spectra(pose=FACING_X, fixed_position=(0, 0, 0)), "leave them out"),
     "at the array": (
-        lambda: Spectra(ROOM.spectrum, ROOM.position, pose=ArrayPose(tuple(ROOM.position[2].tolist()))),
+        of_spectra(pose=ArrayPose((*ROOM.position[2].tolist(),))),
         "position 2 of spectra is that of the fixed end",
     ),
-    "a field of others": (lambda: Spectra(ROOM.spectrum, ROOM.position, colour="red"), "Spectra has no colour"),
+    "a field of others": (of_spectra(colour="red"), "Spectra has no colour"),
     "no positions": (lambda: Spectra(ROOM.spectrum), "spectra and their positions"),
     "a split of others": (
-        lambda: replace(ROOM, named_splits={"day": (torch.arange(20), torch.tensor([24]))}),
-        "split 'day' .* outside 0 to 23",
+        of_room(named_splits={"day": (torch.arange(20), torch.tensor([24]))}),
+        "'day' .* outside 0 to 23",
     ),
-    "no pose": (
-        lambda: Snapshots(torch.ones(5, 4).cfloat(), torch.rand(5, 3), array=PlanarArray.square(2, 1e9)),
-        "needs the pose",
-    ),
-    "other elements": (
-        lambda: Snapshots(torch.ones(5, 3).cfloat(), torch.rand(5, 3), array=PlanarArray.square(2, 1e9), pose=FACING_X),
-        r"channel must have shape \(5, 4\)",
-    ),
-    "infinite RSSI": (lambda: Rssi([[-math.inf]], [[0, 0, 0]]), "rssi_dbm must be finite, or nan"),
-    "RSSI of others": (lambda: Rssi([[-50.0]] * 3, torch.rand(4, 3)), "4 positions, but rssi_dbm has 3 rows"),
-    "one name for two": (
-        lambda: Rssi([[-50.0, -60]], [[0, 0, 0]], receiver_names=["a", "a"]),
-        "2 receivers, but the names",
-    ),
-    "complex spectra": (lambda: Spectra(ROOM.spectrum + 0j, ROOM.position), "spectra must be real"),
-    "masked spectra": (lambda: Spectra(np.ma.masked_less(ROOM.spectrum, 0.1), ROOM.position), "has masked values"),
-    "spectra of truth values": (lambda: Spectra(ROOM.spectrum > 0.5, ROOM.position), "must be float32 numbers"),
-    "complex positions": (lambda: Spectra(ROOM.spectrum, ROOM.position + 0j), "position must be real"),
-    "a position far away": (
-        lambda: Spectra(ROOM.spectrum, 1e9 * ROOM.position),
-        "position must be .* at most 1e.09; row 0",
-    ),
-    "a far end": (
-        lambda: Spectra(ROOM.spectrum, ROOM.position, fixed_position=(0, 0, 1e300)),
-        "fixed_position must be .* at most 1e.09",
-    ),
-    "partly visible": (lambda: replace(ROOM, line_of_sight=[0.3] * 24), "line_of_sight must be True or False, got 0.3"),
-    "labels in degrees": (lambda: replace(ROOM, label=torch.full((24, 2), 200.0)), "convert degrees by deg2rad"),
-    "infinite labels": (lambda: replace(ROOM, label=torch.full((24, 2), math.inf)), "label must be finite, or nan"),
-    "half an index": (lambda: replace(ROOM, index=torch.arange(24) + 0.5), "index must be whole numbers, got 0.5"),
-    "a stretched rotation": (lambda: replace(ROOM, rotation=2 * torch.eye(3)), "must be a rotation matrix"),
-    "a mirrored rotation": (lambda: replace(ROOM, rotation=-torch.eye(3)), "must be a rotation matrix"),
-    "real channels": (
-        lambda: Snapshots(torch.ones(5, 4), torch.rand(5, 3), array=PlanarArray.square(2, 1e9), pose=FACING_X),
-        "channel must be complex64 numbers",
-    ),
-    "channels beyond their type": (
-        lambda: Snapshots(np.full((5, 4), 1e300j), torch.rand(5, 3), array=PlanarArray.square(2, 1e9), pose=FACING_X),
-        "channel must be finite",
-    ),
-    "path loss for RSSI": (lambda: Rssi([[-50.0], [60.0]], torch.rand(2, 3)), "row 2, receiver receiver1: 60 dBm"),
-    "RSSI of a filler": (lambda: Rssi([[-99999.0]], torch.rand(1, 3)), "-99999 dBm is no received power"),
-    "RSSI of truth values": (lambda: Rssi([[True]], torch.rand(1, 3)), "rssi_dbm must be float64 numbers"),
-    "complex RSSI": (lambda: Rssi([[-50j]], torch.rand(1, 3)), "rssi_dbm must be real"),
-    "masked RSSI": (lambda: Rssi(np.ma.masked_values([[-50.0, 100.0]], 100.0), torch.rand(1, 3)), "has masked values"),
-    "far RSSI": (lambda: Rssi([[-50.0]], [[0, 0, 2e9]]), "transmitter_position must be .* at most 1e.09"),
+    "no pose": (of_snapshots(torch.ones(5, 4).cfloat()), "needs the pose"),
+    "other elements": (of_snapshots(torch.ones(5, 3).cfloat(), pose=FACING_X), r"channel must have shape \(5, 4\)"),
+    "real channels": (of_snapshots(torch.ones(5, 4), pose=FACING_X), "channel must be complex64 numbers"),
+    "channels beyond their type": (of_snapshots(np.full((5, 4), 1e300j), pose=FACING_X), "channel must be finite"),
+    "complex spectra": (of_spectra(ROOM.spectrum + 0j), "spectra must be real"),
+    "masked spectra": (of_spectra(np.ma.masked_less(ROOM.spectrum, 0.1)), "has masked values"),
+    "spectra of truth values": (of_spectra(ROOM.spectrum > 0.5), "must be float32 numbers"),
+    "complex positions": (of_spectra(position=ROOM.position + 0j), "position must be real"),
+    "a position far away": (of_spectra(position=1e9 * ROOM.position), "position must be .* at most 1e.09; row 0"),
+    "a far end": (of_spectra(fixed_position=(0, 0, 1e300)), "fixed_position must be .* at most 1e.09"),
+    "partly visible": (of_room(line_of_sight=[0.3] * 24), "line_of_sight must be True or False, got 0.3"),
+    "labels in degrees": (of_room(label=torch.full((24, 2), 200.0)), "convert degrees by deg2rad"),
+    "infinite labels": (of_room(label=torch.full((24, 2), math.inf)), "label must be finite, or nan"),
+    "half an index": (of_room(index=torch.arange(24) + 0.5), "index must be whole numbers, got 0.5"),
+    "a stretched rotation": (of_room(rotation=2 * torch.eye(3)), "must be a rotation matrix"),
+    "a mirrored rotation": (of_room(rotation=-torch.eye(3)), "must be a rotation matrix"),
+    "infinite RSSI": (of_rssi([[-math.inf]]), "rssi_dbm must be finite, or nan"),
+    "RSSI of others": (of_rssi([[-50.0]] * 3, torch.rand(4, 3)), "4 positions, but rssi_dbm has 3 rows"),
+    "one name for two": (of_rssi([[-50.0, -60]], receiver_names=["a", "a"]), "2 receivers, but the names"),
+    "path loss for RSSI": (of_rssi([[-50.0], [60.0]], torch.rand(2, 3)), "row 2, receiver receiver1: 60 dBm"),
+    "RSSI of a filler": (of_rssi([[-99999.0]]), "-99999 dBm is no received power"),
+    "RSSI of truth values": (of_rssi([[True]]), "rssi_dbm must be float64 numbers"),
+    "complex RSSI": (of_rssi([[-50j]]), "rssi_dbm must be real"),
+    "masked RSSI": (of_rssi(np.ma.masked_values([[-50.0, 100.0]], 100.0)), "has masked values"),
+    "far RSSI": (of_rssi([[-50.0]], [[0, 0, 2e9]]), "transmitter_position must be .* at most 1e.09"),
     "a far receiver": (
-        lambda: Rssi([[-50.0]], [[0, 0, 0]], receiver_position=[[2e9, 0, 0]]),
+        of_rssi([[-50.0]], receiver_position=[[2e9, 0, 0]]),
         "receiver_position must be .* at most 1e.09",
     ),
-    "complex receivers": (
-        lambda: Rssi([[-50.0]], [[0, 0, 0]], receiver_position=[[1j, 0, 0]]),
-        "receiver_position must be real",
+    "complex receivers": (of_rssi([[-50.0]], receiver_position=[[1j, 0, 0]]), "receiver_position must be real"),
+    "an infinite time": (of_rssi([[-50.0]], time=[math.inf]), "time must be finite, or nan"),
+    "names in one text": (of_rssi([[-50.0, -60]], receiver_names="ab"), "must be a list, of which each is a text"),
+    "an empty name": (of_rssi([[-50.0]], receiver_names=[" "]), "must be a list of texts"),
+    "a number as name": (of_rssi([[-50.0]], receiver_names=[1]), "must be a list, of which each is a text"),
+    "two lines as name": (of_rssi([[-50.0]], receiver_names=["a\r\nb"]), "must be a list of texts"),
+    "half a place": (
+        of_rssi([[-50.0, -60]], receiver_position=[[0, 0, 0], [0, 0, math.nan]]),
+        "nan where it is unknown; row 1",
     ),
-    "an infinite time": (lambda: Rssi([[-50.0]], [[0, 0, 0]], time=[math.inf]), "time must be finite, or nan"),
-    "names in one text": (
-        lambda: Rssi([[-50.0, -60]], [[0, 0, 0]], receiver_names="ab"),
-        "must be a list, of which each is a text",
-    ),
-    "an empty name": (lambda: Rssi([[-50.0]], [[0, 0, 0]], receiver_names=[" "]), "must be a list of texts"),
-    "a number as name": (
-        lambda: Rssi([[-50.0]], [[0, 0, 0]], receiver_names=[1]),
-        "must be a list, of which each is a text",
-    ),
-    "two lines as name": (lambda: Rssi([[-50.0]], [[0, 0, 0]], receiver_names=["a\r\nb"]), "must be a list of texts"),
     "half a seed": (lambda: ROOM.split("block", 0.5), "seed must be a whole number at least 0, got 0.5"),
     "a seed of text": (lambda: rssi_room(n=20).split(seed="a"), "seed must be a whole number"),
     "a row beyond the last": (lambda: ROOM.subset([24]), "rows of simulated-room must be a list of numbers below 24"),
     "a mask of others": (lambda: ROOM.subset(torch.ones(10, dtype=torch.bool)), "a mask of that length"),
     "half a row": (lambda: ROOM[[0.5]], "a list of numbers below 24"),
     "one row": (lambda: ROOM[3], "must be a list of numbers"),
-    "half a place": (
-        lambda: Rssi([[-50.0, -60]], [[0, 0, 0]], receiver_position=[[0, 0, 0], [0, 0, math.nan]]),
-        "all nan where it is unknown; row 1",
-    ),
 }
 
 
-@pytest.mark.usefixtures("without_annotation_checks")
 @pytest.mark.parametrize("name", WRONG)
 def test_refuses_arrays(name):
     make, says = WRONG[name]
@@ -283,7 +250,6 @@ def test_tables_and_one_line_of_a_data_set():
     assert "30 rows at 12 receivers" in repr(rssi_room(n=30))
 
 
-@pytest.mark.usefixtures("without_annotation_checks")
 @pytest.mark.parametrize(
     ("call", "says"),
     [

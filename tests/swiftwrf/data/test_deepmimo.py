@@ -1,7 +1,5 @@
 """DeepMIMO v4 folders: conventions of angles and phases, and what is refused."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
@@ -123,10 +121,7 @@ def _params(text):
         (lambda f: (f / "phase_t000_tx000_r001.npz").unlink(), "phase_t000_tx000_r001.npz is missing"),
         (lambda f: np.savez(f / "phase_t000_tx000_r001.npz", phase=np.zeros((3, 25))), "all have shape"),
         (lambda f: np.savez(f / "rx_pos_t000_tx000_r001.npz", rx_pos=np.zeros((3, 3))), "rx_pos of pair"),
-        (
-            lambda f: np.savez(f / "rx_pos_t000_tx000_r001.npz", rx_pos=np.full((30, 3), np.nan)),
-            "must be finite",
-        ),
+        (lambda f: np.savez(f / "rx_pos_t000_tx000_r001.npz", rx_pos=np.full((30, 3), np.nan)), "must be finite"),
         (
             lambda f: np.savez(f / "power_t000_tx000_r001.npz", power=np.full((30, 25), np.nan)),
             "no receiver with a path",

@@ -1,7 +1,5 @@
 """Radios of one access point as one receiver."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest

@@ -3,8 +3,6 @@
 What needs Sionna RT is skipped where it, or LLVM, is missing.
 """
 
-from __future__ import annotations
-
 import cmath
 import json
 import math
@@ -221,21 +219,8 @@ def test_a_scene_file_is_traced_as_the_room_that_it_describes(ray_tracer, tmp_pa
     built = trace(Scene(empty("concrete").surfaces(), FREQUENCY), FIXED, places(4), "receiver", Tracing())
     torch.testing.assert_close(read.length, built.length, rtol=1e-5, atol=0)
     torch.testing.assert_close(read.gain.abs(), built.gain.abs(), rtol=1e-2, atol=1e-7)
-    options = (
-        "--moving",
-        "transmitter",
-        "--positions",
-        3,
-        "--fixed",
-        *FIXED.tolist(),
-        "--region",
-        1,
-        1,
-        0.8,
-        5,
-        4,
-        1.9,
-    )
+    options = ("--moving", "transmitter", "--positions", 3, "--fixed", *FIXED.tolist())
+    options += ("--region", 1, 1, 0.8, 5, 4, 1.9)
     assert run("scenes", "--room", file, *options, "--out", tmp_path / "out") == 0
     assert len(load_spectra(tmp_path / "out", grid=AngularGrid.hemisphere(15, 60))) == 3
 

@@ -1,8 +1,5 @@
 """Array snapshots: what is read from npz and HDF5, and everything that is refused."""
 
-from __future__ import annotations
-
-import math
 import sys
 from dataclasses import replace
 
@@ -61,16 +58,6 @@ def test_rows_columns_and_spacing_describe_an_array(tmp_path):
     torch.testing.assert_close(other.spectrum, usual.spectrum, rtol=1e-3, atol=1e-4)
     x, y = made.array.element[1 * 4 + 2].tolist()  # row 1, column 2: columns along x, rows along y
     assert (x, y) == pytest.approx((0.5 * WAVELENGTH / 2, -0.5 * WAVELENGTH / 2))
-
-
-def test_every_takes_one_of_so_many(tmp_path):
-    data = load_spectra(write_snapshots(tmp_path / "a"), every=50, grid=GRID)
-    assert data.index.tolist() == [0, 50, 100]
-
-
-def test_a_file_is_read_as_well_as_its_folder(tmp_path):
-    write_snapshots(tmp_path / "a", name="monday.npz")
-    assert load_snapshots(tmp_path / "a" / "monday.npz").name == "monday"
 
 
 def _csi(change):
@@ -163,12 +150,6 @@ def test_hdf5_that_claims_much_is_refused_before_memory_is_taken(tmp_path):
         file.create_dataset("csi", shape=(2**20, 2**10), dtype="c16", chunks=(1, 1))
     with pytest.raises(InputError, match="unpacks to"):
         read_arrays(tmp_path / "big.h5", ["csi"])
-
-
-def test_label_is_that_of_the_pose(tmp_path):
-    data = load_spectra(write_snapshots(tmp_path / "a"), grid=GRID)
-    away = (data.position[0] - data.fixed_position) @ data.rotation
-    assert data.label[0, 1].item() == pytest.approx(abs(math.asin(float(away[2] / away.norm()))))
 
 
 def test_a_grid_is_given_as_a_pair(tmp_path):

@@ -1,7 +1,5 @@
 """Spectra as they were measured: float32 by the batch, many of them in a file of the cache."""
 
-from __future__ import annotations
-
 import os
 import time
 from dataclasses import replace

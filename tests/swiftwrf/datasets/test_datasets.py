@@ -1,7 +1,5 @@
 """Public data sets by name: a local server in place of the internet, raw files made in the layout of each source."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json
@@ -16,14 +14,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from PIL import Image
-from quick import said
+from quick import command, said
 from scipy.io import savemat
 
 from swiftwrf import InputError, Rssi, Spectra, datasets, load_rssi, load_spectra
 from swiftwrf.datasets import DATA_SETS, DataSet, conversions
-from tasks.command_line import command_line
-from tasks.configs import InspectConfig
-from tasks.inspect import run as inspect
 
 pytest.importorskip("pooch", reason="needs the extra data")
 
@@ -146,15 +141,12 @@ def test_without_pooch_a_sentence_says_what_to_install(served, monkeypatch):
 
 
 def test_commands_take_names_where_there_is_no_such_folder(served, tmp_path, capsys, monkeypatch):
-    def inspected(*arguments):
-        return command_line("tasks.inspect", InspectConfig, inspect, [*arguments])
-
     monkeypatch.chdir(tmp_path)
-    assert inspected("toy", "--out", "a") == 0
+    assert command("inspect", "toy", "--out", "a") == 0
     assert "toy: licence CC BY 4.0" in capsys.readouterr().err
     assert json.loads((tmp_path / "a" / "inspect.json").read_text())["kind"] == "RSSI"
     (tmp_path / "toy").mkdir()
-    assert inspected("toy", "--out", "b") == 2
+    assert command("inspect", "toy", "--out", "b") == 2
     assert "is in none of the known formats" in said(capsys)
 
 
@@ -189,13 +181,19 @@ def pickled_paths(first=0):
     return content.replace(b"cnumpy._core.", b"cnumpy.core.")
 
 
+def converted(folder, files, convert, *options):
+    """Convert raw files, and return the folder of the converted ones."""
+    write(folder / "raw", files)
+    (folder / "out").mkdir()
+    convert(folder / "raw", folder / "out", *options)
+    return folder / "out"
+
+
 def test_newrf_paths(tmp_path):
-    write(tmp_path / "raw", {"data/dataset_bedroom.pkl": pickled_paths()})
-    (tmp_path / "out").mkdir()
-    conversions.newrf(tmp_path / "raw", tmp_path / "out")
-    data = load_spectra(tmp_path / "out", grid=(4, 8))
+    out = converted(tmp_path, {"data/dataset_bedroom.pkl": pickled_paths()}, conversions.newrf)
+    data = load_spectra(out, grid=(4, 8))
     assert data.position.tolist() == [[1, 0, 1.2], [1, 2, 1.2]]
-    with np.load(tmp_path / "out" / "paths.npz") as stored:
+    with np.load(out / "paths.npz") as stored:
         np.testing.assert_allclose(stored["last_point"][1], [2, 1, 1])
         assert stored["gain"].tolist() == [1 + 2j, 3j] * 2
 
@@ -219,10 +217,8 @@ def test_s23(tmp_path):
     files = {f"spectrum/{number:05d}.png": image.getvalue() for number in range(1, count + 1)}
     files |= {"gateway_info.yml": "gateway1:\n  position: [5.0, 0.26, 0]\n  orientation: [0, 0, 0, 1]\n"}
     files |= {"tx_pos.csv": "x,y,z\n" + rows, "train_index.txt": "1\n2\n", "test_index.txt": "3\n"}
-    write(tmp_path / "raw", {f"data_test200/{name}": content for name, content in files.items()})
-    (tmp_path / "out").mkdir()
-    conversions.s23(tmp_path / "raw", tmp_path / "out")
-    data = load_spectra(tmp_path / "out")
+    raw = {f"data_test200/{name}": content for name, content in files.items()}
+    data = load_spectra(converted(tmp_path, raw, conversions.s23))
     assert isinstance(data, Spectra)
     assert data.named_splits["block"][1].tolist() == [count - 3, count - 2, count - 1]
 
@@ -240,10 +236,7 @@ def test_tetam_tracks(tmp_path):
     devices = 'Dongles:{"00ab": [[7, 8, 1.2], 1, "one"], "00cd": [[1, 2, 2.3], 2, "two"]}\nBeacons:{}\n'
     tracks = {"straight_02": still, "straight_03": packets}
     files = {f"trk/{name}_all_sensors.mbd": "".join(line.format(**p) for p in some) for name, some in tracks.items()}
-    write(tmp_path / "raw", {"cnf/tetam.dev": devices, **files})
-    (tmp_path / "out").mkdir()
-    conversions.tetam_tracks(tmp_path / "raw", tmp_path / "out")
-    data = load_rssi(tmp_path / "out")
+    data = load_rssi(converted(tmp_path, {"cnf/tetam.dev": devices, **files}, conversions.tetam_tracks))
     assert data.receiver_names == ("one", "two")
     np.testing.assert_array_equal(data.rssi_dbm[4:], [[-75, -60], [-99.9, np.nan]])
     np.testing.assert_allclose(data.transmitter_position[4:], [[1.1, 2, 1.8], [3, 2, 1.8]])
@@ -256,10 +249,7 @@ def test_dcm(tmp_path):
     walks = {
         f"Dataset/router_{name}.txt": f"{x}\t1.5\t3\t4\t-40\n0 0 1 1 -35.0\n" for name, x in (("01", 2), ("110", 3))
     }
-    write(tmp_path / "raw", {"router_info.csv": router, **walks})
-    (tmp_path / "out").mkdir()
-    conversions.dcm(tmp_path / "raw", tmp_path / "out")
-    data = load_rssi(tmp_path / "out")
+    data = load_rssi(converted(tmp_path, {"router_info.csv": router, **walks}, conversions.dcm))
     assert data.receiver_names == ("r01", "r110")
     assert data.receiver_position.tolist() == [[-4.5, 0.6, 0], [-4, 0, 0]]
     assert data.rssi_dbm[data.transmitter_position[:, 0] == 3].nan_to_num(0).tolist() == [[0, -40]]
@@ -272,10 +262,7 @@ def test_lora(tmp_path):
     foot = header + row.format(latitude + 0.001, longitude, altitude - 2) * 2
     car = header + row.format(latitude, longitude + 0.001, altitude)
     files = {"campus_walking_by_foot/1_Full-Collected-data.csv": foot, "campus_by_car/2_Full-Collected-data.csv": car}
-    write(tmp_path / "raw", files)
-    (tmp_path / "out").mkdir()
-    conversions.lora(tmp_path / "raw", tmp_path / "out")
-    data = load_rssi(tmp_path / "out")
+    data = load_rssi(converted(tmp_path, files, conversions.lora))
     np.testing.assert_allclose(data.transmitter_position[[0, 2]], [[0, 110.57, -2], [103.37, 0, 0]], atol=0.01)
     assert data.rssi_dbm[0].tolist() == [-112, -102]
     assert data.named_splits["foot"][1].tolist() == [2]

@@ -1,7 +1,5 @@
 """Element phases and orientation: recovered if the data determine them, refused otherwise."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

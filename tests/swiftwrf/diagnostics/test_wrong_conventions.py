@@ -1,17 +1,15 @@
 """Wrong frames, units and conventions: each is refused by the reader or named by the inspection."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from samples import FACING_X, snapshots, survey_rows, write_deepmimo, write_snapshots, write_survey
+from samples import FACING_X, snapshots, write_deepmimo
 from scipy.spatial.transform import Rotation
 
-from swiftwrf import AngularGrid, InputError, load_rssi, load_snapshots, load_spectra, rssi_room
+from swiftwrf import AngularGrid, InputError, load_spectra, rssi_room
 from swiftwrf.data import Rssi
 from swiftwrf.data.store import Store
 from swiftwrf.diagnostics.inspection import inspect
@@ -123,14 +121,6 @@ def _deepmimo(**changes):
     return lambda folder: load_spectra(write_deepmimo(folder, **changes), grid=GRID)
 
 
-def _snapshots(**changes):
-    return lambda folder: load_snapshots(write_snapshots(folder, data=DATA, **changes))
-
-
-def _survey(header):
-    return lambda folder: load_rssi(write_survey(folder, header=header))
-
-
 REFUSED = {
     "radians for degrees": (
         _deepmimo(aoa_el=lambda a: np.deg2rad(a["aoa_el"]), aoa_az=lambda a: np.deg2rad(a["aoa_az"])),
@@ -147,21 +137,6 @@ REFUSED = {
     "azimuth clockwise": (_deepmimo(aoa_az=lambda a: -a["aoa_az"]), "turns clockwise"),
     "positions in millimetres": (_deepmimo(rx_pos=lambda a: 1000 * a["rx_pos"]), "not in metres"),
     "delays in nanoseconds": (_deepmimo(delay=lambda a: 1e9 * a["delay"]), "not in metres or delays not in seconds"),
-    "elements in millimetres": (
-        _snapshots(element_position=None, rows=4, columns=4, spacing_m=1000 * DATA.array.wavelength / 2),
-        "is the spacing in metres",
-    ),
-    "carrier in GHz": (_snapshots(frequency_hz=2.4), "carrier in Hz"),
-    "Euler angles in degrees": (_snapshots(array_orientation=np.array([0.0, 90.0, 25.0])), "Euler angles"),
-    "quaternion in degrees": (_snapshots(array_orientation=np.array([0.0, 90.0, 25.0, 1.0])), "unit quaternion"),
-    "subcarriers and elements swapped": (_snapshots(csi=DATA.channel.numpy().transpose(0, 2, 1)), "transpose"),
-    "missing columns": (_survey(["a", "y", "z", *survey_rows()[0][3:]]), "no column for x"),
-    "metres called longitude": (
-        lambda folder: load_rssi(
-            write_survey(folder, header=["lon", "lat", "a"], rows=[[11.5 + i, 48.1, -50] for i in range(12)])
-        ),
-        "may be degrees or metres",
-    ),
 }
 
 

@@ -1,7 +1,5 @@
 """The Gaussian process: kernel, its choice, regression, smooth fields."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

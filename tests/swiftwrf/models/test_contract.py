@@ -1,7 +1,5 @@
 """The contract of every registered field model, and of one from another package."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys
@@ -242,30 +240,27 @@ def test_predictions_of_each_device_are_drawn_tabulated_and_stored(fitted, posit
     assert torch.equal(model.grid.peak_direction(stored.spectrum), peak.cpu())
 
 
-@pytest.mark.usefixtures("without_annotation_checks")
+def gp(spectra):
+    return make_model("gp").fit(spectra)
+
+
 @pytest.mark.parametrize(
     ("call", "says"),
     [
         (lambda spectra, rssi: swiftwrf.fit(rssi), "train must be an instance of Spectra, got <Rssi"),
-        (lambda spectra, rssi: make_model("gp").fit(None), "train must be an instance of Spectra, got None"),
-        (lambda spectra, rssi: make_model("gp").fit(spectra).update(rssi), "new must be an instance of Spectra"),
+        (lambda spectra, rssi: gp(None), "train must be an instance of Spectra, got None"),
+        (lambda spectra, rssi: gp(spectra).update(rssi), "new must be an instance of Spectra"),
         (lambda spectra, rssi: swiftwrf.fit_rssi(spectra), "train must be an instance of Rssi, got <Spectra"),
         (lambda spectra, rssi: swiftwrf.RssiModel().fit(rssi).update(spectra), "new must be an instance of Rssi"),
-        (lambda spectra, rssi: make_model("gp").fit(spectra).predict(spectra), "positions must be numbers"),
-        (lambda spectra, rssi: make_model("gp").fit(spectra).predict(torch.zeros(1, 3) + 0j), "positions must be real"),
-        (
-            lambda spectra, rssi: make_model("gp").fit(spectra).predict([[2e9, 0, 0]]),
-            "positions must be .* at most 1e.09",
-        ),
+        (lambda spectra, rssi: gp(spectra).predict(spectra), "positions must be numbers"),
+        (lambda spectra, rssi: gp(spectra).predict(torch.zeros(1, 3) + 0j), "positions must be real"),
+        (lambda spectra, rssi: gp(spectra).predict([[2e9, 0, 0]]), "positions must be .* at most 1e.09"),
         (lambda spectra, rssi: swiftwrf.load(None), "None is not a readable safetensors file"),
         (lambda spectra, rssi: make_model("gp").fit(spectra, device="gpu"), "device must be .* got 'gpu'"),
         (lambda spectra, rssi: make_model("gp").fit(spectra, device="cuda:99"), "cuda:99 needs an NVIDIA GPU"),
         (lambda spectra, rssi: swiftwrf.RssiModel().fit(rssi, device="cuda:99"), "cuda:99 needs an NVIDIA GPU"),
-        (
-            lambda spectra, rssi: make_model("gp").fit(spectra).predict(spectra.position).interval("0.8"),
-            "level must be",
-        ),
-        (lambda spectra, rssi: make_model("gp").fit(spectra).predict(spectra.position).interval(1.0), "level must be"),
+        (lambda spectra, rssi: gp(spectra).predict(spectra.position).interval("0.8"), "level must be"),
+        (lambda spectra, rssi: gp(spectra).predict(spectra.position).interval(1.0), "level must be"),
     ],
 )
 def test_mistakes_of_newcomers_end_in_a_sentence(call, says):

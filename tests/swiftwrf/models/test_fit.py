@@ -1,13 +1,11 @@
 """Fitting by regression: what it reaches and what it refuses; standard deviations of all models that predict them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
 import torch
 
-from swiftwrf import AngularGrid, InputError, Spectra, SwiftWRF, fit, make_model
+from swiftwrf import AngularGrid, Spectra, SwiftWRF, fit, make_model
 from swiftwrf.data.splits import folds
 from swiftwrf.data.store import Store
 from swiftwrf.gp import GaussianProcess, choose_kernel
@@ -137,19 +135,3 @@ def test_a_fit_like_another_keeps_its_number_of_primitives(room):
     assert records == [{"stage": "final", "n_primitives": 24}]
     assert len(again.mean) == 24
     assert len(SwiftWRF(n_primitives=8).fit(some, like=first).mean) == 8
-
-
-def test_refuses_too_few_spectra_and_what_is_not_finite(room):
-    with pytest.raises(InputError, match="at least 10"):
-        fit(room.subset(torch.arange(9)))
-    broken = room.spectrum.clone()
-    broken[7, 3, 3] = float("nan")
-    with pytest.raises(InputError, match="training spectrum 7"):
-        fit(replace(room, store=Store(broken)))
-
-
-def test_folds_partition_and_repeat(room):
-    for kind in ("random", "block"):
-        fold = folds(room.position, kind, 3)
-        assert fold.bincount().tolist() == [8] * 5
-        assert torch.equal(fold, folds(room.position, kind, 3))

@@ -1,7 +1,5 @@
 """Channels: at subcarriers of known paths, and furniture that is found in them and improves what follows from a room."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace
@@ -9,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from rooms import mirror_room
+from rooms import built_in_walls, mirror_room
 
 from augment.turbo.artifacts import save_artifacts
 from swiftwrf import AngularGrid, InputError, MatchedField, Spectra, load, simulated_room
-from swiftwrf.array.planar import PlanarArray
+from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data import PropagationPaths, Snapshots
 from swiftwrf.data.store import Store
 from swiftwrf.models.geometry import GeometryModel, Plane, furniture
@@ -23,18 +21,7 @@ from swiftwrf.models.geometry.furniture import Furniture
 from swiftwrf.models.geometry.images import PlaneSet
 from tasks.aoa.room import furniture_panels
 
-WALLS = [
-    Plane(normal, offset, 0.9)
-    for normal, offset in [
-        ((-1.0, 0.0, 0.0), 0.0),
-        ((1.0, 0.0, 0.0), 6.0),
-        ((0.0, -1.0, 0.0), 0.0),
-        ((0.0, 1.0, 0.0), 5.0),
-        ((0.0, 0.0, -1.0), 0.0),
-        ((0.0, 0.0, 1.0), 3.0),
-    ]
-]
-LIGHT_SPEED = 299_792_458.0
+WALLS = built_in_walls(0.9)
 
 
 def furnished(room: GeometryModel, absorption: float) -> Furniture:
@@ -105,8 +92,8 @@ def test_a_voxel_attenuates_the_direct_path_by_its_length_in_it():
 
 @pytest.mark.parametrize("moving", ["transmitter", "receiver"])
 def test_furniture_is_found_where_it_stands_and_explains_new_channels(moving, tmp_path):
-    data, walls = measured(6.0, moving)
-    train, test = data.subset(torch.arange(70)), data.subset(torch.arange(70, 100))
+    data, walls = measured(6.0, moving, n=80)
+    train, test = data.subset(torch.arange(60)), data.subset(torch.arange(60, 80))
     channels = walls.channels(test)
     before = 1 - channels.coherence(walls.tensors(), walls.gains(channels.scene))
     room = fitted(walls, train)
@@ -126,12 +113,12 @@ def test_furniture_is_found_where_it_stands_and_explains_new_channels(moving, tm
 
 def test_a_reflecting_surface_is_found_where_it_is(tmp_path):
     lamp = Plane((0.0, 0.0, 1.0), 2.2, 0.9)
-    data, walls = measured(1.0, n=150, surfaces=(lamp,))
-    room = fitted(walls, data.subset(torch.arange(120)))
+    data, walls = measured(1.0, n=120, surfaces=(lamp,))
+    room = fitted(walls, data.subset(torch.arange(100)))
     assert room.furniture is not None
     (found,) = room.furniture.surfaces
     assert (found.normal, found.offset_m) == (lamp.normal, pytest.approx(lamp.offset_m, abs=0.01))
-    channels = room.channels(data.subset(torch.arange(120, 150)))
+    channels = room.channels(data.subset(torch.arange(100, 120)))
     missing = 1 - channels.coherence(room.reflectors, room.gains(channels.scene))
     assert float(missing.median()) < 0.1
     room.save(tmp_path / "room.safetensors")
@@ -179,10 +166,11 @@ def test_phases_of_channels_have_no_alias_and_those_of_packets_are_the_signal():
 
 
 def test_positions_are_located_by_channels_through_furniture(tmp_path):
-    data, walls = measured(6.0)
-    train, test = data.subset(torch.arange(80)), data.subset(torch.arange(80, 100))
-    options = {"n_best": 60, "n_background": 40, "n_split": 8, "spacing": 0.3, "n_calibration": 20, "max_cells": 20_000}
-    locator = MatchedField(**options).fit(train, room=fitted(walls, train))
+    data, _ = measured(6.0, n=80)
+    train, test = data.subset(torch.arange(70)), data.subset(torch.arange(70, 80))
+    cells = {"n_best": 40, "n_background": 20, "n_split": 8, "spacing": 0.3, "max_cells": 10_000}
+    room = fitted(GeometryModel.of_planes(train, WALLS), train)
+    locator = MatchedField(**cells, n_rounds=2, n_calibration=12).fit(train, room=room)
     posterior = locator.locate(test)
     error = (posterior.median - test.position).norm(dim=1)
     assert float(error.median()) < 0.5 * data.array.wavelength

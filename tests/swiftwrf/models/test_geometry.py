@@ -1,14 +1,13 @@
 """Rooms in closed form found again, conclusions on what is not identifiable, samples, state."""
 
-from __future__ import annotations
-
 import math
 from copy import copy
 from dataclasses import replace
 
 import pytest
 import torch
-from rooms import ARRAY, GRID, mirror_room
+from rooms import ARRAY, GRID, built_in_walls, mirror_room
+from small import GLANCE
 from threadpoolctl import ThreadpoolController
 
 from swiftwrf import AngularGrid, InputError, load, simulated_room
@@ -19,7 +18,7 @@ from swiftwrf.metrics import psnr
 from swiftwrf.models.geometry import GeometryConfig, GeometryModel, Plane, path_gains
 from swiftwrf.models.geometry.fit import _pruned, _with_weak_planes, _without_aliases, observe, split
 from swiftwrf.models.geometry.hybrid import HybridModel
-from swiftwrf.models.geometry.images import SIDES, PhaseObservations, PlaneSet, field, images, mirror
+from swiftwrf.models.geometry.images import SIDES, PhaseObservations, PlaneSet, field
 from swiftwrf.models.geometry.path_gains import (
     PRIORS,
     PathGains,
@@ -37,14 +36,7 @@ from swiftwrf.models.neighbours import NearestModel
 from swiftwrf.runtime.checkpoint import write
 
 QUICK = GeometryConfig(search_distance_m=2.0, beam_width=2)
-SIX = {
-    (-1, 0, 0): 0.0,
-    (1, 0, 0): 5.0,
-    (0, -1, 0): 0.0,
-    (0, 1, 0): 4.0,
-    (0, 0, -1): 0.0,
-    (0, 0, 1): 2.8,
-}
+SIX = {(-1, 0, 0): 0.0, (1, 0, 0): 5.0, (0, -1, 0): 0.0, (0, 1, 0): 4.0, (0, 0, -1): 0.0, (0, 0, 1): 2.8}
 
 
 def fit(data, **changes):
@@ -73,7 +65,8 @@ def noisy():
 
 @pytest.fixture(scope="module")
 def room(noisy):
-    return fit(noisy)
+    """The room of the noisy spectra, whose planes are known but for a centimetre: a search has its own tests."""
+    return GeometryModel().fit(noisy, like=known(noisy).refined_on(observe(noisy)[0]))
 
 
 def test_elements_may_be_listed_in_any_order():
@@ -183,13 +176,6 @@ def test_rooms_are_refined_together_as_one_by_one():
         assert float(together.score) == pytest.approx(together.score_at(scene), abs=1e-5)
 
 
-def test_mirroring_twice_returns():
-    point = torch.randn(3, 4, dtype=torch.float64)
-    normal = torch.nn.functional.normalize(torch.randn(3, 4, dtype=torch.float64), dim=0)
-    offset = torch.randn(4, dtype=torch.float64)
-    torch.testing.assert_close(mirror(mirror(point, normal, offset), normal, offset), point)
-
-
 @pytest.mark.parametrize(
     ("planes", "gain", "moving"),
     [
@@ -274,30 +260,12 @@ def test_scores_of_combinations_are_those_of_their_rooms():
 
 @pytest.mark.long
 def test_a_tilted_plane_is_found_to_a_millimetre():
-    model = fit(mirror_room({(0.8, 0.5, 0.1): 5.0}, -0.7, n=40), search_distance_m=0.5, beam_width=1)
+    model = fit(mirror_room({(0.8, 0.5, 0.1): 5.0}, -0.7, n=40), search_distance_m=0.5, beam_width=1, max_order=1)
     assert len(model.planes) == 1
     assert errors(model, {(0.8, 0.5, 0.1): 5.0})[0][0] < 1
     torch.testing.assert_close(
         torch.tensor(model.planes[0].normal), torch.tensor([0.8433, 0.5270, 0.1054]), atol=1e-3, rtol=0
     )
-
-
-def test_images_are_mirrored_in_one_plane_after_another():
-    """Holds for any sequences, also without their prefixes."""
-    generator = torch.Generator().manual_seed(0)
-    normal = torch.nn.functional.normalize(torch.randn(2, 3, 3, generator=generator, dtype=torch.float64), dim=-1)
-    offset, gain = torch.rand(2, 3, generator=generator, dtype=torch.float64), torch.rand(2, 3, generator=generator)
-    position = torch.rand(5, 3, generator=generator, dtype=torch.float64)
-    scene = PhaseObservations.of(position, torch.zeros(3), "transmitter", ARRAY, torch.eye(3), torch.ones(5, 16))
-    planes = PlaneSet(normal, offset, gain, only=((1, 0, 2), (2,), (0, 1)))
-    found, strength = images(scene, planes), planes.image_gain
-    for row, sequence in enumerate(planes.sequence):
-        point, product = position.T[:, None], torch.ones(2)
-        for plane in sequence:
-            point = mirror(point, normal[:, plane].T[..., None], offset[:, plane, None])
-            product = product * gain[:, plane]
-        torch.testing.assert_close(found[:, row], point.movedim(0, -1))
-        torch.testing.assert_close(strength[:, row], product)
 
 
 @pytest.mark.parametrize("moving", ["receiver", "transmitter"])
@@ -318,14 +286,18 @@ def test_nothing_to_find_is_no_plane():
     assert len(model.image_sources()[0]) == 1
 
 
-def test_noise_stays_within_the_deviations(room):
+def test_noise_stays_within_the_deviations(noisy):
+    room = fit(noisy)
     assert len(room.planes) == 6
     assert all(error < 4 * std and error < 20 for error, std in errors(room, SIX))
 
 
 def test_positions_in_a_plane_leave_no_plane_certain():
     model = fit(
-        mirror_room(SIX, noise=0.1, n=24, low=(1.5, 1.2, 1.2), high=(3.5, 3.2, 1.2)), max_extra_planes=0, beam_width=1
+        mirror_room(SIX, noise=0.1, n=24, low=(1.5, 1.2, 1.2), high=(3.5, 3.2, 1.2)),
+        max_extra_planes=0,
+        beam_width=1,
+        max_order=2,
     )
     assert not any(p.certain for p in model.planes)
     assert all(error < 3 * std for error, std in errors(model, SIX) if model.planes)
@@ -336,7 +308,7 @@ def test_pure_noise_has_no_certain_plane():
     data = mirror_room({}, n=14)
     channel = torch.randn(14, 16, dtype=torch.complex128, generator=generator)
     noise = replace(data, store=Store(ARRAY.spectrum(channel, GRID)))
-    model = fit(noise, search_distance_m=0.5, max_extra_planes=0, beam_width=1)
+    model = GeometryModel(replace(GLANCE, n_search_positions=14)).fit(noise)
     assert not any(p.certain for p in model.planes)
 
 
@@ -354,10 +326,11 @@ def test_refusals_say_what_is_missing(change, message):
         fit(replace(mirror_room(SIX, n=12), **change))
 
 
+@pytest.mark.usefixtures("short_searches")
 def test_the_same_seed_finds_the_same_room(noisy):
     few = noisy.subset(torch.arange(12))
-    quick = {"search_distance_m": 0.5, "beam_width": 1, "max_extra_planes": 0}
-    assert fit(few, **quick).to_json() == fit(few, **quick).to_json()
+    one, other = (GeometryModel(GLANCE).fit(few).to_json() for _ in range(2))
+    assert one == other
 
 
 def test_json_and_images_describe_the_room(room):
@@ -372,8 +345,7 @@ def test_json_and_images_describe_the_room(room):
 def test_hybrid_is_not_worse_than_geometry():
     data = simulated_room(n=60, grid=GRID)
     train, test = data.split("random")
-    walls = [Plane(tuple(n), o, gain=-0.6) for n, o in zip(SIDES.tolist(), (0.0, 6.0, 0.0, 5.0, 0.0, 3.0), strict=True)]
-    room = GeometryModel.of_planes(train, walls).refined_on(observe(train)[0])
+    room = GeometryModel.of_planes(train, built_in_walls()).refined_on(observe(train)[0])
     hybrid = HybridModel().fit(train, like=room)
     gained = psnr(hybrid.synthesize(test.position), test.spectrum) - psnr(room.synthesize(test.position), test.spectrum)
     assert float(gained.mean()) > -0.5
@@ -437,7 +409,7 @@ def test_path_gains_follow_a_shadow():
     spectrum = torch.where(hidden[:, None, None], bare.spectrum, whole.spectrum)
     data = replace(whole, store=Store(spectrum))
     train, test = data.subset(torch.arange(0, 110)), data.subset(torch.arange(110, 140))
-    room = fit(train, max_extra_planes=0, beam_width=1)
+    room = GeometryModel().fit(train, like=known(train))
     hybrid = HybridModel().fit(train, like=room)
     assert hybrid.path_gains is not None
     gained = psnr(hybrid.synthesize(test.position), test.spectrum) - psnr(room.synthesize(test.position), test.spectrum)
@@ -564,22 +536,24 @@ def test_room_predicts_any_grid(noisy, room):
 
 
 @pytest.mark.parametrize(
-    "name",
+    "change",
     [
-        "covariance",
-        "position",
-        "coefficient",
-        "component",
-        "path_gains.coefficient",
+        *("covariance", "position", "coefficient", "component", "path_gains.coefficient"),
+        *({"mixing_weight": "x"}, {"order": 9}, {"planes": [{"normal": [1]}]}),
     ],
+    ids=str,
 )
-def test_states_of_wrong_sizes_are_refused(hybrid, name, tmp_path):
+def test_tensors_of_wrong_sizes_and_headers_of_wrong_values_are_refused(hybrid, change, tmp_path):
     """Also tensors that only `predict` would need."""
     known, kernel = hybrid.process.known.clone(), hybrid.process.kernel
     some = PathGains(GaussianProcess(kernel, known, torch.zeros(len(known), 2 * 25 * 2)), 25)
     tensors, header = with_path_gains(hybrid, some).state()
     HybridModel.from_state(tensors, header)
-    write(tmp_path / "model", HybridModel.kind, tensors | {name: tensors[name][:-1]}, header)
+    if isinstance(change, str):
+        tensors = tensors | {change: tensors[change][:-1]}
+    else:
+        header = header | change
+    write(tmp_path / "model", HybridModel.kind, tensors, header)
     with pytest.raises(InputError):
         load(tmp_path / "model")
 
@@ -601,21 +575,6 @@ def test_a_link_that_cannot_be_used_is_refused(room, change, tmp_path):
     tensors, header = room.state()
     write(tmp_path / "model", GeometryModel.kind, tensors, header | {"link": header["link"] | change})
     with pytest.raises(InputError, match="geometry model that can be used"):
-        load(tmp_path / "model")
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("mixing_weight", "x"),
-        ("order", 9),
-        ("planes", [{"normal": [1]}]),
-    ],
-)
-def test_headers_of_wrong_values_are_refused(hybrid, key, value, tmp_path):
-    tensors, header = hybrid.state()
-    write(tmp_path / "model", HybridModel.kind, tensors, header | {key: value})
-    with pytest.raises(InputError):
         load(tmp_path / "model")
 
 

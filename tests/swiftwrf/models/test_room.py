@@ -1,7 +1,5 @@
 """The simulated room against closed forms."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """The paper's model: primitives, network, fit by gradient descent."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,13 +1,12 @@
 """Empty cells as upper limits: against a truth that is known below the limit of detection."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
 import torch
 
 from swiftwrf import Rssi, RssiModel, load, rssi_room
+from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.rssi import compare
 from swiftwrf.rssi.detection import Detection
 from swiftwrf.rssi.offsets import estimate_floor_attenuation
@@ -102,7 +101,8 @@ def test_a_receiver_seen_at_one_distance_has_the_slope_of_all():
     assert float(found.std[0, 0]) > float(found.std[2, 0]) + 0.5  # the trend is uncertain far from the rows
 
 
-def test_detections_are_predicted_and_scored(fitted):
+def test_detections_are_predicted_and_scored(fitted, monkeypatch):
+    monkeypatch.setattr(RSSI_PREDICTORS, "_registered", {name: RSSI_PREDICTORS[name] for name in ("swiftwrf", "mean")})
     data, _, model = fitted
     found = compare(data, split="random")
     score = found.summary()["detection"]

@@ -1,21 +1,17 @@
 """RSSI where both ends of the link move: tables with two positions, the split by place, and models over pairs."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
-from quick import sketched
+from quick import command, sketched
 
 import swiftwrf
 from swiftwrf import InputError, PairModel, Rssi, load_rssi
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.positions import cells
-from tasks.command_line import command_line
-from tasks.rssi import experiment
 
 WALL_DB, WALL_X, ROOM_M = 14.0, 4.0, 8.0
 
@@ -218,17 +214,14 @@ def test_known_places_have_their_own_path_loss():
     torch.testing.assert_close(away, model.path_loss.shared[:1])
 
 
-def run(*arguments):
-    return command_line("tasks.rssi", experiment.RssiTaskConfig, experiment.run, [str(a) for a in arguments])
-
-
 def test_whole_run_at_new_places(tmp_path, monkeypatch):
     kept = ("mri_pooled", "pairs", "knn_pairs")
     monkeypatch.setattr(RSSI_PREDICTORS, "_registered", {name: RSSI_PREDICTORS[name] for name in kept})
+    monkeypatch.setattr("swiftwrf.rssi.maps.CELLS", 8)
     links(n_places=10, rows=15).to_csv(tmp_path / "links.csv", index=False)
     where = ("--data", tmp_path / "links.csv", "--rx", "all", "--split", "place", "--out", tmp_path / "run")
     with sketched():
-        assert run(*where) == 0
+        assert command("rssi", *where) == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["model"] == "pairs"
     assert set(metrics["overall"]) == set(kept)

@@ -1,7 +1,5 @@
 """Damaged model files and checkpoints of fits, files that claim more than they contain, and predictions at far positions."""
 
-from __future__ import annotations
-
 import os
 import resource
 import subprocess

@@ -1,7 +1,5 @@
 """The number of threads: restored whoever uses it, and however users overlap."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 

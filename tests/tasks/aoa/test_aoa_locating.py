@@ -1,7 +1,5 @@
 """Matched-field processing in the angle-of-arrival task: positions, keys, resumption, and the choice of the estimator."""
 
-from __future__ import annotations
-
 import json
 from contextlib import ExitStack, contextmanager
 from copy import copy
@@ -13,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from quick import QuickNetwork, sketched
+from quick import FEW_CELLS, QuickNetwork, command, sketched
 from rooms import mirror_room
 from small import known_planes, with_defaults
 
@@ -23,18 +21,14 @@ from augment.estimators import ESTIMATORS
 from augment.turbo.condition import LOCATED, NETWORKS
 from augment.turbo.locating import containing_level
 from swiftwrf import MatchedField, load, make_model
-from swiftwrf.locate import MatchedFieldConfig, Posterior, matched_field
+from swiftwrf.locate import Posterior, matched_field
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry.model import fingerprint
 from swiftwrf.models.geometry.path_gains import PRIORS
 from swiftwrf.models.geometry.planes import Plane
 from tasks.aoa import experiment
-from tasks.command_line import command_line
-from tasks.configs import AoaConfig, PredictConfig
-from tasks.predict import run as predict
 
 PLANES = {(0.0, 0.0, -1.0): 0.0, (1.0, 0.0, 0.0): 5.0, (0.0, 1.0, 0.0): 4.0}  # outward normal to offset [m]
-FEW_CELLS = MatchedFieldConfig(max_cells=2000, n_best=40, n_background=20, n_rounds=1, n_calibration=16)
 FIT = MatchedField.fit
 ON_SNAPSHOTS = {
     "music",
@@ -75,7 +69,7 @@ def quickly(data, planes=PLANES):
             mock.patch.object(experiment, "simulated_room", return_value=data),
             sketched(),
             mock.patch.object(MatchedField, "fit", fit_once),
-            mock.patch("swiftwrf.locate.student.DEGREES", (5.0,)),
+            mock.patch("swiftwrf.locate.spectrum_likelihood.DEGREES", (5.0,)),
             mock.patch("swiftwrf.models.geometry.path_gains.PRIORS", {"tight": PRIORS["tight"]}),
             mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
             *(
@@ -91,10 +85,6 @@ def lacking(name, data):
     return FIELD_MODELS[name].lacking(data)
 
 
-def run(*arguments):
-    return command_line("tasks.aoa", AoaConfig, experiment.run, [str(a) for a in arguments])
-
-
 def mix_of(folder):
     (found,) = json.loads((folder / "metrics.json").read_text())["mixes"].values()
     return found
@@ -105,7 +95,7 @@ def finished(closed_form, tmp_path_factory):
     """The directory of a run that locates, with a field model that has no room."""
     folder = tmp_path_factory.mktemp("located") / "run"
     with quickly(closed_form):
-        assert run("--mix", 0.6, "--extra", 0, "--synthesizer", "nearest", "--out", folder) == 0
+        assert command("aoa", "--mix", 0.6, "--extra", 0, "--synthesizer", "nearest", "--out", folder) == 0
     return folder
 
 
@@ -157,15 +147,15 @@ def test_the_trained_locator_is_kept_and_estimates_directions(closed_form, finis
     test = closed_form.split()[1]
     np.save(tmp_path / "new.npy", test.spectrum.numpy())
     out = tmp_path / "directions.csv"
-    arguments = [str(file), str(tmp_path / "new.npy"), "--out", str(out)]
+    arguments = (file, tmp_path / "new.npy", "--out", out)
     with quickly(closed_form):  # a locator that is loaded estimates its likelihoods
-        assert command_line("tasks.predict", PredictConfig, predict, arguments) == 0
+        assert command("predict", *arguments) == 0
     errors = pd.read_csv(finished / "errors.csv")
     own = errors[errors.method == LOCATED]
     found = pd.read_csv(out)
     np.testing.assert_allclose(found["elevation_deg"], own["estimate_elevation_deg"], atol=1e-3)
     np.save(tmp_path / "other.npy", np.zeros((1, 5, 5), dtype=np.float32))
-    assert command_line("tasks.predict", PredictConfig, predict, [str(file), str(tmp_path / "other.npy")]) == 2
+    assert command("predict", file, tmp_path / "other.npy") == 2
     assert "trained on others" in capsys.readouterr().err
 
 
@@ -173,7 +163,7 @@ def test_the_trained_locator_is_kept_and_estimates_directions(closed_form, finis
 def test_without_array_or_planes_it_is_left_out_with_one_sentence(closed_form, tmp_path, capsys, missing):
     data, planes = (replace(closed_form, array=None), PLANES) if missing == "array" else (closed_form, {})
     with quickly(data, planes):
-        assert run("--mix", 0.6, "--extra", 0, "--out", tmp_path / "run") == 0
+        assert command("aoa", "--mix", 0.6, "--extra", 0, "--out", tmp_path / "run") == 0
     console = " ".join(capsys.readouterr().err.split())
     mix = mix_of(tmp_path / "run")
     assert LOCATED not in mix["methods"]

@@ -1,6 +1,4 @@
-"""Gains by synthetic spectra: their reference, their interval, and how tables and reports show them."""
-
-from __future__ import annotations
+"""Gains by synthetic spectra: their reference, their interval, in reports, and over repeats that chose differently."""
 
 from dataclasses import replace
 
@@ -10,7 +8,7 @@ import torch
 from pandas import DataFrame
 
 from augment.cross_validation import LOCATOR
-from augment.turbo.condition import Condition
+from augment.turbo.condition import Condition, MeasuredSubset, pooled
 from augment.turbo.experiment import Experiment
 from augment.turbo.results import Results, repeated_summary, summaries
 from augment.turbo.synthesis import Evaluation
@@ -148,10 +146,7 @@ def test_the_report_states_gain_interval_and_judgement(aoa_run):
         assert f"{change['change']:+.0%} [{change['low']:+.0%}, {change['high']:+.0%}] against `{other}`" in sentence
     assert any(text in sentence for text in ("a gain", "a loss", "not significant"))
     changed = {one.name for one in answer(fraction).methods if one.cells["by synthetic spectra"]}
-    assert changed >= {
-        "network, measured + synthetic (swiftwrf)",
-        "kernel_regression, measured + synthetic (swiftwrf)",
-    }
+    assert changed >= {"network, measured + synthetic (swiftwrf)", "kernel_regression, measured + synthetic (swiftwrf)"}
 
 
 def test_the_summary_begins_with_the_estimator_that_cross_validation_chose(aoa_run):
@@ -173,3 +168,94 @@ def test_the_preset_of_the_paper_has_its_fractions_and_no_further_positions():
     given = AoaConfig(mix=(0.2,), preset="paper", extra=9)
     assert (given.mix, given.extra) == ((0.2,), 9)
     assert AoaConfig(mix=(0.3,)).extra is None
+
+
+GP, IDW = (Condition("aann_kernel", "measured + synthetic", name, measured_fraction=0.3) for name in ("gp", "idw"))
+GP_EXTRA, IDW_EXTRA = (
+    replace(condition, training="measured + synthetic + extra", n_synthetic=9) for condition in (GP, IDW)
+)
+
+
+def regression(condition):
+    """Return the condition with another estimator."""
+    return replace(condition, estimator="kernel_regression")
+
+
+def of_repeats(*repeats):
+    """Return a value for each of these conditions, and for the reference, in each repeat."""
+    return [
+        (replace(condition, repeat=repeat), 10 * repeat + number)
+        for repeat, conditions in enumerate(repeats)
+        for number, condition in enumerate((MEASURED, *conditions))
+    ]
+
+
+def values(found, method):
+    return [value for condition, value in found if condition.method == method]
+
+
+def test_repeats_that_agree_are_unchanged():
+    given = of_repeats((GP, regression(GP)), (GP, regression(GP)))
+    assert pooled(given, auto=True) == given
+
+
+def test_the_choices_of_all_repeats_are_one_condition():
+    given = of_repeats((GP, regression(GP)), (IDW, IDW_EXTRA, regression(IDW_EXTRA)))
+    found = pooled(given, auto=True)
+    methods = {condition.method for condition, _ in found}
+    assert methods == {
+        "network, measured",
+        "network, measured + synthetic (auto)",
+        "kernel_regression, measured + synthetic (auto)",
+    }
+    assert values(found, "network, measured + synthetic (auto)") == [1, 12]  # with extra positions if there are some
+    assert values(found, "kernel_regression, measured + synthetic (auto)") == [2, 13]
+    assert values(found, "network, measured") == [0, 10]
+
+
+def test_field_models_asked_for_by_name_add_no_positions_against_cross_validation():
+    found = pooled(of_repeats((GP,), (GP, GP_EXTRA)), auto=False)
+    assert values(found, "network, measured + synthetic (gp)") == [1, 11]
+    assert values(found, "network, measured + synthetic + extra (gp)") == [1, 12]
+
+
+def test_a_network_with_further_positions_alone_is_pooled_with_those_without_any():
+    """The network is trained one way in each repeat, other estimators both ways."""
+    given = of_repeats((GP, regression(GP)), (GP_EXTRA, regression(GP), regression(GP_EXTRA)))
+    found = pooled(given, auto=False)
+    assert values(found, "network, measured + synthetic (gp)") == []
+    assert values(found, "network, measured + synthetic + extra (gp)") == [1, 11]
+    assert values(found, "kernel_regression, measured + synthetic (gp)") == [2, 12]
+    assert values(found, "kernel_regression, measured + synthetic + extra (gp)") == [2, 13]
+
+
+def test_fractions_are_pooled_apart():
+    other = [(replace(condition, measured_fraction=0.5), value) for condition, value in of_repeats((GP,), (GP,))]
+    given = of_repeats((GP,), (IDW,)) + other
+    assert [result for result in pooled(given, auto=True) if result[0].measured_fraction == 0.5] == other
+
+
+def test_the_time_of_all_networks_counts():
+    """Also of conditions that are not pooled, and once if a training stands for two conditions."""
+    room = simulated_room(n=20)
+    trained = of_repeats((GP,), (IDW, IDW_EXTRA))
+    for synthesizer in (("auto",), ("gp", "idw")):
+        found = Results(Experiment(simulated_room(n=40), room, (0.3,), synthesizer, estimators=()))
+        for condition, _ in trained:
+            value = {
+                "estimate": room.label.tolist(),
+                "seconds": {"train": 10.0, "estimate": 1.0},
+                "history": [],
+                "counts": {},
+            }
+            found.add(Evaluation(condition), value)
+        for repeat in range(2):
+            subset = MeasuredSubset(0.3, repeat)
+            found.synthesis.append(
+                subset.columns | {"synthesizer": "gp", "index": 0, "psnr_db": 1.0, "ssim": 1.0, "l1": 1.0}
+            )
+            seconds = {"fit": 2.0, "synthesize": 1.0, "draw": 3.0, "trains": True}
+            found.synthesis_seconds.append(subset.columns | {"synthesizer": "gp"} | seconds)
+        metrics = found.summary(0.3)
+        assert metrics["seconds"] == {"fit": 4.0, "synthesize": 6.0, "train": 50.0}
+        assert metrics["synthesis"]["gp"]["seconds"] == {"fit": 2.0, "synthesize": 1.0}

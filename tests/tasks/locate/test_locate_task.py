@@ -1,12 +1,9 @@
 """The localizers, their experiment, and positions of new observations."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from unittest import mock
 
-import locating
 import numpy as np
 import pandas as pd
 import pytest
@@ -15,17 +12,14 @@ import torch
 from quick import said
 from small import glances
 
-from swiftwrf import AngularGrid, InputError, RssiModel, load, rssi_room, simulated_room
+from swiftwrf import AngularGrid, InputError, load, rssi_room, simulated_room
 from swiftwrf.data import ReadOptions
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.locate import MatchedField
 from swiftwrf.locate.baselines import LEVELS, LOCALIZERS, RegressedCoordinates
 from swiftwrf.locate.comparison import LocateSplit, Trial, compare
-from tasks.command_line import command_line
-from tasks.configs import PredictConfig
 from tasks.labels import LOCALIZERS as LABELS
 from tasks.predict import read_rssi
-from tasks.predict import run as predict
 from tasks.records import LOCATOR as MODEL
 from tasks.source import aligned
 
@@ -35,11 +29,6 @@ GRID = AngularGrid.hemisphere(8, 32)
 def run(*arguments):
     """The experiment with cheap radio maps; its exit code."""
     return quick.run("locate", *arguments)
-
-
-def locate(*arguments):
-    """The positions of new observations; the exit code."""
-    return command_line("tasks.predict", PredictConfig, predict, [str(a) for a in arguments])
 
 
 def strict_json(file):
@@ -78,8 +67,7 @@ def test_a_comparison_without_a_folder_has_the_errors_of_the_command(locate_run)
 
 def test_localizers_describe_themselves():
     assert list(LOCALIZERS) == ["posterior", "knn", "knn_difference", "nearest", "gp", "mean"]
-    for name, localizer in LOCALIZERS.items():
-        assert localizer.name == name
+    for name in LOCALIZERS:
         assert LOCALIZERS.summary(name)
         assert LABELS[name].colour
 
@@ -204,9 +192,9 @@ def test_positions_of_new_rows(locate_run, tmp_path, capsys):
     test = rssi_room(n=80).subset(torch.tensor(pd.read_csv(locate_run / "errors.csv")["index"].unique()))
     known = write_rssi(tmp_path / "known.csv", test)
     unknown = write_rssi(tmp_path / "unknown.csv", test.columns([3, 0, 1, 2, *range(4, 12)]), located=False)
-    assert locate(locate_run / MODEL, known, "--out", tmp_path / "positions.csv") == 0
+    assert quick.command("predict", locate_run / MODEL, known, "--out", tmp_path / "positions.csv") == 0
     assert "16 positions, median error" in capsys.readouterr().out
-    assert locate(locate_run / MODEL, unknown, "--out", tmp_path / "unknown_positions.csv") == 0
+    assert quick.command("predict", locate_run / MODEL, unknown, "--out", tmp_path / "unknown_positions.csv") == 0
     assert "16 positions: " in capsys.readouterr().out
     found, other = pd.read_csv(tmp_path / "positions.csv"), pd.read_csv(tmp_path / "unknown_positions.csv")
     columns = ["index", "x_m", "y_m", "z_m", "std_x_m", "std_y_m", "std_z_m", "credible_radius_80_m", "ambiguous"]
@@ -246,9 +234,9 @@ def test_a_table_without_positions(tmp_path):
 def test_other_rows_are_refused(locate_run, matched, tmp_path, capsys):
     data, out = rssi_room(n=20), tmp_path / "out.csv"
     others = write_rssi(tmp_path / "a.csv", replace(data, receiver_names=tuple("abcdefghijkl")))
-    assert locate(locate_run / MODEL, others, "--out", out) == 2
+    assert quick.command("predict", locate_run / MODEL, others, "--out", out) == 2
     assert "has other receivers (a, b" in said(capsys)
-    assert locate(locate_run / MODEL, others, "--every", 2, "--out", out) == 2
+    assert quick.command("predict", locate_run / MODEL, others, "--every", 2, "--out", out) == 2
     assert "--every is for reading spectra" in said(capsys)
     assert not out.exists()
 
@@ -257,11 +245,11 @@ def test_no_receiver_detected(locate_run, tmp_path, capsys):
     data = rssi_room(n=20)
     data.rssi_dbm[:] = torch.nan
     with mock.patch("tasks.predict.read_rssi", return_value=(data, True)):
-        assert locate(locate_run / MODEL, "walk", "--out", tmp_path / "out.csv") == 2
+        assert quick.command("predict", locate_run / MODEL, "walk", "--out", tmp_path / "out.csv") == 2
     assert "no receiver of" in said(capsys)
     data.rssi_dbm[3] = -70.0
     with mock.patch("tasks.predict.read_rssi", return_value=(data, True)):
-        assert locate(locate_run / MODEL, "walk", "--out", tmp_path / "out.csv") == 0
+        assert quick.command("predict", locate_run / MODEL, "walk", "--out", tmp_path / "out.csv") == 0
     assert "left out: 19" in capsys.readouterr().err
     assert pd.read_csv(tmp_path / "out.csv")["index"].tolist() == [3]
 
@@ -270,7 +258,7 @@ def test_receivers_that_moved_are_refused(locate_run, tmp_path, capsys):
     data = rssi_room(n=20)
     moved = replace(data, receiver_position=data.receiver_position + torch.tensor([0.0, 2.0, 0.0]))
     with mock.patch("tasks.predict.read_rssi", return_value=(moved, True)):
-        assert locate(locate_run / MODEL, "walk", "--out", tmp_path / "out.csv") == 2
+        assert quick.command("predict", locate_run / MODEL, "walk", "--out", tmp_path / "out.csv") == 2
     assert "receiver01 2 m away from its position" in said(capsys)
 
 
@@ -278,30 +266,18 @@ def test_positions_and_directions_of_spectra(matched, tmp_path, capsys):
     data, file = matched
     (tmp_path / "data").mkdir()
     write_spectra(data, tmp_path / "data")
-    assert locate(file, tmp_path / "data", "--out", tmp_path / "known.csv") == 0
+    assert quick.command("predict", file, tmp_path / "data", "--out", tmp_path / "known.csv") == 0
     assert "40 positions, median error" in capsys.readouterr().out
     known = pd.read_csv(tmp_path / "known.csv")
     assert known.great_circle_deg.between(0, 180).all()
     assert known.position_error_m.median() < 2
     np.save(tmp_path / "unknown.npy", data.spectrum.numpy()[:5])
-    assert locate(file, tmp_path / "unknown.npy", "--out", tmp_path / "unknown.csv") == 0
+    assert quick.command("predict", file, tmp_path / "unknown.npy", "--out", tmp_path / "unknown.csv") == 0
     unknown = pd.read_csv(tmp_path / "unknown.csv")
     assert list(unknown)[-2:] == ["azimuth_deg", "elevation_deg"]
     assert len(unknown) == 5
     np.save(tmp_path / "other.npy", np.zeros((3, 8, 16), np.float32))
-    assert locate(file, tmp_path / "other.npy", "--out", tmp_path / "out.csv") == 2
+    assert quick.command("predict", file, tmp_path / "other.npy", "--out", tmp_path / "out.csv") == 2
     assert "--grid 8 32" in said(capsys)
-    assert locate(file, tmp_path / "unknown.npy", "--every", 2, "--out", tmp_path / "out.csv") == 2
+    assert quick.command("predict", file, tmp_path / "unknown.npy", "--every", 2, "--out", tmp_path / "out.csv") == 2
     assert "--every does not apply" in said(capsys)
-
-
-def test_the_benchmark_measures_every_localizer(monkeypatch):
-    written = {}
-    monkeypatch.setattr(locating, "read", lambda source: rssi_room(n=60))
-    monkeypatch.setattr(locating, "write_result", lambda name, content, rows: written.update({name: content}))
-    monkeypatch.setattr(locating, "kept", lambda name, key: {})
-    with mock.patch.object(RssiModel, "config_type", quick.QuickRssiConfig):
-        locating.main(locating.Config(("floor:block",), ("posterior", "knn"), cells=60))
-    (result,) = written["locating_rssi"]["sets"].values()
-    assert set(result["localizers"]) == {"posterior", "knn"}
-    assert set(result["coverage"]) == {"0.5", "0.8", "0.95"}

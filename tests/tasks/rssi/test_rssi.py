@@ -1,7 +1,5 @@
 """The predictors of RSSI and their task."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex
@@ -24,14 +22,14 @@ from test_rssi_model import path_loss_only
 
 from swiftwrf import InputError, fit_rssi, load, rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
-from swiftwrf.comparison import NeRF2Rssi, NeRF2RssiConfig
+from swiftwrf.comparison import NeRF2Rssi
+from swiftwrf.comparison.nerf2 import NeRF2RssiConfig
 from swiftwrf.data.splits import folds
 from swiftwrf.metrics import paired_difference
 from swiftwrf.rssi import RssiPredictor, compare
 from swiftwrf.rssi.baselines import NEIGHBOUR_COUNTS, Blend, BlendConfig
 from swiftwrf.rssi.comparison import make_predictor, pool_of
 from swiftwrf.runtime import registry
-from tasks.command_line import command_line
 from tasks.labels import PREDICTORS as LABELS
 from tasks.report import merge
 from tasks.rssi import experiment
@@ -140,10 +138,11 @@ class Outside(RssiPredictor):
 def small(monkeypatch):
     """The task on a small floor."""
     monkeypatch.setattr(experiment, "rssi_room", lambda seed: rssi_room(n=60, seed=seed))
+    monkeypatch.setattr("swiftwrf.rssi.maps.CELLS", 8)
 
 
 def run(*arguments):
-    return command_line("tasks.rssi", experiment.RssiTaskConfig, experiment.run, [str(a) for a in arguments])
+    return quick.command("rssi", *arguments)
 
 
 def test_a_floor_plan_whose_pixels_are_the_positions_needs_no_extent(tmp_path):

@@ -3,8 +3,6 @@
 The fuzzer mutates the bytes and tables of the same runs.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from functools import partial
@@ -16,14 +14,7 @@ from fuzz.runs import run_of_aoa, run_of_locate, run_of_rssi, show
 
 from swiftwrf import InputError
 
-OPENED = (
-    "config.json",
-    "environment.json",
-    "geometry-*",
-    "maps.npz",
-    "floor-plan.npz",
-    "*.safetensors",
-)
+OPENED = ("config.json", "environment.json", "geometry-*", "maps.npz", "floor-plan.npz", "*.safetensors")
 OTHER_JSON = (None, "x", 1e400, [[]], {"a": None})
 
 
