@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from matplotlib import pyplot
-from quick import cheap, command
+from quick import cheap, command, sketched
 from tables import FILES, rewrite
 
 import swiftwrf
@@ -129,7 +129,7 @@ def test_every_block_of_the_tutorial_runs_and_prints_what_is_shown(part, tmp_pat
         else:
             program, *arguments = shlex.split(block)
             assert program == "swiftwrf"
-            with nullcontext() if shown else cheap():
+            with nullcontext() if shown else cheap(), sketched():
                 assert command(*arguments) == 0, block
             out = Path(arguments[arguments.index("--out") + 1] if "--out" in arguments else arguments[-1])
             assert (out if out.suffix else out / "report.html").is_file()
