@@ -23,6 +23,7 @@ from swiftwrf import AngularGrid, MatchedField, Rssi, RssiModel, Spectra, rssi_r
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.errors import MAX_LENGTH
 from swiftwrf.locate import MatchedFieldConfig
+from swiftwrf.models.geometry.path_gains import PRIORS
 from swiftwrf.rssi import RssiConfig
 from swiftwrf.runtime.validation import configuration
 from tasks import configs
@@ -85,11 +86,14 @@ def one_example() -> Iterator[None]:
 
 @contextmanager
 def cheap() -> Iterator[None]:
-    """Small parts for runs and examples on any data: glances for rooms, few cells, few predictors, no network."""
+    """Small parts for runs and examples on any data: glances for rooms, few primitives, cells and predictors, no network."""
     with (
         glances(),
+        small_swiftwrf(),
         mock.patch.object(MatchedField, "config_type", with_defaults(FEW_CELLS)),
         mock.patch.object(cross_validation, "FOLD_LOCATOR", FEW_CELLS),
+        mock.patch("swiftwrf.locate.spectrum_likelihood.DEGREES", (5.0,)),
+        mock.patch("swiftwrf.models.geometry.path_gains.PRIORS", {"tight": PRIORS["tight"]}),
         mock.patch.object(RssiModel, "config_type", QuickRssiConfig),
         mock.patch("swiftwrf.rssi.maps.CELLS", 8),
         mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
@@ -111,7 +115,6 @@ def quick(drawn: bool = False) -> Iterator[None]:
     with (
         cheap(),
         small_published(),
-        small_swiftwrf(),
         known_planes(),
         mock.patch.object(aoa, "simulated_room", return_value=spectra),
         mock.patch.object(rssi, "rssi_room", return_value=floor),
