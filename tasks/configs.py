@@ -71,8 +71,8 @@ class AoaConfig(Options):
         ),
     ] = (AUTO,)
     scene: str | None = None
-    """room of tasks.scenes or Mitsuba scene (FILE.xml) for --synthesizer raytrace, in the coordinates of the data (default:
-    the room that it estimates from the spectra)"""
+    """room of swiftwrf scenes or Mitsuba scene (FILE.xml) for --synthesizer raytrace, in the coordinates of the data
+    (default: the room that it estimates from the spectra)"""
     extra: NonNegativeInt | None = None
     """number of extra synthetic positions in the region of the measured ones (default: 3000 if cross-validation on the
     measured spectra shows a gain, else none; none with --preset paper)"""
@@ -239,7 +239,7 @@ class PredictConfig(Options):
     """file of a model, or directory of a run: then the estimator that cross-validation chose, the locator or the RSSI
     model"""
     source: Annotated[str, tyro.conf.Positional]
-    """measurements of any format that tasks.aoa or tasks.rssi takes, RSSI without positions included; a .npy file (n,
+    """measurements of any format that swiftwrf aoa or rssi takes, RSSI without positions included; a .npy file (n,
     elevations, azimuths) of magnitudes in [0, 1]; or, for a field or RSSI model, a table of positions: x, y, z [m], or
     latitude, longitude, altitude"""
     track: float | None = None
@@ -287,7 +287,7 @@ class InspectConfig(Options):
 class ConvertConfig(Options):
     """Convert measurements and RSSI maps: OUT is a directory in the toolkit's own layout, or a file.
 
-    SOURCE is measurements of any known format (see docs/formats.md), the directory of a run of tasks.rssi or tasks.locate,
+    SOURCE is measurements of any known format (see docs/formats.md), the directory of a run of rssi or locate,
     or a saved RSSI model.
 
     Example: swiftwrf convert DIR converted --calibrate
@@ -475,7 +475,7 @@ class ViewConfig(Options):
     """
 
     source: Annotated[str, tyro.conf.Positional]
-    """directory of a run of tasks.aoa, tasks.rssi, tasks.locate or tasks.update, or a saved model; an update that is being
+    """directory of a run of aoa, rssi, locate or update, or a saved model; an update that is being
     followed is shown as it grows"""
     port: Annotated[int, Ge(0), Le(65535)] = 8080
     """port of the page; 0 takes any free port"""

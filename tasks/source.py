@@ -78,7 +78,7 @@ def offset_notes(data: Rssi, table: OffsetSource) -> list[str]:
     if table.offset_by is not None or not data.labels:
         return []
     return [
-        f"rows differ in {listed(data.labels)}; if tasks.inspect finds offsets between them, give --offset-by COLUMN"
+        f"rows differ in {listed(data.labels)}; if swiftwrf inspect finds offsets between them, give --offset-by COLUMN"
     ]
 
 

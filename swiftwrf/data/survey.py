@@ -151,7 +151,9 @@ def read_survey(
         notes += found
     labels = survey.labels()
     if labels and not offset_by:
-        notes.append(f"rows differ in {listed(labels)}; tasks.inspect tests whether its values have constant offsets")
+        notes.append(
+            f"rows differ in {listed(labels)}; swiftwrf inspect tests whether its values have constant offsets"
+        )
     moves = bool(survey.end or options.transmitter)
     if moves and not survey.end:
         notes.append(f"both ends move; {len(names)} positions of column {options.transmitter[0]} count as receivers")

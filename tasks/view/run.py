@@ -27,7 +27,7 @@ def run(config: ViewConfig) -> None:
     except ModuleNotFoundError as error:
         if error.name != "nicegui":
             raise
-        raise InputError("tasks.view needs the optional extra: pip install 'swiftwrf-tasks[view]'") from None
+        raise InputError("swiftwrf view needs the optional extra: pip install 'swiftwrf-tasks[view]'") from None
     port = free_port(config.host, config.port)
     view = open_source(Path(config.source))
     page: Any = {SpectraView: SpectraPage, RssiView: RssiPage, FollowedView: FollowedPage}[type(view)]

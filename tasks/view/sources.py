@@ -134,7 +134,7 @@ def _aoa_run(folder: Path, content: Row) -> SpectraView:
                 title = f"{name}, {100 * fraction:g}% measured"
                 models.append(LoadedModel(title, model, planes, in_training, locator_file))
     if not models:
-        raise InputError(f"{folder} holds no model; run tasks.aoa with a --synthesizer that can be saved")
+        raise InputError(f"{folder} holds no model; run swiftwrf aoa with a --synthesizer that can be saved")
     return SpectraView(folder.name, models, data, notes)
 
 
