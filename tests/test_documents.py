@@ -12,6 +12,7 @@ import pytest
 import torch
 from matplotlib import pyplot
 from quick import cheap, command, sketched
+from small import FLOOR, known_planes
 from tables import FILES, rewrite
 
 import swiftwrf
@@ -91,7 +92,7 @@ def test_the_readme_prints_what_it_shows(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize("name", ["formats", "locating", "update"])
 def test_blocks_of_reference_and_how_to_run(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with cheap():
+    with cheap(), known_planes(FLOOR):
         run_blocks(f"docs/{name}.md")
 
 
