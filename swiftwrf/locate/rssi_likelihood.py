@@ -249,7 +249,9 @@ class Fingerprints:
             least = torch.full((len(place),), torch.inf).scatter_reduce(0, number, apart, "amin")
             nearest, order = least.sort(stable=True)
             found.append((nearest[:k], order[:k]))
-        distances, numbers = zip(*found, strict=True) if found else ((rssi.new_zeros(0, k),), (number[:0, None],))
+        if not found:
+            return rssi.new_zeros(0, k), number.new_zeros(0, k)
+        distances, numbers = zip(*found, strict=True)
         return torch.stack(distances), torch.stack(numbers)
 
     def floor(self, position: Tensor) -> Tensor:

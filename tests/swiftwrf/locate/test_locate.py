@@ -317,6 +317,7 @@ def test_neighbours_are_places_that_vote_for_a_floor(building):
     distance, place = known.nearest(test.rssi_dbm, 4)
     assert all(len(set(row)) == 4 for row in place.tolist())
     assert (distance.diff(dim=1) >= 0).all()
+    assert [tensor.shape for tensor in known.nearest(test.rssi_dbm[:0], 4)] == [(0, 4), (0, 4)]
     part, mean, estimate = known.votes(test.rssi_dbm)
     assert torch.allclose(part.sum(dim=1), torch.ones(len(test), dtype=torch.float64))
     assert torch.equal(estimate, mean[torch.arange(len(test)), part.argmax(dim=1)])
