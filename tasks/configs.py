@@ -127,7 +127,7 @@ class AoaConfig(Options):
         if len(set(self.mix)) < len(self.mix):
             raise InputError(f"--mix names a fraction twice: {given_mix}")
         if self.data is None and (names := given(self.spectra)):
-            raise InputError(f"--{names[0]} is an option of the reader; give it with --data")
+            raise InputError(f"--{next(iter(names))} is an option of the reader; give it with --data")
         if self.processes is not None and self.scheduler is not None:
             raise InputError("--processes and --scheduler exclude each other; leave out one")
         if self.seed + self.repeats > SEEDS:

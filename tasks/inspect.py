@@ -23,6 +23,7 @@ from tasks.answer import NextStep
 from tasks.configs import InspectConfig
 from tasks.directory import new_directory
 from tasks.environment import command, stamp
+from tasks.options import given
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table, write_page
 from tasks.page.shared import fingerprinting
@@ -57,20 +58,20 @@ def run(config: InspectConfig) -> None:
             "numbers": findings.numbers,
         }
         write_json(folder / "inspect.json", content)
-        write_page(folder, page(findings, kind, str(config.source)))
+        write_page(folder, page(findings, kind, config))
     terminal.page(content, f"{config.source}: {kind}\n{findings}", out / "report.html")
 
 
-def page(findings: Findings, kind: str, source: str) -> Page:
-    """Return the page: findings and figures of what was read from a source."""
+def page(findings: Findings, kind: str, config: InspectConfig) -> Page:
+    """Return the page: findings and figures of what was read."""
     data, warnings = findings.data, findings.warnings
     rows = [[finding.level, finding.text] for finding in findings.sentences]
     table = Table(["level", "finding"], rows, strong=frozenset(["warning"]), long=True)
     if isinstance(data, Rssi):
-        position, task = data.transmitter_position, ("rssi", "--rx", "all")
+        position, task, options = data.transmitter_position, ("rssi", "--rx", "all"), given(config.table)
         plots = [_floor(data), *([_against_distance(data)] if data.located else []), _detected(data)]
     else:
-        position, task = data.position, ("aoa", "--mix", "0.3")
+        position, task, options = data.position, ("aoa", "--mix", "0.3"), given(config.spectra)
         plots = [_plan(data), _directions(data), *([_neighbours(data)] if len(data) > 1 else [])]
     extent = " x ".join(f"{side:.2f}" for side in (position.amax(dim=0) - position.amin(dim=0)).tolist())
     numbers = [
@@ -78,8 +79,9 @@ def page(findings: Findings, kind: str, source: str) -> Page:
         Number(str(len(data)), f"measurements, read as {kind}"),
         Number(f"{extent} m", "extent of the positions, x by y by z"),
     ]
-    mend = [NextStep("Correct the warnings and inspect again", command("inspect", source))] if warnings else []
-    steps = [*mend, NextStep("Go on", command(*task, "--data", source))]
+    read_as = [word for words in options.values() for word in words]
+    again = NextStep("Correct the warnings and inspect again", command("inspect", config.source, *read_as))
+    steps = [*([again] if warnings else []), NextStep("Go on", command(*task, "--data", config.source, *read_as))]
     conclusion = ["Nothing looks wrong. Errors that the files alone do not reveal remain possible."]
     if warnings:
         conclusion = [

@@ -265,15 +265,20 @@ class OffsetSource(TableSource):
             InputError: Such an option, but no data.
         """
         if data is None and (names := given(self)):
-            raise InputError(f"--{names[0]} is for measured RSSI; give it with --data")
+            raise InputError(f"--{next(iter(names))} is for measured RSSI; give it with --data")
 
 
-def given(group: Any) -> list[str]:
-    """Return the names of the options of a group that are set.
+def given(group: Any) -> dict[str, list[str]]:
+    """Return the options of a group that are set, as words of a command line by name.
 
     Example:
         >>> given(SpectraSource(every=2, drop_null=True))
-        ['every', 'drop-null']
+        {'every': ['--every', '2'], 'drop-null': ['--drop-null']}
     """
-    names = (option.name for option in fields(group) if getattr(group, option.name) != option.default)
-    return [name.replace("_", "-") for name in names]
+    values = {option.name.replace("_", "-"): (getattr(group, option.name), option.default) for option in fields(group)}
+    found = {}
+    for name, (value, default) in values.items():
+        if value != default:
+            words = [] if value is True else value if isinstance(value, tuple) else [value]
+            found[name] = [f"--{name}", *map(str, words)]
+    return found

@@ -59,7 +59,9 @@ def run(config: PredictConfig) -> None:
     for kinds, options in (("RSSI", config.table), ("spectra", config.spectra)):
         is_read = not at_positions and isinstance(model, RssiLocator) == (kinds == "RSSI")
         if not is_read and (unused := given(options)):
-            raise InputError(f"--{unused[0]} is for reading {kinds}, and {file} holds {with_article(model.kind)}")
+            raise InputError(
+                f"--{next(iter(unused))} is for reading {kinds}, and {file} holds {with_article(model.kind)}"
+            )
     if config.track is not None and not isinstance(model, RssiLocator | MatchedField):
         raise InputError(
             f"--track smooths positions, and {file} holds {with_article(model.kind)}, which locates nothing"

@@ -50,7 +50,7 @@ class Record:
     """Measurements that a model learnt one after the other. Adding one and the summary take a constant time."""
 
     source: str  # where the measurements come from
-    unit: str  # unit of the errors, in brackets
+    unit: str  # unit of the errors
     rows: list[Row] = field(default_factory=list)  # a row of `measurements.csv` for each measurement
 
     alarms: list[tuple[int, str]] = field(default_factory=list, init=False)
@@ -75,6 +75,15 @@ class Record:
         """Return the mean of a column of `MEANS`, nan without numbers."""
         total, n = self._sums[name]
         return total / n if n else float("nan")
+
+    @property
+    def error_label(self) -> str:
+        """Label of the errors, with their unit if they have one."""
+        return f"error [{self.unit}]" if self.unit else "error"
+
+    def with_unit(self, error: float) -> str:
+        """Return an error in words."""
+        return f"{error:.3g} {self.unit}".rstrip()
 
     @classmethod
     def read(cls, folder: Path, count: int | None = None) -> Record:
@@ -138,8 +147,8 @@ class Record:
         changes = len(self.alarms)
         text = [
             f"{changes or 'No'} change{'' if changes == 1 else 's'} detected, {found['measurements']} measurements learnt.",
-            f"Their mean error is {found['mean_error']:.4g}{self.unit} before each was learnt, "
-            f"{found['last_running_error'] or float('nan'):.4g} over the last {WINDOW}.",
+            f"Their mean error is {self.with_unit(found['mean_error'])} before each was learnt, "
+            f"{self.with_unit(found['last_running_error'] or float('nan'))} over the last {WINDOW}.",
         ]
         text += [f"Change at measurement {number}: {what}." for number, what in self.alarms]
         return [*text, *(f"{what[0].upper()}{what[1:]}." for _, what in self.notices)]
@@ -176,7 +185,7 @@ def page(record: Record, name: str, folder: Path) -> Page:
     """Return the page of a record, with the name of its data, of an update in a directory."""
     numbers = [
         Number(str(len(record.rows)), "measurements learnt"),
-        Number(f"{record.mean('error'):.3g}{record.unit}", "mean error before each was learnt"),
+        Number(record.with_unit(record.mean("error")), "mean error before each was learnt"),
         Number(str(len(record.alarms)), "changes detected"),
     ]
     if math.isfinite(covered := record.mean("covered")):
@@ -193,7 +202,7 @@ def page(record: Record, name: str, folder: Path) -> Page:
         ]
         for i in order
     ]
-    columns = ["measurement", "x [m]", "y [m]", "z [m]", f"error{record.unit}", "innovation"]
+    columns = ["measurement", "x [m]", "y [m]", "z [m]", record.error_label, "innovation"]
     table = Table(columns, cells, "Measurements with the largest innovations.")
     return Page(f"Update: {name}", summary, [Section("Surprising measurements", [], [table], [map_plot(record)])])
 
@@ -206,7 +215,7 @@ def error_plot(record: Record) -> Plot:
     axes.plot(running, color=BLUE)
     for number, _ in record.alarms:
         axes.axvline(number, color=RED, linewidth=1)
-    axes.set(xlabel="measurement", ylabel=f"error{record.unit}", ylim=(0, None))
+    axes.set(xlabel="measurement", ylabel=record.error_label, ylim=(0, None))
     caption = f"Error of each measurement before it was learnt, mean of the last {WINDOW} (blue), and alarms (red)."
     return Plot("error", [figure], caption, DataFrame({"error": error, "running_error": running}))
 

@@ -139,8 +139,8 @@ def _write_config(config: UpdateConfig, folder: Path) -> None:
 
 
 def _unit(model: FieldModel | RssiModel) -> str:
-    """Return the unit of the errors of a model, in brackets."""
-    return " [dB]" if isinstance(model, RssiModel) else ""
+    """Return the unit of the errors of a model."""
+    return "dB" if isinstance(model, RssiModel) else ""
 
 
 def _model(path: str) -> FieldModel | RssiModel:

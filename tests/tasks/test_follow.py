@@ -364,9 +364,9 @@ def test_names_of_public_data_sets_are_sources(model, tmp_path, monkeypatch, cap
 
 def test_a_line_costs_the_same_in_a_long_record():
     step = Follower(rssi_model()).step(floor().subset(torch.tensor([40])))
-    first = Record("source", " [dB]")
+    first = Record("source", "dB")
     first.add(0, step)
-    record = Record("source", " [dB]", first.rows * 100_000)
+    record = Record("source", "dB", first.rows * 100_000)
     begin = time.process_time()
     for _ in range(10):
         record.add(1, step)

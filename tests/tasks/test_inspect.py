@@ -38,6 +38,7 @@ def test_snapshots(tmp_path, capsys):
     assert "needs no calibration" in text
     html = (tmp_path / "page" / "report.html").read_text()
     assert html.count("<figcaption>") == 3
+    assert "source --grid 24 96" in html  # the next command reads the files in the same way
     assert all(finding["text"][:20] in html for finding in content["findings"])
 
 

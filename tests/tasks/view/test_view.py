@@ -457,7 +457,7 @@ def test_a_dropped_floor_plan_lies_at_its_scale_and_origin_and_stays(rssi_run, t
 
 def test_a_followed_run_is_read_again_when_it_grows(tmp_path):
     data = rssi_room(n=70)
-    follower, record = Follower(RssiModel().fit(data.subset(torch.arange(60)))), Record("source", " [dB]")
+    follower, record = Follower(RssiModel().fit(data.subset(torch.arange(60)))), Record("source", "dB")
     (tmp_path / "config.json").write_text(json.dumps({"task": "update"}))
     with pytest.raises(InputError, match="no record"):
         open_source(tmp_path)

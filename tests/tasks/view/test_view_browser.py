@@ -245,7 +245,7 @@ def test_page_of_rssi(browser, serve, rssi_run, tmp_path):
 def test_page_of_a_followed_run_grows_without_reloading(browser, serve, tmp_path):
     data, folder = rssi_room(n=70), tmp_path / "live"
     folder.mkdir()
-    follower, record = Follower(RssiModel().fit(data.subset(torch.arange(60)))), Record("source", " [dB]")
+    follower, record = Follower(RssiModel().fit(data.subset(torch.arange(60)))), Record("source", "dB")
     (folder / "config.json").write_text('{"task": "update"}')
     record.write(folder)
 
