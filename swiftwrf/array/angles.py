@@ -190,6 +190,42 @@ class ArrayPose:
                 f"length {length:.4g}; divide it by its length"
             )
 
+    @classmethod
+    def facing(
+        cls,
+        position: tuple[float, float, float],
+        normal: tuple[float, float, float],
+        up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    ) -> ArrayPose:
+        """Return the pose of an array by the direction that it faces.
+
+        Args:
+            position: Position of the array's reference point, 3 numbers [m].
+            normal: Normal of the array in the world, of any length.
+            up: World direction that the y axis of the array is closest to.
+
+        Raises:
+            InputError: A normal without length, one along `up`, or a number that is not finite.
+
+        Example:
+            >>> ArrayPose.facing((0.1, 2.4, 1.2), normal=(1, 0, 0)).rotation[:, 1].abs().round().tolist()
+            [0.0, 0.0, 1.0]
+        """
+        z, y = (
+            to_tensor(f"the array's {name}", axis, torch.float64, (3,))
+            for name, axis in (("normal", normal), ("up", up))
+        )
+        z = z / z.norm()
+        y = y / y.norm() - (y / y.norm() @ z) * z
+        if not float(y.norm()) > 1e-3:
+            raise InputError(
+                f"the array's normal {list(normal)} has no length or lies along up {list(up)}; give as up the direction of the "
+                "array's y axis"
+            )
+        y = y / y.norm()
+        matrix = torch.stack([torch.linalg.cross(y, z), y, z], dim=1)
+        return cls(position, tuple(Rotation.from_matrix(matrix.numpy()).as_quat().tolist()))
+
     @cached_property
     @torch.inference_mode(False)
     def rotation(self) -> Tensor:

@@ -29,7 +29,7 @@ from swiftwrf.data.cells import column_of_numbers, text_of
 from swiftwrf.data.columns import column_of
 from swiftwrf.data.files import read_bytes, read_table, read_yaml
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
-from swiftwrf.data.formats.snapshots import array_of, snapshots_of
+from swiftwrf.data.formats.snapshots import POSE, array_of, snapshots_of
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.errors import InputError, listed, optional_module, ranges
 
@@ -38,7 +38,7 @@ NEEDED = (
     f"captures need, in their folder, {POSITIONS} (file,x,y,z: a row per capture) and {DESCRIPTION} (array_position, "
     "array_orientation, frequency_hz, and rows, columns and spacing_m or element_position)"
 )
-GIVEN = ("frequency_hz", "array_position", "array_orientation")
+GIVEN = ("frequency_hz", "array_position")
 OFFSETS = "phases of the receiver's chains are as measured; they contain constant offsets unless these were corrected"
 MAX_PACKETS = 32  # used of each capture, evenly spaced
 Channel = NDArray[np.complex128]
@@ -227,7 +227,7 @@ def _read_description(file: Path) -> Arrays:
     if missing:
         raise InputError(f"{file} lacks {', '.join(missing)}: {NEEDED}")
     arrays = {}
-    for name in (*GIVEN, "rows", "columns", "spacing_m", "element_position"):
+    for name in (*GIVEN, *POSE, "rows", "columns", "spacing_m", "element_position"):
         if name in content:
             try:
                 arrays[name] = np.array(content[name], dtype=np.float64)

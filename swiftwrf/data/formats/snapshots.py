@@ -19,10 +19,11 @@ from swiftwrf.data.splits import read_splits
 from swiftwrf.errors import InputError
 from swiftwrf.positions import check_positions, to_tensor
 
-REQUIRED_ARRAYS = ("csi", "position", "frequency_hz", "array_position", "array_orientation")
-OPTIONAL = ("element_position", "rows", "columns", "spacing_m", "line_of_sight", "time")
+REQUIRED_ARRAYS = ("csi", "position", "frequency_hz", "array_position")
+POSE = ("array_orientation", "array_normal", "array_up")  # the first, or the others
+OPTIONAL = (*POSE, "element_position", "rows", "columns", "spacing_m", "line_of_sight", "time")
 SCALARS = ("frequency_hz", "rows", "columns", "spacing_m")
-VECTORS = ("array_position", "array_orientation", "line_of_sight", "time", "frequency_hz")
+VECTORS = ("array_position", *POSE, "line_of_sight", "time", "frequency_hz")
 
 
 @SNAPSHOT_FORMATS.register("snapshots")
@@ -168,19 +169,26 @@ def _scaled(file: Path, channel: Tensor) -> Tensor:
 
 
 def _pose(file: Path, arrays: Arrays) -> ArrayPose:
-    position, orientation = arrays["array_position"], arrays["array_orientation"]
+    position = arrays["array_position"]
+    if "array_orientation" not in arrays and "array_normal" not in arrays:
+        raise InputError(f"{file} lacks array_orientation; give that unit quaternion, or array_normal and array_up")
+    orientation = arrays.get("array_orientation", arrays.get("array_normal"))
+    assert orientation is not None
     if position.ndim == 2 or orientation.ndim == 2:
         raise InputError(
             f"{file}: array_position and array_orientation have shapes {position.shape} and {orientation.shape}, as of an "
             "array that moves; the array must rest while the transmitter moves, so give its one position (3) and "
             "quaternion (4)"
         )
-    if orientation.shape == (3,):
+    if "array_orientation" in arrays and orientation.shape == (3,):
         raise InputError(
             f"{file}: array_orientation has 3 numbers; Euler angles leave their order open, so give the unit quaternion "
             "(x, y, z, w) that turns array into world coordinates"
         )
     try:
+        if "array_orientation" not in arrays:
+            up = arrays.get("array_up", np.array([0.0, 0.0, 1.0]))
+            return ArrayPose.facing(tuple(position.tolist()), tuple(orientation.tolist()), tuple(up.tolist()))
         return ArrayPose(tuple(position.flatten().tolist()), tuple(orientation.flatten().tolist()))
     except InputError as error:
         raise InputError(f"{file}: {error}") from None

@@ -102,6 +102,17 @@ REFUSED = {
 }
 
 
+def test_an_array_is_turned_by_its_normal_and_its_upper_side(tmp_path):
+    data = snapshots()
+    side, up, normal = data.rotation.T.numpy()
+    given = {"array_orientation": None, "array_normal": 3 * normal, "array_up": up + normal}
+    found = load_snapshots(write_snapshots(tmp_path / "a", **given))
+    torch.testing.assert_close(found.rotation, data.rotation)
+    for wrong in (given | {"array_up": normal}, given | {"array_normal": 0 * side}):
+        with pytest.raises(InputError, match="along up"):
+            load_snapshots(write_snapshots(tmp_path / "b", **wrong))
+
+
 @pytest.mark.parametrize("name", REFUSED)
 def test_refuses(tmp_path, name):
     changes, says = REFUSED[name]
