@@ -219,8 +219,8 @@ class ArrayPose:
         y = y / y.norm() - (y / y.norm() @ z) * z
         if not float(y.norm()) > 1e-3:
             raise InputError(
-                f"the array's normal {list(normal)} has no length or lies along up {list(up)}; give as up the direction of the "
-                "array's y axis"
+                f"the array's normal {list(normal)} has no length or lies along up {list(up)}; give as up the direction of "
+                "the array's y axis"
             )
         y = y / y.norm()
         matrix = torch.stack([torch.linalg.cross(y, z), y, z], dim=1)

@@ -56,7 +56,7 @@ COST, TIE = 0.03, 0.03  # of a fitted parameter; difference of errors that are n
 MIN_POWER = 0.05  # of an error, above the declared frame, in the fraction of the power
 MIN_EXPLAINED = 0.5  # agreement of an error
 # fraction of the power in the best directions that an error must explain, without and with fitted parameters
-MIN_REACHED, MIN_REACHED_FITTED = 0.8, 0.87
+MIN_REACHED, MIN_REACHED_FITTED = 0.8, 0.9
 REACH_GRID = AngularGrid.hemisphere(30, 120)
 MAX_ELSEWHERE = 0.3  # of the positions, whose peak is elsewhere, in one frame
 UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
