@@ -16,6 +16,7 @@ from tasks import labels
 from tasks.answer import NextStep
 from tasks.aoa.records import CHOSEN, LOWER_REFERENCE, UPPER_REFERENCE
 from tasks.aoa.synthesis import SCALES, spectra
+from tasks.configs import InspectConfig
 from tasks.inspect import page as inspection
 from tasks.locate.page import posteriors
 from tasks.page import figures
@@ -157,7 +158,7 @@ def test_figures_of_constant_empty_and_single_values(values):
         room = Spectra(torch.full((n, 9, 36), 0.5), position, grid=AngularGrid.hemisphere(9, 36))
         rssi = Rssi(torch.full((n, 1), -60.0), position, receiver_position=position[:1])
         for data in (room, rssi):
-            found = inspection(Findings(data), "toys", "source")
+            found = inspection(Findings(data), "toys", InspectConfig("source"))
             drawn += [panel for plot in [*found.summary.plots, *found.sections[1].plots] for panel in plot.panels]
         colour_image(values[None], "viridis", values.min(), values.max())
     assert all(figures.as_svg(figure).endswith("</svg>\n") for figure in drawn)
