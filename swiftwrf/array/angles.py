@@ -215,8 +215,8 @@ class ArrayPose:
             to_tensor(f"the array's {name}", axis, torch.float64, (3,))
             for name, axis in (("normal", normal), ("up", up))
         )
-        z = z / z.norm()
-        y = y / y.norm() - (y / y.norm() @ z) * z
+        z, y = z / z.norm(), y / y.norm()
+        y = y - (y @ z) * z
         if not float(y.norm()) > 1e-3:
             raise InputError(
                 f"the array's normal {list(normal)} has no length or lies along up {list(up)}; give as up the direction of "

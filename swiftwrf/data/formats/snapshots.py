@@ -169,27 +169,26 @@ def _scaled(file: Path, channel: Tensor) -> Tensor:
 
 
 def _pose(file: Path, arrays: Arrays) -> ArrayPose:
-    position = arrays["array_position"]
-    if "array_orientation" not in arrays and "array_normal" not in arrays:
+    stated = next((name for name in POSE[:2] if name in arrays), None)
+    if stated is None:
         raise InputError(f"{file} lacks array_orientation; give that unit quaternion, or array_normal and array_up")
-    orientation = arrays.get("array_orientation", arrays.get("array_normal"))
-    assert orientation is not None
+    position, orientation = arrays["array_position"], arrays[stated]
     if position.ndim == 2 or orientation.ndim == 2:
         raise InputError(
             f"{file}: array_position and array_orientation have shapes {position.shape} and {orientation.shape}, as of an "
             "array that moves; the array must rest while the transmitter moves, so give its one position (3) and "
             "quaternion (4)"
         )
-    if "array_orientation" in arrays and orientation.shape == (3,):
+    if stated == "array_orientation" and orientation.shape == (3,):
         raise InputError(
             f"{file}: array_orientation has 3 numbers; Euler angles leave their order open, so give the unit quaternion "
             "(x, y, z, w) that turns array into world coordinates"
         )
     try:
-        if "array_orientation" not in arrays:
-            up = arrays.get("array_up", np.array([0.0, 0.0, 1.0]))
-            return ArrayPose.facing(tuple(position.tolist()), tuple(orientation.tolist()), tuple(up.tolist()))
-        return ArrayPose(tuple(position.flatten().tolist()), tuple(orientation.flatten().tolist()))
+        where, turned = (tuple(values.flatten().tolist()) for values in (position, orientation))
+        if stated == "array_orientation":
+            return ArrayPose(where, turned)
+        return ArrayPose.facing(where, turned, tuple(arrays.get("array_up", np.eye(3)[2]).flatten().tolist()))
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
 

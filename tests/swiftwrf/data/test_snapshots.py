@@ -82,6 +82,7 @@ REFUSED = {
     "no csi": ({"csi": None}, "lacks csi"),
     "no pose": ({"array_orientation": None}, "lacks array_orientation"),
     "Euler angles": ({"array_orientation": np.zeros(3)}, "Euler angles"),
+    "a normal of one number": ({"array_orientation": None, "array_normal": 1.0}, "the array's normal"),
     "no unit quaternion": ({"array_orientation": np.ones(4)}, "unit quaternion"),
     "flat positions": ({"position": np.zeros((120, 2))}, r"shape \(n, 3\)"),
     "at the array": ({"position": np.tile([0.2, 2.4, 1.2], (120, 1))}, "equal to array_position"),
