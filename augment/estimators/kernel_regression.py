@@ -88,9 +88,8 @@ class NadarayaWatson:
     def state(self) -> tuple[dict[str, Tensor], Header]:
         """Return tensors in single precision, and plain values."""
         arrays = {"known": self.known, "dual": self.dual}
-        return {name: torch.from_numpy(array.astype(np.float32)) for name, array in arrays.items()}, {
-            "gamma": self.gamma
-        }
+        tensors = {name: torch.from_numpy(array.astype(np.float32)) for name, array in arrays.items()}
+        return tensors, {"gamma": self.gamma}
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header, features: int, values: int) -> NadarayaWatson:

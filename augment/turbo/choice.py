@@ -56,9 +56,7 @@ class CrossValidation(Step[Experiment]):
     """Compare field models on held-out measured spectra, and determine whether turbo learning helps."""
 
     subset: MeasuredSubset  # measured spectra
-    compared: tuple[
-        str, ...
-    ]  # names of the field models. Empty for all that are fast and whose requirements the data meet
+    compared: tuple[str, ...]  # field models; empty for all that are fast and whose requirements the data meet
 
     title = "comparing field models"
 

@@ -125,10 +125,12 @@ class Monitor:
         reference = None
         if isinstance(train, Spectra):
             model.check_measurements(train)
-            reference = score(model, train).innovation[:, 0]
             if isinstance(model, ProcessModel):  # it can forget spectra: each fifth is predicted without itself
-                for rows in torch.randperm(len(train), generator=torch.Generator().manual_seed(0)).chunk(N_FOLDS):
-                    reference[rows] = score(model.forget(rows), train.subset(rows)).innovation[:, 0]
+                order = torch.randperm(len(train), generator=torch.Generator().manual_seed(0))
+                parts = [score(model.forget(rows), train.subset(rows)) for rows in order.chunk(N_FOLDS)]
+                reference = torch.cat([part.innovation[:, 0] for part in parts])[order.argsort()]
+            else:
+                reference = score(model, train).innovation[:, 0]
         return cls(model.region(), (), reference, false_alarm_rate)
 
     def observe(self, position: Tensor, innovation: Tensor) -> list[Alarm]:

@@ -167,9 +167,8 @@ def estimate_offsets(train: Rssi, reference: str | None = None) -> Offsets:
         right += member[rows].T @ weight @ rssi[rows]
         total += float(rssi[rows] @ weight @ rssi[rows])
     others = torch.tensor([name != chosen for name in names])
-    precision = (
-        normal[others][:, others] + 0.05 * torch.eye(int(others.sum())).double()
-    )  # a standard deviation of 10 dB
+    prior = 0.05 * torch.eye(int(others.sum()), dtype=torch.float64)  # a standard deviation of 10 dB
+    precision = normal[others][:, others] + prior
     offset = torch.zeros(len(names), dtype=torch.float64)
     offset[others] = torch.linalg.solve(precision, right[others])
     explained = float(right @ offset) / total if total > 0 else 0.0

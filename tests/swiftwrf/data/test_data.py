@@ -220,7 +220,7 @@ def folder(tmp_path):
     return write_nerf2_rssi(tmp_path, "a,b,c", "a: [0, 0, 1]\nb: [5, 0, 1]\nc: [0, 5, 1]\n", rows)
 
 
-def test_reads_and_marks_what_was_not_heard(folder):
+def test_reads_and_marks_what_was_not_detected(folder):
     data = load_rssi(folder)
     assert data.receiver_names == ("a", "b", "c")
     assert data.rssi_dbm[0, :2].tolist() == [-50, -60]
@@ -284,13 +284,13 @@ def test_refuses_rssi(folder, name):
 def test_room_is_seeded_and_looks_like_ble():
     a, b = rssi_room(n=80, seed=1), rssi_room(n=80, seed=1)
     assert torch.equal(a.rssi_dbm.nan_to_num(), b.rssi_dbm.nan_to_num())
-    heard = ~a.rssi_dbm.isnan()
-    assert 0.05 < 1 - heard.double().mean() < 0.4
-    assert a.rssi_dbm[heard].min() > -105
-    assert a.rssi_dbm[heard].max() < -20
-    distance = torch.cdist(a.transmitter_position, a.receiver_position)[heard]
+    detected = ~a.rssi_dbm.isnan()
+    assert 0.05 < 1 - detected.double().mean() < 0.4
+    assert a.rssi_dbm[detected].min() > -105
+    assert a.rssi_dbm[detected].max() < -20
+    distance = torch.cdist(a.transmitter_position, a.receiver_position)[detected]
     near = distance < 4
-    assert a.rssi_dbm[heard][near].median() > a.rssi_dbm[heard][distance > 12].median() + 8
+    assert a.rssi_dbm[detected][near].median() > a.rssi_dbm[detected][distance > 12].median() + 8
 
 
 @pytest.mark.data
