@@ -16,7 +16,7 @@ from swiftwrf.data.files import check_carrier, digests
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
 from swiftwrf.data.snapshots import Snapshots, check_spacing, measured, round_trip_array
 from swiftwrf.data.splits import read_splits
-from swiftwrf.errors import InputError
+from swiftwrf.errors import InputError, listed
 from swiftwrf.positions import check_positions, to_tensor
 
 REQUIRED_ARRAYS = ("csi", "position", "frequency_hz", "array_position")
@@ -30,15 +30,19 @@ VECTORS = ("array_position", *POSE, "line_of_sight", "time", "frequency_hz")
 class SnapshotArrays(Format[Snapshots]):
     """Arrays by name, one row a position of the transmitter."""
 
-    takes = frozenset({"beamformer", "grid", "every", "drop_null", "drop_elements", "round_trip"})
+    takes = frozenset({"arrays", "beamformer", "grid", "every", "drop_null", "drop_elements", "round_trip"})
 
     def recognises(self, path: Path) -> bool:
         return _file(path) is not None
 
     def read(self, path: Path, options: ReadOptions) -> Snapshots:
-        file = _file(path)
-        assert file is not None
-        arrays = read_arrays(file, REQUIRED_ARRAYS, OPTIONAL)
+        file, stated = _file(path) or path, options.arrays or {}
+        name = {array: stated.get(array, array) for array in (*REQUIRED_ARRAYS, *OPTIONAL)}
+        if file.is_dir() or stated.keys() - name.keys():
+            raise InputError(f"arrays takes {', '.join(name)} of a file that is named, got {listed(stated)} of {file}")
+        needed = [name[array] for array in dict.fromkeys((*REQUIRED_ARRAYS, *stated))]
+        found = read_arrays(file, needed, [name[array] for array in OPTIONAL if array not in stated])
+        arrays = {array: found[own] for array, own in name.items() if own in found}
         return snapshots_of(file, arrays, options, [file], file.stem if file.stem != "snapshots" else None)
 
 
