@@ -47,7 +47,13 @@ class SnapshotArrays(Format[Snapshots]):
 
 
 def snapshots_of(
-    source: Path, arrays: Arrays, options: ReadOptions, files: list[Path], name: str | None, notes: tuple[str, ...] = ()
+    source: Path,
+    arrays: Arrays,
+    options: ReadOptions,
+    files: list[Path],
+    name: str | None,
+    notes: tuple[str, ...] = (),
+    index: list[int] | None = None,
 ) -> Snapshots:
     """Return the snapshots in arrays of the names of snapshots.npz.
 
@@ -58,6 +64,7 @@ def snapshots_of(
         files: Files that were read, in the folder of the splits.
         name: Name of the data set. Defaults to that of the folder.
         notes: What the user has to know about the arrays.
+        index: Numbers of the measurements, if the arrays hold some of them.
     """
     # scalars and vectors as such, which MATLAB stores as matrices
     vectors = {name: arrays[name] for name in VECTORS if name in arrays and arrays[name].ndim == 2}
@@ -70,6 +77,7 @@ def snapshots_of(
         arrays |= {"frequency_hz": given.mean()}
     position, array = check_positions(arrays["position"], f"{source}: position"), array_of(source, arrays)
     n, folder, pose = len(position), files[0].parent, _pose(source, arrays)
+    is_whole = index is None and options.every in (None, 1)
     raw = _channel(source, arrays["csi"], n, len(array.element))
     channel, kept, elements, missing = measured(source, raw, options.drop_null, options.drop_elements)
     channel, array = _scaled(source, channel), array.subset(elements)
@@ -85,14 +93,15 @@ def snapshots_of(
         array=array,
         pose=pose,
         name=name or folder.resolve().name,
-        named_splits=read_splits(folder, n, first=1) if options.every in (None, 1) else None,
+        index=index,
+        named_splits=read_splits(folder, n, first=1) if is_whole else None,
         source=digests(files, folder),
         line_of_sight=arrays.get("line_of_sight"),
         time=arrays.get("time"),
         frequency_hz=frequency,
         notes=(*notes, *reversed_axes, *polarisations, *missing, *turned),
     )
-    return data if options.every in (None, 1) else data.subset(torch.arange(0, n, options.every))
+    return data if is_whole or index is not None else data.subset(torch.arange(0, n, options.every))
 
 
 def _file(path: Path) -> Path | None:
