@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -78,7 +79,7 @@ def snapshots_of(
     if given.ndim == 1 and arrays["csi"].ndim == 3:
         arrays |= {"frequency_hz": given.mean()}
     position, array = check_positions(arrays["position"], f"{source}: position"), array_of(source, arrays)
-    n, folder, pose = len(position), files[0].parent, _pose(source, arrays)
+    n, folder, pose = len(position), files[0].parent, pose_of(source, arrays)
     is_whole = index is None and options.every in (None, 1)
     raw = _channel(source, arrays["csi"], n, len(array.element))
     channel, kept, elements, missing = measured(source, raw, options.drop_null, options.drop_elements)
@@ -248,7 +249,20 @@ def _scaled(file: Path, channel: Tensor) -> Tensor:
     return (channel / power.sqrt()).to(torch.complex64)
 
 
-def _pose(file: Path, arrays: Arrays) -> ArrayPose:
+def described_arrays(file: Path, content: Mapping[str, Any]) -> Arrays:
+    """Return the arrays of snapshots.npz that describe the array of antennas, from the texts of a YAML mapping."""
+    arrays = {}
+    for name in ("frequency_hz", "array_position", *POSE, "rows", "columns", "spacing_m", "element_position"):
+        if name in content:
+            try:
+                arrays[name] = np.array(content[name], dtype=np.float64)
+            except (TypeError, ValueError):
+                raise InputError(f"{file}: {name} must be a number or lists of numbers of one length") from None
+    return arrays
+
+
+def pose_of(file: Path, arrays: Arrays) -> ArrayPose:
+    """Return the pose of the array, by its orientation or by its normal and upper side."""
     stated = next((name for name in POSE[:2] if name in arrays), None)
     if stated is None:
         raise InputError(f"{file} lacks array_orientation; give that unit quaternion, or array_normal and array_up")
