@@ -10,7 +10,7 @@ from rooms import ARRAY, GRID, built_in_walls, mirror_room
 from small import GLANCE
 from threadpoolctl import ThreadpoolController
 
-from swiftwrf import AngularGrid, InputError, load, simulated_room
+from swiftwrf import AngularGrid, InputError, simulated_room
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.store import Store
 from swiftwrf.gp import GaussianProcess, Kernel
@@ -33,7 +33,6 @@ from swiftwrf.models.geometry.planes import image_jacobian, phase_jacobian, refi
 from swiftwrf.models.geometry.search import SIGNS, SteeringResponses
 from swiftwrf.models.geometry.uncertainty import _AlternativeTable, phase_alternatives
 from swiftwrf.models.neighbours import NearestModel
-from swiftwrf.runtime.checkpoint import write
 
 QUICK = GeometryConfig(search_distance_m=2.0, beam_width=2)
 SIX = {(-1, 0, 0): 0.0, (1, 0, 0): 5.0, (0, -1, 0): 0.0, (0, 1, 0): 4.0, (0, 0, -1): 0.0, (0, 0, 1): 2.8}
@@ -533,49 +532,6 @@ def test_room_predicts_any_grid(noisy, room):
     """On a grid twice as fine every second pixel is the same."""
     fine = room.synthesize(noisy.position[:3], AngularGrid.hemisphere(20, 80))
     torch.testing.assert_close(fine[:, 1::2, ::2], room.synthesize(noisy.position[:3]))
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        *("covariance", "position", "coefficient", "component", "path_gains.coefficient"),
-        *({"mixing_weight": "x"}, {"order": 9}, {"planes": [{"normal": [1]}]}),
-    ],
-    ids=str,
-)
-def test_tensors_of_wrong_sizes_and_headers_of_wrong_values_are_refused(hybrid, change, tmp_path):
-    """Also tensors that only `predict` would need."""
-    known, kernel = hybrid.process.known.clone(), hybrid.process.kernel
-    some = PathGains(GaussianProcess(kernel, known, torch.zeros(len(known), 2 * 25 * 2)), 25)
-    tensors, header = with_path_gains(hybrid, some).state()
-    HybridModel.from_state(tensors, header)
-    if isinstance(change, str):
-        tensors = tensors | {change: tensors[change][:-1]}
-    else:
-        header = header | change
-    write(tmp_path / "model", HybridModel.kind, tensors, header)
-    with pytest.raises(InputError):
-        load(tmp_path / "model")
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"moving": "nothing"},
-        {"fixed_position": [0.0, 1.0]},
-        {"fixed_position": None},
-        {"rotation": [[1.0, 0.0, 0.0]]},
-        {"rotation": None},
-        {"array": {"element": [[0.0], [1.0]], "wavelength": 0.1}},
-        {"array": {"element": [[0.0, 0.0]], "wavelength": float("nan")}},
-        {"array": None},
-    ],
-)
-def test_a_link_that_cannot_be_used_is_refused(room, change, tmp_path):
-    tensors, header = room.state()
-    write(tmp_path / "model", GeometryModel.kind, tensors, header | {"link": header["link"] | change})
-    with pytest.raises(InputError, match="geometry model that can be used"):
-        load(tmp_path / "model")
 
 
 @pytest.mark.parametrize(
