@@ -10,7 +10,7 @@ import pytest
 import quick
 import torch
 from quick import said
-from small import glances
+from small import FLOOR, known_planes
 
 from swiftwrf import AngularGrid, InputError, load, rssi_room, simulated_room
 from swiftwrf.data import ReadOptions
@@ -48,7 +48,7 @@ def matched(tmp_path_factory):
     """Spectra of the built-in room, and the file of a coarse locator that was fitted to them."""
     data = simulated_room(n=40, grid=GRID)
     file = tmp_path_factory.mktemp("matched") / "matched.safetensors"
-    with glances():
+    with known_planes(FLOOR):
         MatchedField(max_cells=200, n_best=20, n_background=10, n_rounds=1).fit(data).save(file)
     return data, file
 
