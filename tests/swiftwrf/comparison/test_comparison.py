@@ -338,11 +338,3 @@ def test_one_field_for_all_receivers(tmp_path):
     transmitter, receiver = ((at - centre).float() for at in (position[7:8], train.receiver_position[2:]))
     signal = received(model.field, config.reach, config.samples, transmitter, receiver, rays).mean(dim=1)
     torch.testing.assert_close(predicted[7, 2].float(), 100 * (torch.hypot(*signal) - 1))
-
-
-@pytest.mark.parametrize("name", ["nerf2", "wrfgs"])
-def test_any_resolution(room, name):
-    """Every other pixel of the doubled grid is one of the grid."""
-    model = fit(room, name)
-    coarse, fine = (model.synthesize(room.position[:3], grid) for grid in (None, AngularGrid.hemisphere(30, 120)))
-    torch.testing.assert_close(fine[:, 1::2, ::2], coarse, atol=1e-5, rtol=1e-4)

@@ -180,9 +180,8 @@ def test_rooms_are_refined_together_as_one_by_one():
     [
         ({(1, 0, 0): 4.6}, -0.7, "receiver"),
         ({(1, 0, 0): 4.6, (0, 0, -1): 0.0}, 0.8, "transmitter"),
-        (SIX, (-0.6, -0.6, -0.6, -0.6, 0.4, 0.4), "receiver"),
     ],
-    ids=["one", "two", "six, floor and ceiling of the other sign"],
+    ids=["one", "two"],
 )
 def test_rooms_without_noise_are_found_to_a_millimetre(planes, gain, moving):
     model = fit(mirror_room(planes, gain, moving, n=40))
@@ -259,7 +258,7 @@ def test_scores_of_combinations_are_those_of_their_rooms():
 
 @pytest.mark.long
 def test_a_tilted_plane_is_found_to_a_millimetre():
-    model = fit(mirror_room({(0.8, 0.5, 0.1): 5.0}, -0.7, n=40), search_distance_m=0.5, beam_width=1, max_order=1)
+    model = fit(mirror_room({(0.8, 0.5, 0.1): 5.0}, -0.7, n=25), search_distance_m=0.5, beam_width=1, max_order=1)
     assert len(model.planes) == 1
     assert errors(model, {(0.8, 0.5, 0.1): 5.0})[0][0] < 1
     torch.testing.assert_close(
@@ -285,10 +284,13 @@ def test_nothing_to_find_is_no_plane():
     assert len(model.image_sources()[0]) == 1
 
 
-def test_noise_stays_within_the_deviations(noisy):
-    room = fit(noisy)
+def test_noise_stays_within_the_deviations():
+    """Also where floor and ceiling have gains of the other sign."""
+    gain = (-0.6, -0.6, -0.6, -0.6, 0.4, 0.4)
+    room = fit(mirror_room(SIX, gain, noise=0.1))
     assert len(room.planes) == 6
     assert all(error < 4 * std and error < 20 for error, std in errors(room, SIX))
+    assert sorted(plane.gain for plane in room.planes) == pytest.approx(sorted(gain), abs=0.1)
 
 
 def test_positions_in_a_plane_leave_no_plane_certain():
@@ -311,18 +313,9 @@ def test_pure_noise_has_no_certain_plane():
     assert not any(p.certain for p in model.planes)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"array": None}, "needs the array, which"),
-        ({"rotation": None}, "needs the fixed end"),
-        ({"fixed_position": None}, "fixed end"),
-        ({"array": PlanarArray.square(4, 915e6, spacing=0.11)}, "check its geometry and carrier"),
-    ],
-)
-def test_refusals_say_what_is_missing(change, message):
-    with pytest.raises(InputError, match=message):
-        fit(replace(mirror_room(SIX, n=12), **change))
+def test_an_array_that_does_not_produce_the_spectra_is_refused():
+    with pytest.raises(InputError, match="check its geometry and carrier"):
+        fit(replace(mirror_room(SIX, n=12), array=PlanarArray.square(4, 915e6, spacing=0.11)))
 
 
 @pytest.mark.usefixtures("short_searches")
@@ -526,12 +519,6 @@ def test_spectra_are_differentiable_in_the_position_of_a_receiver():
             step[axis] = 1e-4
             ends = [(model.synthesize(position + sign * step) * weight).sum((1, 2)) for sign in (1, -1)]
             torch.testing.assert_close(at.grad[:, axis], (ends[0] - ends[1]) / 2e-4, rtol=0.02, atol=1.0)
-
-
-def test_room_predicts_any_grid(noisy, room):
-    """On a grid twice as fine every second pixel is the same."""
-    fine = room.synthesize(noisy.position[:3], AngularGrid.hemisphere(20, 80))
-    torch.testing.assert_close(fine[:, 1::2, ::2], room.synthesize(noisy.position[:3]))
 
 
 @pytest.mark.parametrize(
