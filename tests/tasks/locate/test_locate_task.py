@@ -18,7 +18,6 @@ from swiftwrf.data.writing import write_spectra
 from swiftwrf.locate import MatchedField
 from swiftwrf.locate.baselines import LEVELS, LOCALIZERS, RegressedCoordinates
 from swiftwrf.locate.comparison import LocateSplit, Trial, compare
-from tasks.labels import LOCALIZERS as LABELS
 from tasks.predict import read_rssi
 from tasks.records import LOCATOR as MODEL
 from tasks.source import aligned
@@ -63,13 +62,6 @@ def test_a_comparison_without_a_folder_has_the_errors_of_the_command(locate_run)
     assert {str(level): fraction for level, fraction in result.coverage.items()} == pytest.approx(
         metrics["calibration"]
     )
-
-
-def test_localizers_describe_themselves():
-    assert list(LOCALIZERS) == ["posterior", "knn", "knn_difference", "nearest", "gp", "mean"]
-    for name in LOCALIZERS:
-        assert LOCALIZERS.summary(name)
-        assert LABELS[name].colour
 
 
 @pytest.mark.parametrize("name", [name for name in LOCALIZERS if name != "posterior"])
