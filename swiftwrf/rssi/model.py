@@ -179,7 +179,7 @@ class RssiModel(SavedRssiPredictor):
         if self.detection is not None:
             level = found["held_out"].T.where(~found["held_out"].T.isnan(), training.baseline_held_out[0])
             seen = ~training.rssi.isnan()
-            bins = training.position, seen, training.fold, level
+            bins = training.position, seen, training.fold, level + training.shift
             self.detection_field = DetectionField.fit(training.kernel, *bins, self.detection.limit)
         rows = {name: found[name].T for name in ("dual", "tangent", "variance")}
         prior = {name: found[name] for name in ("prior_level", "prior_slope")}
@@ -313,8 +313,9 @@ class RssiModel(SavedRssiPredictor):
         if self.detection is None or self.detection_field is None:
             return prediction
         assert prediction.std is not None
-        mean, std = self.detection.given_detection(prediction.mean.double(), prediction.std.double())
-        return replace(prediction, mean=mean.float(), std=std.float())
+        offset = 0.0 if self.offsets is None else self.offsets.of(data)[:, None]
+        mean, std = self.detection.given_detection(prediction.mean.double() + offset, prediction.std.double())
+        return replace(prediction, mean=(mean - offset).float(), std=std.float())
 
     @checked
     def predict_detection(self, position: Numbers) -> Tensor:
@@ -420,6 +421,7 @@ def _held_out_predictors(training: RssiTraining, found: dict[str, Tensor]) -> tu
     prior_db, middle = (training.field_db, training.noise_db), training.path_loss.centre
     std = held_out_std(training, training.kernel, prior_db, middle, found["covariance"])
     if (detection := training.path_loss.detection) is not None:
-        given = [detection.given_detection(mean, std) for mean in predictors]
-        predictors, std = torch.stack([mean for mean, _ in given]), given[0][1].where(~field.isnan(), std)
+        given = [detection.given_detection(mean + training.shift, std) for mean in predictors]
+        predictors = torch.stack([mean for mean, _ in given]) - training.shift
+        std = given[0][1].where(~field.isnan(), std)
     return predictors, std

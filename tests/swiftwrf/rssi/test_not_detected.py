@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 
+import pandas as pd
 import pytest
 import torch
 
 from swiftwrf import Rssi, RssiModel, load, rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
+from swiftwrf.data.rssi import Offsets
 from swiftwrf.rssi import compare
 from swiftwrf.rssi.detection import Detection
 from swiftwrf.rssi.offsets import estimate_floor_attenuation
@@ -125,6 +127,19 @@ def test_a_saved_and_updated_model_keeps_its_detections(fitted, tmp_path):
         at = data.transmitter_position
         torch.testing.assert_close(again.predict_detection(at), one.predict_detection(at))
         torch.testing.assert_close(again.predict_detected(data).mean, one.predict_detected(data).mean)
+
+
+def test_the_limit_is_one_of_received_power_whatever_offset_is_removed(fitted):
+    """All rows are of a device that is 20 dB weaker than the reference; its limit of detection is what it receives."""
+    data, _, model = fitted
+    weak = replace(data, groups=pd.Series(["weak"] * len(data), name="phone"))
+    removed = Offsets("phone", "usual", {"usual": 0.0, "weak": -20.0}, 1.0).removed(weak)
+    found, at = RssiModel().fit(removed), data.transmitter_position
+    close = {"atol": 0.1, "rtol": 0}
+    torch.testing.assert_close(found.mixing_weight, model.mixing_weight, atol=0.01, rtol=0)
+    torch.testing.assert_close(found.predict(at).mean - 20, model.predict(at).mean, **close)
+    torch.testing.assert_close(found.predict_detected(removed).mean - 20, model.predict_detected(data).mean, **close)
+    torch.testing.assert_close(found.detection_field.weight, model.detection_field.weight, **close)
 
 
 @pytest.mark.parametrize("located", [True, False])

@@ -90,6 +90,7 @@ def training_of(data, n_primitives=50):
             detection=None,
             floor_db=torch.zeros(r).double(),
         ),
+        shift=torch.zeros(n, r).double(),
         limit=torch.full((n, r), torch.nan).double(),
         field_db=torch.full((r,), FIELD_DB, dtype=torch.float64),
         noise_db=torch.full((r,), NOISE_DB, dtype=torch.float64),
