@@ -243,8 +243,9 @@ class RssiModel(SavedRssiPredictor):
     def with_chosen_kernel(self, without: Tensor | None = None) -> Self:
         """Return the model fitted again to all rows that it has learnt, with kernel, noise and mixing weights chosen again.
 
-        The rows follow from their residuals. Attenuation of floors and offsets stay as fitted. Rows that were averaged in
-        location bins are bins here, so that the scatter of single measurements is unknown: standard deviations stay, too.
+        The rows follow from their residuals, the attenuation of floors is estimated again, and offsets stay as fitted. Rows
+        that were averaged in location bins are bins here, so that the scatter of single measurements is unknown: standard
+        deviations stay, too.
 
         Args:
             without: Numbers of rows that are forgotten first, in the order in which the model received them, int64. Defaults
@@ -264,17 +265,19 @@ class RssiModel(SavedRssiPredictor):
         kept = torch.ones(len(posterior.anchor), dtype=torch.bool)
         if without is not None:
             kept[without] = False
+        at, rssi, attenuation = self.region()[kept], posterior.rssi[kept], self.attenuation
         rows = Rssi(
-            posterior.rssi[kept],
-            self.region()[kept],
+            rssi if attenuation is None else rssi + attenuation.of(at),
+            at,
             receiver_position=self.receiver_position,
             receiver_names=self.receiver_names,
             origin=self.origin,
+            floors=None if attenuation is None else attenuation.floors,
         )
         # the rows have lost their sessions
         validation = "block" if self.config.validation == "session" else self.config.validation
         model = type(self)(replace(self.config, validation=validation)).fit(rows)
-        model.attenuation, model.offsets = self.attenuation, self.offsets
+        model.offsets = self.offsets
         state = posterior.state
         # a mean of several measurements has a smaller variance than one measurement
         if bool(((state.variance > 0) & (state.variance < 0.99 * state.noise_variance)).any()):

@@ -142,8 +142,7 @@ def test_the_limit_is_one_of_received_power_whatever_offset_is_removed(fitted):
     torch.testing.assert_close(found.detection_field.weight, model.detection_field.weight, **close)
 
 
-@pytest.mark.parametrize("located", [True, False])
-def test_the_attenuation_of_floors_counts_what_they_hide(located):
+def building(located):
     """14 dB a floor; two floors away hardly anything is received."""
     generator = torch.Generator().manual_seed(0)
     floor = torch.arange(240) % 3
@@ -158,8 +157,22 @@ def test_the_attenuation_of_floors_counts_what_they_hide(located):
     table = table.rename(columns={"x_m": "x", "y_m": "y", "z_m": "z"}).assign(floor=floor.numpy())
     places = dict(zip("abcd", receiver.tolist(), strict=True)) if located else None
     table[list("abcd")] = table[list("abcd")].where(table[list("abcd")] > LIMIT)
-    data = Rssi.from_frame(table.reset_index(drop=True), receiver_position=places)
-    assert estimate_floor_attenuation(data).db == pytest.approx(14, abs=3)
+    return Rssi.from_frame(table.reset_index(drop=True), receiver_position=places)
+
+
+@pytest.mark.parametrize("located", [True, False])
+def test_the_attenuation_of_floors_counts_what_they_hide(located):
+    assert estimate_floor_attenuation(building(located)).db == pytest.approx(14, abs=3)
+
+
+def test_another_kernel_keeps_the_limit_of_detection_of_a_building():
+    data = building(located=True)
+    model = RssiModel().fit(data)
+    found = model.with_chosen_kernel()
+    assert found.detection.limit == pytest.approx(model.detection.limit, abs=1)
+    at = data.transmitter_position
+    torch.testing.assert_close(found.predict(at).mean, model.predict(at).mean, atol=3, rtol=0)
+    assert ((found.predict_detection(at) > 0.5) == data.detected).double().mean() > 0.85
 
 
 def test_the_built_in_floor_misses_packets_at_random():
