@@ -9,8 +9,9 @@ import torch
 from swiftwrf import Rssi, RssiModel, load, rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.data.rssi import Offsets
+from swiftwrf.gp import Kernel
 from swiftwrf.rssi import compare
-from swiftwrf.rssi.detection import Detection
+from swiftwrf.rssi.detection import Detection, DetectionField
 from swiftwrf.rssi.offsets import estimate_floor_attenuation
 from swiftwrf.rssi.path_loss import fit_path_losses, log_distance
 
@@ -72,6 +73,24 @@ def test_the_limit_and_random_misses_are_told_apart():
     assert found.limit == pytest.approx(LIMIT, abs=2)
     assert float(found.missed.mean()) == pytest.approx(0.2, abs=0.07)
     assert Detection.estimate(data.transmitter_position, data.rssi_dbm.nan_to_num(-90.0)) is None
+
+
+def test_few_values_among_many_rows_are_enough():
+    position = torch.rand(5000, 3, generator=torch.Generator().manual_seed(0)).double()
+    rssi = torch.full((5000, 2), torch.nan).double()
+    rssi[101:103] = -70.0  # between the rows of an even sample
+    assert Detection.estimate(position, rssi).limit == -70
+
+
+@pytest.mark.parametrize("is_detected", [True, False])
+def test_one_cell_of_its_kind_among_many_is_enough(is_detected):
+    position = torch.rand(300, 3, generator=torch.Generator().manual_seed(0)).double()
+    detected = torch.full((300, 100), not is_detected)
+    detected[3, 2] = is_detected
+    kernel, level = Kernel(1.0, matern12_weight=1.0, noise=1.0), torch.full((300, 100), -60.0).double()
+    found = DetectionField.fit(kernel, position, detected, torch.arange(300) % 5, level, -90.0)
+    probability = found.probability(level, position)
+    assert bool(((probability > 0.5) == detected).double().mean() > 0.999)
 
 
 def test_a_receiver_that_is_empty_beside_its_place_keeps_its_path_loss():
