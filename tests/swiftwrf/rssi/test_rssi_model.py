@@ -7,8 +7,9 @@ import pytest
 import torch
 from scipy.optimize import minimize
 
-from swiftwrf import InputError, Rssi, RssiModel, fit_rssi, load, rssi_room
+from swiftwrf import InputError, PairModel, Rssi, RssiModel, fit_rssi, load, rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
+from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.gp import Kernel
 from swiftwrf.rssi import RssiConfig, RssiPaperModel, compare
 from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
@@ -89,6 +90,7 @@ def training_of(data, n_primitives=50):
             detection=None,
             floor_db=torch.zeros(r).double(),
         ),
+        shift=torch.zeros(n, r).double(),
         limit=torch.full((n, r), torch.nan).double(),
         field_db=torch.full((r,), FIELD_DB, dtype=torch.float64),
         noise_db=torch.full((r,), NOISE_DB, dtype=torch.float64),
@@ -263,6 +265,14 @@ def test_shift_of_the_coordinates_changes_nothing():
     torch.testing.assert_close(a, b, atol=1e-3, rtol=0)
 
 
+@pytest.mark.parametrize("make", [RssiModel, PairModel])
+def test_rows_about_another_origin_are_predicted_where_they_were_measured(make):
+    data = replace(path_loss_only(), origin=GeodeticOrigin(48.0, 11.0))
+    model, other = make().fit(data), data.about(GeodeticOrigin(48.001, 11.001))
+    found, expected = (both(model.predict_detected(some)) for some in (other, data))
+    torch.testing.assert_close(found, expected, atol=1e-2, rtol=0)
+
+
 def test_same_data_same_model_and_any_batch(monkeypatch):
     data = with_field(n=60)
     a, b = (fit_rssi(data).predict(data.transmitter_position).mean for _ in range(2))
@@ -375,7 +385,7 @@ def test_refuses():
         model.predict(torch.tensor([[1e20, 0.0, 0.0]]))
     assert both(model.predict(torch.tensor([[1e8, 0.0, 0.0]]))).isfinite().all()
     assert model.predict(torch.empty(0, 3)).mean.shape == (0, 3)
-    with pytest.raises(InputError, match="detected in 0 training rows"):
+    with pytest.raises(InputError, match="receivers a, b, c have 0 training measurements in all; measure at least 10"):
         fit_rssi(replace(data, rssi_dbm=data.rssi_dbm * torch.nan))
     with pytest.raises(InputError, match="rssi_dbm must be finite"):
         fit_rssi(replace(data, rssi_dbm=data.rssi_dbm * torch.inf))
