@@ -240,7 +240,7 @@ def test_kills_lose_nothing_and_repeat_at_most_the_last_line(tmp_path, model_fil
             ]
         )
         if (out / "model.safetensors").exists():
-            assert len(load(out / "model.safetensors").anchor) - 60 in (answered[-1][-1] - 1, answered[-1][-1])
+            assert len(load(out / "model.safetensors").anchor) - 60 in (answered[-1][-1], answered[-1][-1] + 1)
         if answered[-1][-1] >= len(rows) - 2:
             break
     for before, after in pairwise(answered):
@@ -325,5 +325,5 @@ def test_a_notice_is_recorded(tmp_path):
         step = follower.step(floor().subset(torch.tensor([i])))
         record.append(tmp_path, record.add(i, replace(step, notice="kernel chosen again" if i == 61 else "")))
     again = Record.read(tmp_path)
-    assert again.notices == [(1, "kernel chosen again")]
+    assert [(row["index"], row["notice"]) for row in again.notices] == [(61, "kernel chosen again")]
     assert "Kernel chosen again." in again.sentences()

@@ -472,7 +472,7 @@ def test_a_followed_run_is_read_again_when_it_grows(tmp_path):
     assert snapshot(view, view.version) is shown
     assert [row["index"] for row in shown.rows] == [62, 61, 60]
     assert shown.rows[0]["alarm"] == "hall weaker everywhere"
-    assert "Change at measurement 2: hall weaker everywhere." in shown.sentences
+    assert "Change at measurement 62: hall weaker everywhere." in shown.sentences
     assert all(figure.startswith("<svg") for figure in shown.figures.values())
     record.append(tmp_path, record.add(63, step))
     assert view.version != version
