@@ -265,12 +265,12 @@ def test_page_of_a_followed_run_grows_without_reloading(browser, serve, tmp_path
     assert said(browser, "sentence") == "no measurement yet"
     browser.execute_script("window.not_reloaded = true")
     learn(60)
-    until(lambda: "1 measurements learnt" in said(browser, "sentence"))
+    until(lambda: "1 measurement learnt" in said(browser, "sentence"))
     before = find(browser, "#changes").get_attribute("innerHTML")
     for i in range(61, 66):
         learn(i, alarms=("hall weaker everywhere",) if i == 63 else ())
     until(lambda: "6 measurements learnt" in said(browser, "sentence"))
-    assert "Change at measurement 3: hall weaker everywhere." in said(browser, "sentence")
+    assert "Change at measurement 63: hall weaker everywhere." in said(browser, "sentence")
     assert len(browser.find_elements("css selector", "#rows tbody tr")) == 6
     assert find(browser, "#changes").get_attribute("innerHTML") != before
     assert find(browser, "#error svg").is_displayed()
