@@ -77,13 +77,6 @@ def small_published() -> Iterator[None]:
 
 
 @pytest.fixture
-def glances() -> Iterator[None]:
-    """Short searches for rooms during a test."""
-    with small.glances():
-        yield
-
-
-@pytest.fixture
 def short_searches(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorten the search for rooms, not its stages."""
     for module, values in (

@@ -9,7 +9,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small import GLANCE, PUBLISHED
+from rooms import built_in_walls
+from small import PUBLISHED, known_planes
 
 from augment import choose_model, mix, sample_positions, synthetic_positions, withhold
 from augment.choose import candidates
@@ -92,11 +93,10 @@ def fitted(name):
 
 
 @pytest.mark.parametrize("name", [name for name in FIELD_MODELS if not FIELD_MODELS[name].slow])  # they have their own
-def test_field_models_predict_unseen_spectra_better_than_the_mean_spectrum(name, glances, monkeypatch):
-    monkeypatch.setattr(
-        "small.GLANCE", replace(GLANCE, search_distance_m=2.5, n_search_positions=24)
-    )  # a glance as far as the walls
-    predicted = fitted(name).synthesize(TEST.position)
+def test_field_models_predict_unseen_spectra_better_than_the_mean_spectrum(name):
+    """The search for the walls has its own tests."""
+    with known_planes(*built_in_walls()):
+        predicted = fitted(name).synthesize(TEST.position)
     mean = psnr(TRAIN.spectrum.mean(dim=0), TEST.spectrum).median()
     assert psnr(predicted, TEST.spectrum).median() > mean + MARGIN_DB.get(name, 0.5)
 

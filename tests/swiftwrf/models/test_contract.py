@@ -3,9 +3,11 @@
 import shutil
 import subprocess
 import sys
+import tomllib
 from contextlib import ExitStack
 from dataclasses import fields, replace
 from functools import cache
+from pathlib import Path
 
 import outside_mean
 import pytest
@@ -14,10 +16,13 @@ import torch
 from samples import install
 
 import swiftwrf
+from augment import Mixed
+from augment.estimators.kernel_regression import KernelRegression
 from swiftwrf import AngularGrid, FieldModel, InputError, Spectra, load, make_model
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.base import ARRAY, FIXED_END
 from swiftwrf.models.base import model_type as model_type_of
+from swiftwrf.runtime.checkpoint import Saved
 
 OPTIONS = {"swiftwrf": {"n_primitives": 24}}
 NOT_DIFFERENTIABLE = {
@@ -212,20 +217,29 @@ USE = """
 import sys
 sys.path.append(sys.argv[1])
 import swiftwrf
+from swiftwrf.runtime.checkpoint import Saved
 for model in (*map(swiftwrf.load, sys.argv[2:]), swiftwrf.make_model("outside_mean", seed=1)):
     print(type(model).__name__)
+print(*Saved.kinds, sep="\\n")
 """
 
 
 def test_models_of_this_and_other_packages_are_opened_and_made_with_swiftwrf_alone(fitted, room, tmp_path):
+    """The entry points of pyproject.toml suffice for estimators, as in an installation."""
     shutil.copy(outside_mean.__file__, tmp_path)
     install(tmp_path, "swiftwrf.models", outside_mean="outside_mean:Mean")
-    models = [*map(fitted, ("gp", "hybrid", "vae")), outside_mean.Mean(seed=1).fit(room)]
+    project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"]
+    install(tmp_path, "swiftwrf.estimators", **project["entry-points"]["swiftwrf.estimators"])
+    regression = KernelRegression().fit(Mixed.measured(room))
+    models = [*map(fitted, ("gp", "hybrid", "vae")), outside_mean.Mean(seed=1).fit(room), regression]
     files = [tmp_path / str(number) for number in range(len(models))]
     for model, file in zip(models, files, strict=True):
         model.save(file)
     done = subprocess.run([sys.executable, "-c", USE, tmp_path, *files], capture_output=True, text=True, check=False)
-    assert done.stdout.split() == [*(type(model).__name__ for model in models), "Mean"], done.stderr
+    names = [*(type(model).__name__ for model in models), "Mean"]
+    assert done.stdout.splitlines()[: len(names)] == names, done.stderr
+    estimators = {kind for kind, made in Saved.kinds.items() if made.__module__.startswith("augment.estimators")}
+    assert estimators <= {*done.stdout.splitlines()}
 
 
 def test_predictions_of_each_device_are_drawn_tabulated_and_stored(fitted, position):

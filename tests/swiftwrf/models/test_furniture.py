@@ -168,7 +168,7 @@ def test_phases_of_channels_have_no_alias_and_those_of_packets_are_the_signal():
 def test_positions_are_located_by_channels_through_furniture(tmp_path):
     data, _ = measured(6.0, n=80)
     train, test = data.subset(torch.arange(70)), data.subset(torch.arange(70, 80))
-    cells = {"n_best": 40, "n_background": 20, "n_split": 8, "spacing": 0.3, "max_cells": 10_000}
+    cells = {"n_best": 15, "n_background": 8, "n_split": 8, "spacing": 0.3, "max_cells": 4000}
     room = fitted(GeometryModel.of_planes(train, WALLS), train)
     locator = MatchedField(**cells, n_rounds=2, n_calibration=12).fit(train, room=room)
     posterior = locator.locate(test)

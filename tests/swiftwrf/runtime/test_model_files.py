@@ -1,17 +1,12 @@
 """Damaged model files and checkpoints of fits, files that claim more than they contain, and predictions at far positions."""
 
-import os
-import subprocess
-import sys
-import tomllib
 from pathlib import Path
 
 import pytest
-from samples import install
 
 from swiftwrf import CoarrayModel, InputError, load
 from swiftwrf.models.swiftwrf_paper import SwiftWRFPaper
-from swiftwrf.runtime.checkpoint import Saved, read, write
+from swiftwrf.runtime.checkpoint import read, write
 
 ROOT = Path(__file__).parents[3]
 TINY = {"n_primitives": 4, "steps": 10, "check_every": 5}
@@ -44,25 +39,3 @@ def test_a_damaged_state_of_a_fit_is_refused(room, tmp_path):
     write(state, kind, {name: t for name, t in tensors.items() if "mean" not in name}, header)
     with pytest.raises(InputError):
         SwiftWRFPaper(**TINY).fit(room, checkpoint=state)
-
-
-def test_estimators_are_opened_with_swiftwrf_alone(tmp_path):
-    """The entry points of pyproject.toml suffice, as in an installation."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    points = project["entry-points"]["swiftwrf.estimators"]
-    install(tmp_path, "swiftwrf.estimators", **points)
-    import augment.estimators  # noqa: F401 (defines the kinds)
-
-    kinds = {kind for kind, made in Saved.kinds.items() if made.__module__.startswith("augment.estimators")}
-    assert kinds
-    script = "import swiftwrf; from swiftwrf.runtime import checkpoint; checkpoint._import_kinds()"
-    script += "; print(*checkpoint.Saved.kinds, sep='|')"
-    path = os.pathsep.join([str(tmp_path), str(ROOT)])
-    opened = subprocess.run(
-        [sys.executable, "-c", script],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=os.environ | {"PYTHONPATH": path},
-    )
-    assert kinds <= set(opened.stdout.strip().split("|"))

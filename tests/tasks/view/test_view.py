@@ -381,7 +381,7 @@ def test_view_of_a_run_of_locate(located_floor, tmp_path):
 def test_posterior_of_a_spectrum_is_that_of_the_locator(aoa_run, room, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(aoa_run, folder)
-    with small.glances():
+    with small.known_planes(small.FLOOR):
         locator = MatchedField(max_cells=200, n_best=20, n_background=10, n_rounds=1).fit(room)
     locator.save(folder / "matched_field-mix1.safetensors")
     view = open_source(folder)
