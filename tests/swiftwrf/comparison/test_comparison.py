@@ -26,7 +26,7 @@ GRID = AngularGrid.hemisphere(90, 360)
 LEARNS = {
     "nerf2": NeRF2Config(width=48, bands=4, samples=12, steps=240, rate=5e-3),
     "wrfgs": WrfGsConfig(n_gaussians=100, width=32, depth=4, bands=4, steps=250, rate=5e-3),
-    "vae": VaeConfig(latent=4, bands=2, hidden=64, steps=300),
+    "vae": VaeConfig(latent=4, bands=2, hidden=64, steps=200),
     "dcgan": DcganConfig(noise=2, bands=2, hidden=64, steps=300),
 }
 
