@@ -33,7 +33,7 @@ def reading(spectra: SpectraSource, table: TableSource) -> ReadOptions:
         **options
         | {
             "array": _array(spectra),
-            "arrays": pairs("arrays", spectra.arrays),
+            "arrays": pairs("arrays", spectra.arrays, "csi"),
             "grid": AngularGrid.hemisphere(*spectra.grid) if spectra.grid else None,
             "columns": table.column_names,
             "filler": table.fillers,
