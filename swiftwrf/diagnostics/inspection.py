@@ -12,7 +12,6 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.data import Rssi, Snapshots, Spectra
-from swiftwrf.data.powers import has_frequent_edge
 from swiftwrf.data.splits import MAX_REPEATED, MIN_TRAINING, repeated_fraction
 from swiftwrf.diagnostics.calibration import calibrate
 from swiftwrf.diagnostics.elements import in_noise, noisy_elements, some_rows
@@ -378,11 +377,6 @@ def _columns(data: Rssi, detected: Tensor, findings: Findings) -> None:
     if positive := those(lambda v: bool(v.min() < v.max() and v.max() >= 0)):
         findings.warn(f"Receivers with values of 0 dBm and more, which few receivers measure: {listed(positive)}.")
 
-    if repeated := those(lambda v: has_frequent_edge(v.numpy())):
-        findings.warn(
-            "The weakest value is far more frequent than those above it; does it mean not detected? Receivers: "
-            f"{listed(repeated)}."
-        )
     filled = data.rssi_dbm.nan_to_num(0.0)
     same = [
         f"{a} = {b}"
