@@ -376,15 +376,9 @@ def _columns(data: Rssi, detected: Tensor, findings: Findings) -> None:
         findings.warn(f"Receivers with one value everywhere: {listed(constant)}.")
     if positive := those(lambda v: bool(v.min() < v.max() and v.max() >= 0)):
         findings.warn(f"Receivers with values of 0 dBm and more, which few receivers measure: {listed(positive)}.")
-
-    filled = data.rssi_dbm.nan_to_num(0.0)
-    same = [
-        f"{a} = {b}"
-        for i, a in enumerate(data.receiver_names)
-        for j, b in enumerate(data.receiver_names[:i])
-        if bool((filled[:, i] == filled[:, j]).all())
-    ] if len(data.receiver_names) <= 200 else []  # fmt: skip
-    if same:
+    first, filled = dict[bytes, str](), zip(data.receiver_names, data.rssi_dbm.nan_to_num(0.0).T, strict=True)
+    earliest = {name: first.setdefault(column.numpy().tobytes(), name) for name, column in filled}
+    if same := [f"{name} = {other}" for name, other in earliest.items() if name != other]:
         findings.warn(f"Receivers with the same values: {listed(same)}.")
 
 
