@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -139,7 +140,7 @@ def read_receivers(
 def _positions_by_name(file: Path) -> pd.DataFrame:
     """Return the table of a file with NAME: [x, y, z], without receivers of unknown position."""
     content = {name: value for name, value in read_yaml(file).items() if value not in ("", "~", "null", "none")}
-    rows = [(name, *(numbers(value, 3) or ())) for name, value in content.items()]
+    rows: list[Any] = [(name, *(numbers(value, 3) or ())) for name, value in content.items()]
     if wrong := [row[0] for row in rows if len(row) == 1]:
         raise InputError(
             f"{file}: receiver {wrong[0]!r} needs a position of 3 finite numbers [m], got {content[wrong[0]]}"
