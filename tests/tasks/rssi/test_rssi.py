@@ -28,7 +28,7 @@ from swiftwrf.data.splits import folds
 from swiftwrf.metrics import paired_difference
 from swiftwrf.rssi import RssiPredictor, compare
 from swiftwrf.rssi.baselines import NEIGHBOUR_COUNTS, Blend, BlendConfig
-from swiftwrf.rssi.comparison import make_predictor, pool_of
+from swiftwrf.rssi.comparison import compared, make_predictor, pool_of
 from swiftwrf.runtime import registry
 from tasks.labels import PREDICTORS as LABELS
 from tasks.report import merge
@@ -111,6 +111,13 @@ def test_unknown_predictor():
         make_predictor("knn", validation="blok")
     with pytest.raises(InputError, match="KNNPredictor has no option 'k'"):
         RSSI_PREDICTORS["knn"](k=3)
+    room = rssi_room(n=20)
+    with pytest.raises(InputError, match="unknown predictor 'forest'"):
+        compared(room, also=["forest"])
+    with pytest.raises(InputError, match="no member of blend can be fitted to simulated-floor"):
+        Blend(members=()).fit(room)
+    with pytest.raises(InputError, match="fewer must be a list, of which each is a number at least 0 and at most 1"):
+        compare(room, fewer=(-0.5,))
 
 
 def test_a_predictor_of_another_package(monkeypatch):
