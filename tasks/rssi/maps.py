@@ -176,7 +176,9 @@ class Maps:
 
     @cached_property
     def _limits(self) -> tuple[float, float]:
-        low, high = np.nanpercentile(self.arrays["measured"], (1, 99)).tolist()
+        measured = self.arrays["measured"]
+        shown = self.arrays["predicted"] if np.isnan(measured).all() else measured  # nothing may be received on a floor
+        low, high = np.nanpercentile(shown, (1, 99)).tolist()
         return low, high
 
     def _cells(self, fields: dict[str, NDArray[Any]], receivers: list[str]) -> DataFrame:

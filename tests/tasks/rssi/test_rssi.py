@@ -328,6 +328,10 @@ def test_each_floor_has_its_maps_its_rows_and_its_coverage():
     assert first.arrays["measured"].ravel().tolist() == [4.0] * 4
     assert first.summary().name == "summary-1"
     assert [first.by_receiver(kind).name for kind in ("predicted", "width")] == ["map-run-1", "width-run-1"]
+    maps["measured"] = np.where(position[:, 2:] > 0, np.nan, -50.0)  # the first floor receives nothing
+    _, first = Maps.of_floors(SimpleNamespace(arrays=lambda name: maps, file_name="run"))
+    low, high = first.summary().panels[0].axes[0].images[0].get_clim()
+    assert -100 < low < -90 < high < -80
 
 
 @pytest.mark.parametrize("seed", [0, 1])
