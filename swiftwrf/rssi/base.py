@@ -283,11 +283,15 @@ class RssiPredictor(Configured, Displayed, ABC):
         return self.predict(data.about(self.origin).transmitter_position)
 
     @checked
-    def predict_detection(self, position: Numbers) -> Tensor:
+    def predict_detection(self, position: Numbers, offset_db: Tensor | float = 0.0) -> Tensor:
         """Return the probability that each receiver detects a packet, float64 (n, R), at positions (n, 3) [m].
 
         A predictor without a probability has 1 where its mean is above the limit of detection, else 0. All is 1 if every
         cell of the training rows has a value.
+
+        Args:
+            position: Positions of the transmitter, tensor or array (n, 3) [m].
+            offset_db: Offset of the transmitter relative to the reference of `offsets`, one number or (n, 1) [dB].
 
         Raises:
             InputError: As `predict`.
@@ -298,7 +302,7 @@ class RssiPredictor(Configured, Displayed, ABC):
             torch.Size([1, 12])
         """
         with torch.no_grad():
-            mean = self.predict(position).mean.double()
+            mean = self.predict(position).mean.double() + offset_db
         return torch.ones_like(mean) if self.detection is None else (mean > self.detection.limit).double()
 
     def _facts(self) -> dict[str, str]:

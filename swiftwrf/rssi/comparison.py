@@ -260,7 +260,7 @@ def compare(
         if rows is None:
             predictors[name], detected = predictor, test.detected
             if predictor.detection is not None and not bool(detected.all()) and not test.receiver_moves:
-                above = predictor.predict_detection(test.transmitter_position) > 0.5
+                above = predictor.predict_detection(test.transmitter_position, offset) > 0.5
                 found = float(above[detected].double().mean()), float((~above)[~detected].double().mean())
         std = None if prediction.std is None else prediction.std[test.detected]
         error = (prediction.mean + offset - test.rssi_dbm)[test.detected].abs()

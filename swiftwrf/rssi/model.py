@@ -321,11 +321,11 @@ class RssiModel(SavedRssiPredictor):
         return replace(prediction, mean=(mean - offset).float(), std=std.float())
 
     @checked
-    def predict_detection(self, position: Numbers) -> Tensor:
+    def predict_detection(self, position: Numbers, offset_db: Tensor | float = 0.0) -> Tensor:
         if self.detection_field is None:
-            return super().predict_detection(position)
+            return super().predict_detection(position, offset_db)
         with torch.no_grad():
-            level = self.predict(position).mean.double()
+            level = self.predict(position).mean.double() + offset_db
         return self.detection_field.probability(level, check_positions(position) - self.centre)
 
     def plot(self, receiver: str | None = None, height_m: float | None = None, ax: Axes | None = None) -> Axes:

@@ -159,6 +159,7 @@ def test_the_limit_is_one_of_received_power_whatever_offset_is_removed(fitted):
     torch.testing.assert_close(found.predict(at).mean - 20, model.predict(at).mean, **close)
     torch.testing.assert_close(found.predict_detected(removed).mean - 20, model.predict_detected(data).mean, **close)
     torch.testing.assert_close(found.detection_field.weight, model.detection_field.weight, **close)
+    torch.testing.assert_close(found.predict_detection(at, -20.0), model.predict_detection(at), **close)
 
 
 def building(located):
