@@ -203,7 +203,8 @@ def _posteriors(run: Records, several: bool) -> Section:
     data = DataFrame({"index": index, "x_m": xs.round(3), "y_m": ys.round(3), "relative_density": density.round(4)})
     caption = (
         f"Posteriors of {len(maps['index'])} test rows in plan, from the smallest error to the largest, each relative to "
-        "its largest mass. Cross: true position; dot: estimate; circle: 80 % credible region; small dots: training positions."
+        "its largest mass. Cross: true position; dot: estimate; circle: 80 % credible region; small dots: training "
+        "positions."
     )
     plot = Plot(f"posteriors-{run.file_name}", posteriors(maps), caption, data[np.isfinite(density)])
     return Section("", plots=[plot, *([_overview(run, f"overview-{run.file_name}")] if several else [])])
