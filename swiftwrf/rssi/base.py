@@ -26,7 +26,7 @@ from swiftwrf.positions import check_positions, to_tensor
 from swiftwrf.rssi.detection import Detection
 from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation, receiver_floors
 from swiftwrf.runtime.checkpoint import Header, Saved
-from swiftwrf.runtime.threads import parallel_map, to_device
+from swiftwrf.runtime.threads import to_device
 from swiftwrf.runtime.validation import (
     Configured,
     NonNegativeInt,
@@ -39,13 +39,6 @@ from swiftwrf.runtime.validation import (
 
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 RECEIVER_POSITIONS = "positions of the receivers"
-
-
-def map_threads(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
-    """Apply a function to items as `map` does, in as many threads as torch has."""
-    waiting, n_items = list(items), 4 * torch.get_num_threads()  # starting threads costs milliseconds
-    for start in range(0, len(waiting), n_items):
-        yield from parallel_map(function, waiting[start : start + n_items])
 
 
 @configuration
