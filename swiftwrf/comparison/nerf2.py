@@ -49,7 +49,7 @@ from swiftwrf.rssi.base import SavedRssiPredictor
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
 
-MAX_SAMPLES_ON_CPU = 2**16  # the same on a CPU: layers of more samples leave its caches
+MAX_SAMPLES = {"cpu": 2**16, "cuda": 2**19}  # of all rays at a time: layers of more leave the caches, or fill the memory
 PATH_GAIN = 0.025  # [m] amplitude times distance, from the publication's code
 FIRST_PHASE = 1.0  # [rad], from the publication's code
 
@@ -237,8 +237,8 @@ class NeRF2(TrainedModel):
 
     def render(self, network: Field, position: Tensor, grid: AngularGrid) -> Tensor:
         ends, direction = self.ends(position, position.device), self._to_world(grid, position.device)
-        samples = MAX_SAMPLES_ON_CPU if direction.device.type == "cpu" else 2**19  # bounds the memory
-        parts = direction.split(max(1, samples // (len(position) * self.config.samples)))
+        samples = max(1, len(position)) * self.config.samples
+        parts = direction.split(max(1, MAX_SAMPLES[direction.device.type] // samples))
         magnitudes = [self._magnitude(network, *ends, part[None]) for part in parts]
         return torch.cat(magnitudes, dim=1).reshape(-1, *grid.shape)
 
@@ -304,7 +304,7 @@ class NeRF2Rssi(SavedRssiPredictor):
     def _predict(self, position: Tensor) -> tuple[Tensor, None]:
         config, n_receivers = self.config, len(self.receiver_names)
         n_samples = config.azimuths * config.elevations * config.samples * max(n_receivers, 1)
-        some = position.split(max(1, MAX_SAMPLES_ON_CPU // n_samples))
+        some = position.split(max(1, MAX_SAMPLES["cpu"] // n_samples))
         amplitude = torch.cat([self._amplitude(self.field, part) for part in some])
         return check_finite(100 * (amplitude.double() - 1)), None
 

@@ -221,7 +221,7 @@ class FieldModel(Configured, Saved, Displayed):
 
         differentiable = position.requires_grad or any(tensor.requires_grad for tensor in self.parameters())
         with torch.set_grad_enabled(torch.is_grad_enabled() and differentiable):
-            if torch.is_grad_enabled() or 0 < len(position) <= batch:
+            if torch.is_grad_enabled() or len(position) <= batch:
                 means, stds = zip(*(evaluate(some) for some in position.split(batch)), strict=True)
                 mean = means[0] if len(means) == 1 else torch.cat(means)
                 std = None if stds[0] is None else torch.cat(stds)
@@ -385,7 +385,7 @@ class FieldModel(Configured, Saved, Displayed):
         model.bounds = bounding_box(torch.tensor(header["bounds"], dtype=torch.float64))
         model.link = Link.from_json(header["link"])
         if lacking := cls.lacking(model.link):
-            raise InputError(f"the {' and the '.join(lacking)} are missing")
+            raise InputError(f"it lacks the {' and the '.join(lacking)}")
         model._restore(tensors, header)
         return model
 

@@ -92,7 +92,9 @@ def test_predictions_are_spectra(fitted, room, position, name):
     assert torch.equal(model.synthesize(position), found.mean)
     alone = torch.cat([model.predict(one[None]).mean for one in position])
     torch.testing.assert_close(alone, found.mean, atol=2e-5, rtol=0)
-    assert model.predict(position[:0]).mean.shape == (0, *room.grid.shape)
+    nothing = model.predict(position[:0])
+    assert nothing.mean.shape == (0, *room.grid.shape)
+    assert (nothing.std is None) == (found.std is None)
     model.predict(position.float())
     assert model.synthesize(torch.tensor([[1e7] * 3, [1e9] * 3], dtype=torch.float64)).isfinite().all()
 
