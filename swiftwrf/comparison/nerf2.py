@@ -49,7 +49,10 @@ from swiftwrf.rssi.base import SavedRssiPredictor
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
 
-MAX_SAMPLES = {"cpu": 2**16, "cuda": 2**19}  # of all rays at a time: layers of more leave the caches, or fill the memory
+MAX_SAMPLES = {
+    "cpu": 2**16,
+    "cuda": 2**19,
+}  # of all rays at a time: layers of more leave the caches, or fill the memory
 PATH_GAIN = 0.025  # [m] amplitude times distance, from the publication's code
 FIRST_PHASE = 1.0  # [rad], from the publication's code
 

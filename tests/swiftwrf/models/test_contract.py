@@ -259,6 +259,12 @@ def gp(spectra):
         (lambda spectra, rssi: gp(spectra).predict([[2e9, 0, 0]]), "positions must be .* at most 1e.09"),
         (lambda spectra, rssi: swiftwrf.load(None), "None is not a readable safetensors file"),
         (lambda spectra, rssi: make_model("gp").fit(spectra, device="gpu"), "device must be .* got 'gpu'"),
+        (lambda spectra, rssi: make_model("gp").fit(spectra, device="meta"), "device must be .* got 'meta'"),
+        (
+            lambda spectra, rssi: gp(spectra).save("none/model"),
+            "folder of the pixel Gaussian process none/model does not",
+        ),
+        (lambda spectra, rssi: make_model("wrfgs", n_gaussians=3), "n_gaussians must be a whole number at least 4"),
         (lambda spectra, rssi: make_model("gp").fit(spectra, device="cuda:99"), "cuda:99 needs an NVIDIA GPU"),
         (lambda spectra, rssi: swiftwrf.RssiModel().fit(rssi, device="cuda:99"), "cuda:99 needs an NVIDIA GPU"),
         (lambda spectra, rssi: gp(spectra).predict(spectra.position).interval("0.8"), "level must be"),
