@@ -1,5 +1,6 @@
 """The contract of every registered field model, and of one from another package."""
 
+import json
 import shutil
 import subprocess
 import sys
@@ -7,6 +8,7 @@ from contextlib import ExitStack
 from dataclasses import fields, replace
 from functools import cache
 
+import numpy as np
 import outside_mean
 import pytest
 import small
@@ -274,6 +276,17 @@ def gp(spectra):
 def test_mistakes_of_newcomers_end_in_a_sentence(call, says):
     with pytest.raises(InputError, match=says):
         call(swiftwrf.simulated_room(n=12, grid=AngularGrid.hemisphere(9, 36)), swiftwrf.rssi_room(n=20))
+
+
+def test_numbers_of_numpy_are_numbers():
+    room = swiftwrf.simulated_room(n=np.int64(12), grid=AngularGrid.hemisphere(9, np.int32(36)))
+    model = make_model("gp", seed=np.int64(3)).fit(room)
+    assert json.dumps(model.state()[1]["options"]) == json.dumps(make_model("gp", seed=3).config.__dict__)
+    assert len(model.predict(room.position).interval(np.float32(0.5))) == 2
+    with pytest.raises(InputError, match="seed must be a whole number at least 0, got np"):
+        make_model("gp", seed=np.int64(-1))
+    with pytest.raises(InputError, match="seed must be"):
+        make_model("gp", seed=np.float64(1.5))
 
 
 def test_intervals_of_any_level_below_1_are_finite():
