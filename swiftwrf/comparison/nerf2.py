@@ -61,7 +61,7 @@ Medium = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 @configuration
-class FieldConfig(Config):
+class NeuralFieldConfig(Config):
     """Options of a neural field."""
 
     published: ClassVar[dict[str, Any]] = {
@@ -94,10 +94,10 @@ class FieldConfig(Config):
 
 
 @configuration
-class NeRF2Config(FieldConfig):
+class NeRF2Config(NeuralFieldConfig):
     """Options of `NeRF2`."""
 
-    published = FieldConfig.published | {"batch": 8192, "rays": 1, "shared_rays": False}
+    published = NeuralFieldConfig.published | {"batch": 8192, "rays": 1, "shared_rays": False}
 
     steps: PositiveInt = 3000
     rate: PositiveFloat = 3e-3
@@ -109,10 +109,10 @@ class NeRF2Config(FieldConfig):
 
 
 @configuration
-class NeRF2RssiConfig(FieldConfig):
+class NeRF2RssiConfig(NeuralFieldConfig):
     """Options of `NeRF2Rssi`; a batch consists of transmitter positions."""
 
-    published = FieldConfig.published | {"azimuths": 36, "elevations": 9, "batch": 8}
+    published = NeuralFieldConfig.published | {"azimuths": 36, "elevations": 9, "batch": 8}
 
     width: Count = 32
     bands: Count = 4
