@@ -30,22 +30,18 @@ MAX_MAPS = 8  # in memory, e.g. those of as many floors
 MapKind = Literal["RSSI", "interval", "coverage", "best receiver", "posterior", "expected error"]
 LOCATING: tuple[MapKind, ...] = ("posterior", "expected error")
 MAPS = {"measured_position": "f n 3", "measured": "f n receivers", "receiver": "f receivers 3"}  # of maps.npz
-PLAN = {"plan": "u1 height width 3", "plan_extent": "f 4"}  # that maps.npz may hold, too
 Values = NDArray[np.floating]
 
 
-def rows_of_run(file: Path, receivers: tuple[str, ...]) -> tuple[Rssi, FloorPlan | None]:
-    """Return the measured rows and the floor plan in the `maps.npz` of a run.
+def rows_of_run(file: Path, receivers: tuple[str, ...]) -> Rssi:
+    """Return the measured rows in the `maps.npz` of a run.
 
     Raises:
         InputError: The file is damaged, or contains other receivers.
     """
-    stored, plan = read_npz(file, MAPS | PLAN, PLAN), None
-    if "plan" in stored:
-        x0, x1, y0, y1 = stored["plan_extent"].tolist()
-        plan = FloorPlan(stored["plan"], (x0, x1, y0, y1))
+    stored = read_npz(file, MAPS)
     measured, position, receiver = stored["measured"], stored["measured_position"], stored["receiver"]
-    return Rssi(measured, position, receiver_position=receiver, receiver_names=receivers), plan
+    return Rssi(measured, position, receiver_position=receiver, receiver_names=receivers)
 
 
 def rows_of_model(model: RssiModel) -> Rssi:
@@ -88,14 +84,14 @@ class RssiView:
     title: str  # title of the page
     model: RssiModel  # fitted model
     rows: Rssi  # measured rows
-    plan: FloorPlan | None = None  # image of the floor. None if there is none
     locating: RssiLocating | None = None  # locator and the rows that it locates. None if there is no locator
     notes: list[str] = field(default_factory=list)  # remarks on the data, a sentence each
     folder: Path | None = None  # directory of the run, where a floor plan is saved. None for a saved model
+    plan: FloorPlan | None = field(default=None, init=False)  # image of the floor. None if there is none
 
     def __post_init__(self) -> None:
-        if self.folder is not None and (stored := FloorPlan.load(self.folder)) is not None:
-            self.plan = stored
+        if self.folder is not None:
+            self.plan = FloorPlan.load(self.folder)
         self.map = lru_cache(maxsize=MAX_MAPS)(self._map)
         """Return the map at a height of the transmitter [m]; the last ones are cached for all visitors."""
 
