@@ -60,8 +60,9 @@ def fitted(walls: GeometryModel, train: Spectra) -> GeometryModel:
 
 @pytest.fixture(autouse=True)
 def one_setting(monkeypatch):
-    """One size of voxels, because each fit takes a second."""
+    """One size of voxels and fewer steps, because each fit takes seconds."""
     monkeypatch.setattr(furniture, "SETTINGS", ((1.0, 1e-3),))
+    monkeypatch.setattr(furniture, "N_STEPS", 70)
 
 
 @pytest.mark.parametrize("moving", ["transmitter", "receiver"])
