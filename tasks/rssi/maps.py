@@ -52,6 +52,11 @@ class Maps:
         found |= {name: found[name][self.floor] for name in ("predicted", "width", "detection")}
         return found | {name: found[name][rows] for name in ("measured_position", "measured")}
 
+    @cached_property
+    def plan(self) -> maps.FloorPlan | None:
+        """Image of the floor. None if the run has none."""
+        return maps.FloorPlan.load(self.run.folder)
+
     def titled(self, title: str) -> str:
         """Return a title with the name of the floor, if there are several."""
         return f"{title}, {self.arrays['floor_names'][self.floor]}" if self.suffix else title
@@ -137,9 +142,9 @@ class Maps:
         if kind == "predicted" and receiver is None:
             limits = (float(values.min()), float(values.max()))
         style: dict[str, Any] = {"cmap": colours, "vmin": limits[0], "vmax": limits[1]}
-        if "plan" in a:
-            ax.imshow(a["plan"], extent=tuple(a["plan_extent"].tolist()), aspect="equal", zorder=0)
-        opacity = 0.75 if "plan" in a else 1.0
+        if (plan := self.plan) is not None:
+            ax.imshow(plan.pixels, extent=plan.corners, aspect="equal", zorder=0)
+        opacity = 1.0 if plan is None else 0.75
         drawn = ax.imshow(
             values, origin="lower", extent=(x0, x1, y0, y1), alpha=opacity, zorder=1, aspect="equal", **style
         )

@@ -146,7 +146,7 @@ def test_a_floor_plan_whose_pixels_are_the_positions_needs_no_extent(tmp_path):
     Image.new("RGB", (400, 300), "white").save(tmp_path / "plan.png")
     config = SimpleNamespace(floor_plan=str(tmp_path / "plan.png"), floor_extent=None)
     data = replace(rssi_room(n=12), plan_scale=20.0)
-    assert experiment._read_floor_plan(config, data)["plan_extent"].tolist() == [0, 20, -15, 0]
+    assert experiment._read_floor_plan(config, data).corners == (0, 20, -15, 0)
 
 
 def test_whole_run(small, tmp_path):
