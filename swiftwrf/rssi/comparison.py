@@ -279,7 +279,7 @@ def compare(
         less = {str(len(rows)): {name: compute(name, rows)[1]["mean_db"] for name in studied} for rows in parts}
         return None, less | {str(len(train)): {name: values[name]["mean_db"] for name in studied}}
 
-    by_rows = DataFrame.from_dict(keep("fewer rows", study) if parts else {}, orient="index")
+    by_rows = DataFrame.from_dict(keep("fewer rows", study) if fewer else {}, orient="index")
     by_rows = by_rows.set_index(by_rows.index.astype(int)).rename_axis("n_train")
     return RssiComparison(train, test, values, left_out, predictors, by_rows)
 

@@ -29,12 +29,15 @@ def test_errors_by_the_number_of_training_rows(monkeypatch):
     kept = {name: RSSI_PREDICTORS[name] for name in ("swiftwrf", "mean", "knn")}
     monkeypatch.setattr(RSSI_PREDICTORS, "_registered", kept)
     room = rssi_room(n=200, seed=1)
+    asked = []
     whole, found = compare(room, receivers=["6"]), compare(room, receivers=["6"], fewer=(0.01, 0.25, 0.5)).by_rows
+    compare(room, receivers=["6"], fewer=(0.01,), keep=lambda name, compute: asked.append(name) or compute()[1])
     assert list(found.columns) == ["swiftwrf", "knn"]
     assert list(found.index) == [40, 80, 160]  # 2 rows determine nothing
     errors = whole.summary()["mean"]
     assert found.loc[160].to_dict() == pytest.approx(errors[["swiftwrf", "knn"]].to_dict())
     assert whole.by_rows.empty
+    assert asked == ["swiftwrf", "mean", "knn", "fewer rows"]  # as many steps as a run announces
 
 
 def path_loss_only(n=60, noise=0.0, level=-50.0, exponent=2.0, seed=0):
