@@ -68,12 +68,12 @@ def progress_bar(shown: bool = True) -> Progress:
     )
 
 
-def progress(items: Sequence[Item], description: str) -> Iterator[Item]:
+def progress(items: Sequence[Item], description: str, shown: bool = True) -> Iterator[Item]:
     """Yield the items, with a progress bar.
 
     Example:
         >>> list(progress([1, 2], "counting"))
         [1, 2]
     """
-    with progress_bar() as bar:
+    with progress_bar(shown) as bar:
         yield from bar.track(items, description=description)
