@@ -152,8 +152,8 @@ def angle_errors(estimate: Tensor | NDArray[np.floating], truth: Tensor | NDArra
     }
 
 
-def median_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, float]:
-    """Return the confidence interval of the median of independent values (n,), from order statistics.
+def median_interval(values: ArrayLike) -> tuple[float, float]:
+    """Return the 95 % confidence interval of the median of independent values (n,), from order statistics.
 
     With too few values for the confidence it is their range, without values nan.
 
@@ -165,8 +165,7 @@ def median_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float,
     n = len(ordered)
     if n == 0:
         return float("nan"), float("nan")
-    low = int(stats.binom.ppf((1 - confidence) / 2, n, 0.5))
-    low = max(low - 1, 0)
+    low = max(int(stats.binom.ppf(0.025, n, 0.5)) - 1, 0)
     return float(ordered[low]), float(ordered[n - 1 - low])
 
 

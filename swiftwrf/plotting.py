@@ -172,7 +172,7 @@ def hatch(ax: Axes, x: NDArray[Any], y: NDArray[Any], where: NDArray[np.bool_], 
     drawn.set_linewidth(0)
 
 
-def plan_axes(ax: Axes | None = None) -> Axes:
+def plan_axes(ax: Axes | None) -> Axes:
     """Return axes for positions seen from above, those of a new figure for None."""
     if ax is None:
         from matplotlib import pyplot

@@ -286,7 +286,7 @@ class FieldModel(Configured, Saved, Displayed):
             rows: Numbers of training spectra, in the order in which the model received them, int64.
 
         Raises:
-            InputError: A model that must be fitted again, or a number outside the range.
+            InputError: A model that must be fitted again, all of its spectra, or a number outside the range.
         """
         model = self._copy()
         model._forget(to_tensor("rows", rows, torch.int64, (None,)))

@@ -1,4 +1,4 @@
-"""The linear space of the squared spectra of a planar array, projection onto it, and a model in it.
+"""The linear space of the squared spectra of a planar array, and a model in it.
 
     |S(k)|^2 = sum over element differences l of r(l) exp(j 2 pi l . k / wavelength),    r(-l) = conj(r(l))
 
@@ -20,14 +20,12 @@ from swiftwrf.array.planar import PlanarArray, basis, differences
 from swiftwrf.data.spectra import Spectra, coarsening
 from swiftwrf.data.splits import folds
 from swiftwrf.data.store import Store
-from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, choose_kernel, principal_components
 from swiftwrf.models.base import ARRAY
 from swiftwrf.models.link import Linked
 from swiftwrf.models.process import ProcessModel
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.threads import single_thread
-from swiftwrf.runtime.validation import checked
 
 MAX_COMPONENTS = 64  # principal components of the training magnitudes
 MAX_EXACT_ROWS = 2000  # spectra whose principal components are computed in memory
@@ -39,41 +37,6 @@ def _inverse(array: PlanarArray, grid: AngularGrid) -> Tensor:
     """Return the matrix from squared spectra to coefficients by least squares, float64 (pixels, 1 + 2 P)."""
     inverse: Tensor = torch.linalg.pinv(basis(array, grid))
     return inverse
-
-
-@checked
-def project(spectrum: Tensor, array: PlanarArray, grid: AngularGrid, *, stretched: bool = False) -> Tensor:
-    """Return the nearest spectra that the array can produce, by least squares on the squared magnitudes.
-
-    Args:
-        spectrum: Magnitudes in [0, 1], (n, n_elevation, n_azimuth).
-        array: Antenna array with its carrier.
-        grid: Grid of the spectra.
-        stretched: Whether each spectrum was stretched to [0, 1], which removed an offset. The offset is estimated, added for
-            the projection and subtracted again.
-
-    Returns:
-        Magnitudes in [0, 1], float32 of the shape of `spectrum`.
-
-    Raises:
-        InputError: Spectra of another shape than that of the grid.
-
-    Example:
-        >>> import swiftwrf
-        >>> data = swiftwrf.simulated_room(n=10)
-        >>> bool((project(data.spectrum, data.array, data.grid) - data.spectrum).abs().max() < 1e-2)
-        True
-    """
-    if spectrum.dim() != 3 or tuple(spectrum.shape[1:]) != grid.shape:
-        raise InputError(
-            f"expected spectra of shape (n, {grid.shape[0]}, {grid.shape[1]}), got {tuple(spectrum.shape)}"
-        )
-    functions, flat = basis(array, grid), spectrum.flatten(1).double()
-    inverse = _inverse(array, grid)
-    offset = _offset(flat, functions, inverse) if stretched else torch.zeros(len(flat), 1, dtype=torch.float64)
-    power = (flat + offset).square() @ inverse @ functions
-    projected: Tensor = power.clamp_min(0).sqrt() - offset
-    return projected.clamp(0, 1).reshape(spectrum.shape).float()
 
 
 def _offset(flat: Tensor, functions: Tensor, inverse: Tensor) -> Tensor:

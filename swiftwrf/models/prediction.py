@@ -102,7 +102,7 @@ class Prediction(Labelled, Displayed):
         """Return a table: a row for each position and receiver, or for each spectrum with its largest magnitude.
 
         Raises:
-            InputError: Values without position.
+            InputError: Values without positions, or with neither directions nor names of receivers.
 
         Example:
             >>> import torch
@@ -141,7 +141,9 @@ class Prediction(Labelled, Displayed):
 
     def _place(self) -> NDArray[np.float64]:
         if self.position is None or (self.grid is None and not self.receiver_names):
-            raise InputError("this prediction has no positions; take the one that predict returns")
+            raise InputError(
+                "this prediction lacks positions, or directions or receivers of its values; take that of a model's predict"
+            )
         place: NDArray[np.float64] = self.position.detach().cpu().double().numpy()
         return place
 

@@ -160,6 +160,8 @@ class ProcessModel(FieldModel):
         n = len(self.process.known)
         if len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < n:
             raise InputError(f"the model has training rows 0 to {n - 1}, but was asked to forget others")
+        if len(rows.unique()) == n:
+            raise InputError(f"the model was asked to forget all of its {n} training rows; fit another one")
         self.process = self.process.without(rows)
 
     def _age(self, correlation: float) -> None:

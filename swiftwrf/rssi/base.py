@@ -303,14 +303,18 @@ class RssiPredictor(Configured, Displayed, ABC):
 
 
 class SavedRssiPredictor(RssiPredictor, Saved):
-    """Base class of predictors that one file stores, and that have maps: a region and a standard deviation."""
+    """Base class of predictors that one file stores. Those with a region and a standard deviation have maps."""
 
     max_map_predictions: ClassVar[int] = 2**22
     """predictions of a map at all receivers if its cells are not given"""
 
     @abstractmethod
     def region(self) -> Tensor:
-        """Return the training positions (n, 3) [m], whose box a map covers."""
+        """Return the training positions (n, 3) [m], whose box a map covers.
+
+        Raises:
+            InputError: A predictor without standard deviations, which has no maps.
+        """
 
     def _header(self) -> Header:
         """Return the plain values that files of all these predictors contain."""

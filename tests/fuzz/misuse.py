@@ -37,7 +37,6 @@ from swiftwrf import (
 )
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.locate import Posterior
-from swiftwrf.models.coarray import project
 from swiftwrf.models.geometry import Plane
 from swiftwrf.online import Follower
 from swiftwrf.positions import MAX_COORDINATE_M
@@ -183,7 +182,6 @@ ARRAYS: dict[str, Call] = {
     "of_planes(x)": lambda x: GeometryModel.of_planes(x, []),
     "of_planes(spectra, x)": lambda x: GeometryModel.of_planes(spectra(), x),
     "of_planes(order=x)": lambda x: GeometryModel.of_planes(spectra(), [], x),
-    "project(x, array)": lambda x: project(x, spectra().array, spectra().grid),
 }
 MODELS: dict[str, Call] = {
     "make_model(x)": make_model,

@@ -161,7 +161,7 @@ def test_aliases_keep_the_plane_of_each_side():
 def test_a_search_without_reach_finds_no_plane():
     """The wavelength may exceed the search distance many times over."""
     scene, _ = observe(spectra("scale 0.001"))
-    (_, found), *_ = search.find_rooms(scene, reach=1e-4, width=1)
+    (_, found), *_ = search.find_rooms(scene, reach=1e-4, width=1, tick=bool)
     assert not found.by_side()
     assert search.oblique_planes(scene, scene.direct, 1e-4, 3) == []
 

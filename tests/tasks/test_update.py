@@ -99,8 +99,9 @@ def test_forgetting_what_was_learnt_restores_the_model(name):
     if name == "gp":  # the mean is that of the remaining spectra
         assert len(forgot.store) == N
     torch.testing.assert_close(forgot.synthesize(at), model.synthesize(at), rtol=0, atol=SIGNAL)
-    with pytest.raises(InputError, match="training rows 0 to 29"):
-        model.forget(torch.tensor([N]))
+    for rows, says in ((torch.tensor([N]), "training rows 0 to 29"), (torch.arange(N), "all of its 30 training rows")):
+        with pytest.raises(InputError, match=says):
+            model.forget(rows)
 
 
 @pytest.mark.parametrize("name", PROCESSES)

@@ -77,7 +77,7 @@ class GeometryConfig(FieldConfig):
 
 
 @single_thread()
-def search_room(train: Spectra, config: GeometryConfig, progress: bool = False) -> RoomEstimate:
+def search_room(train: Spectra, config: GeometryConfig, progress: bool) -> RoomEstimate:
     """Estimate the planes of a room from training spectra.
 
     Args:

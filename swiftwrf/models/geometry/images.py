@@ -160,7 +160,8 @@ class PhaseObservations:
         """
         away = position - fixed
         size = away.abs().amax(dim=1, keepdim=True)
-        position = torch.where(size > MAX_DISTANCE_M, fixed + MAX_DISTANCE_M * (away / size), position)
+        farthest = fixed + MAX_DISTANCE_M * (away / size.clamp_min(MAX_DISTANCE_M))
+        position = torch.where(size > MAX_DISTANCE_M, farthest, position)
         transmitter, receiver = (position, fixed[None]) if moving == "transmitter" else (fixed[None], position)
         wavenumber = 2 * math.pi / array.wavelength
         element = wavenumber * array.element.double() @ rotation[:, :2].T.double()
@@ -226,8 +227,8 @@ class PhaseObservations:
         Args:
             ray: Vectors from the receiver to the source, float32 (3, ...) [m].
         """
-        # the norm over a first dimension is slow, and an amplitude finite also between ends at one place
-        length = ray.square().sum(0).sqrt().clamp_min(1e-6)
+        # the norm over a first dimension is slow; amplitude and gradient are finite also between ends at one place
+        length = ray.square().sum(0).clamp_min(1e-12).sqrt()
         phase = (self.element @ (ray / length).flatten(1)).reshape(len(self.element), *length.shape)
         return phase - self.wavenumber * length, length
 

@@ -326,7 +326,7 @@ class Search:
 
 
 def find_rooms(
-    scene: PhaseObservations, reach: float, width: int = 8, tick: Callable[[], None] | None = None
+    scene: PhaseObservations, reach: float, width: int, tick: Callable[[], object]
 ) -> list[tuple[Tensor, PlaneSet]]:
     """Return the best room of each of SIGNS with the signs of its gains, the best first.
 
@@ -352,8 +352,7 @@ def find_rooms(
             room = search.improve(start)
             if search not in found or room.score < found[search].score:
                 found[search] = room
-        if tick:
-            tick()
+        tick()
     best = sorted(found.items(), key=lambda item: float(item[1].score))
     return [
         (search.signs, room)

@@ -291,6 +291,12 @@ def test_mistakes_of_newcomers_end_in_a_sentence(call, says):
         call(swiftwrf.simulated_room(n=12, grid=AngularGrid.hemisphere(9, 36)), swiftwrf.rssi_room(n=20))
 
 
+def test_a_table_without_receivers_is_refused():
+    prediction = swiftwrf.Prediction(torch.zeros(2, 3), position=torch.zeros(2, 3))
+    with pytest.raises(InputError, match="lacks positions, or directions or receivers"):
+        prediction.to_frame()
+
+
 def test_numbers_of_numpy_are_numbers():
     room = swiftwrf.simulated_room(n=np.int64(12), grid=AngularGrid.hemisphere(9, np.int32(36)))
     model = make_model("gp", seed=np.int64(3)).fit(room)

@@ -521,6 +521,15 @@ def test_spectra_are_differentiable_in_the_position_of_a_receiver():
             torch.testing.assert_close(at.grad[:, axis], (ends[0] - ends[1]) / 2e-4, rtol=0.02, atol=1.0)
 
 
+def test_spectra_and_their_gradient_are_finite_where_both_ends_meet():
+    room = GeometryModel.of_planes(simulated_room(n=10, grid=GRID), built_in_walls())
+    at = room.fixed_position[None].clone().requires_grad_()
+    spectrum = room.predict(at).mean
+    spectrum.sum().backward()
+    assert spectrum.isfinite().all()
+    assert at.grad.isfinite().all()
+
+
 @pytest.mark.parametrize(
     ("normal", "offset", "gain", "order", "says"),
     [
