@@ -43,14 +43,7 @@ from tasks.records import CONFIG, PARTIAL, Row, read_json
 MAP_FILES = (".tif", ".geojson", ".png")  # suffixes of files that hold a map only
 FILES = (".csv", ".mat", *MAP_FILES)  # other names are directories
 TABLE = ".csv"  # suffix of a followed table; other followed files are JSON lines
-OF_ROWS = (
-    "columns",
-    "filler",
-    "coordinates",
-    "scale",
-    "y_down",
-    "up",
-)  # options of reading that a followed table takes
+OF_ROWS = ("columns", "filler", "coordinates", "scale", "y_down", "up")  # options that a followed table takes
 
 
 @options
