@@ -25,7 +25,7 @@ MAX_WIDTH_DB = 30.0  # end of the scale of interval widths of the page
 MIN_RATIO = 1.2  # of the widest interval inside to the median one, for which the widths are drawn
 COVERED_DBM, CERTAINTY = -75.0, 0.9  # coverage of the summary
 RECEIVER = "#cf4a4a"
-WIDTH_PER_STD = 2 * NormalDist().inv_cdf((1 + LEVEL) / 2)
+WIDTH_PER_STD = 2 * NormalDist().inv_cdf((1 + LEVEL) / 2)  # of the interval of a normal variable
 HATCHED = (
     "Hatched like /: outside the measured positions, where predictions are extrapolated; like \\: a packet is more likely "
     "lost than received."
@@ -181,7 +181,9 @@ class Maps:
 
     @cached_property
     def _limits(self) -> tuple[float, float]:
-        low, high = np.nanpercentile(self.arrays["measured"], (1, 99)).tolist()
+        measured = self.arrays["measured"]
+        shown = self.arrays["predicted"] if np.isnan(measured).all() else measured  # nothing may be received on a floor
+        low, high = np.nanpercentile(shown, (1, 99)).tolist()
         return low, high
 
     def _cells(self, fields: dict[str, NDArray[Any]], receivers: list[str]) -> DataFrame:

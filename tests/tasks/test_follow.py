@@ -153,16 +153,26 @@ def observed(answers):
     ids=["unchanged", "grown", "rewritten", "truncated", "last line the same"],
 )
 @pytest.mark.parametrize("by", ["in place", "by name"])
-def test_a_source_goes_on_after_the_lines_learnt_or_begins_again(follow, model, tmp_path, after, expected, by):
-    source = tmp_path / "rows.csv"
+@pytest.mark.parametrize("when", ["between two starts", "while it is followed"])
+def test_a_source_goes_on_after_the_lines_learnt_or_begins_again(follow, model, tmp_path, after, expected, by, when):
+    source, changed = tmp_path / "rows.csv", []
     source.write_bytes(HEADER + b"".join(ROWS[:3]))
-    assert observed(follow(model, source)[1]) == [-60, -61, -62]
-    if by == "by name":
-        source.rename(tmp_path / "rows.csv.1")
-    source.write_bytes(after)
-    code, answers, _ = follow(model, source)
-    assert code == 130
-    assert observed(answers) == expected
+
+    def change(seconds=0.0):
+        if changed:
+            raise KeyboardInterrupt
+        changed.append(True)
+        if by == "by name":
+            source.rename(tmp_path / "rows.csv.1")
+        source.write_bytes(after)
+
+    if when == "between two starts":
+        answers = follow(model, source)[1]
+        change()
+        answers += follow(model, source)[1]
+    else:
+        answers = follow(model, source, stop=change)[1]
+    assert observed(answers) == [-60, -61, -62, *expected]
     assert indices(tmp_path / "out") == list(range(3 + len(expected)))
 
 
