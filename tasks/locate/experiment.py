@@ -72,8 +72,7 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
         InputError: Data or options that do not exist or do not fit together.
     """
     device = choose_device("cpu")
-    found = measured_rssi(config.data, config.table)
-    data = (rssi_room(seed=config.seed) if found is None else found).receivers(config.rx)
+    data = measurements(config)
     for note in data.notes:
         console.print(f"{data.name}: {note}")
     measured = LocateSplit.of(data, config.split, config.cells, config.seed, config.table.reference)
@@ -96,6 +95,16 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
         result = LocateComparison(measured, values)
         write_table(directory.path("errors.csv"), result.errors.to_dict("records"))
         finish(directory, _metrics(data, result), page, answer)
+
+
+def measurements(config: LocateConfig) -> Rssi:
+    """Return the RSSI of a run at the receivers that are asked for.
+
+    Raises:
+        InputError: The data cannot be read, or have no such receiver.
+    """
+    found = measured_rssi(config.data, config.table)
+    return (rssi_room(seed=config.seed) if found is None else found).receivers(config.rx)
 
 
 def _metrics(data: Rssi, result: LocateComparison) -> Row:
