@@ -22,7 +22,7 @@ from swiftwrf.online import Step
 from swiftwrf.online.scores import LEVEL
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime.durable import strict
-from tasks.configs import OF_ROWS, TABLE, UpdateConfig
+from tasks.configs import OF_ROWS, TABLE_SUFFIX, UpdateConfig
 from tasks.source import reading
 
 POLL_S = 0.2  # between two looks at a file that grows
@@ -51,7 +51,7 @@ def check_source(source: str, model: FieldModel | RssiModel) -> None:
             raise InputError("standard input is closed; connect it or give a file")
         return
     with refusing_unreadable(Path(source)), Path(source).open("rb"):
-        if source.lower().endswith(TABLE) and not isinstance(model, RssiModel):
+        if source.lower().endswith(TABLE_SUFFIX) and not isinstance(model, RssiModel):
             raise InputError(f"{source} is a table, but the model predicts spectra; give JSON lines")
 
 
@@ -78,7 +78,7 @@ def lines(source: str, end: int = 0, sha256: str = "") -> Iterator[Line]:
                 if not line.endswith(b"\n") and _begins_alike(source, end + len(line), digest.hexdigest()):
                     break  # the file was saved again while its last line was not whole
                 end, sha256 = end + len(line), digest.hexdigest()
-                if source.lower().endswith(TABLE) and not header:
+                if source.lower().endswith(TABLE_SUFFIX) and not header:
                     header = line.strip() and line
                 elif end > known and line.strip():
                     yield Line(number, line, header, end, sha256)
