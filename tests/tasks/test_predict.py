@@ -139,7 +139,7 @@ def test_directions_of_measured_and_unknown_positions(finished, small, tmp_path,
 
 
 def test_errors_are_those_of_known_directions(finished, small, tmp_path, capsys, monkeypatch):
-    """Of two errors the median is the mean; without the pose of the array there are none."""
+    """The median of two errors is their mean; without the pose of the array there are no errors."""
     estimator = finished / "kernel_regression-mix0.5.safetensors"
     two = small.subset(torch.arange(2))
     without_pose = Spectra(two.spectrum, two.position, grid=GRID)
