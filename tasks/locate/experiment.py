@@ -103,8 +103,8 @@ def measurements(config: LocateConfig) -> Rssi:
     Raises:
         InputError: The data cannot be read, or have no such receiver.
     """
-    found = measured_rssi(config.data, config.table)
-    return (rssi_room(seed=config.seed) if found is None else found).receivers(config.rx)
+    measured = measured_rssi(config.data, config.table)
+    return (rssi_room(seed=config.seed) if measured is None else measured).receivers(config.rx)
 
 
 def _metrics(data: Rssi, result: LocateComparison) -> Row:
