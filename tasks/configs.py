@@ -42,7 +42,8 @@ from tasks.records import CONFIG, PARTIAL, Row, read_json
 
 MAP_FILES = (".tif", ".geojson", ".png")  # suffixes of files that hold a map only
 FILES = (".csv", ".mat", *MAP_FILES)  # other names are directories
-TABLE = ".csv"  # suffix of a followed table; other followed files are JSON lines
+TABLE_SUFFIX = ".csv"  # suffix of a followed table; other followed files are JSON lines
+OF_ROWS = ("columns", "filler", "coordinates", "scale", "y_down", "up")  # options that a followed table takes
 
 
 @options
@@ -367,10 +368,14 @@ class UpdateConfig(Options):
 
     def check(self) -> None:
         super().check()
-        if self.follow and self.source != "-" and not self.source.lower().endswith((".ndjson", ".jsonl", TABLE)):
-            raise InputError(f"--follow takes .ndjson or .jsonl or {TABLE} files or -, got {self.source}")
+        if self.follow and self.source != "-" and not self.source.lower().endswith((".ndjson", ".jsonl", TABLE_SUFFIX)):
+            raise InputError(f"--follow takes .ndjson or .jsonl or {TABLE_SUFFIX} files or -, got {self.source}")
         if self.follow and (self.output.open or self.output.json):
             raise InputError("--follow prints JSON lines and writes no page; leave out --open and --json")
+        taken = OF_ROWS if self.source.lower().endswith(TABLE_SUFFIX) else ()
+        for name in given(self.spectra) | given(self.table) if self.follow and self.data is None else ():
+            if name.replace("-", "_") not in taken:
+                raise InputError(f"--{name} is no option of a followed source; leave it out")
 
 
 @options

@@ -25,7 +25,7 @@ from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.durable import replacing, write_json
 from tasks.configs import FILES, MAP_FILES, ConvertConfig
-from tasks.directory import check_new_file, model_file, new_directory
+from tasks.directory import check_new_file, kept_model, new_directory
 from tasks.environment import command, invocation
 from tasks.options import plain
 from tasks.page.maps import colour_image
@@ -138,7 +138,7 @@ def saved_model(source: Path) -> RssiModel | None:
     Raises:
         InputError: A run without an RSSI model, or a model of which no map is written.
     """
-    kept = model_file(source)
+    kept = kept_model(source)
     if kept is None and isfile(source / CONFIG):
         raise InputError(f"{source} is a run without an RSSI model; name one of its models, {source}/....safetensors")
     file = kept or source

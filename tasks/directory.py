@@ -35,7 +35,7 @@ LOCK = "lock"
 MAX_LABEL = 60  # characters of the label in the name of a directory under runs/
 
 
-def model_file(folder: Path) -> Path | None:
+def kept_model(folder: Path) -> Path | None:
     """Return the file of the RSSI model or of the locator that a run keeps, None if it keeps neither."""
     return next((file for name in (MODEL, LOCATOR) if isfile(file := folder / name)), None)
 

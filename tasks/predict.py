@@ -28,7 +28,7 @@ from swiftwrf.rssi.base import RssiPredictor
 from tasks.aoa.records import FractionRecords
 from tasks.configs import PredictConfig
 from tasks.convert import write_file
-from tasks.directory import check_new_file, model_file
+from tasks.directory import check_new_file, kept_model
 from tasks.environment import stamp
 from tasks.options import given
 from tasks.page.records import Records
@@ -100,7 +100,7 @@ def saved_file(model: Path) -> Path:
     """
     if not isfile(model / CONFIG):
         return model
-    if kept := model_file(model):
+    if kept := kept_model(model):
         return kept
     records = Records(model)
     fractions = FractionRecords.of(records) if "mixes" in records.metrics else []

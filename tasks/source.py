@@ -23,7 +23,7 @@ from swiftwrf.errors import listed
 from tasks.options import OffsetSource, SpectraSource, TableSource, by_name, pairs
 from tasks.terminal import console
 
-BATCH_ROWS = 1024  # of an array that is read
+ROWS_A_READ = 1024  # of an array that is read
 
 
 def reading(spectra: SpectraSource, table: TableSource) -> ReadOptions:
@@ -170,7 +170,7 @@ def _read_array(file: Path) -> Tensor:
     shape, dtype = array_header(file, "array")
     if len(shape) != 3 or dtype.kind != "f" or not math.prod(shape):
         raise InputError(f"{file} must hold floating-point spectra (n, elevations, azimuths), got {dtype} of {shape}")
-    spectrum = torch.cat([torch.from_numpy(some.astype(np.float32)) for some in read_rows(file, "array", BATCH_ROWS)])
+    spectrum = torch.cat([torch.from_numpy(some.astype(np.float32)) for some in read_rows(file, "array", ROWS_A_READ)])
     if not bool(((spectrum >= 0) & (spectrum <= 1)).all()):
         raise InputError(f"{file} must hold magnitudes in [0, 1]")
     return spectrum

@@ -22,7 +22,8 @@ from swiftwrf.online import Step
 from swiftwrf.online.scores import LEVEL
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime.durable import strict
-from tasks.configs import TABLE, UpdateConfig
+from tasks.configs import OF_ROWS, TABLE_SUFFIX, UpdateConfig
+from tasks.source import reading
 
 POLL_S = 0.2  # between two looks at a file that grows
 CHUNK_BYTES = 2**20
@@ -50,7 +51,7 @@ def check_source(source: str, model: FieldModel | RssiModel) -> None:
             raise InputError("standard input is closed; connect it or give a file")
         return
     with refusing_unreadable(Path(source)), Path(source).open("rb"):
-        if source.lower().endswith(TABLE) and not isinstance(model, RssiModel):
+        if source.lower().endswith(TABLE_SUFFIX) and not isinstance(model, RssiModel):
             raise InputError(f"{source} is a table, but the model predicts spectra; give JSON lines")
 
 
@@ -77,7 +78,7 @@ def lines(source: str, end: int = 0, sha256: str = "") -> Iterator[Line]:
                 if not line.endswith(b"\n") and _begins_alike(source, end + len(line), digest.hexdigest()):
                     break  # the file was saved again while its last line was not whole
                 end, sha256 = end + len(line), digest.hexdigest()
-                if source.lower().endswith(TABLE) and not header:
+                if source.lower().endswith(TABLE_SUFFIX) and not header:
                     header = line.strip() and line
                 elif end > known and line.strip():
                     yield Line(number, line, header, end, sha256)
@@ -153,16 +154,9 @@ def _number(value: object) -> float:
 
 def _of_row(text: str, config: UpdateConfig, model: RssiModel) -> Rssi:
     """Return the measurement in a table of one row; receivers that the model does not have are left out."""
-    source, table = config.table, table_of("the table", text)
-    data = Rssi.from_frame(
-        table,
-        columns=source.column_names,
-        filler=source.fillers,
-        coordinates=source.coordinates,
-        scale=source.scale,
-        y_down=source.y_down,
-        up=source.up,
-    ).about(model.origin)
+    options = reading(config.spectra, config.table)
+    table = table_of("the table", text)
+    data = Rssi.from_frame(table, **{name: getattr(options, name) for name in OF_ROWS}).about(model.origin)
     rssi = zip(spelled_as(data.receiver_names, model.receiver_names)[0], data.rssi_dbm[0].tolist(), strict=True)
     value = {name: x for name, x in rssi if name in model.receiver_names}
     if not value:

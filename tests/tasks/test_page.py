@@ -154,6 +154,7 @@ def test_figures_of_constant_empty_and_single_values(values):
         drawn.append(figure)
     rows = [str(i) for i in range(n)]
     drawn += [figures.dots(rows, {"a": [(x, x, x) for x in values]}, {}, "v", log=log) for log in (False, True)]
+    drawn.append(figures.dots(["a", "b"], {"one": [(2.0, 1.0, 3.0), (None,) * 3]}, {}, "v", log=True))  # b has no rows
     drawn.append(spectra(dict.fromkeys(SCALES, np.full((9, 36), values.mean() if n else 0.0)), "constant"))
     drawn.append(plotting.polar_spectrum(torch.zeros(9, 36), AngularGrid.hemisphere(9, 36)).figure)
     if n:  # data sets have at least one row

@@ -177,10 +177,19 @@ def test_an_update_from_files_writes_model_table_and_page(tmp_path, model_file, 
     assert main(["update", str(model_file), str(tmp_path / "data"), "--out", str(out)]) == 2
 
 
-@pytest.mark.parametrize("arguments", [("--follow", "--json"), ("--false-alarm-rate", "2"), ("--follow", "--open")])
-def test_wrong_options_are_refused(arguments, capsys):
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--follow", "--json"), "--follow prints JSON lines"),
+        (("--false-alarm-rate", "2"), "--false-alarm-rate must be"),
+        (("--follow", "--open"), "--follow prints JSON lines"),
+        (("--follow", "--window", "1"), "--window is no option of a followed source"),
+        (("--follow", "--y-down", "--every", "2"), "--every is no option of a followed source"),
+    ],
+)
+def test_wrong_options_are_refused(arguments, says, capsys):
     assert main(["update", "m", "table.csv", "--out", "x", *arguments]) == 2
-    assert capsys.readouterr().err.startswith("error: ")
+    assert capsys.readouterr().err.startswith(f"error: {says}")
 
 
 def test_a_record_is_cut_to_what_the_model_has_learnt(tmp_path):
