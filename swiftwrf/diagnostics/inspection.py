@@ -236,8 +236,6 @@ def _check_snapshots(data: Snapshots, findings: Findings) -> None:
         findings.add(
             f"Taken over {float(data.time.max() - data.time.min()):.1f} s, {float(step.median()):.3f} s apart (median)."
         )
-        if bool((step < 0).any()):
-            findings.warn("Times are not in order; a block split by position does not mind.")
 
 
 def _check_calibration(data: Snapshots, findings: Findings) -> None:
