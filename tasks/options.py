@@ -271,6 +271,11 @@ class OffsetSource(TableSource):
         """Group whose offset is 0, None for the most frequent one."""
         return None if self.offset_by is None else self.offset_by.partition("=")[2] or None
 
+    def check(self) -> None:
+        super().check()
+        if self.offset_by is not None and self.offset_by.startswith("="):
+            raise InputError(f"--offset-by takes COLUMN or COLUMN=VALUE, got {self.offset_by!r}")
+
     def check_used(self, data: str | None) -> None:
         """Refuse options of reading RSSI without measured data.
 
