@@ -417,11 +417,9 @@ def _repeated_scans(coordinate: Floats, rssi: Floats) -> NDArray[np.bool_]:
 
 def _split_packets(rssi: Floats, time: Floats) -> list[str]:
     """Return a note on rows of one receiver each that follow each other within a second, or none."""
-    if rssi.shape[1] < 2 or len(rssi) < MIN_REPEATS or not np.isfinite(time).all():
-        return []
     alone = float(((~np.isnan(rssi)).sum(axis=1) == 1).mean())
-    step = float(np.median(np.diff(np.sort(time))))
-    if alone < 0.9 or not step < 1:
+    step = float(np.median(np.diff(np.sort(time)))) if len(time) >= MIN_REPEATS else np.inf  # nan without some times
+    if rssi.shape[1] < 2 or alone < 0.9 or not step < 1:
         return []
     return [
         f"rows hold the packet of one receiver each, {step:.2g} s after the row before; --window 1 joins the packets of a "

@@ -274,10 +274,9 @@ def _hypotheses(
         turned = torch.cat([away[:, :2] @ torch.tensor(matrix).double().T, away[:, 2:]], dim=1)
         yield meaning, at(turned)
     for axis in "xyz":
-        offset, mirrored = best_mirror(
+        meaning, mirrored = best_mirror(
             frame.position, frame.fixed[None], axis, lambda p: _agreement(replace(frame, position=p).direction(), peak)
         )
-        meaning = f"{axis} of the positions counts from the other side (near {axis} = {offset:.1f} - {axis})"
         yield meaning, at(replace(frame, position=mirrored).away(), free=1)
 
     def placed(position: Tensor, free: float = 0) -> _Hypothesis:
@@ -315,8 +314,8 @@ def best_explanations(score: Mapping[str, float], tie: float) -> tuple[float, li
 
 def best_mirror(
     position: Tensor, others: Tensor, axis: str, score: Callable[[Tensor], Any], refined: bool = False
-) -> tuple[float, Tensor]:
-    """Return the offset c [m] of the mirror c - x along an axis with the highest score, and the positions (n, 3) in it.
+) -> tuple[str, Tensor]:
+    """Return in words, and the positions (n, 3) in, the mirror c - x [m] along an axis with the highest score.
 
     The mirror lies in the range of the positions and of others (m, 3). Offsets are scanned, and then refined if asked for.
     """
@@ -333,7 +332,7 @@ def best_mirror(
     if refined:
         near = offset - (high - low) / 39, offset + (high - low) / 39
         offset = float(minimize_scalar(lambda c: -score(mirrored(float(c))), bounds=near, method="bounded").x)
-    return offset, mirrored(offset)
+    return f"{axis} of the positions counts from the other side ({axis} = {offset:.1f} - {axis})", mirrored(offset)
 
 
 def _nearest(direction: Tensor, peak: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.data import Rssi, Snapshots, Spectra
+from swiftwrf.data.powers import has_frequent_edge
 from swiftwrf.data.splits import MAX_REPEATED, MIN_TRAINING, repeated_fraction
 from swiftwrf.diagnostics.calibration import calibrate
 from swiftwrf.diagnostics.elements import in_noise, noisy_elements, some_rows
@@ -236,8 +237,6 @@ def _check_snapshots(data: Snapshots, findings: Findings) -> None:
         findings.add(
             f"Taken over {float(data.time.max() - data.time.min()):.1f} s, {float(step.median()):.3f} s apart (median)."
         )
-        if bool((step < 0).any()):
-            findings.warn("Times are not in order; a block split by position does not mind.")
 
 
 def _check_calibration(data: Snapshots, findings: Findings) -> None:
@@ -376,6 +375,11 @@ def _columns(data: Rssi, detected: Tensor, findings: Findings) -> None:
         findings.warn(f"Receivers with one value everywhere: {listed(constant)}.")
     if positive := those(lambda v: bool(v.min() < v.max() and v.max() >= 0)):
         findings.warn(f"Receivers with values of 0 dBm and more, which few receivers measure: {listed(positive)}.")
+    if repeated := those(lambda v: has_frequent_edge(v.numpy())):
+        findings.warn(
+            "The weakest value is far more frequent than those above it; does it mean not detected? Receivers: "
+            f"{listed(repeated)}."
+        )
     first, filled = dict[bytes, str](), zip(data.receiver_names, data.rssi_dbm.nan_to_num(0.0).T, strict=True)
     earliest = {name: first.setdefault(column.numpy().tobytes(), name) for name, column in filled}
     if same := [f"{name} = {other}" for name, other in earliest.items() if name != other]:

@@ -68,8 +68,7 @@ def check_path_loss(data: Rssi) -> PathLossReport | None:
     found = {meaning: _explained(place @ matrix, data) for meaning, matrix in errors.items()}
     fitted, located = dict[str, float](), data.receiver_position[data.receiver_located]
     for axis in varying:
-        offset, mirrored = best_mirror(place, located, axis, lambda p: _explained(p, data), refined=True)
-        meaning = f"{axis} of the positions counts from the other side ({axis} = {offset:.1f} - {axis})"
+        meaning, mirrored = best_mirror(place, located, axis, lambda p: _explained(p, data), refined=True)
         fitted[meaning] = _explained(mirrored, data)
     delays = {late: _explained(earlier(walk.transmitter_position, late)[rows], data) for late in shifts(len(walk))}
     if delays:

@@ -5,6 +5,7 @@ A format or a kind of model joins by a sample here (a test fails for one without
 """
 
 import functools
+import json
 import random
 from collections.abc import Callable
 from pathlib import Path
@@ -88,6 +89,19 @@ def captures(folder: Path, **form: Any) -> None:
 def survey_parquet(folder: Path) -> None:
     header, rows = survey_rows()
     pd.DataFrame(rows, columns=header).to_parquet(folder / "walk.parquet")
+
+
+def survey_json(folder: Path) -> None:
+    header, rows = survey_rows()
+    points = [{"at": row[:2], "scan": dict(zip(header[3:], row[3:], strict=True))} for row in rows]
+    (folder / "walk.json").write_text(json.dumps({"survey": [{"name": "a", "points": points}]}))
+
+
+def track_gpx(folder: Path) -> None:
+    points = (
+        f'<trkpt lat="47.{n}" lon="8.{n}"><extensions><rssi>-{n}</rssi></extensions></trkpt>' for n in range(40, 60)
+    )
+    (folder / "walk.gpx").write_text(f"<gpx><trk><trkseg>{''.join(points)}</trkseg></trk></gpx>")
 
 
 @functools.cache
@@ -222,6 +236,8 @@ KINDS: dict[str, tuple[Callable[[Path], object], Reader]] = {
     "format of RSSI nerf2": (rssi_nerf2, read_rssi),
     "survey in Parquet": (survey_parquet, read_rssi),
     "format of RSSI survey": (rssi_survey, read_rssi),
+    "survey in JSON": (survey_json, lambda folder: read_rssi(folder / "walk.json")),
+    "track in GPX": (track_gpx, lambda folder: read_rssi(folder / "walk.gpx")),
     **{name: (functools.partial(save, name), read_model) for name in MODELS},
     "kernel regression": (functools.partial(save, "kernel regression"), read_estimator),
     "RSSI locator": (functools.partial(save, "RSSI locator"), read_locator),

@@ -172,10 +172,10 @@ def _read_offsets(file: Path) -> NDArray[Any]:
     try:
         content = json.loads(read_text(file))
         values = np.array([content["cpo"], content["sto"]], dtype=np.float64).T
+        if values.ndim != 2 or not np.isfinite(values).all():
+            raise ValueError(f"got {values.shape[::-1]} numbers, or some that are not finite")
     except (ValueError, TypeError, LookupError, RecursionError) as error:
         raise InputError(f"{file} must hold lists cpo and sto with a number for each antenna ({error})") from None
-    if values.ndim != 2 or not np.isfinite(values).all():
-        raise InputError(f"{file} must hold lists cpo and sto with a finite number for each antenna")
     return values
 
 
