@@ -283,6 +283,11 @@ def test_an_interval_of_one_width_sends_nobody_to_measure():
     width = np.tile([[[[7.0]], [[8.0]]]], (1, 1, 4, 5))
     maps = {"x": x, "y": y, "measured_position": corners, "measured": corners[:, :2], "width": width}
     maps |= {"predicted": width, "detection": width, "floor_of_row": np.zeros(4, int)}
+    run = SimpleNamespace(arrays=lambda name: maps)
+    assert where_next(run).startswith("Measure at more positions: 4 are too few")
+    between = np.linspace([0, 0, 1], [4, 3, 1], 30)
+    position = np.concatenate([corners, between])
+    maps |= {"measured_position": position, "measured": position[:, :2], "floor_of_row": np.zeros(34, int)}
     tested = pd.DataFrame({"x": x, "y": 0.0, "z": 1.0, "receiver": "a", "measured": -60.0})
     run = SimpleNamespace(arrays=lambda name: maps, table=lambda name: tested)
     assert "not worth it" in where_next(run)
@@ -320,6 +325,9 @@ def test_each_floor_has_its_maps_its_rows_and_its_coverage():
     assert (ground.place, first.titled("a")) == ("floor Ground", "a, First")
     assert first.arrays["measured"].ravel().tolist() == [4.0] * 4
     assert first.summary().name == "summary-1"
+    maps["y"] = np.arange(4.0) / 20  # a corridor, which would be a line to scale
+    shape = {maps.summary().figures[0].axes[0].get_aspect() for maps in (first, first.of_floors(first.run)[0])}
+    assert shape == {"auto"}
     assert [first.by_receiver(kind).name for kind in ("predicted", "width")] == ["map-run-1", "width-run-1"]
 
 
