@@ -334,7 +334,7 @@ def test_each_floor_has_its_maps_its_rows_and_its_coverage(tmp_path):
     assert first.arrays["measured"].ravel().tolist() == [4.0] * 4
     assert first.summary().name == "summary-1"
     maps["y"] = np.arange(4.0) / 20  # a corridor, which would be a line to scale
-    assert first.summary().panels[0].axes[0].get_aspect() == "auto"
+    assert Maps(run, 1).summary().panels[0].axes[0].get_aspect() == "auto"
     assert [first.by_receiver(kind).name for kind in ("predicted", "width")] == ["map-run-1", "width-run-1"]
     maps["measured"] = np.where(position[:, 2:] > 0, np.nan, -50.0)  # the first floor receives nothing
     _, first = Maps.of_floors(run)
