@@ -67,9 +67,11 @@ def run(config: PredictConfig) -> None:
             f"--track smooths positions, and {file} holds {with_article(model.kind)}, which locates nothing"
         )
     if isinstance(model, FieldModel | RssiPredictor):
-        origin = model.origin if isinstance(model, RssiPredictor) else None
+        origin, floors = None, None
+        if isinstance(model, RssiPredictor):
+            origin, floors = model.origin, model.attenuation and model.attenuation.floors
         frame = PlanFrame(config.table.scale, config.table.y_down, config.table.up)
-        prediction = model.predict(read_places(Path(config.source), origin, frame))
+        prediction = model.predict(read_places(Path(config.source), origin, frame, floors))
         terminal.page({"table": str(out)}, f"{write_file(prediction, out)}: {out}")
         return
     if isinstance(model, RssiLocator):

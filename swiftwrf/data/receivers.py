@@ -13,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from swiftwrf.data.cells import column_of_numbers
+from swiftwrf.data.cells import column_of_numbers, text_of
 from swiftwrf.data.columns import GEODETIC, column_of
-from swiftwrf.data.coordinates import GeodeticOrigin, PlanFrame, frame_of
+from swiftwrf.data.coordinates import Floors, GeodeticOrigin, PlanFrame, frame_of
 from swiftwrf.data.files import numbers, read_table, read_yaml
 from swiftwrf.errors import InputError, listed
 from swiftwrf.positions import check_positions
@@ -148,15 +148,25 @@ def _positions_by_name(file: Path) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["receiver", "x", "y", "z"])
 
 
-def read_places(file: Path, origin: GeodeticOrigin | None, frame: PlanFrame) -> Tensor:
+def read_places(file: Path, origin: GeodeticOrigin | None, frame: PlanFrame, floors: Floors | None = None) -> Tensor:
     """Return the positions in a table with columns x, y, z or longitude, latitude, altitude, float64 (n, 3) [m].
 
-    Without a column of heights, z is 0. Origin and axes are those of `read_receivers`.
+    Without a column of heights, z is 0, or in a building with floors the height of the floor in column floor. Origin and
+    axes are those of `read_receivers`.
 
     Raises:
-        InputError: A column that is missing, or a position that is not usable.
+        InputError: A column that is missing, an unknown floor, or a position that is not usable.
     """
-    return check_positions(_positions(file, read_table(file), origin, frame, "x,y,z"), f"positions of {file}")
+    table = read_table(file)
+    position = _positions(file, table, origin, frame, "x,y,z")
+    if floors is not None and column_of(table, "z", {}) is None:
+        column = column_of(table, "floor", {})
+        named = [] if column is None else text_of(table[column]).tolist()
+        height = {name: z for names, z in zip(floors.names, floors.height_m, strict=True) for name in names.split(", ")}
+        if not named or not set(named) <= set(height):
+            raise InputError(f"{file} needs a column z, or a column floor with names of floors: {listed(list(height))}")
+        position[:, 2] = [height[name] for name in named]
+    return check_positions(position, f"positions of {file}")
 
 
 def _positions(file: Path, table: pd.DataFrame, origin: GeodeticOrigin | None, frame: PlanFrame, header: str) -> Floats:
@@ -178,7 +188,7 @@ def _positions(file: Path, table: pd.DataFrame, origin: GeodeticOrigin | None, f
         return frame_of(file, table, both, frame)[0].to_world(position)
     if not (np.abs(xy - (origin.longitude, origin.latitude)) <= MAX_FROM_ORIGIN_DEG).all():
         raise InputError(
-            f"{file}: receivers must be in degrees as the measurements are, within {MAX_FROM_ORIGIN_DEG:g} degrees of "
+            f"{file}: positions must be in degrees as the measurements are, within {MAX_FROM_ORIGIN_DEG:g} degrees of "
             f"{origin}"
         )
     position[known, :2] = origin.to_metres(xy[:, ::-1])

@@ -131,11 +131,14 @@ def _check_positions(position: Tensor, findings: Findings, wavelength: float | N
         findings.warn(f"All positions have one {' and one '.join(flat)}; directions and planes are not identifiable.")
     if len(position) < 2:
         return
-    _, near = nearest(position)
-    _, times = position.unique(dim=0, return_counts=True)
-    same = int(times[times > 1].sum())
-    if same:
-        findings.add(f"{same} positions occur more than once; the split random keeps each place in one part.")
+    places = position.unique(dim=0)
+    if len(places) < len(position):
+        findings.add(
+            f"{len(position)} rows are at {len(places)} different positions; the split random keeps each in one part."
+        )
+    if len(places) < 2:
+        return
+    _, near = nearest(places)
     middle = float(near.median())
     findings.numbers["nearest_m"] = middle
     if wavelength is None:

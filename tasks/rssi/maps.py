@@ -22,6 +22,7 @@ from tasks.page.records import Records
 MAX_MAPS = 24  # receivers with a map in the report; all are in the tables
 MAX_VECTOR_DOTS = 300  # more dots become an image: the page would grow to megabytes
 MAX_WIDTH_DB = 30.0  # end of the scale of interval widths of the page
+MAX_RATIO = 12.0  # of the sides of a map that is to scale; one of a corridor would be a line
 MIN_RATIO = 1.2  # of the widest interval inside to the median one, for which the widths are drawn
 COVERED_DBM, CERTAINTY = -75.0, 0.9  # coverage of the summary
 RECEIVER = "#cf4a4a"
@@ -137,6 +138,7 @@ class Maps:
         a, values = self.arrays, fields[kind]
         x0, x1, y0, y1 = corners_of(a["x"], a["y"])
         shape = (y1 - y0) / (x1 - x0)
+        aspect = "equal" if 1 / MAX_RATIO <= shape <= MAX_RATIO else "auto"
         figure, ax = figures.panel(width, 0.8 + (width - 1.2) * float(np.clip(shape, 0.4, 1.6)))
         limits, colours = (self._widths, "magma") if kind == "width" else (self._limits, "viridis")
         if kind == "predicted" and receiver is None:
@@ -146,7 +148,7 @@ class Maps:
             ax.imshow(plan.pixels, extent=plan.corners, aspect="equal", zorder=0)
         opacity = 1.0 if plan is None else 0.75
         drawn = ax.imshow(
-            values, origin="lower", extent=(x0, x1, y0, y1), alpha=opacity, zorder=1, aspect="equal", **style
+            values, origin="lower", extent=(x0, x1, y0, y1), alpha=opacity, zorder=1, aspect=aspect, **style
         )
         hatch(ax, a["x"], a["y"], ~self.inside)
         hatch(ax, a["x"], a["y"], fields["detection"] < 0.5, "\\\\\\\\")

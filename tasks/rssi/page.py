@@ -30,6 +30,7 @@ from tasks.rssi.maps import CERTAINTY, COVERED_DBM, MAX_VECTOR_DOTS, MIN_RATIO, 
 COLUMNS = ["index", "receiver", "method", "abs_error_db"]  # of the errors of methods
 COLOURS = colours(PREDICTORS)
 REFERENCES = ("mean", "mri_pooled")  # which explain no place
+MIN_POSITIONS = 30  # for an interval of one width to show that more positions do not help
 MIN_REPEATS = 10  # of measurements at one place
 MAX_RATIO_TO_SCATTER = 1.3  # of an interval to the one of repeated measurements, which then explain it
 MAX_RECEIVERS = 40  # of the figure of differences; all are in its table
@@ -156,9 +157,7 @@ def steps(run: Records) -> list[NextStep]:
     pairs = model_of(run) == "pairs"  # its maps depend on both ends, and the page shows one
     own = [NextStep(where_next(run))]
     if unknown := int(np.isnan(run.arrays("maps")["receiver"]).any(axis=1).sum()):
-        text = (
-            f"Give the positions of the {unknown} access points that are unknown, in `receivers.csv` beside the table"
-        )
+        text = f"Give the unknown positions of access points ({unknown}), in `receivers.csv` beside the table"
         own.insert(0, NextStep(text, "receiver,x,y,z"))
     # the receivers of a row are not independent
     n_test = min(run.metrics["n_test"], run.metrics["overall"][model_of(run)]["abs_error_db"]["n"])
@@ -182,6 +181,8 @@ def where_next(run: Records) -> str:
     typical = float(np.median(width[known]))
     row, column = np.unravel_index(np.argmax(np.where(known, width, -np.inf)), width.shape)
     if width[row, column] < MIN_RATIO * typical:
+        if (n := len(np.unique(run.arrays("maps")["measured_position"], axis=0))) < MIN_POSITIONS:
+            return f"Measure at more positions: {n} are too few to show how RSSI varies between them."
         scatter = scatter_of_repeats(run)
         reason = "and the model explains no more"
         if scatter is not None and typical < MAX_RATIO_TO_SCATTER * scatter:

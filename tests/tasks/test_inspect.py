@@ -71,4 +71,6 @@ def test_more_positions_than_are_looked_at(tmp_path, capsys, monkeypatch):
     (tmp_path / "source").mkdir()
     write_spectra(room.subset(torch.arange(15).repeat(2)), tmp_path / "source")
     assert run(tmp_path / "source", "--out", tmp_path / "page") == 0
-    assert "30 positions occur more than once" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "30 rows are at 15 different positions" in said
+    assert "other position is 0.000 m" not in said

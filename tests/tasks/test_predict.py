@@ -14,7 +14,7 @@ from augment import Mixed
 from augment.estimators.aann import AANN
 from augment.estimators.aann_kernel import AANNKernel
 from augment.estimators.kernel_regression import KernelRegression
-from swiftwrf import AngularGrid, InputError, RssiModel, Spectra, load, make_model, rssi_room, simulated_room
+from swiftwrf import AngularGrid, InputError, Rssi, RssiModel, Spectra, load, make_model, rssi_room, simulated_room
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
 from swiftwrf.runtime.checkpoint import read, write
@@ -208,6 +208,27 @@ def test_spectra_and_rssi_at_the_positions_of_a_table(small, tmp_path, capsys):
     ):
         assert run("predict", tmp_path / "field.safetensors", at, *options, "--out", tmp_path / "b.csv") == 2
         assert reason in said(capsys)
+
+
+def test_positions_on_floors_have_the_heights_of_the_measurements(tmp_path, capsys):
+    draw = np.random.default_rng(0)
+    survey = pd.DataFrame(draw.uniform(0, 9, (60, 2)), columns=["x", "y"])
+    survey["floor"] = np.repeat([0, 1], 30)
+    survey["hall"] = -50 - survey.x - 15 * survey.floor
+    RssiModel().fit(Rssi.from_frame(survey)).save(tmp_path / "model.safetensors")
+
+    def predicted(columns, file):
+        survey[columns].iloc[[0, 59]].to_csv(tmp_path / "at.csv", index=False)
+        return run("predict", tmp_path / "model.safetensors", tmp_path / "at.csv", "--out", tmp_path / file)
+
+    assert predicted(["x", "y", "floor"], "floors.csv") == 0
+    table = pd.read_csv(tmp_path / "floors.csv")
+    assert table.z_m.tolist() == [0, 4]
+    assert table.predicted_dbm.to_numpy() == pytest.approx(survey.hall.iloc[[0, 59]].to_numpy(), abs=5)
+    for columns in (["x", "y"], ["x", "y", "floor"]):
+        survey.floor += 7
+        assert predicted(columns, "none.csv") == 2
+        assert "a column floor with names of floors: 0, 1" in said(capsys)
 
 
 def test_the_directory_of_a_run_is_enough(finished, small, tmp_path, capsys):

@@ -374,6 +374,26 @@ def test_a_rarely_detected_receiver_does_not_stop_the_others(n_detected, validat
     assert (prediction.mean[:, 1] - truth).abs().max() < 30
 
 
+def with_rare(data, n_rare=60):
+    """More receivers, as a phone lists them in passing: each is detected once."""
+    rare = torch.full((len(data), n_rare), torch.nan)
+    rare[torch.arange(n_rare) % len(data), torch.arange(n_rare)] = -85.0
+    names = tuple(f"passing {number}" for number in range(n_rare))
+    return replace(
+        data,
+        rssi_dbm=torch.cat([data.rssi_dbm, rare], dim=1),
+        receiver_position=torch.cat([data.receiver_position, torch.full((n_rare, 3), torch.nan)]),
+        receiver_names=data.receiver_names + names,
+    )
+
+
+def test_receivers_that_were_detected_once_choose_nothing(monkeypatch):
+    data = replace(with_field(), receiver_position=torch.full((3, 3), torch.nan))
+    monkeypatch.setattr(RSSI_PREDICTORS, "_registered", {"swiftwrf": RSSI_PREDICTORS["swiftwrf"]})
+    expected, found = compare(data), compare(with_rare(data))
+    assert found.errors.predicted_dbm.tolist() == expected.errors.predicted_dbm.tolist()
+
+
 def test_measurements_on_a_receiver_give_finite_predictions():
     data = with_field(n=40)
     data.transmitter_position.copy_(data.receiver_position[0])
