@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from statistics import NormalDist
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -138,7 +138,7 @@ class Maps:
         a, values = self.arrays, fields[kind]
         x0, x1, y0, y1 = corners_of(a["x"], a["y"])
         shape = (y1 - y0) / (x1 - x0)
-        aspect = "equal" if 1 / MAX_RATIO <= shape <= MAX_RATIO else "auto"
+        aspect: Literal["equal", "auto"] = "equal" if 1 / MAX_RATIO <= shape <= MAX_RATIO else "auto"
         figure, ax = figures.panel(width, 0.8 + (width - 1.2) * float(np.clip(shape, 0.4, 1.6)))
         limits, colours = (self._widths, "magma") if kind == "width" else (self._limits, "viridis")
         if kind == "predicted" and receiver is None:
