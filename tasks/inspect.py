@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
 from matplotlib.patches import Circle
 from pandas import DataFrame
 from torch import Tensor
@@ -30,7 +29,7 @@ from tasks.page.shared import fingerprinting
 from tasks.source import located, reading
 from tasks.terminal import terminal
 
-AXES = {"x": "#cf4a4a", "y": "#2a9165", "normal": "#3a7fd5"}
+AXES = ("#cf4a4a", "#2a9165", "#3a7fd5")  # colours of x, y and normal
 DOTS, NONE = "#3a7fd5", "#7f8794"  # with line of sight, without
 MAX_DOTS = 2000
 MAX_RECEIVERS = 30  # in a figure
@@ -116,8 +115,9 @@ def _places(position: Tensor, **columns: Tensor) -> DataFrame:
 
 def _plan(data: Spectra) -> Plot:
     marker, panels = "^" if data.moving == "transmitter" else "*", []
+    extent = data.position.amax(dim=0) - data.position.amin(dim=0)
     for a, b in ((0, 1), (0, 2)):
-        span = (data.position.amax(dim=0) - data.position.amin(dim=0))[[a, b]].clamp_min(1e-3)
+        span = extent[[a, b]].clamp_min(1e-3)
         figure, ax = figures.panel(3.8, 0.6 + 3 * float((span[1] / span[0]).clamp(0.4, 1.2)))
         for free, colour in ((False, NONE), (True, DOTS)):
             place = data.position[data.line_of_sight == free]
@@ -126,35 +126,18 @@ def _plan(data: Spectra) -> Plot:
         ax.set_aspect("equal", adjustable="datalim")
         if data.fixed_position is not None:
             ax.plot(*data.fixed_position[[a, b]].tolist(), marker, color="black", markersize=7)
-        _draw_axes(ax, data, a, b)
+        if data.rotation is not None:  # at the array, or at the centre of the positions if it moves
+            fixed = data.fixed_position if data.moving == "transmitter" else None
+            origin = data.position.mean(dim=0) if fixed is None else fixed
+            tips = 0.25 * float(extent.max() or 1.0) * data.rotation[[a, b]]
+            start = origin[[a, b], None].expand(2, 3)
+            ax.quiver(*start, *tips, color=AXES, angles="xy", scale_units="xy", scale=1, width=0.006)
         panels.append(figure)
     caption = (
         "From above and from the side: positions with (blue) and without line of sight (grey); arrows: the array's axes x "
         "(red), y (green) and its normal (blue)."
     )
     return Plot("plan", panels, caption, _places(data.position, line_of_sight=data.line_of_sight))
-
-
-def _draw_axes(ax: Axes, data: Spectra, a: int, b: int) -> None:
-    """Draw the axes at the array, or at the centre of the positions if it moves."""
-    if data.rotation is None:
-        return
-    still = data.moving == "transmitter" and data.fixed_position is not None
-    origin = data.fixed_position if still else data.position.mean(dim=0)
-    assert origin is not None
-    length = 0.25 * float((data.position.amax(dim=0) - data.position.amin(dim=0)).max() or 1.0)
-    for (name, colour), axis in zip(AXES.items(), data.rotation.T, strict=True):
-        dx, dy = (length * axis[[a, b]]).tolist()
-        if np.hypot(dx, dy) < 0.2 * length:  # towards the viewer
-            continue
-        ax.annotate(
-            name,
-            xy=(float(origin[a]), float(origin[b])),
-            xytext=(float(origin[a]) + dx, float(origin[b]) + dy),
-            color=colour,
-            fontsize=8,
-            arrowprops={"arrowstyle": "<-", "color": colour},
-        )
 
 
 def _directions(data: Spectra) -> Plot:

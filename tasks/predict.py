@@ -16,7 +16,7 @@ from augment.estimators import SavedEstimator
 from swiftwrf import FieldModel, InputError, Rssi, Spectra, load
 from swiftwrf.data import ReadOptions
 from swiftwrf.data.coordinates import Floors, PlanFrame, degree_columns
-from swiftwrf.data.files import SUFFIXES, read_table
+from swiftwrf.data.files import TABLES, read_table
 from swiftwrf.data.formats import RSSI_FORMATS, read
 from swiftwrf.data.receivers import read_places
 from swiftwrf.data.survey import has_positions
@@ -164,7 +164,7 @@ def read_rssi(source: str, options: ReadOptions) -> tuple[Rssi, bool]:
 
 
 def _is_table(source: str) -> bool:
-    return Path(source).is_file() and Path(source).suffix.lower() in SUFFIXES
+    return Path(source).is_file() and Path(source).suffix.lower() in TABLES
 
 
 def directions(estimator: SavedEstimator, config: PredictConfig) -> Columns:

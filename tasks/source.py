@@ -20,7 +20,7 @@ from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
 from swiftwrf.data.store import Store
 from swiftwrf.datasets import DATA_SETS, fetch
 from swiftwrf.errors import listed
-from tasks.options import OffsetSource, SpectraSource, TableSource, by_name
+from tasks.options import OffsetSource, SpectraSource, TableSource, by_name, pairs
 from tasks.terminal import console
 
 BATCH_ROWS = 1024  # of an array that is read
@@ -33,6 +33,7 @@ def reading(spectra: SpectraSource, table: TableSource) -> ReadOptions:
         **options
         | {
             "array": _array(spectra),
+            "arrays": pairs("arrays", spectra.arrays),
             "grid": AngularGrid.hemisphere(*spectra.grid) if spectra.grid else None,
             "columns": table.column_names,
             "filler": table.fillers,

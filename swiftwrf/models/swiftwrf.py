@@ -229,8 +229,8 @@ class SwiftWRF(ProcessModel):
         expect(tensors, {"mean": (n, 2), "cholesky": (n, 3), "weight": (1 + k, n)})
         self.mean, self.cholesky, self.weight = (tensors[name] for name in ("mean", "cholesky", "weight"))
         self.calibration = float(header["calibration"])
-        if not self.calibration >= 0:
-            raise InputError(f"calibration is {self.calibration}, expected 0 or more")
+        if not 0 <= self.calibration < math.inf:
+            raise InputError(f"calibration is {self.calibration}, expected a finite number, 0 or more")
         self._move(torch.device("cpu"))
 
 

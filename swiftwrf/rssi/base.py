@@ -150,9 +150,9 @@ class RssiPredictor(Configured, Displayed, ABC):
         """
         pool = pool or train
         if (detected := int(train.detected.sum())) < MIN_TRAINING:
-            names = ", ".join(train.receiver_names)
             raise InputError(
-                f"{names}: detected in {detected} training rows in all; at least {MIN_TRAINING} are needed"
+                f"receivers {listed(train.receiver_names)} have {detected} training measurements in all; measure at least "
+                f"{MIN_TRAINING}"
             )
         more = set(train.receiver_names) <= set(pool.receiver_names)
         if not more or not torch.equal(pool.transmitter_position, train.transmitter_position):
@@ -280,7 +280,7 @@ class RssiPredictor(Configured, Displayed, ABC):
             InputError: As `check_measurements`.
         """
         self.check_measurements(data)
-        return self.predict(data.transmitter_position)
+        return self.predict(data.about(self.origin).transmitter_position)
 
     @checked
     def predict_detection(self, position: Numbers) -> Tensor:

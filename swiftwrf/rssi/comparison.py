@@ -20,7 +20,7 @@ from swiftwrf.data.splits import MIN_TRAINING, Validation
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import method_summary
 from swiftwrf.models.prediction import Prediction
-from swiftwrf.positions import distance
+from swiftwrf.positions import distance, nearest
 from swiftwrf.rssi.base import Map, RssiPredictor
 from swiftwrf.rssi.mixing import LEVEL
 from swiftwrf.rssi.model import RssiModel
@@ -110,7 +110,7 @@ class RssiComparison:
         """Errors, a row for each method and detected pair of test row and receiver."""
         test, (row, column) = self.test, self._pairs
         measured = test.rssi_dbm[row, column]
-        from_training = distance(test.transmitter_position, self.train.transmitter_position).amin(dim=1)[row]
+        from_training = nearest(test.transmitter_position, self.train.transmitter_position, 1)[0][row, 0]
         from_receiver = distance(test.transmitter_position, test.receiver_position)[row, column]
         rows = []
         for name in self.values:

@@ -179,7 +179,7 @@ class RssiModel(SavedRssiPredictor):
         if self.detection is not None:
             level = found["held_out"].T.where(~found["held_out"].T.isnan(), training.baseline_held_out[0])
             seen = ~training.rssi.isnan()
-            bins = training.position, seen, training.fold, level
+            bins = training.position, seen, training.fold, level + training.shift
             self.detection_field = DetectionField.fit(training.kernel, *bins, self.detection.limit)
         rows = {name: found[name].T for name in ("dual", "tangent", "variance")}
         prior = {name: found[name] for name in ("prior_level", "prior_slope")}
@@ -243,8 +243,9 @@ class RssiModel(SavedRssiPredictor):
     def with_chosen_kernel(self, without: Tensor | None = None) -> Self:
         """Return the model fitted again to all rows that it has learnt, with kernel, noise and mixing weights chosen again.
 
-        The rows follow from their residuals. Attenuation of floors and offsets stay as fitted. Rows that were averaged in
-        location bins are bins here, so that the scatter of single measurements is unknown: standard deviations stay, too.
+        The rows follow from their residuals, the attenuation of floors is estimated again, and offsets stay as fitted. Rows
+        that were averaged in location bins are bins here, so that the scatter of single measurements is unknown: standard
+        deviations stay, too.
 
         Args:
             without: Numbers of rows that are forgotten first, in the order in which the model received them, int64. Defaults
@@ -264,17 +265,19 @@ class RssiModel(SavedRssiPredictor):
         kept = torch.ones(len(posterior.anchor), dtype=torch.bool)
         if without is not None:
             kept[without] = False
+        at, rssi, attenuation = self.region()[kept], posterior.rssi[kept], self.attenuation
         rows = Rssi(
-            posterior.rssi[kept],
-            self.region()[kept],
+            rssi if attenuation is None else rssi + attenuation.of(at),
+            at,
             receiver_position=self.receiver_position,
             receiver_names=self.receiver_names,
             origin=self.origin,
+            floors=None if attenuation is None else attenuation.floors,
         )
         # the rows have lost their sessions
         validation = "block" if self.config.validation == "session" else self.config.validation
         model = type(self)(replace(self.config, validation=validation)).fit(rows)
-        model.attenuation, model.offsets = self.attenuation, self.offsets
+        model.offsets = self.offsets
         state = posterior.state
         # a mean of several measurements has a smaller variance than one measurement
         if bool(((state.variance > 0) & (state.variance < 0.99 * state.noise_variance)).any()):
@@ -313,8 +316,9 @@ class RssiModel(SavedRssiPredictor):
         if self.detection is None or self.detection_field is None:
             return prediction
         assert prediction.std is not None
-        mean, std = self.detection.given_detection(prediction.mean.double(), prediction.std.double())
-        return replace(prediction, mean=mean.float(), std=std.float())
+        offset = 0.0 if self.offsets is None else self.offsets.of(data)[:, None]
+        mean, std = self.detection.given_detection(prediction.mean.double() + offset, prediction.std.double())
+        return replace(prediction, mean=(mean - offset).float(), std=std.float())
 
     @checked
     def predict_detection(self, position: Numbers) -> Tensor:
@@ -420,6 +424,7 @@ def _held_out_predictors(training: RssiTraining, found: dict[str, Tensor]) -> tu
     prior_db, middle = (training.field_db, training.noise_db), training.path_loss.centre
     std = held_out_std(training, training.kernel, prior_db, middle, found["covariance"])
     if (detection := training.path_loss.detection) is not None:
-        given = [detection.given_detection(mean, std) for mean in predictors]
-        predictors, std = torch.stack([mean for mean, _ in given]), given[0][1].where(~field.isnan(), std)
+        given = [detection.given_detection(mean + training.shift, std) for mean in predictors]
+        predictors = torch.stack([mean for mean, _ in given]) - training.shift
+        std = given[0][1].where(~field.isnan(), std)
     return predictors, std

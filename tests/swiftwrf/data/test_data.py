@@ -63,7 +63,7 @@ WRONG = {
     "no gateway": (_write("gateway_info.yml", "name: x\n"), "one gateway"),
     "short position": (
         _write("gateway_info.yml", "g:\n  position: [0, 0]\n  orientation: [0, 0, 0, 1]\n"),
-        "3 numbers",
+        r"position must have shape \(3\)",
     ),
     "no positions": (lambda f: (f / "tx_pos.csv").unlink(), "one of tx_pos.csv"),
     "both ends move": (_write("rx_pos.csv", "x,y,z\n1,1,1\n"), "one of tx_pos.csv"),

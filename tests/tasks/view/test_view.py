@@ -1,5 +1,6 @@
 """Content of the page without widgets: views, plans, spectra, maps and refusals."""
 
+import asyncio
 import base64
 import copy
 import io
@@ -472,7 +473,7 @@ def test_a_followed_run_is_read_again_when_it_grows(tmp_path):
     assert snapshot(view, view.version) is shown
     assert [row["index"] for row in shown.rows] == [62, 61, 60]
     assert shown.rows[0]["alarm"] == "hall weaker everywhere"
-    assert "Change at measurement 2: hall weaker everywhere." in shown.sentences
+    assert "Change at measurement 62: hall weaker everywhere." in shown.sentences
     assert all(figure.startswith("<svg") for figure in shown.figures.values())
     record.append(tmp_path, record.add(63, step))
     assert view.version != version
@@ -529,6 +530,32 @@ def test_large_uploads_are_refused_by_the_server(length):
         body = bytes(n)
         content = body if length else iter([body[: n // 2], body[n // 2 :]])
         assert TestClient(app).post("/", content=content).status_code == code
+
+
+@needs_the_extra
+def test_requests_are_answered_one_by_one_and_the_newest_last(monkeypatch):
+    from tasks.view import page
+
+    monkeypatch.setattr(page.background_tasks, "create", asyncio.ensure_future)
+    events, asked = [], []
+
+    async def answer(number):
+        events.append(("begin", number))
+        await asyncio.sleep(0.01)
+        events.append(("end", number))
+        raise ValueError(number)  # does not keep the newest from being answered
+
+    async def ask():
+        queue = page.NewestOnly(answer)
+        for pause in (None, 0.002, 0.002, None, 0.002, 0.1):
+            queue.submit(len(asked))
+            asked.append(pause)
+            if pause:
+                await asyncio.sleep(pause)
+
+    asyncio.run(ask())
+    assert [kind for kind, _ in events] == ["begin", "end"] * (len(events) // 2)
+    assert events[-1] == ("end", 5)
 
 
 @needs_the_extra
