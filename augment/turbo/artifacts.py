@@ -25,7 +25,7 @@ N_LAYERS = 3  # of heights between which furniture is shown
 
 
 def model_file(folder: Path, name: str, key: str) -> Path:
-    """Return the file of a run's fitted field model, by its name and the measured fraction in file names."""
+    """Return the file of a fitted model or estimator, by its name and the measured fraction in file names."""
     return folder / f"{name}-mix{key}.safetensors"
 
 

@@ -10,6 +10,7 @@ from typing import Any, Literal, TypeVar
 
 from augment.cross_validation import LOCATOR, STAND_IN
 from augment.estimators import ESTIMATORS
+from augment.turbo.artifacts import model_file
 from swiftwrf.choices import AUTO, fraction_key
 from swiftwrf.runtime.validation import Preset
 
@@ -121,8 +122,7 @@ def chosen_file(folder: Path, measured_fraction: str, condition: Condition | Non
     if condition is None:
         return None
     alone = condition.estimator == STAND_IN and condition.training == "measured"
-    name = MEASURED_STAND_IN if alone else condition.name
-    file = folder / f"{name}-mix{measured_fraction}.safetensors"
+    file = model_file(folder, MEASURED_STAND_IN if alone else condition.name, measured_fraction)
     return file if file.is_file() else None
 
 

@@ -15,7 +15,7 @@ from augment.estimators import Estimator
 from augment.turbo.condition import LOCATED, MEASURED_STAND_IN, NETWORKS, Condition, MeasuredSubset, Training
 from augment.turbo.experiment import ROOM_MODEL, Experiment
 from augment.turbo.results import TurboResult
-from augment.turbo.stages import compare, evaluate, find_room, locate, locate_fold, synthesize
+from augment.turbo.stages import compare, evaluate, find_room, locate, synthesize
 from swiftwrf.choices import AUTO
 from swiftwrf.data import Spectra
 from swiftwrf.models import FieldModel
@@ -106,8 +106,8 @@ def _learn(
     ) -> Condition:
         condition = Condition(estimator, training, synthesizer, extra, subset.measured_fraction, subset.repeat)
         name = condition.name if condition.is_turbo else MEASURED_STAND_IN
-        file = f"{name}-mix{subset.key}.safetensors" if saved and subset.repeat == 0 else None
-        steps.start(condition.result_name, condition.method, evaluate, condition, file)
+        saved_as = name if saved and subset.repeat == 0 else None
+        steps.start(condition.result_name, condition.method, evaluate, condition, saved_as)
         return condition
 
     # from the measured spectra alone: field models are compared, the room is found, references are trained
@@ -124,12 +124,6 @@ def _learn(
     yield
     # the field models that were asked for or chosen, and others for comparison, predict spectra
     compared = steps[f"choice-{subset}"] if is_compared else {}
-    folds = {
-        fold["number"]: steps.start(
-            f"located-fold{fold['number']}-{subset}", "comparing estimators", locate_fold, subset, fold
-        )
-        for fold in compared.get("folds", ())
-    }
     names = experiment.named or [compared["choice"]["name"]]
     trainings = {name: experiment.trainings(compared.get("cross_validation", {}).get(name)) for name in names}
     models = dict.fromkeys((*names, *experiment.candidates))
@@ -171,4 +165,3 @@ def _learn(
         result.add(condition, steps[condition.result_name])
     if subset.repeat == 0:
         result.compared = compared
-        result.located_folds = {number: steps[name]["errors"] for number, name in folds.items()}

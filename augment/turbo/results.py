@@ -60,8 +60,7 @@ class TurboResult:
 
     def __init__(self, experiment: Experiment, fraction: float, folder: Path) -> None:
         self.experiment, self.fraction, self._folder = experiment, fraction, folder
-        self.compared: Row = {}  # of the first repeat: comparison of the field models
-        self.located_folds: dict[int, list[float] | None] = {}  # and errors of matched-field processing by fold
+        self.compared: Row = {}  # comparison of the field models in the first repeat
         self.synthesized: list[tuple[Row, Row]] = []  # columns and values of each field model
         self.evaluated: list[tuple[Condition, Row]] = []
         self.history: list[Row] = []
@@ -77,15 +76,16 @@ class TurboResult:
     def leave_out(self, method: str, sentence: str, reason: str) -> None:
         """Record why a method is missing, and a sentence about it."""
         self.missing[method] = reason
+        self._note(sentence)
+
+    def _note(self, sentence: str) -> None:
         if sentence not in self.left_out:
             self.left_out.append(sentence)
 
     def add_synthesis(self, subset: MeasuredSubset, name: str, trains: bool, value: Row) -> None:
         """Add the spectra of a field model at the test positions."""
         if "refused" in value:
-            sentence = f"{name} is left out of the comparison: {value['refused']}"
-            if sentence not in self.left_out:
-                self.left_out.append(sentence)
+            self._note(f"{name} is left out of the comparison: {value['refused']}")
             return
         key = asdict(subset) | {"synthesizer": name}
         self.synthesized.append((key, value | {"trains": trains}))
@@ -233,11 +233,8 @@ class TurboResult:
             change = found["changes"].get(conditions[method].measured_only.method)
             row: Row = {name: error[name] for name in ("median", "low", "high", "p90")}
             if change is not None:
-                row |= {
-                    "change": 100 * change["change"],
-                    "change_low": 100 * change["low"],
-                    "change_high": 100 * change["high"],
-                }
+                columns = {"change": "change", "change_low": "low", "change_high": "high"}
+                row |= {column: 100 * change[name] for column, name in columns.items()}
             rows.append(row)
         return DataFrame(rows, index=list(self.metrics["methods"])).sort_values("median")
 
@@ -245,6 +242,11 @@ class TurboResult:
         error = self.summary()["median"]
         chosen = f", chosen: {self.choice['name']}" if self.choice else ""
         return f"<TurboResult: {len(error)} methods, best {error.index[0]} at {error.iloc[0]:.2f} degrees{chosen}>"
+
+    @cached_property
+    def _error(self) -> dict[str, NDArray[np.float64]]:
+        """Angular errors [deg] of each method, (n, repeats)."""
+        return {method: by_repeat(part, "great_circle_deg") for method, part in self.errors.groupby("method")}
 
     def _estimator_choice(self) -> EstimatorChoiceMetrics | None:
         """Return the choice of the estimator by cross-validation. None if field models could not be compared."""
@@ -258,15 +260,14 @@ class TurboResult:
             name if name in own else other or name: [np.array(fold) for fold in folds]
             for name, folds in self.compared["errors"].items()
         }
-        located = self.located_folds if LOCATED in own else {}  # otherwise its fit was refused
-        found = {n: None if fold is None else np.array(fold) for n, fold in located.items()}
+        located = self.compared["located"] if LOCATED in own else {}  # otherwise its fit was refused
+        found = {int(number): None if fold is None else np.array(fold) for number, fold in located.items()}
         choice = choose_estimator(errors, found, LOCATED)
         return {**choice, "better": self._better(choice)}
 
     def _better(self, choice: EstimatorChoiceMetrics) -> dict[str, str]:
         """Return the methods that are significantly better than the chosen one on the test spectra, and why not chosen."""
-        error = {method: by_repeat(part, "great_circle_deg") for method, part in self.errors.groupby("method")}
-        reasons = {}
+        error, reasons = self._error, {}
         for condition, _ in self.pooled:
             if condition.training == "all measured":
                 continue
@@ -291,8 +292,7 @@ class TurboResult:
         reference = reference_of(
             conditions, {name: entry["great_circle_deg"]["median"] for name, entry in found.items()}
         )
-        error = {method: by_repeat(part, "great_circle_deg") for method, part in self.errors.groupby("method")}
-        metrics = {}
+        error, metrics = self._error, {}
         for method, entry in found.items():
             condition = conditions[method]
             others = dict.fromkeys((condition.measured_only.method, reference)) if condition.is_turbo else ()

@@ -22,7 +22,7 @@ from augment.cross_validation import (
 from augment.estimators import SavedEstimator
 from augment.mix import Mixed, mix
 from augment.positions import SyntheticPositions, synthetic_positions
-from augment.turbo.artifacts import LEVEL, as_bytes, save_examples, save_located, save_model
+from augment.turbo.artifacts import LEVEL, as_bytes, model_file, save_examples, save_located, save_model
 from augment.turbo.condition import NETWORKS, Condition, MeasuredSubset, Row
 from augment.turbo.experiment import ROOM_MODEL, Experiment
 from swiftwrf import FitError, GeometryModel, InputError, Spectra, load
@@ -73,16 +73,12 @@ def compare(experiment: Experiment, folder: Path, subset: MeasuredSubset, compar
             errors[Condition(name, "measured").method] = [
                 measured_errors(fold, experiment.make_estimator(name, subset.repeat)) for fold in folds
             ]
-    kept = []  # rooms of folds, and the numbers of their spectra in the data set
-    for number, fold in located_folds(_with_room(experiment, measured, choice, compared, seed)).items():
-        file = _file(f"choice-{subset}-room{number}")
-        fold.model.room.save(folder / file)
-        kept.append({"number": number, "file": file, "train": fold.train.index, "test": fold.test.index})
+    rooms = located_folds(_with_room(experiment, measured, choice, compared, seed))
     return {
         "choice": {name: value for name, value in vars(choice).items() if name != "folds"},
         "cross_validation": {name: entry.metrics for name, entry in validation.items()},
         "errors": errors,
-        "folds": kept,
+        "located": {number: located_errors(fold, seed) for number, fold in rooms.items()},
     }
 
 
@@ -97,17 +93,6 @@ def _with_room(
         return choose_model(measured, (ROOM_MODEL,), seed=seed, device=experiment.device).folds[ROOM_MODEL]
     except InputError:
         return []
-
-
-def locate_fold(experiment: Experiment, folder: Path, subset: MeasuredSubset, fold: Row) -> Row:
-    """Locate held-out measured spectra of a fold that `compare` kept, for the choice of the estimator."""
-    measured, _ = experiment.withhold(subset)
-    train, test = (
-        measured.subset(torch.isin(measured.index, torch.tensor(fold[part])).nonzero()[:, 0])
-        for part in ("train", "test")
-    )
-    room = _read_room(folder, fold["file"])
-    return {"errors": located_errors(Fold(room, train, test), experiment.seed + subset.repeat)}
 
 
 def find_room(experiment: Experiment, folder: Path, subset: MeasuredSubset) -> Row:
@@ -223,7 +208,7 @@ def training_set(experiment: Experiment, folder: Path, condition: Condition) -> 
     return train.add(*part("extra")) if condition.n_synthetic else train
 
 
-def evaluate(experiment: Experiment, folder: Path, condition: Condition, file: str | None) -> Row:
+def evaluate(experiment: Experiment, folder: Path, condition: Condition, saved_as: str | None) -> Row:
     """Train the estimator of a condition, save it under a name if it has one, and estimate the test directions."""
     train = training_set(experiment, folder, condition)
     began = time.perf_counter()
@@ -231,8 +216,8 @@ def evaluate(experiment: Experiment, folder: Path, condition: Condition, file: s
     estimator.fit(train, device=experiment.device)
     fitted = time.perf_counter()
     estimate = estimator.estimate(experiment.test)
-    if isinstance(estimator, SavedEstimator) and file is not None:
-        estimator.save(folder / file)
+    if isinstance(estimator, SavedEstimator) and saved_as is not None:
+        estimator.save(model_file(folder, saved_as, condition.subset.key))
     seconds = {"train": fitted - began, "estimate": time.perf_counter() - fitted}
     return {"estimate": estimate, "seconds": seconds, "history": estimator.history, "counts": train.counts}
 
@@ -253,7 +238,7 @@ def locate(experiment: Experiment, folder: Path, subset: MeasuredSubset, room: R
     found = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
     ended = time.perf_counter()
     if subset.repeat == 0:
-        locator.save(folder / f"{LOCATOR}-mix{subset.key}.safetensors")
+        locator.save(model_file(folder, LOCATOR, subset.key))
         save_located(folder / f"located-mix{subset.key}.npz", locator, measured, test, found["position"])
     seconds = {"room": room["seconds"], "fit": fitted - began, "locate": ended - fitted}
     return {

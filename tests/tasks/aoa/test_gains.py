@@ -98,8 +98,8 @@ def test_the_chosen_estimator_is_named_as_in_the_results_where_repeats_choose_ot
     measured = [replace(alone, repeat=k) for k in range(3)]
     found = results_of(dict.fromkeys((*measured, first, *others), np.ones(20)))
     folds = {alone.method: [[2.0, 3.0]], first.method: [[1.0, 1.0]]}
-    found.compared = {"choice": {"name": "gp"}, "errors": folds}
-    found.located_folds = {0: [0.1, 0.1]}  # the locator itself was refused
+    located = {"0": [0.1, 0.1]}  # the locator itself was refused
+    found.compared = {"choice": {"name": "gp"}, "errors": folds, "located": located}
     choice = found._estimator_choice()
     assert choice["name"] == "kernel_regression, measured + synthetic (auto)"
     assert choice["name"] in found._method_metrics()[0]
@@ -110,8 +110,8 @@ def test_a_better_method_that_is_not_recommended_has_a_reason():
     regression, locator = (replace(MEASURED, estimator=name) for name in ("kernel_regression", LOCATOR))
     spread = np.linspace(0.9, 1.1, 20)
     found = results_of({MEASURED: 4 * spread, regression: 2 * spread, locator: spread})
-    found.compared = {"choice": {"name": "gp"}, "errors": {regression.method: [[2.0, 2.0]]}}
-    found.located_folds = {0: None}
+    errors = {regression.method: [[2.0, 2.0]]}
+    found.compared = {"choice": {"name": "gp"}, "errors": errors, "located": {"0": None}}
     choice = found._estimator_choice()
     assert choice["name"] == regression.method
     assert choice["better"] == {locator.method: "no planes were found without the held-out spectra"}
