@@ -123,7 +123,8 @@ class Steps(Generic[Context]):
 
     def _advance(self) -> None:
         """Compute a step here, or keep the results of workers that are done."""
-        while self._waiting and len(self._pending) < self._slots():
+        slots = self._slots()  # raises an error if all workers are lost
+        while self._waiting and len(self._pending) < slots:
             name = min(self._waiting, key=lambda name: not self._waiting[name][0])
             _, title, call = self._waiting.pop(name)
             self.memo.begin(name, title)
