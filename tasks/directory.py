@@ -27,7 +27,7 @@ from swiftwrf.runtime.steps import STEPS, Memo
 from swiftwrf.runtime.threads import set_threads
 from tasks.environment import environment, invocation, now, number_of_processes, stamp
 from tasks.options import plain
-from tasks.records import CONFIG, ENVIRONMENT, LOCATOR, MODEL, PARTIAL, Row, read_json
+from tasks.records import CONFIG, ENVIRONMENT, LOCATOR, METRICS, MODEL, PARTIAL, Row, read_json
 from tasks.terminal import terminal
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # errors of file systems without locks
@@ -309,9 +309,9 @@ class Run(Memo):
         """
         self._environment["end"] = now()
         self.write_json(ENVIRONMENT, self._environment)
-        plain: Row = strict(metrics)
-        report(self.folder, plain)
-        self.write_json("metrics.json", plain)
+        as_read: Row = strict(metrics)
+        report(self.folder, as_read)
+        self.write_json(METRICS, as_read)
         rename(self.folder, self.final)
         self._claim.release()
         shutil.rmtree(self.final / STEPS, ignore_errors=True)

@@ -144,15 +144,15 @@ def choice(meaning: str, registry: Registry[Any] | None, known: Mapping[str, lab
     return tyro.conf.arg(help=f"{meaning}:", help_behavior_hint=entries)
 
 
-def pairs(option: str, texts: tuple[str, ...]) -> dict[str, str] | None:
-    """Return the names in an option that takes ROLE=NAME, by role, None if there are none.
+def pairs(option: str, texts: tuple[str, ...], role: str) -> dict[str, str] | None:
+    """Return the names in an option that takes ROLE=NAME, by role, None if there are none. A role is the example.
 
     Raises:
         InputError: A role without a name, or named twice.
     """
     found = {role: name for role, _, name in (text.partition("=") for text in texts)}
     if "" in (*found, *found.values()):
-        raise InputError(f"--{option} takes {option} and their names, e.g. position=NAME, got {' '.join(texts)}")
+        raise InputError(f"--{option} takes {option} and their names, e.g. {role}=NAME, got {' '.join(texts)}")
     if len(found) < len(texts):
         raise InputError(f"--{option} names something twice: {' '.join(texts)}")
     return found or None
@@ -194,7 +194,7 @@ class SpectraSource:
         Raises:
             InputError: An unknown beamformer, an array that is none, or arrays without names.
         """
-        pairs("arrays", self.arrays)
+        pairs("arrays", self.arrays, "csi")
         if self.beamformer is not None and self.beamformer not in labels.BEAMFORMERS:
             raise InputError(f"unknown beamformer {self.beamformer!r}; choose from {', '.join(labels.BEAMFORMERS)}")
         if self.array is not None:
@@ -240,7 +240,7 @@ class TableSource:
     @property
     def column_names(self) -> dict[str, str] | None:
         """Names of columns by role, None if there are none."""
-        return pairs("columns", self.columns)
+        return pairs("columns", self.columns, "x")
 
     def check(self) -> None:
         """Refuse options that are wrong whatever the data.
@@ -248,7 +248,7 @@ class TableSource:
         Raises:
             InputError: A column without a name, or named twice, or too many columns of positions.
         """
-        pairs("columns", self.columns)
+        pairs("columns", self.columns, "x")
         if len(self.transmitter) > 3:
             raise InputError(f"--transmitter takes 1 to 3 columns, got {' '.join(self.transmitter)}")
 
@@ -270,6 +270,11 @@ class OffsetSource(TableSource):
     def reference(self) -> str | None:
         """Group whose offset is 0, None for the most frequent one."""
         return None if self.offset_by is None else self.offset_by.partition("=")[2] or None
+
+    def check(self) -> None:
+        super().check()
+        if self.offset_by is not None and self.offset_by.startswith("="):
+            raise InputError(f"--offset-by takes COLUMN or COLUMN=VALUE, got {self.offset_by!r}")
 
     def check_used(self, data: str | None) -> None:
         """Refuse options of reading RSSI without measured data.

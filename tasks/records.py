@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Row = dict[str, Any]
-CONFIG, ENVIRONMENT = "config.json", "environment.json"  # files of a run
+CONFIG, ENVIRONMENT, METRICS = "config.json", "environment.json", "metrics.json"  # files of a run
 MODEL, LOCATOR = "model.safetensors", "locator.safetensors"  # its fitted RSSI models
 PARTIAL = ".partial"  # suffix of a run that is not finished
 NAMES = (  # columns of text, even if a cell reads NA, 1 or 12:34

@@ -327,6 +327,10 @@ def test_files_reach_the_disk_before_they_get_their_name(tmp_path, monkeypatch):
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    with durable.replacing(tmp_path / "a") as one, durable.replacing(tmp_path / "a") as other:  # threads of a process
+        one.write_text("one")
+        other.write_text("other")
+    assert [file.read_text() for file in tmp_path.iterdir()] == ["one"]
     durable.write_text(tmp_path / "a", "old")
     with pytest.raises(UnicodeEncodeError):
         durable.write_text(tmp_path / "a", "\udcff")

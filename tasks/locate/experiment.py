@@ -54,7 +54,8 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
         InputError: Data or options that do not exist or do not fit together.
     """
     device = choose_device("cpu")
-    data = measurements(config)
+    found = measured_rssi(config.data, config.table)
+    data = (rssi_room(seed=config.seed) if found is None else found).receivers(config.rx)
     for note in data.notes:
         console.print(f"{data.name}: {note}")
     measured = LocateSplit.of(data, config.split, config.cells, config.seed, config.table.reference)
@@ -81,16 +82,6 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
 
 def _described(value: Row) -> str:
     return f"{value['median_m']:.2f} m"
-
-
-def measurements(config: LocateConfig) -> Rssi:
-    """Return the RSSI of a run at the receivers that are asked for.
-
-    Raises:
-        InputError: The data cannot be read, or have no such receiver.
-    """
-    measured = measured_rssi(config.data, config.table)
-    return (rssi_room(seed=config.seed) if measured is None else measured).receivers(config.rx)
 
 
 def _metrics(data: Rssi, result: LocateComparison) -> Row:
@@ -132,7 +123,7 @@ def _studies(result: LocateComparison, by: str) -> list[Row]:
 
 
 def posterior_maps(locator: RssiLocator, train: Rssi, test: Rssi, error: Tensor) -> dict[str, Any]:
-    """Return the posteriors in plan of six test rows, from the smallest error (n,) [m] to the largest."""
+    """Return the posteriors in plan of at most six test rows, from the smallest error (n,) [m] to the largest."""
     shown = error.argsort()[torch.linspace(0, len(error) - 1, min(N_MAPS, len(error))).round().long()]
     posterior = locator.locate(test.rssi_dbm[shown])
     plans = [posterior.in_plan(row) for row in range(len(posterior))]

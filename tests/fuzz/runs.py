@@ -62,10 +62,9 @@ def run_of_rssi(folder: Path) -> None:
     data = _rssi()
     _rssi_model().save(folder / "model.safetensors")
     write_json(folder / "config.json", {"task": "rssi", "config": {}})
-    plan = {"plan": np.zeros((6, 8, 3), np.uint8), "plan_extent": np.array([0.0, 20.0, 0.0, 15.0])}
     measured = {"measured_position": data.transmitter_position, "measured": data.rssi_dbm}
     arrays = {name: values.numpy() for name, values in (measured | {"receiver": data.receiver_position}).items()}
-    np.savez(folder / "maps.npz", **plan, **arrays)
+    np.savez(folder / "maps.npz", **arrays)
     FloorPlan.scaled(np.zeros((6, 8, 3), np.uint8), 2.0, (0, 6)).save(folder)
 
 
@@ -103,8 +102,9 @@ def show(folder: Path) -> None:
 
 
 def _show_rssi(view: RssiView) -> None:
-    x, y = (float(line.mean()) for line in (view.chart.x, view.chart.y))
-    assert np.isfinite(view.chart.mean).all()
+    chart = view.map(view.heights[1])
+    x, y = (float(line.mean()) for line in (chart.x, chart.y))
+    assert np.isfinite(chart.mean).all()
     for kind in set(view.kinds) - {"expected error"}:
         selection = MapSelection(kind, 0, view.heights[1])
         view.coloured(selection)

@@ -48,7 +48,7 @@ class Nerf2(Format[Spectra]):
 
     def read(self, path: Path, options: ReadOptions) -> Spectra:
         described = path / "gateway_info.yml"
-        gateways = [value for value in read_yaml(described).values() if isinstance(value, dict)]
+        gateways: list[dict[str, Any]] = [value for value in read_yaml(described).values() if isinstance(value, dict)]
         if len(gateways) != 1:
             raise InputError(
                 f"{described} must describe one gateway with its position and orientation, got {len(gateways)}"

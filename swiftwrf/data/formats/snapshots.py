@@ -80,7 +80,7 @@ def snapshots_of(
         arrays |= {"frequency_hz": given.mean()}
     position, array = check_positions(arrays["position"], f"{source}: position"), array_of(source, arrays)
     n, folder, pose = len(position), files[0].parent, pose_of(source, arrays)
-    is_whole = index is None and options.every in (None, 1)
+    step = 1 if index is not None or options.every is None else options.every
     raw = _channel(source, arrays["csi"], n, len(array.element))
     channel, kept, elements, missing = measured(source, raw, options.drop_null, options.drop_elements)
     channel, array = _scaled(source, channel), array.subset(elements)
@@ -99,14 +99,14 @@ def snapshots_of(
         pose=pose,
         name=name or folder.resolve().name,
         index=index,
-        named_splits=read_splits(folder, n, first=1) if is_whole else None,
+        named_splits=read_splits(folder, n, first=1) if index is None and step == 1 else None,
         source=digests(files, folder),
         line_of_sight=arrays.get("line_of_sight"),
         time=arrays.get("time"),
         frequency_hz=frequency,
         notes=(*notes, *reversed_axes, *polarisations, *missing),
     )
-    return data if is_whole or index is not None else data.subset(torch.arange(0, n, options.every))
+    return data if step == 1 else data.subset(torch.arange(0, n, step))
 
 
 def _file(path: Path) -> Path | None:

@@ -233,10 +233,34 @@ def test_the_prior_region_can_be_given(floor, tmp_path):
     assert torch.equal(load(tmp_path / "locator.safetensors").cells.position, locator.cells.position)
 
 
+def test_a_region_takes_finite_positions_of_any_kind():
+    known = np.random.default_rng(0).random((50, 3))
+    expected = Region(torch.from_numpy(known)).cells(100).position
+    for given in (known, known.tolist(), torch.from_numpy(known).float()):
+        torch.testing.assert_close(Region(given).cells(100).position, expected, atol=1e-5, rtol=0)
+    for given, message in ((known * math.nan, "must be finite"), (known[:1], "at least 2"), (known[:, :2], "shape")):
+        with pytest.raises(InputError, match=message):
+            Region(given)
+
+
 @pytest.mark.parametrize("locator", [MatchedField, RssiLocator])
 def test_unknown_options_are_refused(locator):
     with pytest.raises(InputError, match="has no option 'cells'"):
         locator(cells=4)
+
+
+def test_rows_at_one_position_are_located_there(tmp_path):
+    room = rssi_room(n=60)
+    locator = RssiLocator(n_cells=50).fit(replace(room, transmitter_position=torch.ones(60, 3)))
+    locator.save(tmp_path / "locator.safetensors")
+    assert torch.equal(load(tmp_path / "locator.safetensors").locate(room.rssi_dbm).median, torch.ones(60, 3).double())
+
+
+def test_neighbours_that_cannot_be_held_out_are_refused():
+    room = rssi_room(n=120)
+    room.rssi_dbm[room.transmitter_position[:, 0] > 4] = torch.nan
+    with pytest.raises(InputError, match="no rows of simulated-floor can be held out to choose the neighbours"):
+        Fingerprints.fit(room, torch.arange(120) * 0)
 
 
 def test_sessions_of_unequal_length_can_be_held_out():
@@ -309,6 +333,13 @@ def test_floors_are_located_with_their_probability(building, tmp_path):
     )
     locator.save(tmp_path / "locator.safetensors")
     assert torch.equal(load(tmp_path / "locator.safetensors").locate(test.rssi_dbm).log_weight, posterior.log_weight)
+
+
+def test_each_floor_may_be_a_session_of_its_own(building):
+    """Then no held-out row has a neighbour on its floor."""
+    rows = replace(building, session=building.floors.number(building.transmitter_position))
+    locator = RssiLocator(validation="session", n_cells=100).fit(rows)
+    assert locator.locate(rows.rssi_dbm[:3]).median.isfinite().all()
 
 
 def test_neighbours_are_places_that_vote_for_a_floor(building):

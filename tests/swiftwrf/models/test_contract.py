@@ -1,5 +1,6 @@
 """The contract of every registered field model, and of one from another package."""
 
+import json
 import shutil
 import subprocess
 import sys
@@ -7,6 +8,7 @@ from contextlib import ExitStack
 from dataclasses import fields, replace
 from functools import cache
 
+import numpy as np
 import outside_mean
 import pytest
 import small
@@ -88,7 +90,9 @@ def test_predictions_are_spectra(fitted, room, position, name):
     assert torch.equal(model.synthesize(position), found.mean)
     alone = torch.cat([model.predict(one[None]).mean for one in position])
     torch.testing.assert_close(alone, found.mean, atol=2e-5, rtol=0)
-    assert model.predict(position[:0]).mean.shape == (0, *room.grid.shape)
+    nothing = model.predict(position[:0])
+    assert nothing.mean.shape == (0, *room.grid.shape)
+    assert (nothing.std is None) == (found.std is None)
     model.predict(position.float())
     assert model.synthesize(torch.tensor([[1e7] * 3, [1e9] * 3], dtype=torch.float64)).isfinite().all()
 
@@ -256,6 +260,12 @@ def gp(spectra):
         (lambda spectra, rssi: gp(spectra).predict([[2e9, 0, 0]]), "positions must be .* at most 1e.09"),
         (lambda spectra, rssi: swiftwrf.load(None), "None is not a readable safetensors file"),
         (lambda spectra, rssi: make_model("gp").fit(spectra, device="gpu"), "device must be .* got 'gpu'"),
+        (lambda spectra, rssi: make_model("gp").fit(spectra, device="meta"), "device must be .* got 'meta'"),
+        (
+            lambda spectra, rssi: gp(spectra).save("none/model"),
+            "folder of the pixel Gaussian process none/model does not",
+        ),
+        (lambda spectra, rssi: make_model("wrfgs", n_gaussians=3), "n_gaussians must be a whole number at least 4"),
         (lambda spectra, rssi: make_model("gp").fit(spectra, device="cuda:99"), "cuda:99 needs an NVIDIA GPU"),
         (lambda spectra, rssi: swiftwrf.RssiModel().fit(rssi, device="cuda:99"), "cuda:99 needs an NVIDIA GPU"),
         (lambda spectra, rssi: gp(spectra).predict(spectra.position).interval("0.8"), "level must be"),
@@ -265,6 +275,17 @@ def gp(spectra):
 def test_mistakes_of_newcomers_end_in_a_sentence(call, says):
     with pytest.raises(InputError, match=says):
         call(swiftwrf.simulated_room(n=12, grid=AngularGrid.hemisphere(9, 36)), swiftwrf.rssi_room(n=20))
+
+
+def test_numbers_of_numpy_are_numbers():
+    room = swiftwrf.simulated_room(n=np.int64(12), grid=AngularGrid.hemisphere(9, np.int32(36)))
+    model = make_model("gp", seed=np.int64(3)).fit(room)
+    assert json.dumps(model.state()[1]["options"]) == json.dumps(make_model("gp", seed=3).config.__dict__)
+    assert len(model.predict(room.position).interval(np.float32(0.5))) == 2
+    with pytest.raises(InputError, match="seed must be a whole number at least 0, got np"):
+        make_model("gp", seed=np.int64(-1))
+    with pytest.raises(InputError, match="seed must be"):
+        make_model("gp", seed=np.float64(1.5))
 
 
 def test_intervals_of_any_level_below_1_are_finite():

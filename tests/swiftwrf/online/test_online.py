@@ -9,13 +9,13 @@ import pytest
 import torch
 from rooms import built_in_walls, room_with_box
 
-from swiftwrf import AngularGrid, GeometryModel, HybridModel, RssiModel, load, make_model
+from swiftwrf import AngularGrid, GeometryModel, HybridModel, InputError, RssiModel, load, make_model
 from swiftwrf.data.simulated import ShoeboxRoom, rssi_room, simulated_room
 from swiftwrf.data.writing import write_rssi
 from swiftwrf.metrics import psnr
 from swiftwrf.models.geometry.planes import Plane
 from swiftwrf.online import Follower, Monitor, adapted, alarm_threshold, prequential, score
-from swiftwrf.online.follower import unexplained
+from swiftwrf.online.follower import joined, unexplained
 from tasks.command import main
 from tasks.update.record import Record
 
@@ -82,6 +82,36 @@ def test_intervals_of_rssi_contain_their_share():
     model = RssiModel().fit(floor().subset(torch.arange(70)))
     scores, _ = prequential(model, floor().subset(torch.arange(70, 100)))
     assert 0.6 < scores.covered.mean() < 0.95
+
+
+@pytest.mark.parametrize("n_places", [1, 3])
+def test_each_region_has_a_place_of_its_own(n_places):
+    position = torch.eye(3)[:n_places].repeat(40, 1)
+    monitor = Monitor(position)
+    assert len(monitor.centre.unique(dim=0)) == len(monitor.centre) == n_places
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: Follower(coarray()).step(spectra(72, 0).subset(torch.arange(2))), "one measurement, got 2"),
+        (lambda: Follower(coarray()).step(spectra(72, 0).subset(torch.arange(0))), "one measurement, got 0"),
+        (lambda: Follower(coarray(), spectra(72, 0).subset(torch.arange(60))), "positions of the 72 spectra"),
+        (lambda: Follower(coarray(), spectra(72, 0).subset(torch.arange(72).flip(0))), "in their order"),
+        (lambda: prequential(coarray(), spectra(72, 0), batch=0), "batch must be a whole number at least 1"),
+    ],
+)
+def test_measurements_that_cannot_be_followed_are_refused(call, says):
+    with pytest.raises(InputError, match=says):
+        call()
+
+
+def test_spectra_that_wait_keep_their_snapshots():
+    data = spectra(72, 0).subset(torch.arange(4))
+    measured = replace(data, channel=torch.randn(4, 1, 16, dtype=torch.complex64))
+    parts = [measured.subset(torch.tensor([i])) for i in range(4)]
+    assert torch.equal(joined(parts).channel, measured.channel)
+    assert joined([*parts, data]).channel is None
 
 
 def test_a_change_raises_an_alarm_and_the_same_scene_does_not():

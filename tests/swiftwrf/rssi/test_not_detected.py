@@ -6,13 +6,13 @@ import pandas as pd
 import pytest
 import torch
 
-from swiftwrf import Rssi, RssiModel, load, rssi_room
+from swiftwrf import InputError, Rssi, RssiModel, load, rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.data.rssi import Offsets
 from swiftwrf.gp import Kernel
 from swiftwrf.rssi import compare
 from swiftwrf.rssi.detection import Detection, DetectionField
-from swiftwrf.rssi.offsets import estimate_floor_attenuation
+from swiftwrf.rssi.offsets import estimate_floor_attenuation, estimate_offsets
 from swiftwrf.rssi.path_loss import fit_path_losses, log_distance
 
 LIMIT = -88.0
@@ -159,6 +159,7 @@ def test_the_limit_is_one_of_received_power_whatever_offset_is_removed(fitted):
     torch.testing.assert_close(found.predict(at).mean - 20, model.predict(at).mean, **close)
     torch.testing.assert_close(found.predict_detected(removed).mean - 20, model.predict_detected(data).mean, **close)
     torch.testing.assert_close(found.detection_field.weight, model.detection_field.weight, **close)
+    torch.testing.assert_close(found.predict_detection(at, -20.0), model.predict_detection(at), **close)
 
 
 def building(located):
@@ -182,6 +183,13 @@ def building(located):
 @pytest.mark.parametrize("located", [True, False])
 def test_the_attenuation_of_floors_counts_what_they_hide(located):
     assert estimate_floor_attenuation(building(located)).db == pytest.approx(14, abs=3)
+
+
+def test_floors_and_offsets_need_a_column():
+    with pytest.raises(InputError, match="simulated-floor has no floors; give the table a column"):
+        estimate_floor_attenuation(rssi_room(n=20))
+    with pytest.raises(InputError, match="simulated-floor has no phone in row 1; name the group of each row"):
+        estimate_offsets(replace(rssi_room(n=20), groups=pd.Series(["a", None] * 10, name="phone")))
 
 
 def test_another_kernel_keeps_the_limit_of_detection_of_a_building():

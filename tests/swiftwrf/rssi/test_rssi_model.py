@@ -13,6 +13,7 @@ from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.gp import Kernel
 from swiftwrf.rssi import RssiConfig, RssiPaperModel, compare
 from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
+from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.mixing import mixing_weights
 from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, harmonics, log_distance
 from swiftwrf.rssi.regression import DIRECTIVITY_STD_DB, fit_receiver
@@ -84,7 +85,7 @@ def training_of(data, n_primitives=50):
         path_loss=PathLosses(
             own=path_loss,
             shared=path_loss,
-            centre=torch.zeros(r).double(),
+            middle=torch.zeros(r).double(),
             std=torch.full((r, 2), PATH_LOSS_STD_DB).double(),
             variance=torch.full((r,), FIELD_DB**2 + NOISE_DB**2).double(),
             detection=None,
@@ -395,6 +396,10 @@ def test_refuses():
         RssiModel().predict(data.transmitter_position)
     with pytest.raises(InputError, match="is not fitted"):
         RssiModel().state()
+    with pytest.raises(InputError, match="region must be finite"):
+        RssiMap.predict(model, region=[[float("nan"), 0.0]])
+    with pytest.raises(InputError, match="a region needs at least one position"):
+        RssiMap.predict(model, region=torch.empty(0, 2))
 
 
 def test_another_kernel_keeps_the_intervals_of_rows_in_bins():

@@ -165,6 +165,8 @@ def test_rows_that_no_receiver_detected_are_left_out(tmp_path, capsys):
     data.rssi_dbm[:70] = torch.nan
     with pytest.raises(InputError, match="at least 20 are needed"):
         LocateSplit.of(data, "random", 100, 0)
+    with pytest.raises(InputError, match="split 'place' tests other receivers than it trains; choose random or block"):
+        LocateSplit.of(data, "place", 100, 0)
 
 
 def test_an_interrupted_run_goes_on_to_the_same_numbers(locate_run, tmp_path):

@@ -28,7 +28,7 @@ from swiftwrf.data.splits import folds
 from swiftwrf.metrics import paired_difference
 from swiftwrf.rssi import RssiPredictor, compare
 from swiftwrf.rssi.baselines import NEIGHBOUR_COUNTS, Blend, BlendConfig
-from swiftwrf.rssi.comparison import make_predictor, pool_of
+from swiftwrf.rssi.comparison import compared, make_predictor, pool_of
 from swiftwrf.runtime import registry
 from tasks.report import merge
 from tasks.rssi import experiment
@@ -101,6 +101,13 @@ def test_unknown_predictor():
         make_predictor("knn", validation="blok")
     with pytest.raises(InputError, match="KNNPredictor has no option 'k'"):
         RSSI_PREDICTORS["knn"](k=3)
+    room = rssi_room(n=20)
+    with pytest.raises(InputError, match="unknown predictor 'forest'"):
+        compared(room, also=["forest"])
+    with pytest.raises(InputError, match="no member of blend can be fitted to simulated-floor"):
+        Blend(members=()).fit(room)
+    with pytest.raises(InputError, match="fewer must be a list, of which each is a number at least 0 and at most 1"):
+        compare(room, fewer=(-0.5,))
 
 
 def test_a_predictor_of_another_package(monkeypatch):
@@ -139,7 +146,7 @@ def test_a_floor_plan_whose_pixels_are_the_positions_needs_no_extent(tmp_path):
     Image.new("RGB", (400, 300), "white").save(tmp_path / "plan.png")
     config = SimpleNamespace(floor_plan=str(tmp_path / "plan.png"), floor_extent=None)
     data = replace(rssi_room(n=12), plan_scale=20.0)
-    assert experiment._read_floor_plan(config, data)["plan_extent"].tolist() == [0, 20, -15, 0]
+    assert experiment._read_floor_plan(config, data).corners == (0, 20, -15, 0)
 
 
 def test_whole_run(small, tmp_path):
@@ -321,6 +328,10 @@ def test_each_floor_has_its_maps_its_rows_and_its_coverage():
     assert first.arrays["measured"].ravel().tolist() == [4.0] * 4
     assert first.summary().name == "summary-1"
     assert [first.by_receiver(kind).name for kind in ("predicted", "width")] == ["map-run-1", "width-run-1"]
+    maps["measured"] = np.where(position[:, 2:] > 0, np.nan, -50.0)  # the first floor receives nothing
+    _, first = Maps.of_floors(SimpleNamespace(arrays=lambda name: maps, file_name="run"))
+    low, high = first.summary().panels[0].axes[0].images[0].get_clim()
+    assert -100 < low < -90 < high < -80
 
 
 @pytest.mark.parametrize("seed", [0, 1])
