@@ -101,7 +101,7 @@ def _allowed(value: object, annotation: Any) -> bool:
     if annotation in NUMBERS:
         is_number = isinstance(value, NUMBERS[annotation]) and not isinstance(value, bool)
         if isinstance(value, Integral):
-            return is_number and abs(value) <= LARGEST[annotation]
+            return is_number and abs(int(value)) <= LARGEST[annotation]
         return is_number and not math.isnan(value)  # type: ignore[arg-type]
     if annotation in (None, type(None)):
         return value is None

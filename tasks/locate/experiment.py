@@ -54,8 +54,7 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
         InputError: Data or options that do not exist or do not fit together.
     """
     device = choose_device("cpu")
-    found = measured_rssi(config.data, config.table)
-    data = (rssi_room(seed=config.seed) if found is None else found).receivers(config.rx)
+    data = measurements(config)
     for note in data.notes:
         console.print(f"{data.name}: {note}")
     measured = LocateSplit.of(data, config.split, config.cells, config.seed, config.table.reference)
@@ -82,6 +81,16 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
 
 def _described(value: Row) -> str:
     return f"{value['median_m']:.2f} m"
+
+
+def measurements(config: LocateConfig) -> Rssi:
+    """Return the RSSI of a run at the receivers that are asked for.
+
+    Raises:
+        InputError: The data cannot be read, or have no such receiver.
+    """
+    measured = measured_rssi(config.data, config.table)
+    return (rssi_room(seed=config.seed) if measured is None else measured).receivers(config.rx)
 
 
 def _metrics(data: Rssi, result: LocateComparison) -> Row:
