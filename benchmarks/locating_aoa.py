@@ -23,8 +23,9 @@ from record import RESULTS, options, write_result
 
 from augment import Mixed, withhold
 from augment.estimators import make_estimator
+from augment.turbo.artifacts import LEVEL
 from augment.turbo.experiment import ROOM_MODEL
-from augment.turbo.locating import LEVEL, NO_PLANE, located
+from augment.turbo.stages import located
 from swiftwrf import (
     FitError,
     GeometryModel,
@@ -104,7 +105,7 @@ def measure(measured: Spectra, test: Spectra, draw: int, kernel: bool) -> Row:
         if measured.channel is not None:
             row["channel"] = channel_scores(room.room, measured, test, draw)
         if room.room is None or not room.room.planes:
-            return row | {"left_out": NO_PLANE}
+            return row | {"left_out": "no plane explains the spectra"}
         locator = MatchedField(seed=draw).fit(measured, room=room)
     except (InputError, FitError) as error:
         return row | {"left_out": str(error)}

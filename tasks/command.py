@@ -49,7 +49,7 @@ COMMANDS = {
 
 
 # modules that processes of a run load while the run itself begins
-PRELOADED = {"aoa": ("augment.turbo.choice", "torchvision", "torch._dynamo")}
+PRELOADED = {"aoa": ("augment.turbo.learning", "torchvision", "torch._dynamo")}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -23,7 +23,7 @@ from filelock import FileLock, Timeout
 
 from swiftwrf import InputError
 from swiftwrf.runtime.durable import rename, strict, write_json
-from swiftwrf.runtime.steps import STEPS
+from swiftwrf.runtime.steps import STEPS, Memo
 from swiftwrf.runtime.threads import set_threads
 from tasks.environment import environment, invocation, now, number_of_processes, stamp
 from tasks.options import plain
@@ -170,7 +170,7 @@ def digest(config: Any) -> str:
     return hashlib.sha256(json.dumps(strict(config), sort_keys=True).encode()).hexdigest()
 
 
-class Run:
+class Run(Memo):
     """The directory of a run while it is being filled.
 
     It is made as `NAME.partial` and renamed to `NAME` by `finish`. It keeps the result of each step, so that a resumed run
@@ -186,6 +186,7 @@ class Run:
         resume: Directory of an interrupted run to continue. Each process takes the number of threads of its beginning.
         processes: Number of processes that compute the steps, each with its share of the threads. None for that of
             `number_of_processes`, which becomes the attribute.
+        described: Result of a step in words, which the terminal shows when it arrives; empty if there is nothing to show.
 
     Raises:
         InputError: `out` exists already, another process works in it, or the run began with other input, libraries or code.
@@ -201,7 +202,9 @@ class Run:
         source: dict[str, str],
         resume: Path | None = None,
         processes: int | None = 1,
+        described: Callable[[Row], str] = lambda value: "",
     ) -> None:
+        self.described = described
         if resume is not None:
             self.final = resume.with_name(resume.name.removesuffix(PARTIAL))
         else:
@@ -214,7 +217,7 @@ class Run:
         self._claim = Claim(self.folder, new=resume is None)
         try:
             self._refuse_existing()  # another process may have finished it before the claim
-            (self.folder / STEPS).mkdir(exist_ok=True)
+            super().__init__(self.folder)
             if resume is None:
                 self._begin(task, config, device, source, processes)
             else:
@@ -259,51 +262,34 @@ class Run:
         """Write strict JSON: nan and infinity become null."""
         write_json(self.path(name), content)
 
-    def step(
-        self, name: str, title: str, compute: Callable[[], Row], described: Callable[[Row], str] = lambda value: ""
-    ) -> Row:
+    def step(self, name: str, title: str, compute: Callable[[], Row]) -> Row:
         """Return the plain values of `compute`, which is called once, also over a resumed run.
 
         Args:
             name: Key of the kept result.
             title: What is computed, for the terminal.
             compute: Computes the values.
-            described: Values in words, for the terminal.
 
         Raises:
             InputError: The kept result is damaged.
         """
         value = self.kept(name)
         if value is None:
-            terminal.begin(name, title)
+            self.begin(name, title)
             began = time.perf_counter()
             value = self.keep(name, compute(), time.perf_counter() - began)
-            terminal.end(name, described(value))
         return value
 
-    def holds(self, name: str) -> bool:
-        """Return True if the result of a step is kept."""
-        return self.path(f"{STEPS}/{name}.json").exists()
+    def expect(self, steps: int) -> None:
+        terminal.expect(steps)
 
-    def kept(self, name: str) -> Row | None:
-        """Return the kept result of a step, or None.
-
-        Raises:
-            InputError: The kept result is damaged.
-        """
-        if not self.holds(name):
-            return None
-        file = self.path(f"{STEPS}/{name}.json")
-        value = read_json(file).get("value")
-        if not isinstance(value, dict):
-            raise InputError(f"{file} does not hold what the step computed; remove it and resume again")
-        return value
+    def begin(self, name: str, title: str) -> None:
+        terminal.begin(name, title)
 
     def keep(self, name: str, value: Row, seconds: float) -> Row:
-        """Keep the result and the duration of a step. Return the result as it is read back."""
-        kept: Row = strict(value)
-        self.write_json(f"{STEPS}/{name}.json", {"value": kept, "seconds": seconds})
-        return kept
+        plain = super().keep(name, value, seconds)
+        terminal.end(name, self.described(plain))
+        return plain
 
     def computed_on(self, machines: Iterable[str]) -> None:
         """Record in the environment that these machines computed, too."""

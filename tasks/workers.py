@@ -14,8 +14,8 @@ import shlex
 import signal
 import threading
 import warnings
-from collections.abc import Callable, Collection, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from functools import lru_cache
@@ -28,58 +28,67 @@ import torch
 
 from swiftwrf import FitError, InputError
 from swiftwrf.runtime.progress import silent
-from swiftwrf.runtime.steps import STEPS
+from swiftwrf.runtime.steps import POLL_S, STEPS
 from swiftwrf.runtime.threads import set_threads, to_device
+from tasks.directory import Run
 from tasks.environment import machine, packages
 from tasks.preload import process_context, without_main
 from tasks.terminal import console
 
 CONNECT_S = 5  # until a scheduler has answered
 WORKERS_S = 30  # until workers have come, at the start and after all have gone
-POLL_S = 2  # between two checks that there are workers
 MAX_SECONDS_TO_END = 10.0  # from the signal to the end of a process
 CONTINUE = "go on with swiftwrf resume DIR.partial here, with --scheduler ADDRESS on a cluster"
 
 
-class Workers:
+class Workers(Executor):
     """Processes of an executor that compute as this process would, on a device of the same type.
 
     `hold` makes an object available to all calls and returns what stands for it. `slots` returns the number of processes and
-    raises FitError if all are lost.
+    raises FitError if all are lost, which results raise, too.
     """
 
     def __init__(
         self, executor: Executor, hold: Callable[[object], Any], slots: Callable[[], int], device: torch.device
     ) -> None:
-        self.hold, self.slots = hold, slots
+        self.slots = slots
         self.machines: set[str] = set()  # that have returned a result
-        self._executor, self._device = executor, device.type
+        self._executor, self._hold, self._device = executor, hold, device.type
+        self._function: Any = None
+        self._held: Any = None
 
-    def submit(self, function: Any, *arguments: Any) -> Future[Any]:
-        """Call a held function and return the future of its result."""
+    def submit(self, function: Callable[..., Any], /, *arguments: Any, **_: Any) -> Future[Any]:
+        """Call a function, which is sent once for the calls that follow, and return the future of its result."""
+        if self._function is not function:
+            self._function, self._held = function, self._hold(function)
         terms = torch.get_num_threads(), self._device, packages()
+        result = _Result(self.slots)
+
+        def arrive(done: Future[tuple[Any, str]]) -> None:
+            try:
+                value, machine = done.result()
+            except BaseException as error:  # also of a cancelled call
+                result.set_exception(error)
+            else:
+                self.machines.add(machine)
+                result.set_result(value)
+
         with without_main():
-            return self._executor.submit(_call, terms, function, *arguments)
+            self._executor.submit(_call, terms, self._held, *arguments).add_done_callback(arrive)
+        return result
 
-    def next(self, pending: Collection[Future[Any]]) -> tuple[Future[Any], Any]:
-        """Wait for one of the calls and return it with its result.
 
-        Raises:
-            FitError: All processes are lost.
-            Exception: The exception of the call.
-        """
-        while not (done := wait(pending, POLL_S, FIRST_COMPLETED).done):
-            self.slots()
-        future = next(iter(done))
-        value, where = future.result()
-        self.machines.add(where)
-        return future, value
+class _Result(Future[Any]):
+    """Future of a worker, which does not come if all workers are lost."""
 
-    def map(self, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
-        """Yield the function of each item, in order, as the built-in `map` does."""
-        held = self.hold(function)
-        for future in [self.submit(held, item) for item in items]:
-            yield self.next([future])[1]
+    def __init__(self, slots: Callable[[], int]) -> None:
+        super().__init__()
+        self._slots = slots
+
+    def result(self, timeout: float | None = None) -> Any:
+        while timeout is None and not wait([self], POLL_S).done:
+            self._slots()
+        return super().result(timeout)
 
 
 _ONE_AT_A_TIME = threading.Lock()  # a worker of Dask may have several threads
@@ -143,6 +152,19 @@ def local_processes(number: int, folder: Path) -> Iterator[Workers]:
             process.join(MAX_SECONDS_TO_END)
         for file in files:
             file.unlink(missing_ok=True)
+
+
+@contextmanager
+def workers_of(run: Run, cluster: Workers | None) -> Iterator[Workers | None]:
+    """Yield the workers of a cluster, whose machines are recorded, or the processes of the run; None if it has one alone."""
+    if cluster is None and run.processes > 1:
+        with local_processes(run.processes, run.folder) as processes:
+            yield processes
+        return
+    try:
+        yield cluster
+    finally:
+        run.computed_on(cluster.machines if cluster else ())
 
 
 def _begin() -> None:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict
 from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
 
 from augment import Mixed
-from swiftwrf import AngularGrid, InputError, Spectra
+from swiftwrf import AngularGrid, Spectra
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.registry import Registry
-from swiftwrf.runtime.validation import NonNegativeInt, Preset, configuration
+from swiftwrf.runtime.validation import Configured, NonNegativeInt, Preset, configuration
 
 
 @configuration
@@ -38,7 +38,7 @@ class EstimatorConfig:
         return cls(**options)
 
 
-class Estimator(ABC):
+class Estimator(Configured, ABC):
     """Base class of all estimators: fit to labelled spectra, then predict the direction behind a spectrum.
 
     Args:
@@ -57,17 +57,12 @@ class Estimator(ABC):
     """dataclass of the options"""
     trainable: ClassVar[bool] = True
     """whether more labelled spectra can reduce the error"""
+    fitted_attribute = "grid"
 
     grid: AngularGrid
     """grid of the training spectra, set by `fit`"""
-
-    def __init__(self, config: Any = None, **options: Any) -> None:
-        known = [field.name for field in fields(self.config_type)]
-        unknown = [name for name in options if name not in known]
-        if unknown:
-            raise InputError(f"{type(self).__name__} has no option {unknown[0]!r}; it has {', '.join(known)}")
-        self.config = replace(config or self.config_type(), **options)
-        self.history: list[dict[str, Any]] = []  # step, loss and seconds during the training
+    history: list[dict[str, Any]]
+    """step, loss and seconds during the training, set by `fit`"""
 
     def fit(self, train: Mixed, *, device: torch.device | str = "cpu") -> Self:
         """Fit the estimator to labelled spectra and return it.
@@ -76,7 +71,7 @@ class Estimator(ABC):
             train: Training set.
             device: Device to compute on.
         """
-        self.grid = train.grid
+        self.grid, self.history = train.grid, []
         self._fit(train, torch.device(device))
         return self
 
@@ -114,8 +109,7 @@ class SavedEstimator(Estimator, Saved):
         Raises:
             InputError: An estimator that is not fitted.
         """
-        if not hasattr(self, "grid"):
-            raise InputError(f"this {type(self).__name__} is not fitted; call fit first")
+        self.check_fitted()
         tensors, header = self._state()
         return tensors, header | {"config": asdict(self.config), "grid": asdict(self.grid)}
 

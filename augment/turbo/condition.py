@@ -10,6 +10,7 @@ from typing import Any, Literal, TypeVar
 
 from augment.cross_validation import LOCATOR, STAND_IN
 from augment.estimators import ESTIMATORS
+from augment.turbo.artifacts import model_file
 from swiftwrf.choices import AUTO, fraction_key
 from swiftwrf.runtime.validation import Preset
 
@@ -37,11 +38,6 @@ class MeasuredSubset:
     def key(self) -> str:
         """Measured fraction in metrics.json and in file names."""
         return fraction_key(self.measured_fraction)
-
-    @property
-    def columns(self) -> Row:
-        """Columns of the result tables."""
-        return {"measured_fraction": self.measured_fraction, "repeat": self.repeat}
 
 
 @dataclass(frozen=True)
@@ -116,11 +112,6 @@ class Condition:
 DESCRIPTION = ("estimator", "training", "synthesizer", "n_synthetic")
 
 
-def located_by(subset: MeasuredSubset) -> Condition:
-    """Return the condition of matched-field processing that uses the room found in these measured spectra."""
-    return Condition(LOCATOR, "measured", **subset.columns)
-
-
 def conditions_of(methods: Mapping[str, Mapping[str, Any]]) -> dict[str, Condition]:
     """Return the condition of each method of metrics.json."""
     return {method: Condition(**{name: entry[name] for name in DESCRIPTION}) for method, entry in methods.items()}
@@ -131,8 +122,7 @@ def chosen_file(folder: Path, measured_fraction: str, condition: Condition | Non
     if condition is None:
         return None
     alone = condition.estimator == STAND_IN and condition.training == "measured"
-    name = MEASURED_STAND_IN if alone else condition.name
-    file = folder / f"{name}-mix{measured_fraction}.safetensors"
+    file = model_file(folder, MEASURED_STAND_IN if alone else condition.name, measured_fraction)
     return file if file.is_file() else None
 
 
@@ -165,7 +155,7 @@ def reference_of(conditions: Mapping[str, Condition], error: Mapping[str, float]
 
 
 def pooled(results: list[tuple[Condition, Value]], auto: bool) -> list[tuple[Condition, Value]]:
-    """Return results such that every condition with synthetic spectra has all repeats of its measured fraction.
+    """Return results such that every condition with synthetic spectra has all repeats.
 
     A repeat stands for a user, who chooses a field model and the number of extra positions by cross-validation. Where
     repeats chose differently, the choices of all repeats become one condition. The network is trained with extra positions
@@ -175,14 +165,14 @@ def pooled(results: list[tuple[Condition, Value]], auto: bool) -> list[tuple[Con
     Otherwise a condition with extra positions contains the result without them of those repeats that were advised against
     them.
     """
-    trainings: dict[tuple[float, str], dict[int, set[tuple[str, str]]]] = {}
+    trainings: dict[str, dict[int, set[tuple[str, str]]]] = {}
     for condition, _ in results:
         if condition.is_turbo:
-            repeats = trainings.setdefault((condition.measured_fraction, condition.estimator), {})
+            repeats = trainings.setdefault(condition.estimator, {})
             repeats.setdefault(condition.repeat, set()).add((condition.synthesizer, condition.training))
     found: list[tuple[Condition, Value]] = []
     for condition, value in results:
-        repeats = trainings.get((condition.measured_fraction, condition.estimator), {})
+        repeats = trainings.get(condition.estimator, {})
         if not condition.is_turbo or len({frozenset(names) for names in repeats.values()}) == 1:
             found.append((condition, value))
             continue

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from copy import copy, deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import torch
 
 from augment.choose import candidates
-from augment.cross_validation import STAND_IN, CrossValidationMetrics
+from augment.cross_validation import LOCATOR, STAND_IN, CrossValidationMetrics
 from augment.estimators import ESTIMATORS, Estimator, make_estimator
 from augment.mix import withhold
 from augment.positions import SyntheticPositions
-from augment.turbo.condition import NETWORKS, MeasuredSubset
-from swiftwrf.choices import AUTO, RAYTRACE
+from augment.turbo.condition import NETWORKS, MeasuredSubset, Training
+from swiftwrf.choices import AUTO
 from swiftwrf.data import Spectra
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import WINDOW
@@ -39,19 +39,12 @@ class Experiment:
     train: Spectra
     test: Spectra
     fractions: tuple[float, ...] = (0.3,)  # of the training spectra that count as measured, in (0, 1]
-    models: tuple[str, ...] = (AUTO,)  # field models whose spectra train estimators, or "auto" alone
-    estimators: tuple[str, ...] | None = None  # beside kernel regression; None for all, with the network of the preset
-    # fast field models that are evaluated, too, None for all whose requirements the data meet; with "geometry" the room is
-    # searched, and matched-field processing locates by it
-    compared: tuple[str, ...] | None = None
-    own_models: Mapping[str, FieldModel] = field(default_factory=dict)  # that are in no registry
-    own_estimators: Mapping[str, Estimator] = field(default_factory=dict)  # that are in no registry, and evaluated, too
+    models: Sequence[str | FieldModel] = (AUTO,)  # whose spectra train estimators: names and objects, or "auto" alone
+    estimators: Sequence[str | Estimator] | None = None  # beside kernel regression; None for all
     extra: int | None = None  # most extra synthetic positions; None for 3,000 where cross-validation recommends some
     preset: Preset = "quick"  # sizes of models and network
     repeats: int = 1  # each with its own measured spectra and seed
     seed: int = 0
-    scene: str | None = None  # of the field model `raytrace`
-    suggest: int = 0  # number of positions to measure next that are suggested
     device: torch.device | str = "cpu"
 
     def __post_init__(self) -> None:
@@ -63,19 +56,45 @@ class Experiment:
                 f"spectra of {data.name} have {data.grid.shape[0]} x {data.grid.shape[1]} pixels; SSIM, the measure "
                 f"of their quality, needs at least {WINDOW} x {WINDOW}"
             )
-        for name in self.models:
-            missing = [] if name == AUTO else self.model_type(name).lacking(data)
-            if missing:
+        for name in self.named:
+            if missing := self.model_type(name).lacking(data):
                 hint = "give it with --array" if "array" in missing else "the data must contain its position"
                 raise InputError(
                     f"synthesizer {name} needs the {missing[0]}, which {data.name} does not describe; {hint}"
                 )
-        for name in self.estimators or ():
-            ESTIMATORS.check(name)
+        for name in self._estimators:
+            if name not in (*self._own_estimators, LOCATOR):
+                ESTIMATORS.check(name)
+        for things, names in (("field models", self._models), ("estimators", self._estimators)):
+            for name in names:
+                if names.count(name) > 1:
+                    raise InputError(f"two {things} have the name {name!r}; leave one out, or give it another name")
         if self.extra:
             data.direction_at(data.position[:1])  # refuses unknown geometry
         for fraction in self.fractions:
             withhold(self.train, fraction, self.seed)
+
+    @property
+    def _models(self) -> list[str]:
+        return [model if isinstance(model, str) else model.name for model in self.models]
+
+    @property
+    def _estimators(self) -> list[str]:
+        return [one if isinstance(one, str) else type(one).__name__ for one in self.estimators or ()]
+
+    @property
+    def _own_estimators(self) -> dict[str, Estimator]:
+        return {type(one).__name__: one for one in self.estimators or () if not isinstance(one, str)}
+
+    @property
+    def own_models(self) -> dict[str, FieldModel]:
+        """Field models of the user by name."""
+        return {model.name: model for model in self.models if not isinstance(model, str)}
+
+    @property
+    def named(self) -> list[str]:
+        """Field models that are asked for. Empty where cross-validation chooses one."""
+        return [name for name in self._models if name != AUTO]
 
     @property
     def n_synthetic(self) -> int:
@@ -88,40 +107,45 @@ class Experiment:
         """Measured subsets of all fractions and repeats."""
         return [MeasuredSubset(fraction, repeat) for repeat in range(self.repeats) for fraction in self.fractions]
 
-    def seed_of(self, subset: MeasuredSubset) -> int:
-        """Return the seed of a repeat."""
-        return self.seed + subset.repeat
-
     def withhold(self, subset: MeasuredSubset) -> tuple[Spectra, SyntheticPositions]:
         """Return the measured spectra, and the positions of the others."""
-        return withhold(self.train, subset.measured_fraction, self.seed_of(subset))
+        return withhold(self.train, subset.measured_fraction, self.seed + subset.repeat)
+
+    def trainings(self, validation: CrossValidationMetrics | None) -> list[tuple[Training, int]]:
+        """Return the training sets with spectra of a field model, and their numbers of extra synthetic positions."""
+        # by default only where held-out measured spectra gain from extra positions
+        wanted = self.extra is not None or bool(validation and validation["recommended_n_synthetic"])
+        found: list[tuple[Training, int]] = [("measured + synthetic", 0)]
+        if wanted and self.n_synthetic:
+            found.append(("measured + synthetic + extra", self.n_synthetic))
+        return found
 
     def model_type(self, name: str) -> type[FieldModel]:
         """Return the type of a field model by its name."""
         found: type[FieldModel] = type(self.own_models[name]) if name in self.own_models else FIELD_MODELS[name]
         return found
 
-    def make_model(self, name: str, subset: MeasuredSubset, preset: Preset = "quick") -> FieldModel:
+    def make_model(self, name: str, repeat: int, preset: Preset = "quick") -> FieldModel:
         """Return a field model that is not fitted."""
         if name in self.own_models:
             return copy(self.own_models[name])
         # validation at random: withheld positions lie among the measured ones, whatever the split of the test
-        options = {"preset": preset, "seed": self.seed_of(subset), "validation": "random", "scene": self.scene}
+        options = {"preset": preset, "seed": self.seed + repeat, "validation": "random"}
         chosen = model_type(name, preset)
         return chosen(**chosen.supported(options))
 
-    def make_estimator(self, name: str, subset: MeasuredSubset) -> Estimator:
+    def make_estimator(self, name: str, repeat: int) -> Estimator:
         """Return an estimator that is not trained."""
-        if name in self.own_estimators:
-            return deepcopy(self.own_estimators[name])
-        return make_estimator(name, len(self.train), self.preset, seed=self.seed_of(subset))
+        if name in self._own_estimators:
+            return deepcopy(self._own_estimators[name])
+        return make_estimator(name, len(self.train), self.preset, seed=self.seed + repeat)
 
     @cached_property
     def evaluated(self) -> dict[str, Estimator | type[Estimator]]:
         """Estimators that are evaluated by name, the network first."""
         names = (NETWORKS[self.preset], *(name for name in ESTIMATORS if name not in NETWORKS.values()))
-        chosen = names if self.estimators is None else (*self.estimators, STAND_IN)
-        return {name: ESTIMATORS[name] for name in names if name in chosen} | dict(self.own_estimators)
+        chosen = names if self.estimators is None else (*self._estimators, STAND_IN)
+        return {name: ESTIMATORS[name] for name in names if name in chosen} | self._own_estimators
 
     @property
     def trainable(self) -> list[str]:
@@ -135,16 +159,17 @@ class Experiment:
 
     @property
     def candidates(self) -> list[str]:
-        """Names of the field models that are compared."""
-        return candidates(self.train) if self.compared is None else list(self.compared)
+        """Fast field models that are evaluated, too: all by default, or what the locator needs.
+
+        With "geometry" the room is searched, and matched-field processing locates by it.
+        """
+        return candidates(self.train) if self.estimators is None else [ROOM_MODEL] * (LOCATOR in self._estimators)
+
+    def is_first(self, name: str) -> bool:
+        """Return True for the field model whose spectra stand for turbo learning: the first one, or the chosen one."""
+        return self._models[0] in (AUTO, name)
 
     def finds_room(self, name: str) -> bool:
         """Return True if a field model is built on the room that the spectra show."""
-        has_room = self.model_type(name).room is not FieldModel.room
-        return has_room and not (name == RAYTRACE and self.scene is not None)
-
-    def n_extra(self, validation: CrossValidationMetrics | None) -> int:
-        """Return the number of extra synthetic positions of a field model that trains estimators."""
-        # by default only where held-out measured spectra gain from extra positions
-        wanted = self.extra is not None or bool(validation and validation["recommended_n_synthetic"])
-        return self.n_synthetic if wanted else 0
+        given = name in self.own_models and getattr(self.own_models[name].config, "scene", None) is not None
+        return self.model_type(name).room is not FieldModel.room and not given

@@ -2,87 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from itertools import zip_longest
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import torch
-from pandas import DataFrame
 
-from augment.cross_validation import LOCATOR, EstimatorChoiceMetrics
+from augment.cross_validation import LOCATOR, STAND_IN
 from augment.estimators import Estimator
-from augment.turbo.choice import first_steps
-from augment.turbo.condition import Condition, Row, chosen_file, conditions_of
+from augment.turbo.condition import LOCATED, MEASURED_STAND_IN, NETWORKS, Condition, MeasuredSubset, Training
 from augment.turbo.experiment import ROOM_MODEL, Experiment
-from augment.turbo.results import Results
-from augment.turbo.synthesis import Evaluation
-from swiftwrf.choices import AUTO, fraction_key
+from augment.turbo.results import TurboResult
+from augment.turbo.stages import compare, evaluate, find_room, locate, synthesize
+from swiftwrf.choices import AUTO
 from swiftwrf.data import Spectra
-from swiftwrf.errors import InputError
-from swiftwrf.locate import MatchedField
 from swiftwrf.models import FieldModel
-from swiftwrf.runtime.checkpoint import load
-from swiftwrf.runtime.durable import strict
-from swiftwrf.runtime.steps import STEPS, Step, walk
+from swiftwrf.runtime.steps import Memo, Steps
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, Preset, checked
-
-
-class TurboResult:
-    """Errors of estimators trained on measured, synthetic and all spectra, and the one that cross-validation chose.
-
-    Attributes:
-        errors: A row for each condition and test spectrum: estimator, training set, truth, estimate and errors [deg].
-        positions: A row for each condition that locates and test spectrum: truth, estimate and error [m].
-        metrics: All summaries, as in metrics.json of a run: errors with intervals, paired changes, quality of the synthetic
-            spectra, choices, times.
-        best: The estimator that cross-validation on the measured spectra chose, trained. None if nothing was compared.
-        left_out: A sentence for each method that is missing.
-
-    Example:
-        >>> import swiftwrf
-        >>> data = swiftwrf.simulated_room(n=40, grid=swiftwrf.AngularGrid.hemisphere(10, 40))
-        >>> result = turbo_learning(data, measured=0.5, models=["nearest"], estimators=["peak"], extra=0)
-        >>> result.choice["name"], type(result.best).__name__
-        ('kernel_regression, measured', 'KernelRegression')
-    """
-
-    def __init__(self, results: Results, metrics: Row, best: Estimator | MatchedField | None) -> None:
-        self.errors, self.positions = DataFrame(results.errors()), DataFrame(results.positions())
-        self.metrics, self.best, self.left_out = metrics, best, results.notes
-
-    @property
-    def choice(self) -> EstimatorChoiceMetrics | None:
-        """Choice of the estimator by cross-validation; `choice["name"]` is its method. None if nothing was compared."""
-        found: EstimatorChoiceMetrics | None = self.metrics["estimator_choice"]
-        return found
-
-    def summary(self) -> DataFrame:
-        """Return a row for each method, the smallest median first.
-
-        `median`, `p90`, and `low` and `high` of the median's 95 % interval are those of the angle between true and estimated
-        direction [deg]. `change` [%] is that of the median by synthetic spectra, relative to the same estimator on the
-        measured spectra alone. Its interval, `change_low` and `change_high`, is paired over the test spectra.
-        """
-        conditions = conditions_of(self.metrics["methods"])
-        rows: list[Row] = []
-        for method, found in self.metrics["methods"].items():
-            error = found["great_circle_deg"]
-            change = found["changes"].get(conditions[method].measured_only.method)
-            row: Row = {name: error[name] for name in ("median", "low", "high", "p90")}
-            if change is not None:
-                row |= {
-                    "change": 100 * change["change"],
-                    "change_low": 100 * change["low"],
-                    "change_high": 100 * change["high"],
-                }
-            rows.append(row)
-        return DataFrame(rows, index=list(self.metrics["methods"])).sort_values("median")
-
-    def __repr__(self) -> str:
-        error = self.summary()["median"]
-        chosen = f", chosen: {self.choice['name']}" if self.choice else ""
-        return f"<TurboResult: {len(error)} methods, best {error.index[0]} at {error.iloc[0]:.2f} degrees{chosen}>"
 
 
 @checked
@@ -98,6 +36,8 @@ def turbo_learning(
     repeats: PositiveInt = 1,
     seed: NonNegativeInt = 0,
     device: torch.device | str = "cpu",
+    keep: Memo | None = None,
+    executor: Executor | None = None,
 ) -> TurboResult:
     """Train estimators on few measured spectra, on these and synthetic ones, and on all, and compare their errors.
 
@@ -117,6 +57,8 @@ def turbo_learning(
         repeats: Number of random measured subsets, whose errors are pooled.
         seed: Seed of everything random.
         device: Device to compute on.
+        keep: Results by the names of steps, in a folder. A call with the same data and options continues after them.
+        executor: Processes that compute steps side by side, e.g. a `ProcessPoolExecutor`.
 
     Raises:
         InputError: A split, name or fraction that does not exist, or data that do not suffice.
@@ -134,66 +76,92 @@ def turbo_learning(
         True
     """
     models = (models,) if isinstance(models, str) else models
-    own_models = {model.name: model for model in models if isinstance(model, FieldModel)}
-    own_estimators = {type(one).__name__: one for one in estimators or () if isinstance(one, Estimator)}
-    names = tuple(one if isinstance(one, str) else one.name for one in models)
-    named = tuple(one for one in estimators or () if isinstance(one, str))
-    _check_unique("field models", names)
-    _check_unique("estimators", [one if isinstance(one, str) else type(one).__name__ for one in estimators or ()])
-    train, test = data.split(split, seed)
     experiment = Experiment(
-        train,
-        test,
-        (measured,),
-        names,
-        None if estimators is None else tuple(name for name in named if name != LOCATOR),
-        None if estimators is None else (ROOM_MODEL,) * (LOCATOR in named),
-        own_models,
-        own_estimators,
-        extra,
-        preset,
-        repeats,
-        seed,
-        device=device,
+        *data.split(split, seed), (measured,), models, estimators, extra, preset, repeats, seed, device
     )
-    results, known, steps = Results(experiment), dict[str, Any](), list[Step[Experiment]]()
-    with TemporaryDirectory(prefix="swiftwrf-") as name:
-        folder = Path(name)
-        (folder / STEPS).mkdir()
-
-        def compute(step: Step[Experiment]) -> Row:
-            if step.name not in known:
-                known[step.name] = strict(step.compute(experiment, folder))
-            value: Row = known[step.name]
-            return value
-
-        for step, value in walk(first_steps(experiment), experiment, compute):
-            results.add(step, value)
-            steps.append(step)
-        metrics = results.summary(measured)
-        choice = metrics["estimator_choice"]
-        condition = conditions_of(metrics["methods"])[choice["name"]] if choice else None
-        best = None if condition is None else _trained(condition, experiment, steps, folder)
-        return TurboResult(results, metrics, best)
+    with TemporaryDirectory(prefix="swiftwrf-") as folder:
+        (result,) = learn(experiment, keep or Memo(Path(folder)), executor)
+        if keep is None:
+            result.best  # noqa: B018 - is read from the folder
+    return result
 
 
-def _check_unique(things: str, names: Sequence[str]) -> None:
+def learn(experiment: Experiment, keep: Memo, executor: Executor | None = None) -> list[TurboResult]:
+    """Return the result of each measured fraction. Measured subsets are computed side by side."""
+    steps = Steps(experiment, keep, executor)
+    results = {fraction: TurboResult(experiment, fraction, keep.folder) for fraction in experiment.fractions}
+    subsets = [_learn(experiment, one, steps, results[one.measured_fraction]) for one in experiment.subsets]
+    for _ in zip_longest(*subsets):
+        pass
+    return list(results.values())
+
+
+def _learn(
+    experiment: Experiment, subset: MeasuredSubset, steps: Steps[Experiment], result: TurboResult
+) -> Iterator[None]:
+    """Add the results of a measured subset. Yield before each wait for values, so that other subsets start their steps."""
+
+    def train(
+        estimator: str, training: Training = "measured", extra: int = 0, synthesizer: str = "", *, saved: bool = False
+    ) -> Condition:
+        condition = Condition(estimator, training, synthesizer, extra, subset.measured_fraction, subset.repeat)
+        name = condition.name if condition.is_turbo else MEASURED_STAND_IN
+        saved_as = name if saved and subset.repeat == 0 else None
+        steps.start(condition.result_name, condition.method, evaluate, condition, saved_as)
+        return condition
+
+    # from the measured spectra alone: field models are compared, the room is found, references are trained
+    fast = [name for name in experiment.named if not experiment.model_type(name).slow]
+    if is_compared := bool(fast or not experiment.named):
+        steps.start(f"choice-{subset}", "comparing field models", compare, subset, fast, first=True)
+    if searches := ROOM_MODEL in experiment.candidates:
+        steps.start(f"room-{subset}", "finding the room", find_room, subset, first=True)
+    conditions = [
+        train(name, saved=name == STAND_IN) for name in experiment.evaluated if name not in experiment.lacking
+    ]
+    full = [train(name, "all measured") for name in experiment.trainable]
+
+    yield
+    # the field models that were asked for or chosen, and others for comparison, predict spectra
+    compared = steps[f"choice-{subset}"] if is_compared else {}
+    names = experiment.named or [compared["choice"]["name"]]
+    trainings = {name: experiment.trainings(compared.get("cross_validation", {}).get(name)) for name in names}
+    models = dict.fromkeys((*names, *experiment.candidates))
+    for name in sorted(models, key=experiment.finds_room):
+        room = None
+        if experiment.finds_room(name):
+            room = steps[steps.start(f"room-{subset}", "finding the room", find_room, subset, first=True)]
+        extra = trainings[name][-1][1] if name in names else None
+        title = f"synthesizing spectra by {name}"
+        steps.start(f"synthesis_{name}-{subset}", title, synthesize, subset, name, extra, room, first=name in names)
+
+    # the test spectra are located by the room
+    located = Condition(LOCATOR, "measured", "", 0, subset.measured_fraction, subset.repeat)
+    if searches and steps[f"room-{subset}"].get("planes"):
+        steps.start(located.result_name, LOCATED, locate, subset, steps[f"room-{subset}"])
+
+    yield
+    # estimators are trained on measured and synthetic spectra
     for name in names:
-        if names.count(name) > 1:
-            raise InputError(f"two {things} have the name {name!r}; leave one out, or give it another name")
+        steps[f"synthesis_{name}-{subset}"]
+        for training, extra in trainings[name]:
+            is_last = (training, extra) == trainings[name][-1]
+            conditions += [
+                train(one, training, extra, name, saved=is_last and experiment.is_first(name))
+                for one in experiment.trainable
+                if is_last or one not in NETWORKS.values()  # whose training takes most of the time
+            ]
 
-
-def _trained(
-    condition: Condition, experiment: Experiment, steps: Sequence[Step[Experiment]], folder: Path
-) -> Estimator | MatchedField | None:
-    """Return the estimator of a condition as the first repeat trained it: from its file, or trained again without one."""
-    if file := chosen_file(folder, fraction_key(experiment.fractions[0]), condition):
-        found = load(file)
-        assert isinstance(found, Estimator | MatchedField)
-        return found
-    evaluations = (step for step in steps if isinstance(step, Evaluation) and step.subset.repeat == 0)
-    own = next((step for step in evaluations if step.condition.method == condition.method), None)
-    if own is None:
-        return None
-    estimator = experiment.make_estimator(condition.estimator, own.subset)
-    return estimator.fit(own.training_set(experiment, folder), device=experiment.device)
+    yield
+    for name in models:
+        result.add_synthesis(subset, name, name in names, steps[f"synthesis_{name}-{subset}"])
+    for condition in conditions:
+        result.add(condition, steps[condition.result_name])
+    if searches:
+        room = steps[f"room-{subset}"]
+        refused = {"refused": room.get("refused", "no plane explains the spectra")}
+        result.add(located, steps[located.result_name] if room.get("planes") else refused)
+    for condition in full:
+        result.add(condition, steps[condition.result_name])
+    if subset.repeat == 0:
+        result.compared = compared

@@ -1,145 +1,162 @@
-"""Results of turbo learning: errors of each condition and test spectrum, scores, histories, and their summaries."""
+"""Result of turbo learning: errors of each condition and test spectrum, scores, histories, and their summaries."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pandas import DataFrame
-from torch import Tensor
+from pandas import DataFrame, concat
 
-from augment.cross_validation import (
-    LOCATOR,
-    STAND_IN,
-    EstimatorChoiceMetrics,
-    choose_estimator,
+from augment.cross_validation import LOCATOR, STAND_IN, EstimatorChoiceMetrics, choose_estimator
+from augment.estimators import Estimator
+from augment.turbo.artifacts import LEVEL
+from augment.turbo.condition import (
+    LOCATED,
+    Condition,
+    MeasuredSubset,
+    Row,
+    chosen_file,
+    conditions_of,
+    pooled,
+    reference_of,
 )
-from augment.turbo.choice import CrossValidation, FoldLocating
-from augment.turbo.condition import LOCATED, Condition, MeasuredSubset, Row, located_by, pooled, reference_of
 from augment.turbo.experiment import ROOM_MODEL, Experiment
-from augment.turbo.locating import LEVEL, NO_PLANE, Locating
-from augment.turbo.synthesis import Evaluation, RoomSearch, Synthesis
-from swiftwrf.choices import AUTO, fraction_key
+from augment.turbo.stages import training_set
+from swiftwrf import load
+from swiftwrf.choices import fraction_key
+from swiftwrf.locate import MatchedField
 from swiftwrf.metrics import ErrorSummary, angle_errors, paired_change, summary
 from swiftwrf.models import FIELD_MODELS
-from swiftwrf.runtime.steps import Step
 
 ANGLES = ("azimuth_deg", "elevation_deg", "great_circle_deg")
 
 
-class Results:
-    """Results of the steps, collected one by one; `on_note` is called with each sentence about a method that is missing."""
+class TurboResult:
+    """Errors of estimators trained on measured, synthetic and all spectra, and the one that cross-validation chose.
 
-    def __init__(self, experiment: Experiment, on_note: Callable[[str], object] | None = None) -> None:
-        self.experiment, self.test = experiment, experiment.test
+    Attributes:
+        errors: A row for each condition and test spectrum: estimator, training set, truth, estimate and errors [deg].
+        positions: A row for each condition that locates and test spectrum: truth, estimate and error [m].
+        synthesis: A row for each field model and test spectrum: PSNR [dB], SSIM and L1 of the synthetic spectrum.
+        history: Losses of the trainings, in rows.
+        metrics: All summaries, as in metrics.json of a run: errors with intervals, paired changes, quality of the synthetic
+            spectra, choices, times.
+        best: The estimator that cross-validation on the measured spectra chose, trained. None if nothing was compared.
+        left_out: A sentence for each method that is missing.
+
+    Example:
+        >>> import augment, swiftwrf
+        >>> data = swiftwrf.simulated_room(n=40, grid=swiftwrf.AngularGrid.hemisphere(10, 40))
+        >>> result = augment.turbo_learning(data, measured=0.5, models=["nearest"], estimators=["peak"], extra=0)
+        >>> result.choice["name"], type(result.best).__name__
+        ('kernel_regression, measured', 'KernelRegression')
+    """
+
+    def __init__(self, experiment: Experiment, fraction: float, folder: Path) -> None:
+        self.experiment, self.fraction, self._folder = experiment, fraction, folder
+        self.compared: Row = {}  # comparison of the field models in the first repeat
+        self.synthesized: list[tuple[Row, Row]] = []  # columns and values of each field model
         self.evaluated: list[tuple[Condition, Row]] = []
-        self.synthesis: list[Row] = []  # scores of each test spectrum
-        self.synthesis_seconds: list[Row] = []
         self.history: list[Row] = []
-        self.chosen: dict[str, Row] = {}  # by measured fraction, of the first repeat
-        self.located_folds: dict[str, dict[int, list[float] | None]] = {}  # errors by fold, in the same way
-        self.left_out: dict[Condition, str] = {}  # conditions, and why
-        self.notes: list[str] = []  # a sentence for each method that is missing
-        self._on_note = on_note
-        fractions = [MeasuredSubset(fraction) for fraction in experiment.fractions]
+        self.missing: dict[str, str] = {}  # reason for each method that is missing
+        self.left_out: list[str] = []
         for name, reason in experiment.lacking.items():
-            self.left_out |= {Condition(name, "measured", **subset.columns): reason for subset in fractions}
-        for reason in dict.fromkeys(experiment.lacking.values()):
             names = ", ".join(name for name, own in experiment.lacking.items() if own == reason)
-            self._note(f"left out: {names}, because {reason}")
-        if missing := FIELD_MODELS[ROOM_MODEL].lacking(self.test):
-            reason = f"it needs the {missing[0]}, which {self.test.name} does not describe"
-            self._note(f"{LOCATOR} is left out: {reason}")
-            self.left_out |= {located_by(subset): reason for subset in fractions}
+            self.leave_out(Condition(name, "measured").method, f"left out: {names}, because {reason}", reason)
+        if missing := FIELD_MODELS[ROOM_MODEL].lacking(experiment.test):
+            reason = f"it needs the {missing[0]}, which {experiment.test.name} does not describe"
+            self.leave_out(LOCATED, f"{LOCATOR} is left out: {reason}", reason)
 
-    def add(self, step: Step[Experiment], value: Row) -> None:
-        """Add the result of one step."""
-        match step:
-            case CrossValidation():
-                self.chosen.setdefault(step.subset.key, value)
-            case FoldLocating() if step.compared.subset.repeat == 0:
-                self.located_folds.setdefault(step.compared.subset.key, {})[step.number] = value["errors"]
-            case Synthesis() if "refused" in value:
-                self._note(f"{step.synthesizer} is left out of the comparison: {value['refused']}")
-            case Synthesis():
-                self._add_synthesis(step, value)
-            case RoomSearch() if not value.get("planes"):
-                if step.locates:
-                    self._leave_out_locating(step.subset, value.get("refused", NO_PLANE))
-            case Locating() if "refused" in value:
-                self._leave_out_locating(step.subset, value["refused"])
-            case Evaluation() | Locating():
-                self.evaluated.append((step.condition, value))
-                self.history += [step.condition.columns | row for row in value["history"]]
+    def leave_out(self, method: str, sentence: str, reason: str) -> None:
+        """Record why a method is missing, and a sentence about it."""
+        self.missing[method] = reason
+        self._note(sentence)
 
-    @property
+    def _note(self, sentence: str) -> None:
+        if sentence not in self.left_out:
+            self.left_out.append(sentence)
+
+    def add_synthesis(self, subset: MeasuredSubset, name: str, trains: bool, value: Row) -> None:
+        """Add the spectra of a field model at the test positions."""
+        if "refused" in value:
+            self._note(f"{name} is left out of the comparison: {value['refused']}")
+            return
+        key = asdict(subset) | {"synthesizer": name}
+        self.synthesized.append((key, value | {"trains": trains}))
+        self.history += [key | row for row in value["history"]]
+
+    def add(self, condition: Condition, value: Row) -> None:
+        """Add the estimates of a condition, or the reason why there are none."""
+        if "refused" in value:
+            reason, fraction = value["refused"], condition.measured_fraction
+            self.leave_out(
+                condition.method, f"{condition.name} is left out with {fraction:.0%} measured: {reason}", reason
+            )
+            return
+        self.evaluated.append((condition, value))
+        self.history += [condition.columns | row for row in value["history"]]
+
+    @cached_property
     def pooled(self) -> list[tuple[Condition, Row]]:
         """Results by condition, such that each condition has all repeats."""
-        return pooled(self.evaluated, self.experiment.models == (AUTO,))
+        return pooled(self.evaluated, auto=not self.experiment.named)
 
-    def errors(self) -> list[Row]:
-        """Return one row for each condition and test spectrum: truth, estimate and errors."""
-        rows: list[Row] = []
+    @cached_property
+    def errors(self) -> DataFrame:
+        """A row for each condition and test spectrum: truth, estimate and errors."""
+        test, tables = self.experiment.test, []
+        truth = test.label.rad2deg()
         for condition, value in self.pooled:
             estimate = torch.tensor(value["estimate"], dtype=torch.float64)
+            errors = angle_errors(estimate, test.label)
             columns = {
-                "index": self.test.index,
-                "line_of_sight": self.test.line_of_sight,
-                "truth_azimuth_deg": self.test.label[:, 0].rad2deg(),
-                "truth_elevation_deg": self.test.label[:, 1].rad2deg(),
+                "index": test.index,
+                "line_of_sight": test.line_of_sight,
+                "truth_azimuth_deg": truth[:, 0],
+                "truth_elevation_deg": truth[:, 1],
                 "estimate_azimuth_deg": estimate[:, 0].rad2deg(),
                 "estimate_elevation_deg": estimate[:, 1].rad2deg(),
+                **{f"{angle}_deg": error.rad2deg() for angle, error in errors.items()},
             }
-            errors = angle_errors(estimate, self.test.label)
-            columns |= {f"{angle}_deg": error.rad2deg() for angle, error in errors.items()}
-            rows += rows_of(condition.columns, columns)
-        return rows
+            tables.append(DataFrame(condition.columns | columns))
+        return concat(tables, ignore_index=True)
 
-    def positions(self) -> list[Row]:
-        """Return one row for each condition that locates and each test spectrum: truth, estimate, error and radius."""
-        rows: list[Row] = []
+    @cached_property
+    def positions(self) -> DataFrame:
+        """A row for each condition that locates and each test spectrum: truth, estimate, error and radius."""
+        test, tables = self.experiment.test, [DataFrame()]
         for condition, value in self.evaluated:
-            if "located" not in value:
+            if (found := value.get("located")) is None:
                 continue
-            found = {name: torch.tensor(value["located"][name]) for name in ("radius", "level", "ambiguous")}
-            estimate = torch.tensor(value["located"]["position"], dtype=torch.float64)
-            error = (estimate - self.test.position).norm(dim=1)
-            columns = {"index": self.test.index}
-            for name, at in (("truth", self.test.position), ("estimate", estimate)):
+            estimate = torch.tensor(found["position"], dtype=torch.float64)
+            columns: Row = {"index": test.index}
+            for name, at in (("truth", test.position), ("estimate", estimate)):
                 columns |= {f"{name}_{axis}_m": at[:, number] for number, axis in enumerate("xyz")}
             columns |= {
-                "error_m": error,
+                "error_m": (estimate - test.position).norm(dim=1),
                 "credible_radius_80_m": found["radius"],
-                "covered": found["level"] < LEVEL,
+                "covered": np.array(found["level"]) < LEVEL,
                 "containing_level": found["level"],
                 "ambiguous": found["ambiguous"],
             }
-            rows += rows_of(condition.columns, columns)
-        return rows
+            tables.append(DataFrame(condition.columns | columns))
+        return concat(tables, ignore_index=True)
 
-    def _leave_out_locating(self, subset: MeasuredSubset, reason: str) -> None:
-        """Record why matched-field processing is not in the results of a subset."""
-        self._note(f"{LOCATOR} is left out with {subset.measured_fraction:.0%} measured: {reason}")
-        self.left_out[located_by(subset)] = reason
+    @cached_property
+    def synthesis(self) -> DataFrame:
+        """A row for each field model and test spectrum: PSNR [dB], SSIM and L1."""
+        index = {"index": self.experiment.test.index}
+        return concat([DataFrame(key | index | value["scores"]) for key, value in self.synthesized], ignore_index=True)
 
-    def _note(self, sentence: str) -> None:
-        if sentence not in self.notes:
-            self.notes.append(sentence)
-            if self._on_note is not None:
-                self._on_note(sentence)
-
-    def _add_synthesis(self, step: Synthesis, value: Row) -> None:
-        key = step.subset.columns | {"synthesizer": step.synthesizer}
-        columns = {score: torch.tensor(values) for score, values in value["scores"].items()}
-        self.synthesis += rows_of(key, {"index": self.test.index} | columns)
-        self.synthesis_seconds.append(key | value["seconds"] | {"trains": step.trains})
-        self.history += [key | row for row in value["history"]]
-
-    def summary(self, fraction: float) -> Row:
-        """Return the numbers of metrics.json for one measured fraction.
+    @cached_property
+    def metrics(self) -> Row:
+        """Numbers of metrics.json for the measured fraction.
 
         Returns:
             n_measured: Number of measured spectra.
@@ -158,58 +175,101 @@ class Results:
             left_out: Reasons why methods are missing.
             seconds: Those to `fit` and `synthesize` of the trained field models, and to `train` all networks.
         """
-        chosen = self.chosen.get(fraction_key(fraction), {})
-        evaluated = [(c, value) for c, value in self.evaluated if c.measured_fraction == fraction]
-        scores, fits = _of_fraction(self.synthesis, fraction), _of_fraction(self.synthesis_seconds, fraction)
+        scored = summaries(self.synthesis, "synthesizer", ("psnr_db", "ssim", "l1"))
+        fits = DataFrame([key | value["seconds"] | {"trains": value["trains"]} for key, value in self.synthesized])
         spent, trained = averaged(fits, "synthesizer", ("fit", "synthesize")), fits[fits["trains"]]
-        methods, reference = self._method_metrics(fraction)
+        methods, reference = self._method_metrics()
         return {
-            "n_measured": round(fraction * len(self.experiment.train)),
-            "counts": {condition.training_set: value["counts"] for condition, value in evaluated},
-            "choice": chosen.get("choice"),
-            "cross_validation": chosen.get("cross_validation"),
-            "estimator_choice": self._estimator_choice(fraction),
-            "synthesis": {
-                name: {**entry, "seconds": spent[name]}
-                for name, entry in summaries(scores, "synthesizer", ("psnr_db", "ssim", "l1")).items()
-            },
+            "n_measured": round(self.fraction * len(self.experiment.train)),
+            "counts": {condition.training_set: value["counts"] for condition, value in self.evaluated},
+            "choice": self.compared.get("choice"),
+            "cross_validation": self.compared.get("cross_validation"),
+            "estimator_choice": self._estimator_choice(),
+            "synthesis": {name: {**entry, "seconds": spent[name]} for name, entry in scored.items()},
             "methods": methods,
             "reference": reference,
-            "locating": self._locating_metrics(fraction),
-            "left_out": {c.method: reason for c, reason in self.left_out.items() if c.measured_fraction == fraction},
+            "locating": self._locating_metrics(),
+            "left_out": self.missing,
             "seconds": {
                 "fit": float(trained["fit"].sum()),
                 "synthesize": float(trained["draw"].sum()),
-                "train": sum(value["seconds"]["train"] for condition, value in evaluated if condition.is_network),
+                "train": sum(value["seconds"]["train"] for c, value in self.evaluated if c.is_network),
             },
         }
 
-    def _estimator_choice(self, fraction: float) -> EstimatorChoiceMetrics | None:
-        """Return the choice of the estimator by cross-validation. None if field models could not be compared."""
-        key = fraction_key(fraction)
-        if (chosen := self.chosen.get(key, {})).get("choice") is None:
-            return None
-        errors = {
-            self._pooled_name(name, fraction): [np.array(fold) for fold in folds]
-            for name, folds in chosen["errors"].items()
-        }
-        located = self.located_folds.get(key, {})
-        if not any(c.estimator == LOCATOR and c.measured_fraction == fraction for c, _ in self.pooled):
-            located = {}  # its fit was refused
-        choice = choose_estimator(
-            errors,
-            {n: None if own is None else np.array(own) for n, own in located.items()},
-            LOCATED,
-        )
-        return {**choice, "better": self._better(fraction, choice)}
+    @property
+    def choice(self) -> EstimatorChoiceMetrics | None:
+        """Choice of the estimator by cross-validation; `choice["name"]` is its method. None if nothing was compared."""
+        found: EstimatorChoiceMetrics | None = self.metrics["estimator_choice"]
+        return found
 
-    def _better(self, fraction: float, choice: EstimatorChoiceMetrics) -> dict[str, str]:
+    @cached_property
+    def best(self) -> Estimator | MatchedField | None:
+        """The estimator that cross-validation chose, as the first repeat trained it. None if nothing was compared."""
+        if self.choice is None:
+            return None
+        chosen, experiment = conditions_of(self.metrics["methods"])[self.choice["name"]], self.experiment
+        if file := chosen_file(self._folder, fraction_key(self.fraction), chosen):
+            found = load(file)
+            assert isinstance(found, Estimator | MatchedField)
+            return found
+        own = next((one for one, _ in self.evaluated if one.repeat == 0 and one.method == chosen.method), None)
+        if own is None:
+            return None
+        estimator = experiment.make_estimator(own.estimator, 0)
+        return estimator.fit(training_set(experiment, self._folder, own), device=experiment.device)
+
+    def summary(self) -> DataFrame:
+        """Return a row for each method, the smallest median first.
+
+        `median`, `p90`, and `low` and `high` of the median's 95 % interval are those of the angle between true and estimated
+        direction [deg]. `change` [%] is that of the median by synthetic spectra, relative to the same estimator on the
+        measured spectra alone. Its interval, `change_low` and `change_high`, is paired over the test spectra.
+        """
+        conditions = conditions_of(self.metrics["methods"])
+        rows: list[Row] = []
+        for method, found in self.metrics["methods"].items():
+            error = found["great_circle_deg"]
+            change = found["changes"].get(conditions[method].measured_only.method)
+            row: Row = {name: error[name] for name in ("median", "low", "high", "p90")}
+            if change is not None:
+                columns = {"change": "change", "change_low": "low", "change_high": "high"}
+                row |= {column: 100 * change[name] for column, name in columns.items()}
+            rows.append(row)
+        return DataFrame(rows, index=list(self.metrics["methods"])).sort_values("median")
+
+    def __repr__(self) -> str:
+        error = self.summary()["median"]
+        chosen = f", chosen: {self.choice['name']}" if self.choice else ""
+        return f"<TurboResult: {len(error)} methods, best {error.index[0]} at {error.iloc[0]:.2f} degrees{chosen}>"
+
+    @cached_property
+    def _error(self) -> dict[str, NDArray[np.float64]]:
+        """Angular errors [deg] of each method, (n, repeats)."""
+        return {method: by_repeat(part, "great_circle_deg") for method, part in self.errors.groupby("method")}
+
+    def _estimator_choice(self) -> EstimatorChoiceMetrics | None:
+        """Return the choice of the estimator by cross-validation. None if field models could not be compared."""
+        if self.compared.get("choice") is None:
+            return None
+        methods = [condition for condition, _ in self.pooled]
+        # where repeats chose differently, the stand-in with synthetic spectra has another name than in the first repeat
+        other = next((c.method for c in methods if c.is_turbo and c.estimator == STAND_IN), None)
+        own = {condition.method for condition in methods}
+        errors = {
+            name if name in own else other or name: [np.array(fold) for fold in folds]
+            for name, folds in self.compared["errors"].items()
+        }
+        located = self.compared["located"] if LOCATED in own else {}  # otherwise its fit was refused
+        found = {int(number): None if fold is None else np.array(fold) for number, fold in located.items()}
+        choice = choose_estimator(errors, found, LOCATED)
+        return {**choice, "better": self._better(choice)}
+
+    def _better(self, choice: EstimatorChoiceMetrics) -> dict[str, str]:
         """Return the methods that are significantly better than the chosen one on the test spectra, and why not chosen."""
-        errors = _of_fraction(self.errors(), fraction).groupby("method")
-        error = {method: by_repeat(part, "great_circle_deg") for method, part in errors}
-        reasons = {}
+        error, reasons = self._error, {}
         for condition, _ in self.pooled:
-            if condition.measured_fraction != fraction or condition.training == "all measured":
+            if condition.training == "all measured":
                 continue
             if condition.method in choice["held_out_deg"]:
                 reason = "its error on held-out measured spectra is larger"
@@ -223,26 +283,16 @@ class Results:
         better = [name for name in reasons if paired_change(error[choice["name"]], error[name])["high"] < 0]
         return {name: reasons[name] for name in sorted(better, key=lambda name: float(np.median(error[name])))}
 
-    def _pooled_name(self, method: str, fraction: float) -> str:
-        """Return the name under which `pooled` has a method of the stand-in in the first repeat."""
-        own = [condition for condition, _ in self.pooled if condition.measured_fraction == fraction]
-        if any(condition.method == method for condition in own):
-            return method
-        return next((c.method for c in own if c.is_turbo and c.estimator == STAND_IN), method)
-
-    def _method_metrics(self, fraction: float) -> tuple[dict[str, Row], str]:
+    def _method_metrics(self) -> tuple[dict[str, Row], str]:
         """Return the metrics of each method, and the reference of changes."""
-        own = [(condition, value) for condition, value in self.pooled if condition.measured_fraction == fraction]
-        conditions = {condition.method: condition for condition, _ in reversed(own)}  # of the first repeat
-        errors = _of_fraction(self.errors(), fraction)
-        times = DataFrame([c.columns | value["seconds"] for c, value in own])
+        conditions = {condition.method: condition for condition, _ in reversed(self.pooled)}  # of the first repeat
+        times = DataFrame([c.columns | value["seconds"] for c, value in self.pooled])
         seconds = averaged(times, "method", ("train", "estimate"))
-        found = summaries(errors, "method", ANGLES)
+        found = summaries(self.errors, "method", ANGLES)
         reference = reference_of(
             conditions, {name: entry["great_circle_deg"]["median"] for name, entry in found.items()}
         )
-        error = {method: by_repeat(part, "great_circle_deg") for method, part in errors.groupby("method")}
-        metrics = {}
+        error, metrics = self._error, {}
         for method, entry in found.items():
             condition = conditions[method]
             others = dict.fromkeys((condition.measured_only.method, reference)) if condition.is_turbo else ()
@@ -250,15 +300,14 @@ class Results:
             metrics[method] = {**condition.description, **entry, "changes": changes, "seconds": seconds[method]}
         return metrics, reference
 
-    def _locating_metrics(self, fraction: float) -> dict[str, Row]:
-        rows = _of_fraction(self.positions(), fraction)
-        if not len(rows):
+    def _locating_metrics(self) -> dict[str, Row]:
+        own = [(condition, value["located"]) for condition, value in self.evaluated if "located" in value]
+        if not own:
             return {}
-        own = [(c, v["located"]) for c, v in self.evaluated if "located" in v and c.measured_fraction == fraction]
-        weights = {c.method: found["weights"] for c, found in reversed(own)}  # of the first repeat
+        weights = {condition.method: found["weights"] for condition, found in reversed(own)}  # of the first repeat
         times = DataFrame([c.columns | found["seconds"] for c, found in own])
         seconds = averaged(times, "method", ("room", "fit", "locate"))
-        shares = averaged(rows, "method", ("covered", "ambiguous"))
+        shares = averaged(self.positions, "method", ("covered", "ambiguous"))
         return {
             method: {
                 "position_error_m": entry["error_m"],
@@ -267,19 +316,8 @@ class Results:
                 "weights": weights[method],
                 "seconds": seconds[method],
             }
-            for method, entry in summaries(rows, "method", ("error_m",)).items()
+            for method, entry in summaries(self.positions, "method", ("error_m",)).items()
         }
-
-
-def _of_fraction(rows: list[Row], fraction: float) -> DataFrame:
-    """Return the rows of a measured fraction as a table."""
-    return DataFrame([row for row in rows if row["measured_fraction"] == fraction])
-
-
-def rows_of(key: Row, columns: dict[str, Tensor]) -> list[Row]:
-    """Return the rows of a table of columns, each with the same key."""
-    lists = {name: column.tolist() for name, column in columns.items()}
-    return [key | dict(zip(lists, values, strict=True)) for values in zip(*lists.values(), strict=True)]
 
 
 def summaries(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dict[str, ErrorSummary]]:

@@ -50,6 +50,13 @@ class Trial:
         return self.localizer + rows + (f"-receivers{self.receivers:g}" if self.receivers < 1 else "")
 
     @property
+    def title(self) -> str:
+        """Name of the localizer and the part in words."""
+        parts = [f"{self.rows:.0%} of the rows"] * (self.rows < 1)
+        parts += [f"{self.receivers:.0%} of the receivers"] * (self.receivers < 1)
+        return f"{self.localizer}, {' and '.join(parts)}" if parts else self.localizer
+
+    @property
     def is_whole(self) -> bool:
         """True if the localizer has all training rows and receivers."""
         return self.rows == 1 and self.receivers == 1

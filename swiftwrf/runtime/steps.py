@@ -1,56 +1,145 @@
-"""A computation cut into steps that follow from each other, so that results can be kept and computed in any process."""
+"""Named steps of an experiment: their results are kept for a call that continues it, and they may run side by side."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import json
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-STEPS = "steps"  # folder, beside the results, of the files that only later steps read
+from swiftwrf.errors import InputError
+from swiftwrf.runtime.durable import strict, write_json
 
+STEPS = "steps"  # folder, beside the results, of kept values and of files that only later steps read
+POLL_S = 2  # between two checks that there are workers
+
+Row = dict[str, Any]
 Context = TypeVar("Context")
 """data and configuration that all steps share"""
 
 
-class Step(ABC, Generic[Context]):
-    """One computation of a run. Its fields are small, because it is sent to workers and read from results.
+class Memo:
+    """Results of steps by name, kept in a folder. Steps write their files there, too.
 
-    Large data are in the context, and in files of one folder, which all workers share.
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     Memo(Path(folder)).keep("sum", {"value": 3}, seconds=0.1)
+        ...     Memo(Path(folder)).kept("sum")
+        {'value': 3}
+        {'value': 3}
     """
 
-    @property
-    @abstractmethod
-    def name(self) -> str:
-        """Key of the kept result. Steps with one name are one step."""
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        (folder / STEPS).mkdir(parents=True, exist_ok=True)
 
-    @property
-    def title(self) -> str:
-        """Description of the step for the terminal."""
-        return self.name
+    def holds(self, name: str) -> bool:
+        """Return True if the result of a step is kept."""
+        return (self.folder / STEPS / f"{name}.json").exists()
 
-    @abstractmethod
-    def compute(self, context: Context, folder: Path) -> dict[str, Any]:
-        """Return plain values. Files are read and written in `folder`."""
+    def kept(self, name: str) -> Row | None:
+        """Return the kept result of a step, or None.
 
-    @property
-    def priority(self) -> int:
-        """Priority among the steps that could begin: 2 if other steps wait for this one, 1 if it takes long, else 0."""
-        return 2 if type(self).then is not Step.then else 0
+        Raises:
+            InputError: The kept result is damaged.
+        """
+        if not self.holds(name):
+            return None
+        file = self.folder / STEPS / f"{name}.json"
+        try:
+            value = json.loads(file.read_text(encoding="utf-8"))["value"]
+        except (ValueError, TypeError, LookupError):
+            value = None
+        if not isinstance(value, dict):
+            raise InputError(f"{file} does not hold what the step computed; remove it and resume again")
+        return value
 
-    def then(self, context: Context, value: dict[str, Any]) -> Sequence[Step[Context]]:
-        """Return the steps that follow from the result."""
-        return ()
+    def keep(self, name: str, value: Row, seconds: float) -> Row:
+        """Keep the result and the duration of a step. Return the result as it is read back."""
+        plain: Row = strict(value)
+        write_json(self.folder / STEPS / f"{name}.json", {"value": plain, "seconds": seconds})
+        return plain
+
+    def expect(self, steps: int) -> None:
+        """Take notice of further steps."""
+
+    def begin(self, name: str, title: str) -> None:
+        """Take notice of a step that is computed now."""
 
 
-def walk(
-    steps: Iterable[Step[Context]], context: Context, compute: Callable[[Step[Context]], dict[str, Any]]
-) -> Iterator[tuple[Step[Context], dict[str, Any]]]:
-    """Yield each step with its computed result, followed by the steps that follow from it.
+class Steps(Generic[Context]):
+    """Computations by name. `start` returns at once, and `steps[name]` computes or waits until the result is there.
 
-    Steps with one name have one result.
+    Args:
+        context: First argument of each function, which is sent to each worker once.
+        memo: Kept results. They are not computed again.
+        executor: Workers that see the memo's folder. By default each step is computed here, in order.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> def add(context, folder, number):
+        ...     return {"sum": context + number}
+        >>> with TemporaryDirectory() as folder:
+        ...     steps = Steps(10, Memo(Path(folder)))
+        ...     names = [steps.start(f"sum-{number}", "adding", add, number) for number in (1, 2)]
+        ...     [steps[name]["sum"] for name in names]
+        [11, 12]
     """
-    for step in steps:
-        value = compute(step)
-        yield step, value
-        yield from walk(step.then(context, value), context, compute)
+
+    def __init__(self, context: Context, memo: Memo, executor: Executor | None = None) -> None:
+        self.memo = memo
+        self._compute = partial(_compute, context, memo.folder.resolve())
+        self._executor = executor
+        # number of steps that workers take together; steps beyond wait, because one that others wait for may come
+        self._slots: Callable[[], int] = getattr(executor, "slots", lambda: sys.maxsize)
+        self._values: dict[str, Row] = {}
+        self._waiting: dict[str, tuple[bool, str, tuple[Any, ...]]] = {}
+        self._pending: dict[Future[tuple[Row, float]], str] = {}
+
+    def start(self, name: str, title: str, function: Callable[..., Row], *arguments: Any, first: bool = False) -> str:
+        """Let `function(context, folder, *arguments)` compute the values of a step. Return its name.
+
+        A name that was started is not started again. With `first`, because others wait for it, the step precedes others.
+        """
+        if name not in self._values and name not in self._waiting and name not in self._pending.values():
+            if (value := self.memo.kept(name)) is not None:
+                self._values[name] = value
+            else:
+                self._waiting[name] = first, title, (function, *arguments)
+                self.memo.expect(1)
+        return name
+
+    def __getitem__(self, name: str) -> Row:
+        while name not in self._values:
+            if not self._waiting and not self._pending:
+                raise KeyError(name)
+            self._advance()
+        return self._values[name]
+
+    def _advance(self) -> None:
+        """Compute a step here, or keep the results of workers that are done."""
+        slots = self._slots()  # raises an error if all workers are lost
+        while self._waiting and len(self._pending) < slots:
+            name = min(self._waiting, key=lambda name: not self._waiting[name][0])
+            _, title, call = self._waiting.pop(name)
+            self.memo.begin(name, title)
+            if self._executor is None:
+                self._values[name] = self.memo.keep(name, *self._compute(*call))
+                return
+            self._pending[self._executor.submit(self._compute, *call)] = name
+        for future in wait(self._pending, POLL_S, FIRST_COMPLETED).done:
+            name = self._pending.pop(future)
+            self._values[name] = self.memo.keep(name, *future.result())
+
+
+def _compute(context: Context, folder: Path, function: Callable[..., Row], *arguments: Any) -> tuple[Row, float]:
+    """Return values and seconds of a step, computed here or in a worker."""
+    if not (folder / STEPS).is_dir():
+        raise InputError(f"a worker does not see {folder}; choose an --out on a file system that all machines share")
+    began = time.perf_counter()
+    return function(context, folder, *arguments), time.perf_counter() - began

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from swiftwrf.locate import RssiLocator
 from swiftwrf.locate.baselines import PosteriorLocalizer
 from swiftwrf.locate.comparison import LocateComparison, LocateSplit, Trial
 from swiftwrf.runtime.durable import write_npz
-from swiftwrf.runtime.steps import Step
+from swiftwrf.runtime.steps import Steps
 from tasks.configs import LocateConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
@@ -26,43 +25,26 @@ from tasks.page.page import finish
 from tasks.page.shared import write_suggestion
 from tasks.records import LOCATOR, Row, write_table
 from tasks.source import measured_rssi, split_notes
-from tasks.steps import run_steps
 from tasks.terminal import console, terminal
-from tasks.workers import connected
+from tasks.workers import connected, workers_of
 
 N_MAPS = 6  # test rows with a posterior map
 
 
-@dataclass(frozen=True)
-class Localization(Step[LocateSplit]):
+def localize(split: LocateSplit, folder: Path, trial: Trial, suggest: int) -> Row:
     """Fit the localizer of a trial and locate the test rows; suggest a number of positions for the next measurements."""
-
-    trial: Trial
-    suggest: int = 0
-
-    @property
-    def name(self) -> str:
-        return self.trial.name
-
-    @property
-    def title(self) -> str:
-        rows, receivers = self.trial.rows, self.trial.receivers
-        parts = [f"{rows:.0%} of the rows"] * (rows < 1) + [f"{receivers:.0%} of the receivers"] * (receivers < 1)
-        return f"{self.trial.localizer}, {' and '.join(parts)}" if parts else self.trial.localizer
-
-    def compute(self, context: LocateSplit, folder: Path) -> Row:
-        localizer, values = context.fit(self.trial)
-        if isinstance(localizer, PosteriorLocalizer) and self.trial.is_whole:
-            locator = localizer.locator
-            locator.save(folder / LOCATOR)
-            error = (values["estimate"] - values["truth"]).norm(dim=1)
-            write_npz(folder / "maps.npz", posterior_maps(locator, context.train, context.test, error))
-            if self.suggest:
-                found = suggest_positions(locator, context.train, self.suggest, context.seed)
-                degrees = degree_columns(context.train.origin, found.position.numpy())
-                measured = context.train.transmitter_position
-                write_suggestion(folder / SUGGESTED, measured, found.position, found.variance, degrees)
-        return values
+    localizer, values = split.fit(trial)
+    if isinstance(localizer, PosteriorLocalizer) and trial.is_whole:
+        locator = localizer.locator
+        locator.save(folder / LOCATOR)
+        error = (values["estimate"] - values["truth"]).norm(dim=1)
+        write_npz(folder / "maps.npz", posterior_maps(locator, split.train, split.test, error))
+        if suggest:
+            found = suggest_positions(locator, split.train, suggest, split.seed)
+            degrees = degree_columns(split.train.origin, found.position.numpy())
+            measured = split.train.transmitter_position
+            write_suggestion(folder / SUGGESTED, measured, found.position, found.variance, degrees)
+    return values
 
 
 def run(config: LocateConfig, resume: Path | None = None) -> None:
@@ -83,18 +65,22 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"
     with (
         connected(config.scheduler, device) as cluster,
-        Run("locate", config.out, label, config, device, data.source, resume) as directory,
+        Run("locate", config.out, label, config, device, data.source, resume, described=_described) as directory,
     ):
-        steps, values = (Localization(trial, config.suggest) for trial in measured.trials()), {}
-        with terminal.progress():
-            for step, value in run_steps(
-                directory, steps, measured, cluster, lambda _, value: f"{value['median_m']:.2f} m"
-            ):
-                assert isinstance(step, Localization)
-                values[step.trial] = value
+        with workers_of(directory, cluster) as workers, terminal.progress():
+            steps = Steps(measured, directory, workers)
+            started = {
+                trial: steps.start(trial.name, trial.title, localize, trial, config.suggest)
+                for trial in measured.trials()
+            }
+            values = {trial: steps[name] for trial, name in started.items()}
         result = LocateComparison(measured, values)
         write_table(directory.path("errors.csv"), result.errors.to_dict("records"))
         finish(directory, _metrics(data, result), page, answer)
+
+
+def _described(value: Row) -> str:
+    return f"{value['median_m']:.2f} m"
 
 
 def measurements(config: LocateConfig) -> Rssi:

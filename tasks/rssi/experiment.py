@@ -50,12 +50,12 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     source = data.source | ({"floor plan": sha256(Path(config.floor_plan))} if config.floor_plan else {})
     with (
         connected(config.scheduler, device) as cluster,
-        Run("rssi", config.out, label, config, device, source, resume) as directory,
+        Run("rssi", config.out, label, config, device, source, resume, described=_described) as directory,
     ):
 
         def keep(name: str, compute: Callable[[], tuple[RssiPredictor | None, Row]]) -> Row:
             if name == "fewer rows":
-                return directory.step(name, name, lambda: compute()[1], lambda value: "")
+                return directory.step(name, name, lambda: compute()[1])
 
             def saved() -> Row:
                 predictor, value = compute()
@@ -63,7 +63,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
                     predictor.save(directory.path(MODEL))
                 return value | {"n_primitives": getattr(predictor, "n_primitives", 0)}
 
-            return directory.step(name, name, saved, lambda value: f"{value['median_db']:.2f} dB")
+            return directory.step(name, name, saved)
 
         with terminal.progress():
             terminal.expect(sum(not directory.holds(name) for name in (*names, "fewer rows")))
@@ -92,6 +92,10 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         if plan is not None:
             plan.save(directory.folder)
         finish(directory, _metrics(config, data, result, model), page, answer)
+
+
+def _described(value: Row) -> str:
+    return f"{value['median_db']:.2f} dB" if "median_db" in value else ""
 
 
 def _read_floor_plan(config: RssiTaskConfig, data: Rssi) -> FloorPlan | None:

@@ -1,5 +1,7 @@
 """Turbo learning in one call equals the command, and takes field models and estimators of one's own."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import pandas as pd
 import pytest
 import torch
@@ -10,6 +12,7 @@ from augment.estimators import Estimator
 from swiftwrf import AngularGrid, InputError, load_spectra, make_model, simulated_room
 from swiftwrf.metrics import angle_errors
 from swiftwrf.models.neighbours import NearestModel
+from swiftwrf.runtime.steps import Memo
 
 
 class Zenith(Estimator):
@@ -64,6 +67,18 @@ def test_the_call_gives_the_errors_of_the_command(aoa_run):
     command = command.set_index(["method", "index"])["great_circle_deg"]
     found = result.errors.set_index(["method", "index"])["great_circle_deg"]
     pd.testing.assert_series_equal(found, command.loc[found.index], atol=1e-3)
+
+
+def test_a_call_continues_after_the_steps_that_it_kept_and_computes_the_others_in_an_executor(data, tmp_path):
+    options = {"measured": 0.5, "models": ["idw"], "estimators": ["peak"], "extra": 0}
+    with ThreadPoolExecutor(1) as executor:
+        first = turbo_learning(data, **options, keep=Memo(tmp_path), executor=executor)
+    steps = {file: file.stat().st_mtime_ns for file in (tmp_path / "steps").glob("*.json")}
+    (tmp_path / "steps" / "kernel_regression_measured-mix0.5-r0.json").unlink()
+    again = turbo_learning(data, **options, keep=Memo(tmp_path))
+    pd.testing.assert_frame_equal(again.errors, first.errors)
+    changed = [file.stem for file, time in steps.items() if file.stat().st_mtime_ns != time]
+    assert changed == ["kernel_regression_measured-mix0.5-r0"]
 
 
 @pytest.mark.parametrize(

@@ -12,13 +12,13 @@ import dask
 import pytest
 import torch
 from quick import run, said
-from sums import STEPS, Kill, KillOnce, Sum, results
+from sums import STEPS, Sum, add, kill, kill_once, results
 from test_rssi_model import with_field
 
 from swiftwrf import FitError, InputError, fit_rssi
+from swiftwrf.runtime.steps import _compute
 from swiftwrf.runtime.threads import set_threads
 from tasks import workers
-from tasks.steps import _compute_away
 from tasks.workers import connected
 
 distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
@@ -51,8 +51,8 @@ def cluster(local):
 
 def test_a_cluster_gives_the_results_of_this_machine_when_a_worker_dies(cluster, tmp_path):
     here, _ = results(tmp_path / "here", [*STEPS, Sum(6)])
-    there, arrived = results(tmp_path / "there", [*STEPS, KillOnce(6)], cluster=cluster)
-    assert [(step.name, value["sum"]) for step, value in there] == [(step.name, value["sum"]) for step, value in here]
+    there, arrived = results(tmp_path / "there", [*STEPS, Sum(6, function=kill_once)], cluster=cluster)
+    assert [(name, value["sum"]) for name, value in there] == [(name, value["sum"]) for name, value in here]
     assert len(arrived) == len(set(arrived)) == 6
     assert all(value["process"] != os.getpid() for _, value in there)
     assert (tmp_path / "there" / "sum-5.txt").read_text() == "5"
@@ -96,7 +96,7 @@ def test_workers_that_cannot_compute_the_same_are_refused(local, tmp_path, monke
     with pytest.raises(InputError, match="lacks a package"), connected(local.scheduler_address, CPU) as cluster:
         list(cluster.map(abs, [Foreign()]))
     with pytest.raises(InputError, match="choose an --out on a file system that all machines share"):
-        _compute_away(10, tmp_path / "elsewhere", Sum(1))
+        _compute(10, tmp_path / "elsewhere", add, 1)
     monkeypatch.setattr(workers, "packages", lambda: {"torch": "0.1"})
     with (
         pytest.raises(InputError, match=r"a worker has torch .* \(not 0.1\)"),
@@ -111,7 +111,7 @@ def test_a_step_that_ends_every_worker_ends_in_a_sentence(local, tmp_path, monke
         pytest.raises(FitError, match="a step ended several workers"),
         connected(local.scheduler_address, CPU) as cluster,
     ):
-        results(tmp_path / "run", [Kill(1)], cluster=cluster)
+        results(tmp_path / "run", [Sum(1, function=kill)], cluster=cluster)
 
 
 def test_workers_that_never_come_or_go_for_good(tmp_path, monkeypatch):

@@ -14,7 +14,7 @@ from unittest import mock
 
 import pytest
 import torch
-from sums import STEPS, Exit, Kill, KillOnce, Refusal, Sum, results
+from sums import STEPS, Sum, kill, kill_once, leave, refuse, results
 
 from swiftwrf import FitError, InputError
 from swiftwrf.runtime.threads import set_threads
@@ -27,12 +27,12 @@ from tasks.preload import SERVED
 HERE = Path(__file__).parents[1]
 ENVIRONMENT = os.environ | {"PYTHONPATH": f"{HERE}{os.pathsep}{HERE.parent}"}
 if SERVED:
-    set_forkserver_preload(["tasks.steps"])  # a process starts in a tenth of the time
+    set_forkserver_preload(["tasks.workers"])  # a process starts in a tenth of the time
 
 
 def test_processes_give_the_results_of_one_process_in_the_same_order(tmp_path):
     (here, _), (there, arrived) = (results(tmp_path / str(n), STEPS, n) for n in (1, 2))
-    assert [(step.name, value["sum"]) for step, value in there] == [(step.name, value["sum"]) for step, value in here]
+    assert [(name, value["sum"]) for name, value in there] == [(name, value["sum"]) for name, value in here]
     assert [value["sum"] for _, value in there] == [11, 13, 14, 12, 11, 15]
     assert sorted(arrived) == [f"sum-{number}" for number in range(1, 6)]
     assert all(value["process"] != os.getpid() and value["threads"] == 1 for _, value in there)
@@ -74,9 +74,9 @@ KILLED = "was killed, probably because memory was short; continue with one proce
 @pytest.mark.parametrize(
     ("step", "error"),
     [
-        (Refusal(1), InputError("no such number")),
-        (Kill(1), FitError(KILLED)),
-        (Exit(1), FitError("ended with exit code 3; continue with one process")),
+        (Sum(1, function=refuse), InputError("no such number")),
+        (Sum(1, function=kill), FitError(KILLED)),
+        (Sum(1, function=leave), FitError("ended with exit code 3; continue with one process")),
     ],
 )
 def test_a_step_that_fails_ends_the_run_and_its_processes(tmp_path, step, error):
@@ -88,7 +88,7 @@ def test_a_step_that_fails_ends_the_run_and_its_processes(tmp_path, step, error)
 
 @pytest.mark.parametrize("processes", [1, 2])
 def test_a_run_that_lost_a_process_continues_with_the_results_that_it_kept(tmp_path, processes):
-    steps = [Sum(1, (3, 4)), KillOnce(2, (5,))]
+    steps = [Sum(1, (3, 4)), Sum(2, (5,), kill_once)]
     with pytest.raises(FitError, match=KILLED):
         results(tmp_path / "run", steps, 2)
     found, arrived = results(tmp_path / "run", steps, processes, resume=tmp_path / "run.partial")
@@ -98,18 +98,21 @@ def test_a_run_that_lost_a_process_continues_with_the_results_that_it_kept(tmp_p
 
 SCRIPT = """
 import sys, torch
-from sums import Sum
+from sums import add
+from swiftwrf.runtime.steps import Steps
 from tasks.configs import AoaConfig
 from tasks.directory import Run
-from tasks.steps import run_steps
+from tasks.workers import workers_of
 
 class Own(int): pass
 
 print("once")
 for context in (10, Own(10)):
     out = sys.argv[1] + type(context).__name__
-    with Run("aoa", out, "", AoaConfig(mix=(0.5,)), torch.device("cpu"), {}, None, 2) as run:
-        print([value["sum"] for _, value in run_steps(run, [Sum(1), Sum(2)], context)])
+    with Run("aoa", out, "", AoaConfig(mix=(0.5,)), torch.device("cpu"), {}, None, 2) as run, workers_of(run, None) as two:
+        steps = Steps(context, run, two)
+        names = [steps.start(f"sum-{number}", "", add, number) for number in (1, 2)]
+        print([steps[name]["sum"] for name in names])
 """
 
 
@@ -157,7 +160,7 @@ def is_running(process):
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="reads the states of processes")
 def test_processes_end_with_a_run_that_is_killed(tmp_path):
-    code = "import sys; from sums import *; results(sys.argv[1], [Sum(1), Sleep(2)], 2)"
+    code = "import sys; from sums import *; results(sys.argv[1], [Sum(1), Sum(2, function=sleep)], 2)"
     run = subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "run")], env=ENVIRONMENT)
     file = tmp_path / "run.partial" / "steps" / "sum-1.json"
     while not file.exists():

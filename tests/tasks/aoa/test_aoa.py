@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
 
@@ -16,23 +15,23 @@ from samples import install
 from sklearn.model_selection import KFold
 from small import FIT, with_defaults
 
-from augment import Mixed, choose, cross_validation
+from augment import Mixed, choose, cross_validation, turbo_learning
 from augment.estimators import ESTIMATORS, kernel_regression, make_estimator
 from augment.estimators.aann import AANN, AANNConfig
 from augment.estimators.aann_kernel import AANNKernel, AANNKernelConfig
 from augment.estimators.baselines import Constant, NearestSpectrum, Peak
 from augment.estimators.kernel_regression import KernelRegression
 from augment.turbo import experiment as context
-from augment.turbo import synthesis as synthesizing
-from augment.turbo.condition import Condition, MeasuredSubset, conditions_of, headline
+from augment.turbo.condition import Condition, conditions_of, headline
 from augment.turbo.experiment import Experiment
-from swiftwrf import AngularGrid, load, make_model, simulated_room
+from swiftwrf import AngularGrid, FitError, MatchedField, load, make_model, simulated_room
 from swiftwrf.choices import fraction_key
 from swiftwrf.data.store import Store
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import model as geometry
+from swiftwrf.runtime.steps import Memo
 from tasks.aoa import experiment
 from tasks.aoa.records import palette
 from tasks.labels import colour
@@ -457,43 +456,37 @@ def test_a_new_field_model_is_in_help_and_colours(monkeypatch, capsys):
 
 def test_models_for_comparison_are_always_quick(small, monkeypatch):
     """A field model asked for by name does not bring fits of the published size of others along."""
-    train, test = small.split("random", 0)
-    data = Experiment(train, test, (0.5,), ("idw",), preset="paper", extra=0)
-    made = []
-
-    def model_type(name, preset):
-        made.append((name, preset))
-        return mock.MagicMock()
-
-    monkeypatch.setattr(context, "model_type", model_type)
-    for synthesis in synthesizing.syntheses(data, MeasuredSubset(0.5), ["idw"], {}):
-        synthesis._fitted(data, train, synthesizing._FitHistory(), Path())
-    assert made == [("idw", "paper"), ("gp", "quick"), ("coarray", "quick")]
+    made, model_type = [], context.model_type
+    monkeypatch.setattr(context, "model_type", lambda *given: made.append(given) or model_type(given[0]))
+    monkeypatch.setattr(ESTIMATORS, "_registered", {"aann": Constant, "kernel_regression": KernelRegression})
+    turbo_learning(small, measured=0.5, models=["idw"], preset="paper", extra=0)
+    assert sorted(made) == [("coarray", "quick"), ("gp", "quick"), ("idw", "paper")]
 
 
 def test_the_room_is_searched_once_for_all_models_with_one(room, floor_alone, tmp_path, monkeypatch):
-    """Its time counts as part of the fit of each of them."""
-    data = Experiment(*room.split("random", 0), (0.5,), ("hybrid",), extra=0)
-    monkeypatch.setattr(context, "candidates", lambda data: ["geometry", "hybrid"])
+    """Its time counts as part of the fit of each of them. The comparison of models is kept, so it is not computed."""
     searched, search = [], geometry.search_room
     monkeypatch.setattr(geometry, "search_room", lambda *given: searched.append(1) or search(*given))
-    (tmp_path / "steps").mkdir()
-    (first,) = synthesizing.syntheses(data, MeasuredSubset(0.7), ["hybrid"], {})
-    value = first.compute(data, tmp_path)
-    syntheses = first.then(data, value)
-    assert [synthesis.synthesizer for synthesis in syntheses] == ["hybrid", "geometry"]
-    for synthesis in syntheses:
-        assert synthesis.compute(data, tmp_path)["seconds"]["fit"] > value["seconds"]
+    monkeypatch.setattr(MatchedField, "fit", mock.Mock(side_effect=FitError("not now")))
+    memo = Memo(tmp_path)
+    memo.keep("choice-mix0.7-r0", {"choice": None, "cross_validation": {}}, seconds=1.0)
+    options = {"models": ["hybrid"], "estimators": ["matched_field"], "extra": 0, "keep": memo}
+    result = turbo_learning(room, measured=0.7, **options)
+    fits = {name: entry["seconds"]["fit"] for name, entry in result.metrics["synthesis"].items()}
+    assert set(fits) == {"hybrid", "geometry"}
+    assert min(fits.values()) > memo.kept("room-mix0.7-r0")["seconds"]
     assert len(searched) == 1
+    assert result.left_out == ["matched_field is left out with 70% measured: not now"]
+    again = turbo_learning(room, measured=0.7, **options)
+    assert len(searched) == 1
+    assert again.summary().equals(result.summary())
 
 
 def test_cross_validation_is_that_of_each_field_model(small):
     """A model without cross-validation adds no extra positions by default."""
-    names = ("idw", "gp", "vae")
-    data = Experiment(*small.split("random", 0), (0.5,), names)
-    validation = {"idw": {"recommended_n_synthetic": 300}, "gp": {"recommended_n_synthetic": 0}}
-    found = {s.synthesizer: s for s in synthesizing.syntheses(data, MeasuredSubset(0.5), names, validation)}
-    assert {name: found[name].n_synthetic for name in names} == {"idw": 3000, "gp": 0, "vae": 0}
+    data = Experiment(*small.split("random", 0))
+    numbers = {n: data.trainings({"recommended_n_synthetic": n})[-1][1] for n in (0, 300)}
+    assert (numbers, data.trainings(None)[-1][1]) == ({0: 0, 300: 3000}, 0)
 
 
 def test_coarray_needs_the_array_and_takes_it_from_the_command_line(small, tmp_path, capsys):

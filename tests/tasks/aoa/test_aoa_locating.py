@@ -19,7 +19,7 @@ from augment import Fold, cross_validation
 from augment.cross_validation import LOCATOR
 from augment.estimators import ESTIMATORS
 from augment.turbo.condition import LOCATED, NETWORKS
-from augment.turbo.locating import containing_level
+from augment.turbo.stages import containing_level
 from swiftwrf import MatchedField, load, make_model
 from swiftwrf.locate import Posterior, matched_field
 from swiftwrf.models import FIELD_MODELS

@@ -1,6 +1,7 @@
 """Gains by synthetic spectra: their reference, their interval, in reports, and over repeats that chose differently."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +11,7 @@ from pandas import DataFrame
 from augment.cross_validation import LOCATOR
 from augment.turbo.condition import Condition, MeasuredSubset, pooled
 from augment.turbo.experiment import Experiment
-from augment.turbo.results import Results, repeated_summary, summaries
-from augment.turbo.synthesis import Evaluation
+from augment.turbo.results import TurboResult, repeated_summary, summaries
 from swiftwrf import simulated_room
 from swiftwrf.metrics import median_interval, paired_change
 from swiftwrf.metrics import summary as error_summary
@@ -75,18 +75,18 @@ def test_one_repeat_has_the_interval_of_independent_values():
 def results_of(errors):
     """Return the results of conditions with these elevation errors [deg] at the test positions."""
     room = simulated_room(n=20)
-    found = Results(Experiment(simulated_room(n=40), room, (0.3,), estimators=()))
+    found = TurboResult(Experiment(simulated_room(n=40), room, estimators=()), 0.3, Path())
     for condition, error in errors.items():
         off = torch.stack([torch.zeros(20), torch.as_tensor(error)], dim=1).double().deg2rad()
-        value = {"estimate": (room.label - off).tolist(), "seconds": {"train": 1.0, "estimate": 1.0}, "history": []}
-        found.add(Evaluation(condition), value)
+        seconds = {"train": 1.0, "estimate": 1.0}
+        found.add(condition, {"estimate": (room.label - off).tolist(), "seconds": seconds, "history": []})
     return found
 
 
 def metrics_of(errors, repeats=1):
     """Return the metrics of conditions with these elevation errors [deg] at the test positions."""
     repeated = {replace(c, repeat=repeat): error for repeat in range(repeats) for c, error in errors.items()}
-    return results_of(repeated)._method_metrics(0.3)
+    return results_of(repeated)._method_metrics()
 
 
 def test_the_chosen_estimator_is_named_as_in_the_results_where_repeats_choose_other_field_models():
@@ -98,11 +98,11 @@ def test_the_chosen_estimator_is_named_as_in_the_results_where_repeats_choose_ot
     measured = [replace(alone, repeat=k) for k in range(3)]
     found = results_of(dict.fromkeys((*measured, first, *others), np.ones(20)))
     folds = {alone.method: [[2.0, 3.0]], first.method: [[1.0, 1.0]]}
-    found.chosen["0.3"] = {"choice": {"name": "gp"}, "errors": folds}
-    found.located_folds["0.3"] = {0: [0.1, 0.1]}  # the locator itself was refused
-    choice = found._estimator_choice(0.3)
+    located = {"0": [0.1, 0.1]}  # the locator itself was refused
+    found.compared = {"choice": {"name": "gp"}, "errors": folds, "located": located}
+    choice = found._estimator_choice()
     assert choice["name"] == "kernel_regression, measured + synthetic (auto)"
-    assert choice["name"] in found._method_metrics(0.3)[0]
+    assert choice["name"] in found._method_metrics()[0]
 
 
 def test_a_better_method_that_is_not_recommended_has_a_reason():
@@ -110,9 +110,9 @@ def test_a_better_method_that_is_not_recommended_has_a_reason():
     regression, locator = (replace(MEASURED, estimator=name) for name in ("kernel_regression", LOCATOR))
     spread = np.linspace(0.9, 1.1, 20)
     found = results_of({MEASURED: 4 * spread, regression: 2 * spread, locator: spread})
-    found.chosen["0.3"] = {"choice": {"name": "gp"}, "errors": {regression.method: [[2.0, 2.0]]}}
-    found.located_folds["0.3"] = {0: None}
-    choice = found._estimator_choice(0.3)
+    errors = {regression.method: [[2.0, 2.0]]}
+    found.compared = {"choice": {"name": "gp"}, "errors": errors, "located": {"0": None}}
+    choice = found._estimator_choice()
     assert choice["name"] == regression.method
     assert choice["better"] == {locator.method: "no planes were found without the held-out spectra"}
 
@@ -229,33 +229,21 @@ def test_a_network_with_further_positions_alone_is_pooled_with_those_without_any
     assert values(found, "kernel_regression, measured + synthetic + extra (gp)") == [2, 13]
 
 
-def test_fractions_are_pooled_apart():
-    other = [(replace(condition, measured_fraction=0.5), value) for condition, value in of_repeats((GP,), (GP,))]
-    given = of_repeats((GP,), (IDW,)) + other
-    assert [result for result in pooled(given, auto=True) if result[0].measured_fraction == 0.5] == other
-
-
 def test_the_time_of_all_networks_counts():
     """Also of conditions that are not pooled, and once if a training stands for two conditions."""
     room = simulated_room(n=20)
     trained = of_repeats((GP,), (IDW, IDW_EXTRA))
     for synthesizer in (("auto",), ("gp", "idw")):
-        found = Results(Experiment(simulated_room(n=40), room, (0.3,), synthesizer, estimators=()))
+        found = TurboResult(Experiment(simulated_room(n=40), room, (0.3,), synthesizer, estimators=()), 0.3, Path())
         for condition, _ in trained:
-            value = {
-                "estimate": room.label.tolist(),
-                "seconds": {"train": 10.0, "estimate": 1.0},
-                "history": [],
-                "counts": {},
-            }
-            found.add(Evaluation(condition), value)
+            seconds = {"train": 10.0, "estimate": 1.0}
+            value = {"estimate": room.label.tolist(), "seconds": seconds, "history": [], "counts": {}}
+            found.add(condition, value)
         for repeat in range(2):
-            subset = MeasuredSubset(0.3, repeat)
-            found.synthesis.append(
-                subset.columns | {"synthesizer": "gp", "index": 0, "psnr_db": 1.0, "ssim": 1.0, "l1": 1.0}
+            scores = dict.fromkeys(("psnr_db", "ssim", "l1"), [1.0] * 20)
+            seconds = {"fit": 2.0, "synthesize": 1.0, "draw": 3.0}
+            found.add_synthesis(
+                MeasuredSubset(0.3, repeat), "gp", True, {"scores": scores, "seconds": seconds, "history": []}
             )
-            seconds = {"fit": 2.0, "synthesize": 1.0, "draw": 3.0, "trains": True}
-            found.synthesis_seconds.append(subset.columns | {"synthesizer": "gp"} | seconds)
-        metrics = found.summary(0.3)
-        assert metrics["seconds"] == {"fit": 4.0, "synthesize": 6.0, "train": 50.0}
-        assert metrics["synthesis"]["gp"]["seconds"] == {"fit": 2.0, "synthesize": 1.0}
+        assert found.metrics["seconds"] == {"fit": 4.0, "synthesize": 6.0, "train": 50.0}
+        assert found.metrics["synthesis"]["gp"]["seconds"] == {"fit": 2.0, "synthesize": 1.0}

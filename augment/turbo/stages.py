@@ -1,0 +1,288 @@
+"""Stages of turbo learning, each from the data and from files of earlier ones: plain values, and files for later stages."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import cast
+
+import torch
+from torch import Tensor
+
+from augment.choose import Fold, ModelChoice, choose_model
+from augment.cross_validation import (
+    LOCATOR,
+    STAND_IN,
+    cross_validate,
+    located_errors,
+    located_folds,
+    measured_errors,
+)
+from augment.estimators import SavedEstimator
+from augment.mix import Mixed, mix
+from augment.positions import SyntheticPositions, synthetic_positions
+from augment.turbo.artifacts import LEVEL, as_bytes, model_file, save_examples, save_located, save_model
+from augment.turbo.condition import NETWORKS, Condition, MeasuredSubset, Row
+from augment.turbo.experiment import ROOM_MODEL, Experiment
+from swiftwrf import FitError, GeometryModel, InputError, Spectra, load
+from swiftwrf.data.store import Store
+from swiftwrf.locate import MatchedField, Posterior
+from swiftwrf.metrics import l1, psnr, ssim
+from swiftwrf.runtime.checkpoint import read, write
+from swiftwrf.runtime.steps import STEPS
+
+KIND = "synthetic spectra"
+SCORE = {"psnr_db": psnr, "ssim": ssim, "l1": l1}
+BATCH_POSITIONS = 4096  # spectra predicted before they are rounded: half a gigabyte of 90 x 360 pixels
+BATCH_SPECTRA = 256  # spectra located at a time: a posterior has a thousand candidates
+
+
+def _file(name: str) -> str:
+    return f"{STEPS}/{name}.safetensors"
+
+
+def compare(experiment: Experiment, folder: Path, subset: MeasuredSubset, compared: list[str]) -> Row:
+    """Compare field models on held-out measured spectra, and determine whether turbo learning helps.
+
+    Args:
+        experiment: Data and options.
+        folder: Folder of the files.
+        subset: Measured spectra.
+        compared: Names of field models. Empty for all that are fast and whose requirements the data meet.
+    """
+    measured, _ = experiment.withhold(subset)
+    seed = experiment.seed + subset.repeat
+    models = [experiment.own_models.get(name, name) for name in compared]
+    try:
+        choice = choose_model(measured, models or None, seed=seed, device=experiment.device)
+    except InputError:
+        if not compared:
+            raise
+        # field models asked for by name need no comparison
+        return {"choice": None, "cross_validation": {}}
+    trained = [name for name in compared if name in choice.folds] or [choice.name]
+    validation = {name: cross_validate(choice.folds[name], experiment.n_synthetic, seed) for name in trained}
+    first, folds = validation[trained[0]], choice.folds[trained[0]]
+    errors = {Condition(STAND_IN, "measured").method: first.measured_only}
+    if first.turbo:
+        training, _ = experiment.trainings(first.metrics)[-1]
+        errors[Condition(STAND_IN, training, trained[0]).method] = first.turbo
+    for name in experiment.evaluated:
+        if name not in (*NETWORKS.values(), STAND_IN, *experiment.lacking):
+            errors[Condition(name, "measured").method] = [
+                measured_errors(fold, experiment.make_estimator(name, subset.repeat)) for fold in folds
+            ]
+    rooms = located_folds(_with_room(experiment, measured, choice, compared, seed))
+    return {
+        "choice": {name: value for name, value in vars(choice).items() if name != "folds"},
+        "cross_validation": {name: entry.metrics for name, entry in validation.items()},
+        "errors": errors,
+        "located": {number: located_errors(fold, seed) for number, fold in rooms.items()},
+    }
+
+
+def _with_room(
+    experiment: Experiment, measured: Spectra, choice: ModelChoice, compared: list[str], seed: int
+) -> list[Fold]:
+    """Return the folds of a field model with a room, whether such a model was asked for or not; empty without one."""
+    folds = next((found for found in choice.folds.values() if found[0].model.room is not None), [])
+    if folds or not compared or ROOM_MODEL not in experiment.candidates:
+        return folds
+    try:
+        return choose_model(measured, (ROOM_MODEL,), seed=seed, device=experiment.device).folds[ROOM_MODEL]
+    except InputError:
+        return []
+
+
+def find_room(experiment: Experiment, folder: Path, subset: MeasuredSubset) -> Row:
+    """Find the room in the measured spectra, once for all field models that are built on it and for the locator."""
+    measured, _ = experiment.withhold(subset)
+    began = time.perf_counter()
+    try:
+        model = experiment.make_model(ROOM_MODEL, subset.repeat).fit(measured, device=experiment.device, progress=True)
+    except (InputError, FitError) as error:
+        return {"refused": str(error)}
+    file = _file(f"room-{subset}")
+    model.save(folder / file)
+    planes = len(model.room.planes) if model.room else 0
+    return {"seconds": time.perf_counter() - began, "planes": planes, "file": file}
+
+
+def _read_room(folder: Path, file: str) -> GeometryModel:
+    room = load(folder / file)
+    assert isinstance(room, GeometryModel)
+    return room
+
+
+def synthesize(
+    experiment: Experiment, folder: Path, subset: MeasuredSubset, name: str, extra: int | None, room: Row | None
+) -> Row:
+    """Predict spectra by one field model at test, withheld and extra synthetic positions.
+
+    Args:
+        experiment: Data and options.
+        folder: Folder of the files.
+        subset: Measured spectra.
+        name: Name of the field model.
+        extra: Number of extra synthetic positions. None for a model that is only compared: it predicts at the test positions
+            alone, and without a fit the reason is returned.
+        room: Result of `find_room`, which the model reuses. The time of the search counts as part of the fit.
+    """
+    measured, withheld = experiment.withhold(subset)
+    trains = extra is not None
+    records: list[Row] = []
+    began, earlier = time.perf_counter(), 0.0  # seconds that interrupted calls spent on the fit
+
+    def add(record: Row) -> None:
+        nonlocal earlier
+        records.append(record)
+        earlier = max(earlier, record.get("elapsed", 0.0) - (time.perf_counter() - began))
+
+    synthesis = f"synthesis_{name}-{subset}"
+    try:
+        # models that are only compared are as small as in the choice
+        model = experiment.make_model(name, subset.repeat, experiment.preset if trains else "quick").fit(
+            measured,
+            # without a room the models refuse the spectra themselves
+            like=_read_room(folder, room["file"]) if room and "file" in room else None,
+            device=experiment.device,
+            checkpoint=folder / STEPS / f"{synthesis}-fit.safetensors",
+            on_record=add,
+            progress=True,
+        )
+        fitted = time.perf_counter()
+        test = _as_bytes_at(experiment.test.position, model.synthesize)
+    except (InputError, FitError) as error:
+        if trains:
+            raise
+        return {"refused": str(error)}
+    tested = time.perf_counter()
+    parts = {"withheld": withheld} if trains else {}
+    if extra:
+        parts["extra"] = synthetic_positions(measured, extra, experiment.seed + subset.repeat)
+    tensors = {}
+    for part, positions in parts.items():
+        tensors[part] = _as_bytes_at(positions.position, model.synthesize)
+        tensors |= {f"{part}_{key}": tensor for key, tensor in vars(positions).items()}
+    seconds = {
+        "fit": fitted - began + earlier + (room or {}).get("seconds", 0.0),
+        "synthesize": tested - fitted,
+        "draw": time.perf_counter() - fitted,
+    }
+    pairs = zip(Store(test).batches(), experiment.test.store.batches(), strict=True)
+    scored = [[function(*pair) for function in SCORE.values()] for pair in pairs]
+    scores = {key: torch.cat(batches) for key, batches in zip(SCORE, zip(*scored, strict=True), strict=True)}
+    if trains:
+        write(folder / _file(synthesis), KIND, tensors, {})
+        if subset.repeat == 0:
+            save_model(model, subset.key, measured, experiment.test, folder)
+            if experiment.is_first(name):
+                std = None
+                if model.predict(experiment.test.position[:1]).std is not None:
+                    std = _as_bytes_at(experiment.test.position, lambda at: cast(Tensor, model.predict(at).std))
+                file = folder / f"examples-mix{subset.key}.npz"
+                save_examples(file, name, experiment.test, test, scores["psnr_db"], std)
+    return {"history": records, "seconds": seconds, "scores": scores}
+
+
+def _as_bytes_at(position: Tensor, predict: Callable[[Tensor], Tensor]) -> Tensor:
+    """Return predicted spectra at positions (n, 3), rounded in batches."""
+    return torch.cat([as_bytes(predict(some).cpu()) for some in position.split(BATCH_POSITIONS)])
+
+
+def training_set(experiment: Experiment, folder: Path, condition: Condition) -> Mixed:
+    """Return the spectra that train the estimator of a condition."""
+    if condition.training == "all measured":
+        return Mixed.measured(experiment.train)
+    measured, _ = experiment.withhold(condition.subset)
+    if not condition.is_turbo:
+        return Mixed.measured(measured)
+    file = folder / _file(f"synthesis_{condition.synthesizer}-{condition.subset}")
+    tensors = read(file, KIND)[1]
+
+    def part(name: str) -> tuple[SyntheticPositions, Tensor]:
+        return SyntheticPositions(*(tensors[f"{name}_{key}"] for key in ("position", "label", "index"))), tensors[name]
+
+    train = mix(measured, *part("withheld"))
+    return train.add(*part("extra")) if condition.n_synthetic else train
+
+
+def evaluate(experiment: Experiment, folder: Path, condition: Condition, saved_as: str | None) -> Row:
+    """Train the estimator of a condition, save it under a name if it has one, and estimate the test directions."""
+    train = training_set(experiment, folder, condition)
+    began = time.perf_counter()
+    estimator = experiment.make_estimator(condition.estimator, condition.repeat)
+    estimator.fit(train, device=experiment.device)
+    fitted = time.perf_counter()
+    estimate = estimator.estimate(experiment.test)
+    if isinstance(estimator, SavedEstimator) and saved_as is not None:
+        estimator.save(model_file(folder, saved_as, condition.subset.key))
+    seconds = {"train": fitted - began, "estimate": time.perf_counter() - fitted}
+    return {"estimate": estimate, "seconds": seconds, "history": estimator.history, "counts": train.counts}
+
+
+def locate(experiment: Experiment, folder: Path, subset: MeasuredSubset, room: Row) -> Row:
+    """Locate the moving end from the test spectra by the room that was found; their directions follow."""
+    measured, _ = experiment.withhold(subset)
+    test = experiment.test
+    began = time.perf_counter()
+    try:
+        locator = MatchedField(seed=experiment.seed + subset.repeat).fit(
+            measured, room=_read_room(folder, room["file"])
+        )
+    except (InputError, FitError) as error:
+        return {"refused": str(error)}
+    fitted = time.perf_counter()
+    parts = [located(locator, test.subset(rows)) for rows in torch.arange(len(test)).split(BATCH_SPECTRA)]
+    found = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+    ended = time.perf_counter()
+    if subset.repeat == 0:
+        locator.save(model_file(folder, LOCATOR, subset.key))
+        save_located(folder / f"located-mix{subset.key}.npz", locator, measured, test, found["position"])
+    seconds = {"room": room["seconds"], "fit": fitted - began, "locate": ended - fitted}
+    return {
+        "estimate": found.pop("estimate"),
+        "located": found | {"weights": locator.weight, "seconds": seconds},
+        "seconds": {"train": seconds["room"] + seconds["fit"], "estimate": seconds["locate"]},
+        "history": [],
+        "counts": Mixed.measured(measured).counts,
+    }
+
+
+def located(locator: MatchedField, test: Spectra) -> dict[str, Tensor]:
+    """Return position and direction by the posteriors of test spectra.
+
+    Returns:
+        estimate: Azimuth and elevation (n, 2) [rad].
+        position: Posterior median (n, 3) [m].
+        radius: Radius of the 80 % credible region (n,) [m].
+        level: Smallest level whose credible region contains the true position, (n,).
+        ambiguous: True where a second mode has much of the posterior mass, (n,).
+    """
+    posterior = locator.locate(test)
+    position = posterior.median
+    return {
+        "estimate": locator.direction(posterior),
+        "position": position,
+        "radius": posterior.credible_radius(LEVEL),
+        "level": containing_level(posterior, test.position),
+        "ambiguous": posterior.ambiguous,
+    }
+
+
+def containing_level(posterior: Posterior, truth: Tensor) -> Tensor:
+    """Return the smallest level (n,) whose credible region, a ball around the median, contains the position (n, 3) [m].
+
+    Example:
+        >>> at = torch.tensor([[[0.0, 0, 0], [1.0, 0, 0]]], dtype=torch.float64)
+        >>> posterior = Posterior(at, torch.tensor([[0.75, 0.25]], dtype=torch.float64).log())
+        >>> containing_level(posterior, torch.tensor([[0.5, 0, 0]], dtype=torch.float64))
+        tensor([0.7500], dtype=torch.float64)
+    """
+    median = posterior.median
+    # the inverse of the credible radius
+    error = (truth - median).norm(dim=1) / posterior.inflation - posterior.resolution_m / 4
+    inside = (posterior.position - median[:, None]).norm(dim=2) < error[:, None]
+    level: Tensor = (posterior.weight * inside).sum(dim=1)
+    return level
