@@ -58,7 +58,7 @@ part training 120 "$python" benchmarks/gpu.py training "${size[@]}" --out "$fold
 if command -v compute-sanitizer >/dev/null; then
   for tool in racecheck initcheck synccheck; do # memcheck is one of the tests
     part "$tool" 60 compute-sanitizer --tool "$tool" --error-exitcode 1 \
-      "$python" -m pytest -m cuda -p no:cacheprovider tests/swiftwrf/rasterize/test_cuda.py -k "test_gpu_hard_cases and (seam or pole)"
+      "$python" -m pytest -m cuda -p no:cacheprovider tests/swiftwrf/rasterize/test_cuda.py -k "test_small_hard_cases and gpu and (seam or pole)"
   done
 else
   note sanitizer "left out: compute-sanitizer is not installed" 0

@@ -267,7 +267,8 @@ def paired_difference(errors: DataFrame, method: str, other: str) -> tuple[float
     """Return the mean of one method's errors minus another's on equal pairs, and its 95 % interval.
 
     The interval is a bootstrap over test rows, because the receivers of one row are not independent, or over places if rows
-    repeat them. It is nan for fewer than 10 of them, with which a bootstrap finds false differences.
+    repeat them. It is nan for fewer than 10 of them with a pair, with which a bootstrap finds false differences. Without any
+    pair all three are nan.
 
     Args:
         errors: Errors with a column for each method and a row for each pair, indexed by `index` (the test row), and
@@ -276,7 +277,9 @@ def paired_difference(errors: DataFrame, method: str, other: str) -> tuple[float
         other: Column of the method that it is compared to.
     """
     level = "place" if "place" in errors.index.names else "index"
-    difference = (errors[method] - errors[other]).groupby(level=level).agg(["sum", "count"]).to_numpy()
+    difference = (errors[method] - errors[other]).dropna().groupby(level=level).agg(["sum", "count"]).to_numpy()
+    if not len(difference):
+        return math.nan, math.nan, math.nan
     mean = float(difference[:, 0].sum() / difference[:, 1].sum())
     if len(difference) < MIN_ROWS:
         return mean, math.nan, math.nan
@@ -299,9 +302,8 @@ def method_summary(errors: DataFrame, column: str, reference: str) -> DataFrame:
         A row for each method: the keys of `ErrorSummary`, `difference` and its 95 % interval `difference_low`,
         `difference_high`.
     """
-    pairs = errors.pivot_table(
-        index=[name for name in ("index", "receiver", "place") if name in errors], columns="method", values=column
-    )
+    keys = [name for name in ("index", "receiver", "place") if name in errors]
+    pairs = errors.groupby([*keys, "method"])[column].mean().unstack("method")
     rows = {}
     for name, own in errors.groupby("method", sort=False):
         mean, low, high = paired_difference(pairs, name, reference)

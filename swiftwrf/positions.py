@@ -110,7 +110,7 @@ def normalise(position: Tensor, centre: Tensor, scale: Tensor | float) -> Tensor
 
 
 def distance(a: Tensor, b: Tensor) -> Tensor:
-    """Return the distances (n, m) between positions (n, 3) and (m, 3), in their unit, at most 1e15.
+    """Return the distances (..., n, m) between positions (..., n, 3) and (..., m, 3), in their unit, at most 1e15.
 
     They follow from differences. Products, which are faster, round the distances of close pairs away if the origin is far,
     as that of map coordinates. An infinite distance would give weights of inf / inf.
@@ -121,7 +121,7 @@ def distance(a: Tensor, b: Tensor) -> Tensor:
     """
     apart: Tensor
     if a.is_cuda:  # cdist would start a block of threads for each pair
-        apart = torch.linalg.vector_norm(a.unsqueeze(1) - b, dim=-1)
+        apart = torch.linalg.vector_norm(a.unsqueeze(-2) - b.unsqueeze(-3), dim=-1)
     else:
         apart = torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
     return apart.clamp(max=MAX_COORDINATE)

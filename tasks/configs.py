@@ -146,8 +146,8 @@ class RssiTaskConfig(Options):
     rx: tuple[str, ...]
     """receivers: names, numbers counted from 1, or all"""
     data: str | None = None
-    """survey table (CSV or Parquet), folder with tx_pos.csv, gateway_rssi.csv and gateway_position.yml (NeRF2 layout), or
-    name of a public data set, see docs/formats.md"""
+    """survey table (CSV, Parquet, JSON, GPX, KML), folder with tx_pos.csv, gateway_rssi.csv and gateway_position.yml (NeRF2
+    layout), or name of a public data set, see docs/formats.md"""
     split: str = "random"
     """a split that comes with the data, or a seeded one: random, block, or place (a fifth of the receivers is held out)"""
     also: tuple[str, ...] = ()
@@ -200,7 +200,7 @@ class LocateConfig(Options):
     """
 
     data: str | None = None
-    """survey table (CSV or Parquet), folder in NeRF2 layout, or name of a public data set"""
+    """survey table (CSV, Parquet, JSON, GPX, KML), folder in NeRF2 layout, or name of a public data set"""
     rx: tuple[str, ...] = ("all",)
     """receivers: names, numbers counted from 1, or all"""
     split: str = "random"

@@ -98,7 +98,13 @@ def _write_directory(config: ConvertConfig) -> None:
             data, found = _calibrated(data, config)
         for note in data.notes:
             console.print(f"{data.name}: {note}")
-        written = _write(data, options, folder)
+        spectra = _spectra_or_rssi(data, options)
+        if isinstance(spectra, Rssi):
+            write_rssi(spectra, folder)
+            written = f"{len(spectra)} rows of RSSI at {len(spectra.receiver_names)} receivers"
+        else:
+            write_spectra(spectra, folder)
+            written = f"{len(spectra)} spectra of {spectra.grid.shape[0]} x {spectra.grid.shape[1]} pixels"
         record = {
             "command": invocation("convert"),
             "options": plain(config),
@@ -124,15 +130,6 @@ def _calibrated(data: Spectra | Snapshots | Rssi, config: ConvertConfig) -> tupl
     )
     rows = torch.searchsorted(data.index, train.index), torch.searchsorted(data.index, test.index)
     return replace(found.apply(data), named_splits={**data.named_splits, name: rows}), found
-
-
-def _write(data: Spectra | Snapshots | Rssi, options: ReadOptions, folder: Path) -> str:
-    spectra = _spectra_or_rssi(data, options)
-    if isinstance(spectra, Rssi):
-        write_rssi(spectra, folder)
-        return f"{len(spectra)} rows of RSSI at {len(spectra.receiver_names)} receivers"
-    write_spectra(spectra, folder)
-    return f"{len(spectra)} spectra of {spectra.grid.shape[0]} x {spectra.grid.shape[1]} pixels"
 
 
 def saved_model(source: Path) -> RssiModel | None:

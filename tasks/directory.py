@@ -27,7 +27,7 @@ from swiftwrf.runtime.steps import STEPS
 from swiftwrf.runtime.threads import set_threads
 from tasks.environment import environment, invocation, now, number_of_processes, stamp
 from tasks.options import plain
-from tasks.records import CONFIG, ENVIRONMENT, LOCATOR, MODEL, PARTIAL, Row, read_json
+from tasks.records import CONFIG, ENVIRONMENT, LOCATOR, METRICS, MODEL, PARTIAL, Row, read_json
 from tasks.terminal import terminal
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # errors of file systems without locks
@@ -301,9 +301,9 @@ class Run:
 
     def keep(self, name: str, value: Row, seconds: float) -> Row:
         """Keep the result and the duration of a step. Return the result as it is read back."""
-        plain: Row = strict(value)
-        self.write_json(f"{STEPS}/{name}.json", {"value": plain, "seconds": seconds})
-        return plain
+        kept: Row = strict(value)
+        self.write_json(f"{STEPS}/{name}.json", {"value": kept, "seconds": seconds})
+        return kept
 
     def computed_on(self, machines: Iterable[str]) -> None:
         """Record in the environment that these machines computed, too."""
@@ -323,9 +323,9 @@ class Run:
         """
         self._environment["end"] = now()
         self.write_json(ENVIRONMENT, self._environment)
-        plain: Row = strict(metrics)
-        report(self.folder, plain)
-        self.write_json("metrics.json", plain)
+        as_read: Row = strict(metrics)
+        report(self.folder, as_read)
+        self.write_json(METRICS, as_read)
         rename(self.folder, self.final)
         self._claim.release()
         shutil.rmtree(self.final / STEPS, ignore_errors=True)

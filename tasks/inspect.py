@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
 from matplotlib.patches import Circle
 from pandas import DataFrame
 from torch import Tensor
@@ -26,14 +25,12 @@ from tasks.environment import command, stamp
 from tasks.options import given
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table, write_page
-from tasks.page.shared import fingerprinting
 from tasks.source import located, reading
 from tasks.terminal import terminal
 
-AXES = {"x": "#cf4a4a", "y": "#2a9165", "normal": "#3a7fd5"}
+AXES = ("#cf4a4a", "#2a9165", "#3a7fd5")  # colours of x, y and normal
 DOTS, NONE = "#3a7fd5", "#7f8794"  # with line of sight, without
 MAX_DOTS = 2000
-MAX_RECEIVERS = 30  # in a figure
 MIN_BINS_M = 1e-3  # of the bins of distances together
 
 
@@ -69,7 +66,7 @@ def page(findings: Findings, kind: str, config: InspectConfig) -> Page:
     table = Table(["level", "finding"], rows, strong=frozenset(["warning"]), long=True)
     if isinstance(data, Rssi):
         position, task, options = data.transmitter_position, ("rssi", "--rx", "all"), given(config.table)
-        plots = [_floor(data), *([_against_distance(data)] if data.located else []), _detected(data)]
+        plots = [_floor(data), *([_against_distance(data)] if data.located else [])]
     else:
         position, task, options = data.position, ("aoa", "--mix", "0.3"), given(config.spectra)
         plots = [_plan(data), _directions(data), *([_neighbours(data)] if len(data) > 1 else [])]
@@ -88,24 +85,11 @@ def page(findings: Findings, kind: str, config: InspectConfig) -> Page:
             f"{len(warnings)} {'warning' if len(warnings) == 1 else 'warnings'}: correct the data first.",
             *warnings,
         ]
-    if isinstance(data, Spectra) and (text := _fingerprinting(data)):
-        conclusion.append(text)
     return Page(
         f"Inspection: {data.name}",
         Summary(numbers, plots[:1], conclusion, steps),
         [Section("Findings", tables=[table]), Section("Figures", plots=plots[1:])],
     )
-
-
-def _fingerprinting(data: Spectra) -> str:
-    """Return the warning of `fingerprinting`, from the spread of the lines of sight and the errors of the peaks."""
-    rows = data.line_of_sight.nonzero()[:MAX_DOTS, 0]
-    if not len(rows):
-        return ""
-    line, peak = (to_direction(*angles.unbind(-1)) for angles in (data.label[rows], data.peak_direction(rows)))
-    mean = torch.nn.functional.normalize(line.mean(dim=0), dim=0)
-    spread, error = angular_distance(mean.expand_as(line), line), angular_distance(peak, line)
-    return fingerprinting(*(float(angle.nanmedian().rad2deg()) for angle in (spread, error)))
 
 
 def _places(position: Tensor, **columns: Tensor) -> DataFrame:
@@ -116,8 +100,9 @@ def _places(position: Tensor, **columns: Tensor) -> DataFrame:
 
 def _plan(data: Spectra) -> Plot:
     marker, panels = "^" if data.moving == "transmitter" else "*", []
+    extent = data.position.amax(dim=0) - data.position.amin(dim=0)
     for a, b in ((0, 1), (0, 2)):
-        span = (data.position.amax(dim=0) - data.position.amin(dim=0))[[a, b]].clamp_min(1e-3)
+        span = extent[[a, b]].clamp_min(1e-3)
         figure, ax = figures.panel(3.8, 0.6 + 3 * float((span[1] / span[0]).clamp(0.4, 1.2)))
         for free, colour in ((False, NONE), (True, DOTS)):
             place = data.position[data.line_of_sight == free]
@@ -126,35 +111,18 @@ def _plan(data: Spectra) -> Plot:
         ax.set_aspect("equal", adjustable="datalim")
         if data.fixed_position is not None:
             ax.plot(*data.fixed_position[[a, b]].tolist(), marker, color="black", markersize=7)
-        _draw_axes(ax, data, a, b)
+        if data.rotation is not None:  # at the array, or at the centre of the positions if it moves
+            fixed = data.fixed_position if data.moving == "transmitter" else None
+            origin = data.position.mean(dim=0) if fixed is None else fixed
+            tips = 0.25 * float(extent.max() or 1.0) * data.rotation[[a, b]]
+            start = origin[[a, b], None].expand(2, 3)
+            ax.quiver(*start, *tips, color=AXES, angles="xy", scale_units="xy", scale=1, width=0.006)
         panels.append(figure)
     caption = (
         "From above and from the side: positions with (blue) and without line of sight (grey); arrows: the array's axes x "
         "(red), y (green) and its normal (blue)."
     )
     return Plot("plan", panels, caption, _places(data.position, line_of_sight=data.line_of_sight))
-
-
-def _draw_axes(ax: Axes, data: Spectra, a: int, b: int) -> None:
-    """Draw the axes at the array, or at the centre of the positions if it moves."""
-    if data.rotation is None:
-        return
-    still = data.moving == "transmitter" and data.fixed_position is not None
-    origin = data.fixed_position if still else data.position.mean(dim=0)
-    assert origin is not None
-    length = 0.25 * float((data.position.amax(dim=0) - data.position.amin(dim=0)).max() or 1.0)
-    for (name, colour), axis in zip(AXES.items(), data.rotation.T, strict=True):
-        dx, dy = (length * axis[[a, b]]).tolist()
-        if np.hypot(dx, dy) < 0.2 * length:  # towards the viewer
-            continue
-        ax.annotate(
-            name,
-            xy=(float(origin[a]), float(origin[b])),
-            xytext=(float(origin[a]) + dx, float(origin[b]) + dy),
-            color=colour,
-            fontsize=8,
-            arrowprops={"arrowstyle": "<-", "color": colour},
-        )
 
 
 def _directions(data: Spectra) -> Plot:
@@ -231,15 +199,3 @@ def _against_distance(data: Rssi) -> Plot:
     )
     caption = "RSSI against the distance from the receiver. The line is a path-loss model of all receivers."
     return Plot("path-loss", [figure], caption, table)
-
-
-def _detected(data: Rssi) -> Plot:
-    fraction = (~data.rssi_dbm.isnan()).double().mean(dim=0)
-    order = fraction.argsort(descending=True)[:MAX_RECEIVERS].tolist()
-    names = [figures.short(data.receiver_names[i]) for i in order]
-    figure, ax = figures.panel(max(4.0, 0.3 * len(order) + 2), 3)
-    ax.bar(np.arange(len(order)), fraction[order].numpy(), color=DOTS)
-    ax.set(xticks=range(len(order)), xticklabels=names, ylabel="fraction of rows", ylim=(0, 1))
-    ax.tick_params(axis="x", labelrotation=60)
-    table = DataFrame({"receiver": data.receiver_names, "fraction_detected": fraction.numpy()})
-    return Plot("detected", [figure], "Fraction of the rows in which each receiver detected the transmitter.", table)

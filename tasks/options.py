@@ -144,6 +144,20 @@ def choice(meaning: str, registry: Registry[Any] | None, known: Mapping[str, lab
     return tyro.conf.arg(help=f"{meaning}:", help_behavior_hint=entries)
 
 
+def pairs(option: str, texts: tuple[str, ...], role: str) -> dict[str, str] | None:
+    """Return the names in an option that takes ROLE=NAME, by role, None if there are none. A role is the example.
+
+    Raises:
+        InputError: A role without a name, or named twice.
+    """
+    found = {role: name for role, _, name in (text.partition("=") for text in texts)}
+    if "" in (*found, *found.values()):
+        raise InputError(f"--{option} takes {option} and their names, e.g. {role}=NAME, got {' '.join(texts)}")
+    if len(found) < len(texts):
+        raise InputError(f"--{option} names something twice: {' '.join(texts)}")
+    return found or None
+
+
 @options
 class SpectraSource:
     """Options of reading or computing spectra."""
@@ -151,6 +165,9 @@ class SpectraSource:
     array: tuple[int, float, float] | tuple[int, int, float, float] | None = None
     """array of the spectra if the data do not describe it, or for which spectra of ray paths are computed: elements a side,
     spacing [m], carrier [Hz] of a square array, or rows, columns, spacing [m], carrier [Hz]"""
+    arrays: tuple[str, ...] = ()
+    """names of the arrays in a file of array snapshots that are not those of snapshots.npz: csi=NAME position=NAME
+    frequency_hz=NAME ..."""
     beamformer: Annotated[str | None, choice("beamformer for array snapshots", None, labels.BEAMFORMERS, "phase")] = (
         None
     )
@@ -175,8 +192,9 @@ class SpectraSource:
         """Refuse options that are wrong whatever the data.
 
         Raises:
-            InputError: An unknown beamformer, or an array that is none.
+            InputError: An unknown beamformer, an array that is none, or arrays without names.
         """
+        pairs("arrays", self.arrays, "csi")
         if self.beamformer is not None and self.beamformer not in labels.BEAMFORMERS:
             raise InputError(f"unknown beamformer {self.beamformer!r}; choose from {', '.join(labels.BEAMFORMERS)}")
         if self.array is not None:
@@ -222,7 +240,7 @@ class TableSource:
     @property
     def column_names(self) -> dict[str, str] | None:
         """Names of columns by role, None if there are none."""
-        return {role: name for role, _, name in (text.partition("=") for text in self.columns)} or None
+        return pairs("columns", self.columns, "x")
 
     def check(self) -> None:
         """Refuse options that are wrong whatever the data.
@@ -230,12 +248,7 @@ class TableSource:
         Raises:
             InputError: A column without a name, or named twice, or too many columns of positions.
         """
-        for text in self.columns:
-            role, _, name = text.partition("=")
-            if not role or not name:
-                raise InputError(f"--columns takes what a column holds and its name, e.g. x=NAME, got {text!r}")
-        if len(self.column_names or {}) < len(self.columns):
-            raise InputError(f"--columns names something twice: {' '.join(self.columns)}")
+        pairs("columns", self.columns, "x")
         if len(self.transmitter) > 3:
             raise InputError(f"--transmitter takes 1 to 3 columns, got {' '.join(self.transmitter)}")
 
@@ -257,6 +270,11 @@ class OffsetSource(TableSource):
     def reference(self) -> str | None:
         """Group whose offset is 0, None for the most frequent one."""
         return None if self.offset_by is None else self.offset_by.partition("=")[2] or None
+
+    def check(self) -> None:
+        super().check()
+        if self.offset_by is not None and self.offset_by.startswith("="):
+            raise InputError(f"--offset-by takes COLUMN or COLUMN=VALUE, got {self.offset_by!r}")
 
     def check_used(self, data: str | None) -> None:
         """Refuse options of reading RSSI without measured data.

@@ -16,7 +16,7 @@ from augment.estimators import SavedEstimator
 from swiftwrf import FieldModel, InputError, Rssi, Spectra, load
 from swiftwrf.data import ReadOptions
 from swiftwrf.data.coordinates import Floors, PlanFrame, degree_columns
-from swiftwrf.data.files import SUFFIXES, read_table
+from swiftwrf.data.files import TABLES, read_table
 from swiftwrf.data.formats import RSSI_FORMATS, read
 from swiftwrf.data.receivers import read_places
 from swiftwrf.data.survey import has_positions
@@ -85,7 +85,7 @@ def run(config: PredictConfig) -> None:
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
     write_table(out, rounded(dict(zip(columns, row, strict=True)) for row in rows))
     values: Row = {"n": len(columns["index"]), "table": str(out)}
-    values |= {f"median_{name}": float(columns[name].median()) for name in MEDIANS if name in columns}
+    values |= {f"median_{name}": float(np.median(columns[name])) for name in MEDIANS if name in columns}
     errors = " and ".join(f"{values[f'median_{name}']:.2f} {MEDIANS[name]}" for name in MEDIANS if name in columns)
     what = "positions" if "x_m" in columns else "directions"
     said = f", median error {errors}, too low if these rows trained the model" if errors else ""
@@ -164,7 +164,7 @@ def read_rssi(source: str, options: ReadOptions) -> tuple[Rssi, bool]:
 
 
 def _is_table(source: str) -> bool:
-    return Path(source).is_file() and Path(source).suffix.lower() in SUFFIXES
+    return Path(source).is_file() and Path(source).suffix.lower() in TABLES
 
 
 def directions(estimator: SavedEstimator, config: PredictConfig) -> Columns:
@@ -206,7 +206,7 @@ def positions_of_spectra(locator: MatchedField, config: PredictConfig) -> Column
 
 def _directions(estimate: Tensor, known: Spectra | None) -> Columns:
     columns = {"azimuth_deg": estimate[:, 0].rad2deg(), "elevation_deg": estimate[:, 1].rad2deg()}
-    if known is None:
+    if known is None or bool(known.label.isnan().all()):  # positions without the pose of the array give no directions
         return columns
     truth = known.label.rad2deg()
     columns |= {"truth_azimuth_deg": truth[:, 0], "truth_elevation_deg": truth[:, 1]}

@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Row = dict[str, Any]
-CONFIG, ENVIRONMENT = "config.json", "environment.json"  # files of a run
+CONFIG, ENVIRONMENT, METRICS = "config.json", "environment.json", "metrics.json"  # files of a run
 MODEL, LOCATOR = "model.safetensors", "locator.safetensors"  # its fitted RSSI models
 PARTIAL = ".partial"  # suffix of a run that is not finished
 NAMES = (  # columns of text, even if a cell reads NA, 1 or 12:34
@@ -112,20 +112,33 @@ def read_table(file: Path) -> pd.DataFrame:
     Raises:
         InputError: There is no such file, or its content is no table.
     """
-    import pandas as pd
-
     from swiftwrf.data.files import read_text
     from swiftwrf.runtime.checkpoint import refusing
 
     text = read_text(file)
+    with refusing(f"{file} is not the table that a run writes"):
+        return from_text(text, NAMES)
+
+
+def from_text(text: str, names: Sequence[str]) -> pd.DataFrame:
+    r"""Return the table in a text of `as_table`, whose columns of these names are text.
+
+    Raises:
+        ValueError: The text is no table.
+
+    Example:
+        >>> from_text("receiver,n\r\n'=1+1,2\r\n", ["receiver"]).to_dict("records")
+        [{'receiver': '=1+1', 'n': 2}]
+    """
+    import pandas as pd
+
     if not text.strip():  # a table without rows has no columns either
         return pd.DataFrame()
-    with refusing(f"{file} is not the table that a run writes"):
-        columns = list(pd.read_csv(io.StringIO(text), nrows=0))
-        names = [name for name in NAMES if name in columns]
-        missing = {name: [""] if name in names else ["", "nan"] for name in columns}
-        options = {"dtype": dict.fromkeys(names, str), "keep_default_na": False, "na_values": missing}
-        table = pd.read_csv(io.StringIO(text), **options)
+    columns = list(pd.read_csv(io.StringIO(text), nrows=0))
+    names = [name for name in names if name in columns]
+    missing = {name: [""] if name in names else ["", "nan"] for name in columns}
+    options = {"dtype": dict.fromkeys(names, str), "keep_default_na": False, "na_values": missing}
+    table = pd.read_csv(io.StringIO(text), **options)
     for name in names:
         table[name] = table[name].map(
             lambda text: text[1:] if text.startswith("'") and FORMULA.match(text) else text, na_action="ignore"

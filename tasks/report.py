@@ -41,13 +41,9 @@ def merge(folders: list[Path], out: Path) -> None:
         raise InputError(
             f"a report takes finished runs of one task ({' or '.join(PAGES)}), got {', '.join(tasks) or 'no runs'}"
         )
-    with new_directory(out, "a report") as unfinished:
-        _write(unfinished, tasks[0], runs)
-
-
-def _write(folder: Path, task: str, runs: list[Records]) -> None:
     try:
-        write_page(folder, PAGES[task](runs))
+        with new_directory(out, "a report") as unfinished:
+            write_page(unfinished, PAGES[tasks[0]](runs))
     except InputError:
         raise
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:

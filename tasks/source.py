@@ -20,7 +20,7 @@ from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
 from swiftwrf.data.store import Store
 from swiftwrf.datasets import DATA_SETS, fetch
 from swiftwrf.errors import listed
-from tasks.options import OffsetSource, SpectraSource, TableSource, by_name
+from tasks.options import OffsetSource, SpectraSource, TableSource, by_name, pairs
 from tasks.terminal import console
 
 BATCH_ROWS = 1024  # of an array that is read
@@ -33,6 +33,7 @@ def reading(spectra: SpectraSource, table: TableSource) -> ReadOptions:
         **options
         | {
             "array": _array(spectra),
+            "arrays": pairs("arrays", spectra.arrays, "csi"),
             "grid": AngularGrid.hemisphere(*spectra.grid) if spectra.grid else None,
             "columns": table.column_names,
             "filler": table.fillers,
@@ -114,11 +115,15 @@ def observed_spectra(source: str, options: ReadOptions, grid: AngularGrid, model
     elif options.given:
         raise InputError(f"{source} holds spectra as they are; --{next(iter(options.given))} does not apply")
     store = Store(_read_array(Path(source))) if known is None else known.store
-    if store.shape[1:] != grid.shape or (known is not None and known.grid != grid):
+    if store.shape[1:] != grid.shape:
         shape, its = (" x ".join(map(str, s)) for s in (store.shape[1:], grid.shape))
         raise InputError(
             f"{source} has spectra of {shape} directions, the {model} was trained on others ({its}); where spectra are "
             f"computed, --grid {' '.join(map(str, grid.shape))} makes them alike"
+        )
+    if known is not None and known.grid != grid:
+        raise InputError(
+            f"{source} has as many directions as the {model} was trained on, but others; expected those of {grid}"
         )
     return store, known
 

@@ -57,17 +57,18 @@ class Terminal:
         """Show what the options ask for, during the context; with `verbose` also the messages of `logging`."""
         self._output = output
         self.console.quiet = self._output.quiet or self._output.json
-        handler, loggers = RichHandler(console=self.console, show_path=False), [logging.getLogger(n) for n in LOGGERS]
-        for logger in loggers if verbose else ():
-            logger.addHandler(handler)
-            logger.setLevel(logging.DEBUG)
+        handler = RichHandler(console=self.console, show_path=False)
+        loggers = [logging.getLogger(name) for name in LOGGERS] if verbose else []
+        for each in loggers:
+            each.addHandler(handler)
+            each.setLevel(logging.DEBUG)
         try:
             yield
         finally:
             self._output, self.console.quiet = Answered(), False
-            for logger in loggers if verbose else ():
-                logger.removeHandler(handler)
-                logger.setLevel(logging.NOTSET)
+            for each in loggers:
+                each.removeHandler(handler)
+                each.setLevel(logging.NOTSET)
 
     @contextmanager
     def progress(self) -> Iterator[None]:

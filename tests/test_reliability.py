@@ -5,6 +5,8 @@ import os
 import re
 import shutil
 import subprocess
+import sys
+import time
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -62,8 +64,8 @@ def _files(folder):
 
 def test_a_report_without_out_is_new_each_time(finished, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    for time in ("first", "second"):
-        monkeypatch.setattr("tasks.report.stamp", lambda time=time: time)
+    for name in ("first", "second"):
+        monkeypatch.setattr("tasks.report.stamp", lambda name=name: name)
         assert run("report", finished) == 0
     assert capsys.readouterr().out.splitlines()[-1] == "report: runs/report/second/report.html"
 
@@ -91,6 +93,21 @@ def test_a_run_stopped_while_it_finishes_can_be_finished(finished, tmp_path, mon
         assert (tmp_path / "cut" / name).read_bytes() == (finished / name).read_bytes()
 
 
+@pytest.mark.long
+def test_a_killed_run_goes_on_to_the_same_tables(finished, tmp_path):
+    run_task = [sys.executable, Path(quick.__file__), "rssi", "--rx", "1", "--out", tmp_path / "cut"]
+    process = subprocess.Popen(run_task, env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)})
+    while not (tmp_path / "cut.partial" / "steps" / "mean.json").exists():
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    assert run("resume", tmp_path / "cut.partial") == 0
+    assert not (tmp_path / "cut" / "steps").exists()
+    for name in TABLES:
+        assert (tmp_path / "cut" / name).read_bytes() == (finished / name).read_bytes()
+
+
 def test_a_failed_start_leaves_nothing(tmp_path, monkeypatch):
     def refuse(*_, **options):
         raise InputError("no")
@@ -98,12 +115,6 @@ def test_a_failed_start_leaves_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(rssi, "compare", refuse)
     assert run("rssi", "--rx", "1", "--out", tmp_path / "run") == 2
     assert not list(tmp_path.iterdir())
-
-
-def test_the_console_script_finds_the_task_of_a_run(stopped):
-    with quick.quick():
-        assert main(["resume", str(stopped)]) == 0
-    assert (stopped.with_name("run") / "report.html").exists()
 
 
 @pytest.mark.parametrize(
@@ -146,27 +157,20 @@ def test_resume_refuses_changed_data(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "run.partial" / "steps" / "mean.json").exists()
 
 
-def test_report_says_where_a_run_went_on(stopped):
-    file = stopped / "environment.json"
-    content = json.loads(file.read_text())
-    file.write_text(json.dumps(content | {"device": "an abacus"}))
-    assert run("resume", stopped) == 0
-    report = (stopped.with_name("run") / "report.html").read_text()
-    assert f"; device {content['device']})" in report
-
-
-def test_resumed_run_keeps_its_number_of_threads(stopped):
+def test_a_resumed_run_keeps_its_number_of_threads_and_its_report_says_where_it_went_on(stopped):
     file = stopped / "environment.json"
     content, before = json.loads(file.read_text()), torch.get_num_threads()
-    file.write_text(json.dumps(content | {"threads": before + 1}))
+    file.write_text(json.dumps(content | {"threads": before + 1, "device": "an abacus"}))
     try:
-        assert run("resume", stopped) == 0
+        with quick.quick():
+            assert main(["resume", str(stopped)]) == 0
         assert torch.get_num_threads() == before + 1
     finally:
         torch.set_num_threads(before)
     report = (stopped.with_name("run") / "report.html").read_text()
     assert "like the seed" in report
     assert "resumed" in report
+    assert f"; device {content['device']})" in report
 
 
 @pytest.mark.parametrize("left", [[], ["environment.json"], ["steps/"]])
@@ -323,6 +327,10 @@ def test_files_reach_the_disk_before_they_get_their_name(tmp_path, monkeypatch):
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    with durable.replacing(tmp_path / "a") as one, durable.replacing(tmp_path / "a") as other:  # threads of a process
+        one.write_text("one")
+        other.write_text("other")
+    assert [file.read_text() for file in tmp_path.iterdir()] == ["one"]
     durable.write_text(tmp_path / "a", "old")
     with pytest.raises(UnicodeEncodeError):
         durable.write_text(tmp_path / "a", "\udcff")

@@ -11,6 +11,7 @@ import swiftwrf
 from swiftwrf.array.beamforming import BEAMFORMERS
 from swiftwrf.choices import FIELD_MODELS, ROOMS, RSSI_PREDICTORS
 from swiftwrf.data.raytraced import ROOMS as BUILT_IN_ROOMS
+from swiftwrf.locate.baselines import LOCALIZERS
 from tasks import labels
 from tasks.command import COMMANDS
 
@@ -100,13 +101,20 @@ print(int(not all(unchanged)), file=sys.stderr)
 
 @pytest.mark.parametrize(
     ("registry", "known"),
-    [(FIELD_MODELS, labels.FIELD_MODELS), (BEAMFORMERS, labels.BEAMFORMERS), (RSSI_PREDICTORS, labels.PREDICTORS)],
-    ids=["field models", "beamformers", "predictors"],
+    [
+        (FIELD_MODELS, labels.FIELD_MODELS),
+        (BEAMFORMERS, labels.BEAMFORMERS),
+        (RSSI_PREDICTORS, labels.PREDICTORS),
+        (LOCALIZERS, labels.LOCALIZERS),
+    ],
+    ids=["field models", "beamformers", "predictors", "localizers"],
 )
 def test_what_is_declared_has_a_label_and_can_be_imported(registry, known):
     assert {*registry} == {*known}
     for name in registry:
         assert callable(registry[name])
+        assert isinstance(registry, dict) or registry.summary(name)
+        assert getattr(registry[name], "name", name) == name
 
 
 def test_every_room_has_a_description():

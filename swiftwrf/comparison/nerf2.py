@@ -49,7 +49,10 @@ from swiftwrf.rssi.base import SavedRssiPredictor
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
 
-MAX_SAMPLES_ON_CPU = 2**16  # the same on a CPU: layers of more samples leave its caches
+MAX_SAMPLES = {
+    "cpu": 2**16,
+    "cuda": 2**19,
+}  # of all rays at a time: layers of more leave the caches, or fill the memory
 PATH_GAIN = 0.025  # [m] amplitude times distance, from the publication's code
 FIRST_PHASE = 1.0  # [rad], from the publication's code
 
@@ -58,7 +61,7 @@ Medium = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 @configuration
-class FieldConfig(Config):
+class NeuralFieldConfig(Config):
     """Options of a neural field."""
 
     published: ClassVar[dict[str, Any]] = {
@@ -91,10 +94,10 @@ class FieldConfig(Config):
 
 
 @configuration
-class NeRF2Config(FieldConfig):
+class NeRF2Config(NeuralFieldConfig):
     """Options of `NeRF2`."""
 
-    published = FieldConfig.published | {"batch": 8192, "rays": 1, "shared_rays": False}
+    published = NeuralFieldConfig.published | {"batch": 8192, "rays": 1, "shared_rays": False}
 
     steps: PositiveInt = 3000
     rate: PositiveFloat = 3e-3
@@ -106,10 +109,10 @@ class NeRF2Config(FieldConfig):
 
 
 @configuration
-class NeRF2RssiConfig(FieldConfig):
+class NeRF2RssiConfig(NeuralFieldConfig):
     """Options of `NeRF2Rssi`; a batch consists of transmitter positions."""
 
-    published = FieldConfig.published | {"azimuths": 36, "elevations": 9, "batch": 8}
+    published = NeuralFieldConfig.published | {"azimuths": 36, "elevations": 9, "batch": 8}
 
     width: Count = 32
     bands: Count = 4
@@ -237,8 +240,8 @@ class NeRF2(TrainedModel):
 
     def render(self, network: Field, position: Tensor, grid: AngularGrid) -> Tensor:
         ends, direction = self.ends(position, position.device), self._to_world(grid, position.device)
-        samples = MAX_SAMPLES_ON_CPU if direction.device.type == "cpu" else 2**19  # bounds the memory
-        parts = direction.split(max(1, samples // (len(position) * self.config.samples)))
+        samples = max(1, len(position)) * self.config.samples
+        parts = direction.split(max(1, MAX_SAMPLES[direction.device.type] // samples))
         magnitudes = [self._magnitude(network, *ends, part[None]) for part in parts]
         return torch.cat(magnitudes, dim=1).reshape(-1, *grid.shape)
 
@@ -304,7 +307,7 @@ class NeRF2Rssi(SavedRssiPredictor):
     def _predict(self, position: Tensor) -> tuple[Tensor, None]:
         config, n_receivers = self.config, len(self.receiver_names)
         n_samples = config.azimuths * config.elevations * config.samples * max(n_receivers, 1)
-        some = position.split(max(1, MAX_SAMPLES_ON_CPU // n_samples))
+        some = position.split(max(1, MAX_SAMPLES["cpu"] // n_samples))
         amplitude = torch.cat([self._amplitude(self.field, part) for part in some])
         return check_finite(100 * (amplitude.double() - 1)), None
 

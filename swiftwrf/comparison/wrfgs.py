@@ -30,9 +30,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar, cast
+from typing import Annotated, Any, ClassVar, cast
 
 import torch
+from annotated_types import Ge, Le
 from scipy.spatial import KDTree
 from torch import Tensor, nn
 from torch.nn import functional
@@ -79,8 +80,8 @@ class WrfGsConfig(Config):
         "check_every": 1000,
     }
 
-    n_gaussians: Count = 500
-    """initial number of Gaussians"""
+    n_gaussians: Annotated[int, Ge(4), Le(2**24)] = 500
+    """initial number of Gaussians, each of which is as wide as its three neighbours are far"""
     spread: PositiveFloat = 10.0
     """standard deviation of their means [m]"""
     width: Count = 128

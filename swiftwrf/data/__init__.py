@@ -23,6 +23,7 @@ def load_spectra(
     path: str | Path,
     *,
     array: PlanarArray | None = None,
+    arrays: Mapping[str, str] | None = None,
     beamformer: str | None = None,
     grid: AngularGrid | tuple[PositiveInt, PositiveInt] | None = None,
     every: PositiveInt | None = None,
@@ -39,6 +40,7 @@ def load_spectra(
         path: Folder or file.
         array: Array of the spectra if the files do not describe it, or for which spectra of ray paths are computed. Defaults
             to 4 x 4 elements at half a wavelength.
+        arrays: Names of the arrays in a file of array snapshots that has others than snapshots.npz, by the name there.
         beamformer: Beamformer for array snapshots: phase (default), bartlett or capon.
         grid: Directions of computed spectra, or their numbers of elevations and azimuths. Defaults to 90 x 360.
         every: Reads one measurement of that many.
@@ -64,7 +66,7 @@ def load_spectra(
 
 
 def load_snapshots(path: str | Path, **options: Any) -> Snapshots:
-    """Read array snapshots, with `every`, `station`, `drop_null`, `drop_elements` and `round_trip` as in `load_spectra`.
+    """Read array snapshots, with `arrays`, `every`, `station`, `drop_null`, `drop_elements`, `round_trip` of `load_spectra`.
 
     Raises:
         InputError: As `load_spectra`.

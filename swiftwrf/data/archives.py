@@ -51,14 +51,19 @@ def read_arrays(file: Path, needed: Sequence[str], optional: Sequence[str] = (),
     if not file.is_file():
         raise InputError(f"{file} is missing")
     kind = "an HDF5 file" if _is_hdf5(file) else "a MATLAB file" if file.suffix in MATLAB else "an npz archive"
-    with refusing_broken(file, f"{kind} of plain numbers"), _opened(file, kinds) as (names, find):
+    with refusing_broken(file, f"{kind} of plain numbers"), _opened(file) as (names, find):
         found = {name: find(name) for name in _choose(file, names, needed, optional)}
         _check_total(sum(size for size, _ in found.values()), file)
-        return {name: read() for name, (_, read) in found.items()}
+        arrays = {name: read() for name, (_, read) in found.items()}
+        if wrong := [
+            f"{name} holds {values.dtype}" for name, values in arrays.items() if values.dtype.kind not in kinds
+        ]:
+            raise ValueError(f"{wrong[0]}, expected numbers")
+        return arrays
 
 
 @contextmanager
-def _opened(file: Path, kinds: str = NUMBERS) -> Iterator[tuple[set[str], Callable[[str], Stored]]]:
+def _opened(file: Path) -> Iterator[tuple[set[str], Callable[[str], Stored]]]:
     """Open an archive; yield the names of its arrays, and a function that finds an array by name."""
     if _is_hdf5(file):
         with optional_module("h5py", f"{file} is HDF5, which h5py reads", "formats").File(file, "r") as content:
@@ -68,14 +73,15 @@ def _opened(file: Path, kinds: str = NUMBERS) -> Iterator[tuple[set[str], Callab
 
         def find(name: str) -> Stored:
             size, kind = variables[name]
-            if kind not in MATLAB_NUMBERS:
+            if kind not in MATLAB_NUMBERS:  # is not read
                 raise ValueError(f"{name} holds {kind}, expected numbers")
             return size, lambda: np.ascontiguousarray(loadmat(file, variable_names=[name])[name])
 
         yield set(variables), find
     else:
-        with zipfile.ZipFile(file) as archive:
-            yield _stored(archive), partial(_in_npz, archive, kinds)
+        with np.load(file, allow_pickle=False) as archive:
+            members = {info.filename.removesuffix(".npy"): info.file_size for info in archive.zip.infolist()}
+            yield set(members), lambda name: (members[name], lambda: archive[name])
 
 
 def array_header(file: Path, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
@@ -118,7 +124,7 @@ def _stream(file: Path, name: str) -> Iterator[tuple[Any, int]]:
             yield stream, file.stat().st_size
         return
     with refusing_broken(file, "an npz archive of plain numbers"), zipfile.ZipFile(file) as archive:
-        _choose(file, _stored(archive), [name], ())
+        _choose(file, {stored.removesuffix(".npy") for stored in archive.namelist()}, [name], ())
         member = archive.getinfo(f"{name}.npy")
         _check_total(member.file_size, file, MAX_ROWS_BYTES)
         with archive.open(member) as stream:
@@ -150,26 +156,11 @@ def _check_total(total: int, file: Path, most: int = MAX_STORED_BYTES) -> None:
         raise InputError(f"it unpacks to {total} bytes; at most {most} are read, so split the data")
 
 
-def _stored(archive: zipfile.ZipFile) -> set[str]:
-    return {name.removesuffix(".npy") for name in archive.namelist()}
-
-
-def _in_npz(archive: zipfile.ZipFile, kinds: str, name: str) -> Stored:
-    member = archive.getinfo(f"{name}.npy")
-
-    def read() -> NDArray[Any]:
-        with archive.open(member) as stream:
-            shape, by_columns, dtype = _header(stream, member.filename, member.file_size, kinds)
-            return np.frombuffer(stream.read(), dtype).reshape(shape, order="F" if by_columns else "C")
-
-    return member.file_size, read
-
-
-def _header(stream: Any, name: str, size: int, kinds: str = NUMBERS) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+def _header(stream: Any, name: str, size: int) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     """Return shape, order and type of an array, once the stream is as long as the header claims."""
     readers = {(1, 0): read_array_header_1_0, (2, 0): read_array_header_2_0}
     shape, by_columns, dtype = readers[read_magic(stream)](stream)
-    if dtype.kind not in kinds:
+    if dtype.kind not in NUMBERS:
         raise ValueError(f"{name} holds {dtype}, expected numbers")
     if math.prod(shape) * dtype.itemsize != size - stream.tell():
         raise ValueError(f"{name} does not hold the {shape} numbers that it claims")

@@ -25,13 +25,13 @@ CELL_ID = "(?:global_?)?cell_?id|cid|eci|cgi|pci"
 ROLES = {  # patterns of names in lower case with underscores and without units, the first ones preferred
     "x": [f"(?:(?:{PLACE})_?)*x(?:_?(?:{PLACE}))*|east(?:ing)?s?|e_?coord"],
     "y": [f"(?:(?:{PLACE})_?)*y(?:_?(?:{PLACE}))*|north(?:ing)?s?|n_?coord"],
-    "z": [f"(?:(?:{PLACE})_?)*z(?:_?(?:{PLACE}))*", "height", f"{GPS}(?:alt|altitude|elevation)"],
+    "z": [f"(?:(?:{PLACE})_?)*z(?:_?(?:{PLACE}))*", "height", f"{GPS}(?:alt|altitude|ele|elevation)"],
     "longitude": [f"{GPS}(?:lon|lng|long|longitude){GPS_END}"],
     "latitude": [f"{GPS}(?:lat|latitude){GPS_END}"],
     "floor": ["floor(?:_?(?:id|name|number|no|level))?|storey|etage|stockwerk"],
     "time": [
         "time_?stamp|date_?time|unix(?:_?time)?|epoch(?:_?time)?|(?:gps|utc|local|phone|system|event|measured|received)_?time",
-        "time|t|ts|elapsed(?:_?time)?|uptime",
+        "time|when|t|ts|elapsed(?:_?time)?|uptime",
         "date",
         "(?:first|last)_?seen|(?:received|measured|recorded|created|logged|reported)_?at",
     ],
@@ -235,10 +235,11 @@ def is_rssi(column: pd.Series) -> bool:
     return bool(mostly_below and len(below) and np.median(below) >= MIN_RSSI_DBM)
 
 
+def has_role(name: str, *roles: str) -> bool:
+    """Return True for the name of a column of one of these roles."""
+    return any(re.fullmatch(pattern, plain_name(name)) for role in roles for pattern in ROLES[role])
+
+
 def is_coordinate(name: str) -> bool:
     """Return True for the name of a column with a coordinate."""
-    return any(
-        re.fullmatch(pattern, plain_name(name))
-        for role in (*GEODETIC, "z", *GEODETIC.values())
-        for pattern in ROLES[role]
-    )
+    return has_role(name, *GEODETIC, "z", *GEODETIC.values())

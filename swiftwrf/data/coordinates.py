@@ -173,12 +173,14 @@ def without_fix(position: Floats) -> tuple[NDArray[np.bool_], list[str]]:
         >>> without_fix(np.array([[50.0, 5.0, 1.0], [50.0, 6.0, 1.0], [np.nan, 5.0, 1.0], [0.0, 0.0, 0.0]]))[0]
         array([False, False,  True,  True])
     """
-    empty = np.isnan(position.sum(axis=1))
+    empty, finite = np.isnan(position.sum(axis=1)), np.isfinite(position).all(axis=1)
     found = {"without a position": empty}
     omitted = empty.copy()
     for value in NO_FIX:
         rows = (position[:, 0] == value) & (position[:, 1] == value)
-        if (rows.sum() > 1 or (value == 0 and rows.any())) and _is_apart(position[~omitted & ~rows], position[rows]):
+        if (rows.sum() > 1 or (value == 0 and rows.any())) and _is_apart(
+            position[finite & ~omitted & ~rows], position[rows]
+        ):
             found[f"at {value:g}, {value:g}, apart from all others"] = rows
             omitted |= rows
     notes = [
@@ -212,7 +214,7 @@ def plain_degrees(label: object, names: tuple[str, str], xy: Floats) -> tuple[Fl
     """
     columns = f"columns {names[0]} and {names[1]}"
     size = np.abs(xy)
-    if (size <= 180).all():
+    if (size <= 180).all() or not np.isfinite(size).all():  # refused later
         return xy, []
     if bool((xy % 1 == 0).all()) and (size <= (180e7, 90e7)).all() and size.min(axis=0).max() >= 1e7:
         return xy / 1e7, [f"{columns} count 1e-7 degrees, which are converted to degrees"]

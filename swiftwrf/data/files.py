@@ -21,9 +21,11 @@ from numpy.typing import NDArray
 from swiftwrf.choices import CARRIERS_HZ
 from swiftwrf.data.archives import MAX_UNPACKED_BYTES, refusing_broken
 from swiftwrf.data.cells import NO_VALUE, column_of_numbers
+from swiftwrf.data.documents import DOCUMENTS, table_in_document
 from swiftwrf.errors import InputError, optional_module
 
-SUFFIXES = (".csv", ".parquet")  # of tables
+SUFFIXES = (".csv", ".parquet")  # of tables in a folder
+TABLES = (*SUFFIXES, *DOCUMENTS)  # of tables that are named
 SEPARATORS = ",;\t"
 MAX_TEXT_BYTES = 2**28  # a million rows of positions take a tenth of it
 MAX_PREAMBLE_LINES = 20  # before the header of a table
@@ -155,11 +157,12 @@ def lines_before_header(file: Path) -> int:
 
 
 def read_table(file: Path, header: bool = True) -> pd.DataFrame:
-    """Return the table in a CSV or Parquet file. Cells of CSV are text.
+    """Return the table in a CSV, Parquet, JSON, GPX or KML file. Cells are text, except those of Parquet.
 
     Args:
-        file: Parquet, or one row a line with commas, semicolons or tabs between values; the most frequent one in the header
-            counts. Numbers may have a decimal comma if it is not the comma. Lines before the header are skipped.
+        file: A document as in `swiftwrf.data.documents`, Parquet, or one row a line with commas, semicolons or tabs between
+            values; the most frequent one in the header counts. Numbers may have a decimal comma if it is not the comma.
+            Lines before the header are skipped.
         header: The first line contains the names of the columns. Otherwise, they are named 1, 2, ...
 
     Returns:
@@ -168,6 +171,8 @@ def read_table(file: Path, header: bool = True) -> pd.DataFrame:
     Raises:
         InputError: No such file, one that is broken, a column without name or a name twice, rows of unequal length, no rows.
     """
+    if file.suffix.lower() in DOCUMENTS:
+        return table_in_document(file, read_text(file), file.suffix.lower())
     if file.suffix.lower() != ".parquet":
         text = read_text(file)
         skipped = lines_before_header(file) if header else 0
@@ -189,7 +194,7 @@ def read_table(file: Path, header: bool = True) -> pd.DataFrame:
 
 def has_header(file: Path) -> bool:
     """Return False if the first line of a table holds values: numbers alone, with signs, fractions or twice the same."""
-    if file.suffix.lower() == ".parquet":
+    if file.suffix.lower() in (".parquet", *DOCUMENTS):
         return True
     line = read_text(file).split("\n", 1)[0]
     return not _holds_values(next(csv.reader([line], delimiter=max(SEPARATORS, key=line.count)), []))

@@ -49,19 +49,6 @@ def find_fillers(rssi: Floats) -> list[float]:
     return found
 
 
-def has_frequent_edge(rssi: Floats) -> bool:
-    """Return True if the least of the values of a receiver (n,) [dBm] is far more frequent than those above it.
-
-    Example:
-        >>> has_frequent_edge(np.array([-90.0] * 9 + [-89, -88, -87, -80, -75, -70, -60]))
-        True
-    """
-    value, count = np.unique(rssi, return_counts=True)
-    if len(value) <= MIN_VALUES or int(count[0]) < 0.2 * len(rssi):
-        return False
-    return _is_frequent(value, count, 0, N_NEIGHBOURS_DB)
-
-
 def _is_frequent(value: Floats, count: NDArray[np.int64], index: int, within_db: float) -> bool:
     """Return True if a value is much more frequent than every other one within a distance, in bins of 1 dB."""
     near = np.abs(value - value[index]) <= within_db

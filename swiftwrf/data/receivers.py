@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,7 +16,7 @@ from torch import Tensor
 from swiftwrf.data.cells import column_of_numbers
 from swiftwrf.data.columns import GEODETIC, column_of
 from swiftwrf.data.coordinates import GeodeticOrigin, PlanFrame, frame_of
-from swiftwrf.data.files import read_table
+from swiftwrf.data.files import numbers, read_table, read_yaml
 from swiftwrf.errors import InputError, listed
 from swiftwrf.positions import check_positions
 
@@ -106,7 +107,8 @@ def read_receivers(
     """Return the positions of receivers, float64 (R, 3) [m], nan where the table lacks one, and a note on these.
 
     Args:
-        file: Table of positions with names of receivers, or without names in the order of the receivers.
+        file: Table of positions with names of receivers, or without names in the order of the receivers; or YAML with
+            NAME: [x, y, z].
         names: R names.
         origin: Origin of the measurements, if their positions were in degrees; then these are, too.
         frame: Axes of the measurements, which the receivers share unless their columns state another unit.
@@ -114,7 +116,7 @@ def read_receivers(
     Raises:
         InputError: A name twice, no position of any receiver, or a position that is not usable.
     """
-    table = read_table(file)
+    table = _positions_by_name(file) if file.suffix == ".yml" else read_table(file)
     label = column_of(table, "receiver", {}) or ("name" if "name" in table.columns else None)
     if label is None and len(table) != len(names):
         raise InputError(f"{file} has {len(table)} rows and no column of names, but there are {len(names)} receivers")
@@ -130,14 +132,20 @@ def read_receivers(
     if len(unknown) == len(names):
         raise InputError(f"{file} has none of the receivers ({listed(names)}); there are {listed(listed_names)}")
     found = torch.tensor([place.get(name, [float("nan")] * 3) for name in names], dtype=torch.float64)
-    return found, [*notes, *unknown_positions(unknown)]
+    if unknown:
+        notes.append(f"the position of these receivers is unknown, so they have no path-loss model: {listed(unknown)}")
+    return found, notes
 
 
-def unknown_positions(names: list[str]) -> list[str]:
-    """Return a note on receivers of unknown position, or none."""
-    return [f"the position of these receivers is unknown, so they have no path-loss model: {listed(names)}"] * bool(
-        names
-    )
+def _positions_by_name(file: Path) -> pd.DataFrame:
+    """Return the table of a file with NAME: [x, y, z], without receivers of unknown position."""
+    content = {name: value for name, value in read_yaml(file).items() if value not in ("", "~", "null", "none")}
+    rows: list[Any] = [(name, *(numbers(value, 3) or ())) for name, value in content.items()]
+    if wrong := [row[0] for row in rows if len(row) == 1]:
+        raise InputError(
+            f"{file}: receiver {wrong[0]!r} needs a position of 3 finite numbers [m], got {content[wrong[0]]}"
+        )
+    return pd.DataFrame(rows, columns=["receiver", "x", "y", "z"])
 
 
 def read_places(file: Path, origin: GeodeticOrigin | None, frame: PlanFrame) -> Tensor:

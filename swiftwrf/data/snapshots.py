@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,7 +14,7 @@ from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.dataset import Arrays, Numbers, PositionedData, to_positions, to_rotation
 from swiftwrf.data.spectra import GRID, Spectra, array_spectra, check_pixels, snapshot_frequencies
-from swiftwrf.errors import InputError, ranges
+from swiftwrf.errors import InputError
 from swiftwrf.positions import to_tensor
 from swiftwrf.runtime.validation import checked
 
@@ -140,90 +138,3 @@ class Snapshots(PositionedData):
 
     def _summary(self) -> str:
         return f"{len(self)} channels of {self.channel.shape[1]} snapshots, {self.array.summary}"
-
-
-def check_spacing(file: Path, array: PlanarArray) -> None:
-    """Refuse elements at distances that no array has, e.g. because positions are in millimetres.
-
-    Raises:
-        InputError: One element only, or neighbours outside 0.01 to 20 wavelengths.
-    """
-    if len(array.element) < 2:
-        raise InputError(
-            f"{file} describes an array of one element, which resolves no directions; at least 2 are needed"
-        )
-    apart, (low, high) = array.spacing_wavelengths, (0.01, 20.0)  # beyond, the unit is another one
-    if not low <= apart <= high:
-        raise InputError(
-            f"{file}: neighbouring elements are {apart * array.wavelength:.4g} m, {apart:.3g} wavelengths "
-            f"apart; expected {low:g} to {high:g} wavelengths, so is the spacing in metres and the carrier in Hz?"
-        )
-
-
-def measured(
-    source: Path, channel: Tensor, drop_null: bool = False, drop: Sequence[int] = ()
-) -> tuple[Tensor, Tensor, Tensor, tuple[str, ...]]:
-    """Return a channel (n, S, K) without what is missing, its snapshots and elements among those given, and notes.
-
-    Missing are values that are 0 or NaN. They become 0, which beamformers do not use.
-
-    Elements to drop, counted from 0, and those without any value are left out. So are snapshots if other rows have fewer of
-    them. Null, guard and DC subcarriers hold a constant or nothing: they are the same at every position and element.
-
-    Raises:
-        InputError: A position without any value, fewer than 2 elements, or one to leave out that does not exist.
-
-    Example:
-        >>> channel = torch.randn(5, 4, 3, dtype=torch.complex64)
-        >>> channel[:, 2] = 12 + 3j
-        >>> measured(Path("a"), channel, drop_null=True)[1:]
-        (tensor([0, 1, 3]), tensor([0, 1, 2]), (...are left out (1 of 4, counted from 0): 2',))
-    """
-    count, elements = channel.shape[1:]
-    missing, notes = (channel == 0) | channel.isnan(), []
-    channel = channel.masked_fill(missing, 0)
-    if lost := missing.all(dim=2).all(dim=1).nonzero()[:, 0].tolist():
-        raise InputError(f"{source}: csi of row {lost[0]} has no power; leave it out")
-    if beyond := [number for number in drop if not 0 <= number < elements]:
-        raise InputError(f"{source} has elements 0 to {elements - 1}, so element {beyond[0]} cannot be left out")
-    silent = missing.all(dim=1).all(dim=0)
-    used = ~silent
-    used[list(drop)] = False
-    if int(used.sum()) < 2:
-        raise InputError(
-            f"{source}: csi has values at {int(used.sum())} elements; expected at least 2 to resolve directions"
-        )
-    for which, reason in (
-        (silent.nonzero()[:, 0].tolist(), "silent (0 or NaN everywhere)"),
-        (list(drop), "to be ignored"),
-    ):
-        if which:
-            named = f"element {which[0]} is" if len(which) == 1 else f"elements {ranges(sorted(which))} are"
-            notes.append(f"{named} {reason} and left out (counted from 0)")
-    channel, missing = channel[..., used], missing[..., used]
-    empty = missing.all(dim=2)
-    kept = torch.ones(count, dtype=torch.bool)
-    if bool((empty.any(dim=0) & ~empty.all(dim=0)).any()):  # rows differ in their number of packets
-        kept = ~empty.all(dim=0)
-        notes.append(f"{int(empty.sum())} of {empty.numel()} snapshots are 0 or NaN at all elements and left out")
-    elif len(channel) > 1:
-        first = channel[:1, :, :1]
-        null = ((channel - first).abs() <= 1e-3 * first.abs()).all(dim=2).all(dim=0)
-        if bool(null.any()) and not bool(null.all()):
-            which_null = f"({int(null.sum())} of {count}, counted from 0): {ranges(null.nonzero()[:, 0].tolist())}"
-            name = "null subcarriers, the same at every position and element, are"
-            kept = ~null if drop_null else kept
-            notes.append(
-                f"{name} left out {which_null}"
-                if drop_null
-                else f"{name} used like the others {which_null}; --drop-null leaves them out"
-            )
-    if some := int((missing & ~empty[..., None]).sum()):
-        notes.append(f"{some} of {missing.numel()} values of single elements are 0 or NaN and not used")
-    return channel[:, kept], kept.nonzero()[:, 0], used.nonzero()[:, 0], tuple(notes)
-
-
-def round_trip_array(array: PlanarArray) -> tuple[PlanarArray, tuple[str, ...]]:
-    """Return the array for phases of the way there and back, which change as those of half the wavelength, and a note."""
-    note = "phases are those of the way there and back, so half the wavelength counts"
-    return PlanarArray(array.element, array.wavelength / 2), (note,)

@@ -361,11 +361,11 @@ class _Survey:
     def packets(self, coordinate: Floats, group: pd.Series) -> tuple[list[str], Floats, NDArray[np.int64], Floats]:
         """Return the receivers of a long table, RSSI (n, R), its row in the table (n, R), and coordinates.
 
-        A row is a time and place. Repeated packets have a row each.
+        A row is a time and place. Repeated packets have a row each. Without a receiver, nothing was detected there.
         """
         receiver = text_of(self.table[self.roles["receiver"]])
-        nameless = (receiver == "").to_numpy().nonzero()[0]
-        if len(nameless):
+        power, time, named = self.powers([self.roles["rssi"]])[:, 0], self.text("time"), (receiver != "").to_numpy()
+        if len(nameless := np.flatnonzero(~named & ~np.isnan(power))):
             raise InputError(f"{self.label} row {nameless[0] + 1} has no receiver in column {self.roles['receiver']}")
         plain = receiver.map(plain_receiver)
         one = plain.map(dict(zip(plain[::-1], receiver[::-1], strict=True)))  # in the first spelling
@@ -373,19 +373,18 @@ class _Survey:
             self.notes.append(
                 f"names count as those of one receiver that differ in case, separators or zeros: {listed(others)}"
             )
-        power, time = self.powers([self.roles["rssi"]]), self.text("time")
         keys = pd.DataFrame(coordinate).assign(group=group.to_numpy(), time="" if time is None else time.to_numpy())
         packets = keys.assign(receiver=one.to_numpy())
         keys["repeat"] = packets.groupby(list(packets.columns), sort=False, dropna=False).cumcount()
         row = keys.groupby(list(keys.columns), sort=False, dropna=False).ngroup().to_numpy()
-        column, names = pd.factorize(one)
+        column, names = pd.factorize(one[named])
         _, first = np.unique(row, return_index=True)
         if len(first) * len(names) > MAX_VALUES:
             raise InputError(
                 f"{self.label} has {len(first)} rows and {len(names)} receivers; at most {MAX_VALUES} values are read"
             )
-        values, source = np.full((len(first), len(names)), np.nan), np.zeros((len(first), len(names)), dtype=np.int64)
-        values[row, column], source[row, column] = power[:, 0], np.arange(len(row))
+        values, source = np.full((len(first), len(names)), np.nan), np.repeat(first[:, None], len(names), axis=1)
+        values[row[named], column], source[row[named], column] = power[named], np.flatnonzero(named)
         return list(names), values, source, coordinate[first]
 
     def pools(self, names: list[str], by: str) -> list[str]:

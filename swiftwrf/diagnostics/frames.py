@@ -36,6 +36,7 @@ from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import slabs
 from swiftwrf.diagnostics.elements import (
+    CARRIER,
     constant_phases,
     evidence,
     excess,
@@ -55,8 +56,9 @@ MIN_TURN = math.radians(5)
 COST, TIE = 0.03, 0.03  # of a fitted parameter; difference of errors that are not distinguished
 MIN_POWER = 0.05  # of an error, above the declared frame, in the fraction of the power
 MIN_EXPLAINED = 0.5  # agreement of an error
-# fraction of the power in the best directions that an error must explain, without and with fitted parameters
-MIN_REACHED, MIN_REACHED_FITTED = 0.8, 0.9
+# fraction of the power in the best directions that an error must explain: without and with fitted parameters, and a carrier,
+# whose scale stretched positions share in part
+MIN_REACHED, MIN_REACHED_FITTED, MIN_REACHED_CARRIER = 0.8, 0.9, 0.97
 REACH_GRID = AngularGrid.hemisphere(30, 120)
 MAX_ELSEWHERE = 0.3  # of the positions, whose peak is elsewhere, in one frame
 UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
@@ -215,7 +217,7 @@ def check_frames(spectra: Spectra, snapshots: Snapshots | None = None) -> FrameR
         tried[name] = max(found, tried.get(name, found), key=lambda each: each.score)
     best, names = best_explanations({name: each.score for name, each in tried.items()}, TIE)
     is_clear = best - declared >= (MIN_EVIDENCE if seen is None else MIN_POWER)
-    explained = [name for name in names if is_clear and name != UNCALIBRATED and _reaches(tried[name])]
+    explained = [name for name in names if is_clear and name != UNCALIBRATED and _reaches(name, tried[name])]
     turn = next((tried[name].turn for name in explained if tried[name].turn is not None), None)
     angle_deg, limit_deg = _nearest(direction, peak).rad2deg(), 10.0
     if spectra.array is not None:
@@ -242,7 +244,7 @@ def _evidence(away: Tensor, frame: _Frame, peak: Tensor, seen: Snapshots | None)
     return _kernel(_nearest(frame.folded(functional.normalize(away, dim=1)), peak))
 
 
-def _reaches(found: _Hypothesis) -> bool:
+def _reaches(name: str, found: _Hypothesis) -> bool:
     """Return True if a hypothesis explains nearly what the array can reach, and more than by chance."""
     mean = float(found.evidence.mean())
     if mean - found.chance < MIN_EVIDENCE:
@@ -251,7 +253,8 @@ def _reaches(found: _Hypothesis) -> bool:
         return mean >= MIN_EXPLAINED + 0.1 * found.free
     share = found.seen.array.spectrum(found.seen.channel, REACH_GRID, PHASE).square().amax(dim=(1, 2))
     chance = 1 / found.seen.channel.shape[2]
-    least = MIN_REACHED_FITTED if found.free else MIN_REACHED
+    is_carrier = name.startswith(CARRIER.partition("{")[0])
+    least = MIN_REACHED_CARRIER if is_carrier else MIN_REACHED_FITTED if found.free else MIN_REACHED
     return mean >= max(0.45 + chance, least * float(excess(share, chance).mean()))
 
 

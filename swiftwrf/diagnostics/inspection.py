@@ -12,7 +12,6 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.data import Rssi, Snapshots, Spectra
-from swiftwrf.data.powers import has_frequent_edge
 from swiftwrf.data.splits import MAX_REPEATED, MIN_TRAINING, repeated_fraction
 from swiftwrf.diagnostics.calibration import calibrate
 from swiftwrf.diagnostics.elements import in_noise, noisy_elements, some_rows
@@ -377,20 +376,9 @@ def _columns(data: Rssi, detected: Tensor, findings: Findings) -> None:
         findings.warn(f"Receivers with one value everywhere: {listed(constant)}.")
     if positive := those(lambda v: bool(v.min() < v.max() and v.max() >= 0)):
         findings.warn(f"Receivers with values of 0 dBm and more, which few receivers measure: {listed(positive)}.")
-
-    if repeated := those(lambda v: has_frequent_edge(v.numpy())):
-        findings.warn(
-            "The weakest value is far more frequent than those above it; does it mean not detected? Receivers: "
-            f"{listed(repeated)}."
-        )
-    filled = data.rssi_dbm.nan_to_num(0.0)
-    same = [
-        f"{a} = {b}"
-        for i, a in enumerate(data.receiver_names)
-        for j, b in enumerate(data.receiver_names[:i])
-        if bool((filled[:, i] == filled[:, j]).all())
-    ] if len(data.receiver_names) <= 200 else []  # fmt: skip
-    if same:
+    first, filled = dict[bytes, str](), zip(data.receiver_names, data.rssi_dbm.nan_to_num(0.0).T, strict=True)
+    earliest = {name: first.setdefault(column.numpy().tobytes(), name) for name, column in filled}
+    if same := [f"{name} = {other}" for name, other in earliest.items() if name != other]:
         findings.warn(f"Receivers with the same values: {listed(same)}.")
 
 

@@ -212,7 +212,7 @@ class Components(NamedTuple):
 
 
 def principal_components(
-    rows: Tensor | Callable[[], Iterable[Tensor]], rank: int, min_variance: float = MIN_VARIANCE, seed: int = 0
+    rows: Tensor | Callable[[], Iterable[Tensor]], rank: int, min_variance: float = MIN_VARIANCE
 ) -> Components:
     """Return the largest principal components of rows.
 
@@ -224,7 +224,6 @@ def principal_components(
         rows: Rows (n, P), float32, or a function that yields them in order by the batch, equal at each of three calls.
         rank: Maximum number of components.
         min_variance: Fraction of the variance below which a component is left out.
-        seed: Seed of the sketch.
 
     Example:
         >>> rows = torch.outer(torch.arange(5.0), torch.ones(8))
@@ -232,7 +231,7 @@ def principal_components(
         torch.Size([1, 8])
     """
     if not isinstance(rows, Tensor):
-        return _sketched(rows, rank, min_variance, seed)
+        return _sketched(rows, rank, min_variance)
     mean = rows.mean(dim=0)
     change = rows - mean
     value, vector = torch.linalg.eigh((change @ change.T).double())
@@ -241,13 +240,13 @@ def principal_components(
     return Components(mean, vector, vector.T.float() @ change)
 
 
-def _sketched(batches: Callable[[], Iterable[Tensor]], rank: int, min_variance: float, seed: int) -> Components:
+def _sketched(batches: Callable[[], Iterable[Tensor]], rank: int, min_variance: float) -> Components:
     total, n = torch.zeros((), dtype=torch.float64), 0
     for batch in batches():
         total, n = total + batch.sum(dim=0, dtype=torch.float64), n + len(batch)
     mean = (total / n).float()
     width = min(rank + 16, len(mean))  # more directions are more exact
-    random = torch.randn(len(mean), width, generator=torch.Generator().manual_seed(seed))
+    random = torch.randn(len(mean), width, generator=torch.Generator().manual_seed(0))
     sketch = torch.zeros(len(mean), width, dtype=torch.float64)
     variance = 0.0
     for batch in batches():

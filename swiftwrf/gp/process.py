@@ -62,7 +62,7 @@ class Kernel:
         return float(brentq(lambda r: float(self.at(torch.tensor(r).double())) - 1 / math.e, 0.0, 2 * longest))
 
     def __call__(self, a: Tensor, b: Tensor) -> Tensor:
-        """Return k between positions (n, 3) and (m, 3), (n, m)."""
+        """Return k between positions (..., n, 3) and (..., m, 3), (..., n, m)."""
         if self.vertical != 1:
             scale = a.new_tensor([1.0, 1.0, self.vertical])
             a, b = a * scale, b * scale
@@ -150,10 +150,8 @@ class GaussianProcess:
     def regressed(self, value: Tensor) -> GaussianProcess:
         """Return the process of other values (n, K) at the same positions."""
         kept = value.to(self.coefficient)
-        if not self.is_exact:
-            return self._with(coefficient=kept)
-        coefficient = torch.cholesky_solve(value.double(), self._factor)
-        return self._with(coefficient=coefficient.to(kept), value=kept)
+        coefficient = torch.cholesky_solve(value.double(), self._factor).to(kept) if self.is_exact else kept
+        return self._with(coefficient=coefficient, value=kept)
 
     @cached_property
     def value(self) -> Tensor:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
+from swiftwrf.data.rssi import PLACE
 from swiftwrf.data.splits import matching_validation, places
 from swiftwrf.errors import InputError
 from swiftwrf.locate.baselines import LEVELS, LOCALIZERS, Localizer, PosteriorLocalizer
@@ -81,11 +82,16 @@ class LocateSplit:
         Offsets between groups, if there are any, are estimated from training rows and removed.
 
         Raises:
-            InputError: Receivers that move, no such split, or too few rows in which a receiver detected the transmitter.
+            InputError: Receivers that move, no such split, one of other receivers in the test rows, or too few rows in which
+                a receiver detected the transmitter.
         """
         if data.receiver_moves:
             raise InputError(
                 f"both ends of {data.name} move; positions are found by receivers that stay where they are"
+            )
+        if split == PLACE and split not in data.named_splits:
+            raise InputError(
+                f"split {split!r} tests other receivers than it trains; choose random or block to locate by"
             )
         train, test = data.split(split, seed)
         detected = int(train.detected.any(dim=1).sum())

@@ -343,11 +343,11 @@ def read_inflation(header: Header) -> float:
     """Return the inflation of the header of a saved locator.
 
     Raises:
-        InputError: A value that is not a number above 0.
+        InputError: A value that is not a number at least 0.
     """
     value = header["inflation"]
-    if not (isinstance(value, int | float) and 0 < value < math.inf):
-        raise InputError(f"inflation must be a number above 0, got {value!r}")
+    if not (isinstance(value, int | float) and 0 <= value < math.inf):
+        raise InputError(f"inflation must be a number at least 0, got {value!r}")
     return float(value)
 
 

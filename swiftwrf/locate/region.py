@@ -14,7 +14,7 @@ from torch import Tensor
 
 from swiftwrf.data.coordinates import Floors
 from swiftwrf.errors import InputError
-from swiftwrf.positions import nearest
+from swiftwrf.positions import check_positions, nearest
 from swiftwrf.runtime.validation import from_plain
 
 FLOOR_DISTANCE_M = 1e5  # of two floors, in the search for known positions near a cell
@@ -52,16 +52,16 @@ class Region:
     fills a measured room. In a building with floors, the box is a plane of cells on each floor.
 
     Args:
-        known: Known positions, float64 (n, 3) [m].
+        known: Known positions, (n, 3) [m], kept as float64.
         margin: Fraction of the extent by which the box exceeds the known positions on each side.
         outside: Prior mass spread over the whole box.
         floors: Floors of the building. Defaults to none.
 
     Raises:
-        InputError: Fewer than 2 known positions, a negative margin, or a mass outside (0, 1].
+        InputError: Fewer than 2 known positions, one that is not finite, a negative margin, or a mass outside (0, 1].
 
     Example:
-        >>> region = Region(torch.rand(50, 3, dtype=torch.float64))
+        >>> region = Region(torch.rand(50, 3))
         >>> cells = region.cells(1000)
         >>> round(float(cells.log_volume.exp().sum()), 6)
         1.0
@@ -73,8 +73,9 @@ class Region:
     floors: Floors | None = None
 
     def __post_init__(self) -> None:
-        if self.known.dim() != 2 or self.known.shape[1] != 3 or len(self.known) < 2:
-            raise InputError(f"a region needs at least 2 known positions (n, 3), got shape {tuple(self.known.shape)}")
+        vars(self)["known"] = check_positions(self.known, "known positions of a region")
+        if len(self.known) < 2:
+            raise InputError(f"a region needs at least 2 known positions, got {len(self.known)}")
         if not self.margin >= 0 or not 0 < self.outside <= 1:
             raise InputError(f"a margin is at least 0 and a mass above 0, got {self.margin} and {self.outside}")
 

@@ -19,6 +19,7 @@ from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import places
+from swiftwrf.errors import InputError
 from swiftwrf.locate.spectrum_likelihood import DEGREES
 from swiftwrf.rssi import RssiModel
 
@@ -190,9 +191,18 @@ class Fingerprints:
 
     @classmethod
     def fit(cls, train: Rssi, fold: Tensor, seed: int = 0) -> Self:
-        """Return fingerprints with the metric and k of the lowest mean error at rows of held-out folds (n,)."""
+        """Return fingerprints with the metric and k of the lowest mean error at rows of held-out folds (n,).
+
+        Raises:
+            InputError: All rows with a detection are in one fold.
+        """
         detected = train.detected.any(dim=1)
         train, fold = train.subset(detected), fold[detected]
+        if len(fold.unique()) == 1:
+            raise InputError(
+                f"no rows of {train.name} can be held out to choose the neighbours: all detections are in one part of the "
+                'region or one session; measure elsewhere, too, or take validation="random"'
+            )
         order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))
         held_out = torch.zeros(len(train), dtype=torch.bool).index_fill(0, order[:MAX_HELD_OUT], value=True)
         parts = [((fold == number) & held_out, fold != number) for number in fold.unique()]
@@ -311,10 +321,10 @@ class FingerprintLikelihood:
             truth: Their positions, (n, 3) [m].
             smallest_m: Smallest scale [m].
         """
-        part, mean, _ = votes
+        part = votes[0]
         rows, own = torch.arange(len(truth)), fingerprints.floor(truth)
         right = part[rows, own]
-        error = (mean[rows, own] - truth)[right > 0]
+        error = (_with_estimate(votes)[rows, own] - truth)[(right > 0) | (right == 0).all()]
         scale = (error.abs().quantile(0.6, dim=0).square() + smallest_m**2).sqrt()
 
         def density(miss: float) -> float:
@@ -324,14 +334,20 @@ class FingerprintLikelihood:
 
     def log_likelihood(self, position: Tensor, rssi: Tensor) -> Tensor:
         """Return log-likelihoods (n, m) of candidate positions (m, 3) [m]."""
-        part, mean, estimate = self.fingerprints.votes(rssi)
-        mean = mean.where(part[..., None] > 0, estimate[:, None])
+        votes = self.fingerprints.votes(rssi)
+        part, mean = votes[0], _with_estimate(votes)
         number = self.fingerprints.floor(position)
         away = (position - mean[:, number]) / self.scale_m
         if part.shape[1] > 1:
             away[..., 2] = 0.0
         floor = ((1 - self.miss) * part + self.miss / part.shape[1]).log()
         return floor[:, number] - (self.degrees + 3) / 2 * torch.log1p(away.square().sum(dim=2) / self.degrees)
+
+
+def _with_estimate(votes: Votes) -> Tensor:
+    """Return the mean position on each floor (n, F, 3) [m], that of the estimate on floors without a neighbour."""
+    part, mean, estimate = votes
+    return mean.where(part[..., None] > 0, estimate[:, None])
 
 
 @dataclass(frozen=True, eq=False)

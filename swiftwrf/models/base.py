@@ -23,7 +23,7 @@ from swiftwrf.models.link import Link
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Axes, Displayed, extent
 from swiftwrf.positions import check_positions, to_tensor
-from swiftwrf.runtime.checkpoint import Header, Saved
+from swiftwrf.runtime.checkpoint import Header, Saved, check_folder
 from swiftwrf.runtime.descent import Record
 from swiftwrf.runtime.threads import single_thread, to_device
 from swiftwrf.runtime.validation import (
@@ -154,7 +154,9 @@ class FieldModel(Configured, Saved, Displayed):
                 checkpoint of another fit or in a folder that does not exist.
             FitError: The loss diverged.
         """
-        device, checkpoint = to_device(device), check_checkpoint(checkpoint)
+        device = to_device(device)
+        if checkpoint is not None:
+            check_folder(checkpoint, "checkpoint")
         check_training(train)
         self._check_described(train)
         if like is not None and not self.accepts_like(like):
@@ -221,7 +223,7 @@ class FieldModel(Configured, Saved, Displayed):
 
         differentiable = position.requires_grad or any(tensor.requires_grad for tensor in self.parameters())
         with torch.set_grad_enabled(torch.is_grad_enabled() and differentiable):
-            if torch.is_grad_enabled() or 0 < len(position) <= batch:
+            if torch.is_grad_enabled() or len(position) <= batch:
                 means, stds = zip(*(evaluate(some) for some in position.split(batch)), strict=True)
                 mean = means[0] if len(means) == 1 else torch.cat(means)
                 std = None if stds[0] is None else torch.cat(stds)
@@ -385,7 +387,7 @@ class FieldModel(Configured, Saved, Displayed):
         model.bounds = bounding_box(torch.tensor(header["bounds"], dtype=torch.float64))
         model.link = Link.from_json(header["link"])
         if lacking := cls.lacking(model.link):
-            raise InputError(f"the {' and the '.join(lacking)} are missing")
+            raise InputError(f"it lacks the {' and the '.join(lacking)}")
         model._restore(tensors, header)
         return model
 
@@ -445,17 +447,6 @@ def check_finite(spectrum: Tensor) -> Tensor:
     if not bool(spectrum.detach().sum().isfinite()):
         raise InputError("the model predicts values that are not finite; its parameters overflow, so fit it again")
     return spectrum
-
-
-def check_checkpoint(path: Path | None) -> Path | None:
-    """Return the path of a checkpoint if it can be written.
-
-    Raises:
-        InputError: Its folder does not exist.
-    """
-    if path is not None and not Path(path).parent.is_dir():
-        raise InputError(f"the folder of the checkpoint {path} does not exist; create it")
-    return path
 
 
 @checked

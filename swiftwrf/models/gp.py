@@ -11,7 +11,7 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import folds
 from swiftwrf.data.store import Store
-from swiftwrf.gp import GaussianProcess, choose_kernel, subsample
+from swiftwrf.gp import GaussianProcess, choose_kernel
 from swiftwrf.models.neighbours import MemoryModel
 from swiftwrf.models.process import ProcessModel
 from swiftwrf.runtime.checkpoint import Header
@@ -36,7 +36,7 @@ class GPModel(ProcessModel, MemoryModel):
         self.position, self.store = train.position, train.store
         fold = folds(train.position, self.config.validation, self.config.seed)
         # without values, for weights and variances alone
-        self._prepare(GaussianProcess(choose_kernel(train.position, train.store, fold), train.position))
+        self._set_process(GaussianProcess(choose_kernel(train.position, train.store, fold), train.position))
         self._set_spread(
             train,
             fold,
@@ -44,11 +44,10 @@ class GPModel(ProcessModel, MemoryModel):
             lambda change, _: self._mean + change.reshape(-1, *self.grid.shape),
         )
 
-    def _prepare(self, process: GaussianProcess) -> None:
-        """Precompute what predictions share: mean, and differences from the mean, if they are few."""
+    def _set_process(self, process: GaussianProcess) -> None:
+        """Take a process, and precompute the mean and, if each prediction needs all spectra, their differences from it."""
         self._mean, self.process = self.store.mean(), process
-        some = self.store[:] if process.is_exact else subsample(self.store)[0]
-        self._change = (some - self._mean).flatten(1)
+        self._change = (self.store[:] - self._mean).flatten(1) if process.is_exact else None
 
     def _values(self, new: Spectra) -> Tensor:
         return torch.zeros(len(new), 0)  # the values are the spectra of the store
@@ -56,24 +55,21 @@ class GPModel(ProcessModel, MemoryModel):
     def _weighted_values(self) -> Store:
         return self.store
 
-    def _set_process(self, process: GaussianProcess) -> None:
-        self._prepare(process)
-
     def _update(self, new: Spectra) -> None:
         super()._update(new)
         self.position, self.store = self.process.known, self.store.joined(new.store)
-        self._prepare(self.process)
+        self._set_process(self.process)
 
     def _forget(self, rows: Tensor) -> None:
         super()._forget(rows)
         kept = torch.ones(len(self.store), dtype=torch.bool)
         kept[rows] = False
         self.position, self.store = self.process.known, self.store.subset(kept)
-        self._prepare(self.process)
+        self._set_process(self.process)
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         rows, weight = self.process.weights(position)
-        change = self._change if self.process.is_exact else (self.store[rows] - self._mean).flatten(1)
+        change = (self.store[rows] - self._mean).flatten(1) if self._change is None else self._change
         mean = self._mean + (weight.float() @ change).reshape(-1, *grid.shape)
         return mean, self._std(position, grid) if with_std else None
 
@@ -85,5 +81,5 @@ class GPModel(ProcessModel, MemoryModel):
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         super()._restore(tensors, header)
         none = {"coefficient": torch.zeros(len(self.position), 0)}
-        self._prepare(GaussianProcess.from_state(tensors | none, header, torch.float64))
+        self._set_process(GaussianProcess.from_state(tensors | none, header, torch.float64))
         self._restore_spread(tensors)

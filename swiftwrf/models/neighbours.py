@@ -103,7 +103,7 @@ class IDWModel(MemoryModel):
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         super()._restore(tensors, header)
-        self.k = min(int(header["k"]), len(self.position))
+        self.k = min(max(int(header["k"]), 1), len(self.position))
 
 
 def _held_out_loss(k: int, position: Tensor, gram: Tensor, fold: Tensor) -> float:

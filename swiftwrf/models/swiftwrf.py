@@ -196,17 +196,17 @@ class SwiftWRF(ProcessModel):
     @torch.no_grad()
     def _basis(self, grid: AngularGrid) -> Basis:
         """Return what all predictions on a grid share, from the cache if it is there."""
-        if grid in self._bases:
-            return self._bases[grid]
+        if known := self._bases.get(grid):
+            return known
         kernel = kernels(self.mean, self.cholesky, grid, CUTOFF).flatten(1)
         component = self.weight[1:] @ kernel
         dual = torch.linalg.pinv(component.double() @ component.double().T, hermitian=True) @ component.double()
         prior = component.square().sum(dim=0).sqrt().reshape(grid.shape)
         basis = Basis(kernel, self.weight[0] @ kernel, dual.float(), prior)
-        if kernel.numel() <= MAX_CACHED_VALUES:
-            while len(self._bases) >= 2:
-                del self._bases[next(iter(self._bases))]
-            self._bases[grid] = basis
+        if (
+            kernel.numel() <= MAX_CACHED_VALUES
+        ):  # of two grids; a new dictionary, because other threads read the old one
+            self._bases = dict([*self._bases.items()][-1:]) | {grid: basis}
         return basis
 
     def _values(self, new: Spectra) -> Tensor:
@@ -229,8 +229,8 @@ class SwiftWRF(ProcessModel):
         expect(tensors, {"mean": (n, 2), "cholesky": (n, 3), "weight": (1 + k, n)})
         self.mean, self.cholesky, self.weight = (tensors[name] for name in ("mean", "cholesky", "weight"))
         self.calibration = float(header["calibration"])
-        if not self.calibration >= 0:
-            raise InputError(f"calibration is {self.calibration}, expected 0 or more")
+        if not 0 <= self.calibration < math.inf:
+            raise InputError(f"calibration is {self.calibration}, expected a finite number, 0 or more")
         self._move(torch.device("cpu"))
 
 

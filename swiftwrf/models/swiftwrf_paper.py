@@ -233,10 +233,6 @@ class Optimisation(Descent[DeformableGaussians]):
     def rate(self, step: int) -> float:
         return warm_cosine(step, self.steps, warm_up=50, final=0.02)
 
-    def loss(self, rendered: Tensor, measured: Tensor) -> Tensor:
-        """Return the loss of spectra; see `spectrum_loss`."""
-        return spectrum_loss(rendered, measured, self.config.ssim_weight)
-
     def smoothing(self) -> float:
         """Return the standard deviation of the noise on normalised positions at the present step.
 
@@ -252,7 +248,7 @@ class Optimisation(Descent[DeformableGaussians]):
         position = self.position[rows] + self.smoothing() * self.noise[self.step]
         mean, cholesky, weight = self.model(position, deform=deform)
         rendered = rasterize_magnitude(mean, cholesky, weight, self.grid, cutoff=CUTOFF)
-        return self.loss(rendered, self.spectrum[rows])
+        return spectrum_loss(rendered, self.spectrum[rows], self.config.ssim_weight)
 
     def record(self, loss: Tensor) -> Record:
         return super().record(loss) | {"n_primitives": self.config.n_primitives}

@@ -81,7 +81,7 @@ class Monitor:
         receiver_names: Names of the receivers; none for spectra.
         reference: Innovations (n,) of spectra of the unchanged scene. Defaults to the first measurements.
         false_alarm_rate: False alarms a measurement, over all regions and receivers together.
-        n_regions: Maximum number of regions.
+        n_regions: Maximum number of regions, which are no more than a tenth of the positions, or than the different ones.
 
     Raises:
         InputError: A rate outside (0, 1).
@@ -107,7 +107,7 @@ class Monitor:
         n_regions: int = N_REGIONS,
     ) -> None:
         self.false_alarm_rate, self.receiver_names = false_alarm_rate, tuple(receiver_names)
-        n_regions = min(n_regions, max(1, len(position) // 10))
+        n_regions = min(n_regions, max(1, len(position) // 10), len(position.unique(dim=0)))
         self.centre = torch.from_numpy(kmeans2(position.double().numpy(), n_regions, seed=0, minit="++")[0])
         self.reference = torch.zeros(0, dtype=torch.float64) if reference is None else reference.double()
         n_series = (1 + n_regions) * (2 * len(self.receiver_names) or 1)
@@ -119,13 +119,23 @@ class Monitor:
     def of(
         cls, model: FieldModel | RssiModel, train: Spectra | Rssi | None = None, false_alarm_rate: FalseAlarmRate = 1e-4
     ) -> Monitor:
-        """Return the monitor of a fitted model. Its training spectra, in their order, give the reference."""
+        """Return the monitor of a fitted model. Its training spectra, in their order, give the reference.
+
+        Raises:
+            InputError: As `FieldModel.check_measurements`, or training spectra at other positions than those of the model.
+        """
         if isinstance(model, RssiModel):
             return cls(model.region(), model.receiver_names, None, false_alarm_rate)
         reference = None
         if isinstance(train, Spectra):
             model.check_measurements(train)
             if isinstance(model, ProcessModel):  # it can forget spectra: each fifth is predicted without itself
+                known = model.region()
+                if known.shape != train.position.shape or not torch.allclose(known, train.position, rtol=0, atol=1e-3):
+                    raise InputError(
+                        f"{train.name} does not have the positions of the {len(known)} spectra that the model has "
+                        "learnt; give these spectra in their order"
+                    )
                 order = torch.randperm(len(train), generator=torch.Generator().manual_seed(0))
                 parts = [score(model.forget(rows), train.subset(rows)) for rows in order.chunk(N_FOLDS)]
                 reference = torch.cat([part.innovation[:, 0] for part in parts])[order.argsort()]
@@ -268,8 +278,10 @@ class Follower:
         """Score one measurement, test it for a change, and learn it.
 
         Raises:
-            InputError: As `update`.
+            InputError: Any other number of measurements, or as `update`.
         """
+        if len(new) != 1:
+            raise InputError(f"a step follows one measurement, got {len(new)}; give one after the other")
         scores = score(self.model, new)
         alarms = self.monitor.observe(scores.position[0], scores.innovation[0])
         words, correlation, notices = list(map(self.monitor.describe, alarms)), None, []
@@ -367,12 +379,14 @@ def unexplained(room: GeometryModel, spectra: Spectra) -> Tensor:
 
 
 def joined(parts: list[Spectra]) -> Spectra:
-    """Return the spectra of all parts, of one scene, in memory."""
-    first = parts[0]
+    """Return the spectra of all parts, of one scene, in memory, and their snapshots if all parts have them."""
+    first, channels = parts[0], [part.channel for part in parts if part.channel is not None]
     return Spectra(
         torch.cat([part.store[:] for part in parts]),
         torch.cat([part.position for part in parts]),
         grid=first.grid,
         name=first.name,
+        channel=torch.cat(channels) if len(channels) == len(parts) else None,
+        frequency_hz=first.frequency_hz,
         **vars(Link.from_spectra(first)),
     )

@@ -19,6 +19,7 @@ from swiftwrf.data.spectra import Spectra
 from swiftwrf.models.base import FieldModel
 from swiftwrf.models.process import ProcessModel
 from swiftwrf.rssi.base import RssiPredictor
+from swiftwrf.runtime.validation import PositiveInt, checked
 
 LEVEL = 0.8  # nominal coverage of the intervals
 # standard deviations per measurement that a series may exceed its mean; detects changes of twice as much
@@ -102,7 +103,8 @@ def learnt(model: Model, new: Spectra | Rssi) -> Model:
     return found
 
 
-def prequential(model: Model, new: Spectra | Rssi, batch: int = 1) -> tuple[Scores, Model]:
+@checked
+def prequential(model: Model, new: Spectra | Rssi, batch: PositiveInt = 1) -> tuple[Scores, Model]:
     """Score measurements in order, each before the model learns it.
 
     Args:

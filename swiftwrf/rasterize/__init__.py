@@ -22,7 +22,6 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.errors import InputError
 from swiftwrf.rasterize import cuda, operators, reference
-from swiftwrf.rasterize.operators import magnitude
 from swiftwrf.runtime.validation import check_value
 
 Backend = Literal["auto", "reference", "cpu", "cuda"]
@@ -69,9 +68,7 @@ def rasterize(
     """
     if not _fast(mean, cholesky, weight, backend, cutoff):
         return reference.field(mean, cholesky, weight, grid, cutoff)
-    n_position, n = mean.shape[:-2].numel(), mean.shape[-2]  # all positions in one leading dimension
-    factor = cholesky.reshape(n_position, n, 3) if cholesky.dim() > 2 else cholesky
-    rendered = operators.field(mean.reshape(n_position, n, 2), factor, weight.reshape(n_position, n, 2), grid, cutoff)
+    rendered = operators.field(*_one_batch(mean, cholesky, weight), grid, cutoff)
     return rendered.reshape(*mean.shape[:-2], 2, *grid.shape)
 
 
@@ -97,7 +94,17 @@ def rasterize_magnitude(
         >>> round(spectrum[0, 0].item(), 3)
         1.0
     """
-    return magnitude(rasterize(mean, cholesky, weight, grid, backend, cutoff))
+    if mean.device.type == "cuda" and _fast(mean, cholesky, weight, backend, cutoff):
+        rendered = operators.field_magnitude(*_one_batch(mean, cholesky, weight), grid, cutoff)
+        return rendered.reshape(*mean.shape[:-2], *grid.shape)
+    return operators.magnitude(rasterize(mean, cholesky, weight, grid, backend, cutoff))
+
+
+def _one_batch(mean: Tensor, cholesky: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the primitives with all positions in one leading dimension."""
+    n_position, n = mean.shape[:-2].numel(), mean.shape[-2]
+    factor = cholesky.reshape(n_position, n, 3) if cholesky.dim() > 2 else cholesky
+    return mean.reshape(n_position, n, 2), factor, weight.reshape(n_position, n, 2)
 
 
 @lru_cache

@@ -171,10 +171,29 @@ def kernels(device: torch.device) -> Kernels:
 
 def field(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None) -> Tensor:
     """Return real and imaginary part of the field, (B, 2, n_elevation, n_azimuth); see `operators.field`."""
+    rendered = mean.new_empty(mean.shape[0], 2, *grid.shape)
+    _render(mean, cholesky, weight, grid, cutoff, rendered, None)
+    return rendered
+
+
+def magnitude(
+    mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None, keep_field: bool
+) -> tuple[Tensor, Tensor | None]:
+    """Return |A|, (B, n_elevation, n_azimuth), and with `keep_field` the field, else None."""
+    rendered = mean.new_empty(mean.shape[0], *grid.shape)
+    field = mean.new_empty(mean.shape[0], 2, *grid.shape) if keep_field else None
+    _render(mean, cholesky, weight, grid, cutoff, field, rendered)
+    return rendered, field
+
+
+def _render(
+    mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None,
+    field: Tensor | None, magnitude: Tensor | None,
+) -> None:  # fmt: skip
+    """Write into `field` and `magnitude`."""
     batch, n = mean.shape[:2]
-    rendered = mean.new_empty(batch, 2, *grid.shape)
     if not batch:
-        return rendered
+        return
     mean, cholesky, weight = _aligned(mean, cholesky, weight)
     common = n, cholesky.dim() == 3, _grid(grid), _cutoff(cutoff)
     across, down = -(-grid.n_azimuth // TILE_COLUMNS), -(-grid.n_elevation // TILE_ROWS)
@@ -184,14 +203,17 @@ def field(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cut
     if n:
         launch("find_reach", batch * -(-words // WARPS_PER_BLOCK), THREADS_PER_BLOCK, mean, cholesky, reached, *common)
     blocks = -(-batch * across * down // WARPS_PER_BLOCK)
-    launch("rasterize", blocks, THREADS_PER_BLOCK, mean, cholesky, weight, reached, rendered, batch, *common)
-    return rendered
+    launch("rasterize", blocks, THREADS_PER_BLOCK, mean, cholesky, weight, reached, field, magnitude, batch, *common)
 
 
 def field_gradients(
-    grad: Tensor, mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the gradients of mean, factor and weight for a gradient (B, 2, n_elevation, n_azimuth) of the field."""
+    grad: Tensor, mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None,
+    field: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Return the gradients of mean, factor and weight for a gradient (B, 2, n_elevation, n_azimuth) of the field.
+
+    With `field` it is one (B, n_elevation, n_azimuth) of its magnitude.
+    """
     grad, mean, cholesky, weight = _aligned(grad, mean, cholesky, weight)
     batch, n = mean.shape[:2]
     d_mean, d_weight, d_cholesky = torch.empty_like(mean), torch.empty_like(weight), cholesky.new_empty(batch, n, 3)
@@ -201,7 +223,7 @@ def field_gradients(
         per_warp = min(-(-n // warps), THREADS_PER_WARP)
         kernels(mean.device).launch(
             "rasterize_backward", batch * -(-n // (warps * per_warp)), warps * THREADS_PER_WARP,
-            grad, mean, cholesky, weight, d_mean, d_cholesky, d_weight,
+            grad, field, mean, cholesky, weight, d_mean, d_cholesky, d_weight,
             n, per_warp, cholesky.dim() == 3, _grid(grid), _cutoff(cutoff),
         )  # fmt: skip
     return d_mean, d_cholesky if cholesky.dim() == 3 else d_cholesky.sum(0), d_weight

@@ -26,7 +26,7 @@ from swiftwrf.positions import check_positions, to_tensor
 from swiftwrf.rssi.detection import Detection
 from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation, receiver_floors
 from swiftwrf.runtime.checkpoint import Header, Saved
-from swiftwrf.runtime.threads import parallel_map, to_device
+from swiftwrf.runtime.threads import to_device
 from swiftwrf.runtime.validation import (
     Configured,
     NonNegativeInt,
@@ -39,13 +39,6 @@ from swiftwrf.runtime.validation import (
 
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 RECEIVER_POSITIONS = "positions of the receivers"
-
-
-def map_threads(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
-    """Apply a function to items as `map` does, in as many threads as torch has."""
-    waiting, n_items = list(items), 4 * torch.get_num_threads()  # starting threads costs milliseconds
-    for start in range(0, len(waiting), n_items):
-        yield from parallel_map(function, waiting[start : start + n_items])
 
 
 @configuration
@@ -91,8 +84,6 @@ class RssiPredictor(Configured, Displayed, ABC):
     """whether the positions of the receivers must be known"""
     slow: ClassVar[bool] = False
     """whether a fit takes minutes, so that it is compared only on request"""
-    max_map_predictions: ClassVar[int] = 2**22
-    """predictions of a map at all receivers if its cells are not given"""
     batch_size: ClassVar[int] = 512
     """positions evaluated at a time, few enough to stay in the processor's cache"""
 
@@ -150,9 +141,9 @@ class RssiPredictor(Configured, Displayed, ABC):
         """
         pool = pool or train
         if (detected := int(train.detected.sum())) < MIN_TRAINING:
-            names = ", ".join(train.receiver_names)
             raise InputError(
-                f"{names}: detected in {detected} training rows in all; at least {MIN_TRAINING} are needed"
+                f"receivers {listed(train.receiver_names)} have {detected} training measurements in all; measure at least "
+                f"{MIN_TRAINING}"
             )
         more = set(train.receiver_names) <= set(pool.receiver_names)
         if not more or not torch.equal(pool.transmitter_position, train.transmitter_position):
@@ -227,10 +218,6 @@ class RssiPredictor(Configured, Displayed, ABC):
         """Add checked rows to this copy."""
         raise InputError(f"a predictor {self.name} cannot be updated; fit it again to all rows")
 
-    def region(self) -> Tensor:
-        """Return the training positions (n, 3) [m], whose box a map covers."""
-        raise NotImplementedError
-
     @abstractmethod
     def _fit(self, train: Rssi, *, pool: Rssi, shift: Tensor, curve: Detection | None, **arguments: Any) -> None:
         """Fit to checked data.
@@ -280,14 +267,18 @@ class RssiPredictor(Configured, Displayed, ABC):
             InputError: As `check_measurements`.
         """
         self.check_measurements(data)
-        return self.predict(data.transmitter_position)
+        return self.predict(data.about(self.origin).transmitter_position)
 
     @checked
-    def predict_detection(self, position: Numbers) -> Tensor:
+    def predict_detection(self, position: Numbers, offset_db: Tensor | float = 0.0) -> Tensor:
         """Return the probability that each receiver detects a packet, float64 (n, R), at positions (n, 3) [m].
 
         A predictor without a probability has 1 where its mean is above the limit of detection, else 0. All is 1 if every
         cell of the training rows has a value.
+
+        Args:
+            position: Positions of the transmitter, tensor or array (n, 3) [m].
+            offset_db: Offset of the transmitter relative to the reference of `offsets`, one number or (n, 1) [dB].
 
         Raises:
             InputError: As `predict`.
@@ -298,7 +289,7 @@ class RssiPredictor(Configured, Displayed, ABC):
             torch.Size([1, 12])
         """
         with torch.no_grad():
-            mean = self.predict(position).mean.double()
+            mean = self.predict(position).mean.double() + offset_db
         return torch.ones_like(mean) if self.detection is None else (mean > self.detection.limit).double()
 
     def _facts(self) -> dict[str, str]:
@@ -312,7 +303,14 @@ class RssiPredictor(Configured, Displayed, ABC):
 
 
 class SavedRssiPredictor(RssiPredictor, Saved):
-    """Base class of predictors that one file stores."""
+    """Base class of predictors that one file stores, and that have maps: a region and a standard deviation."""
+
+    max_map_predictions: ClassVar[int] = 2**22
+    """predictions of a map at all receivers if its cells are not given"""
+
+    @abstractmethod
+    def region(self) -> Tensor:
+        """Return the training positions (n, 3) [m], whose box a map covers."""
 
     def _header(self) -> Header:
         """Return the plain values that files of all these predictors contain."""

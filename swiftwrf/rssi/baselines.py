@@ -19,6 +19,7 @@ from torch import Tensor, from_numpy
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.data import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
+from swiftwrf.errors import InputError
 from swiftwrf.models.base import CPU, FieldConfig
 from swiftwrf.rssi.base import Map, RssiPredictor, columns_of
 from swiftwrf.rssi.comparison import make_predictor
@@ -261,6 +262,10 @@ class Blend(RssiPredictor):
             return unfitted.fit(train.subset(rows), pool=pool.subset(rows), device=device, parallel=parallel)
 
         names = [name for name in self.config.members if not RSSI_PREDICTORS[name].lacking(train)]
+        if not names:
+            raise InputError(
+                f"no member of {self.name} can be fitted to {train.name}; name others, got {self.config.members}"
+            )
         fold = folds(train.transmitter_position, self.config.validation, self.config.seed, session=train.session)
         held_out = torch.full((len(names), *train.rssi_dbm.shape), torch.nan, dtype=torch.float64)
         for number in fold.unique():

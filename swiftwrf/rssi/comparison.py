@@ -20,14 +20,14 @@ from swiftwrf.data.splits import MIN_TRAINING, Validation
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import method_summary
 from swiftwrf.models.prediction import Prediction
-from swiftwrf.positions import distance
+from swiftwrf.positions import distance, nearest
 from swiftwrf.rssi.base import Map, RssiPredictor
 from swiftwrf.rssi.mixing import LEVEL
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.offsets import estimate_offsets
 from swiftwrf.rssi.pairs import PairModel
 from swiftwrf.rssi.paper import RssiPaperModel
-from swiftwrf.runtime.validation import Preset, checked
+from swiftwrf.runtime.validation import Fraction, Preset, checked
 
 Values = dict[str, Any]
 Keep = Callable[[str, Callable[[], tuple[RssiPredictor | None, Values]]], Values]
@@ -62,11 +62,16 @@ def compared(data: Rssi, also: Sequence[str] = ()) -> tuple[list[str], dict[str,
         data: RSSI.
         also: Names of predictors that are compared only when named.
 
+    Raises:
+        InputError: An unknown name.
+
     Example:
         >>> import swiftwrf
         >>> compared(swiftwrf.rssi_room(n=20))[0]
         ['swiftwrf', 'mean', 'mri_pooled', 'mri_receiver', 'knn', 'mri_residual', 'gp']
     """
+    for name in also:
+        RSSI_PREDICTORS.check(name)
     asked = [name for name in RSSI_PREDICTORS if RSSI_PREDICTORS[name].compared(data) or name in also]
     left_out = {name: reason for name in asked if (reason := RSSI_PREDICTORS[name].lacking(data))}
     return [name for name in asked if name not in left_out], left_out
@@ -110,7 +115,7 @@ class RssiComparison:
         """Errors, a row for each method and detected pair of test row and receiver."""
         test, (row, column) = self.test, self._pairs
         measured = test.rssi_dbm[row, column]
-        from_training = distance(test.transmitter_position, self.train.transmitter_position).amin(dim=1)[row]
+        from_training = nearest(test.transmitter_position, self.train.transmitter_position, 1)[0][row, 0]
         from_receiver = distance(test.transmitter_position, test.receiver_position)[row, column]
         rows = []
         for name in self.values:
@@ -195,7 +200,7 @@ def compare(
     reference: str | None = None,
     not_detected: NotDetected = "auto",
     validation: Validation | Literal["auto"] = "auto",
-    fewer: Sequence[float] = (),
+    fewer: Sequence[Fraction] = (),
     device: torch.device | str = "cpu",
     parallel: Map | None = None,
     keep: Keep | None = None,
@@ -221,7 +226,7 @@ def compare(
         progress: Show a progress bar on a terminal.
 
     Raises:
-        InputError: Unknown receivers or split, no test row that a receiver detects, or too few rows.
+        InputError: Unknown receivers, split or predictors, no test row that a receiver detects, or too few rows.
 
     Example:
         >>> import swiftwrf
@@ -255,7 +260,7 @@ def compare(
         if rows is None:
             predictors[name], detected = predictor, test.detected
             if predictor.detection is not None and not bool(detected.all()) and not test.receiver_moves:
-                above = predictor.predict_detection(test.transmitter_position) > 0.5
+                above = predictor.predict_detection(test.transmitter_position, offset) > 0.5
                 found = float(above[detected].double().mean()), float((~above)[~detected].double().mean())
         std = None if prediction.std is None else prediction.std[test.detected]
         error = (prediction.mean + offset - test.rssi_dbm)[test.detected].abs()

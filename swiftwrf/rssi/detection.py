@@ -58,7 +58,7 @@ class Detection:
 
         Args:
             position: Positions of the rows, (n, 3) [m].
-            rssi: Measurements (n, R) [dBm], nan where not detected.
+            rssi: Measurements (n, R) [dBm], nan where not detected; at least one value.
 
         Returns:
             The curve; None if every cell has a value. With fewer than 5 empty cells beside values the limit is the lowest
@@ -73,20 +73,19 @@ class Detection:
         """
         if bool(rssi.isfinite().all()) or len(position) < 2:
             return None
-        is_limit = rssi.isnan().any(dim=0)
+        is_limit, lowest = rssi.isnan().any(dim=0), float(rssi[~rssi.isnan()].min())
         position, rssi = subsample(position, rssi, rows=MAX_ROWS)
         seen = ~rssi.isnan()
         number = Neighbours(position)(position, min(NEIGHBOURS + 1, len(position)))[1]
         near = rssi[number].masked_fill((number == torch.arange(len(rssi))[:, None])[..., None], torch.nan)  # (n, 7, R)
         level, usable = near.nanmean(dim=1), (~near.isnan()).sum(dim=1) >= FEWEST
-        lowest = float(rssi[seen].min())
         missed = torch.full((rssi.shape[1],), MISSED, dtype=torch.float64)
         if int((usable & ~seen).sum()) < 5 or int((usable & seen).sum()) < 5:
             return cls(lowest, 0.5, missed, is_limit)
         value, kept_level, lost_level = rssi[usable & seen], level[usable & seen], level[usable & ~seen]
         spread, share = 1.25 * float((value - kept_level).abs().mean()), len(value) / int(usable.sum())
         value, lost_level = (subsample(v.sort().values, rows=MAX_CELLS)[0] for v in (value, lost_level))
-        limit = torch.linspace(lowest - 0.5, float(value.median()), 30).double()[:, None, None, None]
+        limit = torch.linspace(float(rssi[seen].min()) - 0.5, float(value.median()), 30).double()[:, None, None, None]
         width = torch.tensor([0.5, 1, 2, 3, 5, 8]).double()[:, None, None]
         misses = torch.tensor([MISSED, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3]).double()[:, None]
         kept = (torch.special.log_ndtr((value - limit) / width) + (-misses).log1p()).mean(dim=-1)
@@ -178,7 +177,8 @@ class DetectionField:
             share[part.out] = own + part.weight @ (value[part.kept] - own)
         known = level.isfinite()
         features = torch.stack([(level - limit) / 10, share], dim=-1)[known]
-        some = subsample(features, detected[known], rows=MAX_CELLS * 20)
+        detected, order = detected[known].sort(stable=True)  # the first and the last cell, one of each kind, are kept
+        some = subsample(features[order], detected, rows=MAX_CELLS * 20)
         found = LogisticRegression(C=100.0).fit(some[0].numpy(), some[1].numpy())
         weight = torch.tensor([*found.intercept_, *found.coef_[0]], dtype=torch.float64)
         return cls(process, mean, limit, weight)

@@ -17,7 +17,8 @@ from swiftwrf.data.rssi import receiver_row
 from swiftwrf.errors import InputError, listed
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Axes, Displayed, corners_of, hatch, plan_map
-from swiftwrf.rssi.base import RssiPredictor
+from swiftwrf.positions import to_tensor
+from swiftwrf.rssi.base import SavedRssiPredictor
 
 CELLS = 120  # of a map, along its longer side
 MAX_CELLS = 2**22
@@ -53,7 +54,7 @@ class RssiMap(Labelled, Displayed):
     @classmethod
     def predict(
         cls,
-        model: RssiPredictor,
+        model: SavedRssiPredictor,
         cell: float | None = None,
         height: float | None = None,
         region: Numbers | None = None,
@@ -67,7 +68,7 @@ class RssiMap(Labelled, Displayed):
             region: Positions (n, 2 or 3) [m]. Defaults to the training positions and the known positions of receivers.
 
         Raises:
-            InputError: A cell that is not positive, or a map of more than 2^22 cells.
+            InputError: A cell that is not positive, a region of no or other positions, or a map of more than 2^22 cells.
 
         Example:
             >>> import swiftwrf
@@ -78,7 +79,12 @@ class RssiMap(Labelled, Displayed):
         known, receiver = model.region(), model.receiver_position
         if region is None:
             region = torch.cat([known, receiver[receiver.isfinite().all(dim=1)]])
-        corner = np.asarray(region, dtype=np.float64)[:, :2]
+        sides = 2 if np.ndim(region) == 2 and np.shape(region)[1] == 2 else 3
+        corner = to_tensor("region", region, torch.float64, (None, sides)).numpy()[:, :2]
+        if not len(corner):
+            raise InputError(
+                "a region needs at least one position, got none; leave it out for that of the training rows"
+            )
         low, high = corner.min(axis=0), corner.max(axis=0)
         if cell is None:
             n_cells = min(CELLS, math.isqrt(model.max_map_predictions // len(model.receiver_names)))

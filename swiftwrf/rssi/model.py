@@ -8,6 +8,7 @@ directivity_r a few harmonics of the direction from the receiver, and w_r the mi
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from functools import partial
 from typing import Any, ClassVar, Self
@@ -23,7 +24,7 @@ from swiftwrf.models.base import CPU
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Axes
 from swiftwrf.positions import check_positions
-from swiftwrf.rssi.base import Map, RssiConfig, SavedRssiPredictor, columns_of, map_threads
+from swiftwrf.rssi.base import Map, RssiConfig, SavedRssiPredictor, columns_of
 from swiftwrf.rssi.detection import Detection, DetectionField
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
 from swiftwrf.rssi.maps import RssiMap
@@ -35,7 +36,7 @@ from swiftwrf.rssi.training import MAX_KERNEL_RECEIVERS, RssiTraining, prepare
 from swiftwrf.runtime import checkpoint as files
 from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.progress import progress_bar
-from swiftwrf.runtime.threads import single_thread
+from swiftwrf.runtime.threads import parallel_map, single_thread
 from swiftwrf.runtime.validation import checked
 
 FIELD_ALONE = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)  # mixing weights
@@ -118,7 +119,7 @@ class RssiModel(SavedRssiPredictor):
         task = partial(fit_receiver, data=training, config=self.config, device=device)
         parts = [slice(r, r + 1) for r in range(len(training.receiver_names))]
         with progress_bar(progress) as bar:
-            fits = (parallel or map_threads)(task, parts)
+            fits = (parallel or _in_threads)(task, parts)
             results = list(bar.track(fits, total=len(parts), description="receivers"))
         return {name: torch.cat([result[name] for result in results]) for name in results[0]}
 
@@ -169,7 +170,7 @@ class RssiModel(SavedRssiPredictor):
 
         self.n_primitives, self.kernel, self.mixing_weight = training.n_primitives, training.kernel, weight
         self.centre, loss = training.centre, training.path_loss
-        self.middle, self.detection = loss.centre, loss.detection
+        self.middle, self.detection = loss.middle, loss.detection
         self.level = mixed(found["level"], training.baselines.level)
         self.slope = mixed(found["slope"], training.baselines.slope)
         self.directivity = (weight[0] * found["directivity"]).float()
@@ -179,17 +180,15 @@ class RssiModel(SavedRssiPredictor):
         if self.detection is not None:
             level = found["held_out"].T.where(~found["held_out"].T.isnan(), training.baseline_held_out[0])
             seen = ~training.rssi.isnan()
-            bins = training.position, seen, training.fold, level
+            bins = training.position, seen, training.fold, level + training.shift
             self.detection_field = DetectionField.fit(training.kernel, *bins, self.detection.limit)
         rows = {name: found[name].T for name in ("dual", "tangent", "variance")}
-        prior = {name: found[name] for name in ("prior_level", "prior_slope")}
+        prior = {name: found[name] for name in ("prior_level", "prior_slope", "prior_std")}
         state = FitState(
             **rows,
             **prior,
             measured=(~training.rssi.isnan()).to(training.rssi),
             middle=self.middle.clone(),
-            level_std=found["prior_std"][:, 0].clone(),
-            slope_std=found["prior_std"][:, 1].clone(),
             field_variance=training.field_db.square(),
             noise_variance=training.noise_db.square(),
         )
@@ -243,8 +242,9 @@ class RssiModel(SavedRssiPredictor):
     def with_chosen_kernel(self, without: Tensor | None = None) -> Self:
         """Return the model fitted again to all rows that it has learnt, with kernel, noise and mixing weights chosen again.
 
-        The rows follow from their residuals. Attenuation of floors and offsets stay as fitted. Rows that were averaged in
-        location bins are bins here, so that the scatter of single measurements is unknown: standard deviations stay, too.
+        The rows follow from their residuals, the attenuation of floors is estimated again, and offsets stay as fitted. Rows
+        that were averaged in location bins are bins here, so that the scatter of single measurements is unknown: standard
+        deviations stay, too.
 
         Args:
             without: Numbers of rows that are forgotten first, in the order in which the model received them, int64. Defaults
@@ -264,17 +264,19 @@ class RssiModel(SavedRssiPredictor):
         kept = torch.ones(len(posterior.anchor), dtype=torch.bool)
         if without is not None:
             kept[without] = False
+        at, rssi, attenuation = self.region()[kept], posterior.rssi[kept], self.attenuation
         rows = Rssi(
-            posterior.rssi[kept],
-            self.region()[kept],
+            rssi if attenuation is None else rssi + attenuation.of(at),
+            at,
             receiver_position=self.receiver_position,
             receiver_names=self.receiver_names,
             origin=self.origin,
+            floors=None if attenuation is None else attenuation.floors,
         )
         # the rows have lost their sessions
         validation = "block" if self.config.validation == "session" else self.config.validation
         model = type(self)(replace(self.config, validation=validation)).fit(rows)
-        model.attenuation, model.offsets = self.attenuation, self.offsets
+        model.offsets = self.offsets
         state = posterior.state
         # a mean of several measurements has a smaller variance than one measurement
         if bool(((state.variance > 0) & (state.variance < 0.99 * state.noise_variance)).any()):
@@ -313,15 +315,16 @@ class RssiModel(SavedRssiPredictor):
         if self.detection is None or self.detection_field is None:
             return prediction
         assert prediction.std is not None
-        mean, std = self.detection.given_detection(prediction.mean.double(), prediction.std.double())
-        return replace(prediction, mean=mean.float(), std=std.float())
+        offset = 0.0 if self.offsets is None else self.offsets.of(data)[:, None]
+        mean, std = self.detection.given_detection(prediction.mean.double() + offset, prediction.std.double())
+        return replace(prediction, mean=(mean - offset).float(), std=std.float())
 
     @checked
-    def predict_detection(self, position: Numbers) -> Tensor:
+    def predict_detection(self, position: Numbers, offset_db: Tensor | float = 0.0) -> Tensor:
         if self.detection_field is None:
-            return super().predict_detection(position)
+            return super().predict_detection(position, offset_db)
         with torch.no_grad():
-            level = self.predict(position).mean.double()
+            level = self.predict(position).mean.double() + offset_db
         return self.detection_field.probability(level, check_positions(position) - self.centre)
 
     def plot(self, receiver: str | None = None, height_m: float | None = None, ax: Axes | None = None) -> Axes:
@@ -394,6 +397,13 @@ def fit_rssi(train: Rssi, config: RssiConfig | None = None, **options: Any) -> R
     return RssiModel(config).fit(train, **options)
 
 
+def _in_threads(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
+    """Apply a function to items as `map` does, in as many threads as torch has."""
+    waiting, n_items = list(items), 4 * torch.get_num_threads()  # starting threads costs milliseconds
+    for start in range(0, len(waiting), n_items):
+        yield from parallel_map(function, waiting[start : start + n_items])
+
+
 def _shapes(n_receivers: int, n_anchors: int) -> dict[str, tuple[int, ...]]:
     """Return the shape of every saved tensor."""
     per_receiver = dict.fromkeys(("level", "slope", "middle", "field_db", "noise_db"), (n_receivers,))
@@ -417,9 +427,10 @@ def _held_out_predictors(training: RssiTraining, found: dict[str, Tensor]) -> tu
     """
     field = found["held_out"].T.where(~training.rssi.isnan(), torch.nan)
     predictors = torch.cat([field[None], training.baseline_held_out])
-    prior_db, middle = (training.field_db, training.noise_db), training.path_loss.centre
+    prior_db, middle = (training.field_db, training.noise_db), training.path_loss.middle
     std = held_out_std(training, training.kernel, prior_db, middle, found["covariance"])
     if (detection := training.path_loss.detection) is not None:
-        given = [detection.given_detection(mean, std) for mean in predictors]
-        predictors, std = torch.stack([mean for mean, _ in given]), given[0][1].where(~field.isnan(), std)
+        given = [detection.given_detection(mean + training.shift, std) for mean in predictors]
+        predictors = torch.stack([mean for mean, _ in given]) - training.shift
+        std = given[0][1].where(~field.isnan(), std)
     return predictors, std

@@ -77,6 +77,9 @@ def estimate_floor_attenuation(train: Rssi, pool: Rssi | None = None) -> FloorAt
         train: Training rows with floors.
         pool: The same rows at more receivers, which determine the attenuation. Defaults to `train`.
 
+    Raises:
+        InputError: Rows without floors.
+
     Example:
         >>> import pandas as pd
         >>> table = pd.DataFrame({"x": [0.0, 5, 9] * 4, "y": 0.0, "floor": [0] * 6 + [1] * 6})
@@ -85,7 +88,8 @@ def estimate_floor_attenuation(train: Rssi, pool: Rssi | None = None) -> FloorAt
         15
     """
     pool = pool or train
-    assert train.floors is not None
+    if train.floors is None:
+        raise InputError(f"{train.name} has no floors; give the table a column with the floor of each row")
     where = receiver_floors(pool)
     crossed = (train.floors.number(train.transmitter_position)[:, None] - where).abs().double()
     strongest = pool.rssi_dbm.nan_to_num(-torch.inf).topk(min(3, len(pool)), dim=0).indices
@@ -122,7 +126,7 @@ def estimate_offsets(train: Rssi, reference: str | None = None) -> Offsets:
         reference: Group with offset 0. Defaults to the most frequent one.
 
     Raises:
-        InputError: Rows without groups, one group only, or an unknown reference.
+        InputError: Rows without a group, one group only, or an unknown reference.
 
     Example:
         >>> import swiftwrf
@@ -137,6 +141,9 @@ def estimate_offsets(train: Rssi, reference: str | None = None) -> Offsets:
     groups = train.groups
     if groups is None:
         raise InputError(f"{train.name} has no groups; read it with offset_by")
+    if groups.isna().any():
+        row = int(groups.isna().to_numpy().argmax())
+        raise InputError(f"{train.name} has no {groups.name} in row {row}; name the group of each row, or leave it out")
     names, code = groups.cat.categories.tolist(), torch.tensor(groups.cat.codes.to_numpy()).long()
     frequency = code.bincount(minlength=len(names))
     if int((frequency > 0).sum()) < 2:

@@ -9,6 +9,7 @@ known places are predicted, they depend on the place, by a ridge regression.
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -161,7 +162,8 @@ class PairPredictor(RssiPredictor):
         """Predict the RSSI where it is measured; nan elsewhere, which saves time where a row has few receivers."""
         self.check_measurements(data)
         row, column = data.detected.nonzero(as_tuple=True)
-        found = self.predict_pairs(data.transmitter_position[row], self.receiver_position[column])
+        position = data.about(self.origin).transmitter_position
+        found = self.predict_pairs(position[row], self.receiver_position[column])
 
         def spread(values: Tensor) -> Tensor:
             return torch.full(data.rssi_dbm.shape, torch.nan).double().index_put((row, column), values.double())
@@ -329,6 +331,8 @@ class PairModel(PairPredictor, SavedRssiPredictor):
         model = cls._of_header(header)
         model.kernel, (ratio, reciprocal) = Kernel(**header["kernel"]), header["metric"]
         model.metric = Metric(float(ratio), bool(reciprocal))
+        if not (0 < model.metric.ratio < math.inf and model.receiver_position.isfinite().all()):
+            raise InputError("its metric or a position of its receivers is not finite")
         n_pairs, n_places = len(tensors["pair"]), len(tensors["place"])
         shapes = {"pair": (n_pairs, 6), "residual": (n_pairs,), "scale_db": (1,)}
         files.expect(tensors, shapes | {"path_loss": (2,), "place": (n_places, 3), "correction": (n_places, 2)})

@@ -121,7 +121,7 @@ class PathLosses(NamedTuple):
     Args:
         own: Model of each receiver, (R,); that of all receivers where a receiver has no measurements.
         shared: Model of all receivers of its kind, of known or of unknown position, (R,).
-        centre: log10 of the distance at which levels are compared, (R,); 0 for a receiver of unknown position.
+        middle: log10 of the distance at which levels are compared, (R,); 0 for a receiver of unknown position.
         std: Standard deviation of the receivers' level at that distance [dB] and of their slope [dB a decade] about the
             shared ones, with the uncertainty of the latter, (R, 2).
         variance: Variance of the measurements about the receiver's model, (R,) [dB^2].
@@ -131,7 +131,7 @@ class PathLosses(NamedTuple):
 
     own: PathLoss
     shared: PathLoss
-    centre: Tensor
+    middle: Tensor
     std: Tensor
     variance: Tensor
     detection: Detection | None
@@ -141,8 +141,8 @@ class PathLosses(NamedTuple):
         """Return the path loss of some receivers."""
         own, shared = (PathLoss(*(value[number] for value in model)) for model in (self.own, self.shared))
         detection = self.detection and self.detection.columns(number)
-        centre, std, variance, floor_db = (x[number] for x in (self.centre, self.std, self.variance, self.floor_db))
-        return PathLosses(own, shared, centre, std, variance, detection, floor_db)
+        middle, std, variance, floor_db = (x[number] for x in (self.middle, self.std, self.variance, self.floor_db))
+        return PathLosses(own, shared, middle, std, variance, detection, floor_db)
 
 
 @single_thread()
@@ -194,7 +194,7 @@ def fit_path_losses(
         mean, none = rssi.nanmean().repeat(len(receiver)), torch.zeros(len(receiver), dtype=torch.float64)
         # a kind of receivers that measured nothing has the mean of the others
         fields = {"own_level": mean, "shared_level": mean.clone()}
-        fields |= {name: none.clone() for name in ("own_slope", "shared_slope", "centre", "unexplained", "floor_db")}
+        fields |= {name: none.clone() for name in ("own_slope", "shared_slope", "middle", "unexplained", "floor_db")}
         fields["std"] = torch.full((len(receiver), 2), SPREAD_DB, dtype=torch.float64)
         fields["variance"] = torch.full((len(receiver),), SPREAD_DB**2, dtype=torch.float64)
         for kind in (located, ~located):
@@ -205,7 +205,7 @@ def fit_path_losses(
                     fields[name][kind] = value
         own, shared = (PathLoss(fields[f"{of}_level"], fields[f"{of}_slope"] * located) for of in ("own", "shared"))
         std = torch.stack([fields["std"][:, 0], fields["std"][:, 1] * located], dim=1)
-        losses = PathLosses(own, shared, fields["centre"], std, fields["variance"], curve, fields["floor_db"])
+        losses = PathLosses(own, shared, fields["middle"], std, fields["variance"], curve, fields["floor_db"])
         return losses, fields["unexplained"]
 
     found, unexplained = fit(detection)
@@ -227,8 +227,8 @@ def _maximise(
         The fields of `PathLosses` by name, and the share `unexplained` (R,) of empty cells where a value was expected.
     """
     seen, n_receivers = ~rssi.isnan(), rssi.shape[1]
-    centre = distance[seen].mean()
-    feature = torch.stack([torch.ones_like(distance), distance - centre, -crossed], dim=-1)
+    middle = distance[seen].mean()
+    feature = torch.stack([torch.ones_like(distance), distance - middle, -crossed], dim=-1)
     eye, spread = torch.eye(3, dtype=torch.float64), torch.tensor([SPREAD_DB, SPREAD_DB, 1e-3]).double().square()
     (expected, known), of_floor = SLOPE_PRIOR, FLOOR_STD_DB
     certain = torch.tensor([1e-6, known**-2, of_floor**-2], dtype=torch.float64)
@@ -280,14 +280,14 @@ def _maximise(
         share = (other + ROWS_WORTH * other.sum() / (detected + other).sum()) / (detected + other + ROWS_WORTH)
         if bool((distance.std(dim=0) > 0).any()):  # without distances no power is expected anywhere
             unexplained = missed.maximum(share)
-    own_level, shared_level = own[:, 0] - own[:, 1] * centre, shared[0] - shared[1] * centre
+    own_level, shared_level = own[:, 0] - own[:, 1] * middle, shared[0] - shared[1] * middle
     uncertain = (spread + total.inverse().diagonal()).sqrt()
     return {
         "own_level": own_level,
         "own_slope": own[:, 1],
         "shared_level": shared_level.expand(n_receivers),
         "shared_slope": shared[1].expand(n_receivers),
-        "centre": centre.expand(n_receivers),
+        "middle": middle.expand(n_receivers),
         "std": uncertain[:2].expand(n_receivers, 2),
         "floor_db": shared[2].clamp_min(0).expand(n_receivers),
         "variance": variance,

@@ -43,9 +43,8 @@ class FitState:
         measured: 1 where RSSI was measured and not only limited, (n, R).
         prior_level: Prior path-loss model, RSSI at 1 m, (R,) [dBm].
         prior_slope: Its slope, (R,) [dB a decade].
+        prior_std: Prior standard deviation of level [dB] and slope [dB a decade], (R, 2).
         middle: log10 of the distance at which levels are compared, (R,).
-        level_std: Prior standard deviation of the level at that distance, (R,) [dB].
-        slope_std: Prior standard deviation of the slope, (R,) [dB a decade].
         field_variance: Prior variance of the latent field, (R,) [dB^2].
         noise_variance: Variance of one measurement, (R,) [dB^2].
     """
@@ -56,9 +55,8 @@ class FitState:
     measured: Tensor
     prior_level: Tensor
     prior_slope: Tensor
+    prior_std: Tensor
     middle: Tensor
-    level_std: Tensor
-    slope_std: Tensor
     field_variance: Tensor
     noise_variance: Tensor
 
@@ -67,6 +65,7 @@ class FitState:
         """Return the state in the tensors of a file, whose names begin with `fit.`."""
         rows = ("dual", "tangent", "variance", "measured")
         sizes = {field.name: (n_bins, n_receivers) if field.name in rows else (n_receivers,) for field in fields(cls)}
+        sizes["prior_std"] = (n_receivers, 2)
         expect(tensors, {f"fit.{name}": size for name, size in sizes.items()})
         return cls(**{name: tensors[f"fit.{name}"].double() for name in sizes})
 
@@ -164,17 +163,13 @@ class RssiPosterior:
     def _regressors(self, position: Tensor) -> Tensor:
         """Return the scaled regressors of level, slope and directivity at positions (m, 3), float64 (R, m, k)."""
         apart, bearing = log_distance(position, self.receiver), harmonics(position, self.receiver)
-        return regressors(apart, bearing, self.state.middle, self._prior_std)
-
-    @property
-    def _prior_std(self) -> Tensor:
-        return torch.stack([self.state.level_std, self.state.slope_std], dim=1)
+        return regressors(apart, bearing, self.state.middle, self.state.prior_std)
 
     @property
     def linear(self) -> Tensor:
         """Change of level at 1 m, slope and directivity from the prior path-loss model, float64 (R, k) [dB]."""
         coefficient = self._fitted + self.new.gain.mT @ self.new.dual[..., None]
-        change = coefficient[..., 0] * coefficient_scale(self._prior_std)
+        change = coefficient[..., 0] * coefficient_scale(self.state.prior_std)
         return torch.cat([change[:, :1] - change[:, 1:2] * self.state.middle[:, None], change[:, 1:]], dim=1)
 
     def folded(self) -> RssiPosterior:

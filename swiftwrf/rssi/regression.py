@@ -54,7 +54,7 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
     distance = log_distance(data.position, receiver)
     used = (~rssi.isnan() | ~limit.isnan()).nonzero()[:, 0]
     error, dual, tangent, variance = (torch.zeros_like(rssi) for _ in range(4))
-    feature = regressors(distance, harmonics(data.position, receiver), loss.centre, std[None])[0]
+    feature = regressors(distance, harmonics(data.position, receiver), loss.middle, std[None])[0]
     linear, covariance = torch.zeros(feature.shape[1]).double(), std.square().diag()
     if len(used):
         at, weak = data.position[used].to(device), limit[used].isnan().logical_not()
@@ -75,8 +75,8 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
             covariance = std[:, None] * open_ * std  # a slope that is held at 0 is as uncertain as a free one
             slope = float(prior.slope + std[1] * (found[0].cpu() @ feature[used, 1]))
             if slope > 0:
-                middle = prior.level + prior.slope * loss.centre
-                prior, std[1], feature[:, 1] = PathLoss(middle, torch.zeros(1).double()), 0.0, 0.0
+                level = prior.level + prior.slope * loss.middle
+                prior, std[1], feature[:, 1] = PathLoss(level, torch.zeros(1).double()), 0.0, 0.0
                 *found, factor = solved()
             precision, fold = torch.cholesky_inverse(factor), data.fold[used]
             for number in fold.unique():
@@ -90,7 +90,7 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
         linear = dual @ feature * coefficient_scale(std[None])[0]
         error[used] -= target  # prediction less prior
     return {
-        "level": prior.level + linear[0] - linear[1] * loss.centre,
+        "level": prior.level + linear[0] - linear[1] * loss.middle,
         "slope": prior.slope + linear[1],
         "covariance": covariance[None],
         "prior_level": prior.level,

@@ -57,7 +57,8 @@ class RssiTraining(Bins):
         n_primitives: Number of primitives a receiver.
         rendered: Fields of each receiver's head, (R, 2, 2, directions).
         path_loss: Path loss of the receivers, the prior of the fit.
-        limit: Upper limit in each empty cell that has a part in the fit, (n, R) [dBm], nan in all other cells.
+        shift: Received power less RSSI, by floors and offsets that were removed, (n, R) [dB].
+        limit: Upper limit of RSSI in each empty cell that has a part in the fit, (n, R) [dBm], nan in all other cells.
         field_db: Prior standard deviation of the latent field, (R,) [dB].
         noise_db: Standard deviation of one measurement about it, (R,) [dB].
         baselines: Path-loss models of the simple predictors, (3, R): that of each receiver, that of all receivers, and the
@@ -69,6 +70,7 @@ class RssiTraining(Bins):
     n_primitives: int
     rendered: Tensor
     path_loss: PathLosses
+    shift: Tensor
     limit: Tensor
     field_db: Tensor
     noise_db: Tensor
@@ -92,11 +94,11 @@ def prepare(
     bins = binned(train, config)
     rssi, fold, every = bins.rssi, bins.fold, bin_locations(pool, config.max_locations)[1]
     receiver, own = pool.receiver_position.double() - bins.centre, columns_of(train.receiver_names, pool)
-    offset = _bin_means(shift, bins.bin_of_row, len(fold))
+    shift = _bin_means(shift, bins.bin_of_row, len(fold))
 
     def fit_baselines(rows: Tensor, detection: Detection | None) -> tuple[PathLosses, PathLoss]:
         """Fit the simple predictors to some of the bins, the path loss of all receivers of the pool together."""
-        loss = fit_path_losses(bins.position[rows], receiver, every[rows], config.not_detected, offset[rows], detection)
+        loss = fit_path_losses(bins.position[rows], receiver, every[rows], config.not_detected, shift[rows], detection)
         mean = rssi[rows].nanmean(dim=0)
         simple = loss.columns(own)
         level = PathLoss(mean, torch.zeros_like(mean)).where(~mean.isnan(), simple.shared)
@@ -123,7 +125,8 @@ def prepare(
         n_primitives=n_primitives,
         rendered=render(heads),
         path_loss=loss,
-        limit=_limits(rssi, loss, distance, offset[:, own]),
+        shift=shift[:, own],
+        limit=_limits(rssi, loss, distance, shift[:, own]),
         field_db=field_db,
         noise_db=noise_db,
         baselines=baselines,
@@ -131,11 +134,11 @@ def prepare(
     )
 
 
-def _limits(rssi: Tensor, loss: PathLosses, distance: Tensor, offset: Tensor) -> Tensor:
+def _limits(rssi: Tensor, loss: PathLosses, distance: Tensor, shift: Tensor) -> Tensor:
     """Return the upper limit (n, R) [dBm] in each empty cell that neither path loss nor chance explains; nan elsewhere."""
     if loss.detection is None:
         return torch.full_like(rssi, torch.nan)
-    limit = loss.detection.limit - offset
+    limit = loss.detection.limit - shift
     std = (loss.variance + loss.detection.width**2).sqrt()
     z = (limit - loss.own(distance)) / std
     weak = empty_given(z, loss.detection.missed)[1]

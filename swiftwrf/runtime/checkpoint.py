@@ -34,6 +34,16 @@ def write(path: str | Path, kind: str, tensors: dict[str, Tensor], header: Heade
     write_bytes(Path(path), content)
 
 
+def check_folder(path: str | Path, what: str) -> None:
+    """Refuse a file in a folder that does not exist.
+
+    Raises:
+        InputError: There is no such folder; the message names what the file holds.
+    """
+    if not Path(path).parent.is_dir():
+        raise InputError(f"the folder of the {what} {path} does not exist; create it")
+
+
 def read(path: str | Path, *kinds: str) -> tuple[str, dict[str, Tensor], Header]:
     """Return kind, tensors and header of a file of one of the given kinds.
 
@@ -109,7 +119,11 @@ class Saved(ABC):
         Args:
             path: File to write.
             provenance: Additional texts for the header, e.g. data set and commit.
+
+        Raises:
+            InputError: The model is not fitted, or the folder of the file does not exist.
         """
+        check_folder(path, self.kind)
         tensors, header = self.state()
         write(path, self.kind, tensors, header | {"provenance": provenance or {}})
 

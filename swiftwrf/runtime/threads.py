@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import cache
 from typing import Generic, TypeVar
@@ -71,10 +71,11 @@ def to_device(device: torch.device | str) -> torch.device:
         >>> to_device("cpu")
         device(type='cpu')
     """
-    try:
+    found = None
+    with suppress(RuntimeError, TypeError, ValueError):
         found = torch.device(device)
-    except (RuntimeError, TypeError, ValueError):
-        raise InputError(f"device must be a device of torch, cpu or cuda, got {device!r}") from None
+    if found is None or found.type not in ("cpu", "cuda"):
+        raise InputError(f"device must be a device of torch, cpu or cuda, got {str(device)!r}")
     if found.type == "cuda" and (found.index or 0) >= torch.cuda.device_count():
         raise InputError(f"device {found} needs an NVIDIA GPU that torch can use, and there is none; choose cpu")
     return found

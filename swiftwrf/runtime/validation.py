@@ -15,6 +15,7 @@ import types
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, fields, is_dataclass, replace
+from numbers import Integral, Real
 from typing import (
     Annotated,
     Any,
@@ -41,7 +42,7 @@ Preset = Literal["quick", "paper"]
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 Class = TypeVar("Class")
-NUMBERS: dict[type, tuple[type, ...]] = {int: (int,), float: (int, float)}
+NUMBERS = {int: Integral, float: Real}  # NumPy's scalars among them
 LARGEST = {int: 2**63 - 1, float: sys.float_info.max}  # whole number that is accepted
 RANGES: dict[type, tuple[str, str, Callable[[Any, Any], bool]]] = {  # in words, attribute of the bound, comparison
     Ge: ("at least", "ge", operator.ge),
@@ -99,8 +100,8 @@ def _allowed(value: object, annotation: Any) -> bool:
         return isinstance(value, Mapping) and all(all(map(_allowed, item, arguments)) for item in value.items())
     if annotation in NUMBERS:
         is_number = isinstance(value, NUMBERS[annotation]) and not isinstance(value, bool)
-        if isinstance(value, int):
-            return is_number and abs(value) <= LARGEST[annotation]
+        if isinstance(value, Integral):
+            return is_number and abs(int(value)) <= LARGEST[annotation]
         return is_number and not math.isnan(value)  # type: ignore[arg-type]
     if annotation in (None, type(None)):
         return value is None
@@ -149,7 +150,10 @@ def configuration(cls: type[Class]) -> type[Class]:
     def check_fields(self: Any) -> None:
         hints = _hints(cls)  # type: ignore[arg-type]
         for field in fields(self):
-            check_value(field.name, getattr(self, field.name), hints[field.name])
+            value = getattr(self, field.name)
+            check_value(field.name, value, hints[field.name])
+            if isinstance(value, Real) and hasattr(value, "item"):  # NumPy's scalars, which JSON does not store
+                object.__setattr__(self, field.name, value.item())
         if hasattr(self, "check"):
             self.check()
 

@@ -146,7 +146,7 @@ def _studies(result: LocateComparison, by: str) -> list[Row]:
 
 
 def posterior_maps(locator: RssiLocator, train: Rssi, test: Rssi, error: Tensor) -> dict[str, Any]:
-    """Return the posteriors in plan of six test rows, from the smallest error (n,) [m] to the largest."""
+    """Return the posteriors in plan of at most six test rows, from the smallest error (n,) [m] to the largest."""
     shown = error.argsort()[torch.linspace(0, len(error) - 1, min(N_MAPS, len(error))).round().long()]
     posterior = locator.locate(test.rssi_dbm[shown])
     plans = [posterior.in_plan(row) for row in range(len(posterior))]

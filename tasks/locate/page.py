@@ -202,8 +202,9 @@ def _posteriors(run: Records, several: bool) -> Section:
     density = maps["density"].ravel()
     data = DataFrame({"index": index, "x_m": xs.round(3), "y_m": ys.round(3), "relative_density": density.round(4)})
     caption = (
-        "Posteriors of six test rows in plan, from the smallest error to the largest, each relative to its largest mass. "
-        "Cross: true position; dot: estimate; circle: 80 % credible region; small dots: training positions."
+        f"Posteriors of {len(maps['index'])} test rows in plan, from the smallest error to the largest, each relative to "
+        "its largest mass. Cross: true position; dot: estimate; circle: 80 % credible region; small dots: training "
+        "positions."
     )
     plot = Plot(f"posteriors-{run.file_name}", posteriors(maps), caption, data[np.isfinite(density)])
     return Section("", plots=[plot, *([_overview(run, f"overview-{run.file_name}")] if several else [])])

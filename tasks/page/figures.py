@@ -160,15 +160,17 @@ def dots(
         colours: Colours of the series. A single series has one colour and no legend.
         label: Label of the values.
         zero: Whether the line of zero is drawn.
-        log: Whether the axis is logarithmic.
+        log: Whether the axis is logarithmic if all values are positive and the largest is more than ten times the smallest.
     """
     _expect_few(values)
     names = [plain(textwrap.fill(name, NAME)) for name in rows]
     lines = max((name.count("\n") + 1 for name in names), default=1)
     height = 0.27 * max(1.0, 0.55 * len(values), 0.6 * lines)
     figure, axes = panel(5.1, 0.7 + height * len(rows) + (0.2 * len(values) if len(values) > 1 else 0))
+    known = []
     for number, (marker, (name, of_rows)) in enumerate(zip(MARKERS, values.items(), strict=False)):
         value, low, high = np.array(of_rows, dtype=float).reshape(-1, 3).T
+        known += value[np.isfinite(value)].tolist()
         at = np.arange(len(rows)) + 0.2 * (number - (len(values) - 1) / 2)
         error = np.clip(np.nan_to_num([value - low, high - value]), 0, None)
         style: dict[str, Any] = {"color": colour(colours, name), "fmt": marker, "markersize": 5, "elinewidth": 1.4}
@@ -177,13 +179,11 @@ def dots(
         axes.axvline(0, color=RULE, linewidth=1)
     axes.set(yticks=range(len(rows)), yticklabels=names, xlabel=label)
     axes.set_ylim(len(rows) - 0.4, -0.6)
-    if log and any(value > 0 for of_rows in values.values() for value, *_ in of_rows):
+    if log and known and max(known) > 10 * min(known) > 0:
         axes.set_xscale("log")
-        left, right = axes.get_xlim()
         axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_formatter("{x:g}" if right < 10 * left else "")
-        if right >= 10 * left:  # a label a decade would be few
-            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_minor_formatter("")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))  # a label a decade would be few
     axes.grid(axis="y", visible=False)
     if len(values) > 1:
         legend_below(axes)

@@ -39,8 +39,9 @@ def inside(position: ArrayLike, known: ArrayLike) -> NDArray[np.bool_]:
         corners = points[ConvexHull(points).vertices]
         return np.asarray(Delaunay(corners).find_simplex(at) >= 0)
     except (QhullError, ValueError):
-        tree = cKDTree(points)
-        apart = tree.query(points, min(2, len(points)))[0].reshape(len(points), -1)[:, -1]
+        places = np.unique(points, axis=0)
+        tree = cKDTree(places)
+        apart = tree.query(places, min(2, len(places)))[0].reshape(len(places), -1)[:, -1]
         return np.asarray(tree.query(at)[0] <= MIN_REACH * max(float(apart.max()), 1e-6))
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pandas import DataFrame
 
 from swiftwrf import InputError
-from tasks.records import read_json, read_npz, read_table
+from tasks.records import CONFIG, ENVIRONMENT, METRICS, PARTIAL, read_json, read_npz, read_table
 
 
 def notes(run: Records) -> list[str]:
@@ -34,9 +34,9 @@ class Records:
     def __init__(self, folder: Path, metrics: dict[str, Any] | None = None, number: int = 0) -> None:
         self.folder, self.number = folder, number
         if metrics is None:
-            file = folder / "metrics.json"
+            file = folder / METRICS
             if not file.is_file():
-                raise InputError(f"{folder} is no finished run: it has no metrics.json")
+                raise InputError(f"{folder} is no finished run: it has no {METRICS}")
             metrics = read_json(file)
         self.metrics = metrics
         self._tables: dict[str, DataFrame] = {}
@@ -62,12 +62,12 @@ class Records:
     @cached_property
     def config(self) -> dict[str, Any]:
         """Command and configuration."""
-        return read_json(self.folder / "config.json")
+        return read_json(self.folder / CONFIG)
 
     @cached_property
     def environment(self) -> dict[str, Any]:
         """Environment of the run: machine, versions, commit."""
-        return read_json(self.folder / "environment.json")
+        return read_json(self.folder / ENVIRONMENT)
 
     def table(self, name: str) -> DataFrame:
         """One of the run's tables, e.g. `errors`; not to be changed."""
@@ -85,4 +85,4 @@ class Records:
     @property
     def path(self) -> str:
         """Directory of the run as commands take it, also while the run is not finished."""
-        return str(self.folder).removesuffix(".partial")
+        return str(self.folder).removesuffix(PARTIAL)

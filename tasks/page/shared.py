@@ -71,10 +71,8 @@ def errors_section(
     columns = ["method", f"median [{unit}]", f"90 % below [{unit}]", *further, "fit + apply [s]"]
     caption = f"{quantity.capitalize()} on the test rows; medians with their 95 % intervals. {caption}".strip()
     values = {"error": [interval(one.error) for one in short]}
-    medians = [one.error["median"] for one in short if one.error["n"]]
-    spread = max(medians, default=1.0) > 10 * min(medians, default=1.0) > 0
     names = [one.name for one in short]
-    dots = figures.dots(names, values, {"error": MEASURED}, f"median {quantity} [{unit}]", log=spread)
+    dots = figures.dots(names, values, {"error": MEASURED}, f"median {quantity} [{unit}]", log=True)
     figure, axes = figures.panel(5.1, 3.2)
     groups = {one: errors[errors["method"] == one].iloc[:, -1] for one in [*dict.fromkeys([answer.chosen, *names])]}
     limit = max((float(part.quantile(0.9)) for part in groups.values() if len(part)), default=1.0)
@@ -153,9 +151,7 @@ def compared(
     rows = [[name, *(with_interval(of[name]) if name in of else "" for of in short)] for name in methods]
     table = Table(["method", *names], rows, f"Median {quantity} [{unit}] with its 95 % interval.")
     values = {name: [interval(of[name]) if name in of else NONE for of in short] for name in methods[:MAX_CURVES]}
-    medians = [of[name]["median"] for of in short for name in values if name in of]
-    spread = max(medians, default=1.0) > 10 * min(medians, default=1.0) > 0
-    figure = figures.dots(names, values, colours, f"median {quantity} [{unit}]", log=spread)
+    figure = figures.dots(names, values, colours, f"median {quantity} [{unit}]", log=True)
     caption = f"Median {quantity} of each run; whiskers: 95 % intervals."
     plot = Plot("summary", [figure], caption, figures.dots_data("run", names, values, unit.lower()))
     explore = [NextStep(f"Explore run {run.number}", command("view", run.path)) for run in runs]

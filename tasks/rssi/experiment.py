@@ -19,7 +19,7 @@ from swiftwrf.runtime.durable import write_npz
 from tasks.configs import RssiTaskConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
-from tasks.page.maps import read_pixels
+from tasks.page.maps import FloorPlan, read_pixels
 from tasks.page.page import finish
 from tasks.records import MODEL, Row, write_table
 from tasks.rssi.page import answer, page
@@ -88,19 +88,20 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         write_table(directory.path("predictions.csv"), result.predictions.to_dict("records"))
         model = load(directory.path(MODEL))
         assert isinstance(model, RssiModel | PairModel)
-        write_npz(directory.path("maps.npz"), _maps(model, result.train) | plan)
+        write_npz(directory.path("maps.npz"), _maps(model, result.train))
+        if plan is not None:
+            plan.save(directory.folder)
         finish(directory, _metrics(config, data, result, model), page, answer)
 
 
-def _read_floor_plan(config: RssiTaskConfig, data: Rssi) -> dict[str, Any]:
-    """Return the floor plan and its corners as maps.npz stores them, or nothing if there is no plan."""
+def _read_floor_plan(config: RssiTaskConfig, data: Rssi) -> FloorPlan | None:
     if config.floor_plan is None:
-        return {}
+        return None
     if config.floor_extent is None and data.plan_scale is None:
         raise InputError(f"--floor-plan needs --floor-extent x0 x1 y0 y1 [m], since {data.name} is not in its pixels")
     pixels = read_pixels(config.floor_plan, f"--floor-plan {config.floor_plan}")
     height, width = (side / (data.plan_scale or 1.0) for side in pixels.shape[:2])
-    return {"plan": pixels, "plan_extent": np.array(config.floor_extent or (0.0, width, -height, 0.0))}
+    return FloorPlan(pixels, config.floor_extent or (0.0, width, -height, 0.0))
 
 
 def _metrics(config: RssiTaskConfig, data: Rssi, result: RssiComparison, model: RssiModel | PairModel) -> Row:

@@ -25,7 +25,7 @@ MAX_WIDTH_DB = 30.0  # end of the scale of interval widths of the page
 MIN_RATIO = 1.2  # of the widest interval inside to the median one, for which the widths are drawn
 COVERED_DBM, CERTAINTY = -75.0, 0.9  # coverage of the summary
 RECEIVER = "#cf4a4a"
-WIDTH_PER_STD = 2 * NormalDist().inv_cdf((1 + LEVEL) / 2)
+WIDTH_PER_STD = 2 * NormalDist().inv_cdf((1 + LEVEL) / 2)  # of the interval of a normal variable
 HATCHED = (
     "Hatched like /: outside the measured positions, where predictions are extrapolated; like \\: a packet is more likely "
     "lost than received."
@@ -51,6 +51,11 @@ class Maps:
         rows = found["floor_of_row"] == self.floor
         found |= {name: found[name][self.floor] for name in ("predicted", "width", "detection")}
         return found | {name: found[name][rows] for name in ("measured_position", "measured")}
+
+    @cached_property
+    def plan(self) -> maps.FloorPlan | None:
+        """Image of the floor. None if the run has none."""
+        return maps.FloorPlan.load(self.run.folder)
 
     def titled(self, title: str) -> str:
         """Return a title with the name of the floor, if there are several."""
@@ -137,9 +142,9 @@ class Maps:
         if kind == "predicted" and receiver is None:
             limits = (float(values.min()), float(values.max()))
         style: dict[str, Any] = {"cmap": colours, "vmin": limits[0], "vmax": limits[1]}
-        if "plan" in a:
-            ax.imshow(a["plan"], extent=tuple(a["plan_extent"].tolist()), aspect="equal", zorder=0)
-        opacity = 0.75 if "plan" in a else 1.0
+        if (plan := self.plan) is not None:
+            ax.imshow(plan.pixels, extent=plan.corners, aspect="equal", zorder=0)
+        opacity = 1.0 if plan is None else 0.75
         drawn = ax.imshow(
             values, origin="lower", extent=(x0, x1, y0, y1), alpha=opacity, zorder=1, aspect="equal", **style
         )
@@ -176,7 +181,9 @@ class Maps:
 
     @cached_property
     def _limits(self) -> tuple[float, float]:
-        low, high = np.nanpercentile(self.arrays["measured"], (1, 99)).tolist()
+        measured = self.arrays["measured"]
+        shown = self.arrays["predicted"] if np.isnan(measured).all() else measured  # nothing may be received on a floor
+        low, high = np.nanpercentile(shown, (1, 99)).tolist()
         return low, high
 
     def _cells(self, fields: dict[str, NDArray[Any]], receivers: list[str]) -> DataFrame:

@@ -25,12 +25,11 @@ from tasks.page.shared import (
     limits,
     next_steps,
 )
-from tasks.rssi.maps import CERTAINTY, COVERED_DBM, MAX_VECTOR_DOTS, MIN_RATIO, Maps
+from tasks.rssi.maps import CERTAINTY, COVERED_DBM, MAX_VECTOR_DOTS, MIN_RATIO, WIDTH_PER_STD, Maps
 
 COLUMNS = ["index", "receiver", "method", "abs_error_db"]  # of the errors of methods
 COLOURS = colours(PREDICTORS)
 REFERENCES = ("mean", "mri_pooled")  # which explain no place
-WIDTH_OF_80_PERCENT = 2.563  # of an interval, in standard deviations of a normal distribution
 MIN_REPEATS = 10  # of measurements at one place
 MAX_RATIO_TO_SCATTER = 1.3  # of an interval to the one of repeated measurements, which then explain it
 MAX_RECEIVERS = 40  # of the figure of differences; all are in its table
@@ -204,7 +203,7 @@ def scatter_of_repeats(run: Records) -> float | None:
     same = run.table("predictions").groupby(["x", "y", "z", "receiver"])["measured"]
     repeats = same.count() - 1
     n = int(repeats.clip(lower=0).sum())
-    return float(WIDTH_OF_80_PERCENT * np.sqrt((same.var() * repeats).sum() / n)) if n >= MIN_REPEATS else None
+    return float(WIDTH_PER_STD * np.sqrt((same.var() * repeats).sum() / n)) if n >= MIN_REPEATS else None
 
 
 def _by_rows(run: Records) -> list[Figure]:

@@ -183,12 +183,12 @@ def _of_receivers(position: list[list[float]], value: dict[str, float | None], m
     )
 
 
-def answer(number: int, new: Rssi | Spectra, before: FieldModel | RssiModel, step: Step) -> str:
+def answer(index: int, new: Rssi | Spectra, before: FieldModel | RssiModel, step: Step) -> str:
     """Return the answer to a line: what was predicted and observed, the interval, and alarms, as JSON in ASCII.
 
-    Measurements are counted from 1, and the model before had not learnt this one.
+    The index is that of the record, and the model before had not learnt this measurement.
     """
-    found: dict[str, Any] = {"measurement": number, "position": step.scores.position[0]}
+    found: dict[str, Any] = {"measurement": index, "position": step.scores.position[0]}
     if isinstance(new, Rssi):
         assert isinstance(before, RssiModel)
         predicted = before.predict(new.transmitter_position)

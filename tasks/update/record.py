@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import io
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import pandas as pd
 import torch
 from pandas import DataFrame
 from torch import Tensor
 
-from swiftwrf import InputError
+from swiftwrf.data.files import read_bytes
 from swiftwrf.online import Step
 from swiftwrf.positions import nearest
+from swiftwrf.runtime.checkpoint import refusing
 from swiftwrf.runtime.durable import write_json, write_text
 from tasks.answer import NextStep
 from tasks.environment import command
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table
-from tasks.records import MODEL, Row, as_table, read_json
+from tasks.records import MODEL, Row, as_table, from_text, read_json
 
 TABLE, SUMMARY = "measurements.csv", "update.json"
 COLUMNS = (
@@ -37,7 +36,7 @@ COLUMNS = (
     "notice",
 )
 WORDS = ("alarm", "notice")  # columns of text
-TYPES = dict.fromkeys(COLUMNS, float) | {"index": int} | dict.fromkeys(WORDS, str)
+TYPES = dict.fromkeys(COLUMNS, float) | {"index": int} | dict.fromkeys(WORDS, object)
 MEANS = ("error", "covered")  # columns whose means are kept
 WINDOW = 30  # measurements of the running error
 MAX_SURPRISING = 10
@@ -53,20 +52,20 @@ class Record:
     unit: str  # unit of the errors
     rows: list[Row] = field(default_factory=list)  # a row of `measurements.csv` for each measurement
 
-    alarms: list[tuple[int, str]] = field(default_factory=list, init=False)
-    """number of the measurement that raised each alarm, and the change in words"""
-    notices: list[tuple[int, str]] = field(default_factory=list, init=False)
-    """number of the measurement after which the model changed beside its data, and how, in words"""
+    alarms: list[Row] = field(default_factory=list, init=False)
+    """rows that raised an alarm"""
+    notices: list[Row] = field(default_factory=list, init=False)
+    """rows after which the model changed beside its data"""
     _sums: dict[str, tuple[float, int]] = field(default_factory=lambda: dict.fromkeys(MEANS, (0.0, 0)), init=False)
 
     def __post_init__(self) -> None:
-        for number, row in enumerate(self.rows):
-            self._count(number, row)
+        for row in self.rows:
+            self._count(row)
 
-    def _count(self, number: int, row: Row) -> None:
+    def _count(self, row: Row) -> None:
         """Add a row to the alarms, notices and sums."""
-        self.alarms += [(number, row["alarm"])] if row["alarm"] else []
-        self.notices += [(number, row["notice"])] if row["notice"] else []
+        self.alarms += [row] if row["alarm"] else []
+        self.notices += [row] if row["notice"] else []
         for name, (total, n) in self._sums.items():
             if not math.isnan(row[name]):
                 self._sums[name] = (total + row[name], n + 1)
@@ -82,8 +81,8 @@ class Record:
         return f"error [{self.unit}]" if self.unit else "error"
 
     def with_unit(self, error: float) -> str:
-        """Return an error in words."""
-        return f"{error:.3g} {self.unit}".rstrip()
+        """Return an error in words; nan, that of measurements without a detection, is unknown."""
+        return "unknown" if math.isnan(error) else f"{error:.3g} {self.unit}".rstrip()
 
     @classmethod
     def read(cls, folder: Path, count: int | None = None) -> Record:
@@ -114,7 +113,7 @@ class Record:
             "correlation": step.correlation,
             "notice": " ".join(step.notice.split()),
         }
-        self._count(len(self.rows), row)
+        self._count(row)
         self.rows.append(row)
         return row
 
@@ -127,8 +126,8 @@ class Record:
     def summary(self) -> Row:
         """Return the results as plain values."""
         changes = [
-            {"measurement": number, "what": text, "correlation": self.rows[number]["correlation"]}
-            for number, text in self.alarms
+            {"measurement": row["index"], "what": row["alarm"], "correlation": row["correlation"]}
+            for row in self.alarms
         ]
         return {
             "source": self.source,
@@ -138,20 +137,20 @@ class Record:
             "last_running_error": self.rows[-1]["running_error"] if self.rows else None,
             "coverage": self.mean("covered"),
             "alarms": changes,
-            "notices": [{"measurement": number, "what": text} for number, text in self.notices],
+            "notices": [{"measurement": row["index"], "what": row["notice"]} for row in self.notices],
         }
 
     def sentences(self) -> list[str]:
         """Return the results in sentences, whether something changed first."""
-        found = self.summary()
-        changes = len(self.alarms)
+        changes, learnt = len(self.alarms), len(self.rows)
+        last = self.rows[-1]["running_error"] if self.rows else math.nan
         text = [
-            f"{changes or 'No'} change{'' if changes == 1 else 's'} detected, {found['measurements']} measurements learnt.",
-            f"Their mean error is {self.with_unit(found['mean_error'])} before each was learnt, "
-            f"{self.with_unit(found['last_running_error'] or float('nan'))} over the last {WINDOW}.",
+            f"{changes or 'No'} change{'s' * (changes != 1)} detected, {learnt} measurement{'s' * (learnt != 1)} learnt.",
+            f"Mean error before each was learnt: {self.with_unit(self.mean('error'))}, over the last {WINDOW}: "
+            f"{self.with_unit(last)}.",
         ]
-        text += [f"Change at measurement {number}: {what}." for number, what in self.alarms]
-        return [*text, *(f"{what[0].upper()}{what[1:]}." for _, what in self.notices)]
+        text += [f"Change at measurement {row['index']}: {row['alarm']}." for row in self.alarms]
+        return [*text, *(f"{row['notice'][0].upper()}{row['notice'][1:]}." for row in self.notices)]
 
     def write(self, folder: Path) -> None:
         """Write table and summary. Without measurements there is no table."""
@@ -173,12 +172,10 @@ def _rows(table: Path) -> list[Row]:
     """Return the complete lines of a table, none if there is no table yet."""
     if not table.exists():
         return []
-    try:
-        text = table.read_bytes().decode()
-        rows = pd.read_csv(io.StringIO(text[: text.rfind("\n") + 1]), dtype=TYPES)
-        return list(rows[list(COLUMNS)].fillna(dict.fromkeys(WORDS, "")).to_dict("records"))
-    except (OSError, ValueError, KeyError, OverflowError) as error:
-        raise InputError(f"{table} is not the table of an update ({error}); restore it") from None
+    content = read_bytes(table)
+    with refusing(f"{table} is not the table of an update"):
+        rows = from_text(content[: content.rfind(b"\n") + 1].decode(), WORDS)[list(COLUMNS)]
+        return list(rows.fillna(dict.fromkeys(WORDS, "")).astype(TYPES).to_dict("records"))
 
 
 def page(record: Record, name: str, folder: Path) -> Page:
@@ -194,13 +191,11 @@ def page(record: Record, name: str, folder: Path) -> Page:
         "Continue with the updated model", command("update", str(folder / MODEL), "SOURCE", "--out", "NEXT")
     )
     summary = Summary(numbers, [error_plot(record)], record.sentences(), [step])
-    order = record.column("innovation").nan_to_num().argsort(descending=True)[:MAX_SURPRISING].tolist()
+    known = [row for row in record.rows if not math.isnan(row["innovation"])]
+    surprising = sorted(known, key=lambda row: -row["innovation"])[:MAX_SURPRISING]
     cells = [
-        [
-            str(record.rows[i]["index"]),
-            *(f"{record.rows[i][key]:.3g}" for key in ("x_m", "y_m", "z_m", "error", "innovation")),
-        ]
-        for i in order
+        [str(row["index"]), *(f"{row[key]:.3g}" for key in ("x_m", "y_m", "z_m", "error", "innovation"))]
+        for row in surprising
     ]
     columns = ["measurement", "x [m]", "y [m]", "z [m]", record.error_label, "innovation"]
     table = Table(columns, cells, "Measurements with the largest innovations.")
@@ -210,14 +205,14 @@ def page(record: Record, name: str, folder: Path) -> Page:
 def error_plot(record: Record) -> Plot:
     """Return the errors over time, and the alarms."""
     figure, axes = figures.panel(7.4, 3.2)
-    error, running = record.column("error"), record.column("running_error")
-    axes.plot(error, ".", markersize=3, color=figures.RULE)
-    axes.plot(running, color=BLUE)
-    for number, _ in record.alarms:
-        axes.axvline(number, color=RED, linewidth=1)
+    index, error, running = (record.column(name) for name in ("index", "error", "running_error"))
+    axes.plot(index, error, ".", markersize=3, color=figures.RULE)
+    axes.plot(index, running, color=BLUE)
+    for row in record.alarms:
+        axes.axvline(row["index"], color=RED, linewidth=1)
     axes.set(xlabel="measurement", ylabel=record.error_label, ylim=(0, None))
     caption = f"Error of each measurement before it was learnt, mean of the last {WINDOW} (blue), and alarms (red)."
-    return Plot("error", [figure], caption, DataFrame({"error": error, "running_error": running}))
+    return Plot("error", [figure], caption, DataFrame({"index": index, "error": error, "running_error": running}))
 
 
 def map_plot(record: Record) -> Plot:

@@ -85,8 +85,9 @@ def follow(config: UpdateConfig) -> None:
             except InputError as error:  # one bad line does not end a run of days
                 console.print(f"error: {error}", markup=False, soft_wrap=True)
                 continue
-            print(answer(follower.count, new, before, step), flush=True)
-            record.append(folder, record.add(follower.count - 1, step))
+            index = follower.count - 1
+            print(answer(index, new, before, step), flush=True)
+            record.append(folder, record.add(index, step))
             _save(follower, file, line.end, line.sha256)
 
 

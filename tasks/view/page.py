@@ -63,16 +63,19 @@ class NewestOnly:
     def submit(self, *arguments: Any) -> None:
         """Submit a request, which replaces one that has not begun."""
         self._waiting = [arguments]
-        if not self._busy:
-            background_tasks.create(self._work())
+        self._begin()
 
-    async def _work(self) -> None:
-        self._busy = True
+    def _begin(self) -> None:
+        if self._waiting and not self._busy:
+            self._busy = True  # now, and not when the task begins: another request may come before
+            background_tasks.create(self._work(*self._waiting.pop()))
+
+    async def _work(self, *arguments: Any) -> None:
         try:
-            while self._waiting:
-                await self._handle(*self._waiting.pop())
+            await self._handle(*arguments)
         finally:
             self._busy = False
+            self._begin()
 
 
 def header(title: str, notes: list[str]) -> ui.row:

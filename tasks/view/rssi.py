@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -26,25 +26,22 @@ from tasks.view.locating import RssiLocating
 
 RECEIVER_COLOURS, N_RECEIVER_COLOURS = "tab20", 20
 MIN_STD_DB = 1e-6
+MAX_MAPS = 8  # in memory, e.g. those of as many floors
 MapKind = Literal["RSSI", "interval", "coverage", "best receiver", "posterior", "expected error"]
 LOCATING: tuple[MapKind, ...] = ("posterior", "expected error")
 MAPS = {"measured_position": "f n 3", "measured": "f n receivers", "receiver": "f receivers 3"}  # of maps.npz
-PLAN = {"plan": "u1 height width 3", "plan_extent": "f 4"}  # that maps.npz may hold, too
 Values = NDArray[np.floating]
 
 
-def rows_of_run(file: Path, receivers: tuple[str, ...]) -> tuple[Rssi, FloorPlan | None]:
-    """Return the measured rows and the floor plan in the `maps.npz` of a run.
+def rows_of_run(file: Path, receivers: tuple[str, ...]) -> Rssi:
+    """Return the measured rows in the `maps.npz` of a run.
 
     Raises:
         InputError: The file is damaged, or contains other receivers.
     """
-    stored, plan = read_npz(file, MAPS | PLAN, PLAN), None
-    if "plan" in stored:
-        x0, x1, y0, y1 = stored["plan_extent"].tolist()
-        plan = FloorPlan(stored["plan"], (x0, x1, y0, y1))
+    stored = read_npz(file, MAPS)
     measured, position, receiver = stored["measured"], stored["measured_position"], stored["receiver"]
-    return Rssi(measured, position, receiver_position=receiver, receiver_names=receivers), plan
+    return Rssi(measured, position, receiver_position=receiver, receiver_names=receivers)
 
 
 def rows_of_model(model: RssiModel) -> Rssi:
@@ -87,11 +84,16 @@ class RssiView:
     title: str  # title of the page
     model: RssiModel  # fitted model
     rows: Rssi  # measured rows
-    plan: FloorPlan | None = None  # image of the floor. None if there is none
     locating: RssiLocating | None = None  # locator and the rows that it locates. None if there is no locator
     notes: list[str] = field(default_factory=list)  # remarks on the data, a sentence each
     folder: Path | None = None  # directory of the run, where a floor plan is saved. None for a saved model
-    _last: RssiMap | None = field(default=None, init=False, repr=False)
+    plan: FloorPlan | None = field(default=None, init=False)  # image of the floor. None if there is none
+
+    def __post_init__(self) -> None:
+        if self.folder is not None:
+            self.plan = FloorPlan.load(self.folder)
+        self.map = lru_cache(maxsize=MAX_MAPS)(self._map)
+        """Return the map at a height of the transmitter [m]; the last ones are cached for all visitors."""
 
     @property
     def receivers(self) -> tuple[str, ...]:
@@ -128,16 +130,12 @@ class RssiView:
         at = torch.tensor([[0.0, 0.0, height]], dtype=torch.float64)
         return (self.floors.number(self.rows.transmitter_position) == self.floors.number(at)).numpy()
 
-    def __post_init__(self) -> None:
-        if self.folder is not None and (stored := FloorPlan.load(self.folder)) is not None:
-            self.plan = stored
-
     def place(self, plan: FloorPlan) -> None:
         """Show a floor plan below the maps, and save it in the directory of the run."""
         if self.folder is not None:
             plan.save(self.folder)
-        self.plan, self._last = plan, None
-        self.__dict__.pop("inside", None)  # the map covers the plan, too
+        self.plan = plan
+        self.map.cache_clear()  # maps cover the plan, too
 
     @property
     def region(self) -> Values:
@@ -146,16 +144,13 @@ class RssiView:
         receiver = self.rows.receiver_position[self.rows.receiver_located]
         return np.concatenate([self.model.region().numpy()[:, :2], receiver.numpy()[:, :2], corners])
 
-    @property
-    def chart(self) -> RssiMap:
-        """Last map, or that of the median height."""
-        return self._last or self.map(self.heights[1])
+    def _map(self, height: float) -> RssiMap:
+        return RssiMap.predict(self.model, height=height, region=self.region)
 
-    def map(self, height: float) -> RssiMap:
-        """Return the map at a height of the transmitter [m]; the last one is cached."""
-        if self._last is None or self._last.height != height:
-            self._last = RssiMap.predict(self.model, height=height, region=self.region)
-        return self._last
+    def inside(self, height: float) -> NDArray[np.bool_]:
+        """Return which cells of a map are inside the measured positions, in plan (rows, columns)."""
+        chart = self.map(height)
+        return maps.inside(np.stack(np.meshgrid(chart.x, chart.y), axis=-1), self.position)
 
     def silent(self, selection: MapSelection) -> NDArray[np.bool_]:
         """Return where a packet is more likely lost than received, at the selected receiver or at all of them."""
@@ -209,11 +204,6 @@ class RssiView:
         order = [int(number) for number in np.argsort(-counts, kind="stable") if counts[number]]
         return {number: float(counts[number] / counts.sum()) for number in order}
 
-    @cached_property
-    def inside(self) -> NDArray[np.bool_]:
-        """True for each cell inside the measured positions, in plan (rows, columns)."""
-        return maps.inside(np.stack(np.meshgrid(self.chart.x, self.chart.y), axis=-1), self.position)
-
     def sentence(self, selection: MapSelection) -> str:
         """Describe the selected map in a few sentences."""
         if self.locating is not None and selection.kind in LOCATING:
@@ -229,7 +219,7 @@ class RssiView:
             case "coverage":
                 number = selection.at_least
                 who = {0: name, 1: "at least one receiver"}.get(number, f"at least {number} receivers")
-                covered, known = self._covered(selection), self.inside
+                covered, known = self._covered(selection), self.inside(selection.height)
                 area = f", {covered[known].mean():.0%} of the measured area" if known.any() else ""
                 return (
                     f"{covered.mean():.0%} of the map{area} is coloured: there a measurement at {who} is above "

@@ -128,24 +128,30 @@ class RssiPage:
         self._maps.submit(self._selection)
 
     async def _show_map(self, selection: MapSelection) -> None:
-        coloured = await run.io_bound(self._view.coloured, selection)
-        if coloured is None:  # the server is being ended
+        found = await run.io_bound(self._computed, selection)
+        if found is None:  # the server is being ended
             return
+        coloured, data, sentence, best = found
         self._limits.set_visibility(selection.kind == "coverage")
         self._receiver.set_enabled(selection.kind not in ("best receiver", *LOCATING))
         self._height.set_enabled(selection.kind not in LOCATING)
         self._choice.set_visibility(selection.kind == "posterior")
-        self._sentence.set_text(self._view.sentence(selection))
-        best = self._view.best(selection.height) if selection.kind == "best receiver" else {}
+        self._sentence.set_text(sentence)
         entries = [(_colour(r), "■", f"{self._view.receivers[r]} {part:.0%}") for r, part in best.items()]
         self._best.set_content(legend(entries[:N_RECEIVER_COLOURS]))
         limits = coloured.low, coloured.high
         bar = colour_bar(coloured.colours, limits, coloured.label, "measured", coloured.extend)
-        self._plan.show(self._data(selection, coloured), bar if coloured.label else {"id": BAR, "show": False})
+        self._plan.show(data, bar if coloured.label else {"id": BAR, "show": False})
+
+    def _computed(self, selection: MapSelection) -> tuple[ColouredMap, dict[str, Data], str, dict[int, float]]:
+        """Return colours, layers and sentence of a map, and the receivers that are best somewhere."""
+        view, coloured = self._view, self._view.coloured(selection)
+        best = view.best(selection.height) if selection.kind == "best receiver" else {}
+        return coloured, self._data(selection, coloured), view.sentence(selection), best
 
     def _data(self, selection: MapSelection, coloured: ColouredMap) -> dict[str, Data]:
         """Return the data of all layers of the plan."""
-        view, rows, corners = self._view, self._view.rows, self._view.chart.corners
+        view, rows, corners = self._view, self._view.rows, self._view.map(selection.height).corners
         image = colour_image(coloured.values[::-1], coloured.colours, coloured.low, coloured.high)
         hidden = ("floor", "silent", "outside", "rows", "nothing", "measured", "receivers")
         data: dict[str, Data] = {name: [] for name in hidden}
@@ -153,7 +159,9 @@ class RssiPage:
         if view.plan:
             data["floor"] = picture(Image.fromarray(view.plan.pixels), view.plan.corners)
         if selection.kind not in LOCATING:  # grey where the map is extrapolated
-            data["outside"] = picture(colour_image(np.where(view.inside, np.nan, 0.5)[::-1], "gray"), corners, 0.55)
+            data["outside"] = picture(
+                colour_image(np.where(view.inside(selection.height), np.nan, 0.5)[::-1], "gray"), corners, 0.55
+            )
             data["silent"] = picture(colour_image(stripes(view.silent(selection))[::-1], "gray"), corners, 0.6)
         if selection.kind == "RSSI":
             detected, here = rows.detected[:, selection.receiver].numpy(), view.on_floor(selection.height)

@@ -159,11 +159,10 @@ def _locate_run(folder: Path, content: Row) -> RssiView:
 
 
 def _located(title: str, locating: RssiLocating, notes: Sequence[str] = (), folder: Path | None = None) -> RssiView:
-    return RssiView(title, locating.locator.model, locating.rows, None, locating, list(notes), folder)
+    return RssiView(title, locating.locator.model, locating.rows, locating, list(notes), folder)
 
 
 def _rssi_run(folder: Path) -> RssiView:
     model = _kept(RssiModel, folder / MODEL)
     with refusing(f"the maps in {folder} are not those of a run"):
-        rows, plan = rows_of_run(folder / "maps.npz", model.receiver_names)
-        return RssiView(folder.name, model, rows, plan, folder=folder)
+        return RssiView(folder.name, model, rows_of_run(folder / "maps.npz", model.receiver_names), folder=folder)

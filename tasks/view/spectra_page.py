@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 
 import numpy as np
 from nicegui import events, run, ui
@@ -35,7 +34,6 @@ UNSEEN, MOVING, PEAK, SIGHT = "#d1620f", "#cf4a4a", "#ffffff", "#ee6677"
 KEY_STEP = 0.01  # of the plan; ten times as far with Shift
 MAX_PLAN_PX = (500, 520)
 MAX_LARGE_DOTS = 400
-RATE_FRAMES = 20
 MOVES = {
     "ArrowLeft": (0, -1),
     "ArrowRight": (0, 1),
@@ -98,7 +96,6 @@ class SpectraPage:
     def __init__(self, view: SpectraView) -> None:
         self._view, self._model = view, view.models[0]
         self._position, self._shown_measurement = view.start.copy(), -1
-        self._frames: deque[float] = deque(maxlen=RATE_FRAMES)
         self._requests = NewestOnly(self._predict)
         self._low, self._high = view.box
         self._corners = around(self._low[None], self._high[None])
@@ -191,8 +188,6 @@ class SpectraPage:
         return float(np.linalg.norm(position[..., :2] - np.clip(position[..., :2], (x0, y0), (x1, y1))))
 
     def _on_pointer(self, kind: str, buttons: int, x: float, y: float) -> None:
-        if kind == "pointerdown":
-            self._frames.clear()
         if kind == "pointerleave" or (kind == "pointermove" and not buttons & 1):
             return
         self._position[:2] = x, y
@@ -279,14 +274,10 @@ class SpectraPage:
         else:
             between = angle_between(predicted.peak, sight)
             self._angles.set_text(f"line of sight {_described(sight)}; {between:.1f}° from the peak")
-        self._frames.append(time.perf_counter())
-        span = self._frames[-1] - self._frames[0]
-        full = len(self._frames) == RATE_FRAMES and span > 0
-        rate = f", {(RATE_FRAMES - 1) / span:.0f} frames a second" if full else ""
         rows, columns = predicted.grid.shape
         self._frame.set_text(
             f"frame {1e3 * seconds:.0f} ms, of which the model {1e3 * predicted.seconds:.1f} ms for {rows} x {columns} "
-            f"directions{rate}"
+            "directions"
         )
 
 

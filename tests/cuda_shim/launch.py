@@ -12,9 +12,9 @@ from swiftwrf.rasterize import cuda, operators, reference
 from swiftwrf.rasterize.operators import magnitude
 
 
-def with_gradients(field, inputs):
-    """Return the field, and the gradients of a function of it and of its magnitude."""
-    return field, *torch.autograd.grad(magnitude(field).square().sum() + field.sum(), inputs)
+def with_gradients(field, magnitude, inputs):
+    """Return the field, its magnitude, and the gradients of a function of both."""
+    return field, magnitude, *torch.autograd.grad(magnitude.square().sum() + field.sum(), inputs)
 
 
 torch.cuda.get_device_capability = lambda device: (9, 0)
@@ -25,8 +25,9 @@ grid = AngularGrid.hemisphere(17, 33)
 inputs = random_scene(4, 2, grid=grid)
 exact = reference.field(*inputs, grid, 1e-4)
 with mock.patch.dict(operators.BACKENDS, cpu=cuda.__name__):
-    found = with_gradients(operators.field(*inputs, grid, 1e-4), inputs)
-for value, expected in zip(found, with_gradients(exact, inputs), strict=True):
+    drawn = operators.field(*inputs, grid, 1e-4), operators.field_magnitude(*inputs, grid, 1e-4)
+    found = with_gradients(*drawn, inputs)
+for value, expected in zip(found, with_gradients(exact, magnitude(exact), inputs), strict=True):
     torch.testing.assert_close(value, expected, atol=1e-3, rtol=1e-3)
 try:
     cuda.kernels(torch.device("cpu")).launch("other", 1, 32)

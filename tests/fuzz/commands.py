@@ -12,15 +12,11 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import get_type_hints
 
-import numpy as np
 import yaml
-from quick import TASKS, run
+from quick import TASKS
 
-from fuzz.misuse import rssi, rssi_model
 from fuzz.mutate import mutated
-from swiftwrf import InputError, load_rssi
-from swiftwrf.data.writing import write_rssi
-from swiftwrf.errors import MAX_LENGTH
+from swiftwrf import InputError
 from swiftwrf.runtime.validation import check_value
 from tasks.command_line import _defaults, execute
 from tasks.options import by_name
@@ -101,40 +97,3 @@ def config_file(draw: random.Random, folder: Path) -> None:
                 check_value(option.name, getattr(group, option.name), hints[option.name])
             except InputError as error:
                 raise AssertionError(error) from None
-
-
-def updates_and_conversions(draw: random.Random, folder: Path) -> None:
-    """Update an RSSI model, or convert it or its data, with random options.
-
-    Raises:
-        InputError: The command line is refused.
-        AssertionError: Another exit code, no sentence, or data that differ after the conversion.
-    """
-    data, model, said = folder / "data", folder / "model", io.StringIO()
-    data.mkdir()
-    write_rssi(rssi(), data)
-    rssi_model().save(model)
-    task, out = draw.choice(
-        [("update", "new"), *(("convert", f"new{suffix}") for suffix in ("", ".csv", ".mat", ".tif", ".png"))]
-    )
-    source = [str(model), str(data)] if task == "update" else [str(draw.choice([data, model]))]
-    arguments = [*source, "--out", str(folder / out)] if task == "update" else [*source, str(folder / out)]
-    values = [*VALUES, str(data), str(model), "2", "10", "receiver01", "degrees", "metres", "x=x", "100"]
-    for _ in range(draw.randint(0, 2)):
-        arguments.append(
-            draw.choice([option for option in OPTIONS[task] if option not in ("--follow", "--open", "--out")])
-        )
-        arguments += [draw.choice(values) for _ in range(draw.choice([0, 1, 1, 1, 2, 3]))]
-    try:
-        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
-            code = run(task, *arguments)
-    except SystemExit as end:
-        code = 0 if end.code is None else end.code
-    errors = [line.removeprefix("error: ") for line in said.getvalue().splitlines() if line.startswith("error: ")]
-    assert code in (0, 2), (arguments, code)
-    if code == 2:
-        assert len(errors) <= 1, arguments
-        assert all(len(error) <= MAX_LENGTH for error in errors), arguments
-        raise InputError(errors[0] if errors else "the parser refuses the options")
-    if task == "convert" and out == "new" and len(arguments) == 2:
-        np.testing.assert_array_equal(load_rssi(folder / out).rssi_dbm, rssi().rssi_dbm)

@@ -32,7 +32,7 @@ from small import FLOOR, PUBLISHED, PUBLISHED_RSSI
 from augment import Mixed
 from augment.estimators.kernel_regression import KernelRegression
 from fuzz import runs
-from fuzz.commands import config_file, updates_and_conversions
+from fuzz.commands import config_file
 from fuzz.misuse import CALLS, misuse
 from swiftwrf import (
     AngularGrid,
@@ -236,8 +236,6 @@ ATTEMPTS: dict[str, Attempt] = {
     **{f"followed spectra, {name}": functools.partial(runs.followed_lines, name) for name in ("gp", "geometry")},
     "followed RSSI": functools.partial(runs.followed_lines, "rssi"),
     **{f"followed file {name}": functools.partial(runs.followed_file, name) for name in ("rows.csv", "rows.ndjson")},
-    **{f"growing file {name}": functools.partial(runs.growing_file, name) for name in ("rows.csv", "rows.ndjson")},
     **{f"misuse of {name}": functools.partial(misuse, calls) for name, calls in CALLS.items()},
-    "options of update and convert": updates_and_conversions,
     "file of options": config_file,
 }

@@ -5,10 +5,8 @@ import functools
 import io
 import json
 import math
-import os
 import random
 import sys
-from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from types import SimpleNamespace
@@ -50,7 +48,6 @@ from tasks.view.followed import FollowedView, snapshot
 from tasks.view.rssi import MapSelection, RssiView
 from tasks.view.sources import open_source
 
-N_CHANGES = 6  # of a file while it is followed
 ERROR = "error: "
 
 
@@ -65,10 +62,9 @@ def run_of_rssi(folder: Path) -> None:
     data = _rssi()
     _rssi_model().save(folder / "model.safetensors")
     write_json(folder / "config.json", {"task": "rssi", "config": {}})
-    plan = {"plan": np.zeros((6, 8, 3), np.uint8), "plan_extent": np.array([0.0, 20.0, 0.0, 15.0])}
     measured = {"measured_position": data.transmitter_position, "measured": data.rssi_dbm}
     arrays = {name: values.numpy() for name, values in (measured | {"receiver": data.receiver_position}).items()}
-    np.savez(folder / "maps.npz", **plan, **arrays)
+    np.savez(folder / "maps.npz", **arrays)
     FloorPlan.scaled(np.zeros((6, 8, 3), np.uint8), 2.0, (0, 6)).save(folder)
 
 
@@ -106,8 +102,9 @@ def show(folder: Path) -> None:
 
 
 def _show_rssi(view: RssiView) -> None:
-    x, y = (float(line.mean()) for line in (view.chart.x, view.chart.y))
-    assert np.isfinite(view.chart.mean).all()
+    chart = view.map(view.heights[1])
+    x, y = (float(line.mean()) for line in (chart.x, chart.y))
+    assert np.isfinite(chart.mean).all()
     for kind in set(view.kinds) - {"expected error"}:
         selection = MapSelection(kind, 0, view.heights[1])
         view.coloured(selection)
@@ -212,89 +209,3 @@ def followed_file(source: str, draw: random.Random, folder: Path) -> None:
     followed(
         _rssi_model(), mutated(table() if source.endswith(".csv") else json_lines(_rssi_model()), draw), folder, source
     )
-
-
-class GrowingFile:
-    """A file that changes at random while it is followed, and the lines that a reader must find in it."""
-
-    def __init__(self, draw: random.Random, file: Path) -> None:
-        self._draw, self._file, self._count, self._n_given = draw, file, 0, 0
-        self.expected: list[bytes] = []
-        self._content = self._header = b"header\n" if file.suffix == ".csv" else b""
-        self._write(self._header + self._rows())
-
-    def _rows(self) -> bytes:
-        """Return lines that are written once only; the last one may lack its end."""
-        rows = b""
-        for _ in range(self._draw.randrange(4)):
-            self._count += 1
-            rows += (
-                b"%d" % self._count
-                + b"\xc3\xa9" * self._draw.randrange(3)
-                + self._draw.choice([b"\n", b"\r\n", b"\n\n"])
-            )
-        return rows[: len(rows) - self._draw.choice([0, 0, 1, 2])]
-
-    def _write(self, content: bytes) -> None:
-        self._content = content
-        self._file.write_bytes(content)
-        self._expect(content[: content.rfind(b"\n") + 1])
-
-    def _expect(self, complete: bytes) -> None:
-        rows = [line for line in complete[len(self._header) :].split(b"\n") if line.strip()]
-        self.expected += rows[self._n_given :]
-        self._n_given = max(self._n_given, len(rows))
-
-    def grow(self) -> None:
-        """Append bytes."""
-        self._write(self._content + self._rows())
-
-    def rewrite(self) -> None:
-        """Write other rows over the file."""
-        self._n_given = 0
-        self._write(self._header + self._rows())
-
-    def rotate(self) -> None:
-        """Rename the file after its last line, and begin another one."""
-        self._expect(self._content)
-        self._file.rename(self._file.with_suffix(".1"))
-        self.rewrite()
-
-    def replace(self) -> None:
-        """Save the file with more rows under its name, as editors and rsync do."""
-        self._content += self._rows()
-        self._file.with_suffix(".new").write_bytes(self._content)
-        os.replace(self._file.with_suffix(".new"), self._file)
-        self._expect(self._content[: self._content.rfind(b"\n") + 1])
-
-
-def growing_file(name: str, draw: random.Random, folder: Path) -> None:
-    """Follow a file that grows, is rewritten, rotated and replaced, with stops and starts of the reader.
-
-    Raises:
-        AssertionError: A line that was lost or doubled.
-    """
-    source = GrowingFile(draw, folder / name)
-    changes: list[Callable[[], None]] = [
-        draw.choice([source.grow, source.grow, source.rewrite, source.rotate, source.replace]) for _ in range(N_CHANGES)
-    ]
-    done, found, place = [], [], (0, "")
-
-    def sleep(_: float) -> None:
-        if len(changes) == 0 or (stops and draw.random() < 0.3):
-            raise KeyboardInterrupt
-        done.append(changes.pop(0))
-        done[-1]()
-
-    with mock.patch.object(lines, "time", SimpleNamespace(sleep=sleep)):
-        stops = draw.random() < 0.5
-        for _ in range(1 + len(changes)):
-            try:
-                for line in lines.lines(str(folder / name), *place):
-                    found.append(line.content.strip(b"\r\n"))
-                    place = line.end, line.sha256
-            except KeyboardInterrupt:
-                if not changes:
-                    break
-    expected = [line.strip(b"\r\n") for line in source.expected]
-    assert found == expected, f"{[change.__name__ for change in done]}: {found}, not {expected}"

@@ -6,6 +6,7 @@ more, and 200 command lines.
 
 import inspect
 import random
+import resource
 import shutil
 from contextlib import suppress
 from pathlib import Path
@@ -16,8 +17,8 @@ from hypothesis import strategies as st
 from quick import run
 
 from fuzz.commands import command_lines
-from fuzz.kinds import ATTEMPTS, KINDS, Attempt
-from fuzz.mutate import spoil
+from fuzz.kinds import ATTEMPTS, KINDS, MODELS, Attempt
+from fuzz.mutate import damages, spoil
 from swiftwrf import FitError, InputError
 from swiftwrf.data.files import read_table, read_yaml
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
@@ -91,6 +92,35 @@ def test_mutations(kind, seeds, tmp_path):
 @pytest.mark.parametrize("kind", ATTEMPTS)
 def test_attempts(kind, seeds, tmp_path):
     attack(kind, tmp_path, seeds)
+
+
+@pytest.mark.parametrize("every", [8, pytest.param(1, marks=pytest.mark.fuzz)])
+@pytest.mark.parametrize("kind", [*MODELS, *(kind for kind in KINDS if kind.startswith("run of "))])
+def test_other_arrays_and_values_in_a_file(kind, every, tmp_path):
+    """They are refused before memory is taken, or what follows from them is finite."""
+    write, read = KINDS[kind]
+    write(tmp_path)
+    read(tmp_path)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    wrong = []
+    for file in sorted(file for file in tmp_path.iterdir() if file.is_file()):
+        content = file.read_bytes()
+        for name, damage in [*damages(file, kind)][::every]:
+            damage()
+            try:
+                read(tmp_path)
+            except (InputError, FitError) as refusal:
+                if len(str(refusal)) > MAX_LENGTH:
+                    wrong.append(f"{name}: {refusal}")
+            except Exception as error:
+                wrong.append(f"{file.name}, {name}: {type(error).__name__}: {error}")
+            else:
+                # without these coefficients a fit is restored from its rows
+                if name.startswith("tensor") and name != "tensor fit.dual missing":
+                    wrong.append(f"{name} is accepted")
+            file.write_bytes(content)
+    assert not wrong, "\n".join(wrong)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 2**20  # KiB
 
 
 def _end(task, arguments, capfd):

@@ -7,7 +7,17 @@ from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
 from swiftwrf import InputError
-from swiftwrf.metrics import angle_errors, covered, l1, median_interval, paired_difference, psnr, ssim, summary
+from swiftwrf.metrics import (
+    angle_errors,
+    covered,
+    l1,
+    median_interval,
+    method_summary,
+    paired_difference,
+    psnr,
+    ssim,
+    summary,
+)
 
 
 def test_ssim_is_that_of_scikit_image(generator):
@@ -85,3 +95,13 @@ def test_repeated_rows_do_not_narrow_an_interval():
     )
     assert by_place[0] == by_row[0]
     assert by_place[2] - by_place[1] > 2 * (by_row[2] - by_row[1])
+
+
+@pytest.mark.parametrize(("n_pairs", "mean", "has_interval"), [(0, np.nan, False), (9, 1.0, False), (12, 1.0, True)])
+def test_a_method_without_error_at_most_rows_has_few_pairs(n_pairs, mean, has_interval):
+    error = np.concatenate([np.ones(12), np.where(np.arange(12) < n_pairs, 2.0, np.nan)])
+    table = pd.DataFrame({"method": ["a"] * 12 + ["b"] * 12, "index": [*range(12)] * 2, "error": error})
+    found = method_summary(table, "error", "a").loc["b"]
+    assert found["n"] == n_pairs
+    assert found["difference"] == pytest.approx(mean, nan_ok=True)
+    assert np.isfinite(found[["difference_low", "difference_high"]].tolist()).tolist() == [has_interval] * 2

@@ -55,7 +55,7 @@ def test_survey(tmp_path, capsys):
     text = capsys.readouterr().out
     assert "40 rows of RSSI at 3 receivers" in text
     assert "positions are unknown" in text
-    assert (tmp_path / "page" / "report.html").read_text().count("<svg") == 2
+    assert (tmp_path / "page" / "report.html").read_text().count("<svg") == 1
 
 
 def test_the_nearest_other_position():

@@ -165,17 +165,6 @@ def test_a_geotiff_has_values_place_and_projection(geodetic, tmp_path):
     assert unescape(description.text) == "hall & <stairs>"
 
 
-def test_a_geotiff_of_several_receivers_has_a_band_each(model, tmp_path):
-    rasterio = pytest.importorskip("rasterio", reason="reads bands of GeoTIFF")
-    model.save(tmp_path / "model.safetensors")
-    assert run(tmp_path / "model.safetensors", tmp_path / "map.tif", "--cell", 1, "--height", 1.2) == 0
-    expected = RssiMap.predict(model, cell=1.0, height=1.2)
-    with rasterio.open(tmp_path / "map.tif") as found:
-        np.testing.assert_array_equal(found.read(), expected.mean[:, ::-1])
-        assert found.descriptions == model.receiver_names
-        assert found.xy(0, 0) == pytest.approx((expected.x[0], expected.y[-1]))
-
-
 def test_the_pixels_of_several_bands_hold_their_values(model, tmp_path):
     """Pillow reads the tags of several bands of float32, not their pixels."""
     chart = RssiMap.predict(model, cell=1.0)

@@ -20,7 +20,7 @@ from tasks.configs import InspectConfig
 from tasks.inspect import page as inspection
 from tasks.locate.page import posteriors
 from tasks.page import figures
-from tasks.page.maps import colour_image
+from tasks.page.maps import colour_image, inside
 from tasks.page.page import Number, Page, Plot, Section, Summary, write_page
 from tasks.page.shared import again
 from tasks.records import read_table
@@ -136,7 +136,9 @@ def test_pixels_of_a_spectrum_lie_at_their_directions():
     np.testing.assert_allclose(centre, next(iter(ring)), atol=1e-5)
 
 
-@pytest.mark.parametrize("values", [[], [0.0], [0.0] * 9, [0.2, 0.1 + 0.1, 0.3 - 0.1, 0.2], [-3.0] * 2], ids=len)
+@pytest.mark.parametrize(
+    "values", [[], [0.0], [0.1, 2.0, 30.0], [0.0] * 9, [0.2, 0.1 + 0.1, 0.3 - 0.1, 0.2], [-3.0] * 2], ids=len
+)
 def test_figures_of_constant_empty_and_single_values(values):
     values, n = np.array(values), len(values)
     position = torch.tensor(np.outer(np.arange(n), [0.2, 0.0, 0.0])) + torch.tensor([0.0, 0.0, 1.0])  # a regular grid
@@ -162,6 +164,12 @@ def test_figures_of_constant_empty_and_single_values(values):
             drawn += [panel for plot in [*found.summary.plots, *found.sections[1].plots] for panel in plot.panels]
         colour_image(values[None], "viridis", values.min(), values.max())
     assert all(figures.as_svg(figure).endswith("</svg>\n") for figure in drawn)
+
+
+@pytest.mark.parametrize("repeats", [1, 3])
+def test_between_positions_on_a_line_is_inside_however_often_each_was_measured(repeats):
+    known = np.repeat([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]], repeats, axis=0)
+    assert inside([[0.5, 0.5], [1.4, 1.4], [9.0, 9.0]], known).tolist() == [True, True, False]
 
 
 def test_a_cell_of_a_posterior_is_drawn_around_its_centre():

@@ -26,6 +26,7 @@ def test_help_has_groups_names_examples_and_one_default_an_option(name, capsys, 
     with pytest.raises(SystemExit, match="0"):
         main([name, "--help"])
     text = capsys.readouterr().out
+    assert text.startswith(f"usage: swiftwrf {name} ")
     options = re.split(r"^[│ ] (?=-|[A-Z\[])", text, flags=re.MULTILINE)[1:]
     assert all(option.count("(default") + option.count("(required)") <= 1 for option in options)
     assert "default: None" not in text

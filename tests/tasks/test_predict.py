@@ -1,6 +1,7 @@
 """Models are kept, come back as they were, and are applied to new spectra, rows and positions."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -13,7 +14,7 @@ from augment import Mixed
 from augment.estimators.aann import AANN
 from augment.estimators.aann_kernel import AANNKernel
 from augment.estimators.kernel_regression import KernelRegression
-from swiftwrf import AngularGrid, InputError, RssiModel, load, make_model, rssi_room, simulated_room
+from swiftwrf import AngularGrid, InputError, RssiModel, Spectra, load, make_model, rssi_room, simulated_room
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
 from swiftwrf.runtime.checkpoint import read, write
@@ -135,6 +136,25 @@ def test_directions_of_measured_and_unknown_positions(finished, small, tmp_path,
     assert run("predict", estimator, tmp_path / "unknown.npy", "--every", 7, "--out", tmp_path / "some.csv") == 2
     assert "--every does not apply" in said(capsys)
     np.testing.assert_allclose(unknown["elevation_deg"], known["elevation_deg"], atol=0.05)  # 8 or 16 bits on disk
+
+
+def test_errors_are_those_of_known_directions(finished, small, tmp_path, capsys, monkeypatch):
+    """Of two errors the median is the mean; without the pose of the array there are none."""
+    estimator = finished / "kernel_regression-mix0.5.safetensors"
+    two = small.subset(torch.arange(2))
+    without_pose = Spectra(two.spectrum, two.position, grid=GRID)
+    for data in (two, without_pose):
+        monkeypatch.setattr("tasks.source.load_spectra", lambda *_, data=data, **options: data)
+        (tmp_path / "out.csv").unlink(missing_ok=True)
+        assert run("predict", estimator, tmp_path, "--json", "--out", tmp_path / "out.csv") == 0
+        answer, table = json.loads(capsys.readouterr().out), pd.read_csv(tmp_path / "out.csv")
+        if data is two:
+            assert answer["median_great_circle_deg"] == pytest.approx(table["great_circle_deg"].mean(), abs=1e-3)
+    assert (set(answer), list(table)) == ({"n", "table"}, ["index", "azimuth_deg", "elevation_deg"])
+    shifted = Spectra(two.spectrum, two.position, grid=replace(GRID, azimuth_start=0.1))
+    monkeypatch.setattr("tasks.source.load_spectra", lambda *_, **options: shifted)
+    assert run("predict", estimator, tmp_path, "--out", tmp_path / "no.csv") == 2
+    assert "as many directions as the estimator was trained on, but others" in said(capsys)
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,7 @@ import pytest
 import torch
 from sums import STEPS, Exit, Kill, KillOnce, Refusal, Sum, results
 
-from swiftwrf import AngularGrid, FitError, InputError, simulated_room
-from swiftwrf.data.writing import write_spectra
+from swiftwrf import FitError, InputError
 from swiftwrf.runtime.threads import set_threads
 from tasks.command import PRELOADED
 from tasks.configs import AoaConfig
@@ -170,14 +169,3 @@ def test_processes_end_with_a_run_that_is_killed(tmp_path):
     while is_running(process) and time.monotonic() < deadline:
         time.sleep(0.1)
     assert not is_running(process)
-
-
-@pytest.mark.fuzz
-def test_the_command_gives_the_same_numbers_with_one_thread_and_with_two_processes(tmp_path):
-    write_spectra(simulated_room(n=26, grid=AngularGrid.hemisphere(8, 32)), tmp_path)
-    options = ["--mix", "0.5", "--synthesizer", "gp", "--extra", "0", "--data", "."]
-    command = [sys.executable, "-m", "tasks.aoa", *options, "--out"]
-    for threads in ("1", "2"):
-        subprocess.run([*command, threads], cwd=tmp_path, env=ENVIRONMENT | {"OMP_NUM_THREADS": threads}, check=True)
-    one, two = ((tmp_path / threads / "errors.csv").read_text() for threads in ("1", "2"))
-    assert one == two

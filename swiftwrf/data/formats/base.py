@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
@@ -39,6 +40,7 @@ class ReadOptions(TableOptions):
     """
 
     array: PlanarArray | None = None
+    arrays: Mapping[str, str] | None = None
     beamformer: str | None = None
     grid: AngularGrid | None = None
     every: PositiveInt | None = None
@@ -110,7 +112,8 @@ def read(path: str | Path, options: ReadOptions, *registries: Registry[Format[An
         raise InputError(f"{source} is not a folder or file; expected measurements (formats: {known})")
     try:
         readers = [(name, registry[name]()) for registry in registries for name in registry]
-        found = [(name, reader) for name, reader in readers if reader.recognises(source)]
+        # names of arrays state the format
+        found = [(n, r) for n, r in readers if ("arrays" in r.takes if options.arrays else r.recognises(source))]
         if not found:
             raise InputError(f"{source} is in none of the known formats ({known}); docs/formats.md describes them")
         if len(found) > 1:

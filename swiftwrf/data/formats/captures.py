@@ -29,7 +29,7 @@ from swiftwrf.data.cells import column_of_numbers, text_of
 from swiftwrf.data.columns import column_of
 from swiftwrf.data.files import read_bytes, read_table, read_yaml
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
-from swiftwrf.data.formats.snapshots import POSE, array_of, snapshots_of
+from swiftwrf.data.formats.snapshots import array_of, described_arrays, snapshots_of
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.errors import InputError, listed, optional_module, ranges
 
@@ -226,14 +226,7 @@ def _read_description(file: Path) -> Arrays:
     missing = [name for name in GIVEN if name not in content]
     if missing:
         raise InputError(f"{file} lacks {', '.join(missing)}: {NEEDED}")
-    arrays = {}
-    for name in (*GIVEN, *POSE, "rows", "columns", "spacing_m", "element_position"):
-        if name in content:
-            try:
-                arrays[name] = np.array(content[name], dtype=np.float64)
-            except (TypeError, ValueError):
-                raise InputError(f"{file}: {name} must be a number or lists of numbers of one length") from None
-    return arrays
+    return described_arrays(file, content)
 
 
 def _files(table: Path, frame: pd.DataFrame) -> list[Path]:

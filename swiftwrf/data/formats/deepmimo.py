@@ -66,17 +66,17 @@ class DeepMimo(Format[Spectra]):
             )
         pair = pairs[(options.station or 1) - 1]
         frequency, tracer = _params(path / "params.json")
-        table, receiver, transmitter = _tables(path, pair)
-        files = [path / f"{key}_{pair}.npz" for key in (*table, "rx_pos", "tx_pos")]
+        table = _table(path, pair)
+        files = [path / f"{key}_{pair}.npz" for key in table]
         known = np.isfinite(np.stack([table[key] for key in KEYS])).all(axis=0) & (table["power"] > -math.inf)
-        index = np.arange(0, len(receiver), options.every or 1)
+        index = np.arange(0, len(known), options.every or 1)
         reached = known[index].any(axis=1)
         if not reached.any():
             raise InputError(f"{path} has no receiver with a path for pair {pair}")
         notes = [] if reached.all() else [f"receivers without a path are left out: {int((~reached).sum())}"]
         index = index[reached]
-        table = {key: values[index] for key, values in table.items()}
-        paths, found = _paths(path, table, known[index], receiver[index], transmitter, frequency, tracer)
+        table |= {key: values[index] for key, values in table.items() if key != "tx_pos"}
+        paths, found = _paths(path, table, known[index], frequency, tracer)
         return paths.spectra(
             path.resolve().name,
             options.array,
@@ -107,8 +107,8 @@ def _params(file: Path) -> tuple[float, str]:
     return frequency, tracer
 
 
-def _tables(folder: Path, pair: str) -> tuple[dict[str, Floats], Floats, Floats]:
-    """Return the paths by key, (n, paths), and the positions of receivers (n, 3) and transmitter (3,)."""
+def _table(folder: Path, pair: str) -> dict[str, Floats]:
+    """Return the paths by key, (n, paths), and positions: of receivers rx_pos (n, 3), of the transmitter tx_pos (3,)."""
     arrays: dict[str, Floats] = {}
     keys = [*KEYS, *([INTERACTIONS] if (folder / f"{INTERACTIONS}_{pair}.npz").is_file() else [])]
     for key in (*keys, "rx_pos", "tx_pos"):
@@ -117,26 +117,21 @@ def _tables(folder: Path, pair: str) -> tuple[dict[str, Floats], Floats, Floats]
         if values.dtype.kind not in "iuf":
             raise InputError(f"{file} must hold real numbers, got {values.dtype}")
         arrays[key] = values.astype(np.float64)
-    receiver, transmitter = arrays.pop("rx_pos"), arrays.pop("tx_pos").reshape(-1)
+    arrays["tx_pos"] = arrays["tx_pos"].reshape(-1)
     shape = arrays["power"].shape
-    if len(shape) != 2 or 0 in shape or any(values.shape != shape for values in arrays.values()):
-        shapes = ", ".join(f"{key} {values.shape}" for key, values in arrays.items())
+    if len(shape) != 2 or 0 in shape or any(arrays[key].shape != shape for key in keys):
+        shapes = ", ".join(f"{key} {arrays[key].shape}" for key in keys)
         raise InputError(f"{folder}: the paths of pair {pair} must all have shape (receivers, paths), got {shapes}")
-    check_positions(receiver, f"{folder}: rx_pos of pair {pair}", (shape[0], 3))
-    check_positions(transmitter, f"{folder}: tx_pos of pair {pair}", (3,))
-    return arrays, receiver, transmitter
+    check_positions(arrays["rx_pos"], f"{folder}: rx_pos of pair {pair}", (shape[0], 3))
+    check_positions(arrays["tx_pos"], f"{folder}: tx_pos of pair {pair}", (3,))
+    return arrays
 
 
 def _paths(
-    folder: Path,
-    table: dict[str, Floats],
-    known: NDArray[np.bool_],
-    receiver: Floats,
-    transmitter: Floats,
-    frequency: float,
-    tracer: str,
+    folder: Path, table: dict[str, Floats], known: NDArray[np.bool_], frequency: float, tracer: str
 ) -> tuple[PropagationPaths, list[str]]:
     """Return the known paths of receivers that have one, and notes on their conventions."""
+    receiver, transmitter = table["rx_pos"], table["tx_pos"]
     away = transmitter - receiver
     distance = np.linalg.norm(away, axis=1)
     if not (distance > 0).all():

@@ -25,12 +25,11 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from swiftwrf.array.angles import ArrayPose
-from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.choices import Moving
 from swiftwrf.data.archives import array_header, array_names, read_arrays, read_rows, refusing_broken
-from swiftwrf.data.files import check_carrier, digests, number, numbers, read_bytes, read_xyz, read_yaml, sha256
+from swiftwrf.data.files import digests, read_bytes, read_xyz, read_yaml, sha256
 from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format, ReadOptions
+from swiftwrf.data.formats.snapshots import array_of, described_arrays, pose_of
 from swiftwrf.data.spectra import Spectra, check_pixels
 from swiftwrf.data.splits import read_splits
 from swiftwrf.data.store import BATCH_PIXELS, Store, stored
@@ -49,14 +48,17 @@ class Nerf2(Format[Spectra]):
 
     def read(self, path: Path, options: ReadOptions) -> Spectra:
         described = path / "gateway_info.yml"
-        gateways = [value for value in read_yaml(described).values() if isinstance(value, dict)]
+        gateways: list[dict[str, Any]] = [value for value in read_yaml(described).values() if isinstance(value, dict)]
         if len(gateways) != 1:
             raise InputError(
                 f"{described} must describe one gateway with its position and orientation, got {len(gateways)}"
             )
-        (gateway,) = gateways
-        pose = _read_pose(described, gateway)
-        array = _read_array(described, gateway)
+        names = {"position": "array_position", "orientation": "array_orientation"}
+        arrays = described_arrays(described, {names.get(name, name): value for name, value in gateways[0].items()})
+        needed = [*names.values(), *(("frequency_hz", "element_position") if len(arrays) > len(names) else ())]
+        if missing := [name for name in needed if name not in arrays]:
+            raise InputError(f"{described} lacks {', '.join(missing).replace('array_', '')} of the gateway")
+        pose, array = pose_of(described, arrays), array_of(described, arrays) if "frequency_hz" in arrays else None
         if options.array is not None and array is not None and array != options.array:
             raise InputError(f"{described} describes another array than was given; leave one of them out")
         tables = [file for file in (path / "tx_pos.csv", path / "rx_pos.csv") if file.is_file()]
@@ -79,33 +81,6 @@ class Nerf2(Format[Spectra]):
             named_splits=read_splits(path, len(position), first=1),
             source=digests([described, tables[0]], path) | read,
         )
-
-
-def _read_pose(file: Path, gateway: dict[str, Any]) -> ArrayPose:
-    position, orientation = numbers(gateway.get("position"), 3), numbers(gateway.get("orientation"), 4)
-    if position is None or orientation is None:
-        raise InputError(
-            f"{file}: the gateway needs a position of 3 numbers [m] and an orientation (x, y, z, w) of 4, got "
-            f"{gateway.get('position')} and {gateway.get('orientation')}"
-        )
-    try:
-        return ArrayPose(position, orientation)  # type: ignore[arg-type]  # the lengths are checked
-    except InputError as error:
-        raise InputError(f"{file}: {error}") from None
-
-
-def _read_array(file: Path, gateway: dict[str, Any]) -> PlanarArray | None:
-    """Return the antenna array, None if the gateway does not describe it."""
-    if "frequency_hz" not in gateway and "element_position" not in gateway:
-        return None
-    frequency, elements = number(gateway.get("frequency_hz")), gateway.get("element_position")
-    places = [numbers(place, 2) for place in elements] if isinstance(elements, list) else [None]
-    if None in places:
-        raise InputError(
-            f"{file}: frequency_hz [Hz] comes with element_position, a list of x and y [m] of each element"
-        )
-    check_carrier(file, frequency)
-    return PlanarArray(torch.tensor(places, dtype=torch.float64), LIGHT_SPEED / frequency)
 
 
 def _read_spectra(folder: Path, n: int) -> tuple[Store, Tensor, dict[str, str]]:
@@ -174,33 +149,34 @@ def _read_images(folder: Path, n: int) -> tuple[Store, str]:
     if found != n:
         raise InputError(f"{folder} holds {found} images, but there are {n} positions; each position needs its image")
     files = [folder / f"{number:05d}.png" for number in range(1, n + 1)]
-    shape: tuple[int, int] | None = None
     digest = hashlib.sha256()
     for file in files:
         if not file.is_file():
             raise InputError(f"{file} is missing; images are numbered from 00001.png without gaps")
-        content = read_bytes(file)
-        digest.update(f"{hashlib.sha256(content).hexdigest()}  {file.name}\n".encode())
-        shape = _check_size(file, content, n, shape)
-    assert shape is not None
+        digest.update(f"{sha256(file)}  {file.name}\n".encode())
+    rows, columns = _decode(files[0], n).shape
 
     def batches() -> Iterator[Tensor]:
-        return (torch.from_numpy(_decode(file, read_bytes(file)).copy())[None] for file in files)
+        return (torch.from_numpy(_decode(file, n, (rows, columns)).copy())[None] for file in files)
 
-    return stored((n, *shape), torch.uint8, digest.hexdigest, batches), digest.hexdigest()
-
-
-def _opened(content: bytes) -> Image.Image:
-    """Open a PNG image without decoding it. Other formats are excluded, because Pillow starts programs for some."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the size is checked below
-        return Image.open(io.BytesIO(content), formats=["PNG"])
+    return stored((n, rows, columns), torch.uint8, digest.hexdigest, batches), digest.hexdigest()
 
 
-def _check_size(file: Path, content: bytes, n: int, shape: tuple[int, int] | None) -> tuple[int, int]:
-    """Return rows and columns, checked before anything is decoded: a few kilobytes may claim gigabytes."""
-    with refusing_broken(file, "a complete PNG image"), _opened(content) as image:
+def _decode(
+    file: Path, n: int, expected: tuple[int, int] | None = None
+) -> np.ndarray[tuple[int, int], np.dtype[np.uint8]]:
+    """Return the pixels of one of n images. Its size is checked before: a few kilobytes may claim gigabytes."""
+    content = read_bytes(file)
+
+    def opened() -> Image.Image:
+        """Open the image. Other formats than PNG are excluded, because Pillow starts programs for some."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            return Image.open(io.BytesIO(content), formats=["PNG"])
+
+    with refusing_broken(file, "a complete PNG image"), opened() as image:
         rows, columns, mode = image.height, image.width, image.mode
+        image.verify()  # the checksums; loading alone forgives a missing end
     if mode != "L":
         raise InputError(f"{file} has mode {mode}; a spectrum is an 8-bit grey image")
     if not (rows >= 2 and columns == 4 * rows):
@@ -209,16 +185,9 @@ def _check_size(file: Path, content: bytes, n: int, shape: tuple[int, int] | Non
             "(elevations to 90, azimuths to 360 degrees), e.g. 90 x 360"
         )
     check_pixels(str(file), n, (rows, columns))
-    if shape is not None and (rows, columns) != shape:
+    if expected not in (None, (rows, columns)):
         raise InputError(
-            f"{file} has {rows} x {columns} pixels, the first image {shape[0]} x {shape[1]}; all spectra must have one shape"
+            f"{file} has {rows} x {columns} pixels, the first image others; all spectra must have one shape"
         )
-    return rows, columns
-
-
-def _decode(file: Path, content: bytes) -> np.ndarray[tuple[int, int], np.dtype[np.uint8]]:
-    with refusing_broken(file, "a complete PNG image"):
-        with _opened(content) as image:
-            image.verify()  # the checksums; loading alone forgives a missing end
-        with _opened(content) as image:
-            return np.asarray(image)
+    with refusing_broken(file, "a complete PNG image"), opened() as image:
+        return np.asarray(image)

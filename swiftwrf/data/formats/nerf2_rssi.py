@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from swiftwrf.data.cells import column_of_numbers, seconds, text_of
 from swiftwrf.data.columns import column_of
@@ -26,7 +25,7 @@ from swiftwrf.data.coordinates import Floors, GeodeticOrigin, PlanFrame, without
 from swiftwrf.data.files import digests, numbers, read_table, read_xyz, read_yaml
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
 from swiftwrf.data.powers import NOT_DETECTED_DBM, find_fillers, without_fillers
-from swiftwrf.data.receivers import read_receivers, unknown_positions
+from swiftwrf.data.receivers import read_receivers
 from swiftwrf.data.rssi import META, SURVEY, Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
 from swiftwrf.errors import InputError, listed
@@ -63,7 +62,7 @@ class Nerf2Rssi(Format[Rssi]):
         fillers = sorted({NOT_DETECTED_DBM, *find_fillers(rssi)}) if options.filler is None else list(options.filler)
         rssi, notes = without_fillers(rssi, fillers)
         row = torch.from_numpy(~omitted).nonzero()[:, 0]
-        receiver_position, unknown = _receiver_positions(receivers, names)
+        receiver_position, unknown = read_receivers(receivers, names, None, PlanFrame()) if receivers else (None, [])
         if positions.name == "rx_pos.csv":
             missing.append(
                 "the receiver moves; RSSI is reciprocal, so it counts as the transmitter and the others as receivers"
@@ -135,25 +134,3 @@ def _one_of(path: Path, names: tuple[str, ...]) -> Path:
     if not found:
         raise InputError(f"{path / names[0]} is missing")
     return found[0]
-
-
-def _receiver_positions(file: Path | None, names: list[str]) -> tuple[Tensor | None, list[str]]:
-    """Return the positions of the receivers, float64 (R, 3) [m], nan where unknown, and a note on these."""
-    if file is None:
-        return None, []
-    if file.suffix == ".csv":
-        return read_receivers(file, names, None, PlanFrame())
-    content = {name: value for name, value in read_yaml(file).items() if value not in ("", "~", "null", "none")}
-    unknown = [name for name in names if name not in content]
-    if len(unknown) == len(names):
-        raise InputError(f"{file} has no position of the receivers that the table names: {listed(names)}")
-    found = torch.full((len(names), 3), torch.nan, dtype=torch.float64)
-    for number, name in enumerate(names):
-        if name in content:
-            position = numbers(content[name], 3)
-            if position is None:
-                raise InputError(
-                    f"{file}: receiver {name!r} needs a position of 3 finite numbers [m], got {content[name]}"
-                )
-            found[number] = torch.tensor(position, dtype=torch.float64)
-    return found, unknown_positions(unknown)

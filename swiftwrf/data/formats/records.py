@@ -36,16 +36,14 @@ from typing import Annotated, Any, ClassVar
 
 import google_crc32c
 import numpy as np
-import torch
 from annotated_types import Ge, Lt
 from numpy.typing import NDArray
-from torch import Tensor
 
-from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
-from swiftwrf.data.archives import MAX_UNPACKED_BYTES
-from swiftwrf.data.files import check_carrier, digests, read_text
+from swiftwrf.data.archives import MAX_UNPACKED_BYTES, Arrays
+from swiftwrf.data.files import read_text
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
-from swiftwrf.data.snapshots import Snapshots, check_spacing, measured, round_trip_array
+from swiftwrf.data.formats.snapshots import snapshots_of
+from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.errors import InputError
 from swiftwrf.positions import MAX_COORDINATE_M, check_positions
 from swiftwrf.runtime.validation import PositiveFloat, check_value
@@ -57,9 +55,7 @@ DTYPES: dict[Any, np.dtype[Any]] = {
     number: np.dtype(name) for number, name in ((1, "<f4"), (2, "<f8"), (3, "<i4"), (8, "<c8"), (9, "<i8"))
 }
 DTYPES[18] = np.dtype("<c16")
-Assignments = list[
-    list[Annotated[int, Ge(0), Lt(4096)] | None]
-]  # antenna of each row and column, None where it is missing
+Assignments = list[list[Annotated[int, Ge(0), Lt(4096)] | None]]  # antenna of each row and column, None if missing
 
 
 class RecordFormat(Format[Snapshots]):
@@ -92,18 +88,15 @@ class RecordFormat(Format[Snapshots]):
             raise InputError(
                 f"{path} holds records, but no JSON with antennas, which describes their arrays, lies beside them"
             )
-        station, link, antennas = _read_station(*described, options.station, self.assigned)
-        check_spacing(described[0], link["array"])
+        station, arrays, antennas = _read_station(*described, options.station, self.assigned)
         beside, notes = self.prepare(files)
         channels, positions, index, without, stride = [], [], [], 0, options.every or 1
         for number, (file, features) in enumerate((source, f) for source in files for f in records(source)):
             if number % stride:
                 continue
             try:
-                channel, position = (
-                    self.channel(tensor(features["csi"]), file)[antennas],
-                    tensor(features[self.position]),
-                )
+                channel = self.channel(tensor(features["csi"]), file)[antennas]
+                position = tensor(features[self.position])
                 if position.shape != (3,):
                     raise ValueError(f"{self.position} of shape {position.shape}")
             except (KeyError, IndexError, ValueError) as error:
@@ -124,22 +117,10 @@ class RecordFormat(Format[Snapshots]):
             raise InputError(f"{path} holds no record with a position and a channel")
         if without:
             notes = (*notes, f"records without a finite position or channel are left out: {without}")
-        csi = torch.from_numpy(np.stack(channels))
-        csi, _, elements, missing = measured(path, csi, options.drop_null, options.drop_elements)
-        link["array"] = link["array"].subset(elements)
-        turned: tuple[str, ...] = ()
-        if options.round_trip:
-            link["array"], turned = round_trip_array(link["array"])
+        arrays |= {"csi": np.stack(channels), "position": np.stack(positions)}
         name = path.resolve().name if path.is_dir() else path.stem
-        return Snapshots(
-            csi,
-            np.stack(positions),
-            **link,
-            name=f"{name}-{station}" if station else name,
-            index=index,
-            source=digests([*files, described[0], *beside]),
-            notes=(*notes, *missing, *turned),
-        )
+        read = [*files, described[0], *beside]
+        return snapshots_of(path, arrays, options, read, f"{name}-{station}" if station else name, notes, index)
 
 
 @SNAPSHOT_FORMATS.register("espargos")
@@ -220,8 +201,8 @@ def _description(path: Path) -> tuple[Path, dict[str, Any]] | None:
 
 def _read_station(
     file: Path, content: dict[str, Any], number: int | None, assigned: bool
-) -> tuple[str, dict[str, Any], list[int]]:
-    """Return name, array with position and rotation, and antennas of its elements, of the array with that number from 1."""
+) -> tuple[str, Arrays, list[int]]:
+    """Return name, arrays as of snapshots.npz, and antennas of the elements, of the array with that number from 1."""
     antennas = content["antennas"]
     names = [str(antenna.get("name", "")) for antenna in antennas]
     if (number is None and len(antennas) > 1) or not 1 <= (number or 1) <= len(antennas):
@@ -237,7 +218,6 @@ def _read_station(
         ("frequency", frequency),
     ):
         check_value(f"{file}: {name}", value, PositiveFloat)
-    check_carrier(file, frequency)
     rows: Assignments = [[row * COLUMNS + column for column in range(COLUMNS)] for row in range(ROWS)]
     first = index * ROWS * COLUMNS  # of the antennas of ESPARGOS, whose arrays follow each other
     if assigned:
@@ -252,33 +232,33 @@ def _read_station(
             )
     middle = (len(rows) - 1) / 2, (len(rows[0]) - 1) / 2
     cells = [(r, c, antenna) for r, row in enumerate(rows) for c, antenna in enumerate(row) if antenna is not None]
-    element = [(right * (column - middle[1]), up * (middle[0] - row)) for row, column, _ in cells]
-    array = PlanarArray(torch.tensor(element, dtype=torch.float64), LIGHT_SPEED / frequency)
-    location = check_positions(antenna.get("location"), f"{file}: location", (3,))
-    link = {"array": array, "fixed_position": location, "rotation": _rotation(file, antenna)}
-    return names[index], link, [first + antenna for _, _, antenna in cells]
+    normal, top = _facing(file, antenna)
+    arrays = {
+        "frequency_hz": frequency,
+        "element_position": [(right * (column - middle[1]), up * (middle[0] - row)) for row, column, _ in cells],
+        "array_position": _vector(file, antenna, "location"),
+        "array_normal": normal,
+        "array_up": top,
+    }
+    described = {name: np.array(values, dtype=np.float64) for name, values in arrays.items()}
+    return names[index], described, [first + antenna for _, _, antenna in cells]
 
 
-def _rotation(file: Path, antenna: dict[str, Any]) -> Tensor:
-    """Return the matrix of the axes to the right, up and to the front, seen from the front."""
-
-    def vector(name: str) -> NDArray[np.float64]:
-        found: NDArray[np.float64] = check_positions(antenna.get(name), f"{file}: {name}", (3,)).numpy()
-        return found
-
-    if "rightvector" in antenna:
-        right, up = vector("rightvector"), vector("upvector")
-    else:
-        front = vector("direction")
-        right = np.cross([0.0, 0.0, 1.0], front)
-        up = np.cross(front, right)
+def _facing(file: Path, antenna: dict[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the normal of an array, to its front, and its upper side, from the axes to the right and up or the normal."""
+    if "rightvector" not in antenna:
+        return _vector(file, antenna, "direction"), np.array([0.0, 0.0, 1.0])
+    right, up = _vector(file, antenna, "rightvector"), _vector(file, antenna, "upvector")
     size = np.linalg.norm(right) * np.linalg.norm(up)
     if not size > 1e-12 or abs(right @ up) > 0.1 * size:
-        raise InputError(
-            f"{file}: rightvector and upvector of an array must be at right angles, or its direction not vertical"
-        )
-    right, front = (vector / np.linalg.norm(vector) for vector in (right, np.cross(right, up)))
-    return torch.from_numpy(np.stack([right, np.cross(front, right), front], axis=1))
+        raise InputError(f"{file}: rightvector and upvector of an array must be at right angles")
+    normal = np.cross(right, up)
+    return normal, np.cross(normal, right)
+
+
+def _vector(file: Path, antenna: dict[str, Any], name: str) -> NDArray[np.float64]:
+    found: NDArray[np.float64] = check_positions(antenna.get(name), f"{file}: {name}", (3,)).numpy()
+    return found
 
 
 def records(file: Path) -> Iterator[dict[str, bytes]]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,15 +16,16 @@ from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.archives import ARCHIVES, Arrays, array_names, read_arrays
 from swiftwrf.data.files import check_carrier, digests
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
-from swiftwrf.data.snapshots import Snapshots, check_spacing, measured, round_trip_array
+from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.splits import read_splits
-from swiftwrf.errors import InputError
+from swiftwrf.errors import InputError, listed, ranges
 from swiftwrf.positions import check_positions, to_tensor
 
 REQUIRED_ARRAYS = ("csi", "position", "frequency_hz", "array_position")
 POSE = ("array_orientation", "array_normal", "array_up")  # the first, or the others
 OPTIONAL = (*POSE, "element_position", "rows", "columns", "spacing_m", "line_of_sight", "time")
 SCALARS = ("frequency_hz", "rows", "columns", "spacing_m")
+SPACINGS_WAVELENGTHS = (0.01, 20.0)  # of neighbouring elements; beyond, the unit is another one
 VECTORS = ("array_position", *POSE, "line_of_sight", "time", "frequency_hz")
 
 
@@ -30,20 +33,30 @@ VECTORS = ("array_position", *POSE, "line_of_sight", "time", "frequency_hz")
 class SnapshotArrays(Format[Snapshots]):
     """Arrays by name, one row a position of the transmitter."""
 
-    takes = frozenset({"beamformer", "grid", "every", "drop_null", "drop_elements", "round_trip"})
+    takes = frozenset({"arrays", "beamformer", "grid", "every", "drop_null", "drop_elements", "round_trip"})
 
     def recognises(self, path: Path) -> bool:
         return _file(path) is not None
 
     def read(self, path: Path, options: ReadOptions) -> Snapshots:
-        file = _file(path)
-        assert file is not None
-        arrays = read_arrays(file, REQUIRED_ARRAYS, OPTIONAL)
+        file, stated = _file(path) or path, options.arrays or {}
+        name = {array: stated.get(array, array) for array in (*REQUIRED_ARRAYS, *OPTIONAL)}
+        if file.is_dir() or stated.keys() - name.keys():
+            raise InputError(f"arrays takes {', '.join(name)} of a file that is named, got {listed(stated)} of {file}")
+        needed = [name[array] for array in dict.fromkeys((*REQUIRED_ARRAYS, *stated))]
+        found = read_arrays(file, needed, [name[array] for array in OPTIONAL if array not in stated])
+        arrays = {array: found[own] for array, own in name.items() if own in found}
         return snapshots_of(file, arrays, options, [file], file.stem if file.stem != "snapshots" else None)
 
 
 def snapshots_of(
-    source: Path, arrays: Arrays, options: ReadOptions, files: list[Path], name: str | None, notes: tuple[str, ...] = ()
+    source: Path,
+    arrays: Arrays,
+    options: ReadOptions,
+    files: list[Path],
+    name: str | None,
+    notes: tuple[str, ...] = (),
+    index: list[int] | None = None,
 ) -> Snapshots:
     """Return the snapshots in arrays of the names of snapshots.npz.
 
@@ -54,6 +67,7 @@ def snapshots_of(
         files: Files that were read, in the folder of the splits.
         name: Name of the data set. Defaults to that of the folder.
         notes: What the user has to know about the arrays.
+        index: Numbers of the measurements, if the arrays hold some of them.
     """
     # scalars and vectors as such, which MATLAB stores as matrices
     vectors = {name: arrays[name] for name in VECTORS if name in arrays and arrays[name].ndim == 2}
@@ -65,14 +79,17 @@ def snapshots_of(
     if given.ndim == 1 and arrays["csi"].ndim == 3:
         arrays |= {"frequency_hz": given.mean()}
     position, array = check_positions(arrays["position"], f"{source}: position"), array_of(source, arrays)
-    n, folder, pose = len(position), files[0].parent, _pose(source, arrays)
+    n, folder, pose = len(position), files[0].parent, pose_of(source, arrays)
+    step = 1 if index is not None or options.every is None else options.every
     raw = _channel(source, arrays["csi"], n, len(array.element))
     channel, kept, elements, missing = measured(source, raw, options.drop_null, options.drop_elements)
     channel, array = _scaled(source, channel), array.subset(elements)
     if given.ndim == 1:
         frequency = to_tensor(f"{source}: frequency_hz", given, torch.float64, (raw.shape[1],))[kept]
         frequency = 2 * frequency if options.round_trip else frequency
-    array, turned = round_trip_array(array) if options.round_trip else (array, ())
+    if options.round_trip:  # phases change as those of half the wavelength
+        array = PlanarArray(array.element, array.wavelength / 2)
+        missing = (*missing, "phases are those of the way there and back, so half the wavelength counts")
     if bool((position == torch.tensor(pose.position, dtype=torch.float64)).all(dim=1).any()):
         raise InputError(f"{source} has a position equal to array_position, from which there is no direction")
     data = Snapshots(
@@ -81,14 +98,15 @@ def snapshots_of(
         array=array,
         pose=pose,
         name=name or folder.resolve().name,
-        named_splits=read_splits(folder, n, first=1) if options.every in (None, 1) else None,
+        index=index,
+        named_splits=read_splits(folder, n, first=1) if index is None and step == 1 else None,
         source=digests(files, folder),
         line_of_sight=arrays.get("line_of_sight"),
         time=arrays.get("time"),
         frequency_hz=frequency,
-        notes=(*notes, *reversed_axes, *polarisations, *missing, *turned),
+        notes=(*notes, *reversed_axes, *polarisations, *missing),
     )
-    return data if options.every in (None, 1) else data.subset(torch.arange(0, n, options.every))
+    return data if step == 1 else data.subset(torch.arange(0, n, step))
 
 
 def _file(path: Path) -> Path | None:
@@ -158,6 +176,69 @@ def _channel(file: Path, csi: NDArray[np.generic], n: int, elements: int) -> Ten
     return torch.from_numpy(csi.reshape(n, -1, elements).astype(np.complex128))
 
 
+def measured(
+    source: Path, channel: Tensor, drop_null: bool = False, drop: Sequence[int] = ()
+) -> tuple[Tensor, Tensor, Tensor, tuple[str, ...]]:
+    """Return a channel (n, S, K) without what is missing, its snapshots and elements among those given, and notes.
+
+    Missing are values that are 0 or NaN. They become 0, which beamformers do not use.
+
+    Elements to drop, counted from 0, and those without any value are left out. So are snapshots if other rows have fewer of
+    them. Null, guard and DC subcarriers hold a constant or nothing: they are the same at every position and element.
+
+    Raises:
+        InputError: A position without any value, fewer than 2 elements, or one to leave out that does not exist.
+
+    Example:
+        >>> channel = torch.randn(5, 4, 3, dtype=torch.complex64)
+        >>> channel[:, 2] = 12 + 3j
+        >>> measured(Path("a"), channel, drop_null=True)[1:]
+        (tensor([0, 1, 3]), tensor([0, 1, 2]), (...are left out (1 of 4, counted from 0): 2',))
+    """
+    count, elements = channel.shape[1:]
+    missing, notes = (channel == 0) | channel.isnan(), []
+    channel = channel.masked_fill(missing, 0)
+    if lost := missing.all(dim=2).all(dim=1).nonzero()[:, 0].tolist():
+        raise InputError(f"{source}: csi of row {lost[0]} has no power; leave it out")
+    if beyond := [number for number in drop if not 0 <= number < elements]:
+        raise InputError(f"{source} has elements 0 to {elements - 1}, so element {beyond[0]} cannot be left out")
+    silent = missing.all(dim=1).all(dim=0)
+    used = ~silent
+    used[list(drop)] = False
+    if int(used.sum()) < 2:
+        raise InputError(
+            f"{source}: csi has values at {int(used.sum())} elements; expected at least 2 to resolve directions"
+        )
+    for which, reason in (
+        (silent.nonzero()[:, 0].tolist(), "silent (0 or NaN everywhere)"),
+        (list(drop), "to be ignored"),
+    ):
+        if which:
+            named = f"element {which[0]} is" if len(which) == 1 else f"elements {ranges(sorted(which))} are"
+            notes.append(f"{named} {reason} and left out (counted from 0)")
+    channel, missing = channel[..., used], missing[..., used]
+    empty = missing.all(dim=2)
+    kept = torch.ones(count, dtype=torch.bool)
+    if bool((empty.any(dim=0) & ~empty.all(dim=0)).any()):  # rows differ in their number of packets
+        kept = ~empty.all(dim=0)
+        notes.append(f"{int(empty.sum())} of {empty.numel()} snapshots are 0 or NaN at all elements and left out")
+    elif len(channel) > 1:
+        first = channel[:1, :, :1]
+        null = ((channel - first).abs() <= 1e-3 * first.abs()).all(dim=2).all(dim=0)
+        if bool(null.any()) and not bool(null.all()):
+            which_null = f"({int(null.sum())} of {count}, counted from 0): {ranges(null.nonzero()[:, 0].tolist())}"
+            name = "null subcarriers, the same at every position and element, are"
+            kept = ~null if drop_null else kept
+            notes.append(
+                f"{name} left out {which_null}"
+                if drop_null
+                else f"{name} used like the others {which_null}; --drop-null leaves them out"
+            )
+    if some := int((missing & ~empty[..., None]).sum()):
+        notes.append(f"{some} of {missing.numel()} values of single elements are 0 or NaN and not used")
+    return channel[:, kept], kept.nonzero()[:, 0], used.nonzero()[:, 0], tuple(notes)
+
+
 def _scaled(file: Path, channel: Tensor) -> Tensor:
     """Return channels, complex64 (n, S, K), each row scaled to unit mean power, because their unit is arbitrary."""
     total = torch.view_as_real(channel).square().sum(-1).sum(dim=(1, 2), keepdim=True)
@@ -168,7 +249,20 @@ def _scaled(file: Path, channel: Tensor) -> Tensor:
     return (channel / power.sqrt()).to(torch.complex64)
 
 
-def _pose(file: Path, arrays: Arrays) -> ArrayPose:
+def described_arrays(file: Path, content: Mapping[str, Any]) -> Arrays:
+    """Return the arrays of snapshots.npz that describe the array of antennas, from the texts of a YAML mapping."""
+    arrays = {}
+    for name in ("frequency_hz", "array_position", *POSE, "rows", "columns", "spacing_m", "element_position"):
+        if name in content:
+            try:
+                arrays[name] = np.array(content[name], dtype=np.float64)
+            except (TypeError, ValueError):
+                raise InputError(f"{file}: {name} must be a number or lists of numbers of one length") from None
+    return arrays
+
+
+def pose_of(file: Path, arrays: Arrays) -> ArrayPose:
+    """Return the pose of the array, by its orientation or by its normal and upper side."""
     stated = next((name for name in POSE[:2] if name in arrays), None)
     if stated is None:
         raise InputError(f"{file} lacks array_orientation; give that unit quaternion, or array_normal and array_up")
@@ -212,7 +306,16 @@ def array_of(file: Path, arrays: Arrays) -> PlanarArray:
             f"{file} lacks the array: give element_position (elements, 3) in metres, or the numbers rows, columns and "
             "spacing_m"
         )
-    check_spacing(file, array)
+    if len(array.element) < 2:
+        raise InputError(
+            f"{file} describes an array of one element, which resolves no directions; at least 2 are needed"
+        )
+    apart, (low, high) = array.spacing_wavelengths, SPACINGS_WAVELENGTHS
+    if not low <= apart <= high:
+        raise InputError(
+            f"{file}: neighbouring elements are {apart * array.wavelength:.4g} m, {apart:.3g} wavelengths apart; expected "
+            f"{low:g} to {high:g} wavelengths, so is the spacing in metres and the carrier in Hz?"
+        )
     return array
 
 

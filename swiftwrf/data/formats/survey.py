@@ -1,4 +1,7 @@
-"""Reader of survey tables: positions and RSSI in CSV or Parquet, one column a receiver (wide) or one row a packet (long)."""
+"""Reader of survey tables: positions and RSSI, one column a receiver (wide) or one row a packet (long).
+
+Tables are CSV or Parquet, or the records in JSON, GPX and KML documents.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from pathlib import Path
 import pandas as pd
 
 from swiftwrf.data.columns import is_coordinate, is_rssi
-from swiftwrf.data.files import SUFFIXES, digests, has_header, read_table
+from swiftwrf.data.files import SUFFIXES, TABLES, digests, has_header, read_table
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
 from swiftwrf.data.formats.captures import holds_captures
 from swiftwrf.data.formats.nerf2_rssi import FILES as NERF2_FILES
@@ -56,7 +59,7 @@ def _tables(path: Path) -> list[Path]:
     if holds_captures(path):
         return []
     if path.is_file():
-        return [path] if path.suffix.lower() in SUFFIXES else []
+        return [path] if path.suffix.lower() in TABLES else []
     if any((path / name).is_file() for name in NERF2_FILES):
         return []
     return sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.name != RECEIVERS)

@@ -53,7 +53,7 @@ def sionna() -> Any:
         raise InputError(
             "ray tracing needs Sionna RT; install it with pip install 'swiftwrf-tasks[raytrace]'"
         ) from None
-    version = drjit.detail.llvm_version()[0] if (mitsuba.variant() or "").startswith("llvm") else MIN_LLVM
+    version = drjit.detail.llvm_version()[0] if str(mitsuba.variant()).startswith("llvm") else MIN_LLVM
     if version < MIN_LLVM:
         raise InputError(f"Sionna RT needs LLVM {MIN_LLVM} without an NVIDIA GPU, got LLVM {version}; {remedy}")
     drjit.set_thread_count(torch.get_num_threads())

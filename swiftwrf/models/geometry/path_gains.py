@@ -110,7 +110,7 @@ class PathGains:
 
     def change(self, position: Tensor) -> Tensor:
         """Return the differences of the gains from those of the planes in each field, complex64 (n, F, S)."""
-        change = self.process.mean(position).reshape(len(position), -1, self.n_paths, 2)
+        change = self.process.mean(position).unflatten(1, (-1, self.n_paths, 2))
         return torch.view_as_complex(change)
 
 
@@ -199,7 +199,7 @@ def choose_prior(
         fold, by its number, none if not all positions were used.
     """
     complete = len(scene) <= MAX_CHOICE
-    some = torch.linspace(0, len(scene) - 1, min(MAX_CHOICE, len(scene))).long()
+    some = scene.few_rows(MAX_CHOICE)
     scene, fold = scene.subset(some), fold[some]
     kernel = kernel_of(scene.moving)
     candidates: list[tuple[GeometryModel, PriorName]] = [(geometry, name) for name in PRIORS]

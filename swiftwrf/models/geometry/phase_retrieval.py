@@ -45,8 +45,7 @@ def coarray_numbers(spectra: Iterable[Tensor], array: PlanarArray, grid: Angular
         grid: Directions of the pixels.
     """
     functions = basis(array, grid)
-    stride = max(1, functions.shape[1] // MAX_PIXELS)
-    stride += 1 - stride % 2  # odd: an even one would keep to every other column
+    stride = max(1, functions.shape[1] // MAX_PIXELS) | 1  # odd: an even one would keep to every other column
     inverse = torch.linalg.pinv(functions[:, ::stride])
     coefficient = torch.cat([part.flatten(1)[:, ::stride].double().square() @ inverse for part in spectra])
     half = (coefficient.shape[1] - 1) // 2

@@ -29,14 +29,13 @@ from swiftwrf.models.geometry.planes import (
     refine_all,
     sign_alternatives,
 )
-from swiftwrf.models.geometry.search import SteeringResponses
+from swiftwrf.models.geometry.search import N_RESCORED, SteeringResponses
 from swiftwrf.runtime.threads import parallel_map
 
 MIN_SPREAD_RAD = 0.8  # of phase: positions with less spread in any direction count as flat
 CARRIER_SCALES = (0.95, 0.97, 0.98, 0.99, 1.01, 1.02, 1.03, 1.05)  # of alternative carriers
 MAX_PERIODS = 4  # to either side
-N_POSITIONS = 18  # that the best combinations are scored at
-N_RESCORED = 8  # times as many combinations as are wanted are scored at more than the first positions
+N_FIRST, N_NEXT = 6, 18  # positions that all combinations of aliases are scored at, and the best of them
 N_WHOLE = 32  # combinations of whole periods around which half periods are tried
 N_COARSE, N_FINE = 24, 8  # rooms that are refined with some positions, and with all
 HalfPeriods = tuple[int, ...]  # by which each plane is moved
@@ -148,7 +147,7 @@ def phase_alternatives(scene: PhaseObservations, room: PlaneSet) -> list[PlaneSe
     planes = room.normal.shape[1]
     if not planes:
         return []
-    few, table = scene.few(), _AlternativeTable(scene.few(N_POSITIONS), room)
+    few, table = scene.few(), _AlternativeTable(scene.few(N_NEXT), room)
     near = [[h for h in p if abs(h) <= MAX_PERIODS] for p in table.offsets]
     whole = [[h for h in p if h % 2 == 0] for p in table.offsets]
     tried = table.best(near, N_COARSE)
@@ -195,7 +194,7 @@ class _AlternativeTable:
         self.offsets = [_alias_offsets(scene, room, plane) for plane in range(room.normal.shape[1])]
         offset = [torch.tensor(list(p.values()), dtype=torch.float64) for p in self.offsets]
         gain = [g * (-1.0) ** torch.tensor(list(p)) for g, p in zip(room.gain[0], self.offsets, strict=True)]
-        self.scenes = [scene.few(6), scene]  # all combinations are scored at the first
+        self.scenes = [scene.few(N_FIRST), scene]
         self.waves = [SteeringResponses.of(some, room.normal[0], offset, gain, room.order) for some in self.scenes]
 
     def room(self, choice: HalfPeriods) -> PlaneSet:

@@ -91,6 +91,18 @@ def test_distances_of_close_pairs_far_from_the_origin(device):
     )
 
 
+class OnGpu(torch.Tensor):
+    """A tensor in main memory that takes the way of tensors on a GPU."""
+
+    is_cuda = True
+
+
+def test_distances_within_groups_are_those_of_each_group_on_a_gpu(generator):
+    a, b = (torch.rand(4, n, 3, generator=generator) for n in (1, 5))
+    expected = torch.stack([distance(x, y) for x, y in zip(a, b, strict=True)])
+    torch.testing.assert_close(distance(a.as_subclass(OnGpu), b).as_subclass(torch.Tensor), expected)
+
+
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
 def test_gradient_where_two_positions_coincide(device):
     a = torch.tensor([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]], device=device, requires_grad=True)

@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from samples import snapshots, write_snapshots
@@ -112,23 +111,6 @@ def test_the_earliest_path_is_found_below_a_stronger_reflection(array):
     assert float(angular_distance(music(array, channel), first).rad2deg().median()) > 10
     with pytest.raises(InputError, match="at least 4 subcarriers at equal distances, got 3"):
         joint_music(array, channel[:, :3], frequency[:3])
-
-
-def test_music_agrees_with_pyroomacoustics():
-    doa = pytest.importorskip("pyroomacoustics").doa
-    direction = unit(0.35, -0.5)[None]
-    channel, _ = received(SQUARE, direction, snapshots=50)
-    sound, size = 343.0, 64
-    rate = size * sound / SQUARE.wavelength / 8  # bin 8 has the wavelength of the array
-    azimuth, colatitude = np.radians(np.arange(0, 360, 1.0)), np.radians(np.arange(0, 90.5, 1.0))
-    place = torch.nn.functional.pad(SQUARE.element, (0, 1)).T.numpy()
-    reference = doa.MUSIC(place, rate, size, c=sound, num_src=1, dim=3, azimuth=azimuth, colatitude=colatitude)
-    spectra = np.zeros((16, size // 2 + 1, 50), dtype=complex)
-    spectra[:, 8] = channel[0].T.numpy()
-    reference.locate_sources(spectra, num_src=1, freq_bins=[8])
-    (phi,), (theta,) = reference.azimuth_recon, reference.colatitude_recon
-    theirs = torch.tensor([math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta)])
-    assert float(angular_distance(music(SQUARE, channel)[0], theirs.double()).rad2deg()) < 1.5  # their grid
 
 
 def test_estimators_use_the_snapshots_of_measured_spectra(tmp_path):

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from functools import cache
 from itertools import pairwise
 from unittest import mock
 
@@ -22,7 +21,6 @@ from swiftwrf.metrics import psnr
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.mlp import encode
 from swiftwrf.rasterize import rasterize_magnitude
-from swiftwrf.runtime.checkpoint import read, write
 
 GRID = AngularGrid.hemisphere(90, 360)
 LEARNS = {
@@ -340,32 +338,3 @@ def test_one_field_for_all_receivers(tmp_path):
     transmitter, receiver = ((at - centre).float() for at in (position[7:8], train.receiver_position[2:]))
     signal = received(model.field, config.reach, config.samples, transmitter, receiver, rays).mean(dim=1)
     torch.testing.assert_close(predicted[7, 2].float(), 100 * (torch.hypot(*signal) - 1))
-
-
-@pytest.mark.parametrize("name", ["nerf2", "wrfgs"])
-def test_any_resolution(room, name):
-    """Every other pixel of the doubled grid is one of the grid."""
-    model = fit(room, name)
-    coarse, fine = (model.synthesize(room.position[:3], grid) for grid in (None, AngularGrid.hemisphere(30, 120)))
-    torch.testing.assert_close(fine[:, 1::2, ::2], coarse, atol=1e-5, rtol=1e-4)
-
-
-@pytest.fixture(scope="module")
-def fitted(room):
-    """A fitted model of each name, once."""
-    return cache(lambda name: fit(room, name))
-
-
-@every
-@pytest.mark.parametrize(
-    "change", [{"options": {"width": 10**9}}, {"options": {"bands": 10**6}}, {"grid": None}, {"moving": "both"}]
-)
-def test_damaged_models_are_refused(fitted, tmp_path, name, change):
-    fitted(name).save(tmp_path / "model")
-    kind, tensors, header = read(tmp_path / "model", type(fitted(name)).kind)
-    if change == {"moving": "both"} and "moving" not in header:
-        pytest.skip("has no ends")
-    damaged = {k: header[k] | v if isinstance(v, dict) and v else v for k, v in change.items()}
-    write(tmp_path / "damaged", kind, tensors, header | damaged)
-    with pytest.raises(InputError):
-        load(tmp_path / "damaged")

@@ -63,7 +63,7 @@ WRONG = {
     "no gateway": (_write("gateway_info.yml", "name: x\n"), "one gateway"),
     "short position": (
         _write("gateway_info.yml", "g:\n  position: [0, 0]\n  orientation: [0, 0, 0, 1]\n"),
-        "3 numbers",
+        r"position must have shape \(3\)",
     ),
     "no positions": (lambda f: (f / "tx_pos.csv").unlink(), "one of tx_pos.csv"),
     "both ends move": (_write("rx_pos.csv", "x,y,z\n1,1,1\n"), "one of tx_pos.csv"),
@@ -257,7 +257,7 @@ WRONG_RSSI = {
     "two of one name": (_write("gateway_rssi.csv", "a,a,c\n-1,-2,-3\n"), "'a' twice"),
     "another number of rows": (_write("gateway_rssi.csv", "a,b,c\n-50,-60,-70\n"), "has 1 rows, tx_pos.csv 15"),
     "empty": (_write("gateway_rssi.csv", ""), "is empty"),
-    "no receiver with a place": (_write("gateway_position.yml", "d: [0, 0, 1]\n"), "no position of the receivers"),
+    "no receiver with a place": (_write("gateway_position.yml", "d: [0, 0, 1]\n"), "has none of the receivers"),
     "two places of one name": (_write("gateway_position.yml", "a: [0, 0, 1]\na: [1, 1, 1]\n"), "'a' twice"),
     "place of two numbers": (_write("gateway_position.yml", "a: [0, 0]\nb: [1, 1]\nc: [1, 2]\n"), "3 finite numbers"),
     "nan positions": (_write("tx_pos.csv", "x,y,z\n" + "nan,1,1\n" * ROWS), "needs 3 finite numbers"),

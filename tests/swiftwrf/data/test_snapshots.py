@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from samples import FREQUENCY, WAVELENGTH, snapshot_arrays, snapshots, write_snapshots
+from scipy.io import savemat
 
 from augment import Mixed
 from augment.estimators import make_estimator
@@ -48,6 +49,23 @@ def test_one_snapshot_needs_no_axis_of_its_own(tmp_path):
     made = snapshots()
     folder = write_snapshots(tmp_path / "a", csi=made.channel[:, 0].numpy())
     assert load_snapshots(folder).channel.shape == (120, 1, 16)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".mat"])
+def test_arrays_with_other_names(tmp_path, suffix):
+    names = {"csi": "H", "position": "pos", "frequency_hz": "f"}
+    arrays = snapshot_arrays(snapshots()) | {"frequency_hz": FREQUENCY + np.array([-1e6, 0, 1e6])}
+    file = tmp_path / f"run7{suffix}"
+    renamed = {names.get(name, name): values for name, values in arrays.items()}
+    np.savez(file, **renamed) if suffix == ".npz" else savemat(file, renamed)
+    data = load_snapshots(file, arrays=names)
+    assert (data.name, data.channel.shape) == ("run7", (120, 3, 16))
+    assert data.frequency_hz.tolist() == (FREQUENCY + np.array([-1e6, 0, 1e6])).tolist()
+    for wrong, message in (({"csi": "G"}, "lacks G"), ({"noise": "N"}, "arrays takes csi"), ({}, "none of the known")):
+        with pytest.raises(InputError, match=message):
+            load_snapshots(file, arrays=names | wrong if wrong else None)
+    with pytest.raises(InputError, match="a file that is named"):
+        load_snapshots(tmp_path, arrays=names)
 
 
 def test_rows_columns_and_spacing_describe_an_array(tmp_path):

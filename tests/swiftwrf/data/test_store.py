@@ -90,8 +90,10 @@ def test_many_images_lie_in_a_file_that_is_reused(cache, folder, monkeypatch):
     assert fingerprint(data) == fingerprint(load_spectra(folder))
 
     monkeypatch.setattr(store, "MIN_FILE_SPECTRA", N)
-    monkeypatch.setattr(nerf2, "_decode", lambda *_: pytest.fail("decoded again"))
+    decode, decoded = nerf2._decode, []
+    monkeypatch.setattr(nerf2, "_decode", lambda file, *size: decoded.append(file.name) or decode(file, *size))
     assert torch.equal(load_spectra(folder).spectrum, data.spectrum)
+    assert decoded == ["00001.png"]  # for the shape
 
 
 def test_other_images_make_another_file(cache, folder):

@@ -123,6 +123,14 @@ def test_local_predictions_condition_on_the_nearest_positions(generator):
 
 
 @pytest.mark.parametrize("exact", [True, False])
+def test_other_values_replace_those_before(generator, exact):
+    known, value, other = (torch.rand(20, 3, generator=generator, dtype=torch.float64) for _ in range(3))
+    process = GaussianProcess.regress(KERNEL, known, value, exact)
+    torch.testing.assert_close(process.value, value)
+    torch.testing.assert_close(process.regressed(other).value, other)
+
+
+@pytest.mark.parametrize("exact", [True, False])
 def test_slopes_are_those_of_finite_differences(generator, exact):
     position = 2 * torch.rand(70, 3, generator=generator, dtype=torch.float64) - 1
     value = torch.sin(position @ torch.randn(3, 2, generator=generator, dtype=torch.float64))

@@ -34,7 +34,7 @@ ROOM = [
 @pytest.fixture(scope="module")
 def floor():
     """RSSI of a small floor, and its locator."""
-    train, test = rssi_room(n=150, seed=1).split()
+    train, test = rssi_room(n=150, seed=1).columns(range(0, 12, 2)).split()
     return train, test, RssiLocator(n_cells=600).fit(train)
 
 
@@ -233,10 +233,34 @@ def test_the_prior_region_can_be_given(floor, tmp_path):
     assert torch.equal(load(tmp_path / "locator.safetensors").cells.position, locator.cells.position)
 
 
+def test_a_region_takes_finite_positions_of_any_kind():
+    known = np.random.default_rng(0).random((50, 3))
+    expected = Region(torch.from_numpy(known)).cells(100).position
+    for given in (known, known.tolist(), torch.from_numpy(known).float()):
+        torch.testing.assert_close(Region(given).cells(100).position, expected, atol=1e-5, rtol=0)
+    for given, message in ((known * math.nan, "must be finite"), (known[:1], "at least 2"), (known[:, :2], "shape")):
+        with pytest.raises(InputError, match=message):
+            Region(given)
+
+
 @pytest.mark.parametrize("locator", [MatchedField, RssiLocator])
 def test_unknown_options_are_refused(locator):
     with pytest.raises(InputError, match="has no option 'cells'"):
         locator(cells=4)
+
+
+def test_rows_at_one_position_are_located_there(tmp_path):
+    room = rssi_room(n=60)
+    locator = RssiLocator(n_cells=50).fit(replace(room, transmitter_position=torch.ones(60, 3)))
+    locator.save(tmp_path / "locator.safetensors")
+    assert torch.equal(load(tmp_path / "locator.safetensors").locate(room.rssi_dbm).median, torch.ones(60, 3).double())
+
+
+def test_neighbours_that_cannot_be_held_out_are_refused():
+    room = rssi_room(n=120)
+    room.rssi_dbm[room.transmitter_position[:, 0] > 4] = torch.nan
+    with pytest.raises(InputError, match="no rows of simulated-floor can be held out to choose the neighbours"):
+        Fingerprints.fit(room, torch.arange(120) * 0)
 
 
 def test_sessions_of_unequal_length_can_be_held_out():
@@ -246,7 +270,7 @@ def test_sessions_of_unequal_length_can_be_held_out():
 
 
 def test_spectra_at_one_position_are_held_out_together():
-    train = simulated_room(n=40, seed=3, grid=AngularGrid.hemisphere(15, 60))
+    train = simulated_room(n=24, seed=3, grid=AngularGrid.hemisphere(15, 60))
     twice = train.subset(torch.arange(len(train)).repeat_interleave(2))
     room = GeometryModel.of_planes(train, ROOM)
     once, repeated = (MatchedField(**SMALL).fit(some, room=room).residual for some in (train, twice))
@@ -311,6 +335,13 @@ def test_floors_are_located_with_their_probability(building, tmp_path):
     assert torch.equal(load(tmp_path / "locator.safetensors").locate(test.rssi_dbm).log_weight, posterior.log_weight)
 
 
+def test_each_floor_may_be_a_session_of_its_own(building):
+    """Then no held-out row has a neighbour on its floor."""
+    rows = replace(building, session=building.floors.number(building.transmitter_position))
+    locator = RssiLocator(validation="session", n_cells=100).fit(rows)
+    assert locator.locate(rows.rssi_dbm[:3]).median.isfinite().all()
+
+
 def test_neighbours_are_places_that_vote_for_a_floor(building):
     train, test = building.split()
     known = Fingerprints.of(train, k=4)
@@ -350,9 +381,9 @@ def test_detections_are_learnt():
 @pytest.mark.parametrize(
     ("rssi", "message"),
     [
-        (torch.full((2, 12), math.nan), "no receiver detected the transmitter in row 0"),
-        (torch.zeros(2, 5), r"rssi must have shape \(n, 12\), got \(2, 5\)"),
-        (torch.full((1, 12), math.inf), "finite"),
+        (torch.full((2, 6), math.nan), "no receiver detected the transmitter in row 0"),
+        (torch.zeros(2, 5), r"rssi must have shape \(n, 6\), got \(2, 5\)"),
+        (torch.full((1, 6), math.inf), "finite"),
     ],
 )
 def test_observations_that_make_no_sense_are_refused(floor, rssi, message):
@@ -531,34 +562,25 @@ def test_packets_of_one_row_have_its_time():
     assert times(apart) == [0.0, 0.0, 1.0, 1.0]
 
 
-@pytest.mark.parametrize("cell", ["noon", ""])
-def test_walks_without_a_time_are_refused(cell, tmp_path, capsys):
+def test_positions_of_a_walk(locate_run, tmp_path, capsys):
+    """The transmitter rests at one position, so that the smoothed rows agree."""
     data = rssi_room(n=60)
-    RssiLocator(n_cells=300).fit(data).save(tmp_path / "locator")
-    table = pd.DataFrame(data.rssi_dbm[:3].numpy(), columns=list(data.receiver_names)).assign(time=["2", cell, "7"])
-    table.to_csv(tmp_path / "walk.csv", index=False)
-    assert (
-        command("predict", tmp_path / "locator", tmp_path / "walk.csv", "--track", 1, "--out", tmp_path / "out.csv")
-        == 2
-    )
-    assert "row 1 (counted from 0) has no time" in capsys.readouterr().err
-
-
-def test_positions_of_a_walk(tmp_path, capsys):
-    data = rssi_room(n=60)
-    locator = RssiLocator(n_cells=300).fit(data)
-    file = tmp_path / "locator"
-    locator.save(file)
-    # the transmitter rests at one position: the smoothed rows agree
     row = data.rssi_dbm[7] + 6 * torch.randn(10, 12, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     table = pd.DataFrame(row.clamp(-149, 0).numpy(), columns=list(data.receiver_names)).assign(time=np.arange(10) / 10)
     table.to_csv(tmp_path / "walk.csv", index=False)
-    assert command("predict", file, tmp_path / "walk.csv", "--out", tmp_path / "alone.csv") == 0
-    assert command("predict", file, tmp_path / "walk.csv", "--track", 0.1, "--out", tmp_path / "tracked.csv") == 0
-    alone, tracked = (pd.read_csv(tmp_path / name) for name in ("alone.csv", "tracked.csv"))
+    tables = []
+    for options in ((), ("--track", 0.1)):
+        out = tmp_path / f"{len(options)}.csv"
+        assert command("predict", locate_run, tmp_path / "walk.csv", *options, "--out", out) == 0
+        tables.append(pd.read_csv(out))
+    alone, tracked = tables
     assert list(tracked.columns) == list(alone.columns)
     assert tracked[["x_m", "y_m"]].std().sum() < 0.5 * alone[["x_m", "y_m"]].std().sum()
     assert (tracked.credible_radius_80_m <= alone.credible_radius_80_m + 0.5).all()
     capsys.readouterr()
-    assert command("predict", file, tmp_path / "walk.csv", "--track", 0, "--out", tmp_path / "out.csv") == 2
-    assert "speed is a number above 0" in capsys.readouterr().err
+    for speed, time, says in ((0, "3", "speed is a number above 0"), (1, "noon", "row 1 (counted from 0) has no time"),
+                              (1, "", "row 1 (counted from 0) has no time")):  # fmt: skip
+        table.iloc[:3].assign(time=["2", time, "7"]).to_csv(tmp_path / "walk.csv", index=False)
+        walk = ("predict", locate_run, tmp_path / "walk.csv", "--track", speed, "--out", tmp_path / "out.csv")
+        assert command(*walk) == 2
+        assert says in capsys.readouterr().err

@@ -10,7 +10,7 @@ from rooms import ARRAY, GRID, built_in_walls, mirror_room
 from small import GLANCE
 from threadpoolctl import ThreadpoolController
 
-from swiftwrf import AngularGrid, InputError, load, simulated_room
+from swiftwrf import AngularGrid, InputError, simulated_room
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.store import Store
 from swiftwrf.gp import GaussianProcess, Kernel
@@ -33,7 +33,6 @@ from swiftwrf.models.geometry.planes import image_jacobian, phase_jacobian, refi
 from swiftwrf.models.geometry.search import SIGNS, SteeringResponses
 from swiftwrf.models.geometry.uncertainty import _AlternativeTable, phase_alternatives
 from swiftwrf.models.neighbours import NearestModel
-from swiftwrf.runtime.checkpoint import write
 
 QUICK = GeometryConfig(search_distance_m=2.0, beam_width=2)
 SIX = {(-1, 0, 0): 0.0, (1, 0, 0): 5.0, (0, -1, 0): 0.0, (0, 1, 0): 4.0, (0, 0, -1): 0.0, (0, 0, 1): 2.8}
@@ -181,9 +180,8 @@ def test_rooms_are_refined_together_as_one_by_one():
     [
         ({(1, 0, 0): 4.6}, -0.7, "receiver"),
         ({(1, 0, 0): 4.6, (0, 0, -1): 0.0}, 0.8, "transmitter"),
-        (SIX, (-0.6, -0.6, -0.6, -0.6, 0.4, 0.4), "receiver"),
     ],
-    ids=["one", "two", "six, floor and ceiling of the other sign"],
+    ids=["one", "two"],
 )
 def test_rooms_without_noise_are_found_to_a_millimetre(planes, gain, moving):
     model = fit(mirror_room(planes, gain, moving, n=40))
@@ -260,7 +258,7 @@ def test_scores_of_combinations_are_those_of_their_rooms():
 
 @pytest.mark.long
 def test_a_tilted_plane_is_found_to_a_millimetre():
-    model = fit(mirror_room({(0.8, 0.5, 0.1): 5.0}, -0.7, n=40), search_distance_m=0.5, beam_width=1, max_order=1)
+    model = fit(mirror_room({(0.8, 0.5, 0.1): 5.0}, -0.7, n=25), search_distance_m=0.5, beam_width=1, max_order=1)
     assert len(model.planes) == 1
     assert errors(model, {(0.8, 0.5, 0.1): 5.0})[0][0] < 1
     torch.testing.assert_close(
@@ -286,10 +284,13 @@ def test_nothing_to_find_is_no_plane():
     assert len(model.image_sources()[0]) == 1
 
 
-def test_noise_stays_within_the_deviations(noisy):
-    room = fit(noisy)
+def test_noise_stays_within_the_deviations():
+    """Also where floor and ceiling have gains of the other sign."""
+    gain = (-0.6, -0.6, -0.6, -0.6, 0.4, 0.4)
+    room = fit(mirror_room(SIX, gain, noise=0.1))
     assert len(room.planes) == 6
     assert all(error < 4 * std and error < 20 for error, std in errors(room, SIX))
+    assert sorted(plane.gain for plane in room.planes) == pytest.approx(sorted(gain), abs=0.1)
 
 
 def test_positions_in_a_plane_leave_no_plane_certain():
@@ -312,18 +313,9 @@ def test_pure_noise_has_no_certain_plane():
     assert not any(p.certain for p in model.planes)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"array": None}, "needs the array, which"),
-        ({"rotation": None}, "needs the fixed end"),
-        ({"fixed_position": None}, "fixed end"),
-        ({"array": PlanarArray.square(4, 915e6, spacing=0.11)}, "check its geometry and carrier"),
-    ],
-)
-def test_refusals_say_what_is_missing(change, message):
-    with pytest.raises(InputError, match=message):
-        fit(replace(mirror_room(SIX, n=12), **change))
+def test_an_array_that_does_not_produce_the_spectra_is_refused():
+    with pytest.raises(InputError, match="check its geometry and carrier"):
+        fit(replace(mirror_room(SIX, n=12), array=PlanarArray.square(4, 915e6, spacing=0.11)))
 
 
 @pytest.mark.usefixtures("short_searches")
@@ -527,55 +519,6 @@ def test_spectra_are_differentiable_in_the_position_of_a_receiver():
             step[axis] = 1e-4
             ends = [(model.synthesize(position + sign * step) * weight).sum((1, 2)) for sign in (1, -1)]
             torch.testing.assert_close(at.grad[:, axis], (ends[0] - ends[1]) / 2e-4, rtol=0.02, atol=1.0)
-
-
-def test_room_predicts_any_grid(noisy, room):
-    """On a grid twice as fine every second pixel is the same."""
-    fine = room.synthesize(noisy.position[:3], AngularGrid.hemisphere(20, 80))
-    torch.testing.assert_close(fine[:, 1::2, ::2], room.synthesize(noisy.position[:3]))
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        *("covariance", "position", "coefficient", "component", "path_gains.coefficient"),
-        *({"mixing_weight": "x"}, {"order": 9}, {"planes": [{"normal": [1]}]}),
-    ],
-    ids=str,
-)
-def test_tensors_of_wrong_sizes_and_headers_of_wrong_values_are_refused(hybrid, change, tmp_path):
-    """Also tensors that only `predict` would need."""
-    known, kernel = hybrid.process.known.clone(), hybrid.process.kernel
-    some = PathGains(GaussianProcess(kernel, known, torch.zeros(len(known), 2 * 25 * 2)), 25)
-    tensors, header = with_path_gains(hybrid, some).state()
-    HybridModel.from_state(tensors, header)
-    if isinstance(change, str):
-        tensors = tensors | {change: tensors[change][:-1]}
-    else:
-        header = header | change
-    write(tmp_path / "model", HybridModel.kind, tensors, header)
-    with pytest.raises(InputError):
-        load(tmp_path / "model")
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"moving": "nothing"},
-        {"fixed_position": [0.0, 1.0]},
-        {"fixed_position": None},
-        {"rotation": [[1.0, 0.0, 0.0]]},
-        {"rotation": None},
-        {"array": {"element": [[0.0], [1.0]], "wavelength": 0.1}},
-        {"array": {"element": [[0.0, 0.0]], "wavelength": float("nan")}},
-        {"array": None},
-    ],
-)
-def test_a_link_that_cannot_be_used_is_refused(room, change, tmp_path):
-    tensors, header = room.state()
-    write(tmp_path / "model", GeometryModel.kind, tensors, header | {"link": header["link"] | change})
-    with pytest.raises(InputError, match="geometry model that can be used"):
-        load(tmp_path / "model")
 
 
 @pytest.mark.parametrize(

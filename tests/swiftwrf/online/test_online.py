@@ -1,29 +1,21 @@
 """Scores of measurements before they are learnt, tests for changes, adaptation, and the command that follows."""
 
 import json
-import os
-import random
 import re
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from functools import cache
-from itertools import pairwise
-from pathlib import Path
 
 import pytest
 import torch
 from rooms import built_in_walls, room_with_box
 
-from swiftwrf import AngularGrid, GeometryModel, HybridModel, RssiModel, load, make_model
+from swiftwrf import AngularGrid, GeometryModel, HybridModel, InputError, RssiModel, load, make_model
 from swiftwrf.data.simulated import ShoeboxRoom, rssi_room, simulated_room
 from swiftwrf.data.writing import write_rssi
 from swiftwrf.metrics import psnr
 from swiftwrf.models.geometry.planes import Plane
 from swiftwrf.online import Follower, Monitor, adapted, alarm_threshold, prequential, score
-from swiftwrf.online.follower import unexplained
+from swiftwrf.online.follower import joined, unexplained
 from tasks.command import main
 from tasks.update.record import Record
 
@@ -92,6 +84,36 @@ def test_intervals_of_rssi_contain_their_share():
     assert 0.6 < scores.covered.mean() < 0.95
 
 
+@pytest.mark.parametrize("n_places", [1, 3])
+def test_each_region_has_a_place_of_its_own(n_places):
+    position = torch.eye(3)[:n_places].repeat(40, 1)
+    monitor = Monitor(position)
+    assert len(monitor.centre.unique(dim=0)) == len(monitor.centre) == n_places
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: Follower(coarray()).step(spectra(72, 0).subset(torch.arange(2))), "one measurement, got 2"),
+        (lambda: Follower(coarray()).step(spectra(72, 0).subset(torch.arange(0))), "one measurement, got 0"),
+        (lambda: Follower(coarray(), spectra(72, 0).subset(torch.arange(60))), "positions of the 72 spectra"),
+        (lambda: Follower(coarray(), spectra(72, 0).subset(torch.arange(72).flip(0))), "in their order"),
+        (lambda: prequential(coarray(), spectra(72, 0), batch=0), "batch must be a whole number at least 1"),
+    ],
+)
+def test_measurements_that_cannot_be_followed_are_refused(call, says):
+    with pytest.raises(InputError, match=says):
+        call()
+
+
+def test_spectra_that_wait_keep_their_snapshots():
+    data = spectra(72, 0).subset(torch.arange(4))
+    measured = replace(data, channel=torch.randn(4, 1, 16, dtype=torch.complex64))
+    parts = [measured.subset(torch.tensor([i])) for i in range(4)]
+    assert torch.equal(joined(parts).channel, measured.channel)
+    assert joined([*parts, data]).channel is None
+
+
 def test_a_change_raises_an_alarm_and_the_same_scene_does_not():
     monitor = Monitor.of(coarray(), spectra(72, 0), 1e-3)
     same, changed = score(coarray(), spectra(60, 1)), score(coarray(), spectra(30, 2, PLACE))
@@ -137,16 +159,6 @@ def test_a_follower_adapts_and_goes_on():
     assert len(follower.model.process.known) == 102
 
 
-@cache
-def rssi_lines():
-    names = floor().receiver_names
-    rows = zip(floor().transmitter_position.tolist(), floor().rssi_dbm.tolist(), strict=True)
-    return [
-        json.dumps({"position": at, "rssi_dbm": {n: x for n, x in zip(names, row, strict=True) if x == x}}) + "\n"
-        for at, row in rows
-    ]
-
-
 @pytest.fixture
 def model_file(tmp_path):
     file = tmp_path / "model.safetensors"
@@ -169,26 +181,6 @@ def test_an_update_from_files_writes_model_table_and_page(tmp_path, model_file, 
 def test_wrong_options_are_refused(arguments, capsys):
     assert main(["update", "m", "table.csv", "--out", "x", *arguments]) == 2
     assert capsys.readouterr().err.startswith("error: ")
-
-
-def follow(model_file, source, out, **options):
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[3]), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "tasks", "update", str(model_file), str(source), "--out", str(out), "--follow"]
-    return subprocess.Popen(
-        command,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        cwd=model_file.parent,
-        **options,
-    )
-
-
-def csv_rows(rows):
-    header = ",".join(["x", "y", "z", *floor().receiver_names])
-    cells = [[*floor().transmitter_position[i].tolist(), *floor().rssi_dbm[i].tolist()] for i in rows]
-    return [header + "\n", *(",".join("" if x != x else f"{x:g}" for x in row) + "\n" for row in cells)]
 
 
 def test_a_record_is_cut_to_what_the_model_has_learnt(tmp_path):
@@ -217,37 +209,6 @@ def test_a_follower_continues_after_the_model_has_grown():
     again = Follower(follower.model)
     again.resume(json.loads(json.dumps(follower.state())))
     assert again.monitor.threshold == follower.monitor.threshold
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["rows.ndjson", pytest.param("rows.csv", marks=pytest.mark.fuzz)])
-def test_kills_lose_nothing_and_repeat_at_most_the_last_line(tmp_path, model_file, name):
-    kills, source, out = int(os.environ.get("UPDATE_KILLS", "2")), tmp_path / name, tmp_path / "out"
-    rows = list(range(60, 100)) * max(1, kills // 5)  # that no run of the command reaches the end of them
-    source.write_text("".join([rssi_lines()[i] for i in rows] if name == "rows.ndjson" else csv_rows(rows)))
-    wait, answered = random.Random(0), []
-    for _ in range(kills):
-        process = follow(model_file, source, out)
-        first = process.stdout.readline()
-        time.sleep(wait.uniform(0, 0.3))
-        process.send_signal(signal.SIGKILL)
-        rest, _ = process.communicate(timeout=60)
-        answered.append(
-            [
-                json.loads(line)["measurement"]
-                for line in [first, *rest.splitlines()]
-                if line.endswith("}") or line == first
-            ]
-        )
-        if (out / "model.safetensors").exists():
-            assert len(load(out / "model.safetensors").anchor) - 60 in (answered[-1][-1] - 1, answered[-1][-1])
-        if answered[-1][-1] >= len(rows) - 2:
-            break
-    for before, after in pairwise(answered):
-        assert after[0] - before[-1] in (0, 1)
-        assert after == list(range(after[0], after[0] + len(after)))
-    learnt = len(load(out / "model.safetensors").anchor) - 60
-    assert learnt <= len(Record.read(out).rows) <= learnt + 1
 
 
 @cache
@@ -325,5 +286,5 @@ def test_a_notice_is_recorded(tmp_path):
         step = follower.step(floor().subset(torch.tensor([i])))
         record.append(tmp_path, record.add(i, replace(step, notice="kernel chosen again" if i == 61 else "")))
     again = Record.read(tmp_path)
-    assert again.notices == [(1, "kernel chosen again")]
+    assert [(row["index"], row["notice"]) for row in again.notices] == [(61, "kernel chosen again")]
     assert "Kernel chosen again." in again.sentences()

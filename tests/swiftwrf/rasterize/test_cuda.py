@@ -27,7 +27,6 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from swiftwrf import AngularGrid, InputError, rasterize
 from swiftwrf.rasterize import cuda, operators
-from swiftwrf.rasterize.operators import magnitude
 
 SHIM = Path(__file__).parents[2] / "cuda_shim"
 rasterize_package = sys.modules[rasterize.__module__]
@@ -177,7 +176,7 @@ def assert_close(case, cutoff, device="cpu"):
     """A and |A|, in value and gradient, within the table of tolerances."""
     for value, gradient in (
         field_errors(operators.field, case, cutoff, device),
-        magnitude_errors(lambda *arguments: magnitude(operators.field(*arguments)), case, cutoff, device),
+        magnitude_errors(operators.field_magnitude, case, cutoff, device),
     ):
         assert value < VALUE_TOLERANCE[cutoff] * case.slack
         assert gradient < GRADIENT_TOLERANCE[cutoff] * case.slack
@@ -280,7 +279,7 @@ def test_magnitude_has_no_gradient_where_nothing_is():
     leaves = [
         x.requires_grad_() for x in (degrees((180.0, 45.0)), torch.tensor([[0.05, 0.0, 0.05]]), torch.ones(1, 1, 2))
     ]
-    rendered = magnitude(operators.field(*leaves, AngularGrid.hemisphere(30, 120), 1e-4))
+    rendered = operators.field_magnitude(*leaves, AngularGrid.hemisphere(30, 120), 1e-4)
     assert bool((rendered == 0).any())
     assert all(gradient.isfinite().all() for gradient in torch.autograd.grad(rendered.sum(), leaves))
 

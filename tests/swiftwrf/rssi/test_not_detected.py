@@ -2,14 +2,17 @@
 
 from dataclasses import replace
 
+import pandas as pd
 import pytest
 import torch
 
-from swiftwrf import Rssi, RssiModel, load, rssi_room
+from swiftwrf import InputError, Rssi, RssiModel, load, rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
+from swiftwrf.data.rssi import Offsets
+from swiftwrf.gp import Kernel
 from swiftwrf.rssi import compare
-from swiftwrf.rssi.detection import Detection
-from swiftwrf.rssi.offsets import estimate_floor_attenuation
+from swiftwrf.rssi.detection import Detection, DetectionField
+from swiftwrf.rssi.offsets import estimate_floor_attenuation, estimate_offsets
 from swiftwrf.rssi.path_loss import fit_path_losses, log_distance
 
 LIMIT = -88.0
@@ -72,6 +75,24 @@ def test_the_limit_and_random_misses_are_told_apart():
     assert Detection.estimate(data.transmitter_position, data.rssi_dbm.nan_to_num(-90.0)) is None
 
 
+def test_few_values_among_many_rows_are_enough():
+    position = torch.rand(5000, 3, generator=torch.Generator().manual_seed(0)).double()
+    rssi = torch.full((5000, 2), torch.nan).double()
+    rssi[101:103] = -70.0  # between the rows of an even sample
+    assert Detection.estimate(position, rssi).limit == -70
+
+
+@pytest.mark.parametrize("is_detected", [True, False])
+def test_one_cell_of_its_kind_among_many_is_enough(is_detected):
+    position = torch.rand(300, 3, generator=torch.Generator().manual_seed(0)).double()
+    detected = torch.full((300, 100), not is_detected)
+    detected[3, 2] = is_detected
+    kernel, level = Kernel(1.0, matern12_weight=1.0, noise=1.0), torch.full((300, 100), -60.0).double()
+    found = DetectionField.fit(kernel, position, detected, torch.arange(300) % 5, level, -90.0)
+    probability = found.probability(level, position)
+    assert bool(((probability > 0.5) == detected).double().mean() > 0.999)
+
+
 def test_a_receiver_that_is_empty_beside_its_place_keeps_its_path_loss():
     """It was off, so its empty cells are no limits; those of the others are."""
     data, _ = survey()
@@ -127,8 +148,21 @@ def test_a_saved_and_updated_model_keeps_its_detections(fitted, tmp_path):
         torch.testing.assert_close(again.predict_detected(data).mean, one.predict_detected(data).mean)
 
 
-@pytest.mark.parametrize("located", [True, False])
-def test_the_attenuation_of_floors_counts_what_they_hide(located):
+def test_the_limit_is_one_of_received_power_whatever_offset_is_removed(fitted):
+    """All rows are of a device that is 20 dB weaker than the reference; its limit of detection is what it receives."""
+    data, _, model = fitted
+    weak = replace(data, groups=pd.Series(["weak"] * len(data), name="phone"))
+    removed = Offsets("phone", "usual", {"usual": 0.0, "weak": -20.0}, 1.0).removed(weak)
+    found, at = RssiModel().fit(removed), data.transmitter_position
+    close = {"atol": 0.1, "rtol": 0}
+    torch.testing.assert_close(found.mixing_weight, model.mixing_weight, atol=0.01, rtol=0)
+    torch.testing.assert_close(found.predict(at).mean - 20, model.predict(at).mean, **close)
+    torch.testing.assert_close(found.predict_detected(removed).mean - 20, model.predict_detected(data).mean, **close)
+    torch.testing.assert_close(found.detection_field.weight, model.detection_field.weight, **close)
+    torch.testing.assert_close(found.predict_detection(at, -20.0), model.predict_detection(at), **close)
+
+
+def building(located):
     """14 dB a floor; two floors away hardly anything is received."""
     generator = torch.Generator().manual_seed(0)
     floor = torch.arange(240) % 3
@@ -143,8 +177,29 @@ def test_the_attenuation_of_floors_counts_what_they_hide(located):
     table = table.rename(columns={"x_m": "x", "y_m": "y", "z_m": "z"}).assign(floor=floor.numpy())
     places = dict(zip("abcd", receiver.tolist(), strict=True)) if located else None
     table[list("abcd")] = table[list("abcd")].where(table[list("abcd")] > LIMIT)
-    data = Rssi.from_frame(table.reset_index(drop=True), receiver_position=places)
-    assert estimate_floor_attenuation(data).db == pytest.approx(14, abs=3)
+    return Rssi.from_frame(table.reset_index(drop=True), receiver_position=places)
+
+
+@pytest.mark.parametrize("located", [True, False])
+def test_the_attenuation_of_floors_counts_what_they_hide(located):
+    assert estimate_floor_attenuation(building(located)).db == pytest.approx(14, abs=3)
+
+
+def test_floors_and_offsets_need_a_column():
+    with pytest.raises(InputError, match="simulated-floor has no floors; give the table a column"):
+        estimate_floor_attenuation(rssi_room(n=20))
+    with pytest.raises(InputError, match="simulated-floor has no phone in row 1; name the group of each row"):
+        estimate_offsets(replace(rssi_room(n=20), groups=pd.Series(["a", None] * 10, name="phone")))
+
+
+def test_another_kernel_keeps_the_limit_of_detection_of_a_building():
+    data = building(located=True)
+    model = RssiModel().fit(data)
+    found = model.with_chosen_kernel()
+    assert found.detection.limit == pytest.approx(model.detection.limit, abs=1)
+    at = data.transmitter_position
+    torch.testing.assert_close(found.predict(at).mean, model.predict(at).mean, atol=3, rtol=0)
+    assert ((found.predict_detection(at) > 0.5) == data.detected).double().mean() > 0.85
 
 
 def test_the_built_in_floor_misses_packets_at_random():

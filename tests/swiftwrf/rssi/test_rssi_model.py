@@ -7,16 +7,17 @@ import pytest
 import torch
 from scipy.optimize import minimize
 
-from swiftwrf import InputError, Rssi, RssiModel, fit_rssi, load, rssi_room
+from swiftwrf import InputError, PairModel, Rssi, RssiModel, fit_rssi, load, rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
+from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.gp import Kernel
 from swiftwrf.rssi import RssiConfig, RssiPaperModel, compare
 from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
+from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.mixing import mixing_weights
 from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, harmonics, log_distance
 from swiftwrf.rssi.regression import DIRECTIVITY_STD_DB, fit_receiver
 from swiftwrf.rssi.training import RssiTraining, bin_locations
-from swiftwrf.runtime import checkpoint
 from swiftwrf.runtime.threads import threads_kept
 
 KERNEL = Kernel(4.0, 1.0, matern12_weight=0.6, noise=1.0)
@@ -28,12 +29,12 @@ def test_errors_by_the_number_of_training_rows(monkeypatch):
     kept = {name: RSSI_PREDICTORS[name] for name in ("swiftwrf", "mean", "knn")}
     monkeypatch.setattr(RSSI_PREDICTORS, "_registered", kept)
     room = rssi_room(n=200, seed=1)
-    found = compare(room, receivers=["6"], fewer=(0.01, 0.25, 0.5)).by_rows
+    whole, found = compare(room, receivers=["6"]), compare(room, receivers=["6"], fewer=(0.01, 0.25, 0.5)).by_rows
     assert list(found.columns) == ["swiftwrf", "knn"]
     assert list(found.index) == [40, 80, 160]  # 2 rows determine nothing
-    errors = compare(room, receivers=["6"]).summary()["mean"]
+    errors = whole.summary()["mean"]
     assert found.loc[160].to_dict() == pytest.approx(errors[["swiftwrf", "knn"]].to_dict())
-    assert compare(room, receivers=["6"]).by_rows.empty
+    assert whole.by_rows.empty
 
 
 def path_loss_only(n=60, noise=0.0, level=-50.0, exponent=2.0, seed=0):
@@ -84,12 +85,13 @@ def training_of(data, n_primitives=50):
         path_loss=PathLosses(
             own=path_loss,
             shared=path_loss,
-            centre=torch.zeros(r).double(),
+            middle=torch.zeros(r).double(),
             std=torch.full((r, 2), PATH_LOSS_STD_DB).double(),
             variance=torch.full((r,), FIELD_DB**2 + NOISE_DB**2).double(),
             detection=None,
             floor_db=torch.zeros(r).double(),
         ),
+        shift=torch.zeros(n, r).double(),
         limit=torch.full((n, r), torch.nan).double(),
         field_db=torch.full((r,), FIELD_DB, dtype=torch.float64),
         noise_db=torch.full((r,), NOISE_DB, dtype=torch.float64),
@@ -210,7 +212,7 @@ def test_no_primitives_without_a_field():
 
 
 def test_paper_head_learns_without_a_path_loss_model():
-    train, test = with_field().split("random")
+    train, test = with_field().columns([0]).split("random")
     model = RssiPaperModel(steps=200).fit(train)
     assert not model.slope.any()
     mean = (train.rssi_dbm.mean(dim=0) - test.rssi_dbm).abs().median()
@@ -262,6 +264,14 @@ def test_shift_of_the_coordinates_changes_nothing():
     here, there = fit_rssi(data), fit_rssi(moved)
     a, b = here.predict(data.transmitter_position).mean, there.predict(moved.transmitter_position).mean
     torch.testing.assert_close(a, b, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("make", [RssiModel, PairModel])
+def test_rows_about_another_origin_are_predicted_where_they_were_measured(make):
+    data = replace(path_loss_only(), origin=GeodeticOrigin(48.0, 11.0))
+    model, other = make().fit(data), data.about(GeodeticOrigin(48.001, 11.001))
+    found, expected = (both(model.predict_detected(some)) for some in (other, data))
+    torch.testing.assert_close(found, expected, atol=1e-2, rtol=0)
 
 
 def test_same_data_same_model_and_any_batch(monkeypatch):
@@ -338,36 +348,6 @@ def test_saved_model_predicts_the_same(tmp_path):
     assert torch.equal(*(both(m.predict(data.transmitter_position)) for m in (again, model)))
 
 
-@pytest.fixture(scope="module")
-def state():
-    return fit_rssi(with_field(n=30)).state()
-
-
-TENSORS = ("field_db", "noise_db", "mixing_weight", "level", "slope", "centre", "directivity", "anchor", "coefficient")
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        *(*TENSORS, "rendered"),
-        *({"receiver_position": wrong} for wrong in (None, [], [[0, 0, 0]], [[0, 0, float("inf")]] * 3, ["x"] * 3)),
-    ],
-    ids=str,
-)
-def test_a_file_with_a_tensor_of_another_shape_or_unusable_positions_is_refused(tmp_path, state, change):
-    tensors, header = state
-    if isinstance(change, dict):
-        damaged = [(tensors, header | change)]
-    else:
-        others = {name: value for name, value in tensors.items() if name != change}
-        shapes = (tensors[change][..., :-1], tensors[change][None])
-        damaged = [(others, header), *((others | {change: value}, header) for value in shapes)]
-    for some in damaged:
-        checkpoint.write(tmp_path / "model", RssiModel.kind, *some)
-        with pytest.raises(InputError, match="is no rssi model that can be used"):
-            load(tmp_path / "model")
-
-
 @pytest.mark.parametrize("n_detected", [12, 0])
 def test_a_receiver_that_few_of_many_rows_detect(n_detected):
     data = with_field(n=700)
@@ -406,7 +386,7 @@ def test_refuses():
         model.predict(torch.tensor([[1e20, 0.0, 0.0]]))
     assert both(model.predict(torch.tensor([[1e8, 0.0, 0.0]]))).isfinite().all()
     assert model.predict(torch.empty(0, 3)).mean.shape == (0, 3)
-    with pytest.raises(InputError, match="detected in 0 training rows"):
+    with pytest.raises(InputError, match="receivers a, b, c have 0 training measurements in all; measure at least 10"):
         fit_rssi(replace(data, rssi_dbm=data.rssi_dbm * torch.nan))
     with pytest.raises(InputError, match="rssi_dbm must be finite"):
         fit_rssi(replace(data, rssi_dbm=data.rssi_dbm * torch.inf))
@@ -416,6 +396,10 @@ def test_refuses():
         RssiModel().predict(data.transmitter_position)
     with pytest.raises(InputError, match="is not fitted"):
         RssiModel().state()
+    with pytest.raises(InputError, match="region must be finite"):
+        RssiMap.predict(model, region=[[float("nan"), 0.0]])
+    with pytest.raises(InputError, match="a region needs at least one position"):
+        RssiMap.predict(model, region=torch.empty(0, 2))
 
 
 def test_another_kernel_keeps_the_intervals_of_rows_in_bins():

@@ -10,7 +10,7 @@ import pytest
 import quick
 import torch
 from quick import said
-from small import glances
+from small import FLOOR, known_planes
 
 from swiftwrf import AngularGrid, InputError, load, rssi_room, simulated_room
 from swiftwrf.data import ReadOptions
@@ -18,7 +18,6 @@ from swiftwrf.data.writing import write_spectra
 from swiftwrf.locate import MatchedField
 from swiftwrf.locate.baselines import LEVELS, LOCALIZERS, RegressedCoordinates
 from swiftwrf.locate.comparison import LocateSplit, Trial, compare
-from tasks.labels import LOCALIZERS as LABELS
 from tasks.predict import read_rssi
 from tasks.records import LOCATOR as MODEL
 from tasks.source import aligned
@@ -48,7 +47,7 @@ def matched(tmp_path_factory):
     """Spectra of the built-in room, and the file of a coarse locator that was fitted to them."""
     data = simulated_room(n=40, grid=GRID)
     file = tmp_path_factory.mktemp("matched") / "matched.safetensors"
-    with glances():
+    with known_planes(FLOOR):
         MatchedField(max_cells=200, n_best=20, n_background=10, n_rounds=1).fit(data).save(file)
     return data, file
 
@@ -63,13 +62,6 @@ def test_a_comparison_without_a_folder_has_the_errors_of_the_command(locate_run)
     assert {str(level): fraction for level, fraction in result.coverage.items()} == pytest.approx(
         metrics["calibration"]
     )
-
-
-def test_localizers_describe_themselves():
-    assert list(LOCALIZERS) == ["posterior", "knn", "knn_difference", "nearest", "gp", "mean"]
-    for name in LOCALIZERS:
-        assert LOCALIZERS.summary(name)
-        assert LABELS[name].colour
 
 
 @pytest.mark.parametrize("name", [name for name in LOCALIZERS if name != "posterior"])
@@ -173,6 +165,8 @@ def test_rows_that_no_receiver_detected_are_left_out(tmp_path, capsys):
     data.rssi_dbm[:70] = torch.nan
     with pytest.raises(InputError, match="at least 20 are needed"):
         LocateSplit.of(data, "random", 100, 0)
+    with pytest.raises(InputError, match="split 'place' tests other receivers than it trains; choose random or block"):
+        LocateSplit.of(data, "place", 100, 0)
 
 
 def test_an_interrupted_run_goes_on_to_the_same_numbers(locate_run, tmp_path):

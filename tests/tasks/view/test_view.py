@@ -1,5 +1,6 @@
 """Content of the page without widgets: views, plans, spectra, maps and refusals."""
 
+import asyncio
 import base64
 import copy
 import io
@@ -8,8 +9,11 @@ import json
 import shutil
 import socket
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from importlib.util import find_spec
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -23,6 +27,7 @@ from PIL import Image
 from swiftwrf import AngularGrid, InputError, PairModel, Rssi, RssiModel, load, load_rssi, rssi_room
 from swiftwrf.locate import MatchedField, RssiLocator
 from swiftwrf.online import Follower
+from swiftwrf.rssi.maps import RssiMap
 from tasks.configs import LocateConfig
 from tasks.convert import saved_model
 from tasks.options import plain
@@ -183,7 +188,7 @@ def test_maps_are_those_of_the_model(rssi_run):
     assert view.receivers == ("receiver01", "receiver06", "receiver12")
     assert view.plan.corners == (0, 20, 0, 15)
     i, j = 5, 17
-    place = view.chart.x[j], view.chart.y[i]
+    place = view.map(1.2).x[j], view.map(1.2).y[i]
     at = torch.tensor([[*place, 1.2]], dtype=torch.float64)
     predicted = load(rssi_run / "model.safetensors").predict(at)
     np.testing.assert_allclose(view.map(1.2).mean[:, i, j], predicted.mean[0], atol=1e-3)
@@ -193,6 +198,21 @@ def test_maps_are_those_of_the_model(rssi_run):
     described = view.describe(selection, *place)
     assert f"receiver06: {predicted.mean[0, 1]:.1f} dBm" in described
     assert f"best receiver: {view.receivers[predicted.mean[0].argmax()]}" in described
+
+
+def test_visitors_at_other_heights_have_maps_of_their_own(monkeypatch):
+    both = threading.Barrier(2)
+
+    class SlowlyChanged(RssiView):
+        def __setattr__(self, name, value):
+            super().__setattr__(name, value)
+            if threading.current_thread() is not threading.main_thread():
+                both.wait(10)
+
+    view = SlowlyChanged("room", RssiModel(n_primitives=0).fit(rssi_room(n=40)), rssi_room(n=40))
+    monkeypatch.setattr(RssiMap, "predict", lambda *_, height, **options: SimpleNamespace(height=height))
+    with ThreadPoolExecutor(2) as visitors:
+        assert [chart.height for chart in visitors.map(view.map, (1.0, 2.0))] == [1.0, 2.0]
 
 
 def test_certainty_is_that_of_the_interval(rssi_run):
@@ -212,7 +232,7 @@ def test_coverage_is_where_the_probability_is_high_enough(rssi_run):
     assert view.sentence(selection).startswith("50% of the map")
     for cells, sign in ((covered, 1), (~covered, -1)):
         i, j = np.argwhere(cells)[0]
-        above = float(probability_above(view.at(selection, view.chart.x[j], view.chart.y[i]), selection)[2])
+        above = float(probability_above(view.at(selection, view.map(1.2).x[j], view.map(1.2).y[i]), selection)[2])
         assert sign * above >= sign * 0.9 - 1e-3
 
 
@@ -441,12 +461,12 @@ def test_a_dropped_floor_plan_lies_at_its_scale_and_origin_and_stays(rssi_run, t
     folder = tmp_path / "run"
     shutil.copytree(rssi_run, folder)
     view = open_source(folder)
-    before = view.inside.shape
+    before = view.inside(1.0).shape
     pixels = np.full((30, 80, 3), 9, dtype=np.uint8)
     view.place(FloorPlan.scaled(pixels, 0.5, (4, 26)))  # y counts down from the upper edge
     assert view.plan.corners == (-2, 38, -2, 13)
-    assert view.chart.corners[1] == pytest.approx(38)
-    assert view.inside.shape == view.map(1.0).mean.shape[1:] != before
+    assert view.map(1.0).corners[1] == pytest.approx(38)
+    assert view.inside(1.0).shape == view.map(1.0).mean.shape[1:] != before
     again = open_source(folder).plan
     assert again.corners == (-2, 38, -2, 13)
     np.testing.assert_array_equal(again.pixels, pixels)
@@ -472,7 +492,7 @@ def test_a_followed_run_is_read_again_when_it_grows(tmp_path):
     assert snapshot(view, view.version) is shown
     assert [row["index"] for row in shown.rows] == [62, 61, 60]
     assert shown.rows[0]["alarm"] == "hall weaker everywhere"
-    assert "Change at measurement 2: hall weaker everywhere." in shown.sentences
+    assert "Change at measurement 62: hall weaker everywhere." in shown.sentences
     assert all(figure.startswith("<svg") for figure in shown.figures.values())
     record.append(tmp_path, record.add(63, step))
     assert view.version != version
@@ -529,6 +549,32 @@ def test_large_uploads_are_refused_by_the_server(length):
         body = bytes(n)
         content = body if length else iter([body[: n // 2], body[n // 2 :]])
         assert TestClient(app).post("/", content=content).status_code == code
+
+
+@needs_the_extra
+def test_requests_are_answered_one_by_one_and_the_newest_last(monkeypatch):
+    from tasks.view import page
+
+    monkeypatch.setattr(page.background_tasks, "create", asyncio.ensure_future)
+    events, asked = [], []
+
+    async def answer(number):
+        events.append(("begin", number))
+        await asyncio.sleep(0.01)
+        events.append(("end", number))
+        raise ValueError(number)  # does not keep the newest from being answered
+
+    async def ask():
+        queue = page.NewestOnly(answer)
+        for pause in (None, 0.002, 0.002, None, 0.002, 0.1):
+            queue.submit(len(asked))
+            asked.append(pause)
+            if pause:
+                await asyncio.sleep(pause)
+
+    asyncio.run(ask())
+    assert [kind for kind, _ in events] == ["begin", "end"] * (len(events) // 2)
+    assert events[-1] == ("end", 5)
 
 
 @needs_the_extra

@@ -24,7 +24,6 @@ import torch
 
 from swiftwrf import RssiModel, rssi_room
 from swiftwrf.data.writing import write_spectra
-from swiftwrf.locate import RssiLocator
 from swiftwrf.online import Follower
 from tasks.report import merge
 from tasks.update.record import Record
@@ -220,8 +219,9 @@ def test_page_of_spectra(browser, serve, aoa_run, record_property):
     assert_fits(browser, "plan")
 
 
-def test_page_of_rssi(browser, serve, rssi_run, tmp_path):
-    plan = opened(browser, serve(rssi_run), "map", "sentence")
+def test_page_of_a_locator(browser, serve, locate_run, tmp_path):
+    """Maps of RSSI as of a run of RSSI, and posteriors."""
+    plan = opened(browser, serve(locate_run), "map", "sentence")
     pointer(browser).move_to_element_with_offset(plan, 30, 20).perform()
     told = until(lambda: "dBm" in said(browser, "here") and said(browser, "here"))
     pointer(browser).move_by_offset(-150, 60).perform()
@@ -239,6 +239,14 @@ def test_page_of_rssi(browser, serve, rssi_run, tmp_path):
     file = until(lambda: next(tmp_path.glob("*.csv"), None))
     until(lambda: next(tmp_path.glob("*.svg"), None))
     assert set(pd.read_csv(file)["receiver"]) == {"receiver01"}
+    press(browser, "posterior")
+    shown = until(lambda: "median at" in said(browser, "sentence") and said(browser, "sentence"))
+    pointer(browser).move_to_element_with_offset(plan, 150, 60).click().perform()
+    until(lambda: "median at" in said(browser, "sentence") and said(browser, "sentence") != shown)
+    press(browser, "expected error")
+    until(lambda: "simulated rows" in said(browser, "sentence"))
+    pointer(browser).move_to_element_with_offset(plan, 0, 0).perform()
+    until(lambda: "expected position error" in said(browser, "here"))
     assert_fits(browser, "map")
 
 
@@ -257,32 +265,18 @@ def test_page_of_a_followed_run_grows_without_reloading(browser, serve, tmp_path
     assert said(browser, "sentence") == "no measurement yet"
     browser.execute_script("window.not_reloaded = true")
     learn(60)
-    until(lambda: "1 measurements learnt" in said(browser, "sentence"))
+    until(lambda: "1 measurement learnt" in said(browser, "sentence"))
     before = find(browser, "#changes").get_attribute("innerHTML")
     for i in range(61, 66):
         learn(i, alarms=("hall weaker everywhere",) if i == 63 else ())
     until(lambda: "6 measurements learnt" in said(browser, "sentence"))
-    assert "Change at measurement 3: hall weaker everywhere." in said(browser, "sentence")
+    assert "Change at measurement 63: hall weaker everywhere." in said(browser, "sentence")
     assert len(browser.find_elements("css selector", "#rows tbody tr")) == 6
     assert find(browser, "#changes").get_attribute("innerHTML") != before
     assert find(browser, "#error svg").is_displayed()
     assert browser.execute_script("return window.not_reloaded")
     assert_fits(browser, "changes")
     browser.save_screenshot(str(tmp_path / "followed.png"))
-
-
-def test_page_of_a_locator(browser, serve, tmp_path):
-    train, _ = rssi_room(n=100).split()
-    RssiLocator(n_cells=300).fit(train).save(tmp_path / "locator.safetensors")
-    plan = opened(browser, serve(tmp_path / "locator.safetensors"), "map", "sentence")
-    press(browser, "posterior")
-    shown = until(lambda: "median at" in said(browser, "sentence") and said(browser, "sentence"))
-    pointer(browser).move_to_element_with_offset(plan, 150, 60).click().perform()
-    until(lambda: "median at" in said(browser, "sentence") and said(browser, "sentence") != shown)
-    press(browser, "expected error")
-    until(lambda: "simulated rows" in said(browser, "sentence"))
-    pointer(browser).move_to_element_with_offset(plan, 0, 0).perform()
-    until(lambda: "expected position error" in said(browser, "here"))
 
 
 # reports: widths from a phone to a desktop, light and dark

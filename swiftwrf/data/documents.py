@@ -1,0 +1,145 @@
+"""Tables in documents: lists of records anywhere in JSON, and the points of GPX and KML, by the names in them.
+
+Objects and elements inside a record are flattened. Records inside a record, e.g. the access points of a scan, become rows
+of their own, with the values of the record around them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from typing import Any
+from xml.etree import ElementTree
+
+import pandas as pd
+
+from swiftwrf.data.columns import GEODETIC, column_of, has_role, is_coordinate, receiver_columns
+from swiftwrf.errors import InputError
+
+XML, DOCUMENTS = (".gpx", ".kml"), (".json", ".geojson", ".gpx", ".kml")
+POINTS = ("wpt", "rtept", "trkpt", "Placemark")  # elements of GPX and KML
+VIEWS = ("LookAt", "Camera")  # of KML, which hold the position of the viewer
+NAMED = ("Data", "SimpleData")  # of KML, whose name is an attribute
+AXES = ("longitude", "latitude", "altitude")  # of coordinates in GeoJSON and KML
+MAX_CELLS = 2**26
+Keys = tuple[str, ...]  # keys that lead to a value or a list
+Row = dict[Keys, Any]
+
+
+def table_in_document(label: object, text: str, suffix: str) -> pd.DataFrame:
+    """Return the records of a document as a table, whose cells are text. The label stands for it in messages.
+
+    Of several lists, it is the one with positions and RSSI, the outermost first.
+
+    Args:
+        label: Name of the document.
+        text: Its content.
+        suffix: Its kind, one of `DOCUMENTS`.
+
+    Raises:
+        InputError: A document that is broken or holds no records.
+
+    Example:
+        >>> text = '{"points": [{"x": 1, "y": 2, "scan": [{"bssid": "a", "rssi": -60}, {"bssid": "b", "rssi": -70}]}]}'
+        >>> table_in_document("walk.json", text, ".json").to_numpy().tolist()
+        [['1', '2', 'a', '-60'], ['1', '2', 'b', '-70']]
+    """
+    records: dict[Keys, list[Row]] = {}
+    try:
+        _collect(_points(text) if suffix in XML else json.loads(text), (), {}, records)
+    except (ValueError, ElementTree.ParseError, RecursionError) as error:
+        kind = suffix.lstrip(".").upper()
+        raise InputError(f"{label} is no complete {kind} document ({error or 'nested too deeply'})") from None
+    if not records:
+        raise InputError(f"{label} holds no records with names, e.g. points with positions and RSSI")
+    tables = {path: _table(label, rows) for path, rows in records.items()}
+    path = max(tables, key=lambda path: (_n_known(tables[path]), -len(path), len(tables[path])))
+    tables[path].attrs["notes"] = [f"rows are the records in {' > '.join(path)}"] if path else []
+    return tables[path]
+
+
+def _collect(node: Any, path: Keys, around: Row, records: dict[Keys, list[Row]]) -> None:
+    """Add a record or a list of them, with the values around it, to those of its path; then the records inside it."""
+    if isinstance(node, list):
+        for item in node:
+            _collect(item, path, around, records)
+    elif isinstance(node, dict):
+        row, lists = dict(around), dict[Keys, Any]()
+        _flatten(node, path, row, lists)
+        records.setdefault(path, []).append(row)
+        for where, inside in lists.items():
+            _collect(inside, where, row, records)
+
+
+def _flatten(node: dict[str, Any], path: Keys, row: Row, lists: dict[Keys, Any]) -> None:
+    """Add the values of an object to a row, and the lists of records in it to others. Other lists are left out."""
+    for key, value in node.items():
+        where = (*path, key)
+        if isinstance(value, dict) and value and all(map(_is_scan, value.values())):  # by name of the receiver
+            lists[where] = [{"receiver": name, **scan} for name, scan in value.items()]
+        elif isinstance(value, dict):
+            _flatten(value, where, row, lists)
+        elif not isinstance(value, list):
+            row[where] = value
+        elif any(isinstance(item, dict) for item in value):
+            lists[where] = value
+        elif len(value) in (2, 3) and all(isinstance(item, int | float) for item in value):
+            axes = AXES if key == "coordinates" else "xyz"
+            row.update({(*where, axis): item for axis, item in zip(axes, value, strict=False)})
+
+
+def _is_scan(value: Any) -> bool:
+    """Return True for an object with RSSI that does not name its receiver."""
+    return (
+        isinstance(value, dict)
+        and any(has_role(key, "rssi") for key in value)
+        and not any(has_role(key, "receiver") for key in value)
+    )
+
+
+def _table(label: object, rows: list[Row]) -> pd.DataFrame:
+    """Return rows as a table. Columns have the last key, or all keys where several have one last key."""
+    paths = list(dict.fromkeys(path for row in rows for path in row))
+    if len(rows) * len(paths) > MAX_CELLS:
+        raise InputError(f"{label} has {len(rows)} records of {len(paths)} values; at most {MAX_CELLS} cells are read")
+    count = Counter(path[-1] for path in paths)
+    names = [path[-1] if count[path[-1]] == 1 else "_".join(path) for path in paths]
+    cells = [["" if (value := row.get(path)) is None else str(value) for path in paths] for row in rows]
+    return pd.DataFrame(cells, columns=names, dtype=object)
+
+
+def _n_known(table: pd.DataFrame) -> int:
+    """Return 2 for a table with positions and RSSI, 1 for one of them."""
+    if not table.columns.is_unique:
+        return 0
+    placed = all(column_of(table, axis, {}) or column_of(table, other, {}) for axis, other in GEODETIC.items())
+    return placed + bool(receiver_columns(table, [name for name in table if not is_coordinate(name)])[0])
+
+
+def _points(text: str) -> list[dict[str, Any]]:
+    """Return the points of GPX or KML as JSON would hold them."""
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ValueError("it declares entities, which are not read")
+    return [_tree(element) for element in ElementTree.fromstring(text).iter() if _tag(element.tag) in POINTS]
+
+
+def _tree(element: ElementTree.Element) -> dict[str, Any]:
+    found: dict[str, Any] = {_tag(name): value for name, value in element.attrib.items()}
+    for child in element:
+        tag, value = (
+            _tag(child.tag),
+            "".join(child.itertext() if _tag(child.tag) in NAMED else child.text or "").strip(),
+        )
+        name = child.get("name", tag) if tag in NAMED else tag
+        content: Any = value if value else _tree(child)
+        if tag == "coordinates" and len(value.split()) == 1:  # of a point, and no line
+            content = dict(zip(AXES, map(float, value.split(",")), strict=False))
+        if isinstance(several := found.get(name), list):
+            several.append(content)
+        elif tag not in VIEWS:
+            found[name] = [found[name], content] if name in found else content
+    return found
+
+
+def _tag(name: str) -> str:
+    return name.rpartition("}")[2]

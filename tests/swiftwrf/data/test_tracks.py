@@ -1,0 +1,132 @@
+"""Tables in documents: JSON of survey tools, tracks in GPX and KML, and what is refused."""
+
+import json
+
+import pytest
+
+from swiftwrf import InputError, load_rssi
+
+RSSI = {"hall": -50, "office": -60}
+PLACES = [(float(n), float(n * n % 5)) for n in range(12)]
+
+
+def level(n, name):
+    return RSSI[name] - n
+
+
+def flat(n, x, y):
+    return [{"x": x, "y": y, "receiver": name, "rssi": level(n, name)} for name in RSSI]
+
+
+def nested(n, x, y):
+    scan = [{"bssid": name, "rssi": level(n, name), "channel": 6} for name in RSSI]
+    return [{"id": n, "position": [x, y], "scan": scan, "tags": [{"tag": "a"}, {"tag": "b"}]}]
+
+
+def by_name(n, x, y):
+    return [{"location": {"x": x, "y": y, "z": 0}, "readings": {name: level(n, name) for name in RSSI}}]
+
+
+def scans_by_name(n, x, y):
+    return [{"x": x, "y": y, "aps": {name: {"RSSI": level(n, name), "channel": 11} for name in RSSI}}]
+
+
+def scan_events(n, x, y):
+    seen = [{"bssid": name, "rssi_dbm": level(n, name), "frequency_mhz": 5180, "noise_dbm": -94} for name in RSSI]
+    place = {"coordinate_xyz": {"x": x, "y": y, "unit": "meters"}}
+    return [{"id": f"scan-{n}", "coordinate": place, "wifi_observations": seen}]
+
+
+def document(records):
+    """Return records deep inside other content, with lists that are no measurements."""
+    path = {"name": "aisle", "path_points": [{"x": 2, "y": 3}] * 50, "scan_events": records}
+    return {
+        "version": "2.1",
+        "floorplans": [{"name": "level 1", "dimensions": [{"width": 60}], "survey_paths": [path]}],
+    }
+
+
+@pytest.mark.parametrize("record", [flat, nested, by_name, scans_by_name, scan_events])
+@pytest.mark.parametrize("wrapped", [list, document])
+def test_records_in_json(tmp_path, record, wrapped):
+    records = [part for n, (x, y) in enumerate(PLACES) for part in record(n, x, y)]
+    (tmp_path / "survey.json").write_text(json.dumps(wrapped(records)))
+    data = load_rssi(tmp_path / "survey.json")
+    assert data.receiver_names == ("hall", "office")
+    assert data.rssi_dbm.tolist() == [[level(n, name) for name in RSSI] for n in range(len(PLACES))]
+    assert data.transmitter_position[:, :2].tolist() == [list(place) for place in PLACES]
+    assert wrapped is list or "rows are the records in floorplans > survey_paths > scan_events" in "".join(data.notes)
+
+
+def test_survey_points_of_a_heatmap_tool(tmp_path):
+    def point(n):
+        wifi = {"ssid": "net", "bssid": "0c11", "rssi": -40 - n, "signalStrength": 90 - n, "channel": 36}
+        results = {"tcpDownload": {"bitsPerSecond": 5e7, "jitterMs": 1}, "tcpUpload": {"bitsPerSecond": 4e7}}
+        return {"x": 20 * n, "y": 40 * n, "wifiData": None if n == 3 else wifi, "iperfData": results, "isEnabled": True}
+
+    content = {"surveyPoints": [point(n) for n in range(12)], "apMapping": [{"apName": "a", "macAddress": "0c11"}]}
+    (tmp_path / "survey.json").write_text(json.dumps(content))
+    data = load_rssi(tmp_path / "survey.json", scale=20, y_down=True)
+    assert data.receiver_names == ("0c11",)
+    assert data.rssi_dbm.nan_to_num(0)[:, 0].tolist() == [0 if n == 3 else -40 - n for n in range(12)]
+    assert data.transmitter_position[:, :2].tolist() == [[n, -2 * n] for n in range(12)]
+
+
+TRACKS = {
+    ".gpx": (
+        '<?xml version="1.0" encoding="UTF-8"?><gpx xmlns="http://www.topografix.com/GPX/1/1" xmlns:r="urn:r"><trk><trkseg>'
+        "{}</trkseg></trk></gpx>",
+        '<trkpt lat="{y}" lon="{x}"><ele>400</ele><time>2026-01-01T10:00:{n:02}Z</time>'
+        "<extensions><r:TrackPointExtension><r:rssi>{rssi}</r:rssi></r:TrackPointExtension></extensions></trkpt>",
+    ),
+    ".kml": (
+        '<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Folder>{}</Folder></Document></kml>',
+        "<Placemark><name>p{n}</name><LookAt><longitude>9</longitude><latitude>40</latitude></LookAt>"
+        "<TimeStamp><when>2026-01-01T10:00:{n:02}Z</when></TimeStamp><Point><coordinates>{x},{y},400</coordinates></Point>"
+        '<ExtendedData><Data name="rssi"><value>{rssi}</value></Data></ExtendedData></Placemark>',
+    ),
+    ".geojson": (
+        '{{"type": "FeatureCollection", "features": [{}]}}',
+        '{{"type": "Feature", "geometry": {{"type": "Point", "coordinates": [{x}, {y}, 400]}}, '
+        '"properties": {{"rssi": {rssi}, "time": "2026-01-01T10:00:{n:02}Z"}}}}{comma}',
+    ),
+}
+
+
+@pytest.mark.parametrize("suffix", TRACKS)
+def test_tracks(tmp_path, suffix):
+    whole, point = TRACKS[suffix]
+    points = ({"n": n, "x": 8.5 + 1e-4 * n, "y": 47.4, "rssi": -60 - n, "comma": "," * (n < 19)} for n in range(20))
+    file = tmp_path / f"walk{suffix}"
+    file.write_text(whole.format("".join(point.format(**values) for values in points)))
+    data = load_rssi(file)
+    assert data.rssi_dbm[:, 0].tolist() == [-60 - n for n in range(20)]
+    assert data.transmitter_position[:, 2].tolist() == [400] * 20
+    assert data.time.tolist() == list(range(20))
+    assert float(data.transmitter_position[:, 0].diff().mean()) == pytest.approx(7.55, abs=0.05)
+
+
+BOMB = '<!DOCTYPE b [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;">]><gpx><wpt lat="1" lon="2">&b;</wpt></gpx>'
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.json", '{"points": [{"x": 1', "is no complete JSON document"),
+        ("a.json", "[" * 100_000, "is no complete JSON document"),
+        ("a.json", "[[1, 2, -60], [2, 3, -61]]", "holds no records with names"),
+        ("a.json", '[{"ap": "a", "rssi": -60}]', "has no column for x"),
+        ("a.json", '[{"x": 1, "y": 2, "note": "quiet"}]', "has no column of RSSI"),
+        ("a.json", json.dumps([{"x": x, "y": x, "rssi": -60} for x in (0, 1, 2, 3, 1e999)]), "must be finite"),
+        ("a.gpx", "<gpx><trk><trkseg><trkpt lat='1' lon='2'>", "is no complete GPX document"),
+        ("a.gpx", "<gpx><trk><trkseg/></trk></gpx>", "holds no records with names"),
+        ("a.gpx", "<gpx><wpt lat='1' lon='2'/></gpx>", "has no column of RSSI"),
+        ("a.gpx", "<gpx>" + "<wpt>" * 50_000 + "</wpt>" * 50_000 + "</gpx>", "is no complete GPX document"),
+        ("a.gpx", BOMB, "declares entities"),
+        ("a.kml", "<kml><Placemark><coordinates>a,b</coordinates></Placemark></kml>", "is no complete KML document"),
+    ],
+)
+def test_broken_documents_are_refused_in_one_sentence(tmp_path, name, content, message):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(InputError, match=message):
+        load_rssi(tmp_path / name)
