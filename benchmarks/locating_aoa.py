@@ -2,31 +2,38 @@
 
 python benchmarks/locating_aoa.py --data /data/newrf-bedroom /data/newrf-office --fractions 0.1 0.3 --draws 3 --kernel
 
-With --subcarriers, channels are computed from ray paths, and predicted at the test positions, too. The split is the random
-one of seed 0.
-Draws differ in the spectra that count as measured. Test spectra take no part in any fit.
+With --subcarriers, channels are computed from ray paths, and predicted at the test positions, too. --snr-db adds noise to
+them, a delay and a phase of each packet. --rooms adds furnished rooms, one a draw, that Sionna RT traces:
+
+python benchmarks/locating_aoa.py --scenes --rooms 10 --subcarriers 8 --bandwidth 20e6 --snr-db 20 --n-test 60 --kernel
+
+The split is the random one of seed 0. Draws differ in the spectra that count as measured. Test spectra take no part in any
+fit.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import repeat
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 from record import RESULTS, options, write_result
 
 from augment import Mixed, withhold
-from augment.estimators import make_estimator
+from augment.estimators import ESTIMATORS, make_estimator
 from augment.turbo.artifacts import LEVEL
 from augment.turbo.experiment import ROOM_MODEL
 from augment.turbo.stages import located
 from swiftwrf import (
+    AngularGrid,
     FitError,
     GeometryModel,
     InputError,
@@ -36,13 +43,18 @@ from swiftwrf import (
     make_model,
     simulated_room,
 )
-from swiftwrf.choices import fraction_key
+from swiftwrf.choices import Moving, fraction_key
+from swiftwrf.data.raytraced import Box, FurnishedRoom, Material, Scene, Tracing, trace
+from swiftwrf.data.spectra import array_spectra
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import GaussianProcess, choose_kernel
 from swiftwrf.metrics import angle_errors, summary
 from swiftwrf.models.geometry.channels import coherence, field, waves
 
 KERNEL = "kernel_regression"
+MAX_DELAY_S = 100e-9  # of a packet
+WALL = Material("wall", 1.0, 9.0, 0.3)  # reflects -0.5 of the amplitude at normal incidence
+N_BOXES, N_POSITIONS = 6, 300
 Row = dict[str, Any]
 
 
@@ -60,8 +72,14 @@ class Config:
     """number of subcarriers at which channels of ray paths are used; spectra alone by default"""
     bandwidth: float | None = None
     """distance of the first and the last of them [Hz]"""
+    rooms: int = 0
+    """number of furnished rooms that are traced"""
+    snr_db: float | None = None
+    """signal-to-noise ratio of each packet, whose delay and phase are random [dB]; no impairment by default"""
+    n_test: int | None = None
+    """number of test spectra at most"""
     kernel: bool = False
-    """measure kernel regression on the same spectra, too"""
+    """measure kernel regression on the same spectra, and MUSIC and maximum likelihood on the channels, too"""
     name: str = "locating_spectra"
     """name of the result"""
     out: Path = RESULTS
@@ -72,38 +90,85 @@ def main(config: Config) -> None:
     """Measure every scene, measured fraction and draw, and write the result."""
     torch.set_num_threads(1)
     found: dict[str, Any] = {}
-    for name, data in scenes(config):
-        train, test = data.split("random")
-        found[name] = {}
-        for fraction in config.fractions:
-            rows = []
-            for draw in range(config.draws):
-                rows.append(measure(withhold(train, fraction, draw)[0], test, draw, config.kernel))
-                print(name, fraction, rows[-1], flush=True)
-            found[name][fraction_key(fraction)] = {"median": median_of(rows), "draws": rows}
+    for name, draws in scenes(config):
+        rows: dict[str, list[Row]] = {fraction_key(fraction): [] for fraction in config.fractions}
+        for draw, data in enumerate(draws):
+            train, test = (data if config.snr_db is None else impaired(data, config.snr_db, draw)).split("random")
+            test = test.subset(torch.arange(min(len(test), config.n_test or len(test))))
+            for fraction in config.fractions:
+                own = rows[fraction_key(fraction)]
+                measured = withhold(train, fraction, draw)[0]
+                own.append(measure(measured, test, draw, config.kernel, coherent=config.snr_db is None))
+                print(name, fraction, own[-1], flush=True)
+            found[name] = {key: {"median": median_of(own), "draws": own} for key, own in rows.items()}
             write_result(config.name, {"scenes": found}, folder=config.out)
 
 
-def scenes(config: Config) -> Iterator[tuple[str, Spectra]]:
-    """Yield name and spectra of each scene."""
+def scenes(config: Config) -> Iterator[tuple[str, Iterable[Spectra]]]:
+    """Yield the name of each scene and its spectra, one for each draw."""
     for name in config.scenes:
-        yield name, simulated_room(moving="transmitter" if name == "room" else "receiver")
+        yield name, repeat(simulated_room(moving="transmitter" if name == "room" else "receiver"), config.draws)
+    where = "" if config.snr_db is None else f", {(config.bandwidth or 0) / 1e6:g} MHz, {config.snr_db:g} dB"
     for folder in config.data:
-        yield folder.name, load_spectra(folder, subcarriers=config.subcarriers, bandwidth=config.bandwidth)
+        data = load_spectra(folder, subcarriers=config.subcarriers, bandwidth=config.bandwidth)
+        yield folder.name + where, repeat(data, config.draws)
+    if config.rooms:
+        yield "furnished rooms" + where, map(partial(furnished_room, config), range(config.rooms))
 
 
-def measure(measured: Spectra, test: Spectra, draw: int, kernel: bool) -> Row:
-    """Return errors, coverage and seconds of one draw, or the reason why the spectra cannot be located."""
+def furnished_room(config: Config, seed: int) -> Spectra:
+    """Return spectra and channels in a room of random size with boxes of wood, metal and chipboard on its floor."""
+    generator = np.random.default_rng(seed)
+    size = generator.uniform((5, 4, 2.6), (7, 6, 3.2))
+    fixed = np.append(generator.uniform(0.2, 0.6, 2), size[2] - 0.3)  # under the ceiling in a corner
+    boxes: list[Box] = []
+    while len(boxes) < N_BOXES:
+        extent = generator.uniform((0.4, 0.4, 0.5), (1.6, 1.6, 1.9))
+        low = np.append(generator.uniform(0, size[:2] - extent[:2]), 0.0)
+        if (low[:2] > fixed[:2] + 0.3).any():
+            material = ("wood", "metal", "chipboard")[len(boxes) % 3]
+            boxes.append(Box(material, tuple(low), tuple(low + extent)))
+    room = FurnishedRoom(tuple(size), "wall", "wall", "wall", tuple(boxes), tuple(fixed), ((0, 0, 0), (0, 0, 0)))
+    surfaces = [s if s.material.name != WALL.name else replace(s, material=WALL) for s in room.surfaces()]
+    position = torch.from_numpy(generator.uniform((0.4, 0.4, 0.8), (*size[:2] - 0.4, 1.7), (4 * N_POSITIONS, 3)))
+    position = position[room.free(position)][:N_POSITIONS]
+    ends = torch.from_numpy(fixed), position, get_args(Moving)[seed % 2]
+    paths = trace(Scene(surfaces, 2.4e9), *ends, Tracing(order=2, seed=seed), progress=False).reached
+    grid = AngularGrid.hemisphere(30, 120)
+    return paths.spectra("furnished room", grid=grid, subcarriers=config.subcarriers, bandwidth_hz=config.bandwidth)
+
+
+def impaired(data: Spectra, snr_db: float, seed: int) -> Spectra:
+    """Return packets with white noise, and with a delay and a phase of each packet."""
+    if data.channel is None or data.frequency_hz is None or data.array is None:
+        raise SystemExit("noise is added to channels; give --subcarriers")
+    generator = torch.Generator().manual_seed(seed)
+    delay, phase = torch.rand(2, len(data), 1, 1, generator=generator, dtype=torch.float64)
+    away = (data.frequency_hz - data.frequency_hz.mean())[:, None]
+    channel = data.channel * torch.polar(torch.ones_like(delay), math.tau * (phase - MAX_DELAY_S * delay * away))
+    power = channel.abs().square().mean(dim=(1, 2), keepdim=True) * 10 ** (-snr_db / 10)
+    channel = channel + power.sqrt() * torch.randn(channel.shape, generator=generator, dtype=channel.dtype)
+    return replace(data, channel=channel, store=array_spectra(data.array, channel, data.grid))
+
+
+def measure(measured: Spectra, test: Spectra, draw: int, kernel: bool, coherent: bool = True) -> Row:
+    """Return errors, coverage and seconds of one draw, or the reason why the spectra cannot be located.
+
+    With `coherent` the channels of all packets have one delay and one phase, so that errors of predicted channels count.
+    """
     row: Row = {"draw": draw, "n_measured": len(measured), "n_test": len(test)}
-    if kernel:
-        estimate = make_estimator(KERNEL, seed=draw).fit(Mixed.measured(measured)).predict(test.spectrum)
-        row[f"{KERNEL}_angle_deg"] = angle_summary(estimate, test)
+    beside = [KERNEL, *(name for name, kind in ESTIMATORS.items() if not kind.trainable)] if kernel else []
+    for name in beside:
+        if not ESTIMATORS[name].lacking(test):
+            estimator = make_estimator(name, seed=draw).fit(Mixed.measured(measured))
+            row[f"{name}_angle_deg"] = angle_summary(estimator.estimate(test), test)
     began = time.perf_counter()
     try:
         room = make_model(ROOM_MODEL, seed=draw).fit(measured)
         searched = time.perf_counter()
         if measured.channel is not None:
-            row["channel"] = channel_scores(room.room, measured, test, draw)
+            scores = channel_scores(room.room, measured, test, draw)
+            row["channel"] = scores if coherent else {name: {"coherence": s["coherence"]} for name, s in scores.items()}
         if room.room is None or not room.room.planes:
             return row | {"left_out": "no plane explains the spectra"}
         locator = MatchedField(seed=draw).fit(measured, room=room)

@@ -40,10 +40,12 @@ MAX_VOXELS = 50_000
 MIN_SHOWN_DB = 1.0  # absorption [dB/m] of a voxel in JSON: less differs little from empty space
 N_STEPS = 150  # of Adam
 TENSORS = ("low", "absorption", "reflectivity", "crossed_m")
-SETTINGS = ((2.0, 1e-3), (1.0, 1e-3), (2.0, 3e-3))  # edge of a voxel [wavelengths] and weight of the penalty
+# edge of a voxel [wavelengths] and weight of the penalty
+SETTINGS = ((2.0, 1e-3), (1.0, 1e-3), (2.0, 3e-3), (2.0, 3e-4))
 SIGNIFICANCE = 2.5  # standard errors by which furniture must explain held-out channels better
 SURFACE_SIGNIFICANCE = 2.5  # the same of each surface
 MAX_CHOICE = 200  # positions that choose the settings
+MIN_HELD_OUT = 60  # positions in the folds that are held out for it, if there are as many
 
 
 @dataclass(frozen=True, eq=False)
@@ -344,12 +346,16 @@ def fit_furniture(planes: PlaneSet, measured: Channels, start: Furniture) -> Fur
     parts = [group.lengths(math.prod(shape)) for group in crossings]
     sparse = {id(group): (part, part.T.tocsr()) for group, part in zip(crossings, parts, strict=True)}
     raw = torch.full(start.absorption.shape, -3.0, requires_grad=True)
-    strength = planes.gain[0].abs().clamp(0.05, 0.98)[:, None].expand_as(start.reflectivity)
-    logit = torch.special.logit(strength).clone().requires_grad_()
-    optimiser = torch.optim.Adam([{"params": [raw], "lr": 0.1}, {"params": [logit], "lr": 0.05}])
+    level = torch.special.logit(planes.gain[0].abs().clamp(0.05, 0.98))[:, None].requires_grad_()  # of each plane
+    change = torch.zeros_like(start.reflectivity, requires_grad=True)
+    optimiser = torch.optim.Adam([{"params": [raw], "lr": 0.1}, {"params": [level, change], "lr": 0.05}])
     area, normal, n_planes = start.voxel_m**2, planes.normal[0], len(start.reflectivity) - len(start.surfaces)
+    # a surface beyond all positions, on a side without a plane, is a wall that the search for the room has missed
+    side, ends = planes.side[0].tolist(), torch.cat([scene.transmitter, scene.receiver])
+    beyond = ((ends @ normal.T).amax(0) < planes.offset[0]).tolist()
+    is_wall = [row < n_planes or (beyond[row] and side[row] not in side[:n_planes]) for row in range(len(side))]
     for _ in range(N_STEPS):
-        absorption, reflectivity = softplus(raw), logit.sigmoid()
+        absorption, reflectivity, usual = softplus(raw), (level + change).sigmoid(), level.sigmoid()
         values = _padded(absorption)
 
         def transmission(group: _Crossings, values: Tensor = values) -> Tensor:
@@ -362,8 +368,8 @@ def fit_furniture(planes: PlaneSet, measured: Channels, start: Furniture) -> Fur
             sides = [size for other, size in enumerate(absorption.shape) if other != axis]
             cells = values[: math.prod(sides)].reshape(sides)
             penalty = penalty + start.voxel_m * _variation(cells)
-            # a plane of the room reflects everywhere unless channels need less, another surface nowhere
-            penalty = penalty + area * (1 - cells if number < n_planes else cells).sum()
+            # a wall reflects alike everywhere unless channels need another gain, another surface nowhere
+            penalty = penalty + area * ((cells - usual[number]).abs() if is_wall[number] else cells).sum()
         loss = 1 - coherence(observed, field(gain, wave)).mean() + start.penalty * penalty
         optimiser.zero_grad()
         loss.backward()
@@ -372,7 +378,7 @@ def fit_furniture(planes: PlaneSet, measured: Channels, start: Furniture) -> Fur
     return replace(
         start,
         absorption=softplus(raw).detach(),
-        reflectivity=logit.sigmoid().detach(),
+        reflectivity=(level + change).sigmoid().detach(),
         crossed_m=crossed.reshape(shape)[1:-1, 1:-1, 1:-1],
     )
 
@@ -402,7 +408,8 @@ def find_furniture(
         empty.append(Furniture(low, voxel, torch.zeros(shape), cells, torch.zeros(shape), penalty))
     some = torch.linspace(0, len(fold) - 1, min(MAX_CHOICE, len(fold))).long()
     chosen, fold = measured.subset(some), fold[some]
-    splits = [((fold != number).nonzero()[:, 0], (fold == number).nonzero()[:, 0]) for number in fold.unique()[:2]]
+    numbers = fold.unique()[: max(2, math.ceil(MIN_HELD_OUT * len(fold.unique()) / len(fold)))]
+    splits = [((fold != number).nonzero()[:, 0], (fold == number).nonzero()[:, 0]) for number in numbers]
 
     def fitted(task: tuple[Furniture, tuple[Tensor, Tensor]]) -> Furniture:
         start, (kept, _) = task
@@ -421,24 +428,24 @@ def find_furniture(
     best = max(range(len(empty)), key=lambda row: float(with_furniture[row].mean()))
     held = chosen.subset(torch.cat([held for _, held in splits]))
     alone = log_explained(held.coherence(planes, constant.expand(len(held.value), -1)))
-    if advantage(with_furniture[best], alone) < SIGNIFICANCE:
-        return None
+    is_furnished = advantage(with_furniture[best], alone) > SIGNIFICANCE
+    # without furniture a strong penalty is best, but leaves too much in the residual to find walls that are hidden at times
+    best = best if is_furnished else 0
     found = fit_furniture(planes, measured, empty[best])
     surfaces = find_surfaces(planes, found.gains(planes, measured.scene), measured, low, high)
-    if not surfaces:
-        return found
-    wider = empty[best].with_surfaces(surfaces)
-    fits = parallel_map(fitted, [(wider, split) for split in splits])
-    whole, n = explained(fits), planes.gain.shape[1]
-    kept = [
-        row
-        for row in range(len(surfaces))
-        if advantage(whole, explained([fit.with_reflectivity(n + row, 0.0) for fit in fits])) > SURFACE_SIGNIFICANCE
-    ]
-    if not kept or advantage(whole, with_furniture[best]) < SIGNIFICANCE:
-        return found
-    wider = empty[best].with_surfaces([surfaces[row] for row in kept])
-    return fit_furniture(wider.joined(planes), measured, wider)
+    if surfaces:
+        wider = empty[best].with_surfaces(surfaces)
+        fits = parallel_map(fitted, [(wider, split) for split in splits])
+        whole, n = explained(fits), planes.gain.shape[1]
+        kept = [
+            surface
+            for row, surface in enumerate(surfaces)
+            if advantage(whole, explained([fit.with_reflectivity(n + row, 0.0) for fit in fits])) > SURFACE_SIGNIFICANCE
+        ]
+        if kept and min(advantage(whole, other) for other in (with_furniture[best], alone)) > SIGNIFICANCE:
+            wider = empty[best].with_surfaces(kept)
+            return fit_furniture(wider.joined(planes), measured, wider)
+    return found if is_furnished else None
 
 
 def _variation(values: Tensor) -> Tensor:

@@ -28,6 +28,7 @@ START_GAIN = 0.12
 RARITY = 1.2  # factor by which a sign that most planes do not have must explain more; a small shift may imitate it
 SIDE_LOBE = 0.2  # of the strongest improvement: less may be left of a surface that is modelled imperfectly
 MARGIN = 2.0  # wavelengths beyond the voxels
+OPEN_MARGIN_M = 3.0  # the same on a side without a plane, whose wall may be one that is hidden from most positions
 STEP = 1 / 12  # of the offsets of the scan, in wavelengths
 CELL, MAX_CELLS = 4.0, 12  # least edge of a cell in wavelengths, and cells along each side of the region
 MAX_OFFSETS = 4000  # along each axis, those nearest to the fixed end
@@ -52,10 +53,12 @@ def find_surfaces(planes: PlaneSet, gain: Tensor, measured: Channels, low: Tenso
     scene = measured.scene
     wavelength = math.tau / scene.wavenumber
     residual = _Residual.of(measured, field(gain, waves(planes, scene, measured.frequency)), low, high)
-    step, margin = STEP * wavelength, MARGIN * wavelength
+    step = STEP * wavelength
+    margin = [MARGIN * wavelength if side in planes.by_side() else OPEN_MARGIN_M for side in range(6)]
 
     def scanned(axis: int) -> list[tuple[float, int, float]]:
-        offset = torch.arange(float(low[axis]) - margin, float(high[axis]) + margin, step, dtype=torch.float64)
+        first, last = float(low[axis]) - margin[2 * axis], float(high[axis]) + margin[2 * axis + 1]
+        offset = torch.arange(first, last, step, dtype=torch.float64)
         offset = offset[(offset - residual.fixed[axis]).abs().argsort()[:MAX_OFFSETS].sort().values]
         parts = [residual.improvement(axis, some)[0].mean(-1).amax(0) for some in offset.split(BATCH)]
         value = torch.cat(parts)

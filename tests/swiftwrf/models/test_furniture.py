@@ -15,7 +15,7 @@ from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data import PropagationPaths, Snapshots
 from swiftwrf.data.store import Store
 from swiftwrf.models.geometry import GeometryModel, Plane, furniture
-from swiftwrf.models.geometry.channels import coherence, field, waves
+from swiftwrf.models.geometry.channels import Channels, coherence, field, waves
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.geometry.furniture import Furniture
 from swiftwrf.models.geometry.images import PlaneSet
@@ -35,18 +35,22 @@ def furnished(room: GeometryModel, absorption: float) -> Furniture:
 
 
 def measured(
-    absorption: float, moving="transmitter", n: int = 100, surfaces: tuple[Plane, ...] = ()
+    absorption: float, moving="transmitter", n: int = 100, surfaces: tuple[Plane, ...] = (), noise: float = 0.0
 ) -> tuple[Spectra, GeometryModel]:
-    """Return the channels of a furnished room at four subcarriers, and its walls."""
+    """Return packets of a furnished room at four subcarriers, each with a delay and a phase, and the walls of the room."""
     data = mirror_room({}, moving=moving, n=n)
     walls = GeometryModel.of_planes(data, WALLS)
     truth = GeometryModel.of_planes(data, WALLS)
     shelf = furnished(truth, absorption)
     truth.furniture = shelf.with_surfaces([*surfaces]) if surfaces else shelf
-    frequency = LIGHT_SPEED / data.array.wavelength + torch.linspace(-40e6, 40e6, 4, dtype=torch.float64)
+    generator, away = torch.Generator().manual_seed(0), torch.linspace(-10e6, 10e6, 4, dtype=torch.float64)
+    frequency = LIGHT_SPEED / data.array.wavelength + away
     channel = truth.channel(data.position, frequency)
-    phase = torch.randn(n, 4, 1, generator=torch.Generator().manual_seed(0))
-    channel = channel * torch.polar(torch.ones_like(phase), phase)  # of each snapshot, unknown
+    delay, phase = torch.rand(2, n, 1, 1, generator=generator)
+    turn = math.tau * (phase - 100e-9 * delay * away[:, None]).float()
+    channel = channel * torch.polar(torch.ones_like(turn), turn)
+    error = torch.randn(channel.shape, dtype=channel.dtype, generator=generator)
+    channel = channel + noise * channel.abs().square().mean(dim=(1, 2), keepdim=True).sqrt() * error
     return replace(
         data, store=Store(data.array.spectrum(channel, data.grid)), channel=channel, frequency_hz=frequency
     ), walls
@@ -112,6 +116,16 @@ def test_furniture_is_found_where_it_stands_and_explains_new_channels(moving, tm
     assert torch.equal(load(tmp_path / "room.safetensors").channel(test.position), room.channel(test.position))
 
 
+def test_walls_reflect_alike_where_no_path_determines_their_reflectivity():
+    """A strong penalty does not pull walls of gain 0.5 to perfect mirrors."""
+    data = mirror_room({}, n=20)
+    room = GeometryModel.of_planes(data, built_in_walls(0.5))
+    scene, start = room.scene(data.position), replace(furnished(room, 0.0), penalty=1e-2)
+    channel = field(room.gains(scene), waves(room.tensors(), scene, torch.ones(1)))
+    found = furniture.fit_furniture(room.tensors(), Channels(scene, channel, torch.ones(1)), start)
+    assert found.reflectivity.mean() == pytest.approx(0.5, abs=0.1)
+
+
 def test_a_reflecting_surface_is_found_where_it_is(tmp_path):
     lamp = Plane((0.0, 0.0, 1.0), 2.2, 0.9)
     data, walls = measured(1.0, n=120, surfaces=(lamp,))
@@ -166,8 +180,8 @@ def test_phases_of_channels_have_no_alias_and_those_of_packets_are_the_signal():
     assert torch.allclose(match, torch.ones_like(match), atol=1e-5)
 
 
-def test_positions_are_located_by_channels_through_furniture(tmp_path):
-    data, _ = measured(6.0, n=80)
+def test_positions_are_located_by_noisy_packets_through_furniture(tmp_path):
+    data, _ = measured(6.0, n=80, noise=0.1)
     train, test = data.subset(torch.arange(70)), data.subset(torch.arange(70, 80))
     cells = {"n_best": 15, "n_background": 8, "n_split": 8, "spacing": 0.3, "max_cells": 4000}
     room = fitted(GeometryModel.of_planes(train, WALLS), train)

@@ -209,9 +209,9 @@ def test_the_estimator_is_chosen_by_held_out_errors_alone(closed_form):
 
 
 def test_the_benchmark_writes_every_draw_and_their_medians(closed_form, tmp_path, monkeypatch):
-    monkeypatch.setattr(locating_aoa, "scenes", lambda config: [("closed form", closed_form)])
+    monkeypatch.setattr(locating_aoa, "scenes", lambda config: [("closed form", [closed_form] * 2)])
     with quickly(closed_form):
-        locating_aoa.main(locating_aoa.Config(fractions=(0.5,), draws=2, kernel=True, out=tmp_path))
+        locating_aoa.main(locating_aoa.Config(fractions=(0.5,), kernel=True, out=tmp_path))
     written = json.loads((tmp_path / "locating_spectra.json").read_text())
     assert {"command", "environment"} <= set(written)
     found = written["scenes"]["closed form"]["0.5"]
