@@ -309,7 +309,7 @@ def test_an_interval_of_one_width_sends_nobody_to_measure():
     assert "x = 3.0 m, y = 2.0 m" not in where_next(run)
 
 
-def test_each_floor_has_its_maps_its_rows_and_its_coverage():
+def test_each_floor_has_its_maps_its_rows_and_its_coverage(tmp_path):
     corners = np.array([[0, 0, 0], [4, 0, 0], [0, 3, 0], [4, 3, 0]], dtype=float)
     position = np.concatenate([corners, corners + np.array([0, 0, 4])])
     level = np.stack([np.full((1, 4, 5), dbm) for dbm in (-50.0, -90.0)])
@@ -322,14 +322,15 @@ def test_each_floor_has_its_maps_its_rows_and_its_coverage():
     }
     maps |= {"measured_position": position, "measured": position[:, 2:], "floor_of_row": np.repeat([0, 1], 4)}
     maps |= {"floor_names": np.array(["Ground", "First"]), "receiver_names": np.array(["a"]), "receiver": corners[:1]}
-    ground, first = Maps.of_floors(SimpleNamespace(arrays=lambda name: maps, file_name="run"))
+    run = SimpleNamespace(arrays=lambda name: maps, file_name="run", folder=tmp_path)
+    ground, first = Maps.of_floors(run)
     assert (ground.covered, first.covered) == (1, 0)
     assert (ground.place, first.titled("a")) == ("floor Ground", "a, First")
     assert first.arrays["measured"].ravel().tolist() == [4.0] * 4
     assert first.summary().name == "summary-1"
     assert [first.by_receiver(kind).name for kind in ("predicted", "width")] == ["map-run-1", "width-run-1"]
     maps["measured"] = np.where(position[:, 2:] > 0, np.nan, -50.0)  # the first floor receives nothing
-    _, first = Maps.of_floors(SimpleNamespace(arrays=lambda name: maps, file_name="run"))
+    _, first = Maps.of_floors(run)
     low, high = first.summary().panels[0].axes[0].images[0].get_clim()
     assert -100 < low < -90 < high < -80
 
