@@ -84,6 +84,8 @@ class RssiPredictor(Configured, Displayed, ABC):
     """whether the positions of the receivers must be known"""
     slow: ClassVar[bool] = False
     """whether a fit takes minutes, so that it is compared only on request"""
+    max_map_predictions: ClassVar[int] = 2**22
+    """predictions of a map at all receivers if its cells are not given"""
     batch_size: ClassVar[int] = 512
     """positions evaluated at a time, few enough to stay in the processor's cache"""
 
@@ -218,6 +220,10 @@ class RssiPredictor(Configured, Displayed, ABC):
         """Add checked rows to this copy."""
         raise InputError(f"a predictor {self.name} cannot be updated; fit it again to all rows")
 
+    def region(self) -> Tensor:
+        """Return the training positions (n, 3) [m], whose box a map covers."""
+        raise InputError(f"a predictor {self.name} has no map; choose swiftwrf or pairs")
+
     @abstractmethod
     def _fit(self, train: Rssi, *, pool: Rssi, shift: Tensor, curve: Detection | None, **arguments: Any) -> None:
         """Fit to checked data.
@@ -303,18 +309,7 @@ class RssiPredictor(Configured, Displayed, ABC):
 
 
 class SavedRssiPredictor(RssiPredictor, Saved):
-    """Base class of predictors that one file stores. Those with a region and a standard deviation have maps."""
-
-    max_map_predictions: ClassVar[int] = 2**22
-    """predictions of a map at all receivers if its cells are not given"""
-
-    @abstractmethod
-    def region(self) -> Tensor:
-        """Return the training positions (n, 3) [m], whose box a map covers.
-
-        Raises:
-            InputError: A predictor without standard deviations, which has no maps.
-        """
+    """Base class of predictors that one file stores."""
 
     def _header(self) -> Header:
         """Return the plain values that files of all these predictors contain."""

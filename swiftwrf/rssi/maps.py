@@ -18,7 +18,7 @@ from swiftwrf.errors import InputError, listed
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Axes, Displayed, corners_of, hatch, plan_map
 from swiftwrf.positions import to_tensor
-from swiftwrf.rssi.base import SavedRssiPredictor
+from swiftwrf.rssi.base import RssiPredictor
 
 CELLS = 120  # of a map, along its longer side
 MAX_CELLS = 2**22
@@ -54,7 +54,7 @@ class RssiMap(Labelled, Displayed):
     @classmethod
     def predict(
         cls,
-        model: SavedRssiPredictor,
+        model: RssiPredictor,
         cell: float | None = None,
         height: float | None = None,
         region: Numbers | None = None,
@@ -68,7 +68,8 @@ class RssiMap(Labelled, Displayed):
             region: Positions (n, 2 or 3) [m]. Defaults to the training positions and the known positions of receivers.
 
         Raises:
-            InputError: A cell that is not positive, a region of no or other positions, or a map of more than 2^22 cells.
+            InputError: A cell that is not positive, a region of no or other positions, a map of more than 2^22 cells, or a
+                predictor without maps.
 
         Example:
             >>> import swiftwrf

@@ -419,6 +419,8 @@ def test_refuses():
         RssiModel().predict(data.transmitter_position)
     with pytest.raises(InputError, match="is not fitted"):
         RssiModel().state()
+    with pytest.raises(InputError, match="a predictor mean has no map; choose swiftwrf or pairs"):
+        RssiMap.predict(RSSI_PREDICTORS["mean"]().fit(data))
     with pytest.raises(InputError, match="region must be finite"):
         RssiMap.predict(model, region=[[float("nan"), 0.0]])
     with pytest.raises(InputError, match="a region needs at least one position"):
