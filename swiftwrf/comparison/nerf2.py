@@ -42,7 +42,6 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.comparison.base import Config, Count, Depth, TrainedModel, Training, draw_parameters, restored
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.errors import InputError
 from swiftwrf.models.base import CPU, FIXED_END, check_finite
 from swiftwrf.models.mlp import SkipMLP, encode
 from swiftwrf.positions import frame, normalise
@@ -293,9 +292,6 @@ class NeRF2Rssi(SavedRssiPredictor):
 
         training = Training(config, field.to(device), loss, betas=(0.9, 0.999), weight_decay=config.weight_decay)
         self.field = training.run("", progress=progress).cpu()
-
-    def region(self) -> Tensor:
-        raise InputError(f"{self.name} predicts no standard deviation, so it has no map; take RssiModel or PairModel")
 
     def _blank(self) -> Field:
         return Field(self.config.width, self.config.depth, self.config.bands)

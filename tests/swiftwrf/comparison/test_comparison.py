@@ -328,7 +328,7 @@ def test_one_field_for_all_receivers(tmp_path):
     train = rssi_room(n=40).receivers(["1", "2", "3"])
     train.rssi_dbm[::3, 1] = torch.nan
     model = NeRF2Rssi(PUBLISHED_RSSI).fit(train)
-    with pytest.raises(InputError, match="nerf2 predicts no standard deviation, so it has no map"):
+    with pytest.raises(InputError, match="a predictor nerf2 has no map"):
         model.region()
     model.save(tmp_path / "model")
     position = train.transmitter_position
