@@ -190,7 +190,7 @@ def test_receivers_of_a_table_in_degrees(tmp_path, floor):
     expected = np.linalg.norm(floor.position[:, None] - floor.receiver, axis=2)
     np.testing.assert_allclose(torch.cdist(data.transmitter_position, data.receiver_position), expected, atol=1e-3)
     floor.write_receivers(tmp_path)
-    with pytest.raises(InputError, match="receivers must be in degrees"):
+    with pytest.raises(InputError, match="receivers.csv: positions must be in degrees"):
         load_rssi(tmp_path / "walk.csv")
 
 
@@ -359,7 +359,7 @@ def test_outputs_of_a_table_in_degrees(tmp_path):
     table[40:].to_csv(tmp_path / "later.csv", index=False)
     run = tmp_path / "rssi"
     assert quick.run("rssi", "--rx", "all", "--data", tmp_path / "walk.csv", "--out", run) == 0
-    assert "access points that are unknown" in (run / "report.html").read_text()
+    assert "unknown positions of access points" in (run / "report.html").read_text()
     predicted = pd.read_csv(run / "predictions.csv")
     near = np.abs(predicted[["latitude_deg", "longitude_deg"]].to_numpy()[:, None] - degrees).max(axis=2).min(axis=1)
     assert near.max() < 1e-8
