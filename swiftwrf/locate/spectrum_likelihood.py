@@ -335,9 +335,9 @@ class PathLikelihood(PhaseLikelihood):
 
         match = 2 * product(m, x, own, other).abs()
         misfit = product(x, x, other, other).real + product(m, m, own, own).real
-        density: Tensor = match + torch.special.i0e(match).log() - misfit
         volume = small.diagonal(dim1=1, dim2=2).real.log().sum(1) + count * (root.diagonal().real / scale).log().sum()
-        return density - 2 * volume
+        density: Tensor = match + torch.special.i0e(match).log() - misfit - 2 * volume
+        return density
 
 
 @dataclass(frozen=True, eq=False)
