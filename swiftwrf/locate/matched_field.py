@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Annotated, ClassVar, Self
 
@@ -26,6 +26,7 @@ from swiftwrf.locate.spectrum_likelihood import (
     ChannelLikelihood,
     CoarrayLikelihood,
     Features,
+    PathLikelihood,
     PathWaves,
     PhaseLikelihood,
     SpectrumFeatures,
@@ -46,8 +47,8 @@ from swiftwrf.runtime.validation import Configured, NonNegativeInt, PositiveInt,
 
 FOLDS = 5
 START_WEIGHTS = (0.05, 0.05, 0.3)  # of the likelihoods, by which the calibration searches
-START_WEIGHTS_CHANNEL = (0.1, 1.0)
-CHANNEL_SPLITS = 6  # times as many cells are split for channels, whose likelihood is narrower than a cell
+START_WEIGHTS_CHANNEL = (0.5, 0.05)
+CHANNEL_SPLITS = 3  # times as many cells are split for channels, whose likelihood is narrower than a cell
 MIN_FLOOR = 1e-4  # of missing coherence, by rounding
 MIN_SPECTRA = 15
 BATCH_CANDIDATES = 2048  # whose waves are computed together: as many as a processor's cache holds
@@ -177,7 +178,7 @@ class MatchedField(Configured, Saved):
     """Posterior over the position of the moving end, given a spectrum.
 
     Three likelihoods of spectra are pooled: co-array numbers predicted by constant path gains, by position-dependent path
-    gains, and element phases under uncertain path gains. Of channels, these phases and the channel itself are pooled. The
+    gains, and element phases under uncertain path gains. Of channels, those under uncertain and constant path gains are. The
     covariances come from held-out positions, and so do the weights, which maximise the posterior density there. This also
     calibrates the posterior.
 
@@ -251,20 +252,26 @@ class MatchedField(Configured, Saved):
         def fitted(kept: Tensor) -> _Fit:
             phases = scene.subset(kept[rows].nonzero()[:, 0])
             part = chosen.refined_on(phases).furnished_on(train.subset(kept))
-            likelihood = PhaseLikelihood.fit(part, train.position[kept], features.subset(kept), self._frequency(part))
-            return _Fit(part, None if self.n_snapshots else fit_path_gains(part, phases, kernel, prior), likelihood)
+            if self.n_snapshots:
+                return _Fit(part, None, PathLikelihood(part, torch.zeros(4 + part.reflectors.gain.shape[1])))
+            likelihood = PhaseLikelihood.fit([(part, PathWaves.at(part, train.position[kept]), features.subset(kept))])
+            return _Fit(part, fit_path_gains(part, phases, kernel, prior), likelihood)
 
         everything = torch.ones_like(fold, dtype=torch.bool)
         *parts, self._fit = parallel_map(fitted, [*(fold != number for number in range(FOLDS)), everything])
         # of every spectrum, by the fit without its fold
         self.residual = torch.empty(len(self._fit.features), *features.coarray.shape)
-        missing = torch.ones(len(train))
+        missing, held = torch.ones(len(train)), []
         for number, part in enumerate(parts):
             waves = PathWaves.at(part.room, train.position[fold == number], self._frequency(part.room))
+            held.append((part.room, waves, features.subset(fold == number)))
             for kind, predict in enumerate(part.features):
                 self.residual[kind, fold == number] = predict(waves) - features.coarray[fold == number]
             if features.channel is not None:
                 missing[fold == number] = 1 - coherence(features.channel[fold == number], waves.channel)
+        if self.n_snapshots:  # furniture is fitted more closely to the channels that determine it than to others
+            variance = PathLikelihood.fit(held).log_variance
+            *parts, self._fit = (replace(f, phases=PathLikelihood(f.room, variance)) for f in (*parts, self._fit))
         self.floor = max(float(missing.median()), MIN_FLOOR)
         self.observed_power = float(features.coarray.square().mean())
         held_out = [train.position[fold == number] for number in range(FOLDS)]
@@ -458,7 +465,8 @@ class MatchedField(Configured, Saved):
         if not locator.floor > 0 or (frequency is not None and len(frequency) != locator.n_snapshots):
             raise InputError("frequencies and missing coherence are not those of a fitted locator")
         locator.grid = room.grid
-        locator._fit = _Fit(room, gains, PhaseLikelihood(room, tensors["statistics"]))
+        likelihood = PathLikelihood if is_channel else PhaseLikelihood
+        locator._fit = _Fit(room, gains, likelihood(room, tensors["statistics"]))
         locator.residual, locator.weight = tensors["residual"], tensors["weight"]
         locator.region, locator.observed_power = Region.from_state(tensors, header), float(header["observed_power"])
         locator.inflation = read_inflation(header)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
@@ -24,7 +24,7 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.models.geometry.channels import coherence, ends, field, waves
+from swiftwrf.models.geometry.channels import coherence, field, waves
 from swiftwrf.models.geometry.fit import carrier_phases
 from swiftwrf.models.geometry.model import GeometryModel, kept_snapshots
 from swiftwrf.models.geometry.path_gains import PathGains
@@ -33,6 +33,7 @@ from swiftwrf.models.geometry.phase_retrieval import autocorrelation, coarray_nu
 CARRIER = torch.ones(1, dtype=torch.float64)  # frequency relative to the carrier
 DEGREES = (3.0, 5.0, 10.0, 30.0, math.inf)  # degrees of freedom of Student distributions that are compared
 SHRINKAGES = (0.05, 0.1, 0.2, 0.4, 0.7)  # of scale matrices to multiples of the identity, that are compared
+N_ALIGNED = 3  # iterations of the phases of snapshots and the expected field
 BOUNDS = (-10.0, 6.0)  # of the logarithms of variances: products of four of them stay within float32
 
 
@@ -42,8 +43,8 @@ class SpectrumFeatures:
 
     Args:
         coarray: Real and imaginary parts of the co-array numbers, float32 (n, F).
-        phases: Element phasors of unit modulus and their indistinguishable aliases, complex64 (n, G, T, K). T is 2 if there
-            are aliases. G is 1 for spectra, and 2 if there are channels at several frequencies, the lowest and the highest.
+        phases: Element phasors of unit modulus at the carrier and their indistinguishable aliases, complex64 (n, T, K). T is
+            2 if there are aliases.
         channel: Measured channels, complex64 (n, F, K), or None.
     """
 
@@ -58,15 +59,14 @@ class SpectrumFeatures:
         channel, _ = retrieve_phases(numbers, array, seed)
         opposite = array.opposite
         aliases = [channel] if opposite is None else [channel, channel.conj()[:, opposite]]
-        return cls(real_parts(numbers), torch.stack(aliases, dim=1).to(torch.complex64)[:, None])
+        return cls(real_parts(numbers), torch.stack(aliases, dim=1).to(torch.complex64))
 
     @classmethod
     def of_channels(cls, channel: Tensor, frequency_hz: Tensor | None, array: PlanarArray) -> SpectrumFeatures:
         """Compute the features of channels (n, S, K) at frequencies (S,) [Hz]."""
         carrier = carrier_phases(channel, frequency_hz, array)
         kept = channel[:, kept_snapshots(channel.shape[1])]
-        phases = carrier[:, None] if frequency_hz is None else kept[:, ends(kept.shape[1])].sgn()
-        return cls(real_parts(autocorrelation(carrier, array)), phases[:, :, None], kept)
+        return cls(real_parts(autocorrelation(carrier, array)), carrier[:, None], kept)
 
     def subset(self, rows: Tensor) -> SpectrumFeatures:
         """Return the features of some of the spectra."""
@@ -251,18 +251,21 @@ class PhaseLikelihood:
         self._isotropic = torch.sinc(2 * torch.cdist(element, element) / room.array.wavelength).to(torch.complex64)
 
     @classmethod
-    def fit(
-        cls, room: GeometryModel, position: Tensor, observed: SpectrumFeatures, frequency: Tensor = CARRIER
-    ) -> Self:
-        """Fit the variances by the marginal likelihood of n observations at known positions (n, 3)."""
+    def fit(cls, parts: Sequence[tuple[GeometryModel, PathWaves, SpectrumFeatures]]) -> Self:
+        """Fit the variances by the marginal likelihood of observations at known positions.
+
+        Args:
+            parts: Rooms, waves of each room at the positions, and observations there. The result is that of the first room.
+        """
+        room = parts[0][0]
         start = np.array([-3.0, *[-2.0] * room.reflectors.gain.shape[1], 0.0, -2.0, -2.0])
-        waves = PathWaves.at(room, position, frequency)
 
         @torch.enable_grad()
         def loss(values: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
             raw = torch.from_numpy(values).float().requires_grad_()
             # the penalty keeps variances that the data do not determine near 1
-            total = 0.01 * raw.square().mean() - cls(room, raw)(waves, observed).mean()
+            density = torch.cat([cls(own, raw)(waves, observed) for own, waves, observed in parts])
+            total = 0.01 * raw.square().mean() - density.mean()
             (gradient,) = torch.autograd.grad(total, raw)
             return float(total.detach()), gradient.double().numpy()
 
@@ -271,19 +274,8 @@ class PhaseLikelihood:
         return cls(room, torch.from_numpy(found.x).float())
 
     def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
-        """Return log-likelihoods (m,) of m observations at m candidates, up to a constant of each observation.
-
-        The path gains at several frequencies count as independent.
-        """
-        rows = ends(waves.wave.shape[2])
-        parts = [
-            self._density(waves.channel[:, row], waves.wave[:, :, row], phases)
-            for row, phases in zip(rows, observed.phases.unbind(1), strict=True)
-        ]
-        return torch.stack(parts).sum(dim=0)
-
-    def _density(self, mean: Tensor, wave: Tensor, phases: Tensor) -> Tensor:
-        """Return log-likelihoods (m,) of phases (m, T, K) at one frequency, with mean (m, K) and waves (m, 1 + S, K)."""
+        """Return log-likelihoods (m,) of m observations at m candidates, up to a constant of each observation."""
+        mean, wave, phases = waves.channel[:, 0], waves.wave[:, :, 0], observed.phases
         power = (self._variance[:, None] * wave.abs().square()).sum(dim=1).mean(dim=1) + mean.abs().square().mean(dim=1)
         total = power * (1 + self._diffuse + self._floor)
         weighted = wave * self._variance.sqrt()[:, None]
@@ -299,6 +291,53 @@ class PhaseLikelihood:
         density = match + torch.special.i0e(match).log() - misfit
         total_density: Tensor = density.logsumexp(dim=1) - 2 * root.diagonal(dim1=1, dim2=2).real.log().sum(dim=1)
         return total_density
+
+
+class PathLikelihood(PhaseLikelihood):
+    """Marginal likelihood of channels at all frequencies under uncertain path gains, as `PhaseLikelihood` of phases.
+
+    A path has one gain at all frequencies. The phase of each snapshot is unknown, and so is a delay of the packet. It is
+    estimated relative to the expected field, given all snapshots.
+    """
+
+    def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
+        assert observed.channel is not None
+        channel = observed.channel / observed.channel.abs().square().mean((1, 2), keepdim=True).sqrt().clamp_min(1e-30)
+        count = channel.shape[1]  # snapshots at one frequency have the same waves
+        wave, mean = waves.wave.expand(-1, -1, count, -1), waves.channel.expand(-1, count, -1)
+        variance = self._variance[:, None, None]
+        power = (variance * wave.abs().square()).sum(1).mean((1, 2)) + mean.abs().square().mean((1, 2))
+        root = torch.linalg.cholesky(self._diffuse * self._isotropic + self._floor * torch.eye(wave.shape[-1]))
+        scale = (1 + self._diffuse + self._floor).sqrt()
+        whitening = torch.linalg.inv(root).mT * scale
+        amount = power.rsqrt()[:, None, None] / scale  # so that the expected power is that of the observation
+        m, x = (mean * amount) @ whitening, channel @ whitening  # (m, F, K)
+        spread = ((wave * amount[..., None] * variance.sqrt()) @ whitening).flatten(2)  # (m, 1 + S, F K)
+        gram = spread.conj() @ spread.mT + torch.eye(spread.shape[1])
+        small = torch.linalg.cholesky(gram)
+
+        def along(values: Tensor) -> Tensor:
+            match = spread.conj() @ values.flatten(1)[..., None]
+            found: Tensor = torch.linalg.solve_triangular(small, match, upper=False)
+            return found
+
+        expected, own = m, along(m)
+        for number in range(N_ALIGNED):
+            x = x * (x.conj() * expected).sum(-1, keepdim=True).sgn().detach()
+            other = along(x)
+            if number < N_ALIGNED - 1:
+                change = torch.linalg.solve_triangular(small.mH, other - own, upper=True)
+                expected = m + (change.mT @ spread)[:, 0].view_as(m)
+
+        def product(a: Tensor, b: Tensor, along_a: Tensor, along_b: Tensor) -> Tensor:
+            whole: Tensor = (a.conj() * b).sum((1, 2)) - (along_a.conj() * along_b).sum((1, 2))
+            return whole
+
+        match = 2 * product(m, x, own, other).abs()
+        misfit = product(x, x, other, other).real + product(m, m, own, own).real
+        volume = small.diagonal(dim1=1, dim2=2).real.log().sum(1) + count * (root.diagonal().real / scale).log().sum()
+        density: Tensor = match + torch.special.i0e(match).log() - misfit - 2 * volume
+        return density
 
 
 @dataclass(frozen=True, eq=False)

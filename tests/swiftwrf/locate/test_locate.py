@@ -412,7 +412,7 @@ def test_variances_of_phases_that_no_room_explains_stay_finite():
     room = GeometryModel.of_planes(data, [Plane(*plane, gain=0.6) for plane in six.items()], order=3)
     assert data.array is not None
     features = SpectrumFeatures.of(data.store.batches(), data.array, data.grid, 0)
-    likelihood = PhaseLikelihood.fit(room, data.position, features)
+    likelihood = PhaseLikelihood.fit([(room, PathWaves.at(room, data.position), features)])
     assert bool((likelihood.log_variance >= BOUNDS[0] - 1e-4).all())
     assert bool((likelihood.log_variance <= BOUNDS[1] + 1e-4).all())
     assert bool(likelihood(PathWaves.at(room, data.position), features).isfinite().all())

@@ -14,6 +14,7 @@ from swiftwrf import AngularGrid, InputError, MatchedField, Spectra, load, simul
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data import PropagationPaths, Snapshots
 from swiftwrf.data.store import Store
+from swiftwrf.locate.spectrum_likelihood import PathLikelihood, PathWaves, SpectrumFeatures
 from swiftwrf.models.geometry import GeometryModel, Plane, furniture
 from swiftwrf.models.geometry.channels import Channels, coherence, field, waves
 from swiftwrf.models.geometry.fit import observe
@@ -194,6 +195,38 @@ def test_positions_are_located_by_noisy_packets_through_furniture(tmp_path):
     assert torch.equal(again.log_weight, posterior.log_weight)
     with pytest.raises(InputError, match="was fitted to channels"):
         locator.locate(test.spectrum)
+
+
+def test_the_likelihood_of_channels_is_a_normal_distribution_that_no_delay_or_phase_changes():
+    data, walls = measured(0.0, n=6)
+    frequency = data.frequency_hz * data.array.wavelength / LIGHT_SPEED
+    at = PathWaves.at(walls, data.position, frequency)
+    log_variance = torch.linspace(-4.0, -1.0, 10)
+    likelihood = PathLikelihood(walls, log_variance)
+
+    def value(channel):
+        return likelihood(at, SpectrumFeatures.of_channels(channel, data.frequency_hz, data.array))
+
+    known, (_, diffuse, floor) = at.channel, log_variance[-3:].exp().double()
+    wave, mean, variance = at.wave.flatten(2).cdouble(), known.flatten(1).cdouble(), likelihood._variance.double()
+    power = (variance[:, None] * wave.abs().square()).sum(1).mean(1) + mean.abs().square().mean(1)
+    noise = (diffuse * likelihood._isotropic + floor * torch.eye(16)) / (1 + diffuse + floor)
+    total = power * (1 + diffuse + floor)
+    covariance = torch.einsum("nsk,nsl,s->nkl", wave, wave.conj(), variance.cdouble()) / total[:, None, None]
+    covariance = covariance + torch.block_diag(*[noise.cdouble()] * 4)
+    mean = mean / total.sqrt()[:, None]
+    x = mean / mean.abs().square().mean(1, keepdim=True).sqrt()
+
+    def product(a, b):
+        return (a.conj() * torch.linalg.solve(covariance, b)).sum(1)
+
+    match = 2 * product(mean, x).abs()
+    expected = match + torch.special.i0e(match).log() - (product(x, x) + product(mean, mean)).real
+    expected = expected - torch.linalg.slogdet(covariance).logabsdet
+    assert torch.allclose(value(known).double(), expected, atol=0.15)  # the estimated phases fit slightly better
+    turn = torch.rand(6, 4, 1, generator=torch.Generator().manual_seed(0))
+    assert torch.allclose(value(known * torch.polar(torch.ones(6, 4, 1), 7 * turn)), value(known), atol=0.05)
+    assert bool((value(data.channel[[1, 2, 3, 4, 5, 0]]) < value(data.channel)).all())
 
 
 def paths(length: torch.Tensor | None) -> PropagationPaths:
