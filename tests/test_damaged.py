@@ -156,6 +156,10 @@ def test_references_to_references_take_no_memory(tmp_path):
     lines = ["a0: &a0 [1, 2, 3]"] + [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 40)]
     folder = _rssi(tmp_path / "data", position="\n".join([*lines, "a: [0, 0, 1]", "b: *a0", ""]))
     assert load_rssi(folder).receiver_position[1].tolist() == [1, 2, 3]
+    folder = _rssi(tmp_path / "other", position="\n".join([*lines, "a: *a39", "b: *a0", ""]))
+    with pytest.raises(InputError, match="receiver 'a' needs a position of 3 finite numbers") as refused:
+        load_rssi(folder)
+    assert len(str(refused.value)) < 2000
 
 
 def test_a_byte_order_mark_is_no_part_of_the_header(tmp_path):

@@ -51,19 +51,14 @@ def read_arrays(file: Path, needed: Sequence[str], optional: Sequence[str] = (),
     if not file.is_file():
         raise InputError(f"{file} is missing")
     kind = "an HDF5 file" if _is_hdf5(file) else "a MATLAB file" if file.suffix in MATLAB else "an npz archive"
-    with refusing_broken(file, f"{kind} of plain numbers"), _opened(file) as (names, find):
+    with refusing_broken(file, f"{kind} of plain numbers"), _opened(file, kinds) as (names, find):
         found = {name: find(name) for name in _choose(file, names, needed, optional)}
         _check_total(sum(size for size, _ in found.values()), file)
-        arrays = {name: read() for name, (_, read) in found.items()}
-        if wrong := [
-            f"{name} holds {values.dtype}" for name, values in arrays.items() if values.dtype.kind not in kinds
-        ]:
-            raise ValueError(f"{wrong[0]}, expected numbers")
-        return arrays
+        return {name: read() for name, (_, read) in found.items()}
 
 
 @contextmanager
-def _opened(file: Path) -> Iterator[tuple[set[str], Callable[[str], Stored]]]:
+def _opened(file: Path, kinds: str = NUMBERS) -> Iterator[tuple[set[str], Callable[[str], Stored]]]:
     """Open an archive; yield the names of its arrays, and a function that finds an array by name."""
     if _is_hdf5(file):
         with optional_module("h5py", f"{file} is HDF5, which h5py reads", "formats").File(file, "r") as content:
@@ -81,17 +76,22 @@ def _opened(file: Path) -> Iterator[tuple[set[str], Callable[[str], Stored]]]:
     else:
         with np.load(file, allow_pickle=False) as archive:
             members = {info.filename.removesuffix(".npy"): info.file_size for info in archive.zip.infolist()}
-            yield set(members), lambda name: (members[name], lambda: archive[name])
+
+            def member(name: str) -> Stored:
+                array_header(file, name, kinds)  # refuses a claim of more than the archive holds
+                return members[name], lambda: archive[name]
+
+            yield set(members), member
 
 
-def array_header(file: Path, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Return shape and type of the array in an npy file, or of the array of that name in an npz archive.
+def array_header(file: Path, name: str, kinds: str = NUMBERS) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Return shape and type, of these NumPy kinds, of the array in an npy file, or of that name in an npz archive.
 
     Raises:
         InputError: As `read_rows`.
     """
     with _stream(file, name) as (stream, size):
-        shape, _, dtype = _header(stream, name, size)
+        shape, _, dtype = _header(stream, name, size, kinds)
         return shape, dtype
 
 
@@ -156,11 +156,11 @@ def _check_total(total: int, file: Path, most: int = MAX_STORED_BYTES) -> None:
         raise InputError(f"it unpacks to {total} bytes; at most {most} are read, so split the data")
 
 
-def _header(stream: Any, name: str, size: int) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+def _header(stream: Any, name: str, size: int, kinds: str = NUMBERS) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     """Return shape, order and type of an array, once the stream is as long as the header claims."""
     readers = {(1, 0): read_array_header_1_0, (2, 0): read_array_header_2_0}
     shape, by_columns, dtype = readers[read_magic(stream)](stream)
-    if dtype.kind not in NUMBERS:
+    if dtype.kind not in kinds:
         raise ValueError(f"{name} holds {dtype}, expected numbers")
     if math.prod(shape) * dtype.itemsize != size - stream.tell():
         raise ValueError(f"{name} does not hold the {shape} numbers that it claims")

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
+import reprlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -116,7 +116,7 @@ def read_receivers(
     Raises:
         InputError: A name twice, no position of any receiver, or a position that is not usable.
     """
-    table = _positions_by_name(file) if file.suffix == ".yml" else read_table(file)
+    table = _positions_by_name(file, names) if file.suffix == ".yml" else read_table(file)
     label = column_of(table, "receiver", {}) or ("name" if "name" in table.columns else None)
     if label is None and len(table) != len(names):
         raise InputError(f"{file} has {len(table)} rows and no column of names, but there are {len(names)} receivers")
@@ -137,14 +137,15 @@ def read_receivers(
     return found, notes
 
 
-def _positions_by_name(file: Path) -> pd.DataFrame:
-    """Return the table of a file with NAME: [x, y, z], without receivers of unknown position."""
+def _positions_by_name(file: Path, names: Sequence[str]) -> pd.DataFrame:
+    """Return the table of a file with NAME: [x, y, z], without receivers of unknown position and other content."""
     content = {name: value for name, value in read_yaml(file).items() if value not in ("", "~", "null", "none")}
-    rows: list[Any] = [(name, *(numbers(value, 3) or ())) for name, value in content.items()]
-    if wrong := [row[0] for row in rows if len(row) == 1]:
-        raise InputError(
-            f"{file}: receiver {wrong[0]!r} needs a position of 3 finite numbers [m], got {content[wrong[0]]}"
-        )
+    place = {name: numbers(value, 3) for name, value in content.items()}
+    spelled, _ = spelled_as(list(content), names)
+    if wrong := [name for name, own in zip(content, spelled, strict=True) if place[name] is None and own in names]:
+        got = reprlib.repr(content[wrong[0]])  # references may make it as long as any memory
+        raise InputError(f"{file}: receiver {wrong[0]!r} needs a position of 3 finite numbers [m], got {got}")
+    rows = [(name, *position) for name, position in place.items() if position is not None]
     return pd.DataFrame(rows, columns=["receiver", "x", "y", "z"])
 
 

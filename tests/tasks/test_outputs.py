@@ -92,7 +92,7 @@ def test_predictions_become_tables(field, model, room):
     spectra = field.predict(position)
     peak = GRID.peak_direction(spectra.mean).rad2deg().numpy()
     np.testing.assert_array_equal(spectra.to_frame()[["azimuth_deg", "elevation_deg"]], peak)
-    with pytest.raises(InputError, match="no positions"):
+    with pytest.raises(InputError, match="lacks positions"):
         type(spectra)(spectra.mean).to_frame()
 
 

@@ -190,7 +190,7 @@ def test_receivers_of_a_table_in_degrees(tmp_path, floor):
     expected = np.linalg.norm(floor.position[:, None] - floor.receiver, axis=2)
     np.testing.assert_allclose(torch.cdist(data.transmitter_position, data.receiver_position), expected, atol=1e-3)
     floor.write_receivers(tmp_path)
-    with pytest.raises(InputError, match="receivers.csv: positions must be in degrees"):
+    with pytest.raises(InputError, match=r"receivers\.csv: positions must be in degrees"):
         load_rssi(tmp_path / "walk.csv")
 
 
