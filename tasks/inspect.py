@@ -188,7 +188,8 @@ def _against_distance(data: Rssi) -> Plot:
     ax.plot((10**log10).flatten(), rssi.flatten(), ".", markersize=2, color=DOTS, alpha=0.5)
     model, ends = fit_path_loss(log10, rssi, shared=True), torch.stack(log10[~rssi.isnan()].aminmax())
     ax.plot(10**ends, model.level + model.slope * ends, color="black", linewidth=1.5)
-    ax.set(xlabel="distance from the receiver [m]", ylabel="RSSI [dBm]", xscale="log")
+    ax.set(xlabel="distance from the receiver [m]", ylabel="RSSI [dBm]")
+    figures.log_scale(ax)
     row, column = (~rssi.isnan()).nonzero(as_tuple=True)
     table = DataFrame(
         {

@@ -132,11 +132,20 @@ def speed(axes: Axes, colours: Colours, points: Mapping[str, tuple[float, float]
     """Draw the cost and the error of each method, costs on a logarithmic scale."""
     for marker, (name, (cost, error)) in zip("osD^vP", points.items(), strict=False):
         axes.plot(max(cost, 1e-4), error, marker, color=colour(colours, name), label=name)
-    axes.set(xscale="log", xlabel=x, ylabel=y, ylim=(0, None))
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 3)))
+    axes.set(xlabel=x, ylabel=y, ylim=(0, None))
+    log_scale(axes)
+    legend_below(axes)
+
+
+def log_scale(axes: Axes) -> None:
+    """Give the axis of x a logarithmic scale with plain numbers, of which a range of several decades has fewer a decade."""
+    axes.set_xscale("log")
+    low, high = axes.get_xlim()
+    axes.xaxis.set_major_locator(
+        LogLocator(subs=(1, 2, 5) if high < 50 * low else (1, 3) if high < 2000 * low else (1,))
+    )
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter("")
-    legend_below(axes)
 
 
 def _expect_few(lines: Mapping[str, Any]) -> None:
@@ -180,10 +189,7 @@ def dots(
     axes.set(yticks=range(len(rows)), yticklabels=names, xlabel=label)
     axes.set_ylim(len(rows) - 0.4, -0.6)
     if log and known and max(known) > 10 * min(known) > 0:
-        axes.set_xscale("log")
-        axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_formatter("")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))  # a label a decade would be few
+        log_scale(axes)
     axes.grid(axis="y", visible=False)
     if len(values) > 1:
         legend_below(axes)
