@@ -157,7 +157,7 @@ def test_references_to_references_take_no_memory(tmp_path):
     folder = _rssi(tmp_path / "data", position="\n".join([*lines, "a: [0, 0, 1]", "b: *a0", ""]))
     assert load_rssi(folder).receiver_position[1].tolist() == [1, 2, 3]
     folder = _rssi(tmp_path / "other", position="\n".join([*lines, "a: *a39", "b: *a0", ""]))
-    with pytest.raises(InputError, match="receiver 'a' needs a position of 3 finite numbers") as refused:
+    with pytest.raises(InputError, match="receiver 'a' needs a position") as refused:
         load_rssi(folder)
     assert len(str(refused.value)) < 2000
 

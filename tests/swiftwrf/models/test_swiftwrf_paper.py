@@ -95,7 +95,7 @@ def test_the_preset_paper_is_the_paper():
 
 
 def test_fit_beats_the_mean_spectrum(room):
-    model = SwiftWRFPaper(QUICK, steps=250, batch=16, coarse_fraction=0.3).fit(room)
+    model = SwiftWRFPaper(QUICK, steps=400, batch=16, coarse_fraction=0.3).fit(room)
     fitted = psnr(model.synthesize(room.position), room.spectrum).median()
     mean = psnr(room.spectrum.mean(dim=0), room.spectrum).median()
     assert fitted > mean + 1
