@@ -68,7 +68,7 @@ def _opened(file: Path, kinds: str = NUMBERS) -> Iterator[tuple[set[str], Callab
 
         def find(name: str) -> Stored:
             size, kind = variables[name]
-            if kind not in MATLAB_NUMBERS:  # is not read
+            if kind not in MATLAB_NUMBERS:
                 raise ValueError(f"{name} holds {kind}, expected numbers")
             return size, lambda: np.ascontiguousarray(loadmat(file, variable_names=[name])[name])
 
@@ -78,20 +78,24 @@ def _opened(file: Path, kinds: str = NUMBERS) -> Iterator[tuple[set[str], Callab
             members = {info.filename.removesuffix(".npy"): info.file_size for info in archive.zip.infolist()}
 
             def member(name: str) -> Stored:
-                array_header(file, name, kinds)  # refuses a claim of more than the archive holds
-                return members[name], lambda: archive[name]
+                def read() -> NDArray[Any]:
+                    with archive.zip.open(f"{name}.npy") as stream:
+                        _header(stream, name, members[name], kinds)  # refuses a claim of more than the archive holds
+                    return np.asarray(archive[name])
+
+                return members[name], read
 
             yield set(members), member
 
 
-def array_header(file: Path, name: str, kinds: str = NUMBERS) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Return shape and type, of these NumPy kinds, of the array in an npy file, or of that name in an npz archive.
+def array_header(file: Path, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Return shape and type of the array in an npy file, or of the array of that name in an npz archive.
 
     Raises:
         InputError: As `read_rows`.
     """
     with _stream(file, name) as (stream, size):
-        shape, _, dtype = _header(stream, name, size, kinds)
+        shape, _, dtype = _header(stream, name, size)
         return shape, dtype
 
 
