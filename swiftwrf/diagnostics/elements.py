@@ -24,7 +24,6 @@ from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.errors import listed
 
 NOISE = "elements {listed}, counted from 0, hold noise: their phase follows no other element (--drop-elements {option})"
-CARRIER = "the carrier is about {ghz:.2g} GHz, or elements are {scale:.2f} times as far apart"
 MIN_SCALE = 0.06  # of wavelengths, relative to the declared one and to its half
 ORDERS = 40  # from which the order of the elements is searched
 ROUND_TRIP = (
@@ -53,8 +52,8 @@ def other_readings(data: Snapshots, away: Tensor) -> Iterator[tuple[str, float, 
     scaled = {scale: replace(data, array=PlanarArray(array.element, array.wavelength / scale)) for scale in scales}
     scale = max(scaled, key=lambda scale: float(evidence(scaled[scale], away).mean()))
     if min(abs(math.log(scale)), abs(math.log(scale / 2))) > MIN_SCALE:
-        meaning = CARRIER.format(ghz=scaled[scale].array.frequency_hz / 1e9, scale=scale)
-        yield meaning, 1, scaled[scale]
+        carrier = f"the carrier is about {scaled[scale].array.frequency_hz / 1e9:.2g} GHz"
+        yield f"{carrier}, or elements are {scale:.2f} times as far apart", 1, scaled[scale]
     order = best_order(data, away)
     if moved := (order != torch.arange(len(order))).nonzero()[:, 0].tolist():
         names = " and ".join(map(str, moved)) if len(moved) == 2 else listed(moved)

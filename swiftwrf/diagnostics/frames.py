@@ -36,7 +36,6 @@ from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import slabs
 from swiftwrf.diagnostics.elements import (
-    CARRIER,
     constant_phases,
     evidence,
     excess,
@@ -217,7 +216,7 @@ def check_frames(spectra: Spectra, snapshots: Snapshots | None = None) -> FrameR
         tried[name] = max(found, tried.get(name, found), key=lambda each: each.score)
     best, names = best_explanations({name: each.score for name, each in tried.items()}, TIE)
     is_clear = best - declared >= (MIN_EVIDENCE if seen is None else MIN_POWER)
-    explained = [name for name in names if is_clear and name != UNCALIBRATED and _reaches(name, tried[name])]
+    explained = [name for name in names if is_clear and name != UNCALIBRATED and _reaches(tried[name], seen)]
     turn = next((tried[name].turn for name in explained if tried[name].turn is not None), None)
     angle_deg, limit_deg = _nearest(direction, peak).rad2deg(), 10.0
     if spectra.array is not None:
@@ -244,17 +243,18 @@ def _evidence(away: Tensor, frame: _Frame, peak: Tensor, seen: Snapshots | None)
     return _kernel(_nearest(frame.folded(functional.normalize(away, dim=1)), peak))
 
 
-def _reaches(name: str, found: _Hypothesis) -> bool:
+def _reaches(found: _Hypothesis, declared: Snapshots | None) -> bool:
     """Return True if a hypothesis explains nearly what the array can reach, and more than by chance."""
     mean = float(found.evidence.mean())
     if mean - found.chance < MIN_EVIDENCE:
         return False
-    if found.seen is None:
+    if found.seen is None or declared is None:
         return mean >= MIN_EXPLAINED + 0.1 * found.free
     share = found.seen.array.spectrum(found.seen.channel, REACH_GRID, PHASE).square().amax(dim=(1, 2))
     chance = 1 / found.seen.channel.shape[2]
-    is_carrier = name.startswith(CARRIER.partition("{")[0])
-    least = MIN_REACHED_CARRIER if is_carrier else MIN_REACHED_FITTED if found.free else MIN_REACHED
+    least = MIN_REACHED_FITTED if found.free else MIN_REACHED
+    if found.free and found.seen.array.wavelength != declared.array.wavelength:
+        least = MIN_REACHED_CARRIER
     return mean >= max(0.45 + chance, least * float(excess(share, chance).mean()))
 
 
