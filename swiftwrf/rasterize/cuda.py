@@ -177,20 +177,20 @@ def field(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cut
 
 
 def magnitude(
-    mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None, keep_field: bool
+    mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None, keep_phase: bool
 ) -> tuple[Tensor, Tensor | None]:
-    """Return |A|, (B, n_elevation, n_azimuth), and with `keep_field` the field, else None."""
+    """Return |A|, (B, n_elevation, n_azimuth), and with `keep_phase` A / |A|, 0 where A is 0, else None."""
     rendered = mean.new_empty(mean.shape[0], *grid.shape)
-    field = mean.new_empty(mean.shape[0], 2, *grid.shape) if keep_field else None
-    _render(mean, cholesky, weight, grid, cutoff, field, rendered)
-    return rendered, field
+    phase = mean.new_empty(mean.shape[0], 2, *grid.shape) if keep_phase else None
+    _render(mean, cholesky, weight, grid, cutoff, phase, rendered)
+    return rendered, phase
 
 
 def _render(
     mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None,
     field: Tensor | None, magnitude: Tensor | None,
 ) -> None:  # fmt: skip
-    """Write into `field` and `magnitude`."""
+    """Write into `field` and `magnitude`; with both, the field is divided by its magnitude."""
     batch, n = mean.shape[:2]
     if not batch:
         return
@@ -208,11 +208,11 @@ def _render(
 
 def field_gradients(
     grad: Tensor, mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None,
-    field: Tensor | None = None,
+    phase: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Return the gradients of mean, factor and weight for a gradient (B, 2, n_elevation, n_azimuth) of the field.
 
-    With `field` it is one (B, n_elevation, n_azimuth) of its magnitude.
+    With `phase`, the field divided by its magnitude, it is one (B, n_elevation, n_azimuth) of the magnitude.
     """
     grad, mean, cholesky, weight = _aligned(grad, mean, cholesky, weight)
     batch, n = mean.shape[:2]
@@ -223,7 +223,7 @@ def field_gradients(
         per_warp = min(-(-n // warps), THREADS_PER_WARP)
         kernels(mean.device).launch(
             "rasterize_backward", batch * -(-n // (warps * per_warp)), warps * THREADS_PER_WARP,
-            grad, field, mean, cholesky, weight, d_mean, d_cholesky, d_weight,
+            grad, phase, mean, cholesky, weight, d_mean, d_cholesky, d_weight,
             n, per_warp, cholesky.dim() == 3, _grid(grid), _cutoff(cutoff),
         )  # fmt: skip
     return d_mean, d_cholesky if cholesky.dim() == 3 else d_cholesky.sum(0), d_weight

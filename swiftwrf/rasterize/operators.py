@@ -67,16 +67,16 @@ class _FieldMagnitude(torch.autograd.Function):
     @staticmethod
     def forward(ctx, mean, cholesky, weight, grid, cutoff):
         ctx.backend, ctx.options = backend_module(mean.device.type), (grid, cutoff)
-        keep_field = any(ctx.needs_input_grad)
-        rendered, field = ctx.backend.magnitude(mean, cholesky, weight, grid, cutoff, keep_field)
-        ctx.save_for_backward(mean, cholesky, weight, field)
+        keep_phase = any(ctx.needs_input_grad)
+        rendered, phase = ctx.backend.magnitude(mean, cholesky, weight, grid, cutoff, keep_phase)
+        ctx.save_for_backward(mean, cholesky, weight, phase)
         return rendered
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad):
-        *primitives, field = ctx.saved_tensors
-        return *ctx.backend.field_gradients(grad, *primitives, *ctx.options, field), None, None
+        *primitives, phase = ctx.saved_tensors
+        return *ctx.backend.field_gradients(grad, *primitives, *ctx.options, phase), None, None
 
 
 def field_magnitude(mean: Tensor, cholesky: Tensor, weight: Tensor, grid: AngularGrid, cutoff: float | None) -> Tensor:

@@ -168,7 +168,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 5) rasterize(
     const float* __restrict__ cholesky,    // (N, 3) or (B, N, 3) [rad]
     const float2* __restrict__ weight,     // (B, N) real and imaginary part
     const unsigned* __restrict__ reached,  // (B, strips, words), from find_reach
-    float* __restrict__ field,             // (B, 2, n_elevation, n_azimuth): A
+    float* __restrict__ field,             // (B, 2, n_elevation, n_azimuth): A; with `magnitude` A / |A|, 0 where A is 0
     float* __restrict__ magnitude,         // (B, n_elevation, n_azimuth): |A|; one of both may be null
     unsigned n_positions, int n, int cholesky_per_position, Grid grid, Cutoff cutoff) {
     __shared__ int s_collected[WARPS][2 * LANES];   // indices: fewer than 32 wait while up to 32 come
@@ -258,10 +258,15 @@ extern "C" __global__ void __launch_bounds__(THREADS, 5) rasterize(
     for (int k = 0; k < PIXELS; ++k) {
         if (row + k * ROW_STEP < grid.n_elevation && column < grid.n_azimuth) {
             const size_t at = pixel + static_cast<size_t>(k) * ROW_STEP * grid.n_azimuth;
-            if (magnitude) magnitude[plane * position + at] = hypotf(re[k], im[k]);
+            float unit = 1.0f;  // what the field is divided by
+            if (magnitude) {
+                const float length = hypotf(re[k], im[k]);
+                magnitude[plane * position + at] = length;
+                unit = length == 0.0f ? 1.0f : length;
+            }
             if (field) {
-                field[2 * plane * position + at] = re[k];
-                field[2 * plane * position + plane + at] = im[k];
+                field[2 * plane * position + at] = re[k] / unit;
+                field[2 * plane * position + plane + at] = im[k] / unit;
             }
         }
     }
@@ -290,8 +295,8 @@ struct Prepared {
 };
 
 extern "C" __global__ void __launch_bounds__(GATHERING_THREADS, 2) rasterize_backward(
-    const float* __restrict__ grad,      // (B, 2, n_elevation, n_azimuth), by A; by |A| without the 2 where `field` is given
-    const float* __restrict__ field,     // (B, 2, n_elevation, n_azimuth): A, or null
+    const float* __restrict__ grad,      // (B, 2, n_elevation, n_azimuth), by A; by |A| without the 2 where `phase` is given
+    const float* __restrict__ phase,     // (B, 2, n_elevation, n_azimuth): A / |A|, or null
     const float2* __restrict__ mean,     // (B, N)
     const float* __restrict__ cholesky,  // (N, 3) or (B, N, 3)
     const float2* __restrict__ weight,   // (B, N)
@@ -310,8 +315,8 @@ extern "C" __global__ void __launch_bounds__(GATHERING_THREADS, 2) rasterize_bac
     const size_t i = static_cast<size_t>(position) * n + primitive;
     cholesky += 3 * (cholesky_per_position ? i : primitive);
     const int plane = grid.n_elevation * grid.n_azimuth;
-    grad += static_cast<size_t>(field ? 1 : 2) * plane * position;
-    if (field) field += static_cast<size_t>(2) * plane * position;
+    grad += static_cast<size_t>(phase ? 1 : 2) * plane * position;
+    if (phase) phase += static_cast<size_t>(2) * plane * position;
 
     float columns = -1e30f, rows = -1e30f;  // how far the thread's primitive reaches
     if (mine) {
@@ -360,12 +365,8 @@ extern "C" __global__ void __launch_bounds__(GATHERING_THREADS, 2) rasterize_bac
                 float2 g = make_float2(0.0f, 0.0f);
                 if (lane < width && row < height) {
                     const int at = (patch_row + row) * grid.n_azimuth + patch_column + lane;
-                    if (field) {  // the gradient by |A| times A / |A|, 0 where A is 0
-                        const float re = field[at], im = field[at + plane], length = hypotf(re, im);
-                        if (length > 0.0f) g = make_float2(grad[at] * (re / length), grad[at] * (im / length));
-                    } else {
-                        g = make_float2(grad[at], grad[at + plane]);
-                    }
+                    g = phase ? make_float2(grad[at] * phase[at], grad[at] * phase[at + plane])
+                              : make_float2(grad[at], grad[at + plane]);
                 }
                 s_grad[row][lane] = g;
             }
