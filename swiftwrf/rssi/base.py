@@ -131,7 +131,7 @@ class RssiPredictor(Configured, Displayed, ABC):
         Args:
             train: Training rows, at least 10 measurements in all. Missing values (nan) are ignored.
             pool: The same rows at every receiver of the data, from which properties common to all receivers are learnt.
-                Defaults to `train`.
+                Defaults to `train`. Receivers with fewer than 10 rows choose no kernel and no mixing weights.
             device: Device to compute on. The fitted predictor is on the CPU.
             parallel: Function that maps a picklable fit over receivers as `map` does, e.g. on other machines. Defaults to
                 threads of this process.
@@ -142,6 +142,8 @@ class RssiPredictor(Configured, Displayed, ABC):
             FitError: The fit diverged.
         """
         pool = pool or train
+        useful = {*train.receiver_names, *(pool.receiver_names[c] for c in heard_often(pool).tolist())}
+        pool = pool.columns([c for c, name in enumerate(pool.receiver_names) if name in useful])
         if (detected := int(train.detected.sum())) < MIN_TRAINING:
             raise InputError(
                 f"receivers {listed(train.receiver_names)} have {detected} training measurements in all; measure at least "
@@ -336,6 +338,13 @@ class SavedRssiPredictor(RssiPredictor, Saved):
         predictor.offsets = Offsets(**header["offsets"]) if header.get("offsets") else None
         predictor.detection = None
         return predictor
+
+
+def heard_often(pool: Rssi) -> Tensor:
+    """Return the columns of receivers detected in 10 rows or more, int64; of all detected ones if there is none."""
+    count = pool.detected.sum(dim=0)
+    often = count >= MIN_TRAINING
+    return (often if bool(often.any()) else count > 0).nonzero()[:, 0]
 
 
 def columns_of(receiver_names: Sequence[str], pool: Rssi) -> Tensor:
