@@ -320,6 +320,7 @@ class SavedRssiPredictor(RssiPredictor, Saved):
             "origin": self.origin,
             "offsets": self.offsets and asdict(self.offsets),
             "attenuation": self.attenuation and asdict(self.attenuation),
+            "detection": self.detection and self.detection.plain(),
             "receiver_names": self.receiver_names,
             "receiver_position": [None if math.isnan(at[0]) else at for at in self.receiver_position.tolist()],
         }
@@ -336,7 +337,8 @@ class SavedRssiPredictor(RssiPredictor, Saved):
         predictor.origin = GeodeticOrigin(*map(float, header["origin"])) if header.get("origin") else None
         predictor.attenuation = FloorAttenuation.from_plain(header.get("attenuation"))
         predictor.offsets = Offsets(**header["offsets"]) if header.get("offsets") else None
-        predictor.detection = None
+        curve = header.get("detection")
+        predictor.detection = Detection.from_plain(curve, len(known)) if curve else None
         return predictor
 
 

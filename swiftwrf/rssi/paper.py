@@ -110,8 +110,8 @@ class RssiPaperModel(RssiModel):
         self.covariance = covariance
         self.directivity = torch.zeros(n_receivers, N_HARMONICS)
         dual = torch.linalg.solve_triangular(root.T, white.T.double() * prior_db[0], upper=True)
-        self.coefficient, self._posterior = dual.float(), None
-        self._precompute()
+        self.coefficient = dual.float()
+        self._precompute(None)
 
 
 @single_thread()
