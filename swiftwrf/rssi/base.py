@@ -24,7 +24,7 @@ from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Displayed
 from swiftwrf.positions import check_positions, to_tensor
 from swiftwrf.rssi.detection import Detection
-from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation, receiver_floors
+from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.threads import to_device
 from swiftwrf.runtime.validation import (
@@ -160,8 +160,9 @@ class RssiPredictor(Configured, Displayed, ABC):
         if train.offsets is not None:
             shift = shift + train.offsets.of(pool)[:, None]
         if train.floors is not None:
-            self.attenuation = estimate_floor_attenuation(train, pool)
-            of_pool = replace(self.attenuation, receiver_floor=tuple(receiver_floors(pool).tolist()))
+            of_pool = estimate_floor_attenuation(pool)
+            own = columns_of(self.receiver_names, pool).tolist()
+            self.attenuation = replace(of_pool, receiver_floor=tuple(of_pool.receiver_floor[c] for c in own))
             shift = shift + of_pool.of(pool.transmitter_position)
             train, pool = self.attenuation.removed(train), of_pool.removed(pool)
         curve = Detection.estimate(pool.transmitter_position, pool.rssi_dbm + shift)
