@@ -24,7 +24,7 @@ from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Displayed
 from swiftwrf.positions import check_positions, to_tensor
 from swiftwrf.rssi.detection import Detection
-from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation, receiver_floors
+from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.threads import to_device
 from swiftwrf.runtime.validation import (
@@ -131,7 +131,7 @@ class RssiPredictor(Configured, Displayed, ABC):
         Args:
             train: Training rows, at least 10 measurements in all. Missing values (nan) are ignored.
             pool: The same rows at every receiver of the data, from which properties common to all receivers are learnt.
-                Defaults to `train`.
+                Defaults to `train`. Receivers with fewer than 10 rows choose no kernel and no mixing weights.
             device: Device to compute on. The fitted predictor is on the CPU.
             parallel: Function that maps a picklable fit over receivers as `map` does, e.g. on other machines. Defaults to
                 threads of this process.
@@ -142,6 +142,8 @@ class RssiPredictor(Configured, Displayed, ABC):
             FitError: The fit diverged.
         """
         pool = pool or train
+        useful = {*train.receiver_names, *(pool.receiver_names[c] for c in heard_often(pool).tolist())}
+        pool = pool.columns([c for c, name in enumerate(pool.receiver_names) if name in useful])
         if (detected := int(train.detected.sum())) < MIN_TRAINING:
             raise InputError(
                 f"receivers {listed(train.receiver_names)} have {detected} training measurements in all; measure at least "
@@ -158,8 +160,9 @@ class RssiPredictor(Configured, Displayed, ABC):
         if train.offsets is not None:
             shift = shift + train.offsets.of(pool)[:, None]
         if train.floors is not None:
-            self.attenuation = estimate_floor_attenuation(train, pool)
-            of_pool = replace(self.attenuation, receiver_floor=tuple(receiver_floors(pool).tolist()))
+            of_pool = estimate_floor_attenuation(pool)
+            own = columns_of(self.receiver_names, pool).tolist()
+            self.attenuation = replace(of_pool, receiver_floor=tuple(of_pool.receiver_floor[c] for c in own))
             shift = shift + of_pool.of(pool.transmitter_position)
             train, pool = self.attenuation.removed(train), of_pool.removed(pool)
         curve = Detection.estimate(pool.transmitter_position, pool.rssi_dbm + shift)
@@ -318,6 +321,7 @@ class SavedRssiPredictor(RssiPredictor, Saved):
             "origin": self.origin,
             "offsets": self.offsets and asdict(self.offsets),
             "attenuation": self.attenuation and asdict(self.attenuation),
+            "detection": self.detection and self.detection.plain(),
             "receiver_names": self.receiver_names,
             "receiver_position": [None if math.isnan(at[0]) else at for at in self.receiver_position.tolist()],
         }
@@ -334,8 +338,16 @@ class SavedRssiPredictor(RssiPredictor, Saved):
         predictor.origin = GeodeticOrigin(*map(float, header["origin"])) if header.get("origin") else None
         predictor.attenuation = FloorAttenuation.from_plain(header.get("attenuation"))
         predictor.offsets = Offsets(**header["offsets"]) if header.get("offsets") else None
-        predictor.detection = None
+        curve = header.get("detection")
+        predictor.detection = Detection.from_plain(curve, len(known)) if curve else None
         return predictor
+
+
+def heard_often(pool: Rssi) -> Tensor:
+    """Return the columns of receivers detected in 10 rows or more, int64; of all detected ones if there is none."""
+    count = pool.detected.sum(dim=0)
+    often = count >= MIN_TRAINING
+    return (often if bool(often.any()) else count > 0).nonzero()[:, 0]
 
 
 def columns_of(receiver_names: Sequence[str], pool: Rssi) -> Tensor:

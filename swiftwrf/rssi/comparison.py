@@ -238,8 +238,7 @@ def compare(
     train, test = chosen.split(split, seed)
     if not bool(test.detected.any()):
         raise InputError(f"split {split!r} of {data.name} has no test rows that detect these receivers")
-    # receivers that were detected a few times determine no kernel and no mixing weights
-    pool = pool_of(data.receivers(("all",)), train, test, split, seed)
+    pool = pool_of(data, train, test, split, seed)
     if pool.groups is not None:
         offsets = estimate_offsets(pool, reference)
         train, pool = offsets.removed(train), offsets.removed(pool)

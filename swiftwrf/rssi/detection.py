@@ -117,6 +117,17 @@ class Detection:
         """Return the curve of some receivers."""
         return replace(self, missed=self.missed[number], is_limit=self.is_limit[number])
 
+    def plain(self) -> Header:
+        """Return the curve as plain values."""
+        return vars(self) | {"missed": self.missed.tolist(), "is_limit": self.is_limit.tolist()}
+
+    @classmethod
+    def from_plain(cls, values: Header, n_receivers: int) -> Self:
+        """Return the curve of plain values."""
+        types = {"missed": torch.float64, "is_limit": torch.bool}
+        missed, is_limit = (to_tensor(name, values[name], dtype, (n_receivers,)) for name, dtype in types.items())
+        return cls(float(values["limit"]), float(values["width"]), missed, is_limit)
+
     def given_detection(self, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean [dBm] and standard deviation [dB] of the power of packets that were detected, each (n, R).
 

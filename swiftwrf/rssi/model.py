@@ -24,7 +24,7 @@ from swiftwrf.models.base import CPU
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Axes
 from swiftwrf.positions import check_positions
-from swiftwrf.rssi.base import Map, RssiConfig, SavedRssiPredictor, columns_of
+from swiftwrf.rssi.base import Map, RssiConfig, SavedRssiPredictor, columns_of, heard_often
 from swiftwrf.rssi.detection import Detection, DetectionField
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
 from swiftwrf.rssi.maps import RssiMap
@@ -137,8 +137,7 @@ class RssiModel(SavedRssiPredictor):
         The weights are those of all receivers: the few folds determine no weights for each of them. They follow from the
         receivers of the pool, so that a receiver's prediction is the same whichever others are fitted with it.
         """
-        detecting = pool.detected.any(dim=0).nonzero()[:, 0]
-        some = pool.columns(subsample(detecting, rows=MAX_KERNEL_RECEIVERS)[0].tolist())
+        some = pool.columns(subsample(heard_often(pool), rows=MAX_KERNEL_RECEIVERS)[0].tolist())
         if set(some.receiver_names) <= set(train.receiver_names):
             predictors = predictors[:, :, columns_of(some.receiver_names, train)]
         else:
@@ -192,12 +191,11 @@ class RssiModel(SavedRssiPredictor):
             field_variance=training.field_db.square(),
             noise_variance=training.noise_db.square(),
         )
-        self._posterior = self._posterior_of(state)
         noise_db = (scale * training.noise_db).clamp_min(rounding_std(train.rssi_dbm))
         self.field_db, self.noise_db = (scale * training.field_db).float(), noise_db.float()
         # only two predictors have the receiver's path loss
         self.covariance = (weight[:2].sum() * scale).square()[:, None, None] * found["covariance"]
-        self._precompute()
+        self._precompute(state)
 
     @property
     def receiver(self) -> Tensor:
@@ -208,19 +206,17 @@ class RssiModel(SavedRssiPredictor):
         """Return the positions (n, 3) [m] of the location bins."""
         return self.anchor.double() + self.centre
 
-    def _precompute(self) -> None:
-        """Compute what all predictions share."""
-        self._table = HeadTable(self.rendered)
+    def _precompute(self, state: FitState | None) -> None:
+        """Compute what all predictions share, and the posterior that `update` continues, if there is one."""
+        self._table, receiver = HeadTable(self.rendered), self.receiver_position - self.centre
         self._offset = self._table(torch.zeros(1, len(self.level)))[0]
-        self._uncertainty = self._uncertainty_of_rows()
+        self._uncertainty, self._posterior = self._uncertainty_of_rows(), None
+        if state is not None:
+            self._posterior = RssiPosterior(state, self.anchor, receiver, self.kernel, self._table, self.config.huber)
 
     def _uncertainty_of_rows(self) -> Uncertainty:
         receiver = self.receiver_position - self.centre
         return Uncertainty(self.kernel, self.anchor.double(), receiver, self.middle, self.covariance)
-
-    def _posterior_of(self, state: FitState) -> RssiPosterior:
-        table, receiver = HeadTable(self.rendered), self.receiver_position - self.centre
-        return RssiPosterior(state, self.anchor, receiver, self.kernel, table, self.config.huber)
 
     @single_thread()
     def _update(self, new: Rssi) -> None:
@@ -350,9 +346,6 @@ class RssiModel(SavedRssiPredictor):
         self.check_fitted()
         tensors = {name: getattr(self, name) for name in _shapes(0, 0)}
         header = self._header() | {"kernel": asdict(self.kernel), "n_primitives": self.n_primitives}
-        if self.detection is not None:
-            tensors |= {"missed": self.detection.missed, "is_limit": self.detection.is_limit}
-            header |= {"detection": [self.detection.limit, self.detection.width]}
         if self.detection_field is not None:
             of_field = self.detection_field.state()
             tensors, header = tensors | of_field[0], header | of_field[1]
@@ -368,21 +361,15 @@ class RssiModel(SavedRssiPredictor):
         files.expect(tensors, shapes)
         for name in shapes:
             setattr(model, name, tensors[name])
-        model.detection, model.detection_field, n_receivers = None, None, len(model.receiver_names)
+        model.detection_field, n_receivers = None, len(model.receiver_names)
         if "share" in header:
             files.expect(
                 tensors,
                 {"share.mean": (n_receivers,), "share.coefficient": (len(tensors["share.position"]), n_receivers)},
             )
             model.detection_field = DetectionField.from_state(tensors, header)
-        if "detection" in header:
-            files.expect(tensors, dict.fromkeys(("missed", "is_limit"), (n_receivers,)))
-            limit, width = map(float, header["detection"])
-            model.detection = Detection(limit, width, tensors["missed"].double(), tensors["is_limit"].bool())
-        model._posterior = None
-        if "fit.dual" in tensors:
-            model._posterior = model._posterior_of(FitState.of(tensors, n_receivers, len(tensors["anchor"])))
-        model._precompute()
+        fitted = "fit.dual" in tensors
+        model._precompute(FitState.of(tensors, n_receivers, len(tensors["anchor"])) if fitted else None)
         return model
 
 

@@ -68,14 +68,13 @@ class FloorAttenuation:
         return data.derived(rssi_dbm=data.rssi_dbm - self.of(data.transmitter_position))
 
 
-def estimate_floor_attenuation(train: Rssi, pool: Rssi | None = None) -> FloorAttenuation:
+def estimate_floor_attenuation(data: Rssi) -> FloorAttenuation:
     """Estimate the attenuation of a floor jointly with the path-loss models of the receivers; see `fit_path_losses`.
 
     A receiver of unknown position counts as on the floor of its strongest mean RSSI, amid its three strongest rows.
 
     Args:
-        train: Training rows with floors.
-        pool: The same rows at more receivers, which determine the attenuation. Defaults to `train`.
+        data: Training rows with floors, at all receivers that determine the attenuation.
 
     Raises:
         InputError: Rows without floors.
@@ -87,31 +86,21 @@ def estimate_floor_attenuation(train: Rssi, pool: Rssi | None = None) -> FloorAt
         >>> round(estimate_floor_attenuation(Rssi.from_frame(table)).db)
         15
     """
-    pool = pool or train
-    if train.floors is None:
-        raise InputError(f"{train.name} has no floors; give the table a column with the floor of each row")
-    where = receiver_floors(pool)
-    crossed = (train.floors.number(train.transmitter_position)[:, None] - where).abs().double()
-    strongest = pool.rssi_dbm.nan_to_num(-torch.inf).topk(min(3, len(pool)), dim=0).indices
-    nearby = pool.transmitter_position[strongest].mean(dim=0)
-    receiver = pool.receiver_position.where(pool.receiver_located[:, None], nearby)
-    found = fit_path_losses(pool.transmitter_position, receiver, pool.rssi_dbm, crossed=crossed)
-    measured = pool.detected.sum(dim=0).double()
-    db = float(found.floor_db @ measured / measured.sum())
-    number = dict(zip(pool.receiver_names, where.tolist(), strict=True))
-    return FloorAttenuation(train.floors, tuple(number[name] for name in train.receiver_names), db)
-
-
-def receiver_floors(data: Rssi) -> Tensor:
-    """Return the floor of each receiver by its position, or by where its mean RSSI is strongest, int64 (R,)."""
-    assert data.floors is not None
-    floor, mean = data.floors.number(data.transmitter_position), []
-    rssi = data.rssi_dbm.nan_to_num(float(data.rssi_dbm[data.detected].min()))  # what was not received was weak
-    for number in range(len(data.floors.names)):
-        enough = data.detected[floor == number].sum(dim=0) >= 3
-        mean.append(rssi[floor == number].mean(dim=0).where(enough, -torch.inf))
-    strongest = torch.stack(mean).argmax(dim=0)
-    return data.floors.number(data.receiver_position.nan_to_num(0.0)).where(data.receiver_located, strongest)
+    if data.floors is None:
+        raise InputError(f"{data.name} has no floors; give the table a column with the floor of each row")
+    floor, rssi = data.floors.number(data.transmitter_position), data.rssi_dbm
+    member = torch.nn.functional.one_hot(floor, len(data.floors.names)).double()
+    heard = member.T @ data.detected.double()  # rows of each floor that a receiver detected
+    weak = rssi.nan_to_num(float(rssi[data.detected].min()))  # what was not received was weak
+    mean = (member.T @ weak) / member.sum(dim=0)[:, None]
+    strongest = mean.where(heard >= heard.amax(dim=0).clamp(1, 3), -torch.inf).argmax(dim=0)
+    own = data.floors.number(data.receiver_position.nan_to_num(0.0)).where(data.receiver_located, strongest)
+    nearby = data.transmitter_position[rssi.nan_to_num(-torch.inf).topk(min(3, len(data)), dim=0).indices].mean(dim=0)
+    receiver = data.receiver_position.where(data.receiver_located[:, None], nearby)
+    crossed = (floor[:, None] - own).abs().double()
+    found = fit_path_losses(data.transmitter_position, receiver, rssi, crossed=crossed)
+    measured = data.detected.sum(dim=0).double()
+    return FloorAttenuation(data.floors, tuple(own.tolist()), float(found.floor_db @ measured / measured.sum()))
 
 
 @single_thread()

@@ -143,7 +143,8 @@ def measurement(line: Line, config: UpdateConfig, model: FieldModel | RssiModel)
         raise InputError(f"line {line.number}: {error}") from None
     except CONTENT_ERRORS as error:
         kind = "row of the table" if line.header else f"JSON object with position and {needed}"
-        raise InputError(f"line {line.number} is no {kind} ({type(error).__name__}: {error}); mend it") from None
+        reason = f"it has no {error}" if isinstance(error, KeyError) else error
+        raise InputError(f"line {line.number} is no {kind}: {reason}; mend it") from None
 
 
 def _number(value: object) -> float:

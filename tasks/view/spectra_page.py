@@ -34,6 +34,8 @@ UNSEEN, MOVING, PEAK, SIGHT = "#d1620f", "#cf4a4a", "#ffffff", "#ee6677"
 KEY_STEP = 0.01  # of the plan; ten times as far with Shift
 MAX_PLAN_PX = (500, 520)
 MAX_LARGE_DOTS = 400
+MIN_PATH_DB = -20.0  # of a path that is drawn, relative to the direct one, both without furniture
+HIDDEN_DB = 6.0  # loss in furniture of paths that are drawn as hidden
 MOVES = {
     "ArrowLeft": (0, -1),
     "ArrowRight": (0, 1),
@@ -119,6 +121,7 @@ class SpectraPage:
         else:
             ui.label(titles[0]).classes("quiet")
         self._locate = ui.switch("posterior", on_change=lambda: self._request(dragging=False)).props("id=locate")
+        self._paths = ui.switch("paths", on_change=lambda: self._request(dragging=False)).props("id=paths")
         self._polar = ui.toggle({False: "rectangular", True: "polar"}, value=False, on_change=self._lay_out)
         self._polar.props("no-caps padding='2px 12px'")
 
@@ -127,6 +130,7 @@ class SpectraPage:
             size = 6 if self._view.data is None or len(self._view.data) < MAX_LARGE_DOTS else 4
             layers = [pictures("posterior"), dots("unseen", UNSEEN, size), dots("measured", MEASURED, size)]
             layers += [lines("walls"), lines("uncertain", kind="dashed"), crosses("fixed", FIXED), *located_layers()]
+            layers += [lines("open", FIXED, 1.5), lines("hidden", FIXED, 1, "dotted")]
             layers += [lines("away", MOVING, 2), dots("moving", MOVING, 16)]
             self._plan = PlanChart("plan", self._corners, layers, MAX_PLAN_PX, self._on_pointer)
             self._plan.element.props("tabindex=0").on("keydown", self._on_key, js_handler=KEYS)
@@ -149,6 +153,7 @@ class SpectraPage:
             entries.append((FIXED, "✕", "fixed end"))
         if any(loaded.planes for loaded in self._view.models):
             entries.append(("inherit", "━", "walls found, dashed where uncertain"))
+            entries.append((FIXED, "━", "strong paths, dotted where furniture hides them"))
         return entries
 
     def _choose(self, number: int) -> None:
@@ -161,6 +166,7 @@ class SpectraPage:
         self._shown_measurement = -1
         self._measured.column.set_visibility(self._view.data is not None)
         self._locate.set_visibility(self._view.data is not None and self._model.locator_file is not None)
+        self._paths.set_visibility(bool(self._model.planes))
         self._plan.show(self._background())
         self._request(dragging=False)
 
@@ -218,6 +224,7 @@ class SpectraPage:
             self._show(predicted)
             self._describe(predicted, time.perf_counter() - began)
         await self._show_located(loaded, position, dragging)
+        await self._show_paths(loaded, position, dragging)
         if not dragging:
             await run.io_bound(lambda: loaded.drag_grid)  # found before the pointer begins to drag
 
@@ -235,6 +242,18 @@ class SpectraPage:
             described = f"Posterior of spectrum {int(self._view.data.index[index])}: {located.describe()}"
         self._plan.show({"posterior": image} | located_data(located))
         self._located.set_text(described)
+
+    async def _show_paths(self, loaded: LoadedModel, position: NDArray[np.floating], dragging: bool) -> None:
+        """Show the strong paths between the ends of the link; while dragging, only their removal."""
+        found: dict[str, Data] = {"open": [], "hidden": []}
+        if not dragging and self._paths.value and loaded.model.room is not None:
+            there = await run.io_bound(loaded.model.room.paths, position)
+            if there is None or loaded is not self._model:
+                return
+            strong = there[there.level_db + there.hidden_db > MIN_PATH_DB]
+            is_hidden = strong.hidden_db > HIDDEN_DB
+            found = {"open": paths(strong.points[~is_hidden]), "hidden": paths(strong.points[is_hidden])}
+        self._plan.show(found)
 
     def _show(self, predicted: PredictedSpectrum) -> None:
         grid = predicted.grid

@@ -201,7 +201,7 @@ class Furniture:
         A path is straight towards its image. Samples of it beyond a reflection are mirrored back into the room.
         """
         fixed = scene.receiver if scene.end == "transmitter" else scene.transmitter
-        order = _orders(tuple(sequence), tuple(map(tuple, planes.normal[0].tolist())))  # (S, Q, D)
+        order = orders(tuple(sequence), tuple(map(tuple, planes.normal[0].tolist())))  # (S, Q, D)
         if scene.end == "transmitter":
             order = order.flip(-1)
         # coordinates come first, in voxels from the corner of the layer of empty ones around the grid
@@ -315,7 +315,7 @@ class _Depth(torch.autograd.Function):
 
 
 @lru_cache(maxsize=64)
-def _orders(sequence: tuple[Sequence, ...], normal: tuple[tuple[float, ...], ...]) -> Tensor:
+def orders(sequence: tuple[Sequence, ...], normal: tuple[tuple[float, ...], ...]) -> Tensor:
     """Return all orders of reflection with the image of each sequence, (S, Q, D), filled up with the first order.
 
     Perpendicular planes one after the other may change places; which order exists depends on the position.

@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from copy import copy
 from dataclasses import replace
 from typing import Any, Self
 
+import pandas as pd
 import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import LIGHT_SPEED
+from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.spectra import Spectra, fingerprint
 from swiftwrf.data.splits import folds
 from swiftwrf.errors import InputError
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, bounding_box
 from swiftwrf.models.geometry.channels import Channels, field, waves
 from swiftwrf.models.geometry.fit import GeometryConfig, observe, search_room, update_room
-from swiftwrf.models.geometry.furniture import Furniture, find_furniture, fit_furniture
-from swiftwrf.models.geometry.images import PhaseObservations, PlaneSet, images
+from swiftwrf.models.geometry.furniture import Furniture, find_furniture, fit_furniture, orders
+from swiftwrf.models.geometry.images import PhaseObservations, PlaneSet, Sequence, images, mirror
 from swiftwrf.models.geometry.planes import Plane, RoomEstimate, plane_set, refine
 from swiftwrf.models.link import Link, Linked
+from swiftwrf.positions import check_positions
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import checked
@@ -209,6 +213,45 @@ class GeometryModel(Linked, FieldModel):
         constant = torch.cat([torch.ones(1), room.image_gain[0]]) if room.sequence else torch.ones(1)
         return constant.expand(len(scene), -1)
 
+    @checked
+    def paths(self, position: Numbers) -> pd.DataFrame:
+        """Return the paths between one position of the moving end and the fixed end, strongest first.
+
+        Args:
+            position: Position (3,) [m].
+
+        Returns:
+            Each path that exists in a row. `reflections`: numbers of the planes, those of surfaces of the furniture follow
+            those of the room. `length_m`. `level_db`: amplitude, relative to a direct path that nothing hides. `hidden_db`:
+            part of the level that is lost in furniture. `points`: places of reflection from the transmitter to the
+            receiver, both included, (2 + D, 3) [m].
+
+        Raises:
+            InputError: Another shape, or a position that is not finite.
+
+        Example:
+            >>> import swiftwrf
+            >>> room = swiftwrf.simulated_room(n=20)
+            >>> model = GeometryModel.of_planes(room, [Plane((0.0, 0.0, -1.0), offset_m=0.0, gain=-0.6)])
+            >>> model.paths(room.position[0]).reflections.tolist()
+            [(), (0,)]
+        """
+        scene, room = self.scene(check_positions(position, "position", (3,))[None]), self.reflectors
+        gain = free = self.gains(scene)[0]
+        if self.furniture is not None:
+            nothing = torch.zeros_like(self.furniture.absorption)
+            free = replace(self.furniture, absorption=nothing).gains(room, scene)[0]
+        direct, rows = float(torch.dist(scene.transmitter[0], scene.receiver[0])), []
+        for number, sequence in enumerate([(), *room.sequence]):
+            points = _points(scene, room, sequence)
+            if points is not None:
+                length = float(points.diff(dim=0).norm(dim=1).sum())
+                level, hidden = (20 * math.log10(max(abs(float(x[number])), 1e-9)) for x in (gain, free))
+                spread = 20 * math.log10(direct / length)
+                rows.append((sequence, length, level + spread, hidden - level, points.numpy()))
+        found = pd.DataFrame(rows, columns=["reflections", "length_m", "level_db", "hidden_db", "points"])
+        return found.sort_values("level_db", ascending=False, ignore_index=True)
+
     def scene(self, position: Tensor) -> PhaseObservations:
         """Return the link at positions (n, 3) [m], without observations."""
         nothing = torch.ones(len(position), len(self.array.element), dtype=torch.complex64)
@@ -267,3 +310,21 @@ class GeometryModel(Linked, FieldModel):
             conclusion=str(header["conclusion"]),
             covariance=tensors["covariance"].double(),
         )
+
+
+def _points(scene: PhaseObservations, room: PlaneSet, sequence: Sequence) -> Tensor | None:
+    """Return the ends and the places of reflection of one path at the only position of a scene, (2 + D, 3), if it exists."""
+    normal, offset = room.normal[0], room.offset[0]
+    for planes in orders((sequence,), tuple(map(tuple, normal.tolist())))[0].tolist():
+        image, points = [scene.transmitter[0]], [scene.receiver[0]]
+        for plane in planes:
+            image.append(mirror(image[-1], normal[plane], offset[plane]))
+        for plane in reversed(planes):
+            towards = image.pop() - points[-1]
+            share = float((offset[plane] - points[-1] @ normal[plane]) / (towards @ normal[plane]))
+            if not 0 < share < 1:
+                break
+            points.append(points[-1] + share * towards)
+        else:
+            return torch.stack([scene.transmitter[0], *reversed(points)])
+    return None

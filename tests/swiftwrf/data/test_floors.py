@@ -44,6 +44,12 @@ def test_attenuation_of_a_floor_is_recovered(located, true_db):
     assert found.db == pytest.approx(true_db, abs=1.0 if located else 2.0)  # chance of the rows, without distances
 
 
+def test_a_receiver_that_was_detected_twice_is_on_the_floor_of_its_rows():
+    table = building()
+    table["rare"] = np.where(table.index.isin(table.index[table.floor == 2][:2]), -70.0, np.nan)
+    assert estimate_floor_attenuation(rssi(table, located=False)).receiver_floor == (0, 1, 2, 2)
+
+
 def test_floors_by_number_without_heights_and_with_heights_above_the_floor():
     table = building()
     for changed in (table.drop(columns="z"), table.assign(z=1.2)):

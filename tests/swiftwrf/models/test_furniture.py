@@ -19,7 +19,7 @@ from swiftwrf.models.geometry import GeometryModel, Plane, furniture
 from swiftwrf.models.geometry.channels import Channels, coherence, field, waves
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.geometry.furniture import Furniture
-from swiftwrf.models.geometry.images import PlaneSet
+from swiftwrf.models.geometry.images import PlaneSet, images
 from tasks.aoa.room import furniture_panels
 
 WALLS = built_in_walls(0.9)
@@ -80,6 +80,29 @@ def test_paths_through_voxels_are_those_of_the_image_sources(moving):
     assert torch.allclose(gain, room.gains(scene), atol=1e-5)
     channel = field(gain, waves(planes, scene, torch.ones(1)))[:, 0]
     assert torch.allclose(channel, planes.channel(scene), atol=1e-4)
+
+
+@pytest.mark.parametrize("moving", ["transmitter", "receiver"])
+def test_paths_of_a_position_are_straight_between_reflections_and_name_what_hides_them(moving):
+    data, room = measured(4.0, moving, n=20)
+    room.furniture = furnished(room, 4.0)
+    found = room.paths(data.position[0])
+    scene = room.scene(data.position[:1])
+    image = torch.cat([scene.transmitter[None], images(scene, room.tensors())[0]])[:, 0]
+    lengths = dict(zip([(), *room.tensors().sequence], (image - scene.receiver).norm(dim=1).tolist(), strict=True))
+    assert len(found) == len(lengths), "all paths of a cuboid exist"
+    for row in found.itertuples():
+        assert row.length_m == pytest.approx(lengths[row.reflections])
+        assert len(row.points) == len(row.reflections) + 2
+    gain = room.gains(scene)[0]
+    direct = found[found.reflections == ()].iloc[0]
+    assert direct.level_db == pytest.approx(20 * math.log10(gain[0]), abs=1e-4)
+    assert direct.hidden_db == pytest.approx(-direct.level_db, abs=1e-4)
+    assert found.level_db.is_monotonic_decreasing
+    assert (found.hidden_db > -1e-4).all()
+    assert (found.hidden_db > 3).any()
+    with pytest.raises(InputError, match="position must have shape"):
+        room.paths(data.position[:2])
 
 
 def test_a_voxel_attenuates_the_direct_path_by_its_length_in_it():

@@ -187,6 +187,9 @@ def test_predictions_of_pairs_rows_and_measured_cells_agree(tmp_path, new_places
     torch.testing.assert_close(every.mean[data.detected], measured.mean[data.detected])
     torch.testing.assert_close(every.std[data.detected], measured.std[data.detected])
     assert bool(measured.mean[~data.detected].isnan().all())
+    far = data.transmitter_position + torch.tensor([1000.0, 0.0, 0.0])  # out of reach
+    assert not model.predict_detection(far).any()
+    assert not loaded.predict_detection(far).any()
     with pytest.raises(InputError, match="each pair needs two positions"):
         model.predict_pairs(torch.zeros(2, 3), torch.zeros(1, 3))
 

@@ -22,8 +22,9 @@ import pytest
 import quick
 import torch
 
-from swiftwrf import RssiModel, rssi_room
+from swiftwrf import GeometryModel, RssiModel, rssi_room, simulated_room
 from swiftwrf.data.writing import write_spectra
+from swiftwrf.models.geometry import Plane
 from swiftwrf.online import Follower
 from tasks.report import merge
 from tasks.update.record import Record
@@ -217,6 +218,16 @@ def test_page_of_spectra(browser, serve, aoa_run, record_property):
     print(f"{rate:.1f} frames a second while dragging")
     has_views_models_and_keys(browser)
     assert_fits(browser, "plan")
+
+
+def test_paths_of_a_room_are_drawn(browser, serve, tmp_path):
+    walls = [Plane((1.0, 0.0, 0.0), 6.0, -0.6), Plane((0.0, 0.0, -1.0), 0.0, -0.6)]
+    GeometryModel.of_planes(simulated_room(n=10), walls).save(tmp_path / "room.safetensors")
+    opened(browser, serve(tmp_path / "room.safetensors"), "plan", "where")
+    drawn = "return [...document.querySelectorAll('#plan path')].map(path => path.getAttribute('d')).join()"
+    before = browser.execute_script(drawn)
+    find(browser, "#paths").click()
+    until(lambda: browser.execute_script(drawn) != before)
 
 
 def test_page_of_a_locator(browser, serve, locate_run, tmp_path):
