@@ -47,6 +47,7 @@ class Experiment:
     repeats: int = 1  # each with its own measured spectra and seed
     seed: int = 0
     device: torch.device | str = "cpu"
+    split: str = "random"  # name of the split that gave training and test spectra
 
     def __post_init__(self) -> None:
         data = self.test

@@ -78,12 +78,11 @@ def turbo_learning(
     """
     models = (models,) if isinstance(models, str) else models
     experiment = Experiment(
-        *data.split(split, seed), (measured,), models, estimators, extra, preset, repeats, seed, device
+        *data.split(split, seed), (measured,), models, estimators, extra, preset, repeats, seed, device, split
     )
-    with TemporaryDirectory(prefix="swiftwrf-") as folder:
-        (result,) = learn(experiment, keep or Memo(Path(folder)), executor)
-        if keep is None:
-            result.best  # noqa: B018 - is read from the folder
+    folder = TemporaryDirectory(prefix="swiftwrf-")
+    (result,) = learn(experiment, keep or Memo(Path(folder.name)), executor)
+    result.temporary = folder  # deleted with the result, which reads its files
     return result
 
 
