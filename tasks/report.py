@@ -13,7 +13,7 @@ from typing import Any
 from augment.turbo.results import TurboResult
 from swiftwrf import InputError
 from swiftwrf.rssi import RssiComparison
-from swiftwrf.runtime.durable import strict, write_json, write_text
+from swiftwrf.runtime.durable import strict, write_json
 from tasks.aoa.experiment import record as aoa_record
 from tasks.aoa.page import page as aoa
 from tasks.configs import ReportConfig
@@ -64,7 +64,7 @@ def write(task: str, result: Any, file: Path) -> None:
         write_json(folder / CONFIG, {"command": CALLS[task]})
         write_json(folder / ENVIRONMENT, environment(choose_device("cpu"), source))
         write_page(folder, replace(PAGES[task]([Records(folder, strict(metrics))]), alone=True))
-        write_text(file, (folder / REPORT).read_text(encoding="utf-8"))
+        shutil.copyfile(folder / REPORT, file)
 
 
 def merge(folders: list[Path], out: Path) -> None:
