@@ -131,20 +131,17 @@ def numbers(value: Any, count: int) -> tuple[float, ...] | None:
     return found if all(map(math.isfinite, found)) else None
 
 
-def lines_before_header(file: Path) -> int:
+def _lines_before_header(text: str) -> int:
     """Return the number of lines before the header of a table, e.g. 1 for a first line of metadata.
 
     The header is the first line of names that has as many cells as the line below, or that is followed by numbers.
-
-    Raises:
-        InputError: The file cannot be read.
     """
-    lines = read_text(file).split("\n", MAX_PREAMBLE_LINES + 2)[: MAX_PREAMBLE_LINES + 2]
+    lines = text.split("\n", MAX_PREAMBLE_LINES + 2)[: MAX_PREAMBLE_LINES + 2]
     for skipped, (line, below) in enumerate(itertools.pairwise(lines)):
-        separator = max(SEPARATORS, key=line.count)
+        separator = _separator(line)
         try:
-            header, row = (next(csv.reader([text], delimiter=separator), []) for text in (line, below))
-        except csv.Error:  # read_table refuses it
+            header, row = (next(csv.reader([each], delimiter=separator), []) for each in (line, below))
+        except csv.Error:  # table_of refuses it
             return 0
         names = [cell for cell in header if cell.strip()]
         is_header = len(names) > 1 and all(math.isnan(number(cell)) for cell in names)
@@ -175,7 +172,7 @@ def read_table(file: Path, header: bool = True) -> pd.DataFrame:
         return table_in_document(file, read_text(file), file.suffix.lower())
     if file.suffix.lower() != ".parquet":
         text = read_text(file)
-        skipped = lines_before_header(file) if header else 0
+        skipped = _lines_before_header(text) if header else 0
         *before, rest = text.split("\n", skipped)
         table = table_of(file, rest, header)
         if skipped:
@@ -188,8 +185,7 @@ def read_table(file: Path, header: bool = True) -> pd.DataFrame:
         groups = range(content.metadata.num_row_groups)
         if (total := sum(content.metadata.row_group(i).total_byte_size for i in groups)) > MAX_UNPACKED_BYTES:
             raise InputError(f"it unpacks to {total} bytes; at most {MAX_UNPACKED_BYTES} are read, so split the data")
-        table = content.read().to_pandas()
-        return table
+        return content.read().to_pandas()
 
 
 def has_header(file: Path) -> bool:
@@ -197,7 +193,11 @@ def has_header(file: Path) -> bool:
     if file.suffix.lower() in (".parquet", *DOCUMENTS):
         return True
     line = read_text(file).split("\n", 1)[0]
-    return not _holds_values(next(csv.reader([line], delimiter=max(SEPARATORS, key=line.count)), []))
+    return not _holds_values(next(csv.reader([line], delimiter=_separator(line)), []))
+
+
+def _separator(header: str) -> str:
+    return max(SEPARATORS, key=header.count)
 
 
 def _holds_values(cells: list[str]) -> bool:
@@ -207,8 +207,7 @@ def _holds_values(cells: list[str]) -> bool:
 
 def table_of(label: object, text: str, header: bool = True) -> pd.DataFrame:
     """Return the table in the text of a CSV file, as `read_table`; the label stands for it in messages."""
-    first = text.split("\n", 1)[0]
-    separator = max(SEPARATORS, key=first.count)
+    separator = _separator(text.split("\n", 1)[0])
     try:
         stream = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
         lines = [line for line in stream if line]

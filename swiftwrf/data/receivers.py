@@ -124,7 +124,7 @@ def read_receivers(
     if len(set(listed_names)) < len(listed_names):
         raise InputError(f"{file} must have each receiver once, got {listed(listed_names)}")
     listed_names, notes = spelled_as(listed_names, names)
-    position = _positions(file, table, origin, frame, "receiver,x,y,z")
+    position = _positions(file, table, origin, frame)
     given = np.flatnonzero(~np.isnan(position[:, :2]).all(axis=1))
     position, listed_names = position[given], [listed_names[row] for row in given]
     place = dict(zip(listed_names, check_positions(position, f"positions of {file}").tolist(), strict=True))
@@ -159,7 +159,7 @@ def read_places(file: Path, origin: GeodeticOrigin | None, frame: PlanFrame, flo
         InputError: A column that is missing, an unknown floor, or a position that is not usable.
     """
     table = read_table(file)
-    position = _positions(file, table, origin, frame, "x,y,z")
+    position = _positions(file, table, origin, frame)
     if floors is not None and column_of(table, "z", {}) is None:
         column = column_of(table, "floor", {})
         named = [] if column is None else text_of(table[column]).tolist()
@@ -170,12 +170,14 @@ def read_places(file: Path, origin: GeodeticOrigin | None, frame: PlanFrame, flo
     return check_positions(position, f"positions of {file}")
 
 
-def _positions(file: Path, table: pd.DataFrame, origin: GeodeticOrigin | None, frame: PlanFrame, header: str) -> Floats:
+def _positions(file: Path, table: pd.DataFrame, origin: GeodeticOrigin | None, frame: PlanFrame) -> Floats:
     """Return the positions (n, 3) [m] in a table, nan where a cell is empty."""
     columns = [column_of(table, axis, {}) or column_of(table, GEODETIC[axis], {}) for axis in "xy"]
     both = [name for name in columns if name is not None]
     if len(both) < 2:
-        raise InputError(f"{file} must start with the header {header}, got {','.join(map(str, table.columns))}")
+        raise InputError(
+            f"{file} has no columns of positions, x and y or longitude and latitude; there are {listed(table.columns)}"
+        )
     height = column_of(table, "z", {})
     values = [column_of_numbers(file, table, name) for name in both]
     position = np.column_stack([*values, column_of_numbers(file, table, height) if height else np.zeros(len(table))])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import fnmatch
 from collections.abc import Mapping, Sequence, Set
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -199,6 +200,9 @@ class _Survey:
             raise InputError(
                 f"{label} has no column {options.offset_by!r} for offsets; there are {listed(table.columns)}"
             )
+        with suppress(TypeError):  # cells that are lists
+            if n := int(table.duplicated().sum()):
+                self.notes.append(f"rows equal an earlier one in all columns and count once more: {n} of {len(table)}")
         self.table, self.names, self.end = table, list[str](), dict[str, str]()
         asked = dict(options.columns or {})
         if len(options.transmitter) == 1:

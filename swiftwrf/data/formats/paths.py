@@ -26,17 +26,8 @@ from swiftwrf.data.splits import read_splits
 from swiftwrf.errors import InputError
 from swiftwrf.positions import check_positions, to_tensor
 
-SHAPES = {  # of n receivers and P paths
-    "transmitter_position": ("n", 3),
-    "receiver_position": ("n", 3),
-    "path_count": ("n",),
-    "last_point": ("P", 3),
-    "gain": ("P",),
-    "line_of_sight": ("n",),
-    "frequency_hz": (),
-}
-LENGTH = "length"  # of each path [m], optional
-TYPES = {"gain": torch.complex128, "path_count": torch.int64, "line_of_sight": torch.bool}  # others: float64
+POSITIONS = ("transmitter_position", "receiver_position", "last_point")
+NEEDED = (*POSITIONS, "path_count", "gain", "line_of_sight", "frequency_hz")
 MIN_DISTANCE_M = 1e-9  # between two points
 MAX_GAIN = 1e100  # sums of larger ones overflow
 
@@ -68,64 +59,55 @@ def read_paths(source: Path) -> PropagationPaths:
     """Return the paths in a paths.npz, or in a folder with one.
 
     Raises:
-        InputError: No paths, arrays that do not match, or values that are not usable.
+        InputError: No paths, arrays that do not match, or values from which no spectra or labels follow.
     """
-    arrays = _read(source / "paths.npz" if source.is_dir() else source)
-    receiver, count = arrays["receiver_position"], arrays["path_count"]
-    offset = arrays["last_point"] - receiver.repeat_interleave(count, dim=0)
-    return PropagationPaths(
-        transmitter=arrays["transmitter_position"],
-        receiver=receiver,
-        count=count,
-        direction=offset / offset.norm(dim=1, keepdim=True),
-        gain=arrays["gain"],
-        line_of_sight=arrays["line_of_sight"],
-        frequency_hz=float(arrays["frequency_hz"]),
-        length=arrays.get(LENGTH),
-    )
-
-
-def _read(file: Path) -> dict[str, Tensor]:
-    """Return the checked arrays by name."""
+    file = source / "paths.npz" if source.is_dir() else source
     if not file.is_file():
         raise InputError(f"{file} does not exist; expected ray paths")
-    arrays = read_arrays(file, list(SHAPES), [LENGTH])
-    count = arrays["path_count"]
-    if count.ndim != 1 or count.dtype.kind not in "iu":
+    arrays = read_arrays(file, NEEDED, ["length"])
+    counts = arrays["path_count"]
+    if counts.ndim != 1 or counts.dtype.kind not in "iu":
         raise InputError(
-            f"{file}: path_count must be one whole number a receiver, got {count.dtype} of shape {count.shape}"
+            f"{file}: path_count must be one whole number a receiver, got {counts.dtype} of shape {counts.shape}"
         )
-    n = len(count)
-    if n == 0 or int(count.min()) < 1:
+    if len(counts) == 0 or int(counts.min()) < 1:
         raise InputError(f"{file}: every receiver needs at least one path; leave out those without")
-    sizes = {"n": n, "P": sum(count.tolist())}
-    tensors = {}
-    for name, symbols in (SHAPES | dict.fromkeys({LENGTH} & {*arrays}, ("P",))).items():
-        shape = tuple(sizes.get(str(symbol), symbol) for symbol in symbols)
-        tensors[name] = to_tensor(f"{file}: {name}", arrays[name], TYPES.get(name, torch.float64), shape)
-    _check_physics(file, tensors)
-    return tensors
 
+    def checked(name: str, dtype: torch.dtype, *shape: int) -> Tensor:
+        return to_tensor(f"{file}: {name}", arrays[name], dtype, shape)
 
-def _check_physics(file: Path, arrays: dict[str, Tensor]) -> None:
-    """Refuse values from which no spectra or labels follow."""
-    check_carrier(file, float(arrays["frequency_hz"]))
-    for name in ("transmitter_position", "receiver_position", "last_point"):
-        check_positions(arrays[name], f"{file}: {name}")
-    receiver = arrays["receiver_position"]
-    same = ((arrays["transmitter_position"] - receiver).norm(dim=1) < MIN_DISTANCE_M).nonzero()
+    n, n_paths = len(counts), sum(counts.tolist())
+    count = checked("path_count", torch.int64, n)
+    transmitter, receiver, last = (
+        check_positions(arrays[name], f"{file}: {name}", (rows, 3))
+        for name, rows in zip(POSITIONS, (n, n, n_paths), strict=True)
+    )
+    gain, frequency_hz = checked("gain", torch.complex128, n_paths), float(checked("frequency_hz", torch.float64))
+    check_carrier(file, frequency_hz)
+    same = ((transmitter - receiver).norm(dim=1) < MIN_DISTANCE_M).nonzero()
     if len(same):
         raise InputError(f"{file}: transmitter and receiver of row {int(same[0])} are at one place; leave it out")
-    if float(arrays["gain"].abs().max()) > MAX_GAIN:
+    if float(gain.abs().max()) > MAX_GAIN:
         raise InputError(f"{file}: gain holds a value beyond {MAX_GAIN:g}; give amplitudes")
-    owner = torch.arange(len(receiver)).repeat_interleave(arrays["path_count"])
-    none = ((arrays["last_point"] - receiver[owner]).norm(dim=1) < MIN_DISTANCE_M).nonzero()
-    if len(none):
+    owner = torch.arange(n).repeat_interleave(count)
+    offset = last - receiver[owner]
+    distance = offset.norm(dim=1, keepdim=True)
+    if len(none := (distance[:, 0] < MIN_DISTANCE_M).nonzero()):
         raise InputError(
             f"{file}: last_point of path {int(none[0])} is the receiver itself, so the path comes from no direction"
         )
-    silent = ~torch.isin(torch.arange(len(receiver)), owner[arrays["gain"] != 0])
+    silent = ~torch.isin(torch.arange(n), owner[gain != 0])
     if bool(silent.any()):
         raise InputError(
             f"{file}: receiver {int(silent.nonzero()[0])} has no path with a gain other than 0; leave it out"
         )
+    return PropagationPaths(
+        transmitter=transmitter,
+        receiver=receiver,
+        count=count,
+        direction=offset / distance,
+        gain=gain,
+        line_of_sight=checked("line_of_sight", torch.bool, n),
+        frequency_hz=frequency_hz,
+        length=checked("length", torch.float64, n_paths) if "length" in arrays else None,
+    )

@@ -29,10 +29,9 @@ from __future__ import annotations
 import json
 import math
 import struct
-from abc import abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import google_crc32c
 import numpy as np
@@ -51,6 +50,9 @@ from swiftwrf.runtime.validation import PositiveFloat, check_value
 SUFFIX = ".tfrecords"
 ROWS, COLUMNS = 2, 4  # of an array of ESPARGOS
 MAX_RECORD_BYTES = 2**28
+NO_OFFSETS = (
+    "no reftx-offsets-NAME.json lies beside the records, so the elements' phases are as measured: calibrate them"
+)
 DTYPES: dict[Any, np.dtype[Any]] = {
     number: np.dtype(name) for number, name in ((1, "<f4"), (2, "<f8"), (3, "<i4"), (8, "<c8"), (9, "<i8"))
 }
@@ -58,29 +60,17 @@ DTYPES[18] = np.dtype("<c16")
 Assignments = list[list[Annotated[int, Ge(0), Lt(4096)] | None]]  # antenna of each row and column, None if missing
 
 
-class RecordFormat(Format[Snapshots]):
-    """Reader of TFRecord files with channel and position, one record a measurement."""
+@SNAPSHOT_FORMATS.register("records")
+class Records(Format[Snapshots]):
+    """TFRecord files with channel and position, one record a measurement, of ESPARGOS or DICHASUS.
+
+    See https://espargos.net/datasets and https://dichasus.inue.uni-stuttgart.de.
+    """
 
     takes = frozenset({"beamformer", "grid", "every", "station", "drop_null", "drop_elements", "round_trip"})
-    assigned: ClassVar[bool]
-    """whether the description assigns antennas to rows and columns"""
-    position: ClassVar[str]
-    """name of the position (3,) [m] in a record"""
-
-    @abstractmethod
-    def channel(self, csi: NDArray[Any], file: Path) -> NDArray[Any]:
-        """Return the channel (antennas, subcarriers) of a record; refuse others by ValueError."""
-
-    def prepare(self, files: list[Path]) -> tuple[list[Path], tuple[str, ...]]:
-        """Read what lies beside the records; return its files and notes."""
-        return [], ()
 
     def recognises(self, path: Path) -> bool:
-        if not _record_files(path):
-            return False
-        described = _description(path)
-        assigns = described is not None and any("assignments" in antenna for antenna in described[1]["antennas"])
-        return self.assigned == assigns
+        return bool(_record_files(path))
 
     def read(self, path: Path, options: ReadOptions) -> Snapshots:
         files, described = _record_files(path), _description(path)
@@ -88,17 +78,22 @@ class RecordFormat(Format[Snapshots]):
             raise InputError(
                 f"{path} holds records, but no JSON with antennas, which describes their arrays, lies beside them"
             )
-        station, arrays, antennas = _read_station(*described, options.station, self.assigned)
-        beside, notes = self.prepare(files)
+        is_dichasus = any("assignments" in antenna for antenna in described[1]["antennas"])
+        station, arrays, antennas = _read_station(*described, options.station, is_dichasus)
+        beside = {file: file.with_name(f"reftx-offsets-{file.stem}.json") for file in files} if is_dichasus else {}
+        offsets = {file: _read_offsets(source) for file, source in beside.items() if source.is_file()}
+        notes = [NO_OFFSETS] * (len(offsets) < len(beside))
+        place = "pos-tachy" if is_dichasus else "pos"
         channels, positions, index, without, stride = [], [], [], 0, options.every or 1
         for number, (file, features) in enumerate((source, f) for source in files for f in records(source)):
             if number % stride:
                 continue
             try:
-                channel = self.channel(tensor(features["csi"]), file)[antennas]
-                position = tensor(features[self.position])
+                csi = tensor(features["csi"])
+                channel = (_of_dichasus(csi, offsets.get(file)) if is_dichasus else _of_espargos(csi))[antennas]
+                position = tensor(features[place])
                 if position.shape != (3,):
-                    raise ValueError(f"{self.position} of shape {position.shape}")
+                    raise ValueError(f"{place} of shape {position.shape}")
             except (KeyError, IndexError, ValueError) as error:
                 raise InputError(f"{file}: record {number + 1} of all is not what the data set has ({error})") from None
             channel = channel[:, :: max(1, channel.shape[1] // 64)].T  # more subcarriers do not improve directions
@@ -116,55 +111,34 @@ class RecordFormat(Format[Snapshots]):
         if not channels:
             raise InputError(f"{path} holds no record with a position and a channel")
         if without:
-            notes = (*notes, f"records without a finite position or channel are left out: {without}")
+            notes.append(f"records without a finite position or channel are left out: {without}")
         arrays |= {"csi": np.stack(channels), "position": np.stack(positions)}
         name = path.resolve().name if path.is_dir() else path.stem
-        read = [*files, described[0], *beside]
-        return snapshots_of(path, arrays, options, read, f"{name}-{station}" if station else name, notes, index)
+        read = [*files, described[0], *(beside[file] for file in offsets)]
+        return snapshots_of(path, arrays, options, read, f"{name}-{station}" if station else name, tuple(notes), index)
 
 
-@SNAPSHOT_FORMATS.register("espargos")
-class Espargos(RecordFormat):
-    """Data sets of https://espargos.net/datasets: `csi` complex (arrays, 2, 4, subcarriers), `pos` (3,) [m]."""
-
-    assigned = False
-    position = "pos"
-
-    def channel(self, csi: NDArray[Any], file: Path) -> NDArray[Any]:
-        if csi.ndim != 4 or csi.shape[1:3] != (ROWS, COLUMNS) or csi.dtype.kind != "c" or 0 in csi.shape:
-            raise ValueError(f"csi of shape {csi.shape}")
-        return csi.reshape(-1, csi.shape[3])
+def _of_espargos(csi: NDArray[Any]) -> NDArray[Any]:
+    """Return the channel (antennas, subcarriers) of a record of ESPARGOS."""
+    if csi.ndim != 4 or csi.shape[1:3] != (ROWS, COLUMNS) or csi.dtype.kind != "c" or 0 in csi.shape:
+        raise ValueError(f"csi of shape {csi.shape}")
+    return csi.reshape(-1, csi.shape[3])
 
 
-@SNAPSHOT_FORMATS.register("dichasus")
-class Dichasus(RecordFormat):
-    """Data sets of https://dichasus.inue.uni-stuttgart.de.
-
-    `csi` is float32 (antennas, subcarriers, 2) of real and imaginary parts, `pos-tachy` (3,) [m]. The phase and time offsets
-    of the antennas are those of reftx-offsets-NAME.json if it lies beside NAME.tfrecords.
-    """
-
-    assigned = True
-    position = "pos-tachy"
-
-    def prepare(self, files: list[Path]) -> tuple[list[Path], tuple[str, ...]]:
-        found = {file: file.with_name(f"reftx-offsets-{file.stem}.json") for file in files}
-        self._offsets = {file: _read_offsets(source) for file, source in found.items() if source.is_file()}
-        note = "no reftx-offsets-NAME.json lies beside the records, so the elements' phases are as measured: calibrate them"
-        return [found[file] for file in self._offsets], () if len(self._offsets) == len(files) else (note,)
-
-    def channel(self, csi: NDArray[Any], file: Path) -> NDArray[Any]:
-        if csi.ndim != 3 or csi.shape[2] != 2 or csi.dtype.kind != "f" or 0 in csi.shape:
-            raise ValueError(f"csi of shape {csi.shape}")
-        joined = csi.view(np.result_type(csi.dtype, np.complex64))[..., 0]
-        channel = np.fft.fftshift(joined, axes=1)  # from the order of the FFT to that of frequency
-        if (offsets := self._offsets.get(file)) is not None:
-            if len(offsets) != len(channel):
-                raise ValueError(f"{len(channel)} antennas, but offsets of {len(offsets)}")
-            cycles = np.arange(channel.shape[1]) / channel.shape[1]
-            with np.errstate(invalid="ignore", over="ignore"):  # `read` omits channels that are not finite
-                channel = channel * np.exp(1j * (offsets[:, :1] + offsets[:, 1:] * 2 * np.pi * cycles))
+def _of_dichasus(csi: NDArray[Any], offsets: NDArray[Any] | None) -> NDArray[Any]:
+    """Return the channel (antennas, subcarriers) of a record of DICHASUS, with offsets applied if they are known."""
+    if csi.ndim != 3 or csi.shape[2] != 2 or csi.dtype.kind != "f" or 0 in csi.shape:
+        raise ValueError(f"csi of shape {csi.shape}")
+    joined = csi.view(np.result_type(csi.dtype, np.complex64))[..., 0]
+    channel = np.fft.fftshift(joined, axes=1)  # from the order of the FFT to that of frequency
+    if offsets is None:
         return channel
+    if len(offsets) != len(channel):
+        raise ValueError(f"{len(channel)} antennas, but offsets of {len(offsets)}")
+    cycles = np.arange(channel.shape[1]) / channel.shape[1]
+    with np.errstate(invalid="ignore", over="ignore"):  # `read` omits channels that are not finite
+        turned: NDArray[Any] = channel * np.exp(1j * (offsets[:, :1] + offsets[:, 1:] * 2 * np.pi * cycles))
+    return turned
 
 
 def _read_offsets(file: Path) -> NDArray[Any]:

@@ -6,10 +6,10 @@ Tables are CSV or Parquet, or the records in JSON, GPX and KML documents.
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
+import torch
 
 from swiftwrf.data.columns import is_coordinate, is_rssi
 from swiftwrf.data.files import SUFFIXES, TABLES, digests, has_header, read_table
@@ -42,17 +42,18 @@ class SurveyTable(Format[Rssi]):
         stated = receivers if receivers.is_file() else None
         splits = read_splits(file.parent, len(table), first=0)
         found = read_survey(file, table, options, stated, keeps_rows=bool(splits))
-        data = Rssi(**found, name=file.stem)
+        data = Rssi(
+            **found,
+            name=file.stem,
+            named_splits=kept_splits(splits, torch.from_numpy(found["index"]), len(table)),
+            source=digests([file, *others, *([stated] if stated else [])], file.parent),
+        )
         if data.receiver_moves and bool(data.receiver_position.isnan().any()):
             raise InputError(
                 f"{file}: column {options.transmitter[0]} has names of positions, so {RECEIVERS} beside it must contain "
                 "each of them"
             )
-        return replace(
-            data,
-            named_splits=kept_splits(splits, data.index, len(table)),
-            source=digests([file, *others, *([stated] if stated else [])], file.parent),
-        )
+        return data
 
 
 def _tables(path: Path) -> list[Path]:

@@ -9,6 +9,8 @@ import torch
 from samples import survey_rows, write_survey
 
 from swiftwrf import InputError, load_rssi
+from swiftwrf.data.coordinates import PlanFrame
+from swiftwrf.data.receivers import read_places
 
 NAMES, ROWS = survey_rows()
 WIDE = pd.DataFrame(ROWS, columns=NAMES)
@@ -50,6 +52,17 @@ def test_long_parquet_may_lack_times_and_not_receivers(tmp_path):
     table.assign(receiver=["a"] * 4 + [None] + ["a"] * 7).to_parquet(tmp_path / "walk.parquet")
     with pytest.raises(InputError, match="row 5 has no receiver"):
         load_rssi(tmp_path / "walk.parquet")
+
+
+def test_rows_that_equal_an_earlier_one_are_named(tmp_path):
+    notes = load_rssi(write_survey(tmp_path, rows=[*ROWS, ROWS[3], ROWS[3]])).notes
+    assert f"rows equal an earlier one in all columns and count once more: 2 of {len(ROWS) + 2}" in notes
+
+
+def test_positions_without_a_known_header_are_refused_with_all_that_are_known(tmp_path):
+    (tmp_path / "places.csv").write_text("width,depth\n1,2\n")
+    with pytest.raises(InputError, match="no columns of positions, x and y or longitude and latitude; there are width"):
+        read_places(tmp_path / "places.csv", None, PlanFrame())
 
 
 def test_packets_of_one_place_have_a_row_each(tmp_path):
