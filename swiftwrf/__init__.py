@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from swiftwrf.models.prediction import Prediction as Prediction
     from swiftwrf.models.swiftwrf import SwiftWRF as SwiftWRF
     from swiftwrf.models.swiftwrf import fit as fit
+    from swiftwrf.predicting import predict as predict
     from swiftwrf.rasterize import rasterize as rasterize
     from swiftwrf.rssi import PairModel as PairModel
     from swiftwrf.rssi import RssiModel as RssiModel
@@ -67,6 +68,7 @@ import_lazily(
         "swiftwrf.models.geometry": ("GeometryModel", "HybridModel"),
         "swiftwrf.models.prediction": ("Prediction",),
         "swiftwrf.models.swiftwrf": ("SwiftWRF", "fit"),
+        "swiftwrf.predicting": ("predict",),
         "swiftwrf.rasterize": ("rasterize",),
         "swiftwrf.rssi": ("PairModel", "RssiModel", "fit_rssi"),
         "swiftwrf.runtime.checkpoint": ("load",),

@@ -40,3 +40,22 @@ def test_the_best_estimator_of_a_result_predicts_and_is_saved(tmp_path):
     result.best.save(tmp_path / "best.safetensors")
     spectra = result.experiment.test.spectrum
     assert swiftwrf.load(tmp_path / "best.safetensors").predict(spectra).equal(result.best.predict(spectra))
+
+
+def test_predictions_are_those_of_the_models():
+    train, test = swiftwrf.rssi_room(n=60).split()
+    locator = swiftwrf.RssiLocator(n_cells=300).fit(train)
+    found, posterior = swiftwrf.predict(locator, test), locator.locate(test.rssi_dbm[test.detected.any(dim=1)])
+    assert found[["x_m", "y_m", "z_m"]].to_numpy() == pytest.approx(posterior.median.numpy())
+    assert "position_error_m" in found
+    assert "position_error_m" not in swiftwrf.predict(locator, test, truth=False)
+    at = test.transmitter_position
+    assert swiftwrf.predict(locator.model, at).mean.equal(locator.model.predict(at).mean)
+    with pytest.raises(InputError, match="locates nothing"):
+        swiftwrf.predict(locator.model, at, track=1.0)
+    with pytest.raises(InputError, match="takes Rssi"):
+        swiftwrf.predict(locator, at)
+    spectra = swiftwrf.simulated_room(n=12, grid=AngularGrid.hemisphere(10, 40))
+    estimator = augment.estimators.make_estimator("peak").fit(augment.Mixed.measured(spectra))
+    assert len(swiftwrf.predict(estimator, spectra.store)) == 12
+    assert swiftwrf.predict(estimator, spectra)["great_circle_deg"].between(0, 180).all()

@@ -138,7 +138,7 @@ def test_an_interrupted_run_says_how_to_resume(tmp_path, capsys, monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("tasks.rssi.experiment._metrics", interrupt)
+    monkeypatch.setattr("tasks.rssi.experiment.record", interrupt)
     assert quick.run("rssi", "--rx", "1", "--quiet", "--out", tmp_path / "run") == 130
     assert capsys.readouterr().err == f"stopped; continue with: swiftwrf resume {tmp_path / 'run.partial'}\n"
     monkeypatch.undo()

@@ -240,7 +240,7 @@ def test_no_receiver_detected(locate_run, tmp_path, capsys):
     data.rssi_dbm[:] = torch.nan
     with mock.patch("tasks.predict.read_rssi", return_value=(data, True)):
         assert quick.command("predict", locate_run / MODEL, "walk", "--out", tmp_path / "out.csv") == 2
-    assert "no receiver of" in said(capsys)
+    assert "no receiver detected the transmitter" in said(capsys)
     data.rssi_dbm[3] = -70.0
     with mock.patch("tasks.predict.read_rssi", return_value=(data, True)):
         assert quick.command("predict", locate_run / MODEL, "walk", "--out", tmp_path / "out.csv") == 0

@@ -1,0 +1,194 @@
+"""A fitted model applied to new positions or measurements: fields at positions, or positions and directions as a table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from pandas import DataFrame
+from torch import Tensor
+
+from swiftwrf.data import Rssi, Spectra
+from swiftwrf.data.coordinates import Floors, degree_columns
+from swiftwrf.data.dataset import Numbers
+from swiftwrf.data.store import Store
+from swiftwrf.errors import InputError, with_article
+from swiftwrf.locate import MatchedField, Posterior, RssiLocator, smoothed
+from swiftwrf.locate.baselines import BATCH_ROWS
+from swiftwrf.metrics import angle_errors
+from swiftwrf.models.base import FieldModel
+from swiftwrf.models.prediction import Prediction
+from swiftwrf.rssi.base import RssiPredictor
+from swiftwrf.runtime.checkpoint import load
+
+MAX_STEP_S = 1000.0  # between rows of a walk
+MAX_TRACKED = 20_000_000  # candidate positions of a walk that are in memory together
+
+Columns = dict[str, Any]  # of tensors, and arrays of names
+
+
+def predict(
+    model: Any, new: Numbers | Rssi | Spectra | Store, *, track: float | None = None, truth: bool = True
+) -> Prediction | DataFrame:
+    """Apply a fitted model to new positions or measurements.
+
+    Args:
+        model: The model, or its file. Models of spectra and RSSI take positions (n, 3) [m], an `RssiLocator` takes `Rssi` at
+            its receivers, a `MatchedField` and estimators of the direction take `Spectra`, or a store of unknown positions.
+        new: Positions or measurements.
+        track: Speed [m/s] of a walk, along which positions are smoothed: the standard deviation of each component.
+        truth: Compare with the positions of the measurements.
+
+    Returns:
+        Mean and standard deviation at positions. Otherwise a table with a row for each measurement: positions with standard
+        deviations and 80 % radius [m], directions [deg], and truth and error where positions are known. Rows of RSSI that
+        no receiver detected are left out.
+
+    Raises:
+        InputError: Measurements of other receivers, of another array or grid, or nothing detected; rows without time or a
+            walk that is too long; or a model that predicts nothing.
+
+    Example:
+        >>> import swiftwrf
+        >>> train, test = swiftwrf.rssi_room(n=60).split()
+        >>> locator = swiftwrf.RssiLocator(n_cells=300).fit(train)
+        >>> predict(locator, test)[["x_m", "y_m", "position_error_m"]].shape
+        (12, 3)
+    """
+    if isinstance(model, str | Path):
+        model = load(model)
+    if track is not None and not isinstance(model, RssiLocator | MatchedField):
+        raise InputError(
+            f"a walk smooths positions, and {with_article(getattr(model, 'kind', 'model'))} locates nothing"
+        )
+    if isinstance(model, FieldModel | RssiPredictor):
+        found: Prediction = model.predict(new)
+        return found
+    if isinstance(model, RssiLocator):
+        if not isinstance(new, Rssi):
+            raise InputError(f"an RSSI locator takes Rssi, got {type(new).__name__}")
+        columns = _positions_of_rssi(model, new, track, truth)
+    elif not hasattr(model, "predict"):
+        raise InputError(f"expected a fitted model or its file, got {type(model).__name__}")
+    else:
+        known = new if isinstance(new, Spectra) else None
+        store = (
+            new if isinstance(new, Store) else new.store if isinstance(new, Spectra) else Store(torch.as_tensor(new))
+        )
+        if isinstance(model, MatchedField):
+            columns = _positions_of_spectra(model, store, known, track)
+        else:
+            estimate = torch.cat([model.predict(part) for part in store.batches()])
+            index = torch.arange(len(store)) if known is None else known.index
+            columns = {"index": index} | _directions(estimate, known)
+    return DataFrame({name: np.asarray(column) for name, column in columns.items()})
+
+
+def _positions_of_rssi(locator: RssiLocator, data: Rssi, track: float | None, truth: bool) -> Columns:
+    locator.model.check_measurements(data)
+    data = data.subset(data.detected.any(dim=1))
+    if not len(data):
+        raise InputError(f"no receiver detected the transmitter in any row of {data.name}")
+    posteriors: Iterable[Posterior] = map(locator.locate, data.rssi_dbm.split(BATCH_ROWS))
+    if track is not None:
+        posteriors = _tracked(posteriors, _times(data), track)
+    columns = _located(posteriors, data.index, data.transmitter_position if truth else None, locator.region.floors)
+    degrees = degree_columns(locator.model.origin, torch.stack([columns["x_m"], columns["y_m"]], dim=1).numpy())
+    return columns | {name: torch.from_numpy(values.copy()) for name, values in degrees.items()}
+
+
+def _positions_of_spectra(locator: MatchedField, store: Store, known: Spectra | None, track: float | None) -> Columns:
+    if known is not None and known.array is not None and known.array != locator.room.array:
+        raise InputError(f"{known.name} has spectra of another array than those that the locator was fitted to")
+    found: list[Tensor] = []
+    index = torch.arange(len(store)) if known is None else known.index
+    batches: Iterable[Tensor] = (part for batch in store.batches() for part in batch.split(BATCH_ROWS))
+    if known is not None and known.channel is not None:
+        batches = known.channel.split(BATCH_ROWS) if locator.n_snapshots else batches
+    posteriors: Iterable[Posterior] = map(locator.locate, batches)
+    if track is not None:
+        posteriors = _tracked(posteriors, index.double(), track)
+
+    def with_direction(posterior: Posterior) -> Posterior:
+        found.append(locator.direction(posterior))
+        return posterior
+
+    columns = _located(map(with_direction, posteriors), index, None if known is None else known.position)
+    return columns | _directions(torch.cat(found), known)
+
+
+def _directions(estimate: Tensor, known: Spectra | None) -> Columns:
+    columns = {"azimuth_deg": estimate[:, 0].rad2deg(), "elevation_deg": estimate[:, 1].rad2deg()}
+    if known is None or bool(known.label.isnan().all()):  # positions without the pose of the array give no directions
+        return columns
+    truth = known.label.rad2deg()
+    columns |= {"truth_azimuth_deg": truth[:, 0], "truth_elevation_deg": truth[:, 1]}
+    return columns | {"great_circle_deg": angle_errors(estimate, known.label)["great_circle"].rad2deg()}
+
+
+def _times(data: Rssi) -> Tensor:
+    """Return the times (n,) [s] of rows of RSSI: one second a row of the file without a column of times.
+
+    Raises:
+        InputError: A row without time.
+    """
+    if data.time is None:
+        return data.index.double()
+    missing = data.time.isnan()
+    if bool(missing.any()):
+        raise InputError(
+            f"{data.name} row {int(data.index[missing][0])} (counted from 0) has no time [s] or date, which a walk needs"
+        )
+    step = float(data.time.sort().values.diff().median()) if len(data) > 1 else 0.0
+    if step >= MAX_STEP_S:
+        raise InputError(
+            f"{data.name} has steps of {step:.0f} s, too long for a walk; if its times are in milliseconds, call their "
+            "column time_ms"
+        )
+    return data.time
+
+
+def _tracked(posteriors: Iterable[Posterior], time: Tensor, speed_m_s: float) -> Iterator[Posterior]:
+    """Yield the posteriors of a walk in groups, smoothed along it.
+
+    Raises:
+        InputError: A walk that is too long, or times or a speed that are none.
+    """
+    parts: list[Posterior] = []
+    for part in posteriors:
+        parts.append(part)
+        if sum(some.log_weight.numel() for some in parts) > MAX_TRACKED:
+            most = MAX_TRACKED // part.log_weight.shape[1]
+            raise InputError(
+                f"a walk has at most {most} rows with this locator; split it, or fit the locator with fewer cells"
+            )
+    whole = smoothed(Posterior.cat(parts), time, speed_m_s)
+    for start in range(0, len(whole), BATCH_ROWS):
+        rows = slice(start, start + BATCH_ROWS)
+        position = whole.position if len(whole.position) == 1 else whole.position[rows]
+        yield replace(whole, position=position, log_weight=whole.log_weight[rows])
+
+
+def _located(
+    posteriors: Iterable[Posterior], index: Tensor, truth: Tensor | None, floors: Floors | None = None
+) -> Columns:
+    """Return the columns of a table with the positions of observations, batch by batch."""
+    parts = (
+        (each.median, each.std, each.credible_radius(0.8), each.ambiguous, each.floor_probability.amax(dim=1))
+        for each in posteriors
+    )
+    position, std, radius, ambiguous, probability = (torch.cat(values) for values in zip(*parts, strict=True))
+    columns: Columns = {"index": index}
+    columns |= dict(zip(("x_m", "y_m", "z_m"), position.T, strict=True))
+    columns |= dict(zip(("std_x_m", "std_y_m", "std_z_m"), std.T, strict=True))
+    columns |= {"credible_radius_80_m": radius, "ambiguous": ambiguous}
+    if floors is not None:
+        columns |= {"floor": np.array(floors.named(position)), "floor_probability": probability}
+    if truth is not None:
+        columns |= dict(zip(("truth_x_m", "truth_y_m", "truth_z_m"), truth.T, strict=True))
+        columns["position_error_m"] = (position - truth).norm(dim=1)
+    return columns
