@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass
 from typing import Any
@@ -104,6 +104,7 @@ def choose_model(
     validation: Validation = "random",
     seed: int = 0,
     device: torch.device | str = "cpu",
+    structures: Sequence[tuple[FieldModel, float]] = (),
     **options: Any,
 ) -> ModelChoice:
     """Return the field model with the highest PSNR on held-out measured spectra.
@@ -118,6 +119,8 @@ def choose_model(
         validation: Rule by which the spectra are divided into folds.
         seed: Seed of the folds and of the fits.
         device: Device to compute on.
+        structures: A fitted model for each of the `blind_folds`, and the seconds of its fit. Candidates that can reuse its
+            structure do not search.
         options: Further options of the candidates. Each candidate takes those that it has.
 
     Raises:
@@ -140,9 +143,9 @@ def choose_model(
     for option in options:
         if not any(field_model.supported({option: options[option]}) for field_model in types.values()):
             raise InputError(f"none of the candidates {', '.join(types)} has an option {option!r}; leave it out")
-    fold, blind_folds = _blind_folds(measured, validation, seed)
+    fold, every_blind = blind_folds(measured, validation, seed)
     options |= {"validation": validation, "seed": seed}
-    searched: list[list[tuple[FieldModel, float]]] = [[] for _ in blind_folds]
+    searched = [[model] for model in structures] or [list[tuple[FieldModel, float]]() for _ in every_blind]
     psnr_db: dict[str, float] = {}
     found: dict[str, list[Fold]] = {}
     seconds: dict[str, float] = {}
@@ -151,14 +154,13 @@ def choose_model(
         scored, score, spent = [], [], 0.0
         try:
             unfitted = field_model(**field_model.supported(options)) if isinstance(field_model, type) else field_model
-            for blind, fitted in zip(blind_folds, searched, strict=True):
+            for blind, fitted in zip(every_blind, searched, strict=True):
                 structure = None
                 if unfitted.searches:
-                    structure, searching = _structure(unfitted, measured.subset(_without(fold, *blind)), fitted, device)
+                    structure, searching = _structure(unfitted, measured.subset(without(fold, *blind)), fitted, device)
                     spent += searching
                 for number in blind:
-                    rows, *_ = subsample((fold == number).nonzero()[:, 0], rows=1000)  # more do not change the choice
-                    train, test = measured.subset(_without(fold, number)), measured.subset(rows)
+                    train, test = held_out(measured, fold, number)
                     began = time.perf_counter()
                     model = copy(unfitted).fit(train, like=structure, device=device)
                     predicted = model.synthesize(test.position).cpu()
@@ -177,10 +179,16 @@ def choose_model(
     return ModelChoice(best, psnr_db, seconds, found, left_out)
 
 
-def _blind_folds(measured: Spectra, validation: Validation, seed: int) -> tuple[Tensor, tuple[tuple[int, ...], ...]]:
+def held_out(measured: Spectra, fold: Tensor, number: int) -> tuple[Spectra, Spectra]:
+    """Return the spectra outside of a fold, and at most 1000 of those in it: more do not change the choice."""
+    rows, *_ = subsample((fold == number).nonzero()[:, 0], rows=1000)
+    return measured.subset(without(fold, number)), measured.subset(rows)
+
+
+def blind_folds(measured: Spectra, validation: Validation, seed: int) -> tuple[Tensor, tuple[tuple[int, ...], ...]]:
     """Return the fold of each spectrum, and the folds that each structure search leaves out."""
     fold, n = folds(measured.position, validation, seed), len(measured)
-    if all(len(_without(fold, *blind)) >= MIN_TRAINING for blind in BLIND_FOLDS):
+    if all(len(without(fold, *blind)) >= MIN_TRAINING for blind in BLIND_FOLDS):
         return fold, BLIND_FOLDS
     if n <= MIN_TRAINING:
         raise InputError(f"cross-validation of field models needs more than {MIN_TRAINING} measured spectra, got {n}")
@@ -204,6 +212,6 @@ def _structure(
     return searched[-1]
 
 
-def _without(fold: Tensor, *numbers: int) -> Tensor:
+def without(fold: Tensor, *numbers: int) -> Tensor:
     """Return the rows outside the folds of these numbers."""
     return (~torch.isin(fold, torch.tensor(numbers))).nonzero()[:, 0]

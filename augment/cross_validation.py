@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from augment import Fold, Mixed, synthetic_positions
-from augment.choose import BLIND_FOLDS
 from augment.estimators import Estimator, make_estimator
 from swiftwrf import FitError, InputError
 from swiftwrf.gp import subsample
@@ -139,11 +138,6 @@ def measured_errors(fold: Fold, estimator: Estimator) -> Errors:
     return _degrees(estimator.fit(Mixed.measured(fold.train)).estimate(fold.test), fold.test.label)
 
 
-def located_folds(folds: Sequence[Fold]) -> dict[int, Fold]:
-    """Return the folds by number on which matched-field processing is compared: one of each structure search."""
-    return {number: folds[number] for number in range(0, len(folds), len(BLIND_FOLDS[0]))[: len(BLIND_FOLDS)]}
-
-
 def located_errors(fold: Fold, seed: int) -> Errors | None:
     """Return the angular errors [deg] of matched-field processing on held-out spectra of a fold; None without a room.
 
@@ -167,8 +161,9 @@ def choose_estimator(
 ) -> EstimatorChoiceMetrics:
     """Return the estimator with the smallest median error on held-out measured spectra, `better` left empty.
 
-    Matched-field processing is compared on few folds, because its fits take seconds. It is a candidate only if planes were
-    found without the spectra of each of these folds. All estimators are then compared on the spectra that it located.
+    Matched-field processing is compared on a fold of each of two searches, because its fits take seconds. It is a candidate
+    only if planes were found without the spectra of each of these folds. All estimators are then compared on the spectra
+    that it located.
 
     Args:
         errors: Angular errors [deg] on the held-out spectra of each fold, by name of the method.

@@ -1,22 +1,34 @@
-"""One report over several finished runs of one task."""
+"""Reports of finished runs of one task, and of a result of the library."""
 
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
+from augment.turbo.results import TurboResult
 from swiftwrf import InputError
+from swiftwrf.rssi import RssiComparison
+from swiftwrf.runtime.durable import strict, write_json
+from tasks.aoa.experiment import record as aoa_record
 from tasks.aoa.page import page as aoa
 from tasks.configs import ReportConfig
-from tasks.directory import new_directory
-from tasks.environment import stamp
+from tasks.directory import check_new_file, new_directory
+from tasks.environment import choose_device, environment, stamp
+from tasks.locate.experiment import record as locate_record
 from tasks.locate.page import page as locate
-from tasks.page.page import Page, write_page
+from tasks.page.page import REPORT, Page, write_page
 from tasks.page.records import Records
+from tasks.records import CONFIG, ENVIRONMENT
+from tasks.rssi.experiment import record as rssi_record
 from tasks.rssi.page import page as rssi
 from tasks.terminal import terminal
 
+CALLS = {"aoa": "augment.turbo_learning", "rssi": "swiftwrf.rssi.compare", "locate": "swiftwrf.locate.compare"}
 PAGES: dict[str, Callable[[list[Records]], Page]] = {"aoa": aoa, "rssi": rssi, "locate": locate}
 
 
@@ -24,8 +36,35 @@ def run(config: ReportConfig) -> None:
     """Write the report and print its place."""
     out = Path(config.out) if config.out else Path("runs") / "report" / stamp()
     merge([Path(folder) for folder in config.runs], out)
-    page = out / "report.html"
+    page = out / REPORT
     terminal.page({"runs": list(config.runs)}, "", page)
+
+
+def write(task: str, result: Any, file: Path) -> None:
+    """Write the report of a result of the library into an HTML file, without a directory of a run.
+
+    Args:
+        task: Name of the task.
+        result: `TurboResult`, `RssiComparison` or `LocateComparison`.
+        file: New file.
+
+    Raises:
+        InputError: The file exists already, or its folder does not.
+    """
+    check_new_file(file)
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        if isinstance(result, TurboResult):
+            shutil.copytree(result.folder, folder, dirs_exist_ok=True)  # what the steps left for the report
+            metrics, source = aoa_record([result], folder), result.experiment.train.source
+        elif isinstance(result, RssiComparison):
+            metrics, source = rssi_record(result, folder), result.train.source
+        else:
+            metrics, source = locate_record(result, folder), result.split.train.source
+        write_json(folder / CONFIG, {"command": CALLS[task]})
+        write_json(folder / ENVIRONMENT, environment(choose_device("cpu"), source))
+        write_page(folder, replace(PAGES[task]([Records(folder, strict(metrics))]), alone=True))
+        shutil.copyfile(folder / REPORT, file)
 
 
 def merge(folders: list[Path], out: Path) -> None:

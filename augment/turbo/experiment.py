@@ -9,7 +9,7 @@ from functools import cached_property
 
 import torch
 
-from augment.choose import candidates
+from augment.choose import blind_folds, candidates
 from augment.cross_validation import LOCATOR, STAND_IN, CrossValidationMetrics
 from augment.estimators import ESTIMATORS, Estimator, make_estimator
 from augment.mix import withhold
@@ -17,6 +17,7 @@ from augment.positions import SyntheticPositions
 from augment.turbo.condition import NETWORKS, MeasuredSubset, Training
 from swiftwrf.choices import AUTO
 from swiftwrf.data import Spectra
+from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import WINDOW
 from swiftwrf.models import FIELD_MODELS, FieldModel
@@ -46,6 +47,7 @@ class Experiment:
     repeats: int = 1  # each with its own measured spectra and seed
     seed: int = 0
     device: torch.device | str = "cpu"
+    split: str = "random"  # name of the split that gave training and test spectra
 
     def __post_init__(self) -> None:
         data = self.test
@@ -110,6 +112,13 @@ class Experiment:
     def withhold(self, subset: MeasuredSubset) -> tuple[Spectra, SyntheticPositions]:
         """Return the measured spectra, and the positions of the others."""
         return withhold(self.train, subset.measured_fraction, self.seed + subset.repeat)
+
+    def blind_folds(self, subset: MeasuredSubset) -> list[tuple[int, ...]]:
+        """Return the folds of the measured spectra that each search for a room leaves out; empty for too few spectra."""
+        measured, _ = self.withhold(subset)
+        if len(measured) <= MIN_TRAINING:
+            return []
+        return list(blind_folds(measured, "random", self.seed + subset.repeat)[1])
 
     def trainings(self, validation: CrossValidationMetrics | None) -> list[tuple[Training, int]]:
         """Return the training sets with spectra of a field model, and their numbers of extra synthetic positions."""

@@ -10,12 +10,13 @@ from tempfile import TemporaryDirectory
 
 import torch
 
+from augment.choose import candidates
 from augment.cross_validation import LOCATOR, STAND_IN
 from augment.estimators import Estimator
 from augment.turbo.condition import LOCATED, MEASURED_STAND_IN, NETWORKS, Condition, MeasuredSubset, Training
 from augment.turbo.experiment import ROOM_MODEL, Experiment
 from augment.turbo.results import TurboResult
-from augment.turbo.stages import compare, evaluate, find_room, locate, synthesize
+from augment.turbo.stages import compare, evaluate, find_room, locate, locate_held_out, room_name, synthesize
 from swiftwrf.choices import AUTO
 from swiftwrf.data import Spectra
 from swiftwrf.models import FieldModel
@@ -77,12 +78,11 @@ def turbo_learning(
     """
     models = (models,) if isinstance(models, str) else models
     experiment = Experiment(
-        *data.split(split, seed), (measured,), models, estimators, extra, preset, repeats, seed, device
+        *data.split(split, seed), (measured,), models, estimators, extra, preset, repeats, seed, device, split
     )
-    with TemporaryDirectory(prefix="swiftwrf-") as folder:
-        (result,) = learn(experiment, keep or Memo(Path(folder)), executor)
-        if keep is None:
-            result.best  # noqa: B018 - is read from the folder
+    folder = TemporaryDirectory(prefix="swiftwrf-")
+    (result,) = learn(experiment, keep or Memo(Path(folder.name)), executor)
+    result.temporary = folder  # deleted with the result, which reads its files
     return result
 
 
@@ -107,38 +107,59 @@ def _learn(
         condition = Condition(estimator, training, synthesizer, extra, subset.measured_fraction, subset.repeat)
         name = condition.name if condition.is_turbo else MEASURED_STAND_IN
         saved_as = name if saved and subset.repeat == 0 else None
-        steps.start(condition.result_name, condition.method, evaluate, condition, saved_as)
+        # trainings on synthetic spectra begin last and take longest
+        steps.start(condition.result_name, condition.method, evaluate, condition, saved_as, first=condition.is_turbo)
         return condition
 
-    # from the measured spectra alone: field models are compared, the room is found, references are trained
+    # from the measured spectra alone: the room is found, with and without held-out folds, and references are trained
     fast = [name for name in experiment.named if not experiment.model_type(name).slow]
-    if is_compared := bool(fast or not experiment.named):
-        steps.start(f"choice-{subset}", "comparing field models", compare, subset, fast, first=True)
-    if searches := ROOM_MODEL in experiment.candidates:
-        steps.start(f"room-{subset}", "finding the room", find_room, subset, first=True)
+    is_compared = bool(fast or not experiment.named)
+    searches = ROOM_MODEL in experiment.candidates
+    compared_models = [*experiment.candidates, *(fast or candidates(experiment.train))]
+    blind: list[tuple[int, ...]] = []
+    if is_compared and any(map(experiment.finds_room, compared_models)):
+        blind = experiment.blind_folds(subset)
+
+    def find(*some: int) -> str:
+        return steps.start(room_name(subset, some), "finding the room", find_room, subset, some, first=True)
+
+    for some in blind:
+        find(*some)
+    if searches:
+        find()
     conditions = [
         train(name, saved=name == STAND_IN) for name in experiment.evaluated if name not in experiment.lacking
     ]
     full = [train(name, "all measured") for name in experiment.trainable]
 
     yield
+    # field models are compared; held-out spectra and test spectra are located by the room
+    choice, held_out = f"choice-{subset}", {}
+    if is_compared:
+        found = [steps[find(*some)] for some in blind]
+        steps.start(choice, "comparing field models", compare, subset, fast, found, first=True)
+        if searches and subset.repeat == 0:
+            title = "locating held-out spectra"
+            for (number, *_), without in list(zip(blind, found, strict=True))[:2]:
+                name = f"held_out_{number}-{subset}"
+                held_out[number] = steps.start(name, title, locate_held_out, subset, number, without)
+    located = Condition(LOCATOR, "measured", "", 0, subset.measured_fraction, subset.repeat)
+    if searches and steps[find()].get("planes"):
+        steps.start(located.result_name, LOCATED, locate, subset, steps[find()])
+
+    yield
     # the field models that were asked for or chosen, and others for comparison, predict spectra
-    compared = steps[f"choice-{subset}"] if is_compared else {}
+    compared = steps[choice] if is_compared else {}
     names = experiment.named or [compared["choice"]["name"]]
     trainings = {name: experiment.trainings(compared.get("cross_validation", {}).get(name)) for name in names}
     models = dict.fromkeys((*names, *experiment.candidates))
     for name in sorted(models, key=experiment.finds_room):
         room = None
         if experiment.finds_room(name):
-            room = steps[steps.start(f"room-{subset}", "finding the room", find_room, subset, first=True)]
+            room = steps[find()]
         extra = trainings[name][-1][1] if name in names else None
         title = f"synthesizing spectra by {name}"
         steps.start(f"synthesis_{name}-{subset}", title, synthesize, subset, name, extra, room, first=name in names)
-
-    # the test spectra are located by the room
-    located = Condition(LOCATOR, "measured", "", 0, subset.measured_fraction, subset.repeat)
-    if searches and steps[f"room-{subset}"].get("planes"):
-        steps.start(located.result_name, LOCATED, locate, subset, steps[f"room-{subset}"])
 
     yield
     # estimators are trained on measured and synthetic spectra
@@ -158,10 +179,10 @@ def _learn(
     for condition in conditions:
         result.add(condition, steps[condition.result_name])
     if searches:
-        room = steps[f"room-{subset}"]
+        room = steps[find()]
         refused = {"refused": room.get("refused", "no plane explains the spectra")}
         result.add(located, steps[located.result_name] if room.get("planes") else refused)
     for condition in full:
         result.add(condition, steps[condition.result_name])
     if subset.repeat == 0:
-        result.compared = compared
+        result.compared = compared | {"located": {number: steps[name]["errors"] for number, name in held_out.items()}}

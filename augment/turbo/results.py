@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
@@ -33,6 +34,7 @@ from swiftwrf.choices import fraction_key
 from swiftwrf.locate import MatchedField
 from swiftwrf.metrics import ErrorSummary, angle_errors, paired_change, summary
 from swiftwrf.models import FIELD_MODELS
+from swiftwrf.runtime.registry import write_report
 
 ANGLES = ("azimuth_deg", "elevation_deg", "great_circle_deg")
 
@@ -59,7 +61,8 @@ class TurboResult:
     """
 
     def __init__(self, experiment: Experiment, fraction: float, folder: Path) -> None:
-        self.experiment, self.fraction, self._folder = experiment, fraction, folder
+        self.experiment, self.fraction, self.folder = experiment, fraction, folder
+        self.temporary: TemporaryDirectory[str] | None = None  # of `folder`, if nothing else keeps it
         self.compared: Row = {}  # comparison of the field models in the first repeat
         self.synthesized: list[tuple[Row, Row]] = []  # columns and values of each field model
         self.evaluated: list[tuple[Condition, Row]] = []
@@ -209,7 +212,7 @@ class TurboResult:
         if self.choice is None:
             return None
         chosen, experiment = conditions_of(self.metrics["methods"])[self.choice["name"]], self.experiment
-        if file := chosen_file(self._folder, fraction_key(self.fraction), chosen):
+        if file := chosen_file(self.folder, fraction_key(self.fraction), chosen):
             found = load(file)
             assert isinstance(found, Estimator | MatchedField)
             return found
@@ -217,7 +220,7 @@ class TurboResult:
         if own is None:
             return None
         estimator = experiment.make_estimator(own.estimator, 0)
-        return estimator.fit(training_set(experiment, self._folder, own), device=experiment.device)
+        return estimator.fit(training_set(experiment, self.folder, own), device=experiment.device)
 
     def summary(self) -> DataFrame:
         """Return a row for each method, the smallest median first.
@@ -237,6 +240,14 @@ class TurboResult:
                 row |= {column: 100 * change[name] for column, name in columns.items()}
             rows.append(row)
         return DataFrame(rows, index=list(self.metrics["methods"])).sort_values("median")
+
+    def report(self, file: str | Path) -> None:
+        """Write the report of `swiftwrf aoa` on this result into an HTML file, which opens offline.
+
+        Raises:
+            InputError: The file exists already.
+        """
+        write_report("aoa", self, file)
 
     def __repr__(self) -> str:
         error = self.summary()["median"]

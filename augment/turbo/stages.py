@@ -10,13 +10,12 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from augment.choose import Fold, ModelChoice, choose_model
+from augment.choose import Fold, blind_folds, choose_model, held_out, without
 from augment.cross_validation import (
     LOCATOR,
     STAND_IN,
     cross_validate,
     located_errors,
-    located_folds,
     measured_errors,
 )
 from augment.estimators import SavedEstimator
@@ -42,7 +41,12 @@ def _file(name: str) -> str:
     return f"{STEPS}/{name}.safetensors"
 
 
-def compare(experiment: Experiment, folder: Path, subset: MeasuredSubset, compared: list[str]) -> Row:
+def room_name(subset: MeasuredSubset, blind: tuple[int, ...] = ()) -> str:
+    """Return the name of the step that finds the room without some folds."""
+    return "_".join((f"room-{subset}", *map(str, blind)))
+
+
+def compare(experiment: Experiment, folder: Path, subset: MeasuredSubset, compared: list[str], rooms: list[Row]) -> Row:
     """Compare field models on held-out measured spectra, and determine whether turbo learning helps.
 
     Args:
@@ -50,12 +54,16 @@ def compare(experiment: Experiment, folder: Path, subset: MeasuredSubset, compar
         folder: Folder of the files.
         subset: Measured spectra.
         compared: Names of field models. Empty for all that are fast and whose requirements the data meet.
+        rooms: Results of `find_room` without the folds that are predicted.
     """
     measured, _ = experiment.withhold(subset)
     seed = experiment.seed + subset.repeat
     models = [experiment.own_models.get(name, name) for name in compared]
+    # a search that was refused is repeated, so that the models that need it are left out with its reason
+    structures = [(_read_room(folder, room["file"]), room["seconds"]) for room in rooms if "file" in room]
+    structures = structures if len(structures) == len(rooms) else []
     try:
-        choice = choose_model(measured, models or None, seed=seed, device=experiment.device)
+        choice = choose_model(measured, models or None, seed=seed, device=experiment.device, structures=structures)
     except InputError:
         if not compared:
             raise
@@ -73,37 +81,56 @@ def compare(experiment: Experiment, folder: Path, subset: MeasuredSubset, compar
             errors[Condition(name, "measured").method] = [
                 measured_errors(fold, experiment.make_estimator(name, subset.repeat)) for fold in folds
             ]
-    rooms = located_folds(_with_room(experiment, measured, choice, compared, seed))
     return {
         "choice": {name: value for name, value in vars(choice).items() if name != "folds"},
         "cross_validation": {name: entry.metrics for name, entry in validation.items()},
         "errors": errors,
-        "located": {number: located_errors(fold, seed) for number, fold in rooms.items()},
     }
 
 
-def _with_room(
-    experiment: Experiment, measured: Spectra, choice: ModelChoice, compared: list[str], seed: int
-) -> list[Fold]:
-    """Return the folds of a field model with a room, whether such a model was asked for or not; empty without one."""
-    folds = next((found for found in choice.folds.values() if found[0].model.room is not None), [])
-    if folds or not compared or ROOM_MODEL not in experiment.candidates:
-        return folds
-    try:
-        return choose_model(measured, (ROOM_MODEL,), seed=seed, device=experiment.device).folds[ROOM_MODEL]
-    except InputError:
-        return []
+def locate_held_out(experiment: Experiment, folder: Path, subset: MeasuredSubset, number: int, room: Row) -> Row:
+    """Return the errors of directions by matched-field processing on the held-out spectra of a fold.
 
-
-def find_room(experiment: Experiment, folder: Path, subset: MeasuredSubset) -> Row:
-    """Find the room in the measured spectra, once for all field models that are built on it and for the locator."""
+    Args:
+        experiment: Data and options.
+        folder: Folder of the files.
+        subset: Measured spectra.
+        number: Number of the fold.
+        room: Result of `find_room` without the fold.
+    """
     measured, _ = experiment.withhold(subset)
+    seed = experiment.seed + subset.repeat
+    train, test = held_out(measured, blind_folds(measured, "random", seed)[0], number)
+    if not room.get("planes"):
+        return {"errors": None}
+    try:
+        blind = _read_room(folder, room["file"])
+        model = experiment.make_model(ROOM_MODEL, subset.repeat).fit(train, like=blind, device=experiment.device)
+    except (InputError, FitError):
+        return {"errors": None}
+    return {"errors": located_errors(Fold(model, train, test), seed)}
+
+
+def find_room(experiment: Experiment, folder: Path, subset: MeasuredSubset, blind: tuple[int, ...] = ()) -> Row:
+    """Find the room in the measured spectra, once for all field models that are built on it and for the locator.
+
+    Args:
+        experiment: Data and options.
+        folder: Folder of the files.
+        subset: Measured spectra.
+        blind: Folds that are left out.
+    """
+    measured, _ = experiment.withhold(subset)
+    name = room_name(subset, blind)
+    if blind:
+        fold, _ = blind_folds(measured, "random", experiment.seed + subset.repeat)
+        measured = measured.subset(without(fold, *blind))
     began = time.perf_counter()
     try:
         model = experiment.make_model(ROOM_MODEL, subset.repeat).fit(measured, device=experiment.device, progress=True)
     except (InputError, FitError) as error:
         return {"refused": str(error)}
-    file = _file(f"room-{subset}")
+    file = _file(name)
     model.save(folder / file)
     planes = len(model.room.planes) if model.room else 0
     return {"seconds": time.perf_counter() - began, "planes": planes, "file": file}

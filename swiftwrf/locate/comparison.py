@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,10 @@ from swiftwrf.data.rssi import PLACE
 from swiftwrf.data.splits import matching_validation, places
 from swiftwrf.errors import InputError
 from swiftwrf.locate.baselines import LEVELS, LOCALIZERS, Localizer, PosteriorLocalizer
+from swiftwrf.locate.rssi import RssiLocator
 from swiftwrf.metrics import ErrorSummary, method_summary, summary
 from swiftwrf.rssi import estimate_offsets
+from swiftwrf.runtime.registry import write_report
 from swiftwrf.runtime.validation import checked
 
 MIN_ROWS = 20  # training rows that a receiver detected: five folds, of which four hold at least 10 rows
@@ -179,6 +182,7 @@ class LocateComparison:
     Args:
         split: Training and test rows.
         values: What `LocateSplit.fit` gave, by trial.
+        locator: Locator of all training rows.
 
     Example:
         >>> import swiftwrf
@@ -189,6 +193,7 @@ class LocateComparison:
 
     split: LocateSplit
     values: Mapping[Trial, Values]
+    locator: RssiLocator | None = None
 
     @cached_property
     def errors(self) -> DataFrame:
@@ -198,6 +203,14 @@ class LocateComparison:
     def summary(self) -> DataFrame:
         """Return a row for each method: errors [m], and their mean difference to the posterior; see `method_summary`."""
         return method_summary(self.errors, "position_error_m", "posterior")
+
+    def report(self, file: str | Path) -> None:
+        """Write the report of `swiftwrf locate` on this result into an HTML file, which opens offline.
+
+        Raises:
+            InputError: The file exists already.
+        """
+        write_report("locate", self, file)
 
     @property
     def coverage(self) -> dict[float, float]:
@@ -294,4 +307,9 @@ def compare(
         True
     """
     measured = LocateSplit.of(data.receivers(receivers), split, n_cells, seed, reference)
-    return LocateComparison(measured, {trial: measured.fit(trial)[1] for trial in measured.trials()})
+    values, locator = {}, None
+    for trial in measured.trials():
+        localizer, values[trial] = measured.fit(trial)
+        if isinstance(localizer, PosteriorLocalizer) and trial.is_whole:
+            locator = localizer.locator
+    return LocateComparison(measured, values, locator)

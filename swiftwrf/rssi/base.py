@@ -59,7 +59,8 @@ class RssiConfig(FieldConfig):
     """location bins that the rows are averaged in; the time of a fit grows with the cube of their number"""
     not_detected: NotDetected = "auto"
     """meaning of an empty cell: "weak", the power was below the limit of detection; "unknown", it is ignored; "auto" decides
-    for each receiver by whether its empty cells are where its path loss expects no value"""
+    for each receiver by whether its empty cells are where its path loss expects no value. Only the path loss of a receiver
+    with fewer than 10 values counts its empty cells"""
 
 
 class RssiPredictor(Configured, Displayed, ABC):

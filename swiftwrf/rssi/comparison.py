@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -27,6 +28,7 @@ from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.offsets import estimate_offsets
 from swiftwrf.rssi.pairs import PairModel
 from swiftwrf.rssi.paper import RssiPaperModel
+from swiftwrf.runtime.registry import write_report
 from swiftwrf.runtime.validation import Fraction, Preset, checked
 
 Values = dict[str, Any]
@@ -86,10 +88,12 @@ class RssiComparison:
         test: Test rows.
         values: What each predictor gave, by name: `predicted` at the detected test pairs (n,) [dBm], their standard
             deviations `std` (n,) [dB] or None, median absolute error `median_db` [dB], seconds to `fit` and to `predict`.
-            `detection` are the shares of detected and of empty test cells that are predicted as such, or None.
+            `detection` are the shares of detected and of empty test cells that are predicted as such, or None. Predictors
+            without primitives have 0 `n_primitives`.
         left_out: Reason for each predictor that the data do not suffice for.
         predictors: Fitted predictors by name, without those whose values `keep` had.
         by_rows: Mean absolute errors [dB] of the model and of "knn" by the number of training rows, a column for each.
+        options: The split, the preset and the seed.
 
     Example:
         >>> import swiftwrf
@@ -104,6 +108,7 @@ class RssiComparison:
     left_out: dict[str, str]
     predictors: dict[str, RssiPredictor] = field(default_factory=dict)
     by_rows: DataFrame = field(default_factory=DataFrame)
+    options: Values = field(default_factory=dict)
 
     @property
     def model(self) -> str:
@@ -162,6 +167,14 @@ class RssiComparison:
         found = method_summary(self.errors, "abs_error_db", self.model)
         right = {name: sum(value["detection"]) / 2 for name, value in self.values.items() if value.get("detection")}
         return found.assign(detection=found.index.map(right)) if right else found
+
+    def report(self, file: str | Path) -> None:
+        """Write the report of `swiftwrf rssi` on this result into an HTML file, which opens offline.
+
+        Raises:
+            InputError: The file exists already.
+        """
+        write_report("rssi", self, file)
 
     @property
     def _pairs(self) -> tuple[Tensor, Tensor]:
@@ -266,7 +279,7 @@ def compare(
         error = (prediction.mean + offset - test.rssi_dbm)[test.detected].abs()
         values = {"predicted": prediction.mean[test.detected], "std": std, "median_db": float(error.quantile(0.5))}
         values["mean_db"] = float(error.mean())
-        return predictor, seconds | values | {"detection": found}
+        return predictor, seconds | values | {"detection": found, "n_primitives": getattr(predictor, "n_primitives", 0)}
 
     keep = keep or (lambda name, compute: compute()[1])
     values = {name: keep(name, partial(compute, name)) for name in names}
@@ -281,7 +294,8 @@ def compare(
 
     by_rows = DataFrame.from_dict(keep("fewer rows", study) if fewer else {}, orient="index")
     by_rows = by_rows.set_index(by_rows.index.astype(int)).rename_axis("n_train")
-    return RssiComparison(train, test, values, left_out, predictors, by_rows)
+    used = {"split": split, "preset": preset, "seed": seed}
+    return RssiComparison(train, test, values, left_out, predictors, by_rows, used)
 
 
 def pool_of(whole: Rssi, train: Rssi, test: Rssi, split: str, seed: int) -> Rssi:

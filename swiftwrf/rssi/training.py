@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.splits import folds
+from swiftwrf.data.splits import MIN_TRAINING, folds
 from swiftwrf.gp import Kernel, candidates, held_out_errors, subsample
 from swiftwrf.positions import cells
 from swiftwrf.rssi.base import RssiConfig, columns_of, heard_often
@@ -58,7 +58,8 @@ class RssiTraining(Bins):
         rendered: Fields of each receiver's head, (R, 2, 2, directions).
         path_loss: Path loss of the receivers, the prior of the fit.
         shift: Received power less RSSI, by floors and offsets that were removed, (n, R) [dB].
-        limit: Upper limit of RSSI in each empty cell that has a part in the fit, (n, R) [dBm], nan in all other cells.
+        limit: Upper limit of RSSI in each empty cell that has a part in the fit, (n, R) [dBm], nan in all other cells and at
+            receivers with fewer than 10 measured bins.
         field_db: Prior standard deviation of the latent field, (R,) [dB].
         noise_db: Standard deviation of one measurement about it, (R,) [dB].
         baselines: Path-loss models of the simple predictors, (3, R): that of each receiver, that of all receivers, and the
@@ -144,8 +145,9 @@ def _limits(rssi: Tensor, loss: PathLosses, distance: Tensor, shift: Tensor) -> 
     z = (limit - loss.own(distance)) / std
     weak = empty_given(z, loss.detection.missed)[1]
     unexplained = (torch.special.ndtr(z) < CERTAIN) & (weak > 1 - CERTAIN)
-    received = (~rssi.isnan()).any(dim=0)
-    return limit.where(rssi.isnan() & unexplained & loss.detection.is_limit & received, torch.nan)
+    # a few rows are no evidence of weak signals elsewhere, e.g. those of a phone that passed
+    enough = (~rssi.isnan()).sum(dim=0) >= MIN_TRAINING
+    return limit.where(rssi.isnan() & unexplained & loss.detection.is_limit & enough, torch.nan)
 
 
 def binned(train: Rssi, config: RssiConfig) -> Bins:

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from importlib.metadata import entry_points
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar
 
@@ -117,3 +118,9 @@ def _entry_points(group: str, path: tuple[str, ...]) -> tuple[Any, ...]:
     """Return the entry points of a group. A search reads the metadata of every installed package, so its result is kept."""
     # a backport of importlib.metadata, if another package has loaded it, returns its own class
     return tuple(entry_points(group=group))
+
+
+def write_report(task: str, result: Any, file: str | Path) -> None:
+    """Write the report of a task's result by the package that writes reports, an entry point of `swiftwrf.reports`."""
+    (point,) = _entry_points("swiftwrf.reports", tuple(sys.path))
+    point.load()(task, result, Path(file))

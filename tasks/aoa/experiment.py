@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -9,6 +10,7 @@ import torch
 from augment import suggest
 from augment.turbo.experiment import Experiment
 from augment.turbo.learning import learn
+from augment.turbo.results import TurboResult
 from swiftwrf import Spectra, make_model, simulated_room
 from swiftwrf.choices import RAYTRACE, fraction_key
 from swiftwrf.data.files import sha256
@@ -59,6 +61,7 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
         repeats=config.repeats,
         seed=config.seed,
         device=device,
+        split=config.split,
     )
     label = f"mix{'_'.join(map(fraction_key, config.mix))}-s{config.seed}"
 
@@ -90,28 +93,34 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
             measured, _ = experiment.withhold(subset)
             found = suggest(measured, config.suggest, config.seed)
             write_suggestion(run.path(f"suggested-mix{subset.key}"), measured.position, found.position, found.variance)
-        write_table(run.path("history.csv"), (row for result in results for row in result.history))
-        for name in ("errors", "synthesis", "positions"):
-            rows = [row for result in results for row in getattr(result, name).to_dict("records")]
-            if rows or name != "positions":
-                write_table(run.path(f"{name}.csv"), rows)
-        metrics: Row = {
-            "task": "aoa",
-            "data": data.name,
-            "split": config.split,
-            "preset": config.preset,
-            "seed": config.seed,
-            "repeats": config.repeats,
-            "moving": data.moving,
-            "notes": list(data.notes),
-            "extra": experiment.n_synthetic,
-            "n_train": len(train),
-            "n_test": len(test),
-            "grid": data.grid.shape,
-            "line_of_sight_share": float(test.line_of_sight.float().mean()),
-            "mixes": {fraction_key(result.fraction): result.metrics for result in results},
-        }
-        finish(run, metrics, page, answer_of)
+        finish(run, record(results, run.folder), page, answer_of)
+
+
+def record(results: Sequence[TurboResult], folder: Path) -> Row:
+    """Write the tables of the results of one experiment into a folder, and return the content of metrics.json."""
+    write_table(folder / "history.csv", (row for result in results for row in result.history))
+    for name in ("errors", "synthesis", "positions"):
+        rows = [row for result in results for row in getattr(result, name).to_dict("records")]
+        if rows or name != "positions":
+            write_table(folder / f"{name}.csv", rows)
+    experiment = results[0].experiment
+    train, test = experiment.train, experiment.test
+    return {
+        "task": "aoa",
+        "data": train.name,
+        "split": experiment.split,
+        "preset": experiment.preset,
+        "seed": experiment.seed,
+        "repeats": experiment.repeats,
+        "moving": train.moving,
+        "notes": list(train.notes),
+        "extra": experiment.n_synthetic,
+        "n_train": len(train),
+        "n_test": len(test),
+        "grid": train.grid.shape,
+        "line_of_sight_share": float(test.line_of_sight.float().mean()),
+        "mixes": {fraction_key(result.fraction): result.metrics for result in results},
+    }
 
 
 def measurements(config: AoaConfig) -> Spectra:

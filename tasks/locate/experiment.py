@@ -28,6 +28,7 @@ from tasks.source import measured_rssi, split_notes
 from tasks.terminal import console, terminal
 from tasks.workers import connected, workers_of
 
+MAPS = "maps.npz"  # posteriors of some test rows
 N_MAPS = 6  # test rows with a posterior map
 
 
@@ -38,7 +39,7 @@ def localize(split: LocateSplit, folder: Path, trial: Trial, suggest: int) -> Ro
         locator = localizer.locator
         locator.save(folder / LOCATOR)
         error = (values["estimate"] - values["truth"]).norm(dim=1)
-        write_npz(folder / "maps.npz", posterior_maps(locator, split.train, split.test, error))
+        write_npz(folder / MAPS, posterior_maps(locator, split.train, split.test, error))
         if suggest:
             found = suggest_positions(locator, split.train, suggest, split.seed)
             degrees = degree_columns(split.train.origin, found.position.numpy())
@@ -74,9 +75,7 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
                 for trial in measured.trials()
             }
             values = {trial: steps[name] for trial, name in started.items()}
-        result = LocateComparison(measured, values)
-        write_table(directory.path("errors.csv"), result.errors.to_dict("records"))
-        finish(directory, _metrics(data, result), page, answer)
+        finish(directory, record(LocateComparison(measured, values), directory.folder), page, answer)
 
 
 def _described(value: Row) -> str:
@@ -93,16 +92,21 @@ def measurements(config: LocateConfig) -> Rssi:
     return (rssi_room(seed=config.seed) if measured is None else measured).receivers(config.rx)
 
 
-def _metrics(data: Rssi, result: LocateComparison) -> Row:
-    """Return the content of metrics.json."""
+def record(result: LocateComparison, folder: Path) -> Row:
+    """Write the table and maps of a result into a folder, and return the content of metrics.json."""
     split = result.split
     train, offsets = split.train, split.train.offsets
+    write_table(folder / "errors.csv", result.errors.to_dict("records"))
+    if result.locator is not None:  # the step that fitted it in a run has written them
+        own = result.values[Trial("posterior")]
+        error = (own["estimate"] - own["truth"]).norm(dim=1)
+        write_npz(folder / MAPS, posterior_maps(result.locator, train, split.test, error))
     return {
         "task": "locate",
-        "data": data.name,
+        "data": train.name,
         "notes": [
             *split_notes(train, split.test, split.split),
-            *data.notes,
+            *train.notes,
             *([offsets.note()] if offsets else []),
         ],
         "split": split.split,

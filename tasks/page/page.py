@@ -23,6 +23,7 @@ from tasks.terminal import terminal
 
 HALF = 92  # letters of a table that fit into half of the page
 WIDE = 7.5  # [inches] figures that are wider take the whole width of the page, others half
+REPORT = "report.html"  # its file
 MAX_SECTIONS = 5  # of a page, whose navigation has the details, too
 
 
@@ -115,12 +116,16 @@ class Summary:
 
 @dataclass(frozen=True)
 class Page:
-    """A report: first screen, at most `MAX_SECTIONS` sections in the navigation, and folded sections as details."""
+    """A report: first screen, at most `MAX_SECTIONS` sections in the navigation, and folded sections as details.
+
+    A page that stands `alone`, outside of the directory of a run, has neither commands on it nor links to its files.
+    """
 
     title: str
     summary: Summary
     sections: list[Section]
     details: list[Section] = field(default_factory=list)
+    alone: bool = False
 
     def __post_init__(self) -> None:
         if len(self.sections) > MAX_SECTIONS:
@@ -170,7 +175,7 @@ def write_page(folder: Path, page: Page) -> None:
     )
     environment.filters["rich"] = rich
     html = environment.get_template("template.html").render(page=page, svg=inlined)
-    write_text(folder / "report.html", html)
+    write_text(folder / REPORT, html)
 
 
 def finish(
@@ -178,7 +183,7 @@ def finish(
 ) -> None:
     """Finish a run with its metrics and its report, and show its answer."""
     final = run.finish(metrics, lambda folder, values: write_page(folder, page([Records(folder, values)])))
-    terminal.answer(answer(Records(final)), final / "report.html")
+    terminal.answer(answer(Records(final)), final / REPORT)
 
 
 def sections_of(

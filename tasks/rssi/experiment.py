@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +62,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
                 predictor, value = compute()
                 if isinstance(predictor, RssiModel | PairModel) and name == model_of(data):
                     predictor.save(directory.path(MODEL))
-                return value | {"n_primitives": getattr(predictor, "n_primitives", 0)}
+                return value
 
             return directory.step(name, name, saved)
 
@@ -84,14 +85,16 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
                 progress=True,
             )
         directory.computed_on(cluster.machines if cluster else ())
-        write_table(directory.path("errors.csv"), result.errors.to_dict("records"))
-        write_table(directory.path("predictions.csv"), result.predictions.to_dict("records"))
         model = load(directory.path(MODEL))
         assert isinstance(model, RssiModel | PairModel)
-        write_npz(directory.path("maps.npz"), _maps(model, result.train))
+        if result.train.offsets is not None:
+            console.print(f"{data.name}: {result.train.offsets.note()}")
+        if model.detection is not None:
+            console.print(f"{data.name}: {model.detection.note(data.receiver_names)}")
         if plan is not None:
             plan.save(directory.folder)
-        finish(directory, _metrics(config, data, result, model), page, answer)
+        result = replace(result, predictors={result.model: model})
+        finish(directory, record(result, directory.folder, offset_notes(data, config.table)), page, answer)
 
 
 def _described(value: Row) -> str:
@@ -108,33 +111,39 @@ def _read_floor_plan(config: RssiTaskConfig, data: Rssi) -> FloorPlan | None:
     return FloorPlan(pixels, config.floor_extent or (0.0, width, -height, 0.0))
 
 
-def _metrics(config: RssiTaskConfig, data: Rssi, result: RssiComparison, model: RssiModel | PairModel) -> Row:
-    """Return the content of metrics.json."""
-    train = result.train
+def record(result: RssiComparison, folder: Path, notes: Sequence[str] = ()) -> Row:
+    """Write the tables and maps of a result into a folder, and return the content of metrics.json.
+
+    Args:
+        result: Comparison, with the fitted model.
+        folder: Folder of the files.
+        notes: Further sentences on the data.
+    """
+    train, model = result.train, result.predictors[result.model]
+    assert isinstance(model, RssiModel | PairModel)
+    write_table(folder / "errors.csv", result.errors.to_dict("records"))
+    write_table(folder / "predictions.csv", result.predictions.to_dict("records"))
+    write_npz(folder / "maps.npz", _maps(model, train))
     seconds: dict[str, Row] = {
         name: {"fit": value["fit"], "predict": value["predict"]} for name, value in result.values.items()
     }
-    notes = [*split_notes(train, result.test, config.split), *offset_notes(data, config.table), *data.notes]
+    notes = [*split_notes(train, result.test, result.options["split"]), *notes, *train.notes]
     if train.offsets is not None:
         notes.append(train.offsets.note())
-        console.print(f"{data.name}: {notes[-1]}")
     attenuation_db = None if model.attenuation is None else model.attenuation.db
     if attenuation_db is not None and train.floors is not None:
         notes.append(f"each of the {len(train.floors.names)} floors takes {attenuation_db:.1f} dB")
     if model.detection is not None:
         notes.append(model.detection.note(train.receiver_names))
-        console.print(f"{data.name}: {notes[-1]}")
     overall = {name: summary(errors) for name, errors in result.errors.groupby("method")["abs_error_db"]}
     at_receiver = {
         key: summary(errors) for key, errors in result.errors.groupby(["receiver", "method"])["abs_error_db"]
     }
     return {
         "task": "rssi",
-        "data": data.name,
+        "data": train.name,
         "notes": notes,
-        "split": config.split,
-        "preset": config.preset,
-        "seed": config.seed,
+        **result.options,
         "n_train": len(train),
         "n_test": len(result.test),
         "overall": {

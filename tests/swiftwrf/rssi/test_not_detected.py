@@ -130,6 +130,15 @@ def test_detections_are_predicted_and_scored(fitted, monkeypatch):
     assert "detection" not in compare(full, split="random", validation="block").summary()
 
 
+def test_empty_cells_do_not_outweigh_the_few_values_of_a_receiver():
+    """A phone that passed is not weak where it was not received."""
+    data = replace(survey()[0], receiver_position=torch.full((4, 3), torch.nan).double())
+    passed = torch.arange(len(data)) % 20 == 0
+    data.rssi_dbm[:, 3] = torch.where(passed, -65.0, torch.nan)
+    model = RssiModel().fit(data.subset((torch.arange(len(data)) % 40 != 0).nonzero()[:, 0]))
+    assert float((model.predict_detected(data).mean[passed, 3] + 65).abs().mean()) < 7  # 21 dB with the limits
+
+
 def test_a_saved_and_updated_model_keeps_its_detections(fitted, tmp_path):
     data, _, model = fitted
     model.save(tmp_path / "model")
