@@ -10,8 +10,7 @@ import numpy as np
 import torch
 
 from swiftwrf import FieldModel, InputError, RssiModel, load
-from swiftwrf.array.beamforming import PHASE
-from swiftwrf.data import ReadOptions, Rssi, Snapshots, Spectra
+from swiftwrf.data import Rssi, Snapshots, Spectra
 from swiftwrf.data.dataset import Labelled
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
 from swiftwrf.data.formats.paths import read_paths
@@ -72,7 +71,7 @@ def _write_new_file(config: ConvertConfig, model: RssiModel | None) -> None:
         raise InputError(f"{config.source} is a model; --{next(iter(options)).replace('_', '-')} is for measurements")
     check_new_file(out)
     if model is None:
-        _answer(config, write_file(_spectra_or_rssi(_read(config), reading(config.spectra, config.table)), out))
+        _answer(config, write_file(reading(config.spectra, config.table).spectra_of(_read(config)), out))
     else:
         found = RssiMap.predict(model, config.cell, config.height)
         _answer(config, write_file(found.receivers(config.rx) if config.rx else found, out))
@@ -85,10 +84,6 @@ def _read(config: ConvertConfig) -> Spectra | Snapshots | Rssi:
     return data
 
 
-def _spectra_or_rssi(data: Spectra | Snapshots | Rssi, options: ReadOptions) -> Spectra | Rssi:
-    return data.spectra(options.grid, options.beamformer or PHASE) if isinstance(data, Snapshots) else data
-
-
 def _write_directory(config: ConvertConfig) -> None:
     options = reading(config.spectra, config.table)
     with new_directory(Path(config.out), "a directory") as folder:
@@ -98,7 +93,7 @@ def _write_directory(config: ConvertConfig) -> None:
             data, found = _calibrated(data, config)
         for note in data.notes:
             console.print(f"{data.name}: {note}")
-        spectra = _spectra_or_rssi(data, options)
+        spectra = options.spectra_of(data)
         if isinstance(spectra, Rssi):
             write_rssi(spectra, folder)
             written = f"{len(spectra)} rows of RSSI at {len(spectra.receiver_names)} receivers"

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from swiftwrf import AngularGrid, InputError, Rssi, Spectra
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.data import ReadOptions, load_rssi, load_spectra
 from swiftwrf.data.archives import array_header, read_rows
+from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, ReadOptions, read
 from swiftwrf.data.receivers import spelled_as
 from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
 from swiftwrf.data.store import Store
@@ -34,7 +34,6 @@ def reading(spectra: SpectraSource, table: TableSource) -> ReadOptions:
         | {
             "array": _array(spectra),
             "arrays": pairs("arrays", spectra.arrays, "csi"),
-            "grid": AngularGrid.hemisphere(*spectra.grid) if spectra.grid else None,
             "columns": table.column_names,
             "filler": table.fillers,
             "offset_by": (options.get("offset_by") or "").partition("=")[0] or None,
@@ -71,7 +70,10 @@ def measured_rssi(data: str | None, table: TableSource) -> Rssi | None:
     Raises:
         InputError: RSSI that cannot be read.
     """
-    return None if data is None else load_rssi(located(data), **reading(SpectraSource(), table).given)
+    if data is None:
+        return None
+    found: Rssi = read(located(data), reading(SpectraSource(), table), RSSI_FORMATS)
+    return found
 
 
 def offset_notes(data: Rssi, table: OffsetSource) -> list[str]:
@@ -111,7 +113,7 @@ def observed_spectra(source: str, options: ReadOptions, grid: AngularGrid, model
     """
     known = None
     if not source.endswith(".npy"):
-        known = load_spectra(located(source), **options.given)
+        known = options.spectra_of(read(located(source), options, SPECTRA_FORMATS, SNAPSHOT_FORMATS))
     elif options.given:
         raise InputError(f"{source} holds spectra as they are; --{next(iter(options.given))} does not apply")
     store = Store(_read_array(Path(source))) if known is None else known.store

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.coordinates import Coordinates, Up
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, ReadOptions, read
@@ -59,10 +58,10 @@ def load_spectra(
         Traceback (most recent call last):
         swiftwrf.errors.InputError: nowhere is not a folder or file; expected measurements (formats: ...)
     """
-    options = locals().copy()
-    source, directions = options.pop("path"), None if grid is None else AngularGrid.of(grid)
-    data = read(source, ReadOptions(**options | {"grid": directions}), SPECTRA_FORMATS, SNAPSHOT_FORMATS)
-    return data.spectra(directions, beamformer or PHASE) if isinstance(data, Snapshots) else data
+    given = locals().copy()
+    source, options = given.pop("path"), ReadOptions(**given)
+    found: Spectra = options.spectra_of(read(source, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS))
+    return found
 
 
 def load_snapshots(path: str | Path, **options: Any) -> Snapshots:

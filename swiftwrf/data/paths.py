@@ -137,7 +137,7 @@ class PropagationPaths:
         self,
         name: str,
         array: PlanarArray | None = None,
-        grid: AngularGrid | None = None,
+        grid: AngularGrid | tuple[int, int] | None = None,
         *,
         subcarriers: int | None = None,
         bandwidth_hz: float | None = None,
@@ -148,7 +148,7 @@ class PropagationPaths:
         Args:
             name: Name of the data set.
             array: The array. Defaults to 4 x 4 elements at half a wavelength.
-            grid: Directions. Defaults to 90 x 360.
+            grid: Directions, or their numbers of elevations and azimuths. Defaults to 90 x 360.
             subcarriers: Number of frequencies at which the channel is kept. Defaults to spectra alone.
             bandwidth_hz: Distance of the first and the last of them [Hz].
             details: index, named_splits, source and notes of `Spectra`.
@@ -156,7 +156,7 @@ class PropagationPaths:
         Raises:
             InputError: An array for another carrier, spectra of too many pixels, or as `subcarriers`.
         """
-        grid = grid or GRID
+        grid = AngularGrid.of(grid or GRID)
         check_pixels(name, len(self.count), grid.shape)
         array, wavelength = array or PlanarArray.square(4, self.frequency_hz), LIGHT_SPEED / self.frequency_hz
         if abs(array.wavelength - wavelength) > 1e-3 * wavelength:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
 from swiftwrf.array.angles import AngularGrid
+from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.snapshots import Snapshots
@@ -42,7 +43,7 @@ class ReadOptions(TableOptions):
     array: PlanarArray | None = None
     arrays: Mapping[str, str] | None = None
     beamformer: str | None = None
-    grid: AngularGrid | None = None
+    grid: AngularGrid | tuple[PositiveInt, PositiveInt] | None = None
     every: PositiveInt | None = None
     station: PositiveInt | None = None
     subcarriers: PositiveInt | None = None
@@ -56,6 +57,10 @@ class ReadOptions(TableOptions):
         """Options that differ from their defaults, by name."""
         values = {field.name: (getattr(self, field.name), field.default) for field in fields(self)}
         return {name: value for name, (value, default) in values.items() if value != default}
+
+    def spectra_of(self, data: Any) -> Any:
+        """Return the spectra of array snapshots, and other data as they are."""
+        return data.spectra(self.grid, self.beamformer or PHASE) if isinstance(data, Snapshots) else data
 
 
 class Format(ABC, Generic[Data]):
