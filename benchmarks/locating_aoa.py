@@ -54,7 +54,7 @@ from swiftwrf.models.geometry.channels import coherence, field, waves
 KERNEL = "kernel_regression"
 MAX_DELAY_S = 100e-9  # of a packet
 WALL = Material("wall", 1.0, 9.0, 0.3)  # reflects -0.5 of the amplitude at normal incidence
-N_BOXES, N_POSITIONS = 6, 300
+N_BOXES, N_POSITIONS = 6, 1000
 Row = dict[str, Any]
 
 

@@ -121,6 +121,12 @@ def _entry_points(group: str, path: tuple[str, ...]) -> tuple[Any, ...]:
 
 
 def write_report(task: str, result: Any, file: str | Path) -> None:
-    """Write the report of a task's result by the package that writes reports, an entry point of `swiftwrf.reports`."""
-    (point,) = _entry_points("swiftwrf.reports", tuple(sys.path))
-    point.load()(task, result, Path(file))
+    """Write the report of a task's result by the entry point of the group `swiftwrf.reports`.
+
+    Raises:
+        InputError: The package is not installed, or was installed before it had this entry point.
+    """
+    points = _entry_points("swiftwrf.reports", tuple(sys.path))
+    if not points:
+        raise InputError("nothing here writes reports; install this package again: pip install -e .")
+    points[0].load()(task, result, Path(file))
