@@ -44,9 +44,9 @@ def channels() -> str:
             row = found["median"]
             error = [f"{row[key]['median']:.2g} / {row[key]['p90']:.2g}" for key in ("angle_deg", "position_m")]
             predicted = [
-                f"{row['channel'][name]['coherence']:.2f} / {row['channel'][name]['nmse_db']:+.1f}"
+                f"{own['coherence']:.2f}" + (f" / {own['nmse_db']:+.1f}" if "nmse_db" in own else "")
                 for name in ("nearest", "gaussian_process", "planes", "furniture")
-                if name in row["channel"]
+                if (own := row["channel"].get(name))
             ]
             what = [scene, f"{float(fraction):.0%}", name.split("_")[1], str(len(found["draws"]))]
             rows.append([*what, *error, f"{row['coverage_80']:.0%}", *predicted])
