@@ -144,6 +144,10 @@ def choose_model(
         if not any(field_model.supported({option: options[option]}) for field_model in types.values()):
             raise InputError(f"none of the candidates {', '.join(types)} has an option {option!r}; leave it out")
     fold, every_blind = blind_folds(measured, validation, seed)
+    if not every_blind:
+        raise InputError(
+            f"cross-validation of field models needs more than {MIN_TRAINING} measured spectra, got {len(measured)}"
+        )
     options |= {"validation": validation, "seed": seed}
     searched = [[model] for model in structures] or [list[tuple[FieldModel, float]]() for _ in every_blind]
     psnr_db: dict[str, float] = {}
@@ -186,12 +190,12 @@ def held_out(measured: Spectra, fold: Tensor, number: int) -> tuple[Spectra, Spe
 
 
 def blind_folds(measured: Spectra, validation: Validation, seed: int) -> tuple[Tensor, tuple[tuple[int, ...], ...]]:
-    """Return the fold of each spectrum, and the folds that each structure search leaves out."""
+    """Return the fold of each spectrum, and the folds that each structure search leaves out, none for too few spectra."""
     fold, n = folds(measured.position, validation, seed), len(measured)
     if all(len(without(fold, *blind)) >= MIN_TRAINING for blind in BLIND_FOLDS):
         return fold, BLIND_FOLDS
     if n <= MIN_TRAINING:
-        raise InputError(f"cross-validation of field models needs more than {MIN_TRAINING} measured spectra, got {n}")
+        return fold, ()
     number = max(FOLDS, math.ceil(n / (n - MIN_TRAINING)))
     return folds(measured.position, validation, seed, number), tuple((fold,) for fold in range(number))
 

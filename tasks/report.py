@@ -10,9 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from augment.turbo.results import TurboResult
 from swiftwrf import InputError
-from swiftwrf.rssi import RssiComparison
 from swiftwrf.runtime.durable import strict, write_json
 from tasks.aoa.experiment import record as aoa_record
 from tasks.aoa.page import page as aoa
@@ -54,13 +52,14 @@ def write(task: str, result: Any, file: Path) -> None:
     check_new_file(file)
     with TemporaryDirectory() as name:
         folder = Path(name)
-        if isinstance(result, TurboResult):
-            shutil.copytree(result.folder, folder, dirs_exist_ok=True)  # what the steps left for the report
-            metrics, source = aoa_record([result], folder), result.experiment.train.source
-        elif isinstance(result, RssiComparison):
-            metrics, source = rssi_record(result, folder), result.train.source
-        else:
-            metrics, source = locate_record(result, folder), result.split.train.source
+        match task:
+            case "aoa":
+                shutil.copytree(result.folder, folder, dirs_exist_ok=True)  # what the steps left for the report
+                metrics, source = aoa_record([result], folder), result.experiment.train.source
+            case "rssi":
+                metrics, source = rssi_record(result, folder), result.train.source
+            case _:
+                metrics, source = locate_record(result, folder), result.split.train.source
         write_json(folder / CONFIG, {"command": CALLS[task]})
         write_json(folder / ENVIRONMENT, environment(choose_device("cpu"), source))
         write_page(folder, replace(PAGES[task]([Records(folder, strict(metrics))]), alone=True))

@@ -14,7 +14,7 @@ from torch import Tensor
 from swiftwrf import AngularGrid, InputError, Rssi, Spectra
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.archives import array_header, read_rows
-from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, ReadOptions, read
+from swiftwrf.data.formats import RSSI_FORMATS, ReadOptions, read, read_spectra
 from swiftwrf.data.receivers import spelled_as
 from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
 from swiftwrf.data.store import Store
@@ -113,7 +113,7 @@ def observed_spectra(source: str, options: ReadOptions, grid: AngularGrid, model
     """
     known = None
     if not source.endswith(".npy"):
-        known = options.spectra_of(read(located(source), options, SPECTRA_FORMATS, SNAPSHOT_FORMATS))
+        known = read_spectra(located(source), options)
     elif options.given:
         raise InputError(f"{source} holds spectra as they are; --{next(iter(options.given))} does not apply")
     store = Store(_read_array(Path(source))) if known is None else known.store

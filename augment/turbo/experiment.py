@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
+from torch import Tensor
 
 from augment.choose import blind_folds, candidates
 from augment.cross_validation import LOCATOR, STAND_IN, CrossValidationMetrics
@@ -17,7 +18,6 @@ from augment.positions import SyntheticPositions
 from augment.turbo.condition import NETWORKS, MeasuredSubset, Training
 from swiftwrf.choices import AUTO
 from swiftwrf.data import Spectra
-from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import WINDOW
 from swiftwrf.models import FIELD_MODELS, FieldModel
@@ -113,12 +113,9 @@ class Experiment:
         """Return the measured spectra, and the positions of the others."""
         return withhold(self.train, subset.measured_fraction, self.seed + subset.repeat)
 
-    def blind_folds(self, subset: MeasuredSubset) -> list[tuple[int, ...]]:
-        """Return the folds of the measured spectra that each search for a room leaves out; empty for too few spectra."""
-        measured, _ = self.withhold(subset)
-        if len(measured) <= MIN_TRAINING:
-            return []
-        return list(blind_folds(measured, "random", self.seed + subset.repeat)[1])
+    def blind_folds(self, subset: MeasuredSubset) -> tuple[Tensor, tuple[tuple[int, ...], ...]]:
+        """Return the fold of each measured spectrum, and the folds that each search for a room leaves out."""
+        return blind_folds(self.withhold(subset)[0], "random", self.seed + subset.repeat)
 
     def trainings(self, validation: CrossValidationMetrics | None) -> list[tuple[Training, int]]:
         """Return the training sets with spectra of a field model, and their numbers of extra synthetic positions."""

@@ -7,6 +7,7 @@ from concurrent.futures import Executor
 from itertools import zip_longest
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from weakref import finalize
 
 import torch
 
@@ -80,9 +81,11 @@ def turbo_learning(
     experiment = Experiment(
         *data.split(split, seed), (measured,), models, estimators, extra, preset, repeats, seed, device, split
     )
+    if keep is not None:
+        return learn(experiment, keep, executor)[0]
     folder = TemporaryDirectory(prefix="swiftwrf-")
-    (result,) = learn(experiment, keep or Memo(Path(folder.name)), executor)
-    result.temporary = folder  # deleted with the result, which reads its files
+    (result,) = learn(experiment, Memo(Path(folder.name)), executor)
+    finalize(result, folder.cleanup)  # the result reads its files
     return result
 
 
@@ -116,9 +119,9 @@ def _learn(
     is_compared = bool(fast or not experiment.named)
     searches = ROOM_MODEL in experiment.candidates
     compared_models = [*experiment.candidates, *(fast or candidates(experiment.train))]
-    blind: list[tuple[int, ...]] = []
+    blind: tuple[tuple[int, ...], ...] = ()
     if is_compared and any(map(experiment.finds_room, compared_models)):
-        blind = experiment.blind_folds(subset)
+        _, blind = experiment.blind_folds(subset)
 
     def find(*some: int) -> str:
         return steps.start(room_name(subset, some), "finding the room", find_room, subset, some, first=True)

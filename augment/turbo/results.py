@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
@@ -62,7 +61,6 @@ class TurboResult:
 
     def __init__(self, experiment: Experiment, fraction: float, folder: Path) -> None:
         self.experiment, self.fraction, self.folder = experiment, fraction, folder
-        self.temporary: TemporaryDirectory[str] | None = None  # of `folder`, if nothing else keeps it
         self.compared: Row = {}  # comparison of the field models in the first repeat
         self.synthesized: list[tuple[Row, Row]] = []  # columns and values of each field model
         self.evaluated: list[tuple[Condition, Row]] = []

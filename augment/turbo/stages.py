@@ -10,7 +10,7 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from augment.choose import Fold, blind_folds, choose_model, held_out, without
+from augment.choose import Fold, choose_model, held_out, without
 from augment.cross_validation import (
     LOCATOR,
     STAND_IN,
@@ -100,7 +100,7 @@ def locate_held_out(experiment: Experiment, folder: Path, subset: MeasuredSubset
     """
     measured, _ = experiment.withhold(subset)
     seed = experiment.seed + subset.repeat
-    train, test = held_out(measured, blind_folds(measured, "random", seed)[0], number)
+    train, test = held_out(measured, experiment.blind_folds(subset)[0], number)
     if not room.get("planes"):
         return {"errors": None}
     try:
@@ -123,8 +123,7 @@ def find_room(experiment: Experiment, folder: Path, subset: MeasuredSubset, blin
     measured, _ = experiment.withhold(subset)
     name = room_name(subset, blind)
     if blind:
-        fold, _ = blind_folds(measured, "random", experiment.seed + subset.repeat)
-        measured = measured.subset(without(fold, *blind))
+        measured = measured.subset(without(experiment.blind_folds(subset)[0], *blind))
     began = time.perf_counter()
     try:
         model = experiment.make_model(ROOM_MODEL, subset.repeat).fit(measured, device=experiment.device, progress=True)

@@ -9,7 +9,7 @@ from typing import Any
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.coordinates import Coordinates, Up
-from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, ReadOptions, read
+from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, ReadOptions, read, read_spectra
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.snapshots import Snapshots
@@ -59,9 +59,7 @@ def load_spectra(
         swiftwrf.errors.InputError: nowhere is not a folder or file; expected measurements (formats: ...)
     """
     given = locals().copy()
-    source, options = given.pop("path"), ReadOptions(**given)
-    found: Spectra = options.spectra_of(read(source, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS))
-    return found
+    return read_spectra(given.pop("path"), ReadOptions(**given))
 
 
 def load_snapshots(path: str | Path, **options: Any) -> Snapshots:

@@ -143,8 +143,8 @@ class RssiPredictor(Configured, Displayed, ABC):
             FitError: The fit diverged.
         """
         pool = pool or train
-        useful = {*train.receiver_names, *(pool.receiver_names[c] for c in heard_often(pool).tolist())}
-        pool = pool.columns([c for c, name in enumerate(pool.receiver_names) if name in useful])
+        names = {*train.receiver_names, *(pool.receiver_names[c] for c in often_detected(pool).tolist())}
+        pool = pool.columns([c for c, name in enumerate(pool.receiver_names) if name in names])
         if (detected := int(train.detected.sum())) < MIN_TRAINING:
             raise InputError(
                 f"receivers {listed(train.receiver_names)} have {detected} training measurements in all; measure at least "
@@ -344,7 +344,7 @@ class SavedRssiPredictor(RssiPredictor, Saved):
         return predictor
 
 
-def heard_often(pool: Rssi) -> Tensor:
+def often_detected(pool: Rssi) -> Tensor:
     """Return the columns of receivers detected in 10 rows or more, int64; of all detected ones if there is none."""
     count = pool.detected.sum(dim=0)
     often = count >= MIN_TRAINING

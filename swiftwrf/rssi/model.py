@@ -24,7 +24,7 @@ from swiftwrf.models.base import CPU
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Axes
 from swiftwrf.positions import check_positions
-from swiftwrf.rssi.base import Map, RssiConfig, SavedRssiPredictor, columns_of, heard_often
+from swiftwrf.rssi.base import Map, RssiConfig, SavedRssiPredictor, columns_of, often_detected
 from swiftwrf.rssi.detection import Detection, DetectionField
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
 from swiftwrf.rssi.maps import RssiMap
@@ -137,7 +137,7 @@ class RssiModel(SavedRssiPredictor):
         The weights are those of all receivers: the few folds determine no weights for each of them. They follow from the
         receivers of the pool, so that a receiver's prediction is the same whichever others are fitted with it.
         """
-        some = pool.columns(subsample(heard_often(pool), rows=MAX_KERNEL_RECEIVERS)[0].tolist())
+        some = pool.columns(subsample(often_detected(pool), rows=MAX_KERNEL_RECEIVERS)[0].tolist())
         if set(some.receiver_names) <= set(train.receiver_names):
             predictors = predictors[:, :, columns_of(some.receiver_names, train)]
         else:

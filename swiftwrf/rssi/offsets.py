@@ -90,10 +90,10 @@ def estimate_floor_attenuation(data: Rssi) -> FloorAttenuation:
         raise InputError(f"{data.name} has no floors; give the table a column with the floor of each row")
     floor, rssi = data.floors.number(data.transmitter_position), data.rssi_dbm
     member = torch.nn.functional.one_hot(floor, len(data.floors.names)).double()
-    heard = member.T @ data.detected.double()  # rows of each floor that a receiver detected
+    count = member.T @ data.detected.double()  # rows of each floor that a receiver detected
     weak = rssi.nan_to_num(float(rssi[data.detected].min()))  # what was not received was weak
     mean = (member.T @ weak) / member.sum(dim=0)[:, None]
-    strongest = mean.where(heard >= heard.amax(dim=0).clamp(1, 3), -torch.inf).argmax(dim=0)
+    strongest = mean.where(count >= count.amax(dim=0).clamp(1, 3), -torch.inf).argmax(dim=0)
     own = data.floors.number(data.receiver_position.nan_to_num(0.0)).where(data.receiver_located, strongest)
     nearby = data.transmitter_position[rssi.nan_to_num(-torch.inf).topk(min(3, len(data)), dim=0).indices].mean(dim=0)
     receiver = data.receiver_position.where(data.receiver_located[:, None], nearby)

@@ -19,7 +19,7 @@ from torch.nn import functional
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.errors import FitError
 from swiftwrf.models.base import CPU
-from swiftwrf.rssi.base import Map, RssiConfig, heard_often
+from swiftwrf.rssi.base import Map, RssiConfig, often_detected
 from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
 from swiftwrf.rssi.mixing import check_comparable, interval_scale, rounding_std
 from swiftwrf.rssi.model import FIELD_ALONE, RssiModel
@@ -78,8 +78,8 @@ class RssiPaperModel(RssiModel):
         config, bins = self.config, binned(train, self.config)
         pool_rssi = bin_locations(pool, config.max_locations)[1]
         pool_residual = pool_rssi - pool_rssi.nanmean(dim=0)
-        judged = pool_residual[:, heard_often(pool)]
-        self.kernel = choose_residual_kernel(bins.position, judged, bins.fold, train.floors is not None)[0]
+        residual = pool_residual[:, often_detected(pool)]
+        self.kernel = choose_residual_kernel(bins.position, residual, bins.fold, train.floors is not None)[0]
         variance = (bins.rssi - bins.rssi.nanmean(dim=0)).square().nanmean(dim=0)
         variance = variance.nan_to_num(float(pool_residual.square().nanmean())).clamp_min(1e-6)
         prior_db = prior_std(variance, self.kernel)

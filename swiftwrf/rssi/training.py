@@ -11,7 +11,7 @@ from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
 from swiftwrf.gp import Kernel, candidates, held_out_errors, subsample
 from swiftwrf.positions import cells
-from swiftwrf.rssi.base import RssiConfig, columns_of, heard_often
+from swiftwrf.rssi.base import RssiConfig, columns_of, often_detected
 from swiftwrf.rssi.detection import Detection, empty_given
 from swiftwrf.rssi.head import Head, render
 from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_losses, log_distance
@@ -113,8 +113,8 @@ def prepare(
         held_out[:, out] = fit_baselines(~out, everything.detection)[1](distance[out])
     pool_residual = every - everything.own(log_distance(bins.position, receiver))
     if like is None:
-        judged = pool_residual[:, heard_often(pool)]
-        kernel, helps = choose_residual_kernel(bins.position, judged, fold, train.floors is not None)
+        residual = pool_residual[:, often_detected(pool)]
+        kernel, helps = choose_residual_kernel(bins.position, residual, fold, train.floors is not None)
         n_primitives = config.n_primitives if helps else 0
     else:
         kernel, n_primitives = like.kernel, like.n_primitives

@@ -14,7 +14,7 @@ from augment.turbo.results import TurboResult
 from swiftwrf import Spectra, make_model, simulated_room
 from swiftwrf.choices import RAYTRACE, fraction_key
 from swiftwrf.data.files import sha256
-from swiftwrf.data.formats import SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
+from swiftwrf.data.formats import read_spectra
 from swiftwrf.data.raytraced import sionna
 from swiftwrf.metrics import angle_errors
 from swiftwrf.models import FieldModel
@@ -131,6 +131,4 @@ def measurements(config: AoaConfig) -> Spectra:
     """
     if config.data is None:
         return simulated_room(seed=config.seed, moving=config.moving or "transmitter")
-    options = reading(config.spectra, TableSource())
-    found: Spectra = options.spectra_of(read(located(config.data), options, SPECTRA_FORMATS, SNAPSHOT_FORMATS))
-    return found
+    return read_spectra(located(config.data), reading(config.spectra, TableSource()))

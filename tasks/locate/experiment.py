@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from augment.suggest import suggest_positions
 from swiftwrf import Rssi, rssi_room
@@ -38,8 +37,7 @@ def localize(split: LocateSplit, folder: Path, trial: Trial, suggest: int) -> Ro
     if isinstance(localizer, PosteriorLocalizer) and trial.is_whole:
         locator = localizer.locator
         locator.save(folder / LOCATOR)
-        error = (values["estimate"] - values["truth"]).norm(dim=1)
-        write_npz(folder / MAPS, posterior_maps(locator, split.train, split.test, error))
+        write_npz(folder / MAPS, posterior_maps(locator, split, values))
         if suggest:
             found = suggest_positions(locator, split.train, suggest, split.seed)
             degrees = degree_columns(split.train.origin, found.position.numpy())
@@ -98,9 +96,7 @@ def record(result: LocateComparison, folder: Path) -> Row:
     train, offsets = split.train, split.train.offsets
     write_table(folder / "errors.csv", result.errors.to_dict("records"))
     if result.locator is not None:  # the step that fitted it in a run has written them
-        own = result.values[Trial("posterior")]
-        error = (own["estimate"] - own["truth"]).norm(dim=1)
-        write_npz(folder / MAPS, posterior_maps(result.locator, train, split.test, error))
+        write_npz(folder / MAPS, posterior_maps(result.locator, split, result.values[Trial("posterior")]))
     return {
         "task": "locate",
         "data": train.name,
@@ -135,8 +131,15 @@ def _studies(result: LocateComparison, by: str) -> list[Row]:
     ]
 
 
-def posterior_maps(locator: RssiLocator, train: Rssi, test: Rssi, error: Tensor) -> dict[str, Any]:
-    """Return the posteriors in plan of at most six test rows, from the smallest error (n,) [m] to the largest."""
+def posterior_maps(locator: RssiLocator, split: LocateSplit, values: Row) -> dict[str, Any]:
+    """Return the posteriors in plan of at most six test rows, from the smallest error to the largest.
+
+    Args:
+        locator: Locator of all training rows.
+        split: Training and test rows.
+        values: What `LocateSplit.fit` gave for it.
+    """
+    test, error = split.test, (values["estimate"] - values["truth"]).norm(dim=1)
     shown = error.argsort()[torch.linspace(0, len(error) - 1, min(N_MAPS, len(error))).round().long()]
     posterior = locator.locate(test.rssi_dbm[shown])
     plans = [posterior.in_plan(row) for row in range(len(posterior))]
@@ -148,5 +151,5 @@ def posterior_maps(locator: RssiLocator, train: Rssi, test: Rssi, error: Tensor)
         "truth": test.transmitter_position[shown].numpy(),
         "estimate": posterior.median.numpy(),
         "radius_80_m": posterior.credible_radius(0.8).numpy(),
-        "training_position": train.transmitter_position.numpy(),
+        "training_position": split.train.transmitter_position.numpy(),
     }

@@ -118,9 +118,15 @@ def record(result: RssiComparison, folder: Path, notes: Sequence[str] = ()) -> R
         result: Comparison, with the fitted model.
         folder: Folder of the files.
         notes: Further sentences on the data.
+
+    Raises:
+        InputError: The result has no fitted model.
     """
-    train, model = result.train, result.predictors[result.model]
-    assert isinstance(model, RssiModel | PairModel)
+    train, model = result.train, result.predictors.get(result.model)
+    if not isinstance(model, RssiModel | PairModel):
+        raise InputError(
+            "a report needs the fitted model, of which `keep` had the values alone; compare without `keep`"
+        )
     write_table(folder / "errors.csv", result.errors.to_dict("records"))
     write_table(folder / "predictions.csv", result.predictions.to_dict("records"))
     write_npz(folder / "maps.npz", _maps(model, train))

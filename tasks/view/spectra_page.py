@@ -153,6 +153,7 @@ class SpectraPage:
             entries.append((FIXED, "✕", "fixed end"))
         if any(loaded.planes for loaded in self._view.models):
             entries.append(("inherit", "━", "walls found, dashed where uncertain"))
+        if any(loaded.model.room is not None for loaded in self._view.models):
             entries.append((FIXED, "━", "strong paths, dotted where furniture hides them"))
         return entries
 
@@ -166,7 +167,7 @@ class SpectraPage:
         self._shown_measurement = -1
         self._measured.column.set_visibility(self._view.data is not None)
         self._locate.set_visibility(self._view.data is not None and self._model.locator_file is not None)
-        self._paths.set_visibility(bool(self._model.planes))
+        self._paths.set_visibility(self._model.model.room is not None)
         self._plan.show(self._background())
         self._request(dragging=False)
 

@@ -59,3 +59,14 @@ def test_predictions_are_those_of_the_models():
     estimator = augment.estimators.make_estimator("peak").fit(augment.Mixed.measured(spectra))
     assert len(swiftwrf.predict(estimator, spectra.store)) == 12
     assert swiftwrf.predict(estimator, spectra)["great_circle_deg"].between(0, 180).all()
+
+
+def test_a_report_without_the_fitted_model_is_refused(tmp_path):
+    data, kept = swiftwrf.rssi_room(n=60), {}
+
+    def keep(name, compute):
+        return kept.get(name) or kept.setdefault(name, compute()[1])
+
+    swiftwrf.rssi.compare(data, receivers=["6"], keep=keep)
+    with pytest.raises(InputError, match="needs the fitted model"):
+        swiftwrf.rssi.compare(data, receivers=["6"], keep=keep).report(tmp_path / "report.html")

@@ -137,3 +137,13 @@ def read(path: str | Path, options: ReadOptions, *registries: Registry[Format[An
         raise InputError(f"{error.filename or source} cannot be read ({reason})") from None
     array = getattr(data, "array", None)
     return data if array is None or array.axis is None else replace(data, notes=(*data.notes, LINEAR_ARRAY))
+
+
+def read_spectra(path: str | Path, options: ReadOptions) -> Spectra:
+    """Return the spectra in a folder or file, or those of its array snapshots.
+
+    Raises:
+        InputError: As `read`.
+    """
+    found: Spectra = options.spectra_of(read(path, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS))
+    return found
