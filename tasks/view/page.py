@@ -24,10 +24,16 @@ from tasks.view.locating import Located
 
 MAX_UPLOAD_BYTES, MAX_FRAME_BYTES = 2**25, 2**12  # of an image, and of the form around it
 MEDIAN, TRUTH = "#ffffff", "#66ccee"
-SET_OPTION = """(function set(left) {
-    const chart = getElement(%(id)d)?.chart;  // not there until the page is built
-    if (chart) chart.setOption(%(option)s); else if (left) setTimeout(set, 20, left - 1);
-})(1500)"""
+SHOW = """{
+    const component = getElement(%(id)d), option = %(option)s;
+    if (component) {  // else removed meanwhile
+        // the component draws its own options again when it is ready, which may be later
+        for (const layer of option.series)
+            Object.assign(component.options.series.find(({id}) => id === layer.id), layer);
+        if (option.visualMap) Object.assign(component.options.visualMap, option.visualMap);
+        component.chart?.setOption(option);
+    }
+}"""
 POINTER = """(event) => {
     const box = event.currentTarget.getBoundingClientRect();
     const at = [event.clientX - box.left, event.clientY - box.top];
@@ -103,7 +109,7 @@ class Chart:
         """Replace the data of layers by their names, and the colour bar."""
         option: Option = {"series": [{"id": name, "data": data} for name, data in layers.items()]}
         option |= {} if bar is None else {"visualMap": bar}
-        code = SET_OPTION % {"id": self.element.id, "option": json.dumps(option, allow_nan=False)}
+        code = SHOW % {"id": self.element.id, "option": json.dumps(option, allow_nan=False)}
         self.element.client.run_javascript(code)
 
 

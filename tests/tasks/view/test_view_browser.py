@@ -185,6 +185,9 @@ def has_views_models_and_keys(browser):
     from selenium.webdriver.common.keys import Keys
 
     rectangular = until(lambda: shown(browser, "measured"))
+    # the component may draw its options after their data came, if the browser is slow
+    browser.execute_script("for (const element of Object.values(mounted_app.$refs)) element.update_chart?.()")
+    assert shown(browser, "measured") == rectangular
     press(browser, "polar")
     until(lambda: shown(browser, "measured") not in (None, rectangular))
     assert find(browser, "#deviation").is_displayed()
