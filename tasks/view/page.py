@@ -30,7 +30,7 @@ SHOW = """{
         // the component draws its own options again when it is ready, which may be later
         for (const layer of option.series)
             Object.assign(component.options.series.find(({id}) => id === layer.id), layer);
-        if (option.visualMap) Object.assign(component.options.visualMap, option.visualMap);
+        if (option.visualMap) component.options.visualMap = {...component.options.visualMap, ...option.visualMap};
         component.chart?.setOption(option);
     }
 }"""
