@@ -47,7 +47,7 @@ STYLE: dict[str, Any] = {
 def panel(width: float, height: float) -> tuple[Figure, Axes]:
     """Return a figure of width x height inches in the style of the reports, and its axes."""
     with matplotlib.style.context(STYLE):
-        figure = Figure(figsize=(width, height), layout="constrained")
+        figure = Figure(figsize=(width, height), layout="compressed")
         return figure, figure.subplots()
 
 

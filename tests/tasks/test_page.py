@@ -167,6 +167,16 @@ def test_figures_of_constant_empty_and_single_values(values):
     assert all(figures.as_svg(figure).endswith("</svg>\n") for figure in drawn)
 
 
+def test_labels_of_a_plan_with_equal_scales_lie_inside_the_figure():
+    figure, plan = figures.panel(5.4, 4.2)
+    dots = plan.scatter([7348, 8348], [-7348, -6439], c=[0, 1])
+    plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    figures.colour_bar(plan, dots, "position error [m]", extend="max")
+    figures.as_svg(figure)
+    assert plan.get_tightbbox().x0 >= 0
+    assert figure.axes[1].get_tightbbox().x1 <= figure.bbox.width
+
+
 @pytest.mark.parametrize("repeats", [1, 3])
 def test_between_positions_on_a_line_is_inside_however_often_each_was_measured(repeats):
     known = np.repeat([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]], repeats, axis=0)
