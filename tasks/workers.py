@@ -135,6 +135,7 @@ def local_processes(number: int, folder: Path) -> Iterator[Workers]:
     try:
         yield Workers(pool, hold, lambda: number, torch.device("cpu"))
     except BrokenProcessPool:
+        pool.shutdown()  # its own thread reads exit codes, too, and each can be read once
         codes = filter(None, [process.exitcode for process in started.values()])
         # the pool terminates the other processes
         code = min(codes, key=lambda code: (code != -signal.SIGKILL, code == -signal.SIGTERM), default=0)

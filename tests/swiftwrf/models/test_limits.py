@@ -32,8 +32,8 @@ def test_field_models_do_not_depend_on_the_origin(room, small_published, name):
         with small.known_planes(floor) if name == "hybrid" else small.glances():
             predicted.append(FIELD_MODELS[name]().fit(moved(train, shift)).predict(test.position + shift).mean)
     # positions at 1e7 m are rounded to 2e-9 m. Two networks that train against each other amplify it,
-    # and so do path gains.
-    torch.testing.assert_close(*predicted, atol={"dcgan": 2e-2, "hybrid": 5e-3}.get(name, 2e-3), rtol=0)
+    # and so do path gains, on processors without AVX-512 to 6e-3.
+    torch.testing.assert_close(*predicted, atol={"dcgan": 2e-2, "hybrid": 1e-2}.get(name, 2e-3), rtol=0)
 
 
 @pytest.mark.parametrize("name", [name for name in RSSI_PREDICTORS if name != "swiftwrf"])
