@@ -14,6 +14,7 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 from unittest.mock import patch
 
@@ -27,6 +28,7 @@ from swiftwrf.models.prediction import Prediction
 from swiftwrf.rssi import LEVEL, RssiModel
 from swiftwrf.rssi.comparison import compare
 from swiftwrf.rssi.head import DB_PER_UNIT, Head, render
+from swiftwrf.runtime.steps import Memo
 
 RESULT = "rssi"
 SPLITS = {
@@ -82,13 +84,11 @@ def splits(names: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]:
 def measure(data: Rssi, split: str, also: tuple[str, ...] = ()) -> Row:
     """Return errors, differences to the best baseline, coverage of intervals and seconds of every predictor on a split."""
     result = compare(data, split=split, also=also)
-    with patch("swiftwrf.rssi.training.render", in_phase):
-        identity = compare(
-            data,
-            split=split,
-            also=also,
-            keep=lambda name, compute: compute()[1] if name == RssiModel.name else result.values[name],
-        )
+    with TemporaryDirectory() as folder, patch("swiftwrf.rssi.training.render", in_phase):
+        others = Memo(Path(folder))
+        for name in result.values.keys() - {RssiModel.name, result.model}:
+            others.keep(name, result.values[name], 0.0)
+        identity = compare(data, split=split, also=also, keep=others)
     result = replace(result, values={**result.values, IDENTITY: identity.values[RssiModel.name]})
     median = {name: values["median_db"] for name, values in result.values.items()}
     best = min((name for name in median if name not in OWN), key=lambda name: median[name])

@@ -11,7 +11,6 @@ import secrets
 import shlex
 import shutil
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from os.path import isfile  # unlike Path.is_file, it is False for names that are too long
@@ -23,11 +22,11 @@ from filelock import FileLock, Timeout
 
 from swiftwrf import InputError
 from swiftwrf.runtime.durable import rename, strict, write_json
-from swiftwrf.runtime.steps import STEPS, Memo
+from swiftwrf.runtime.steps import LOCATOR, MODEL, STEPS, Memo
 from swiftwrf.runtime.threads import set_threads
 from tasks.environment import environment, invocation, now, number_of_processes, stamp
 from tasks.options import plain
-from tasks.records import CONFIG, ENVIRONMENT, LOCATOR, METRICS, MODEL, PARTIAL, Row, read_json
+from tasks.records import CONFIG, ENVIRONMENT, METRICS, PARTIAL, Row, read_json
 from tasks.terminal import terminal
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # errors of file systems without locks
@@ -261,24 +260,6 @@ class Run(Memo):
     def write_json(self, name: str, content: Any) -> None:
         """Write strict JSON: nan and infinity become null."""
         write_json(self.path(name), content)
-
-    def step(self, name: str, title: str, compute: Callable[[], Row]) -> Row:
-        """Return the plain values of `compute`, which is called once, also over a resumed run.
-
-        Args:
-            name: Key of the kept result.
-            title: What is computed, for the terminal.
-            compute: Computes the values.
-
-        Raises:
-            InputError: The kept result is damaged.
-        """
-        value = self.kept(name)
-        if value is None:
-            self.begin(name, title)
-            began = time.perf_counter()
-            value = self.keep(name, compute(), time.perf_counter() - began)
-        return value
 
     def expect(self, steps: int) -> None:
         terminal.expect(steps)

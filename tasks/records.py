@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 CONFIG, ENVIRONMENT, METRICS = "config.json", "environment.json", "metrics.json"  # files of a run
-MODEL, LOCATOR = "model.safetensors", "locator.safetensors"  # its fitted RSSI models
 PARTIAL = ".partial"  # suffix of a run that is not finished
 NAMES = (  # columns of text, even if a cell reads NA, 1 or 12:34
     "method",

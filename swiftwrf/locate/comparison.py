@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -23,7 +25,9 @@ from swiftwrf.locate.baselines import LEVELS, LOCALIZERS, Localizer, PosteriorLo
 from swiftwrf.locate.rssi import RssiLocator
 from swiftwrf.metrics import ErrorSummary, method_summary, summary
 from swiftwrf.rssi import estimate_offsets
+from swiftwrf.runtime.checkpoint import load
 from swiftwrf.runtime.registry import write_report
+from swiftwrf.runtime.steps import LOCATOR, Memo, Steps
 from swiftwrf.runtime.validation import checked
 
 MIN_ROWS = 20  # training rows that a receiver detected: five folds, of which four hold at least 10 rows
@@ -284,6 +288,8 @@ def compare(
     seed: int = 0,
     n_cells: int = 4000,
     reference: str | None = None,
+    keep: Memo | None = None,
+    executor: Executor | None = None,
 ) -> LocateComparison:
     """Fit every localizer to the training rows of a split, and locate the test rows.
 
@@ -296,6 +302,8 @@ def compare(
         seed: Seed of everything random.
         n_cells: Number of candidate positions of the posterior.
         reference: Group whose offset is 0. Defaults to the most frequent one.
+        keep: Results by the names of steps, in a folder. A call with the same data and options continues after them.
+        executor: Processes that compute steps side by side, e.g. a `ProcessPoolExecutor`.
 
     Raises:
         InputError: Receivers that move, unknown receivers or split, or too few rows that a receiver detected.
@@ -307,9 +315,19 @@ def compare(
         True
     """
     measured = LocateSplit.of(data.receivers(receivers), split, n_cells, seed, reference)
-    values, locator = {}, None
-    for trial in measured.trials():
-        localizer, values[trial] = measured.fit(trial)
-        if isinstance(localizer, PosteriorLocalizer) and trial.is_whole:
-            locator = localizer.locator
-    return LocateComparison(measured, values, locator)
+    with TemporaryDirectory(prefix="swiftwrf-") as folder:
+        memo = keep or Memo(Path(folder))
+        steps = Steps(measured, memo, executor)
+        started = {trial: steps.start(trial.name, trial.title, _locate, trial) for trial in measured.trials()}
+        values = {trial: steps[name] for trial, name in started.items()}
+        locator = load(memo.folder / LOCATOR)
+        assert isinstance(locator, RssiLocator)
+        return LocateComparison(measured, values, locator)
+
+
+def _locate(split: LocateSplit, folder: Path, trial: Trial) -> Values:
+    """Return the values of a trial. The locator of all training rows is saved in a folder."""
+    localizer, values = split.fit(trial)
+    if isinstance(localizer, PosteriorLocalizer) and trial.is_whole:
+        localizer.locator.save(folder / LOCATOR)
+    return values

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -22,17 +23,18 @@ from swiftwrf.errors import InputError
 from swiftwrf.metrics import method_summary
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import distance, nearest
-from swiftwrf.rssi.base import Map, RssiPredictor
+from swiftwrf.rssi.base import RssiPredictor
 from swiftwrf.rssi.mixing import LEVEL
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.offsets import estimate_offsets
 from swiftwrf.rssi.pairs import PairModel
 from swiftwrf.rssi.paper import RssiPaperModel
+from swiftwrf.runtime.checkpoint import Saved, load
 from swiftwrf.runtime.registry import write_report
+from swiftwrf.runtime.steps import MODEL, Memo
 from swiftwrf.runtime.validation import Fraction, Preset, checked
 
 Values = dict[str, Any]
-Keep = Callable[[str, Callable[[], tuple[RssiPredictor | None, Values]]], Values]
 
 
 @checked
@@ -91,7 +93,7 @@ class RssiComparison:
             `detection` are the shares of detected and of empty test cells that are predicted as such, or None. Predictors
             without primitives have 0 `n_primitives`.
         left_out: Reason for each predictor that the data do not suffice for.
-        predictors: Fitted predictors by name, without those whose values `keep` had.
+        predictors: Fitted predictors by name. Of those whose values `keep` had, the model alone.
         by_rows: Mean absolute errors [dB] of the model and of "knn" by the number of training rows, a column for each.
         options: The split, the preset and the seed.
 
@@ -215,8 +217,8 @@ def compare(
     validation: Validation | Literal["auto"] = "auto",
     fewer: Sequence[Fraction] = (),
     device: torch.device | str = "cpu",
-    parallel: Map | None = None,
-    keep: Keep | None = None,
+    keep: Memo | None = None,
+    executor: Executor | None = None,
     progress: bool = False,
 ) -> RssiComparison:
     """Fit every predictor to the training rows of a split, and predict the test rows.
@@ -233,9 +235,9 @@ def compare(
         validation: Folds that choose all settings: "random", "block" or "session". Defaults to those like the test rows.
         fewer: Fractions of the training rows that the model and "knn" are fitted to, too, e.g. (0.25, 0.5).
         device: Device to compute on.
-        parallel: Function that maps a picklable fit over receivers as `map` does.
-        keep: Memo `keep(name, compute)`, which returns the values that it has under a name, or the second item of
-            `compute()`. The first item is the fitted predictor. Defaults to no memo.
+        keep: Results by the names of predictors, in a folder, and the model. A call with the same data and options
+            continues after them.
+        executor: Processes that fit receivers side by side, e.g. a `ProcessPoolExecutor`.
         progress: Show a progress bar on a terminal.
 
     Raises:
@@ -259,9 +261,16 @@ def compare(
     kind = train.validation_for(split, test) if validation == "auto" else validation
     options: Values = {"validation": kind, "seed": seed, "new_places": split == PLACE, "not_detected": not_detected}
     names, left_out = compared(chosen, also)
-    predictors: dict[str, RssiPredictor] = {}
+    own, predictors = model_of(train), dict[str, RssiPredictor]()
+    if keep is not None:
+        keep.expect(sum(not keep.holds(name) for name in [*names, *(["fewer rows"] * bool(fewer))]))
 
-    def compute(name: str, rows: Tensor | None = None) -> tuple[RssiPredictor, Values]:
+    parallel = None if executor is None else executor.map
+
+    def step(name: str, compute: Callable[[], Values]) -> Values:
+        return compute() if keep is None else keep.step(name, name, compute)
+
+    def compute(name: str, rows: Tensor | None = None) -> Values:
         predictor = make_predictor(name, preset, **options)
         part, every = (train, pool) if rows is None else (train.subset(rows), pool.subset(rows))
         began = time.perf_counter()
@@ -272,6 +281,8 @@ def compare(
         found = None  # shares of detected and of empty test cells that are predicted as such, if there are both kinds
         if rows is None:
             predictors[name], detected = predictor, test.detected
+            if keep is not None and name == own and isinstance(predictor, Saved):
+                predictor.save(keep.folder / MODEL)
             if predictor.detection is not None and not bool(detected.all()) and not test.receiver_moves:
                 above = predictor.predict_detection(test.transmitter_position, offset) > 0.5
                 found = float(above[detected].double().mean()), float((~above)[~detected].double().mean())
@@ -279,20 +290,23 @@ def compare(
         error = (prediction.mean + offset - test.rssi_dbm)[test.detected].abs()
         values = {"predicted": prediction.mean[test.detected], "std": std, "median_db": float(error.quantile(0.5))}
         values["mean_db"] = float(error.mean())
-        return predictor, seconds | values | {"detection": found, "n_primitives": getattr(predictor, "n_primitives", 0)}
+        return seconds | values | {"detection": found, "n_primitives": getattr(predictor, "n_primitives", 0)}
 
-    keep = keep or (lambda name, compute: compute()[1])
-    values = {name: keep(name, partial(compute, name)) for name in names}
+    values = {name: step(name, partial(compute, name)) for name in names}
+    if keep is not None and own not in predictors:
+        model = load(keep.folder / MODEL)
+        assert isinstance(model, RssiModel | PairModel)
+        predictors[own] = model
     order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))
     parts = [order[: round(fraction * len(train))].sort().values for fraction in fewer]
     parts = [rows for rows in parts if int(train.detected[rows].sum(dim=0).min()) >= MIN_TRAINING]
-    studied = [name for name in (model_of(train), "knn") if name in names]
+    studied = [name for name in (own, "knn") if name in names]
 
-    def study() -> tuple[None, Values]:
-        less = {str(len(rows)): {name: compute(name, rows)[1]["mean_db"] for name in studied} for rows in parts}
-        return None, less | {str(len(train)): {name: values[name]["mean_db"] for name in studied}}
+    def study() -> Values:
+        less = {str(len(rows)): {name: compute(name, rows)["mean_db"] for name in studied} for rows in parts}
+        return less | {str(len(train)): {name: values[name]["mean_db"] for name in studied}}
 
-    by_rows = DataFrame.from_dict(keep("fewer rows", study) if fewer else {}, orient="index")
+    by_rows = DataFrame.from_dict(step("fewer rows", study) if fewer else {}, orient="index")
     by_rows = by_rows.set_index(by_rows.index.astype(int)).rename_axis("n_train")
     used = {"split": split, "preset": preset, "seed": seed}
     return RssiComparison(train, test, values, left_out, predictors, by_rows, used)

@@ -15,6 +15,7 @@ from swiftwrf.errors import InputError
 from swiftwrf.runtime.durable import strict, write_json
 
 STEPS = "steps"  # folder, beside the results, of kept values and of files that only later steps read
+MODEL, LOCATOR = "model.safetensors", "locator.safetensors"  # fitted models of RSSI, among the results
 POLL_S = 2  # between two checks that there are workers
 
 Row = dict[str, Any]
@@ -64,6 +65,24 @@ class Memo:
         plain: Row = strict(value)
         write_json(self.folder / STEPS / f"{name}.json", {"value": plain, "seconds": seconds})
         return plain
+
+    def step(self, name: str, title: str, compute: Callable[[], Row]) -> Row:
+        """Return the plain values of `compute`, which is called once, also over calls that continue.
+
+        Args:
+            name: Key of the kept result.
+            title: What is computed, in words.
+            compute: Computes the values.
+
+        Raises:
+            InputError: The kept result is damaged.
+        """
+        value = self.kept(name)
+        if value is None:
+            self.begin(name, title)
+            began = time.perf_counter()
+            value = self.keep(name, compute(), time.perf_counter() - began)
+        return value
 
     def expect(self, steps: int) -> None:
         """Take notice of further steps."""

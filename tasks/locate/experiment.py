@@ -6,44 +6,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from augment.suggest import suggest_positions
 from swiftwrf import Rssi, rssi_room
 from swiftwrf.data.coordinates import degree_columns
-from swiftwrf.locate import RssiLocator
-from swiftwrf.locate.baselines import PosteriorLocalizer
-from swiftwrf.locate.comparison import LocateComparison, LocateSplit, Trial
+from swiftwrf.locate.comparison import LocateComparison, Trial, compare
 from swiftwrf.runtime.durable import write_npz
-from swiftwrf.runtime.steps import Steps
 from tasks.configs import LocateConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
-from tasks.locate.page import SUGGESTED, answer, page
+from tasks.locate.page import OWN, SUGGESTED, answer, page
 from tasks.page.page import finish
 from tasks.page.shared import write_suggestion
-from tasks.records import LOCATOR, Row, write_table
+from tasks.records import Row, write_table
 from tasks.source import measured_rssi, split_notes
 from tasks.terminal import console, terminal
 from tasks.workers import connected, workers_of
 
 MAPS = "maps.npz"  # posteriors of some test rows
 N_MAPS = 6  # test rows with a posterior map
-
-
-def localize(split: LocateSplit, folder: Path, trial: Trial, suggest: int) -> Row:
-    """Fit the localizer of a trial and locate the test rows; suggest a number of positions for the next measurements."""
-    localizer, values = split.fit(trial)
-    if isinstance(localizer, PosteriorLocalizer) and trial.is_whole:
-        locator = localizer.locator
-        locator.save(folder / LOCATOR)
-        write_npz(folder / MAPS, posterior_maps(locator, split, values))
-        if suggest:
-            found = suggest_positions(locator, split.train, suggest, split.seed)
-            degrees = degree_columns(split.train.origin, found.position.numpy())
-            measured = split.train.transmitter_position
-            write_suggestion(folder / SUGGESTED, measured, found.position, found.variance, degrees)
-    return values
 
 
 def run(config: LocateConfig, resume: Path | None = None) -> None:
@@ -56,24 +37,32 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
     data = measurements(config)
     for note in data.notes:
         console.print(f"{data.name}: {note}")
-    measured = LocateSplit.of(data, config.split, config.cells, config.seed, config.table.reference)
-    if measured.n_undetected:
-        console.print(f"{data.name}: test rows that no receiver detected are left out: {measured.n_undetected}")
-    if measured.train.offsets is not None:
-        console.print(f"{data.name}: {measured.train.offsets.note()}")
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"
     with (
         connected(config.scheduler, device) as cluster,
         Run("locate", config.out, label, config, device, data.source, resume, described=_described) as directory,
     ):
         with workers_of(directory, cluster) as workers, terminal.progress():
-            steps = Steps(measured, directory, workers)
-            started = {
-                trial: steps.start(trial.name, trial.title, localize, trial, config.suggest)
-                for trial in measured.trials()
-            }
-            values = {trial: steps[name] for trial, name in started.items()}
-        finish(directory, record(LocateComparison(measured, values), directory.folder), page, answer)
+            result = compare(
+                data,
+                split=config.split,
+                seed=config.seed,
+                n_cells=config.cells,
+                reference=config.table.reference,
+                keep=directory,
+                executor=workers,
+            )
+        split, train = result.split, result.split.train
+        if split.n_undetected:
+            console.print(f"{data.name}: test rows that no receiver detected are left out: {split.n_undetected}")
+        if train.offsets is not None:
+            console.print(f"{data.name}: {train.offsets.note()}")
+        if config.suggest and result.locator is not None:
+            found = suggest_positions(result.locator, train, config.suggest, split.seed)
+            degrees = degree_columns(train.origin, found.position.numpy())
+            measured = train.transmitter_position
+            write_suggestion(directory.path(SUGGESTED), measured, found.position, found.variance, degrees)
+        finish(directory, record(result, directory.folder), page, answer)
 
 
 def _described(value: Row) -> str:
@@ -95,8 +84,7 @@ def record(result: LocateComparison, folder: Path) -> Row:
     split = result.split
     train, offsets = split.train, split.train.offsets
     write_table(folder / "errors.csv", result.errors.to_dict("records"))
-    if result.locator is not None:  # the step that fitted it in a run has written them
-        write_npz(folder / MAPS, posterior_maps(result.locator, split, result.values[Trial("posterior")]))
+    write_npz(folder / MAPS, posterior_maps(result))
     return {
         "task": "locate",
         "data": train.name,
@@ -113,7 +101,7 @@ def record(result: LocateComparison, folder: Path) -> Row:
         "n_undetected": split.n_undetected,
         "overall": result.overall,
         "calibration": {str(level): fraction for level, fraction in result.coverage.items()},
-        "weights": result.values[Trial("posterior")]["weights"],
+        "weights": result.values[Trial(OWN)]["weights"],
         "by_rows": _studies(result, "rows"),
         "by_receivers": _studies(result, "receivers"),
     }
@@ -131,17 +119,13 @@ def _studies(result: LocateComparison, by: str) -> list[Row]:
     ]
 
 
-def posterior_maps(locator: RssiLocator, split: LocateSplit, values: Row) -> dict[str, Any]:
-    """Return the posteriors in plan of at most six test rows, from the smallest error to the largest.
-
-    Args:
-        locator: Locator of all training rows.
-        split: Training and test rows.
-        values: What `LocateSplit.fit` gave for it.
-    """
-    test, error = split.test, (values["estimate"] - values["truth"]).norm(dim=1)
-    shown = error.argsort()[torch.linspace(0, len(error) - 1, min(N_MAPS, len(error))).round().long()]
-    posterior = locator.locate(test.rssi_dbm[shown])
+def posterior_maps(result: LocateComparison) -> dict[str, Any]:
+    """Return the posteriors in plan of at most six test rows, from the smallest error to the largest."""
+    assert result.locator is not None
+    test, errors = result.split.test, result.errors
+    order = errors.loc[errors["method"] == OWN, "position_error_m"].to_numpy().argsort()
+    shown = order[np.linspace(0, len(order) - 1, min(N_MAPS, len(order))).round().astype(int)]
+    posterior = result.locator.locate(test.rssi_dbm[shown])
     plans = [posterior.in_plan(row) for row in range(len(posterior))]
     return {
         "x": plans[0].x,
@@ -151,5 +135,5 @@ def posterior_maps(locator: RssiLocator, split: LocateSplit, values: Row) -> dic
         "truth": test.transmitter_position[shown].numpy(),
         "estimate": posterior.median.numpy(),
         "radius_80_m": posterior.credible_radius(0.8).numpy(),
-        "training_position": split.train.transmitter_position.numpy(),
+        "training_position": result.split.train.transmitter_position.numpy(),
     }

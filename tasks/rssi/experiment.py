@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from swiftwrf import InputError, Rssi, load, rssi_room
+from swiftwrf import InputError, Rssi, rssi_room
 from swiftwrf.data.files import sha256
 from swiftwrf.metrics import summary
-from swiftwrf.rssi import LEVEL, PairModel, RssiComparison, RssiModel, RssiPredictor, compare
-from swiftwrf.rssi.comparison import compared, model_of
+from swiftwrf.rssi import LEVEL, PairModel, RssiComparison, RssiModel, compare
+from swiftwrf.rssi.comparison import compared
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.runtime.durable import write_npz
 from tasks.configs import RssiTaskConfig
@@ -22,7 +21,7 @@ from tasks.directory import Run
 from tasks.environment import choose_device
 from tasks.page.maps import FloorPlan, read_pixels
 from tasks.page.page import finish
-from tasks.records import MODEL, Row, write_table
+from tasks.records import Row, write_table
 from tasks.rssi.page import answer, page
 from tasks.source import measured_rssi, offset_notes, split_notes
 from tasks.terminal import console, terminal
@@ -44,8 +43,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     plan = _read_floor_plan(config, data)
     for note in data.notes:
         console.print(f"{data.name}: {note}")
-    names, left_out = compared(data, config.also)
-    for reason in left_out.values():
+    for reason in compared(data, config.also)[1].values():
         console.print(f"left out: {reason}")
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"
     source = data.source | ({"floor plan": sha256(Path(config.floor_plan))} if config.floor_plan else {})
@@ -53,21 +51,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         connected(config.scheduler, device) as cluster,
         Run("rssi", config.out, label, config, device, source, resume, described=_described) as directory,
     ):
-
-        def keep(name: str, compute: Callable[[], tuple[RssiPredictor | None, Row]]) -> Row:
-            if name == "fewer rows":
-                return directory.step(name, name, lambda: compute()[1])
-
-            def saved() -> Row:
-                predictor, value = compute()
-                if isinstance(predictor, RssiModel | PairModel) and name == model_of(data):
-                    predictor.save(directory.path(MODEL))
-                return value
-
-            return directory.step(name, name, saved)
-
         with terminal.progress():
-            terminal.expect(sum(not directory.holds(name) for name in (*names, "fewer rows")))
             result = compare(
                 whole,
                 receivers=config.rx,
@@ -80,20 +64,17 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
                 reference=config.table.reference,
                 fewer=FEWER,
                 device=device,
-                parallel=cluster.map if cluster else None,
-                keep=keep,
+                keep=directory,
+                executor=cluster,
                 progress=True,
             )
         directory.computed_on(cluster.machines if cluster else ())
-        model = load(directory.path(MODEL))
-        assert isinstance(model, RssiModel | PairModel)
         if result.train.offsets is not None:
             console.print(f"{data.name}: {result.train.offsets.note()}")
-        if model.detection is not None:
-            console.print(f"{data.name}: {model.detection.note(data.receiver_names)}")
+        if (detection := result.predictors[result.model].detection) is not None:
+            console.print(f"{data.name}: {detection.note(data.receiver_names)}")
         if plan is not None:
             plan.save(directory.folder)
-        result = replace(result, predictors={result.model: model})
         finish(directory, record(result, directory.folder, offset_notes(data, config.table)), page, answer)
 
 
@@ -115,18 +96,12 @@ def record(result: RssiComparison, folder: Path, notes: Sequence[str] = ()) -> R
     """Write the tables and maps of a result into a folder, and return the content of metrics.json.
 
     Args:
-        result: Comparison, with the fitted model.
+        result: Comparison.
         folder: Folder of the files.
         notes: Further sentences on the data.
-
-    Raises:
-        InputError: The result has no fitted model.
     """
-    train, model = result.train, result.predictors.get(result.model)
-    if not isinstance(model, RssiModel | PairModel):
-        raise InputError(
-            "a report needs the fitted model, of which `keep` had the values alone; compare without `keep`"
-        )
+    train, model = result.train, result.predictors[result.model]
+    assert isinstance(model, RssiModel | PairModel)
     write_table(folder / "errors.csv", result.errors.to_dict("records"))
     write_table(folder / "predictions.csv", result.predictions.to_dict("records"))
     write_npz(folder / "maps.npz", _maps(model, train))

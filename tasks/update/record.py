@@ -15,11 +15,12 @@ from swiftwrf.online import Step
 from swiftwrf.positions import nearest
 from swiftwrf.runtime.checkpoint import refusing
 from swiftwrf.runtime.durable import write_json, write_text
+from swiftwrf.runtime.steps import MODEL
 from tasks.answer import NextStep
 from tasks.environment import command
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table
-from tasks.records import MODEL, Row, as_table, from_text, read_json
+from tasks.records import Row, as_table, from_text, read_json
 
 TABLE, SUMMARY = "measurements.csv", "update.json"
 COLUMNS = (

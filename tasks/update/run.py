@@ -19,12 +19,13 @@ from swiftwrf.online import Follower
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime import checkpoint
 from swiftwrf.runtime.durable import write_json
+from swiftwrf.runtime.steps import MODEL
 from tasks.configs import UpdateConfig
 from tasks.directory import Claim, begun, new_directory, unchanged_environment
 from tasks.environment import environment, invocation
 from tasks.options import plain
 from tasks.page.page import write_page
-from tasks.records import CONFIG, ENVIRONMENT, MODEL
+from tasks.records import CONFIG, ENVIRONMENT
 from tasks.source import aligned, located, reading
 from tasks.terminal import console, terminal
 from tasks.update.lines import answer, check_source, lines, measurement

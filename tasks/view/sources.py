@@ -21,11 +21,12 @@ from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import Plane
 from swiftwrf.rssi.base import RssiPredictor
 from swiftwrf.runtime.checkpoint import Saved, refusing
+from swiftwrf.runtime.steps import LOCATOR, MODEL
 from tasks.aoa.experiment import measurements as spectra_of
 from tasks.command_line import parse
 from tasks.configs import AoaConfig, LocateConfig
 from tasks.locate.experiment import measurements as rssi_of
-from tasks.records import CONFIG, ENVIRONMENT, LOCATOR, MODEL, Row, read_json
+from tasks.records import CONFIG, ENVIRONMENT, Row, read_json
 from tasks.view.followed import FollowedView
 from tasks.view.locating import RssiLocating
 from tasks.view.rssi import RssiView, rows_of_model, rows_of_run

@@ -1,10 +1,15 @@
 """Results of the library, which need no directory, process or terminal."""
 
+from functools import partial
+from unittest import mock
+
+import pandas as pd
 import pytest
 
 import augment
 import swiftwrf
 from swiftwrf import AngularGrid, InputError
+from swiftwrf.runtime.steps import Memo
 
 
 def turbo():
@@ -61,12 +66,11 @@ def test_predictions_are_those_of_the_models():
     assert swiftwrf.predict(estimator, spectra)["great_circle_deg"].between(0, 180).all()
 
 
-def test_a_report_without_the_fitted_model_is_refused(tmp_path):
-    data, kept = swiftwrf.rssi_room(n=60), {}
-
-    def keep(name, compute):
-        return kept.get(name) or kept.setdefault(name, compute()[1])
-
-    swiftwrf.rssi.compare(data, receivers=["6"], keep=keep)
-    with pytest.raises(InputError, match="needs the fitted model"):
-        swiftwrf.rssi.compare(data, receivers=["6"], keep=keep).report(tmp_path / "report.html")
+@pytest.mark.parametrize("compare", [swiftwrf.rssi.compare, partial(swiftwrf.locate.compare, n_cells=300)])
+def test_a_comparison_continues_after_its_kept_results(tmp_path, compare):
+    data = swiftwrf.rssi_room(n=80)
+    first = compare(data, receivers=["1", "6", "12"], keep=Memo(tmp_path))
+    with mock.patch.object(Memo, "begin", side_effect=AssertionError("nothing is computed again")):
+        again = compare(data, receivers=["1", "6", "12"], keep=Memo(tmp_path))
+    pd.testing.assert_frame_equal(again.errors, first.errors)
+    again.report(tmp_path / "report.html")

@@ -18,8 +18,8 @@ from swiftwrf.data.writing import write_spectra
 from swiftwrf.locate import MatchedField
 from swiftwrf.locate.baselines import LEVELS, LOCALIZERS, RegressedCoordinates
 from swiftwrf.locate.comparison import LocateSplit, Trial, compare
+from swiftwrf.runtime.steps import LOCATOR as MODEL
 from tasks.predict import read_rssi
-from tasks.records import LOCATOR as MODEL
 from tasks.source import aligned
 
 GRID = AngularGrid.hemisphere(8, 32)
