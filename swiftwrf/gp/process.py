@@ -371,15 +371,18 @@ def held_out_errors(precision: Tensor, dual: Tensor, out: Tensor) -> Tensor:
     5.12).
 
     Args:
-        precision: Inverse covariance P of the noisy values (n, n).
-        dual: P @ y, (n, ...).
+        precision: Inverse covariance P of the noisy values (..., n, n), of one kernel or of several.
+        dual: P @ y, (..., n, m).
         out: Numbers g of the rows that are held out, (o,).
+
+    Returns:
+        Errors (..., o, m).
 
     Example:
         >>> position = torch.linspace(0, 1, 9, dtype=torch.float64)[:, None] * torch.ones(3)
         >>> precision = torch.linalg.inv(Kernel(noise=0.01).covariance(position))
-        >>> held_out_errors(precision, precision @ position[:, 0], torch.tensor([3, 4])).shape
-        torch.Size([2])
+        >>> held_out_errors(precision, precision @ position, torch.tensor([3, 4])).shape
+        torch.Size([2, 3])
     """
-    errors: Tensor = torch.linalg.solve(precision.index_select(0, out).index_select(1, out), dual[out])
+    errors: Tensor = torch.linalg.solve(precision[..., out[:, None], out], dual[..., out, :])
     return errors

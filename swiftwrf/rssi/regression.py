@@ -81,7 +81,7 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
             precision, fold = torch.cholesky_inverse(factor), data.fold[used]
             for number in fold.unique():
                 part = (fold == number).nonzero()[:, 0]
-                error[used[part]] = held_out_errors(precision, found[0], part.to(device)).cpu()
+                error[used[part]] = held_out_errors(precision, found[0][:, None], part.to(device))[:, 0].cpu()
         except torch.linalg.LinAlgError as reason:  # type: ignore[attr-defined]
             raise FitError(
                 f"the RSSI fit of receiver {data.receiver_names[some][0]!r} broke ({reason}); are its values sane?"
@@ -162,6 +162,7 @@ def solve(
     weight, latent = torch.ones_like(value), torch.zeros_like(value)
     target, noise = value.where(~weak, 0.0), noise_db.square()
     precision, pull = torch.zeros_like(value), torch.zeros_like(value)  # of the sites of empty cells
+    own, limits = torch.ones_like(value), torch.eye(len(value)).to(value)[:, weak]  # diagonal of the inverse covariance
     step, last = 1.0, math.inf
     for _ in range(30):
         head, slope = (x[:, 0] for x in table(latent[:, None]))
@@ -180,7 +181,7 @@ def solve(
         weight = (huber * noise_db / error.clamp_min(1e-12)).clamp_max(1).where(~weak, 1.0)
         settled = float((weight - previous).abs().max()) < WEIGHT_TOLERANCE
         if censored is not None:
-            own = torch.cholesky_inverse(factor).diagonal()
+            own[weak] = torch.linalg.solve_triangular(factor, limits, upper=False).square().sum(dim=0)
             left_mean, left = used - dual / own, (1 / own - variance).clamp_min(1e-6)  # without the cell itself
             site = _site(left_mean, left, value, noise, censored)
             moved = DAMPING * (site - torch.stack([precision, pull])).where(weak, 0.0)

@@ -62,6 +62,7 @@ class RssiTraining(Bins):
             receivers with fewer than 10 measured bins.
         field_db: Prior standard deviation of the latent field, (R,) [dB].
         noise_db: Standard deviation of one measurement about it, (R,) [dB].
+        losses: Path loss of all receivers of the pool, from all bins and without each fold.
         baselines: Path-loss models of the simple predictors, (3, R): that of each receiver, that of all receivers, and the
             mean of each receiver.
         baseline_held_out: Their predictions of held-out bins, (3, n, R) [dBm].
@@ -75,6 +76,7 @@ class RssiTraining(Bins):
     limit: Tensor
     field_db: Tensor
     noise_db: Tensor
+    losses: list[PathLosses]
     baselines: PathLoss
     baseline_held_out: Tensor
 
@@ -90,27 +92,35 @@ def prepare(
 ) -> RssiTraining:
     """Average the rows by location bin, fit the path-loss models and choose the kernel.
 
-    The arguments are those of `RssiPredictor._fit`. With `like`, training data of the same pool, their kernel is taken.
+    The arguments are those of `RssiPredictor._fit`. With `like`, training data of the same pool, their kernel
+    and path losses are taken.
     """
     bins = binned(train, config)
     rssi, fold, every = bins.rssi, bins.fold, bin_locations(pool, config.max_locations)[1]
     receiver, own = pool.receiver_position.double() - bins.centre, columns_of(train.receiver_names, pool)
     shift = _bin_means(shift, bins.bin_of_row, len(fold))
 
-    def fit_baselines(rows: Tensor, detection: Detection | None) -> tuple[PathLosses, PathLoss]:
-        """Fit the simple predictors to some of the bins, the path loss of all receivers of the pool together."""
-        loss = fit_path_losses(bins.position[rows], receiver, every[rows], config.not_detected, shift[rows], detection)
-        mean = rssi[rows].nanmean(dim=0)
-        simple = loss.columns(own)
-        level = PathLoss(mean, torch.zeros_like(mean)).where(~mean.isnan(), simple.shared)
-        return loss, PathLoss(*(torch.stack(values) for values in zip(simple.own, simple.shared, level, strict=True)))
+    def fit(rows: Tensor, detection: Detection | None) -> PathLosses:
+        return fit_path_losses(bins.position[rows], receiver, every[rows], config.not_detected, shift[rows], detection)
 
-    everything, baselines = fit_baselines(torch.ones_like(fold, dtype=torch.bool), curve)
+    def simple(loss: PathLosses, rows: Tensor) -> PathLoss:
+        """Return the simple predictors of the bins `rows`, from the path loss of all receivers of the pool."""
+        mean, loss = rssi[rows].nanmean(dim=0), loss.columns(own)
+        level = PathLoss(mean, torch.zeros_like(mean)).where(~mean.isnan(), loss.shared)
+        return PathLoss(*(torch.stack(values) for values in zip(loss.own, loss.shared, level, strict=True)))
+
+    kept = [torch.ones_like(fold, dtype=torch.bool), *(fold != number for number in fold.unique())]
+    if like is None:
+        everything = fit(kept[0], curve)
+        losses = [everything, *(fit(rows, everything.detection) for rows in kept[1:])]
+    else:
+        losses = like.losses
+        everything = losses[0]
+    baselines, *partial = map(simple, losses, kept)
     distance = log_distance(bins.position, bins.receiver)
     held_out = torch.empty(3, *distance.shape, dtype=torch.float64)
-    for number in fold.unique():
-        out = fold == number
-        held_out[:, out] = fit_baselines(~out, everything.detection)[1](distance[out])
+    for baseline, rows in zip(partial, kept[1:], strict=True):
+        held_out[:, ~rows] = baseline(distance[~rows])
     pool_residual = every - everything.own(log_distance(bins.position, receiver))
     if like is None:
         residual = pool_residual[:, often_detected(pool)]
@@ -131,6 +141,7 @@ def prepare(
         limit=_limits(rssi, loss, distance, shift[:, own]),
         field_db=field_db,
         noise_db=noise_db,
+        losses=losses,
         baselines=baselines,
         baseline_held_out=held_out,
     )
@@ -236,15 +247,12 @@ def choose_residual_kernel(
         gaps = missing.nonzero()[:, 0]
         held_out += [(r, len(part), torch.cat([part, gaps])) for part in parts if len(part)]
 
-    def error(kernel: Kernel) -> float:
-        precision = torch.linalg.inv(kernel.covariance(position))
-        dual = precision @ residual.nan_to_num()
-        errors = [held_out_errors(precision, dual[:, r], out)[:n] for r, n, out in held_out]
-        return float(torch.cat(errors).abs().mean())
-
     # rough fields only: a choice among mixtures with a smooth part follows chance, and its errors are no lower
     rough = [kernel for kernel in candidates(position, RELATIVE_NOISE_VARIANCES) if kernel.matern12_weight == 1]
     # floors alike, or nearly independent beyond their attenuation
-    stretched = (replace(kernel, vertical=vertical) for vertical in (1.0, 5.0)[: 1 + has_floors] for kernel in rough)
-    score, best = min(((error(kernel), kernel) for kernel in stretched), key=lambda pair: pair[0])
-    return best, score < float(residual.abs().nanmean())
+    stretched = [replace(kernel, vertical=vertical) for vertical in (1.0, 5.0)[: 1 + has_floors] for kernel in rough]
+    precision = torch.linalg.inv(torch.stack([kernel.covariance(position) for kernel in stretched]))
+    dual = precision @ residual.nan_to_num()
+    errors = [held_out_errors(precision, dual[:, :, r, None], out)[:, :n, 0] for r, n, out in held_out]
+    score, best = torch.cat(errors, dim=1).abs().mean(dim=1).min(dim=0)
+    return stretched[int(best)], bool(score < residual.abs().nanmean())
