@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import torch
@@ -31,7 +32,7 @@ from swiftwrf.rssi.pairs import PairModel
 from swiftwrf.rssi.paper import RssiPaperModel
 from swiftwrf.runtime.checkpoint import Saved, load
 from swiftwrf.runtime.registry import write_report
-from swiftwrf.runtime.steps import MODEL, Memo
+from swiftwrf.runtime.steps import MODEL, Memo, Steps
 from swiftwrf.runtime.validation import Fraction, Preset, checked
 
 Values = dict[str, Any]
@@ -262,15 +263,9 @@ def compare(
     options: Values = {"validation": kind, "seed": seed, "new_places": split == PLACE, "not_detected": not_detected}
     names, left_out = compared(chosen, also)
     own, predictors = model_of(train), dict[str, RssiPredictor]()
-    if keep is not None:
-        keep.expect(sum(not keep.holds(name) for name in [*names, *(["fewer rows"] * bool(fewer))]))
-
     parallel = None if executor is None else executor.map
 
-    def step(name: str, compute: Callable[[], Values]) -> Values:
-        return compute() if keep is None else keep.step(name, name, compute)
-
-    def compute(name: str, rows: Tensor | None = None) -> Values:
+    def compute(_: None, folder: Path, name: str, rows: Tensor | None = None) -> Values:
         predictor = make_predictor(name, preset, **options)
         part, every = (train, pool) if rows is None else (train.subset(rows), pool.subset(rows))
         began = time.perf_counter()
@@ -281,8 +276,8 @@ def compare(
         found = None  # shares of detected and of empty test cells that are predicted as such, if there are both kinds
         if rows is None:
             predictors[name], detected = predictor, test.detected
-            if keep is not None and name == own and isinstance(predictor, Saved):
-                predictor.save(keep.folder / MODEL)
+            if name == own and isinstance(predictor, Saved):
+                predictor.save(folder / MODEL)
             if predictor.detection is not None and not bool(detected.all()) and not test.receiver_moves:
                 above = predictor.predict_detection(test.transmitter_position, offset) > 0.5
                 found = float(above[detected].double().mean()), float((~above)[~detected].double().mean())
@@ -292,21 +287,27 @@ def compare(
         values["mean_db"] = float(error.mean())
         return seconds | values | {"detection": found, "n_primitives": getattr(predictor, "n_primitives", 0)}
 
-    values = {name: step(name, partial(compute, name)) for name in names}
-    if keep is not None and own not in predictors:
-        model = load(keep.folder / MODEL)
-        assert isinstance(model, RssiModel | PairModel)
-        predictors[own] = model
     order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))
     parts = [order[: round(fraction * len(train))].sort().values for fraction in fewer]
     parts = [rows for rows in parts if int(train.detected[rows].sum(dim=0).min()) >= MIN_TRAINING]
     studied = [name for name in (own, "knn") if name in names]
 
-    def study() -> Values:
-        less = {str(len(rows)): {name: compute(name, rows)["mean_db"] for name in studied} for rows in parts}
+    def study(_: None, folder: Path) -> Values:
+        less = {str(len(rows)): {name: compute(_, folder, name, rows)["mean_db"] for name in studied} for rows in parts}
         return less | {str(len(train)): {name: values[name]["mean_db"] for name in studied}}
 
-    by_rows = DataFrame.from_dict(step("fewer rows", study) if fewer else {}, orient="index")
+    with TemporaryDirectory(prefix="swiftwrf-") as temporary:
+        memo = keep or Memo(Path(temporary))
+        steps = Steps(None, memo)
+        started = [steps.start(name, name, compute, name) for name in names]
+        if fewer:
+            steps.start("fewer rows", "fewer rows", study)
+        values = {name: steps[name] for name in started}
+        by_rows = DataFrame.from_dict(steps["fewer rows"] if fewer else {}, orient="index")
+        if own in names and own not in predictors:
+            model = load(memo.folder / MODEL)
+            assert isinstance(model, RssiModel | PairModel)
+            predictors[own] = model
     by_rows = by_rows.set_index(by_rows.index.astype(int)).rename_axis("n_train")
     used = {"split": split, "preset": preset, "seed": seed}
     return RssiComparison(train, test, values, left_out, predictors, by_rows, used)

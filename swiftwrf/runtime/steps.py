@@ -66,24 +66,6 @@ class Memo:
         write_json(self.folder / STEPS / f"{name}.json", {"value": plain, "seconds": seconds})
         return plain
 
-    def step(self, name: str, title: str, compute: Callable[[], Row]) -> Row:
-        """Return the plain values of `compute`, which is called once, also over calls that continue.
-
-        Args:
-            name: Key of the kept result.
-            title: What is computed, in words.
-            compute: Computes the values.
-
-        Raises:
-            InputError: The kept result is damaged.
-        """
-        value = self.kept(name)
-        if value is None:
-            self.begin(name, title)
-            began = time.perf_counter()
-            value = self.keep(name, compute(), time.perf_counter() - began)
-        return value
-
     def expect(self, steps: int) -> None:
         """Take notice of further steps."""
 
