@@ -12,7 +12,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from os.path import isfile  # unlike Path.is_file, it is False for names that are too long
 from pathlib import Path
 from typing import Any
@@ -65,6 +65,7 @@ class Claim:
 
     def __init__(self, folder: Path, *, new: bool) -> None:
         self.folder, self.made = folder, False
+        self._new_parents = [parent for parent in folder.parents if not parent.exists()]
         if new:
             folder.parent.mkdir(parents=True, exist_ok=True)
             try:
@@ -97,12 +98,17 @@ class Claim:
     def discard_if_empty(self) -> bool:
         """Delete the directory if it holds no result: neither steps, if this process made it, nor any file of others.
 
+        Folders above it that it was made with go, too, unless others use them by now.
+
         Returns:
             True if deleted.
         """
         empty = not has_steps(self.folder) if self.made else {file.name for file in self.folder.iterdir()} <= {LOCK}
         if empty:
             shutil.rmtree(self.folder)
+            with suppress(OSError):
+                for parent in self._new_parents:
+                    parent.rmdir()
         self.release()
         return empty
 

@@ -151,6 +151,7 @@ def test_unknown_commands_and_directories(tmp_path, capsys):
         ("locate", ("--data", ""), "--data is empty"),
         ("locate", ("--rx", "99"), "no receiver '99'"),
         ("locate", ("--split", "nowhere"), "choose one of block, random"),
+        ("rssi", ("--rx", "1", "--split", "nowhere"), "choose one of block, random"),
         ("locate", ("--cells", 9), "--cells must be a whole number at least 10"),
         ("aoa", ("--mix", 0.5, "--processes", 0), "--processes must be a whole number at least 1, got 0"),
         ("rssi", ("--rx", "1", "--out", "link"), "link exists already"),
