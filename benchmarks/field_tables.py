@@ -185,7 +185,9 @@ def updates() -> str:
     cells = []
     for row in load("update")["change"]:
         name = f"{row['moving']} moves, box at {row['place'][0]}, {row['place'][1]} m"
-        cells.append((name, "alarm after", f"{row['alarm_at']} spectra"))
+        cells.append((name, "alarm after", f"{row['alarm_after'] or 'more than 72'} spectra"))
         kinds = {"stale": "old model", "update": "update", "adapted": "adapted", "alone": "fit to the new ones"}
         cells += [(name, f"{text} [dB]", f"{row['psnr_db_20'][kind]:.1f}") for kind, text in kinds.items()]
+    for row in load("update")["unchanged"]:
+        cells.append((f"{row['moving']} moves, no box", "alarm after", f"{row['alarms']} alarms in {row['spectra']:,}"))
     return pivot("scene", cells)

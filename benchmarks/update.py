@@ -1,9 +1,9 @@
-"""Measure updates: speed, adaptation to a box in the built-in room, and walks in their order."""
+"""Measure updates: speed, alarms and adaptation after a box appeared in the built-in room, false alarms, and walks."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -15,14 +15,14 @@ import swiftwrf
 from swiftwrf import AngularGrid, Rssi, RssiModel, Spectra, rssi_room, simulated_room
 from swiftwrf.data import load_rssi
 from swiftwrf.metrics import psnr
-from swiftwrf.online import Scores, adapted, prequential, score
+from swiftwrf.online import Follower, Scores, adapted, prequential, score
 
-Part = Literal["spectra", "rssi", "change", "tracks"]
+Part = Literal["spectra", "rssi", "change", "unchanged", "tracks"]
 PLACES = ((1.6, 2.4), (4.8, 2.0), (3.2, 0.9))  # centres of boxes [m]
 MOBILITIES = ("transmitter", "receiver")
-N_BEFORE, N_AFTER, N_TEST = 72, 72, 100
+N_BEFORE, N_AFTER, N_TEST, N_UNCHANGED = 72, 72, 100, 1000
 LEARNT = (10, 20, 40, 72)  # measurements after the change
-SEEDS = {"before": 100, "after": 101, "test": 102}
+SEEDS = {"before": 100, "after": 101, "test": 102, "unchanged": 103}
 TRACK_TRAINING = 0.4  # of the rows of the walks, the first ones
 BLOCK = 25  # consecutive rows that a bootstrap draws together
 REPEATS = 7
@@ -87,8 +87,16 @@ def scene(moving: Any, part: str, n: int, place: tuple[float, float] | None = No
     return simulated_room(n=n, moving=moving, seed=SEEDS[part], room=room_with_box(place) if place else None)
 
 
+def alarms(model: Any, train: Spectra, new: Spectra) -> Iterator[int]:
+    """Follow spectra one by one. Yield the number of spectra at each alarm."""
+    follower = Follower(model, train)
+    for i in range(len(new)):
+        if follower.step(new.subset(torch.tensor([i]))).alarms:
+            yield i + 1
+
+
 def change(config: Config) -> list[dict[str, Any]]:
-    """Measure the PSNR at unseen positions after a box appeared."""
+    """Measure the number of spectra until an alarm, and the PSNR at unseen positions, after a box appeared."""
     rows = []
     for moving in MOBILITIES:
         before = scene(moving, "before", N_BEFORE)
@@ -96,6 +104,7 @@ def change(config: Config) -> list[dict[str, Any]]:
         for place in PLACES:
             after, test = scene(moving, "after", N_AFTER, place), scene(moving, "test", N_TEST, place)
             row: dict[str, Any] = {"moving": moving, "place": place}
+            row["alarm_after"] = next(alarms(model, before, after), None)
             for n in LEARNT:
                 some = after.subset(torch.arange(n))
                 alone = swiftwrf.make_model("coarray").fit(some)
@@ -105,6 +114,17 @@ def change(config: Config) -> list[dict[str, Any]]:
                 row[f"psnr_db_{n}"] = {**mean, "correlation": correlation}
             rows.append(row)
             print(row, flush=True)
+    return rows
+
+
+def unchanged(config: Config) -> list[dict[str, Any]]:
+    """Count the false alarms among spectra of the unchanged room."""
+    rows = []
+    for moving in MOBILITIES:
+        before, new = scene(moving, "before", N_BEFORE), scene(moving, "unchanged", N_UNCHANGED)
+        model = swiftwrf.make_model("coarray").fit(before)
+        rows.append({"moving": moving, "spectra": len(new), "alarms": len(list(alarms(model, before, new)))})
+        print(rows[-1], flush=True)
     return rows
 
 
