@@ -185,9 +185,11 @@ def updates() -> str:
     cells = []
     for row in load("update")["change"]:
         name = f"{row['moving']} moves, box at {row['place'][0]}, {row['place'][1]} m"
-        cells.append((name, "alarm after", f"{row['alarm_after'] or 'more than 72'} spectra"))
+        after = {model: n or "more than 72" for model, n in row["alarm_after"].items()}
+        cells += [(name, f"alarm after, {model}", f"{n} spectra") for model, n in after.items()]
         kinds = {"stale": "old model", "update": "update", "adapted": "adapted", "alone": "fit to the new ones"}
         cells += [(name, f"{text} [dB]", f"{row['psnr_db_20'][kind]:.1f}") for kind, text in kinds.items()]
     for row in load("update")["unchanged"]:
-        cells.append((f"{row['moving']} moves, no box", "alarm after", f"{row['alarms']} alarms in {row['spectra']:,}"))
+        name, counts = f"{row['moving']} moves, no box", row["alarms"].items()
+        cells += [(name, f"alarm after, {model}", f"{n} alarms in {row['spectra']:,}") for model, n in counts]
     return pivot("scene", cells)

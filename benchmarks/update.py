@@ -88,10 +88,11 @@ def scene(moving: Any, part: str, n: int, place: tuple[float, float] | None = No
 
 
 def alarms(model: Any, train: Spectra, new: Spectra) -> Iterator[int]:
-    """Follow spectra one by one. Yield the number of spectra at each alarm."""
+    """Follow spectra one by one. Yield their number at each alarm, or when the room no longer explains them."""
     follower = Follower(model, train)
     for i in range(len(new)):
-        if follower.step(new.subset(torch.tensor([i]))).alarms:
+        step = follower.step(new.subset(torch.tensor([i])))
+        if step.alarms or "no longer explains" in step.notice:
             yield i + 1
 
 
@@ -101,10 +102,11 @@ def change(config: Config) -> list[dict[str, Any]]:
     for moving in MOBILITIES:
         before = scene(moving, "before", N_BEFORE)
         model: Any = swiftwrf.make_model("coarray").fit(before)
+        room = swiftwrf.make_model("geometry").fit(before)
         for place in PLACES:
             after, test = scene(moving, "after", N_AFTER, place), scene(moving, "test", N_TEST, place)
             row: dict[str, Any] = {"moving": moving, "place": place}
-            row["alarm_after"] = next(alarms(model, before, after), None)
+            row["alarm_after"] = {m.name: next(alarms(m, before, after), None) for m in (model, room)}
             for n in LEARNT:
                 some = after.subset(torch.arange(n))
                 alone = swiftwrf.make_model("coarray").fit(some)
@@ -122,8 +124,9 @@ def unchanged(config: Config) -> list[dict[str, Any]]:
     rows = []
     for moving in MOBILITIES:
         before, new = scene(moving, "before", N_BEFORE), scene(moving, "unchanged", N_UNCHANGED)
-        model = swiftwrf.make_model("coarray").fit(before)
-        rows.append({"moving": moving, "spectra": len(new), "alarms": len(list(alarms(model, before, new)))})
+        models = [swiftwrf.make_model(name).fit(before) for name in ("coarray", "geometry")]
+        found = {model.name: len(list(alarms(model, before, new))) for model in models}
+        rows.append({"moving": moving, "spectra": len(new), "alarms": found})
         print(rows[-1], flush=True)
     return rows
 
