@@ -88,11 +88,12 @@ def scene(moving: Any, part: str, n: int, place: tuple[float, float] | None = No
 
 
 def alarms(model: Any, train: Spectra, new: Spectra) -> Iterator[int]:
-    """Follow spectra one by one. Yield their number at each alarm, or when the room no longer explains them."""
+    """Follow spectra one by one. Yield their number at each alarm, of a room when it no longer explains them."""
     follower = Follower(model, train)
+    has_room = follower.room is not None
     for i in range(len(new)):
         step = follower.step(new.subset(torch.tensor([i])))
-        if step.alarms or "no longer explains" in step.notice:
+        if "no longer explains" in step.notice if has_room else step.alarms:
             yield i + 1
 
 
