@@ -119,7 +119,10 @@ class Monitor:
     def of(
         cls, model: FieldModel | RssiModel, train: Spectra | Rssi | None = None, false_alarm_rate: FalseAlarmRate = 1e-4
     ) -> Monitor:
-        """Return the monitor of a fitted model. Its training spectra, in their order, give the reference.
+        """Return the monitor of a fitted model.
+
+        The training spectra, in their order, give the reference if the model can forget them. Errors of spectra that it has
+        learnt are lower than those of new ones, which would raise false alarms.
 
         Raises:
             InputError: As `FieldModel.check_measurements`, or training spectra at other positions than those of the model.
@@ -129,7 +132,7 @@ class Monitor:
         reference = None
         if isinstance(train, Spectra):
             model.check_measurements(train)
-            if isinstance(model, ProcessModel):  # it can forget spectra: each fifth is predicted without itself
+            if isinstance(model, ProcessModel):  # each fifth is predicted without itself
                 known = model.region()
                 if known.shape != train.position.shape or not torch.allclose(known, train.position, rtol=0, atol=1e-3):
                     raise InputError(
@@ -139,8 +142,6 @@ class Monitor:
                 order = torch.randperm(len(train), generator=torch.Generator().manual_seed(0))
                 parts = [score(model.forget(rows), train.subset(rows)) for rows in order.chunk(N_FOLDS)]
                 reference = torch.cat([part.innovation[:, 0] for part in parts])[order.argsort()]
-            else:
-                reference = score(model, train).innovation[:, 0]
         return cls(model.region(), (), reference, false_alarm_rate)
 
     def observe(self, position: Tensor, innovation: Tensor) -> list[Alarm]:

@@ -276,6 +276,11 @@ def test_a_room_that_explains_its_spectra_gives_no_notice():
     assert not [a for at, x in zip(new.position, missing, strict=True) for a in follower.room.observe(at, x[None])]
 
 
+def test_spectra_that_a_room_has_learnt_do_not_calibrate_its_alarms():
+    """Their errors are lower than those of new spectra."""
+    assert len(Monitor.of(walls(), spectra(72, 0)).reference) == 0
+
+
 def test_a_followed_geometry_is_refined_with_every_ten_spectra():
     follower, new = Follower(walls()), spectra(12, 1)
     models = []
