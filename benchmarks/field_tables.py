@@ -190,6 +190,6 @@ def updates() -> str:
         kinds = {"stale": "old model", "update": "update", "adapted": "adapted", "alone": "fit to the new ones"}
         cells += [(name, f"{text} [dB]", f"{row['psnr_db_20'][kind]:.1f}") for kind, text in kinds.items()]
     for row in load("update")["unchanged"]:
-        name, counts = f"{row['moving']} moves, no box", row["alarms"].items()  # a room warns once
-        cells += [(name, f"alarm after, {model}", f"{n} alarms in {row['spectra']:,}") for model, n in counts]
+        name, counts = f"{row['moving']} moves, no box", row["alarms"].items()
+        cells += [(name, f"alarm after, {model}", f"{n} in {row['spectra']:,} spectra") for model, n in counts]
     return pivot("scene", cells)

@@ -237,7 +237,8 @@ class Follower:
 
     Args:
         model: Fitted model with `update`.
-        train: Training data of the model in their order, which calibrate the test for spectra.
+        train: Training data of the model in their order. They calibrate the test of a room, and that of errors if the model
+            can forget spectra.
         false_alarm_rate: False alarms a measurement, over all regions and receivers together.
 
     Raises:
