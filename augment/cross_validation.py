@@ -20,7 +20,6 @@ from torch import Tensor
 
 from augment import Fold, Mixed, synthetic_positions
 from augment.estimators import Estimator, make_estimator
-from swiftwrf import FitError, InputError
 from swiftwrf.gp import subsample
 from swiftwrf.locate import MatchedField, MatchedFieldConfig
 from swiftwrf.metrics import ChangeMetrics, angle_errors, paired_change
@@ -138,21 +137,18 @@ def measured_errors(fold: Fold, estimator: Estimator) -> Errors:
     return _degrees(estimator.fit(Mixed.measured(fold.train)).estimate(fold.test), fold.test.label)
 
 
-def located_errors(fold: Fold, seed: int) -> Errors | None:
-    """Return the angular errors [deg] of matched-field processing on held-out spectra of a fold; None without a room.
+def located_errors(fold: Fold, seed: int) -> Errors:
+    """Return the angular errors [deg] of matched-field processing on held-out spectra of a fold.
 
     Args:
         fold: Model with a room and its spectra. At most 60 of the held-out spectra are located.
         seed: Seed of the locator.
+
+    Raises:
+        InputError: Spectra that do not suffice, or a model without a room.
     """
-    room = fold.model.room
-    if room is None or not room.planes:
-        return None
     test = fold.test.subset(_located_rows(len(fold.test)))
-    try:
-        locator = MatchedField(FOLD_LOCATOR, seed=seed).fit(fold.train, room=room)
-    except (InputError, FitError):
-        return None
+    locator = MatchedField(FOLD_LOCATOR, seed=seed).fit(fold.train, room=fold.model)
     return _degrees(locator.predict(test), test.label)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from pandas import DataFrame
 
 from augment.estimators import SavedEstimator
-from swiftwrf import FieldModel, InputError, Rssi, load, predict
+from swiftwrf import FieldModel, InputError, Prediction, Rssi, load, predict
 from swiftwrf.data import ReadOptions
 from swiftwrf.data.coordinates import PlanFrame
 from swiftwrf.data.files import TABLES, read_table
@@ -51,16 +51,13 @@ def run(config: PredictConfig) -> None:
             raise InputError(
                 f"--{next(iter(unused))} is for reading {kinds}, and {file} holds {with_article(model.kind)}"
             )
-    if config.track is not None and not isinstance(model, RssiLocator | MatchedField):
-        raise InputError(
-            f"--track smooths positions, and {file} holds {with_article(model.kind)}, which locates nothing"
-        )
     if isinstance(model, FieldModel | RssiPredictor):
         origin, floors = None, None
         if isinstance(model, RssiPredictor):
             origin, floors = model.origin, model.attenuation and model.attenuation.floors
         frame = PlanFrame(config.table.scale, config.table.y_down, config.table.up)
-        prediction = model.predict(read_places(Path(config.source), origin, frame, floors))
+        prediction = predict(model, read_places(Path(config.source), origin, frame, floors), track=config.track)
+        assert isinstance(prediction, Prediction)
         terminal.page({"table": str(out)}, f"{write_file(prediction, out)}: {out}")
         return
     if isinstance(model, RssiLocator):

@@ -106,9 +106,9 @@ def locate_held_out(experiment: Experiment, folder: Path, subset: MeasuredSubset
     try:
         blind = _read_room(folder, room["file"])
         model = experiment.make_model(ROOM_MODEL, subset.repeat).fit(train, like=blind, device=experiment.device)
+        return {"errors": located_errors(Fold(model, train, test), seed)}
     except (InputError, FitError):
         return {"errors": None}
-    return {"errors": located_errors(Fold(model, train, test), seed)}
 
 
 def find_room(experiment: Experiment, folder: Path, subset: MeasuredSubset, blind: tuple[int, ...] = ()) -> Row:
