@@ -11,7 +11,7 @@ from torch import Tensor
 
 from swiftwrf import InputError
 from swiftwrf.data.files import sha256
-from swiftwrf.data.raytraced import ROOMS, FurnishedRoom, Scene, Tracing, trace
+from swiftwrf.data.raytraced import ROOMS, FurnishedRoom, Tracing, open_scene, trace
 from swiftwrf.data.writing import write_paths
 from swiftwrf.runtime.durable import write_json
 from tasks.configs import ScenesConfig
@@ -35,10 +35,7 @@ def run(config: ScenesConfig) -> None:
     room, fixed, region = where(config)
     with new_directory(Path(config.out), "a scene") as folder:
         position = draw_positions(room, region, config.positions, config.seed)
-        if room is None:
-            scene = Scene.read(Path(config.room), config.frequency, config.scattering)
-        else:
-            scene = Scene(room.surfaces(), config.frequency, config.scattering)
+        scene = open_scene(config.room, config.frequency, config.scattering)
         began = time.perf_counter()
         tracing = Tracing(config.order, config.scattering > 0, config.diffraction, config.seed)
         paths = trace(scene, fixed, position, config.moving, tracing)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
@@ -17,7 +17,7 @@ from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.survey import TableOptions
-from swiftwrf.errors import InputError
+from swiftwrf.errors import InputError, listed
 from swiftwrf.runtime.registry import Registry
 from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, configuration
 
@@ -147,3 +147,11 @@ def read_spectra(path: str | Path, options: ReadOptions) -> Spectra:
     """
     found: Spectra = options.spectra_of(read(path, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS))
     return found
+
+
+def station(holds: str, names: Sequence[str], number: int | None) -> int:
+    """Return the index of the array with a number from 1, or of the only one; `holds` begins the sentence of refusal."""
+    if (number is None and len(names) > 1) or not 1 <= (number or 1) <= len(names):
+        known = listed(f"{i} {name}" for i, name in enumerate(names, start=1))
+        raise InputError(f"{holds}; choose one by its number: station ({known})")
+    return (number or 1) - 1

@@ -29,7 +29,7 @@ from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.data.archives import read_arrays
 from swiftwrf.data.files import check_carrier, digests, read_text
-from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format, ReadOptions
+from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format, ReadOptions, station
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.errors import InputError
@@ -59,12 +59,7 @@ class DeepMimo(Format[Spectra]):
 
     def read(self, path: Path, options: ReadOptions) -> Spectra:
         pairs = _pairs(path)
-        if (options.station is None and len(pairs) > 1) or not 1 <= (options.station or 1) <= len(pairs):
-            listed = ", ".join(f"{number} {pair}" for number, pair in enumerate(pairs[:8], start=1))
-            raise InputError(
-                f"{path} holds {len(pairs)} pairs of transmitter and receivers; choose one by its number: station ({listed})"
-            )
-        pair = pairs[(options.station or 1) - 1]
+        pair = pairs[station(f"{path} holds {len(pairs)} pairs of transmitter and receivers", pairs, options.station)]
         frequency, tracer = _params(path / "params.json")
         table = _table(path, pair)
         files = [path / f"{key}_{pair}.npz" for key in table]

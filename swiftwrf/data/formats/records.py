@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 
 from swiftwrf.data.archives import MAX_UNPACKED_BYTES, Arrays
 from swiftwrf.data.files import read_text
-from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
+from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions, station
 from swiftwrf.data.formats.snapshots import snapshots_of
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.errors import InputError
@@ -79,7 +79,7 @@ class Records(Format[Snapshots]):
                 f"{path} holds records, but no JSON with antennas, which describes their arrays, lies beside them"
             )
         is_dichasus = any("assignments" in antenna for antenna in described[1]["antennas"])
-        station, arrays, antennas = _read_station(*described, options.station, is_dichasus)
+        name, arrays, antennas = _read_station(*described, options.station, is_dichasus)
         beside = {file: file.with_name(f"reftx-offsets-{file.stem}.json") for file in files} if is_dichasus else {}
         offsets = {file: _read_offsets(source) for file, source in beside.items() if source.is_file()}
         notes = [NO_OFFSETS] * (len(offsets) < len(beside))
@@ -113,9 +113,9 @@ class Records(Format[Snapshots]):
         if without:
             notes.append(f"records without a finite position or channel are left out: {without}")
         arrays |= {"csi": np.stack(channels), "position": np.stack(positions)}
-        name = path.resolve().name if path.is_dir() else path.stem
+        name = "-".join(filter(None, [path.resolve().name if path.is_dir() else path.stem, name]))
         read = [*files, described[0], *(beside[file] for file in offsets)]
-        return snapshots_of(path, arrays, options, read, f"{name}-{station}" if station else name, tuple(notes), index)
+        return snapshots_of(path, arrays, options, read, name, tuple(notes), index)
 
 
 def _of_espargos(csi: NDArray[Any]) -> NDArray[Any]:
@@ -177,13 +177,9 @@ def _read_station(
     file: Path, content: dict[str, Any], number: int | None, assigned: bool
 ) -> tuple[str, Arrays, list[int]]:
     """Return name, arrays as of snapshots.npz, and antennas of the elements, of the array with that number from 1."""
-    antennas = content["antennas"]
-    names = [str(antenna.get("name", "")) for antenna in antennas]
-    if (number is None and len(antennas) > 1) or not 1 <= (number or 1) <= len(antennas):
-        listed = ", ".join(f"{i} {name}" for i, name in enumerate(names, start=1))
-        raise InputError(f"{file} describes {len(antennas)} arrays; choose one by its number: station ({listed})")
-    index = (number or 1) - 1
-    antenna = antennas[index]
+    names = [str(antenna.get("name", "")) for antenna in content["antennas"]]
+    index = station(f"{file} describes {len(names)} arrays", names, number)
+    antenna = content["antennas"][index]
     right, up = antenna.get("spacingX"), antenna.get("spacingY")
     frequency: Any = content.get("frequency")
     for name, value in (

@@ -137,18 +137,16 @@ class Scene:
             material.scattering_coefficient = coefficient
 
 
-def open_scene(name: str, frequency_hz: float) -> Scene:
+def open_scene(name: str, frequency_hz: float, scattering: float = 0.0) -> Scene:
     """Return the scene of a built-in room, or of a file, at a carrier frequency [Hz].
 
     Raises:
         InputError: As `Scene`, or an unknown room.
     """
     check_scene(name)
-    return (
-        Scene.read(Path(name), frequency_hz)
-        if name.endswith(SCENE_FILE)
-        else Scene(ROOMS[name].surfaces(), frequency_hz)
-    )
+    if name.endswith(SCENE_FILE):
+        return Scene.read(Path(name), frequency_hz, scattering)
+    return Scene(ROOMS[name].surfaces(), frequency_hz, scattering)
 
 
 def _at(held: Any, frequency_hz: float) -> Any:
