@@ -24,6 +24,7 @@ from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.errors import MAX_LENGTH
 from swiftwrf.locate import MatchedFieldConfig
 from swiftwrf.locate import comparison as locating
+from swiftwrf.models.geometry import furniture
 from swiftwrf.models.geometry.path_gains import PRIORS
 from swiftwrf.rssi import RssiConfig
 from swiftwrf.runtime.validation import configuration
@@ -95,6 +96,7 @@ def cheap() -> Iterator[None]:
         mock.patch.object(cross_validation, "FOLD_LOCATOR", FEW_CELLS),
         mock.patch("swiftwrf.locate.spectrum_likelihood.DEGREES", (5.0,)),
         mock.patch("swiftwrf.models.geometry.path_gains.PRIORS", {"tight": PRIORS["tight"]}),
+        mock.patch.multiple(furniture, SETTINGS=furniture.SETTINGS[:1], N_STEPS=10, MIN_HELD_OUT=20),
         mock.patch.object(RssiModel, "config_type", QuickRssiConfig),
         mock.patch("swiftwrf.rssi.maps.CELLS", 8),
         mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
