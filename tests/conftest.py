@@ -83,6 +83,13 @@ def short_searches() -> Iterator[None]:
 
 
 @pytest.fixture
+def short_fits() -> Iterator[None]:
+    """Few kernels, folds and steps of path gains during a test."""
+    with small.few_kernels(), small.few_folds(), small.short_path_gains():
+        yield
+
+
+@pytest.fixture
 def floor_alone() -> Iterator[None]:
     """The floor as the only plane that any search for a room finds, without a search."""
     with small.known_planes(small.FLOOR):

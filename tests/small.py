@@ -1,10 +1,13 @@
 """Field models and RSSI predictors in their smallest size, so that a fit takes a second or less."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import fields, replace
+from itertools import islice
 from typing import Any, get_type_hints
 from unittest import mock
+
+from torch import Tensor
 
 from swiftwrf import Spectra
 from swiftwrf.comparison import NeRF2Rssi
@@ -12,11 +15,12 @@ from swiftwrf.comparison.base import Config
 from swiftwrf.comparison.generative import DcganConfig, VaeConfig
 from swiftwrf.comparison.nerf2 import NeRF2Config, NeRF2RssiConfig
 from swiftwrf.comparison.wrfgs import WrfGsConfig
+from swiftwrf.gp import Kernel, candidates
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import GeometryConfig, GeometryModel, search, uncertainty
 from swiftwrf.models.geometry.fit import search_room
-from swiftwrf.models.geometry.planes import Plane, RoomEstimate
 from swiftwrf.models.geometry.path_gains import PRIORS
+from swiftwrf.models.geometry.planes import Plane, RoomEstimate
 from swiftwrf.models.geometry.search import Search
 from swiftwrf.models.swiftwrf import SwiftWRFConfig
 from swiftwrf.models.swiftwrf_paper import SwiftWRFPaperConfig
@@ -99,6 +103,19 @@ def short_path_gains() -> Iterator[None]:
     """Fit path gains of one prior in few steps; their accuracy has its own tests."""
     priors = {"tight": replace(PRIORS["tight"], steps=15)}
     with mock.patch("swiftwrf.models.geometry.path_gains.PRIORS", priors):
+        yield
+
+
+@contextmanager
+def few_kernels() -> Iterator[None]:
+    """Choose among few kernels; the choice has its own tests."""
+
+    def few(position: Tensor, noises: Sequence[float]) -> Iterator[Kernel]:
+        return islice(candidates(position, noises), 0, None, 12)
+
+    with ExitStack() as patches:
+        for place in ("gp.choice", "rssi.training", "rssi.pairs"):
+            patches.enter_context(mock.patch(f"swiftwrf.{place}.candidates", few))
         yield
 
 

@@ -153,9 +153,14 @@ MODELS: dict[str, Callable[[], Any]] = {
 }
 
 
+@functools.cache
+def _fitted(name: str) -> Any:
+    return MODELS[name]()
+
+
 def save(name: str, folder: Path) -> None:
     """Save a model of this kind."""
-    MODELS[name]().save(folder / "model")
+    _fitted(name).save(folder / "model")
 
 
 def rssi_survey(folder: Path) -> None:

@@ -5,11 +5,19 @@ from unittest import mock
 
 import pandas as pd
 import pytest
+from quick import cheap, sketched
 
 import augment
 import swiftwrf
 from swiftwrf import AngularGrid, InputError
 from swiftwrf.runtime.steps import Memo
+
+
+@pytest.fixture(autouse=True)
+def small_parts():
+    """Fits that take a second; their accuracy has its own tests."""
+    with cheap():
+        yield
 
 
 def turbo():
@@ -73,4 +81,5 @@ def test_a_comparison_continues_after_its_kept_results(tmp_path, compare):
     with mock.patch.object(Memo, "begin", side_effect=AssertionError("nothing is computed again")):
         again = compare(data, receivers=["1", "6", "12"], keep=Memo(tmp_path))
     pd.testing.assert_frame_equal(again.errors, first.errors)
-    again.report(tmp_path / "report.html")
+    with sketched():
+        again.report(tmp_path / "report.html")

@@ -34,8 +34,7 @@ def errors(found, phase, turn):
     return math.degrees(left.magnitude()), float((beside * beside.sum().conj()).angle().abs().max().rad2deg())
 
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("echo", [0.0, 0.1])
+@pytest.mark.parametrize(("seed", "echo"), [(0, 0.0), (1, 0.1), (2, 0.1), (3, 0.0)])
 def test_phases_and_a_turn_of_20_degrees_are_recovered(seed, echo):
     data, phase, turn = spoilt(snapshots(n=300, noise=0.2, echo=echo), seed=seed)
     found = calibrate(data)
