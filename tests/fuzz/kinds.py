@@ -120,7 +120,7 @@ def _of_the_floor() -> GeometryModel:
 
 def _hybrid() -> HybridModel:
     model = HybridModel().fit(_room(), like=_of_the_floor())
-    model.path_gains = fit_path_gains(_of_the_floor(), observe(_room())[0], Kernel())
+    model.path_gains = fit_path_gains(_of_the_floor(), observe(_room())[0], Kernel(), "tight")
     return model
 
 

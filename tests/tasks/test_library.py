@@ -15,8 +15,8 @@ from swiftwrf.runtime.steps import Memo
 
 @pytest.fixture(autouse=True)
 def small_parts():
-    """Fits that take a second; their accuracy has its own tests."""
-    with cheap():
+    """Fits and figures that take a second; they have their own tests."""
+    with cheap(), sketched():
         yield
 
 
@@ -81,5 +81,4 @@ def test_a_comparison_continues_after_its_kept_results(tmp_path, compare):
     with mock.patch.object(Memo, "begin", side_effect=AssertionError("nothing is computed again")):
         again = compare(data, receivers=["1", "6", "12"], keep=Memo(tmp_path))
     pd.testing.assert_frame_equal(again.errors, first.errors)
-    with sketched():
-        again.report(tmp_path / "report.html")
+    again.report(tmp_path / "report.html")
