@@ -14,7 +14,6 @@ from PIL import Image
 from swiftwrf import AngularGrid, InputError, Spectra, make_model, simulated_room
 from swiftwrf.data.raytraced import sionna
 from swiftwrf.data.writing import write_spectra
-from swiftwrf.models.geometry import search, uncertainty
 
 collect_ignore = ["cuda_shim"]  # programs of tests, which have no examples
 torch.set_num_threads(1)  # tests run side by side, and mocks reach steps that are computed in this process alone
@@ -77,15 +76,17 @@ def small_published() -> Iterator[None]:
 
 
 @pytest.fixture
-def short_searches(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shorten the search for rooms, not its stages."""
-    for module, values in (
-        (search, {"SIGNS": search.SIGNS[:1], "MAX_MOVES": 1, "N_REFINED": 2, "MAX_ALTERNATIVES": {2: 5, 3: 2}}),
-        (uncertainty, {"MAX_PERIODS": 1, "N_COARSE": 2, "N_FINE": 1, "N_WHOLE": 1}),
-        (search, {"N_HORIZONTAL_NORMALS": 20, "N_SPHERE_NORMALS": 20}),
-    ):
-        for name, value in values.items():
-            monkeypatch.setattr(module, name, value)
+def short_searches() -> Iterator[None]:
+    """Short searches for rooms during a test."""
+    with small.short_searches():
+        yield
+
+
+@pytest.fixture
+def short_fits() -> Iterator[None]:
+    """Few kernels, folds and steps of path gains during a test."""
+    with small.few_kernels(), small.few_folds(), small.short_path_gains():
+        yield
 
 
 @pytest.fixture

@@ -13,10 +13,19 @@ from pathlib import Path
 from unittest import mock
 
 from matplotlib.figure import Figure
-from small import glances, known_planes, small_published, small_swiftwrf, with_defaults
+from small import (
+    few_folds,
+    few_kernels,
+    glances,
+    known_planes,
+    short_path_gains,
+    small_published,
+    small_swiftwrf,
+    with_defaults,
+)
 
 from augment import cross_validation
-from augment.estimators import ESTIMATORS
+from augment.estimators import ESTIMATORS, kernel_regression
 from augment.estimators.baselines import Constant
 from augment.turbo.condition import NETWORKS
 from swiftwrf import AngularGrid, MatchedField, Rssi, RssiModel, Spectra, rssi_room, simulated_room
@@ -24,7 +33,7 @@ from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.errors import MAX_LENGTH
 from swiftwrf.locate import MatchedFieldConfig
 from swiftwrf.locate import comparison as locating
-from swiftwrf.models.geometry.path_gains import PRIORS
+from swiftwrf.models.geometry import furniture
 from swiftwrf.rssi import RssiConfig
 from swiftwrf.runtime.validation import configuration
 from tasks import configs
@@ -93,8 +102,11 @@ def cheap() -> Iterator[None]:
         small_swiftwrf(),
         mock.patch.object(MatchedField, "config_type", with_defaults(FEW_CELLS)),
         mock.patch.object(cross_validation, "FOLD_LOCATOR", FEW_CELLS),
-        mock.patch("swiftwrf.locate.spectrum_likelihood.DEGREES", (5.0,)),
-        mock.patch("swiftwrf.models.geometry.path_gains.PRIORS", {"tight": PRIORS["tight"]}),
+        mock.patch.multiple(kernel_regression, MAX_ROWS=400, MAX_CHOICE_ROWS=150),
+        few_folds(),
+        few_kernels(),
+        short_path_gains(),
+        mock.patch.multiple(furniture, SETTINGS=furniture.SETTINGS[:1], N_STEPS=10, MIN_HELD_OUT=20),
         mock.patch.object(RssiModel, "config_type", QuickRssiConfig),
         mock.patch("swiftwrf.rssi.maps.CELLS", 8),
         mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),

@@ -1,10 +1,13 @@
 """Field models and RSSI predictors in their smallest size, so that a fit takes a second or less."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import fields, replace
+from itertools import islice
 from typing import Any, get_type_hints
 from unittest import mock
+
+from torch import Tensor
 
 from swiftwrf import Spectra
 from swiftwrf.comparison import NeRF2Rssi
@@ -12,9 +15,11 @@ from swiftwrf.comparison.base import Config
 from swiftwrf.comparison.generative import DcganConfig, VaeConfig
 from swiftwrf.comparison.nerf2 import NeRF2Config, NeRF2RssiConfig
 from swiftwrf.comparison.wrfgs import WrfGsConfig
+from swiftwrf.gp import Kernel, candidates
 from swiftwrf.models import FIELD_MODELS
-from swiftwrf.models.geometry import GeometryConfig, GeometryModel
+from swiftwrf.models.geometry import GeometryConfig, GeometryModel, search, uncertainty
 from swiftwrf.models.geometry.fit import search_room
+from swiftwrf.models.geometry.path_gains import PRIORS
 from swiftwrf.models.geometry.planes import Plane, RoomEstimate
 from swiftwrf.models.geometry.search import Search
 from swiftwrf.models.swiftwrf import SwiftWRFConfig
@@ -83,13 +88,56 @@ def known_planes(*planes: Plane) -> Iterator[None]:
 
 
 @contextmanager
+def short_searches() -> Iterator[None]:
+    """Shorten the search for rooms, not its stages."""
+    few = {"MAX_MOVES": 1, "N_REFINED": 2, "N_HORIZONTAL_NORMALS": 20, "N_SPHERE_NORMALS": 20}
+    with (
+        mock.patch.multiple(search, SIGNS=search.SIGNS[:1], MAX_ALTERNATIVES={2: 5, 3: 2}, **few),
+        mock.patch.multiple(uncertainty, MAX_PERIODS=1, N_COARSE=2, N_FINE=1, N_WHOLE=1),
+    ):
+        yield
+
+
+@contextmanager
+def short_path_gains() -> Iterator[None]:
+    """Fit path gains of one prior in few steps; their accuracy has its own tests."""
+    priors = {"tight": replace(PRIORS["tight"], steps=15)}
+    with mock.patch("swiftwrf.models.geometry.path_gains.PRIORS", priors):
+        yield
+
+
+@contextmanager
+def few_kernels() -> Iterator[None]:
+    """Choose among few kernels; the choice has its own tests."""
+
+    def few(position: Tensor, noises: Sequence[float]) -> Iterator[Kernel]:
+        return islice(candidates(position, noises), 0, None, 12)
+
+    with ExitStack() as patches:
+        for place in ("gp.choice", "rssi.training", "rssi.pairs"):
+            patches.enter_context(mock.patch(f"swiftwrf.{place}.candidates", few))
+        yield
+
+
+@contextmanager
+def few_folds() -> Iterator[None]:
+    """Hold out thirds of the spectra for a locator, with one distribution of residuals."""
+    with (
+        mock.patch("swiftwrf.locate.matched_field.FOLDS", 3),
+        mock.patch("swiftwrf.locate.spectrum_likelihood.DEGREES", (5.0,)),
+    ):
+        yield
+
+
+@contextmanager
 def glances() -> Iterator[None]:
-    """Shorten the search for rooms, which has its own tests."""
+    """Shorten the search for rooms, which has its own tests, to one of few planes."""
 
     def glance(train: Spectra, config: GeometryConfig, progress: bool = False) -> RoomEstimate:
         return search_room(train, replace(GLANCE, seed=config.seed, validation=config.validation), progress)
 
     with (
+        short_searches(),
         mock.patch("swiftwrf.models.geometry.model.search_room", glance),
         mock.patch.object(Search, "improve", lambda search, room: room),
     ):

@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pandas as pd
 import pytest
 import torch
-from small import small_swiftwrf
+from quick import cheap
 
 from augment import turbo_learning
 from augment.estimators import Estimator
@@ -61,7 +61,7 @@ def test_models_and_estimators_of_ones_own(data):
 
 def test_the_call_gives_the_errors_of_the_command(aoa_run):
     data, estimators = load_spectra(aoa_run.parent / "data"), ["peak", "nearest_spectrum"]
-    with small_swiftwrf():
+    with cheap():
         result = turbo_learning(data, measured=0.5, models=["swiftwrf"], estimators=estimators, extra=0)
     command = pd.read_csv(aoa_run / "errors.csv").query("measured_fraction == 0.5")
     command = command.set_index(["method", "index"])["great_circle_deg"]

@@ -120,7 +120,7 @@ def _of_the_floor() -> GeometryModel:
 
 def _hybrid() -> HybridModel:
     model = HybridModel().fit(_room(), like=_of_the_floor())
-    model.path_gains = fit_path_gains(_of_the_floor(), observe(_room())[0], Kernel())
+    model.path_gains = fit_path_gains(_of_the_floor(), observe(_room())[0], Kernel(), "tight")
     return model
 
 
@@ -153,9 +153,14 @@ MODELS: dict[str, Callable[[], Any]] = {
 }
 
 
+@functools.cache
+def _fitted(name: str) -> Any:
+    return MODELS[name]()
+
+
 def save(name: str, folder: Path) -> None:
     """Save a model of this kind."""
-    MODELS[name]().save(folder / "model")
+    _fitted(name).save(folder / "model")
 
 
 def rssi_survey(folder: Path) -> None:

@@ -25,6 +25,8 @@ from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMAT
 from swiftwrf.errors import MAX_LENGTH
 from swiftwrf.runtime.checkpoint import Saved
 
+pytestmark = pytest.mark.usefixtures("short_fits")
+
 
 def attack(kind: str, folder: Path, seeds: range) -> dict[str, int]:
     """Return the number of mutated samples, or attempts, that were read and that were refused.

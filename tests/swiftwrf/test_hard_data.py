@@ -111,13 +111,14 @@ def check(fit, position, bounds):
         assert high.max() <= bounds[1]
 
 
-@pytest.mark.usefixtures("short_searches")
+@pytest.mark.usefixtures("short_searches", "short_fits")
 @pytest.mark.parametrize(("name", "case"), [(name, case) for name in MODELS for case in CASES.get(name, ALL)])
 def test_field_models_of_hard_data(name, case):
     data = spectra(case)
     check(lambda: make_model(name, **OPTIONS.get(name, {})).fit(data), data.position, (0, 1))
 
 
+@pytest.mark.usefixtures("short_fits")
 @pytest.mark.parametrize("case", [*PLACES, *RSSI])
 @pytest.mark.parametrize("model", [RssiModel, PairModel])
 def test_rssi_models_of_hard_data(model, case):
@@ -125,6 +126,7 @@ def test_rssi_models_of_hard_data(model, case):
     check(lambda: model().fit(data), data.transmitter_position, (-torch.inf, torch.inf))
 
 
+@pytest.mark.usefixtures("short_fits")
 @pytest.mark.parametrize("case", [*PLACES, *RSSI])
 def test_rssi_locators_of_hard_data(case):
     data = rssi(case)
@@ -135,7 +137,7 @@ def test_rssi_locators_of_hard_data(case):
     assert posterior.median.isfinite().all()
 
 
-@pytest.mark.usefixtures("short_searches")
+@pytest.mark.usefixtures("short_searches", "short_fits")
 @pytest.mark.parametrize("case", ["scale 1000", "constant"])
 def test_matched_field_locators_of_hard_data(case):
     data = spectra(case)

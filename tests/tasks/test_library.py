@@ -5,11 +5,19 @@ from unittest import mock
 
 import pandas as pd
 import pytest
+from quick import cheap, sketched
 
 import augment
 import swiftwrf
 from swiftwrf import AngularGrid, InputError
 from swiftwrf.runtime.steps import Memo
+
+
+@pytest.fixture(autouse=True)
+def small_parts():
+    """Fits and figures that take a second; they have their own tests."""
+    with cheap(), sketched():
+        yield
 
 
 def turbo():

@@ -34,8 +34,7 @@ def errors(found, phase, turn):
     return math.degrees(left.magnitude()), float((beside * beside.sum().conj()).angle().abs().max().rad2deg())
 
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("echo", [0.0, 0.1])
+@pytest.mark.parametrize(("seed", "echo"), [(0, 0.0), (1, 0.1), (2, 0.1), (3, 0.0)])
 def test_phases_and_a_turn_of_20_degrees_are_recovered(seed, echo):
     data, phase, turn = spoilt(snapshots(n=300, noise=0.2, echo=echo), seed=seed)
     found = calibrate(data)
@@ -50,7 +49,7 @@ def test_phases_and_a_turn_of_20_degrees_are_recovered(seed, echo):
 def test_deviations_are_those_of_the_estimates():
     """Over draws of the noise, errors in units of their deviation have a deviation of one."""
     score = []
-    for seed in range(8):
+    for seed in range(4):
         data, phase, turn = spoilt(snapshots(n=120, count=1, noise=0.3, seed=seed))
         found = calibrate(data)
         turn_error = Rotation.from_rotvec(found.turn.numpy()).inv() * Rotation.from_rotvec(turn.numpy())
@@ -144,7 +143,10 @@ def test_elements_that_hold_noise_are_named(noise):
     found = inspect(replace(data, channel=channel), grid=(24, 96))
     assert found.numbers["noisy_elements"] == noise
     assert "--drop-elements " + " ".join(map(str, noise)) in " ".join(found.warnings)
-    assert "noisy_elements" not in inspect(data, grid=(24, 96)).numbers
+
+
+def test_no_element_of_a_sound_array_holds_noise():
+    assert "noisy_elements" not in inspect(snapshots(n=120, count=2), grid=(24, 96)).numbers
 
 
 def near_field(seed=0):

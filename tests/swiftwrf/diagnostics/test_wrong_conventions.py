@@ -106,9 +106,8 @@ def test_inspection_names_it(name):
 
 @pytest.mark.parametrize("data", [DATA, SPECTRA, ROOM], ids=["snapshots", "spectra", "RSSI"])
 def test_inspection_names_nothing_where_all_is_right(data):
-    assert not any(
-        word in warnings(data) for word in ("frame", "rotation", "metres", "calibrat", "would fit", "would explain")
-    )
+    found = warnings(data)
+    assert not any(word in found for word in ("frame", "rotation", "metres", "calibrat", "would fit", "would explain"))
 
 
 def test_inspection_names_a_sign_of_not_heard_that_is_not_known():

@@ -172,7 +172,7 @@ def test_a_room_in_closed_form_is_located_to_two_millimetres(closed_form):
 
 
 def test_few_cells_are_enough_where_path_gains_change_with_position():
-    spectra = simulated_room(n=300, seed=3, grid=AngularGrid.hemisphere(15, 60))
+    spectra = simulated_room(n=200, seed=3, grid=AngularGrid.hemisphere(15, 60))
     room, kernel = GeometryModel.of_planes(spectra, ROOM, order=1), Kernel(20.0, matern12_weight=1.0, noise=1e-3)
     normal = torch.randn(len(spectra), 8, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     value = 2 * torch.linalg.cholesky(kernel.covariance(spectra.position)) @ normal
@@ -269,6 +269,7 @@ def test_sessions_of_unequal_length_can_be_held_out():
     assert locator.locate(rows.rssi_dbm[:3]).median.isfinite().all()
 
 
+@pytest.mark.usefixtures("short_fits")
 def test_spectra_at_one_position_are_held_out_together():
     train = simulated_room(n=24, seed=3, grid=AngularGrid.hemisphere(15, 60))
     twice = train.subset(torch.arange(len(train)).repeat_interleave(2))
@@ -318,7 +319,7 @@ def building():
     return Rssi(rssi, at, floors=Floors(("ground", "first"), (0.0, 3.0)))
 
 
-def test_floors_are_located_with_their_probability(building, tmp_path):
+def test_floors_are_located_with_their_probability(building, short_fits, tmp_path):
     train, test = building.split()
     locator = RssiLocator(n_cells=400).fit(train)
     posterior = locator.locate(test.rssi_dbm)
@@ -336,7 +337,7 @@ def test_floors_are_located_with_their_probability(building, tmp_path):
     assert torch.equal(load(tmp_path / "locator.safetensors").locate(test.rssi_dbm).log_weight, posterior.log_weight)
 
 
-def test_each_floor_may_be_a_session_of_its_own(building):
+def test_each_floor_may_be_a_session_of_its_own(building, short_fits):
     """Then no held-out row has a neighbour on its floor."""
     rows = replace(building, session=building.floors.number(building.transmitter_position))
     locator = RssiLocator(validation="session", n_cells=100).fit(rows)

@@ -50,7 +50,7 @@ def test_the_smallest_size_that_does_as_well_as_any_is_found(losses, found, trie
 
 
 @pytest.mark.parametrize("level", [0.0, 0.5])
-def test_constant_spectra_are_predicted(room, level):
+def test_constant_spectra_are_predicted(room, short_fits, level):
     still = replace(room, store=Store(torch.full_like(room.spectrum, level)))
     found = fit(still).update(still).predict(room.position)
     torch.testing.assert_close(found.mean, still.spectrum, atol=2e-2, rtol=0)

@@ -63,11 +63,21 @@ def fitted(walls: GeometryModel, train: Spectra) -> GeometryModel:
     return walls
 
 
-@pytest.fixture(autouse=True)
-def one_setting(monkeypatch):
-    """One size of voxels and fewer steps, because each fit takes seconds."""
-    monkeypatch.setattr(furniture, "SETTINGS", ((1.0, 1e-3),))
-    monkeypatch.setattr(furniture, "N_STEPS", 70)
+@pytest.fixture(scope="module", autouse=True)
+def one_setting():
+    """One size of voxels, fewer steps and folds, because each fit takes seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in {"SETTINGS": ((1.0, 1e-3),), "N_STEPS": 70, "MIN_HELD_OUT": 20}.items():
+            patch.setattr(furniture, name, value)
+        yield
+
+
+@pytest.fixture(scope="module", params=["transmitter", "receiver"])
+def furnished_room(request):
+    """Noisy packets of a furnished room, for training and test, and the room fitted to the former."""
+    data, walls = measured(6.0, request.param, n=80, noise=0.1)
+    train = data.subset(torch.arange(70))
+    return train, data.subset(torch.arange(70, 80)), fitted(walls, train)
 
 
 @pytest.mark.parametrize("moving", ["transmitter", "receiver"])
@@ -119,18 +129,16 @@ def test_a_voxel_attenuates_the_direct_path_by_its_length_in_it():
     assert float(inside.max()) > 0.2
 
 
-@pytest.mark.parametrize("moving", ["transmitter", "receiver"])
-def test_furniture_is_found_where_it_stands_and_explains_new_channels(moving, tmp_path):
-    data, walls = measured(6.0, moving, n=80)
-    train, test = data.subset(torch.arange(60)), data.subset(torch.arange(60, 80))
+def test_furniture_is_found_where_it_stands_and_explains_new_channels(furnished_room, tmp_path):
+    train, test, room = furnished_room
+    walls = GeometryModel.of_planes(train, WALLS)
     channels = walls.channels(test)
     before = 1 - channels.coherence(walls.tensors(), walls.gains(channels.scene))
-    room = fitted(walls, train)
     assert room.furniture is not None
     after = 1 - channels.coherence(room.reflectors, room.gains(channels.scene))
     assert float(after.mean()) < 0.5 * float(before.mean())
     centre = (
-        (torch.tensor([2.75, 2.3, 0.7 if moving == "transmitter" else 2.1]).double() - room.furniture.low)
+        (torch.tensor([2.75, 2.3, 0.7 if train.moving == "transmitter" else 2.1]).double() - room.furniture.low)
         / room.furniture.voxel_m
     ).long()
     i, j, k = centre.tolist()
@@ -185,7 +193,7 @@ def test_furniture_is_drawn_by_height_and_hatched_where_it_is_unknown(tmp_path):
 
 
 def test_an_empty_room_has_no_furniture_and_spectra_alone_have_none():
-    data, walls = measured(0.0, n=60)
+    data, walls = measured(0.0, n=40)
     assert fitted(walls, data).furniture is None
     walls._furnish(replace(data, channel=None))
     assert walls.furniture is None
@@ -204,15 +212,14 @@ def test_phases_of_channels_have_no_alias_and_those_of_packets_are_the_signal():
     assert torch.allclose(match, torch.ones_like(match), atol=1e-5)
 
 
-def test_positions_are_located_by_noisy_packets_through_furniture(tmp_path):
-    data, _ = measured(6.0, n=80, noise=0.1)
-    train, test = data.subset(torch.arange(70)), data.subset(torch.arange(70, 80))
+@pytest.mark.parametrize("furnished_room", ["transmitter"], indirect=True)
+def test_positions_are_located_by_noisy_packets_through_furniture(furnished_room, tmp_path):
+    train, test, room = furnished_room
     cells = {"n_best": 15, "n_background": 8, "n_split": 8, "spacing": 0.3, "max_cells": 4000}
-    room = fitted(GeometryModel.of_planes(train, WALLS), train)
     locator = MatchedField(**cells, n_rounds=2, n_calibration=12).fit(train, room=room)
     posterior = locator.locate(test)
     error = (posterior.median - test.position).norm(dim=1)
-    assert float(error.median()) < 0.5 * data.array.wavelength
+    assert float(error.median()) < 0.5 * test.array.wavelength
     locator.save(tmp_path / "locator.safetensors")
     again = load(tmp_path / "locator.safetensors").locate(test.channel)
     assert torch.equal(again.log_weight, posterior.log_weight)

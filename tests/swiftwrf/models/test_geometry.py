@@ -15,7 +15,7 @@ from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.store import Store
 from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.metrics import psnr
-from swiftwrf.models.geometry import GeometryConfig, GeometryModel, Plane, path_gains
+from swiftwrf.models.geometry import GeometryConfig, GeometryModel, Plane, path_gains, search
 from swiftwrf.models.geometry.fit import _pruned, _with_weak_planes, _without_aliases, observe, split
 from swiftwrf.models.geometry.hybrid import HybridModel
 from swiftwrf.models.geometry.images import SIDES, PhaseObservations, PlaneSet, field
@@ -30,7 +30,7 @@ from swiftwrf.models.geometry.path_gains import (
 )
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation, correlations, retrieve_phases
 from swiftwrf.models.geometry.planes import image_jacobian, phase_jacobian, refine, refine_all
-from swiftwrf.models.geometry.search import SIGNS, SteeringResponses
+from swiftwrf.models.geometry.search import N_SPHERE_NORMALS, SIGNS, SteeringResponses
 from swiftwrf.models.geometry.uncertainty import _AlternativeTable, phase_alternatives
 from swiftwrf.models.neighbours import NearestModel
 
@@ -257,7 +257,9 @@ def test_scores_of_combinations_are_those_of_their_rooms():
 
 
 @pytest.mark.long
-def test_a_tilted_plane_is_found_to_a_millimetre():
+@pytest.mark.usefixtures("short_searches")
+def test_a_tilted_plane_is_found_to_a_millimetre(monkeypatch):
+    monkeypatch.setattr(search, "N_SPHERE_NORMALS", N_SPHERE_NORMALS)
     model = fit(mirror_room({(0.8, 0.5, 0.1): 5.0}, -0.7, n=25), search_distance_m=0.5, beam_width=1, max_order=1)
     assert len(model.planes) == 1
     assert errors(model, {(0.8, 0.5, 0.1): 5.0})[0][0] < 1
@@ -293,6 +295,7 @@ def test_noise_stays_within_the_deviations():
     assert sorted(plane.gain for plane in room.planes) == pytest.approx(sorted(gain), abs=0.1)
 
 
+@pytest.mark.usefixtures("short_searches")
 def test_positions_in_a_plane_leave_no_plane_certain():
     model = fit(
         mirror_room(SIX, noise=0.1, n=16, low=(1.5, 1.2, 1.2), high=(3.5, 3.2, 1.2)),
@@ -304,6 +307,7 @@ def test_positions_in_a_plane_leave_no_plane_certain():
     assert all(error < 3 * std for error, std in errors(model, SIX) if model.planes)
 
 
+@pytest.mark.usefixtures("short_searches")
 def test_pure_noise_has_no_certain_plane():
     generator = torch.Generator().manual_seed(0)
     data = mirror_room({}, n=10)

@@ -23,7 +23,7 @@ def moved(spectra, shift):
 
 
 @pytest.mark.parametrize("name", FIELD_MODELS)
-def test_field_models_do_not_depend_on_the_origin(room, small_published, name):
+def test_field_models_do_not_depend_on_the_origin(room, small_published, short_fits, name):
     """The origin of map coordinates may be thousands of kilometres away."""
     train, test = room.subset(torch.arange(24)).split("random")
     predicted = []
@@ -37,7 +37,7 @@ def test_field_models_do_not_depend_on_the_origin(room, small_published, name):
 
 
 @pytest.mark.parametrize("name", [name for name in RSSI_PREDICTORS if name != "swiftwrf"])
-def test_predictors_do_not_depend_on_the_origin(small_published, name):
+def test_predictors_do_not_depend_on_the_origin(small_published, short_fits, name):
     data, predicted = rssi_room(n=40).receivers(["1", "2"]), []
     for shift in (0.0, 1e7):
         moved = replace(

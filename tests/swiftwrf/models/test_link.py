@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from small import FLOOR as FLOOR_PLANE
+from small import few_kernels, short_path_gains
 
 from swiftwrf import (
     FieldModel,
@@ -42,8 +43,9 @@ def given_room(data):
 @pytest.fixture(scope="module")
 def models(room):
     known = given_room(room)
-    closed_form = [make_model(name).fit(room) for name in ("gp", "coarray")]
-    return [*closed_form, known, HybridModel().fit(room, like=known)]
+    with short_path_gains(), few_kernels():
+        closed_form = [make_model(name).fit(room) for name in ("gp", "coarray")]
+        return [*closed_form, known, HybridModel().fit(room, like=known)]
 
 
 @other_links
@@ -82,7 +84,7 @@ def test_what_spectra_do_not_describe_is_not_compared(room, models):
 
 
 @pytest.mark.parametrize("predictor", [RssiModel, PairModel])
-def test_rows_at_other_receivers_are_refused(tmp_path, predictor):
+def test_rows_at_other_receivers_are_refused(short_fits, tmp_path, predictor):
     model = predictor().fit(FLOOR)
     model.save(tmp_path / "model")
     model = load(tmp_path / "model")
@@ -124,7 +126,7 @@ def test_unknown_positions_of_receivers_are_not_compared(tmp_path):
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_a_fit_that_fails_leaves_the_model_as_it_was(room, model, last_step, monkeypatch):
+def test_a_fit_that_fails_leaves_the_model_as_it_was(room, short_fits, model, last_step, monkeypatch):
     spectra = isinstance(model, MatchedField | FieldModel)
     data = room.subset(range(20)) if spectra else FLOOR.subset(range(30)).columns([0, 4, 8])
     options = {"room": given_room(room)} if isinstance(model, MatchedField) else {}

@@ -1,5 +1,6 @@
 """SwiftWRF after its fit, and the co-array: exact space, projection, model."""
 
+from copy import deepcopy
 from dataclasses import replace
 
 import pytest
@@ -17,9 +18,15 @@ from swiftwrf.rasterize import rasterize_magnitude
 from swiftwrf.runtime import checkpoint
 
 
-@pytest.fixture
-def model(room):
+@pytest.fixture(scope="module")
+def fitted(room):
     return fit(room, n_primitives=32)
+
+
+@pytest.fixture
+def model(fitted):
+    """A model that a test may change."""
+    return deepcopy(fitted)
 
 
 def test_far_from_all_training_positions_the_spectrum_is_their_mean(room, model):

@@ -463,7 +463,7 @@ def test_models_for_comparison_are_always_quick(small, monkeypatch):
     assert sorted(made) == [("coarray", "quick"), ("gp", "quick"), ("idw", "paper")]
 
 
-def test_the_room_is_searched_once_for_all_models_with_one(room, floor_alone, tmp_path, monkeypatch):
+def test_the_room_is_searched_once_for_all_models_with_one(room, floor_alone, short_fits, tmp_path, monkeypatch):
     """Its time counts as part of the fit of each of them. The comparison of models has a search for each pair of folds."""
     searched, search = [], geometry.search_room
     monkeypatch.setattr(geometry, "search_room", lambda *given: searched.append(1) or search(*given))

@@ -13,7 +13,7 @@ import pytest
 import torch
 from quick import FEW_CELLS, QuickNetwork, command, sketched
 from rooms import mirror_room
-from small import known_planes, with_defaults
+from small import few_folds, known_planes, short_path_gains, with_defaults
 
 from augment import cross_validation
 from augment.cross_validation import LOCATOR
@@ -24,7 +24,6 @@ from swiftwrf import MatchedField, load
 from swiftwrf.locate import Posterior, matched_field
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry.model import fingerprint
-from swiftwrf.models.geometry.path_gains import PRIORS
 from swiftwrf.models.geometry.planes import Plane
 from tasks.aoa import experiment
 
@@ -69,8 +68,8 @@ def quickly(data, planes=PLANES):
             mock.patch.object(experiment, "simulated_room", return_value=data),
             sketched(),
             mock.patch.object(MatchedField, "fit", fit_once),
-            mock.patch("swiftwrf.locate.spectrum_likelihood.DEGREES", (5.0,)),
-            mock.patch("swiftwrf.models.geometry.path_gains.PRIORS", {"tight": PRIORS["tight"]}),
+            few_folds(),
+            short_path_gains(),
             mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
             *(
                 mock.patch(f"{place}.candidates", lambda data: [n for n in ("idw", "geometry") if not lacking(n, data)])

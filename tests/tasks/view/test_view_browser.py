@@ -12,7 +12,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -38,7 +38,7 @@ pytestmark = pytest.mark.skipif(bool(missing), reason=f"needs {' and '.join(miss
 ROOT = Path(__file__).parents[3]
 WIDTHS, THEMES = (360, 700, 1400), ("light", "dark")
 PATIENCE = 60  # [s], for machines that are busy
-MOVES = 60  # of a drag, one in 16 ms as a pointer's are
+MOVES = 30  # of a drag, one in 16 ms as a pointer's are
 COUNT = """
 window.frames_seen = [];
 const seen = () => window.frames_seen.push(performance.now());
@@ -67,32 +67,33 @@ def serve():
         assert process.wait(PATIENCE) in (0, 130)
 
 
-@contextmanager
-def chromium(*arguments, preferences=None):
-    """Yield a browser without a window that must have nothing to complain about in the end."""
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory):
+    """A browser without a window, for all tests, and the folder of its downloads, which it does not ask the visitor for."""
     from selenium import webdriver
     from selenium.webdriver.chrome.service import Service
 
-    options = webdriver.ChromeOptions()
+    options, folder = webdriver.ChromeOptions(), tmp_path_factory.mktemp("downloads")
     options.binary_location = shutil.which("chromium")
-    for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", *arguments):
-        options.add_argument(argument)
-    options.add_experimental_option("prefs", preferences or {})
+    for argument in ("headless=new", "no-sandbox", "disable-dev-shm-usage", "hide-scrollbars", "window-size=1400,1037"):
+        options.add_argument(f"--{argument}")
+    several = "profile.default_content_setting_values.automatic_downloads"
+    options.add_experimental_option("prefs", {"download.default_directory": str(folder), several: 1})
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     driver = webdriver.Chrome(options, Service(shutil.which("chromedriver")))
-    yield driver
-    complaints = [entry["message"] for entry in driver.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")]
+    yield driver, folder
     driver.quit()
-    assert complaints == []
 
 
 @pytest.fixture
-def browser(serve, tmp_path):
-    """A browser that ends before the servers and downloads without asking the visitor."""
-    several = "profile.default_content_setting_values.automatic_downloads"
-    preferences = {"download.default_directory": str(tmp_path), several: 1}
-    with chromium("--window-size=1400,1037", preferences=preferences) as driver:
-        yield driver
+def browser(serve, chromium):
+    """The browser in its own size, which leaves the page before its server ends and has nothing to complain about."""
+    driver, _ = chromium
+    driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    yield driver
+    complaints = [entry["message"] for entry in driver.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")]
+    driver.get("about:blank")
+    assert complaints == []
 
 
 def until(check):
@@ -233,7 +234,7 @@ def test_paths_of_a_room_are_drawn(browser, serve, tmp_path):
     until(lambda: browser.execute_script(drawn) != before)
 
 
-def test_page_of_a_locator(browser, serve, locate_run, tmp_path):
+def test_page_of_a_locator(browser, chromium, serve, locate_run):
     """Maps of RSSI as of a run of RSSI, and posteriors."""
     plan = opened(browser, serve(locate_run), "map", "sentence")
     pointer(browser).move_to_element_with_offset(plan, 30, 20).perform()
@@ -250,8 +251,8 @@ def test_page_of_a_locator(browser, serve, locate_run, tmp_path):
         assert ("receiver01" in said(browser, "best")) == (kind == "best receiver")  # its legend
     press(browser, "SVG")
     press(browser, "CSV")
-    file = until(lambda: next(tmp_path.glob("*.csv"), None))
-    until(lambda: next(tmp_path.glob("*.svg"), None))
+    file = until(lambda: next(chromium[1].glob("*.csv"), None))
+    until(lambda: next(chromium[1].glob("*.svg"), None))
     assert set(pd.read_csv(file)["receiver"]) == {"receiver01"}
     press(browser, "posterior")
     shown = until(lambda: "median at" in said(browser, "sentence") and said(browser, "sentence"))
@@ -334,45 +335,38 @@ return [...found];
 """
 
 
-@pytest.fixture(scope="module")
-def viewer():
-    """A browser for all reports."""
-    with chromium("--hide-scrollbars") as driver:
-        yield driver
-
-
-def fits(viewer, address):
+def fits(browser, address):
     """Open a report in every width and theme."""
-    viewer.get(address)
-    viewer.execute_script("document.querySelectorAll('details').forEach(one => one.open = true)")
-    assert len(viewer.find_elements("css selector", "nav a")) <= 6
-    assert not viewer.execute_script(
+    browser.get(address)
+    browser.execute_script("document.querySelectorAll('details').forEach(one => one.open = true)")
+    assert len(browser.find_elements("css selector", "nav a")) <= 6
+    assert not browser.execute_script(
         "return [...document.querySelectorAll('figure svg')].filter(svg => !svg.querySelector('title')).length"
     )
     for theme in THEMES:
         for width in WIDTHS:
-            looks(viewer, width, theme)
-            assert viewer.execute_script("return document.documentElement.scrollWidth") <= width, (width, theme)
-            assert viewer.execute_script(BEYOND, TOLERANCE_PX) == [], (width, theme)
-        assert viewer.execute_script(FAINT, MIN_CONTRAST) == [], theme
+            looks(browser, width, theme)
+            assert browser.execute_script("return document.documentElement.scrollWidth") <= width, (width, theme)
+            assert browser.execute_script(BEYOND, TOLERANCE_PX) == [], (width, theme)
+        assert browser.execute_script(FAINT, MIN_CONTRAST) == [], theme
 
 
-def test_reports_of_angles(viewer, aoa_run):
-    fits(viewer, (aoa_run / "report.html").as_uri())
+def test_reports_of_angles(browser, aoa_run):
+    fits(browser, (aoa_run / "report.html").as_uri())
 
 
-def test_reports_of_rssi(viewer, rssi_run, tmp_path):
-    fits(viewer, (rssi_run / "report.html").as_uri())
+def test_reports_of_rssi(browser, rssi_run, tmp_path):
+    fits(browser, (rssi_run / "report.html").as_uri())
     merge([rssi_run, rssi_run], tmp_path / "both")
-    fits(viewer, (tmp_path / "both" / "report.html").as_uri())
-    viewer.get((tmp_path / "both" / "report.html").as_uri())
-    first = viewer.find_element("css selector", ".first").text
+    fits(browser, (tmp_path / "both" / "report.html").as_uri())
+    browser.get((tmp_path / "both" / "report.html").as_uri())
+    first = browser.find_element("css selector", ".first").text
     assert "1: the simulated floor, random split" in first
     assert "2: the simulated floor, random split" in first
 
 
-def test_reports_of_files(viewer, room, tmp_path):
+def test_reports_of_files(browser, room, tmp_path):
     (tmp_path / "data").mkdir()
     write_spectra(room, tmp_path / "data")
     assert quick.run("inspect", tmp_path / "data", "--out", tmp_path / "inspection", drawn=True) == 0
-    fits(viewer, (tmp_path / "inspection" / "report.html").as_uri())
+    fits(browser, (tmp_path / "inspection" / "report.html").as_uri())
