@@ -15,7 +15,8 @@ from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.data import Rssi, Snapshots, Spectra
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
-from swiftwrf.diagnostics.inspection import Findings, inspect, nearest, propose_offsets
+from swiftwrf.diagnostics.inspection import Findings, inspect, propose_offsets
+from swiftwrf.positions import nearest
 from swiftwrf.rssi import fit_path_loss, log_distance
 from swiftwrf.runtime.durable import write_json
 from tasks.answer import NextStep
@@ -151,7 +152,7 @@ def _directions(data: Spectra) -> Plot:
 
 def _neighbours(data: Spectra) -> Plot:
     figure, ax = figures.panel(6, 3)
-    rows, apart = nearest(data.position)
+    apart = nearest(data.position, data.position, 2)[0][:, 1]
     low, high = (float(end) for end in apart.aminmax())  # all are equal on a regular grid, up to rounding
     ax.hist(apart.numpy(), bins=40, range=(low, max(high, low + MIN_BINS_M)), color=DOTS)
     if data.array is not None:
@@ -160,7 +161,7 @@ def _neighbours(data: Spectra) -> Plot:
     caption = "Distance to the nearest other position."
     if data.array is not None:
         caption += " The line is half a wavelength."
-    return Plot("neighbours", [figure], caption, _places(data.position[rows], nearest_m=apart))
+    return Plot("neighbours", [figure], caption, _places(data.position, nearest_m=apart))
 
 
 def _floor(data: Rssi) -> Plot:

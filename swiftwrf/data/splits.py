@@ -6,15 +6,13 @@ import math
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from scipy.stats import wasserstein_distance
 from torch import Tensor
 
 from swiftwrf.data.files import read_text
 from swiftwrf.errors import InputError
+from swiftwrf.positions import nearest
 from swiftwrf.runtime.validation import PositiveInt, checked
 
 TEST_SHARE = 0.2
@@ -61,12 +59,10 @@ def _read_indices(file: Path, n: int, first: int) -> list[int]:
     for line, text in enumerate(read_text(file).split(), start=1):
         digits = text.lstrip("0") or "0"
         if not (text.isascii() and text.isdecimal() and len(digits) <= 18):
-            raise InputError(f"{file} entry {line} is {text!r}; expected a whole number, {first} to {n - 1 + first}")
+            raise InputError(f"{file} entry {line} is {text!r}, which is no whole number")
         row = int(digits) - first
         if not 0 <= row < n:
-            raise InputError(
-                f"{file} entry {line} is {text}; expected {first} to {n - 1 + first}, the measurements there are"
-            )
+            raise InputError(f"{file} entry {line} is {text}; expected {first} to {n - 1 + first}")
         if row in rows:
             raise InputError(f"{file} lists index {text} twice; each measurement belongs to a part once")
         rows[row] = None
@@ -142,8 +138,7 @@ def repeated_fraction(train: Tensor, test: Tensor) -> float:
         return 0.0
     sides = (train.amax(dim=0) - train.amin(dim=0)).sort(descending=True).values
     spacing = math.sqrt(float(sides[0] * sides[1]) / len(train))
-    distance, _ = cKDTree(train.numpy()).query(test.numpy())
-    return float((distance <= 0.02 * spacing).mean())
+    return float((nearest(test, train, 1)[0] <= 0.02 * spacing).double().mean())
 
 
 def slabs(position: Tensor, n_slabs: int) -> Tensor:
@@ -224,14 +219,13 @@ def matching_validation(train: Tensor, test: Tensor) -> Validation:
         ('random', 'block')
     """
 
-    def distances(known: Tensor, other: Tensor) -> NDArray[np.float64]:
-        found: NDArray[np.float64] = cKDTree(known.numpy()).query(other.numpy())[0]
-        return found
+    def distances(known: Tensor, other: Tensor) -> Tensor:
+        return nearest(other, known, 1)[0][:, 0]
 
     def misfit(validation: Validation) -> float:
         fold = folds(train, validation, 0)
         held_out = [distances(train[fold != number], train[fold == number]) for number in fold.unique()]
-        return float(wasserstein_distance(np.concatenate(held_out), distances(train, test)))
+        return float(wasserstein_distance(torch.cat(held_out), distances(train, test)))
 
     kinds: tuple[Validation, Validation] = ("random", "block")
     return min(kinds, key=misfit)

@@ -15,16 +15,15 @@ from swiftwrf.data import Rssi, Snapshots, Spectra
 from swiftwrf.data.powers import has_frequent_edge
 from swiftwrf.data.splits import MAX_REPEATED, MIN_TRAINING, repeated_fraction
 from swiftwrf.diagnostics.calibration import calibrate
-from swiftwrf.diagnostics.elements import in_noise, noisy_elements, some_rows
+from swiftwrf.diagnostics.elements import in_noise, noisy_elements
 from swiftwrf.diagnostics.frames import MIN_CLEAR_POSITIONS, FrameReport, check_frames
 from swiftwrf.diagnostics.path_loss import check_path_loss
 from swiftwrf.errors import InputError, listed
-from swiftwrf.positions import distance
+from swiftwrf.positions import nearest
 from swiftwrf.rssi import estimate_offsets
 from swiftwrf.runtime.validation import checked
 
 Level = Literal["fact", "warning"]
-MAX_POSITIONS = 3000  # whose neighbours are searched
 SMOOTH, ROUGH = 0.25, 0.5  # wavelengths between neighbours: below, fields are smooth; above, fringes are lost
 SPARSE = 2.0  # wavelengths between neighbours, beyond which a search for a room finds few of its planes or none
 MAX_END_OFFSET = 1e-3  # of normalised coordinates from the ends of their interval
@@ -129,8 +128,6 @@ def _check_positions(position: Tensor, findings: Findings, wavelength: float | N
     flat = [axis for axis, size in zip("xyz", extent, strict=True) if size < 1e-9]
     if {"x", "y"} & set(flat):
         findings.warn(f"All positions have one {' and one '.join(flat)}; directions and planes are not identifiable.")
-    if len(position) < 2:
-        return
     places = position.unique(dim=0)
     if len(places) < len(position):
         findings.add(
@@ -138,8 +135,7 @@ def _check_positions(position: Tensor, findings: Findings, wavelength: float | N
         )
     if len(places) < 2:
         return
-    _, near = nearest(places)
-    middle = float(near.median())
+    middle = float(nearest(places, places, 2)[0][:, 1].median())
     findings.numbers["nearest_m"] = middle
     if wavelength is None:
         findings.add(f"The nearest other position is {middle:.3f} m away (median).")
@@ -168,14 +164,6 @@ def _normalised(position: Tensor) -> str:
         if int(varying.sum()) >= 2 and bool((ends.abs() <= MAX_END_OFFSET).all()):
             return name
     return ""
-
-
-def nearest(position: Tensor) -> tuple[Tensor, Tensor]:
-    """Return rows of positions (n, 3), a subset of many, and the distance from each to the nearest other one [m]."""
-    some = some_rows(len(position), MAX_POSITIONS)
-    apart = torch.cat([distance(position[rows], position) for rows in some.split(500)])
-    apart[torch.arange(len(some)), some] = torch.inf
-    return some, apart.amin(dim=1)
 
 
 def _add_splits(data: Spectra | Snapshots | Rssi, findings: Findings) -> None:

@@ -9,7 +9,6 @@ from samples import WAVELENGTH, snapshots, write_snapshots, write_survey
 
 from swiftwrf import AngularGrid, simulated_room
 from swiftwrf.data.writing import write_spectra
-from swiftwrf.diagnostics.inspection import nearest
 
 
 def run(*arguments):
@@ -58,15 +57,7 @@ def test_survey(tmp_path, capsys):
     assert (tmp_path / "page" / "report.html").read_text().count("<svg") == 1
 
 
-def test_the_nearest_other_position():
-    position = torch.tensor([[0.0, 0, 0], [0, 0, 2], [0, 1, 0], [0, 1, 0]], dtype=torch.float64)
-    rows, apart = nearest(position)
-    assert rows.tolist() == [0, 1, 2, 3]
-    assert apart.tolist() == [1, 2, 0, 0]
-
-
-def test_more_positions_than_are_looked_at(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("swiftwrf.diagnostics.inspection.MAX_POSITIONS", 20)
+def test_positions_that_repeat(tmp_path, capsys):
     room = simulated_room(n=15, grid=AngularGrid.hemisphere(8, 32))
     (tmp_path / "source").mkdir()
     write_spectra(room.subset(torch.arange(15).repeat(2)), tmp_path / "source")
