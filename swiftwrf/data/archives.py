@@ -136,13 +136,13 @@ def _stream(file: Path, name: str) -> Iterator[tuple[Any, int]]:
 
 
 @contextmanager
-def refusing_broken(file: Path, kind: str) -> Iterator[None]:
-    """Turn exceptions on a broken file into an InputError that names the file and its expected kind."""
+def refusing_broken(file: object, kind: str) -> Iterator[None]:
+    """Turn exceptions on a broken file, or what a label names, into an InputError with its expected kind."""
     try:
         yield
     except InputError as error:
         raise InputError(f"{file}: {error}" if str(file) not in str(error) else str(error)) from None
-    except Exception as error:  # zipfile, zlib, NumPy, h5py, pyarrow and Pillow raise exceptions of many types
+    except Exception as error:  # readers of files raise exceptions of many types
         raise InputError(f"{file} is not {kind} ({error})") from None
 
 

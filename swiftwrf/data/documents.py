@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 
 import pandas as pd
 
+from swiftwrf.data.archives import refusing_broken
 from swiftwrf.data.columns import GEODETIC, column_of, has_role, is_coordinate, receiver_columns
 from swiftwrf.errors import InputError
 
@@ -45,11 +46,8 @@ def table_in_document(label: object, text: str, suffix: str) -> pd.DataFrame:
         [['1', '2', 'a', '-60'], ['1', '2', 'b', '-70']]
     """
     records: dict[Keys, list[Row]] = {}
-    try:
+    with refusing_broken(label, f"a complete {suffix.lstrip('.').upper()} document"):
         _collect(_points(text) if suffix in XML else json.loads(text), (), {}, records)
-    except (ValueError, ElementTree.ParseError, RecursionError) as error:
-        kind = suffix.lstrip(".").upper()
-        raise InputError(f"{label} is no complete {kind} document ({error or 'nested too deeply'})") from None
     if not records:
         raise InputError(f"{label} holds no records with names, e.g. points with positions and RSSI")
     tables = {path: _table(label, rows) for path, rows in records.items()}

@@ -81,12 +81,10 @@ def read_text(file: Path) -> str:
         size = file.stat().st_size
     if size > MAX_TEXT_BYTES:
         raise InputError(f"{file} has {size} bytes; a table or list has at most {MAX_TEXT_BYTES}")
-    try:
+    with refusing_broken(file, "a text in UTF-8"):
         text = read_bytes(file).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{file} is no text in UTF-8 (byte {error.start + 1}); save it in that encoding") from None
-    if "\0" in text:
-        raise InputError(f"{file} is no text in UTF-8: it holds zero bytes; save it in that encoding")
+        if "\0" in text:
+            raise ValueError("it holds zero bytes")
     return text
 
 
@@ -104,11 +102,8 @@ def read_yaml(file: Path) -> dict[str, Any]:
     Raises:
         InputError: No such file, not YAML, not a mapping, or a name twice.
     """
-    text = read_text(file)
-    try:
-        content = yaml.load(text, Loader=_PlainLoader)
-    except (yaml.YAMLError, RecursionError, TypeError, ValueError) as error:
-        raise InputError(f"{file} is not valid YAML: {error or 'nested too deeply'}") from None
+    with refusing_broken(file, "valid YAML"):
+        content = yaml.load(read_text(file), Loader=_PlainLoader)
     if not isinstance(content, dict):
         raise InputError(f"{file} must hold names and values, got {type(content).__name__}")
     return content
@@ -208,11 +203,8 @@ def _holds_values(cells: list[str]) -> bool:
 def table_of(label: object, text: str, header: bool = True) -> pd.DataFrame:
     """Return the table in the text of a CSV file, as `read_table`; the label stands for it in messages."""
     separator = _separator(text.split("\n", 1)[0])
-    try:
-        stream = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
-        lines = [line for line in stream if line]
-    except csv.Error as error:
-        raise InputError(f"{label} is not a comma-separated table ({error})") from None
+    with refusing_broken(label, "a comma-separated table"):
+        lines = [line for line in csv.reader(io.StringIO(text, newline=""), delimiter=separator) if line]
     if not lines:
         raise InputError(f"{label} is empty; expected a header and one row a measurement")
     if header and _holds_values(lines[0]):

@@ -93,12 +93,8 @@ def pooled(rssi: Floats, pools: Sequence[str]) -> tuple[list[str], Floats]:
         (['hall'], array([[-50.],
                [-60.]]))
     """
-    names = list(dict.fromkeys(pools))
-    member = np.array([[pool == name for name in names] for pool in pools], dtype=np.float64)
-    detected = ~np.isnan(rssi)
-    power = np.where(detected, 10 ** (np.nan_to_num(rssi) / 10), 0.0) @ member
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return names, 10 * np.log10(power / (detected @ member))
+    power = pd.DataFrame(10 ** (rssi.T / 10)).groupby(list(pools), sort=False).mean()  # without nan
+    return list(power.index), 10 * np.log10(power.to_numpy().T)
 
 
 def read_receivers(

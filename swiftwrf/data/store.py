@@ -151,7 +151,16 @@ def stored(
                 with suppress(OSError):  # another process may be faster
                     if time.time() - other.stat().st_mtime > 30 * 86_400:
                         other.unlink()
-            _write(file, shape, dtype, make)
+            size, free = math.prod(shape) * dtype.itemsize, shutil.disk_usage(file.parent).free
+            if size > free:
+                raise InputError(
+                    f"{shape[0]} spectra take {size / 1e9:.1f} GB in {file.parent}, where {free / 1e9:.1f} GB are free; set "
+                    "XDG_CACHE_HOME to a directory with room"
+                )
+            # written without a map, because a full disk under a map ends the process by a signal
+            with replacing(file) as temporary, temporary.open("wb") as stream, progress_bar() as bar:
+                task = bar.add_task("storing spectra", total=shape[0])
+                write_npy(stream, shape, dtype, make(), lambda count: bar.advance(task, count))
         found = _mapped(file, shape, dtype)
     assert found is not None
     return Store(found)
@@ -165,19 +174,6 @@ def _mapped(file: Path, shape: tuple[int, int, int], dtype: torch.dtype) -> Tens
     except (OSError, ValueError, EOFError):
         return None
     return torch.from_numpy(values) if values.shape == shape and values.dtype == TYPES[dtype] else None
-
-
-def _write(file: Path, shape: tuple[int, int, int], dtype: torch.dtype, make: Callable[[], Iterable[Tensor]]) -> None:
-    """Write the file without mapping it, because a full disk under a map ends the process by a signal."""
-    size, free = math.prod(shape) * dtype.itemsize, shutil.disk_usage(file.parent).free
-    if size > free:
-        raise InputError(
-            f"{shape[0]} spectra take {size / 1e9:.1f} GB in {file.parent}, where {free / 1e9:.1f} GB are free; set "
-            "XDG_CACHE_HOME to a directory with room"
-        )
-    with replacing(file) as temporary, temporary.open("wb") as stream, progress_bar() as bar:
-        task = bar.add_task("storing spectra", total=shape[0])
-        write_npy(stream, shape, dtype, make(), lambda count: bar.advance(task, count))
 
 
 def write_npy(

@@ -467,15 +467,15 @@ def _columns_of_end(label: object, table: pd.DataFrame, given: Sequence[str]) ->
                 f"{' '.join(given)}; there are {listed(table.columns)}"
             )
         return dict(zip("xyz", given, strict=False))
-    marked = {axis: {_mark(name): name for name in reversed(candidates(table, axis))} for axis in "xyz"}
+
+    def mark(name: str) -> str:
+        return next((MARKS[word] for word in plain_name(name).split("_") if word in MARKS), "")
+
+    marked = {axis: {mark(name): name for name in reversed(candidates(table, axis))} for axis in "xyz"}
     for mark, beside in (("transmitter", {"receiver", ""}), ("receiver", {""})):
         if all(mark in marked[axis] and beside & marked[axis].keys() for axis in "xy"):
             return {axis: names[mark] for axis, names in marked.items() if mark in names}
     return {}
-
-
-def _mark(name: str) -> str:
-    return next((MARKS[word] for word in plain_name(name).split("_") if word in MARKS), "")
 
 
 def _as_receivers(label: object, rssi: Floats, ends: Floats) -> tuple[list[str], Floats, Floats, Floats, list[str]]:

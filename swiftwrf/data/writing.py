@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import zipfile
 from collections.abc import Mapping
@@ -26,7 +25,7 @@ from swiftwrf.data.rssi import META, SURVEY, Rssi
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.store import write_npy
 from swiftwrf.errors import InputError
-from swiftwrf.runtime.durable import replacing, write_bytes, write_text
+from swiftwrf.runtime.durable import replacing, write_npz, write_text
 
 
 def write_spectra(data: Spectra, folder: Path) -> None:
@@ -90,20 +89,17 @@ def write_rssi(data: Rssi, folder: Path) -> None:
 
 def write_paths(paths: PropagationPaths, folder: Path) -> None:
     """Write paths with known corners, at least one a link, as paths.npz."""
-    stream = io.BytesIO()
-    length: dict[str, Any] = {} if paths.length is None else {"length": paths.length.numpy()}
-    np.savez_compressed(
-        stream,
-        **length,
-        transmitter_position=paths.transmitter.numpy(),
-        receiver_position=paths.receiver.numpy(),
-        path_count=paths.count.numpy(),
-        last_point=paths.last_point().numpy(),
-        gain=paths.gain.numpy(),
-        line_of_sight=paths.line_of_sight.numpy(),
-        frequency_hz=np.float64(paths.frequency_hz),
-    )
-    write_bytes(folder / "paths.npz", stream.getvalue())
+    arrays = {
+        "transmitter_position": paths.transmitter,
+        "receiver_position": paths.receiver,
+        "path_count": paths.count,
+        "last_point": paths.last_point(),
+        "gain": paths.gain,
+        "line_of_sight": paths.line_of_sight,
+        "length": paths.length,
+    }
+    known = {name: values.numpy() for name, values in arrays.items() if values is not None}
+    write_npz(folder / "paths.npz", known | {"frequency_hz": np.float64(paths.frequency_hz)})
 
 
 def write_deepmimo(paths: PropagationPaths, folder: Path) -> None:
@@ -138,8 +134,7 @@ def write_deepmimo(paths: PropagationPaths, folder: Path) -> None:
     empty = torch.full((len(paths.count), int(paths.count.max())), torch.nan, dtype=torch.float64)
     arrays = {name: empty.index_put(place, values.double()) for name, values in columns.items()}
     for name, values in (arrays | {"rx_pos": paths.receiver, "tx_pos": transmitter}).items():
-        with replacing(folder / f"{name}_t000_tx000_r001.npz") as temporary, temporary.open("wb") as stream:
-            np.savez_compressed(stream, **{name: values.numpy()})
+        write_npz(folder / f"{name}_t000_tx000_r001.npz", {name: values.numpy()})
     params = {"rt_params": {"frequency": paths.frequency_hz, "raytracer_name": "SwiftWRF"}}
     write_text(folder / "params.json", json.dumps(params, indent=1) + "\n")
 

@@ -24,7 +24,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from swiftwrf.data.archives import MAX_UNPACKED_BYTES, Arrays, refusing_broken
+from swiftwrf.data.archives import MAX_UNPACKED_BYTES, refusing_broken
 from swiftwrf.data.cells import column_of_numbers, text_of
 from swiftwrf.data.columns import column_of
 from swiftwrf.data.files import read_bytes, read_table, read_yaml
@@ -182,7 +182,10 @@ class Captures(Format[Snapshots]):
         missing = [file.name for file in (table, described) if not file.is_file()]
         if missing:
             raise InputError(f"{path} lacks {' and '.join(missing)}: {NEEDED}")
-        description, frame = _read_description(described), read_table(table)
+        content, frame = read_yaml(described), read_table(table)
+        if absent := [name for name in GIVEN if name not in content]:
+            raise InputError(f"{described} lacks {', '.join(absent)}: {NEEDED}")
+        description = described_arrays(described, content)
         elements = len(array_of(described, description).element)
         files = _files(table, frame)
         channels, left_out = zip(*(_read_capture(file, elements) for file in files), strict=True)
@@ -218,15 +221,6 @@ def _captures(path: Path) -> list[Path]:
             if TOOLS[file.suffix].recognises(start) if file.suffix in TOOLS else b"CSI_DATA" in start:
                 found.append(file)
     return found
-
-
-def _read_description(file: Path) -> Arrays:
-    """Return the arrays of snapshots.npz that describe the array, by name."""
-    content = read_yaml(file)
-    missing = [name for name in GIVEN if name not in content]
-    if missing:
-        raise InputError(f"{file} lacks {', '.join(missing)}: {NEEDED}")
-    return described_arrays(file, content)
 
 
 def _files(table: Path, frame: pd.DataFrame) -> list[Path]:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.array.planar import LIGHT_SPEED
-from swiftwrf.data.archives import read_arrays
+from swiftwrf.data.archives import read_arrays, refusing_broken
 from swiftwrf.data.files import check_carrier, digests, read_text
 from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format, ReadOptions, station
 from swiftwrf.data.paths import PropagationPaths
@@ -91,13 +91,9 @@ def _pairs(path: Path) -> list[str]:
 
 def _params(file: Path) -> tuple[float, str]:
     """Return the carrier [Hz] and the name of the ray tracer."""
-    try:
+    with refusing_broken(file, "JSON with rt_params, and in it frequency, the carrier in Hz"):
         given = json.loads(read_text(file))["rt_params"]
         frequency, tracer = float(given["frequency"]), str(given.get("raytracer_name", ""))
-    except (LookupError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise InputError(
-            f"{file} must be JSON with rt_params, and in it frequency, the carrier in Hz ({error!r})"
-        ) from None
     check_carrier(file, frequency)
     return frequency, tracer
 

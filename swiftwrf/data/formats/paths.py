@@ -65,19 +65,14 @@ def read_paths(source: Path) -> PropagationPaths:
     if not file.is_file():
         raise InputError(f"{file} does not exist; expected ray paths")
     arrays = read_arrays(file, NEEDED, ["length"])
-    counts = arrays["path_count"]
-    if counts.ndim != 1 or counts.dtype.kind not in "iu":
-        raise InputError(
-            f"{file}: path_count must be one whole number a receiver, got {counts.dtype} of shape {counts.shape}"
-        )
-    if len(counts) == 0 or int(counts.min()) < 1:
-        raise InputError(f"{file}: every receiver needs at least one path; leave out those without")
 
-    def checked(name: str, dtype: torch.dtype, *shape: int) -> Tensor:
+    def checked(name: str, dtype: torch.dtype, *shape: int | None) -> Tensor:
         return to_tensor(f"{file}: {name}", arrays[name], dtype, shape)
 
-    n, n_paths = len(counts), sum(counts.tolist())
-    count = checked("path_count", torch.int64, n)
+    count = checked("path_count", torch.int64, None)
+    if not len(count) or int(count.min()) < 1:
+        raise InputError(f"{file}: every receiver needs at least one path; leave out those without")
+    n, n_paths = len(count), sum(count.tolist())
     transmitter, receiver, last = (
         check_positions(arrays[name], f"{file}: {name}", (rows, 3))
         for name, rows in zip(POSITIONS, (n, n, n_paths), strict=True)

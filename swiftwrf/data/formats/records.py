@@ -38,7 +38,7 @@ import numpy as np
 from annotated_types import Ge, Lt
 from numpy.typing import NDArray
 
-from swiftwrf.data.archives import MAX_UNPACKED_BYTES, Arrays
+from swiftwrf.data.archives import MAX_UNPACKED_BYTES, Arrays, refusing_broken
 from swiftwrf.data.files import read_text
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions, station
 from swiftwrf.data.formats.snapshots import snapshots_of
@@ -143,13 +143,11 @@ def _of_dichasus(csi: NDArray[Any], offsets: NDArray[Any] | None) -> NDArray[Any
 
 def _read_offsets(file: Path) -> NDArray[Any]:
     """Return carrier phase [rad] and sampling time [samples] to add to each antenna, (antennas, 2)."""
-    try:
+    with refusing_broken(file, "JSON with lists cpo and sto, a number for each antenna"):
         content = json.loads(read_text(file))
         values = np.array([content["cpo"], content["sto"]], dtype=np.float64).T
         if values.ndim != 2 or not np.isfinite(values).all():
             raise ValueError(f"got {values.shape[::-1]} numbers, or some that are not finite")
-    except (ValueError, TypeError, LookupError, RecursionError) as error:
-        raise InputError(f"{file} must hold lists cpo and sto with a number for each antenna ({error})") from None
     return values
 
 

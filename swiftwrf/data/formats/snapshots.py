@@ -13,7 +13,7 @@ from torch import Tensor
 
 from swiftwrf.array.angles import ArrayPose
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
-from swiftwrf.data.archives import ARCHIVES, Arrays, array_names, read_arrays
+from swiftwrf.data.archives import ARCHIVES, Arrays, array_names, read_arrays, refusing_broken
 from swiftwrf.data.files import check_carrier, digests
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
 from swiftwrf.data.snapshots import Snapshots
@@ -254,10 +254,8 @@ def described_arrays(file: Path, content: Mapping[str, Any]) -> Arrays:
     arrays = {}
     for name in ("frequency_hz", "array_position", *POSE, "rows", "columns", "spacing_m", "element_position"):
         if name in content:
-            try:
+            with refusing_broken(f"{name} of {file}", "a number or lists of numbers of one length"):
                 arrays[name] = np.array(content[name], dtype=np.float64)
-            except (TypeError, ValueError):
-                raise InputError(f"{file}: {name} must be a number or lists of numbers of one length") from None
     return arrays
 
 
@@ -278,13 +276,11 @@ def pose_of(file: Path, arrays: Arrays) -> ArrayPose:
             f"{file}: array_orientation has 3 numbers; Euler angles leave their order open, so give the unit quaternion "
             "(x, y, z, w) that turns array into world coordinates"
         )
-    try:
+    with refusing_broken(file, "the description of an array"):
         where, turned = (tuple(values.flatten().tolist()) for values in (position, orientation))
         if stated == "array_orientation":
             return ArrayPose(where, turned)
         return ArrayPose.facing(where, turned, tuple(arrays.get("array_up", np.eye(3)[2]).flatten().tolist()))
-    except InputError as error:
-        raise InputError(f"{file}: {error}") from None
 
 
 def array_of(file: Path, arrays: Arrays) -> PlanarArray:

@@ -21,6 +21,7 @@ from torch import Tensor
 from swiftwrf.array.angles import to_direction
 from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.choices import SCENE_FILE, Moving, check_scene
+from swiftwrf.data.archives import refusing_broken
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.raytraced.rooms import ROOMS, Material, Surface
 from swiftwrf.errors import InputError
@@ -239,7 +240,12 @@ def trace(
 
 
 def _trace_batch(held: Any, fixed: Tensor, position: Tensor, moving: Moving, tracing: Tracing) -> PropagationPaths:
-    _place(held, fixed, position)
+    rt = sionna()
+    for name in (*held.transmitters, *held.receivers):
+        held.remove(name)
+    held.add(rt.Transmitter("fixed", fixed.tolist()))  # wherever the transmitter is, as paths are reciprocal
+    for number, place in enumerate(position.tolist()):
+        held.add(rt.Receiver(f"moving-{number}", place))
     tables = [_solve(held, tracing, 30_000, diffuse=False)]  # search for chains
     if tracing.scattering:
         tables.append(_solve(held, tracing, 300, diffuse=True))  # each is a path wherever it scatters
@@ -268,16 +274,6 @@ def _trace_batch(held: Any, fixed: Tensor, position: Tensor, moving: Moving, tra
         length=torch.from_numpy(table["length"]),
         corner=torch.from_numpy(corner),
     )
-
-
-def _place(held: Any, fixed: Tensor, position: Tensor) -> None:
-    """Put the fixed end into the scene as Sionna's transmitter, and the positions as its receivers."""
-    rt = sionna()
-    for name in (*held.transmitters, *held.receivers):
-        held.remove(name)
-    held.add(rt.Transmitter("fixed", fixed.tolist()))
-    for number, place in enumerate(position.tolist()):
-        held.add(rt.Receiver(f"moving-{number}", place))
 
 
 def _solve(held: Any, tracing: Tracing, rays: int, diffuse: bool) -> Table:

@@ -112,18 +112,18 @@ BOMB = '<!DOCTYPE b [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;">]><gpx
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.json", '{"points": [{"x": 1', "is no complete JSON document"),
-        ("a.json", "[" * 100_000, "is no complete JSON document"),
+        ("a.json", '{"points": [{"x": 1', "is not a complete JSON document"),
+        ("a.json", "[" * 100_000, "is not a complete JSON document"),
         ("a.json", "[[1, 2, -60], [2, 3, -61]]", "holds no records with names"),
         ("a.json", '[{"ap": "a", "rssi": -60}]', "has no column for x"),
         ("a.json", '[{"x": 1, "y": 2, "note": "quiet"}]', "has no column of RSSI"),
         ("a.json", json.dumps([{"x": x, "y": x, "rssi": -60} for x in (0, 1, 2, 3, 1e999)]), "must be finite"),
-        ("a.gpx", "<gpx><trk><trkseg><trkpt lat='1' lon='2'>", "is no complete GPX document"),
+        ("a.gpx", "<gpx><trk><trkseg><trkpt lat='1' lon='2'>", "is not a complete GPX document"),
         ("a.gpx", "<gpx><trk><trkseg/></trk></gpx>", "holds no records with names"),
         ("a.gpx", "<gpx><wpt lat='1' lon='2'/></gpx>", "has no column of RSSI"),
-        ("a.gpx", "<gpx>" + "<wpt>" * 50_000 + "</wpt>" * 50_000 + "</gpx>", "is no complete GPX document"),
+        ("a.gpx", "<gpx>" + "<wpt>" * 50_000 + "</wpt>" * 50_000 + "</gpx>", "is not a complete GPX document"),
         ("a.gpx", BOMB, "declares entities"),
-        ("a.kml", "<kml><Placemark><coordinates>a,b</coordinates></Placemark></kml>", "is no complete KML document"),
+        ("a.kml", "<kml><Placemark><coordinates>a,b</coordinates></Placemark></kml>", "is not a complete KML document"),
     ],
 )
 def test_broken_documents_are_refused_in_one_sentence(tmp_path, name, content, message):
