@@ -52,7 +52,7 @@ def run(config: InspectConfig) -> None:
         content = {
             "source": config.source,
             "kind": kind,
-            "findings": [{"level": finding.level, "text": finding.text} for finding in findings.sentences],
+            "findings": [{"level": level, "text": text} for level, text in findings.sentences],
             "numbers": findings.numbers,
         }
         write_json(folder / "inspect.json", content)
@@ -63,7 +63,7 @@ def run(config: InspectConfig) -> None:
 def page(findings: Findings, kind: str, config: InspectConfig) -> Page:
     """Return the page: findings and figures of what was read."""
     data, warnings = findings.data, findings.warnings
-    rows = [[finding.level, finding.text] for finding in findings.sentences]
+    rows = [[level, text] for level, text in findings.sentences]
     table = Table(["level", "finding"], rows, strong=frozenset(["warning"]), long=True)
     if isinstance(data, Rssi):
         position, task, options = data.transmitter_position, ("rssi", "--rx", "all"), given(config.table)

@@ -36,45 +36,37 @@ MAX_LEVEL_DBM = 10.0  # at 1 m, which no usual transmitter reaches
 MIN_EXPLAINED, MIN_SPREAD_DB = 0.15, 1.0  # of offsets that are proposed
 
 
-@dataclass(frozen=True)
-class Finding:
-    """One sentence: a fact or a warning."""
-
-    level: Level
-    text: str
-
-
 @dataclass
 class Findings:
     """Facts and warnings about measurements, in the order of the checks. `print` shows a line each, warnings with a mark.
 
     Args:
         data: Measurements that were inspected, snapshots as spectra.
-        sentences: Facts and warnings.
+        sentences: Facts and warnings: level and text.
         numbers: Numbers behind the sentences by name, with units in the names.
     """
 
     data: Spectra | Rssi
-    sentences: list[Finding] = field(default_factory=list)
+    sentences: list[tuple[Level, str]] = field(default_factory=list)
     numbers: dict[str, Any] = field(default_factory=dict)
 
     @property
     def warnings(self) -> list[str]:
         """Texts of the warnings."""
-        return [finding.text for finding in self.sentences if finding.level == "warning"]
+        return [text for level, text in self.sentences if level == "warning"]
 
     def add(self, text: str, **numbers: Any) -> None:
         """Add a fact."""
-        self.sentences.append(Finding("fact", text))
+        self.sentences.append(("fact", text))
         self.numbers |= numbers
 
     def warn(self, text: str, **numbers: Any) -> None:
         """Add a warning."""
-        self.sentences.append(Finding("warning", text))
+        self.sentences.append(("warning", text))
         self.numbers |= numbers
 
     def __str__(self) -> str:
-        return "\n".join(f"{'!' if finding.level == 'warning' else ' '} {finding.text}" for finding in self.sentences)
+        return "\n".join(f"{'!' if level == 'warning' else ' '} {text}" for level, text in self.sentences)
 
 
 @checked
