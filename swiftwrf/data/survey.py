@@ -468,10 +468,10 @@ def _columns_of_end(label: object, table: pd.DataFrame, given: Sequence[str]) ->
             )
         return dict(zip("xyz", given, strict=False))
 
-    def mark(name: str) -> str:
+    def end_of(name: str) -> str:
         return next((MARKS[word] for word in plain_name(name).split("_") if word in MARKS), "")
 
-    marked = {axis: {mark(name): name for name in reversed(candidates(table, axis))} for axis in "xyz"}
+    marked = {axis: {end_of(name): name for name in reversed(candidates(table, axis))} for axis in "xyz"}
     for mark, beside in (("transmitter", {"receiver", ""}), ("receiver", {""})):
         if all(mark in marked[axis] and beside & marked[axis].keys() for axis in "xy"):
             return {axis: names[mark] for axis, names in marked.items() if mark in names}
