@@ -93,10 +93,8 @@ class Scene:
         if not file.is_file():
             raise InputError(f"{file} does not exist; expected a Mitsuba scene (XML) or the name of a room")
         rt, scene = sionna(), cls.__new__(cls)
-        try:
+        with refusing_broken(file, "a scene that Sionna RT reads"):
             held = rt.load_scene(str(file))
-        except Exception as error:  # parsers of XML, meshes and materials raise exceptions of their own
-            raise InputError(f"{file} is no scene that Sionna RT reads ({error})") from None
         if not held.objects:
             raise InputError(f"{file} is a scene without objects; there is nothing to trace")
         try:

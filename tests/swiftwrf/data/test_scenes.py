@@ -244,8 +244,14 @@ def write_scene(folder, material):
     ("arguments", "says"),
     [
         ((*OPTIONS, "--frequency", 9e8), "ITU-R P.2040 knows plasterboard at"),
-        (("--room", "{folder}/junk.xml", *OPTIONS[2:], "--fixed", 0, 0, 1, "--region", 0, 0, 0, 1, 1, 1), "no scene"),
-        (("--room", "{folder}/empty.xml", *OPTIONS[2:], "--fixed", 0, 0, 1, "--region", 0, 0, 0, 1, 1, 1), "no scene"),
+        (
+            ("--room", "{folder}/junk.xml", *OPTIONS[2:], "--fixed", 0, 0, 1, "--region", 0, 0, 0, 1, 1, 1),
+            "not a scene",
+        ),
+        (
+            ("--room", "{folder}/empty.xml", *OPTIONS[2:], "--fixed", 0, 0, 1, "--region", 0, 0, 0, 1, 1, 1),
+            "not a scene",
+        ),
         (("--room", "{folder}/room.xml", *OPTIONS[2:], "--fixed", 0, 0, 9, "--region", 1, 1, 1, 2, 2, 2), "no path"),
     ],
 )
