@@ -106,8 +106,6 @@ def test_unknown_predictor():
         compared(room, also=["forest"])
     with pytest.raises(InputError, match="no member of blend can be fitted to simulated-floor"):
         Blend(members=()).fit(room)
-    with pytest.raises(InputError, match="fewer must be a list, of which each is a number at least 0 and at most 1"):
-        compare(room, fewer=(-0.5,))
 
 
 def test_a_predictor_of_another_package(monkeypatch):
