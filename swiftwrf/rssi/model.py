@@ -146,7 +146,7 @@ class RssiModel(SavedRssiPredictor):
         predicted = predictors[:, training.bin_of_row]
         if not comparable(predicted, some.rssi_dbm).any():
             return FIELD_ALONE
-        return mixing_weights(predicted, some.rssi_dbm, 0.05)  # by nested cross-validation
+        return mixing_weights(predicted, some.rssi_dbm)
 
     @single_thread()
     def _assemble(
