@@ -113,7 +113,7 @@ class Detection:
             said.append(f"{where} empty cells say nothing")
         return ", ".join(said)
 
-    def columns(self, number: Tensor) -> Self:
+    def columns(self, number: Tensor | slice) -> Self:
         """Return the curve of some receivers."""
         return replace(self, missed=self.missed[number], is_limit=self.is_limit[number])
 

@@ -48,21 +48,21 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
     Raises:
         FitError: A system that cannot be solved, for positions or values beyond any measurement.
     """
-    rssi, receiver, limit = data.rssi[:, some][:, 0], data.receiver[some], data.limit[:, some][:, 0]
-    loss = data.path_loss.columns(torch.arange(len(data.receiver_names))[some])
+    data = data.columns(some)
+    rssi, limit, loss = data.rssi[:, 0], data.limit[:, 0], data.path_loss
     prior, std = loss.shared, loss.std[0].clone()
-    distance = log_distance(data.position, receiver)
+    distance = log_distance(data.position, data.receiver)
     used = (~rssi.isnan() | ~limit.isnan()).nonzero()[:, 0]
     error, dual, tangent, variance = (torch.zeros_like(rssi) for _ in range(4))
-    feature = regressors(distance, harmonics(data.position, receiver), loss.middle, std[None])[0]
+    feature = regressors(distance, harmonics(data.position, data.receiver), loss.middle, std[None])[0]
     linear, covariance = torch.zeros(feature.shape[1]).double(), std.square().diag()
     if len(used):
         at, weak = data.position[used].to(device), limit[used].isnan().logical_not()
-        prior_covariance = float(data.field_db[some]) ** 2 * data.kernel(at, at)
-        noise_db = (data.noise_db[some] / data.count[used, some][:, 0].clamp_min(1).sqrt()).to(device)
+        prior_covariance = float(data.field_db) ** 2 * data.kernel(at, at)
+        noise_db = (data.noise_db / data.count[used, 0].clamp_min(1).sqrt()).to(device)
         detection = loss.detection
         censored = None if detection is None or not weak.any() else (detection.width, float(detection.missed))
-        rest = prior_covariance, noise_db, HeadTable(data.rendered[some].to(device)), config.huber, censored
+        rest = prior_covariance, noise_db, HeadTable(data.rendered.to(device)), config.huber, censored
 
         def solved() -> tuple[Tensor, ...]:
             value = (rssi.where(limit.isnan(), limit) - prior(distance)[:, 0])[used].to(device)
@@ -84,7 +84,7 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
                 error[used[part]] = held_out_errors(precision, found[0][:, None], part.to(device))[:, 0].cpu()
         except torch.linalg.LinAlgError as reason:  # type: ignore[attr-defined]
             raise FitError(
-                f"the RSSI fit of receiver {data.receiver_names[some][0]!r} broke ({reason}); are its values sane?"
+                f"the RSSI fit of receiver {data.receiver_names[0]!r} broke ({reason}); are its values sane?"
             ) from None
         dual[used], tangent[used], variance[used], target = (x.cpu() for x in found)
         linear = dual @ feature * coefficient_scale(std[None])[0]
@@ -97,11 +97,11 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
         "prior_slope": prior.slope,
         "prior_std": std[None],
         "directivity": linear[None, 2:],
-        "coefficient": float(data.field_db[some]) ** 2 * (tangent * dual)[None],
+        "coefficient": float(data.field_db) ** 2 * (tangent * dual)[None],
         "dual": dual[None],
         "tangent": tangent[None],
         "variance": variance[None],
-        "rendered": data.rendered[some],
+        "rendered": data.rendered,
         "held_out": (prior(distance)[:, 0] - error).where(variance > 0, torch.nan)[None],
     }
 

@@ -83,7 +83,6 @@ def training_of(data, n_primitives=50):
         limit=torch.full((n, r), torch.nan).double(),
         field_db=torch.full((r,), FIELD_DB, dtype=torch.float64),
         noise_db=torch.full((r,), NOISE_DB, dtype=torch.float64),
-        losses=[],
         baselines=PathLoss(*(values.expand(3, -1) for values in path_loss)),
         baseline_held_out=torch.zeros(3, n, r, dtype=torch.float64),
     )
