@@ -22,7 +22,7 @@ from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.phase_retrieval import correlations, retrieve_phases
 from swiftwrf.models.link import Link
 from swiftwrf.models.process import ProcessModel
-from swiftwrf.online.scores import ALLOWANCE, Alarm, Scores, alarm_threshold, learnt, score
+from swiftwrf.online.scores import ALLOWANCE, Alarm, Scores, alarm_threshold, score
 from swiftwrf.positions import nearest
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.runtime.validation import checked
@@ -258,7 +258,8 @@ class Follower:
         train: Spectra | Rssi | None = None,
         false_alarm_rate: FalseAlarmRate = 1e-4,
     ) -> None:
-        self.model, self.count = model, 0
+        self.model: Any = model
+        self.count = 0
         self.monitor = Monitor.of(model, train, false_alarm_rate)
         self.room: Monitor | None = None
         """test of the coherence of room and spectra; None without room or training spectra, and after its alarm"""
@@ -302,12 +303,12 @@ class Follower:
     def _learn(self, new: Spectra | Rssi) -> list[str]:
         """Learn a measurement. A geometry learns it with those that wait; return a notice if it gives them up."""
         if not isinstance(self.model, GeometryModel) or not isinstance(new, Spectra):
-            self.model = learnt(self.model, new)
+            self.model = self.model.update(new)
             return []
         self.waiting = waiting = new if self.waiting is None else joined([self.waiting, new])
         notices = []
         try:
-            self.model = learnt(self.model, waiting)
+            self.model = self.model.update(waiting)
         except InputError as error:  # fewer than 10 positions, or spectra that do not fit the array
             if len(waiting) < 5 * MIN_TRAINING:
                 return []
