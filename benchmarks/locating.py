@@ -62,7 +62,7 @@ def measure(data: Rssi, split: str, config: Config) -> dict[str, Any]:
     """
     measured = LocateSplit.of(data.receivers(["all"]), split, config.cells, config.seed)
     whole = LocateSplit.of(data, split, config.cells, config.seed)
-    values = {name: (whole if name == "nearest" else measured).fit(name)[1] for name in config.localizers}
+    values = {name: (whole if name == "nearest" else measured).fit(None, name) for name in config.localizers}
     result = LocateComparison(measured, values)
     return {
         "n_train": len(measured.train),

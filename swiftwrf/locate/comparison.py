@@ -20,7 +20,7 @@ from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.rssi import PLACE
 from swiftwrf.data.splits import matching_validation, places
 from swiftwrf.errors import InputError
-from swiftwrf.locate.baselines import LEVELS, LOCALIZERS, Localizer, PosteriorLocalizer
+from swiftwrf.locate.baselines import LEVELS, LOCALIZERS, PosteriorLocalizer
 from swiftwrf.locate.rssi import RssiLocator
 from swiftwrf.metrics import method_summary, summary
 from swiftwrf.rssi import estimate_offsets
@@ -87,8 +87,8 @@ class LocateSplit:
             train, test = offsets.removed(train), offsets.removed(test)
         return cls(train, test, split, n_cells, seed, int((~kept).sum()))
 
-    def fit(self, name: str) -> tuple[Localizer, Values]:
-        """Fit a localizer and locate the test rows. Return the localizer, and values for `LocateComparison`."""
+    def fit(self, folder: Path | None, name: str) -> Values:
+        """Fit a localizer and locate the test rows. Return values for `LocateComparison`. A folder gets the locator."""
         train, test = self.train, self.test
         validation = train.validation_for(self.split, test)
         if validation == "block" and self.split != "block":
@@ -112,7 +112,9 @@ class LocateSplit:
         if isinstance(localizer, PosteriorLocalizer):
             weight = localizer.locator.weight.tolist()
             values["weights"] = dict(zip(("values", "detections", "fingerprints"), weight, strict=True))
-        return localizer, values
+            if folder is not None:
+                localizer.locator.save(folder / LOCATOR)
+        return values
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +129,7 @@ class LocateComparison:
     Example:
         >>> import swiftwrf
         >>> split = LocateSplit.of(swiftwrf.rssi_room(n=60), "random", 100, 0)
-        >>> len(LocateComparison(split, {"mean": split.fit("mean")[1]}).errors)
+        >>> len(LocateComparison(split, {"mean": split.fit(None, "mean")}).errors)
         12
     """
 
@@ -238,16 +240,8 @@ def compare(
     with TemporaryDirectory(prefix="swiftwrf-") as folder:
         memo = keep or Memo(Path(folder))
         steps = Steps(measured, memo, executor)
-        started = [steps.start(name, name, _locate, name) for name in LOCALIZERS]
+        started = [steps.start(name, name, LocateSplit.fit, name) for name in LOCALIZERS]
         values = {name: steps[name] for name in started}
         locator = load(memo.folder / LOCATOR)
         assert isinstance(locator, RssiLocator)
         return LocateComparison(measured, values, locator)
-
-
-def _locate(split: LocateSplit, folder: Path, name: str) -> Values:
-    """Return the values of a localizer. The locator of a posterior is saved in a folder."""
-    localizer, values = split.fit(name)
-    if isinstance(localizer, PosteriorLocalizer):
-        localizer.locator.save(folder / LOCATOR)
-    return values
