@@ -160,11 +160,7 @@ class Student:
         return matrix
 
     def log_density(self, distance: Tensor) -> Tensor:
-        """Return the log-density of squared whitened distances, without the determinants of scale and whitening.
-
-        Args:
-            distance: Squared distances, of any shape.
-        """
+        """Return the log-density of squared whitened distances of any shape, without the determinants."""
         f = len(self.scale)
         if math.isinf(self.degrees):
             normal: Tensor = -distance / 2 - f / 2 * math.log(2 * math.pi)
@@ -184,13 +180,9 @@ class Student:
 
 
 def covariance(residual: Tensor, shrinkage: Tensor, degrees: float, floor: float) -> Tensor:
-    """Return scale matrices (S, F, F) of residuals (n, F), shrunk to multiples of the identity.
+    """Return scale matrices (S, F, F) of residuals (n, F), shrunk to the identity by weights (S,), variances above `floor`.
 
-    Args:
-        residual: Residuals without gaps.
-        shrinkage: Weights of the identity, (S,).
-        degrees: Degrees of freedom, for which expectation maximisation weights the rows.
-        floor: Smallest variance.
+    Expectation maximisation weights the rows by the degrees of freedom.
     """
     n, f = residual.shape
     weight, identity = residual.new_ones(len(shrinkage), 1, n), torch.eye(f, dtype=residual.dtype)

@@ -114,14 +114,7 @@ def coefficient_scale(std: Tensor) -> Tensor:
 def regressors(distance: Tensor, bearing: Tensor, middle: Tensor, std: Tensor) -> Tensor:
     """Return the regressors of level, slope and directivity, scaled by the standard deviations of their coefficients.
 
-    Args:
-        distance: log10 of the distances [m], (n, R).
-        bearing: Harmonics of the directions, (n, R, 8).
-        middle: log10 of the distance at which levels are compared, (R,).
-        std: Prior standard deviation of level and slope, (R, 2).
-
-    Returns:
-        float64 (R, n, 10).
+    They are float64 (R, n, 10), at log10 distances (n, R) and harmonics (n, R, 8). For the rest see `PathLosses`.
     """
     apart = (distance - middle)[..., None]
     feature = torch.cat([torch.ones_like(apart), apart, bearing], dim=-1) * coefficient_scale(std)
@@ -200,12 +193,7 @@ def solve(
 def _site(mean: Tensor, variance: Tensor, limit: Tensor, noise: Tensor, censored: tuple[float, float]) -> Tensor:
     """Return precision and precision times value, (2, n), that match the likelihood of empty cells; 0 if not concave.
 
-    Args:
-        mean: Mean of each value by all others, (n,) [dB].
-        variance: Its variance without noise [dB^2].
-        limit: Upper limits [dB].
-        noise: Variance of the noise [dB^2].
-        censored: See `solve`.
+    `mean` [dB] and `variance` [dB^2] are those of each value by all others, without noise, (n,).
     """
     width, missed = censored
     std = (variance + noise + width**2).sqrt()
@@ -254,12 +242,7 @@ def held_out_std(
 ) -> Tensor:
     """Return the standard deviations (n, R) [dB] that models without a bin's fold predict, before they are calibrated.
 
-    Args:
-        bins: Training rows by location bin.
-        kernel: Kernel of the latent field.
-        prior_db: Standard deviations of latent field and noise, each (R,) [dB].
-        middle: See `Uncertainty`.
-        covariance: See `Uncertainty`.
+    `prior_db` are the standard deviations of latent field and noise, each (R,) [dB]; the rest is as in `Uncertainty`.
     """
     (field_db, noise_db), std = prior_db, torch.empty_like(bins.rssi)
     for number in bins.fold.unique():

@@ -185,10 +185,6 @@ def prior_std(variance: Tensor, kernel: Kernel | None) -> tuple[Tensor, Tensor]:
 def bin_locations(rows: Rssi, max_locations: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Average measurements by location bin: each row by itself, or in the cubes of a grid if there are too many rows.
 
-    Args:
-        rows: Measurements.
-        max_locations: Largest number of bins.
-
     Returns:
         Mean position (n, 3) [m], mean RSSI (n, R) [dBm] (nan where not detected), the number of measurements in each mean
         (n, R), and the bin of each row (rows,).
@@ -217,11 +213,7 @@ def choose_residual_kernel(
 ) -> tuple[Kernel, bool]:
     """Choose the kernel with the lowest mean absolute error on held-out residuals of the path-loss model.
 
-    Args:
-        position: Positions of the bins (n, 3) [m].
-        residual: Residuals (n, R) [dB], nan where not detected.
-        fold: Cross-validation fold of each bin, (n,).
-        has_floors: Whether differences in height may count more than horizontal ones.
+    Residuals are (n, R) [dB], nan where not detected. With floors, differences in height may count more than others.
 
     Returns:
         The kernel, and whether its error is lower than that of no field at all.
