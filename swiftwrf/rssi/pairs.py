@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from dataclasses import asdict, dataclass
-from functools import cached_property
 from statistics import NormalDist
 from typing import Any, ClassVar, Self
 
@@ -26,7 +25,7 @@ from swiftwrf.gp import GaussianProcess, Kernel, candidates
 from swiftwrf.gp.process import N_NEIGHBOURS, local_weights
 from swiftwrf.models.base import FieldConfig
 from swiftwrf.models.prediction import Prediction
-from swiftwrf.positions import Neighbours, check_positions, distance
+from swiftwrf.positions import Neighbours, check_positions, distance, nearest
 from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiPredictor, SavedRssiPredictor
 from swiftwrf.rssi.mixing import LEVEL, rounding_std
 from swiftwrf.rssi.path_loss import MIN_DISTANCE_M, fit_path_loss
@@ -92,16 +91,12 @@ class PairPathLoss:
         level = (right[:, 0] - normal[:, 0, 1] * slope) / normal[:, 0, 0]
         return cls(shared, place, torch.stack([level - slope * centre, slope], dim=1))
 
-    @cached_property
-    def _places(self) -> Neighbours:
-        return Neighbours(self.place)
-
     def __call__(self, pair: Tensor) -> Tensor:
         """Return the RSSI (m,) [dBm] at pairs (m, 6) [m]; at places without a correction by the shared model."""
         values = self.shared.expand(len(pair), 2)
         if len(self.place) and len(pair):
-            away, nearest = (found[:, 0] for found in self._places(pair[:, 3:], 1))
-            values = values + self.correction[nearest].where(away[:, None] < 1e-3, 0.0)
+            away, number = (found[:, 0] for found in nearest(pair[:, 3:], self.place, 1))
+            values = values + self.correction[number].where(away[:, None] < 1e-3, 0.0)
         return values[:, 0] + values[:, 1] * _pair_log_distance(pair)
 
 
