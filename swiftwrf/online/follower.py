@@ -228,6 +228,7 @@ class Follower:
     """A fitted model that learns measurements one by one.
 
     An alarm of the innovations adapts models of spectra to the change, if these can forget spectra, and restarts the test.
+
     With a room and training spectra, a notice reports once if the room no longer explains the spectra. The planes of a
     geometry are refined whenever 10 positions are new; until then, its spectra wait.
 

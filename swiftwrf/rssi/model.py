@@ -126,10 +126,8 @@ class RssiModel(SavedRssiPredictor):
         predictors, std = _held_out_predictors(training, found)
         predictors, std, mine = predictors[:, training.bin_of_row], std[training.bin_of_row], slice(len(own))
         # one set of weights for all receivers: the few folds determine none for each of them
-        predicted, measured = (
-            predictors[..., [every.tolist().index(c) for c in often.tolist()]],
-            pool.rssi_dbm[:, often],
-        )
+        columns = [every.tolist().index(c) for c in often.tolist()]
+        predicted, measured = predictors[..., columns], pool.rssi_dbm[:, often]
         is_comparable = bool(comparable(predicted, measured).any())
         weight = mixing_weights(predicted, measured) if is_comparable else FIELD_ALONE
         found = {name: value[mine] for name, value in found.items()}
