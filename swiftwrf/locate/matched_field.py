@@ -45,7 +45,7 @@ from swiftwrf.runtime.validation import Configured, NonNegativeInt, PositiveInt,
 
 FOLDS = 5
 START_WEIGHTS = (0.05, 0.05, 0.3)  # of the likelihoods, by which the calibration searches
-START_WEIGHTS_CHANNEL = (0.05, 0.5)
+START_WEIGHTS_CHANNEL = (0.5, 0.05)
 CHANNEL_SPLITS = 3  # times as many cells are split for channels, whose likelihood is narrower than a cell
 MIN_FLOOR = 1e-4  # of missing coherence, by rounding
 MIN_SPECTRA = 15
@@ -236,7 +236,7 @@ class MatchedField(Configured, Saved):
         count = math.prod((extent / spacing).clamp_min(1).tolist())
         self.cells = self.region.cells(int(min(max(count, 1), self.config.max_cells)))
         self.likelihoods = self._likelihoods(self._fit)
-        batches, own = self.cells.position.split(BATCH_CANDIDATES), self.likelihoods.parts[0]
+        batches, own = self.cells.position.split(BATCH_CANDIDATES), self.likelihoods.parts[-1]
         if isinstance(own, ChannelLikelihood):
             frequency = self._frequency(self.room)[ends(len(self._frequency(self.room)))]
 
@@ -259,7 +259,7 @@ class MatchedField(Configured, Saved):
 
     def _likelihoods(self, fit: _Fit, kept: Tensor | None = None) -> _Likelihoods:
         if self.n_snapshots:
-            return _Likelihoods(fit.room, self._frequency(fit.room), (ChannelLikelihood(self.floor), fit.paths))
+            return _Likelihoods(fit.room, self._frequency(fit.room), (fit.paths, ChannelLikelihood(self.floor)))
         residual = self.residual if kept is None else self.residual[:, kept]
         coarray = (
             CoarrayLikelihood(predict, part, self.observed_power)
