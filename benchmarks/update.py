@@ -112,10 +112,10 @@ def change(config: Config) -> list[dict[str, Any]]:
             for n in LEARNT:
                 some = after.subset(torch.arange(n))
                 alone = swiftwrf.make_model("coarray").fit(some)
-                adapted_model, forgotten = adapted(model, some)
+                adapted_model, correlation = adapted(model, some)
                 models = {"stale": model, "update": model.update(some), "adapted": adapted_model, "alone": alone}
                 mean = {k: float(psnr(m.synthesize(test.position), test.spectrum).mean()) for k, m in models.items()}
-                row[f"psnr_db_{n}"] = {**mean, "forgotten": forgotten}
+                row[f"psnr_db_{n}"] = {**mean, "correlation": correlation}
             rows.append(row)
             print(row, flush=True)
     return rows

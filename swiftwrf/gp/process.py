@@ -11,9 +11,11 @@ from typing import Annotated, NamedTuple
 
 import torch
 from annotated_types import Ge, Gt, Lt
+from scipy.optimize import brentq
 from torch import Tensor
 from torch.nn import functional
 
+from swiftwrf.errors import InputError
 from swiftwrf.positions import Neighbours, distance
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.validation import Fraction, configuration
@@ -52,6 +54,12 @@ class Kernel:
     matern12_weight: Fraction = 0.6
     noise: Annotated[float, Ge(0), Lt(math.inf)] = 1e-2
     vertical: Scale = 1.0
+
+    @property
+    def correlation_length(self) -> float:
+        """Distance at which the covariance has fallen to 1/e, in the unit of the positions."""
+        longest = max(self.matern12_length, self.matern32_length)
+        return float(brentq(lambda r: float(self.at(torch.tensor(r).double())) - 1 / math.e, 0.0, 2 * longest))
 
     def __call__(self, a: Tensor, b: Tensor) -> Tensor:
         """Return k between positions (..., n, 3) and (..., m, 3), (..., n, m)."""
@@ -105,6 +113,8 @@ class GaussianProcess:
         coefficient: Dual coefficients of an exact process, values of a local one, (n, K); see `regress`. Defaults to none,
             for weights and variances alone.
         exact: Whether every prediction conditions on all positions. Defaults to n <= 2000.
+        correlation: Correlation of the field at the time of each value with the present field, (n,), from above 0 to 1,
+            ascending. Defaults to 1. Between two values of correlations a <= b it is a / b (autoregressive in time).
 
     Example:
         >>> position = torch.rand(20, 3, dtype=torch.float64)
@@ -117,11 +127,13 @@ class GaussianProcess:
     known: Tensor
     coefficient: Tensor = None  # type: ignore[assignment]
     exact: bool | None = None
+    correlation: Tensor = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         known = self.known.double()
+        correlation = known.new_ones(len(known)) if self.correlation is None else self.correlation.double()
         coefficient = known.new_zeros(len(known), 0) if self.coefficient is None else self.coefficient
-        vars(self).update(known=known, coefficient=coefficient)
+        vars(self).update(known=known, coefficient=coefficient, correlation=correlation)
 
     @property
     def is_exact(self) -> bool:
@@ -156,10 +168,11 @@ class GaussianProcess:
         """
         values = torch.cat([self.value, value.to(self.coefficient)])
         known = torch.cat([self.known, position.double()])
-        process = replace(self, known=known, coefficient=values)
+        correlation = torch.cat([self.correlation, self.correlation.new_ones(len(position))])
+        process = replace(self, known=known, coefficient=values, correlation=correlation)
         if not (self.is_exact and process.is_exact):
             return process.regressed(values)
-        n, coefficient, cross = len(self.known), self.coefficient.double(), self.kernel(position.double(), self.known)
+        n, coefficient, cross = len(self.known), self.coefficient.double(), self._cross(position)
         root = torch.linalg.solve_triangular(self._factor, cross.T, upper=False)  # (n, k)
         corner = torch.linalg.cholesky(self.kernel.covariance(position) - root.T @ root)
         new = torch.cholesky_solve(value.double() - cross @ coefficient, corner)
@@ -173,12 +186,20 @@ class GaussianProcess:
         """Return the process without the values of some rows, by regression on the remaining ones."""
         kept = torch.ones(len(self.known), dtype=torch.bool)
         kept[rows] = False
-        return replace(self, known=self.known[kept]).regressed(self.value[kept])
+        process = replace(self, known=self.known[kept], correlation=self.correlation[kept])
+        return process.regressed(self.value[kept])
 
     def widened(self, count: int) -> GaussianProcess:
         """Return the process with some more columns of values, all 0."""
         coefficient, value = (functional.pad(x, (0, count)) for x in (self.coefficient, self.value))
         return self._with(coefficient=coefficient, value=value)
+
+    def aged(self, correlation: float) -> GaussianProcess:
+        """Return the process after a change of the field, whose values before and after have the given correlation.
+
+        Covariances of the values stay as they are, and the posterior mean is multiplied by the correlation.
+        """
+        return self._with(correlation=correlation * self.correlation)
 
     def _with(self, **changes: Tensor) -> GaussianProcess:
         """Return a copy with other fields or cached properties. All other cached properties must stay valid."""
@@ -189,7 +210,7 @@ class GaussianProcess:
     def mean(self, position: Tensor) -> Tensor:
         """Return the posterior mean at positions (m, 3), (m, K), in the precision of the coefficients."""
         if self.is_exact:
-            mean: Tensor = self.kernel(position.double(), self.known).to(self.coefficient) @ self.coefficient
+            mean: Tensor = self._cross(position).to(self.coefficient) @ self.coefficient
             return mean
         return self.local(position)[0]
 
@@ -200,7 +221,7 @@ class GaussianProcess:
             Row numbers (r,) of the values that count, and their weights, float64 (m, r).
         """
         if self.is_exact:
-            weight = torch.cholesky_solve(self.kernel(position.double(), self.known).T, self._factor).T
+            weight = torch.cholesky_solve(self._cross(position).T, self._factor).T
             return torch.arange(len(self.known)), weight
         number, weight, _ = self._local(position)
         return dense_weights(number, weight)
@@ -209,13 +230,15 @@ class GaussianProcess:
         """Return the posterior variance, without noise, at positions (m, 3), relative to k(0) = 1, float64 (m,)."""
         if not self.is_exact:
             return self._local(position)[2]
-        root = torch.linalg.solve_triangular(self._factor, self.kernel(position.double(), self.known).T, upper=False)
+        root = torch.linalg.solve_triangular(self._factor, self._cross(position).T, upper=False)
         variance: Tensor = 1 - root.square().sum(dim=0)
         return variance.clamp(0, 1)
 
     def state(self, prefix: str = "") -> tuple[dict[str, Tensor], Header]:
         """Return positions and coefficients, and the kernel as plain values, with names that begin with `prefix`."""
         tensors = {f"{prefix}position": self.known, f"{prefix}coefficient": self.coefficient}
+        if bool((self.correlation < 1).any()):
+            tensors[f"{prefix}correlation"] = self.correlation
         return tensors, {f"{prefix}kernel": asdict(self.kernel)}
 
     @classmethod
@@ -230,13 +253,24 @@ class GaussianProcess:
         known, coefficient = tensors[f"{prefix}position"], tensors[f"{prefix}coefficient"]
         n = len(known)
         expect(tensors, {f"{prefix}position": (n, 3), f"{prefix}coefficient": (n, *coefficient.shape[1:2])})
-        return cls(Kernel(**header[f"{prefix}kernel"]), known, coefficient.to(dtype), exact)
+        correlation = tensors.get(f"{prefix}correlation", known.new_ones(n))
+        expect({"correlation": correlation}, {"correlation": (n,)})
+        if not bool(((correlation > 0) & (correlation <= 1)).all()):
+            raise InputError("correlation in time must be above 0 and at most 1")
+        return cls(Kernel(**header[f"{prefix}kernel"]), known, coefficient.to(dtype), exact, correlation)
+
+    def _cross(self, position: Tensor) -> Tensor:
+        """Return the covariances of the present field at positions (m, 3) with the values, float64 (m, n)."""
+        cross: Tensor = self.kernel(position.double(), self.known)
+        return cross * self.correlation
 
     @cached_property
     @torch.inference_mode(False)
     def _factor(self) -> Tensor:
         """Cholesky factor of the covariance of the values, float64 (n, n)."""
-        factor: Tensor = torch.linalg.cholesky(self.kernel.covariance(self.known))
+        ratio = self.correlation[:, None] / self.correlation
+        covariance = self.kernel.covariance(self.known) * torch.minimum(ratio, ratio.T)
+        factor: Tensor = torch.linalg.cholesky(covariance)
         return factor
 
     @cached_property
@@ -253,8 +287,11 @@ class GaussianProcess:
         position = position.to(self.known)
         number = self._neighbours(position, min(N_NEIGHBOURS, len(self.known)))[1].to(self.known.device)
         near = self.known[number]
-        cross = self.kernel(position[:, None], near)[:, 0]
-        return number, *local_weights(self.kernel(near, near), cross, self.kernel.noise)
+        correlation = self.correlation[number]
+        ratio = correlation[:, :, None] / correlation[:, None]
+        covariance = self.kernel(near, near) * torch.minimum(ratio, ratio.mT)
+        cross = self.kernel(position[:, None], near)[:, 0] * correlation
+        return number, *local_weights(covariance, cross, self.kernel.noise)
 
 
 def local_weights(covariance: Tensor, cross: Tensor, noise: float) -> tuple[Tensor, Tensor]:

@@ -7,9 +7,10 @@ from collections.abc import Callable, Iterable
 from copy import copy
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import torch
+from annotated_types import Gt, Le
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
@@ -291,6 +292,20 @@ class FieldModel(Configured, Saved, Displayed):
         model._forget(to_tensor("rows", rows, torch.int64, (None,)))
         return model
 
+    @checked
+    def aged(self, correlation: Annotated[float, Gt(0), Le(1)]) -> Self:
+        """Return the model after a change of the scene, for which earlier spectra count less than new ones.
+
+        Args:
+            correlation: Correlation of the fields before and after the change, above 0 and at most 1.
+
+        Raises:
+            InputError: A model that must be fitted again, or a correlation outside the range.
+        """
+        model = self._copy()
+        model._age(correlation)
+        return model
+
     def _copy(self) -> Self:
         """Return a copy that shares all tensors."""
         self.check_fitted()
@@ -303,6 +318,10 @@ class FieldModel(Configured, Saved, Displayed):
     def _forget(self, rows: Tensor) -> None:
         """Remove training spectra from this copy."""
         raise InputError(f"{self.kind}: cannot forget single spectra; fit it again to the others")
+
+    def _age(self, correlation: float) -> None:
+        """Lower the weight of the training spectra of this copy."""
+        raise InputError(f"{self.kind}: cannot weigh earlier spectra less; fit it again to the new ones")
 
     @property
     def room(self) -> Any:

@@ -70,7 +70,9 @@ class GPModel(ProcessModel, MemoryModel):
         return mean, self._std(position, grid) if with_std else None
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
-        return super()._state()[0] | self._spread_state(), self.process.state()[1]
+        tensors, header = self.process.state()
+        kept = {name: tensors[name] for name in tensors if name == "correlation"}
+        return super()._state()[0] | kept | self._spread_state(), header
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         super()._restore(tensors, header)

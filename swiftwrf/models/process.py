@@ -120,3 +120,6 @@ class ProcessModel(FieldModel):
         if len(rows.unique()) == n:
             raise InputError(f"the model was asked to forget all of its {n} training rows; fit another one")
         self.process = self.process.without(rows)
+
+    def _age(self, correlation: float) -> None:
+        self.process = self.process.aged(correlation)

@@ -203,6 +203,6 @@ def answer(index: int, new: Rssi | Spectra, before: FieldModel | RssiModel, step
     found |= {"error": round(float(step.scores.error[0]), 5), "alarm": "; ".join(step.alarms) or None}
     if step.notice:
         found["notice"] = step.notice
-    if step.forgotten is not None:
-        found["forgotten"] = step.forgotten
+    if step.correlation is not None:
+        found["correlation"] = step.correlation
     return json.dumps(strict(found), allow_nan=False)

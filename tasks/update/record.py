@@ -33,7 +33,7 @@ COLUMNS = (
     "innovation",
     "covered",
     "alarm",
-    "forgotten",
+    "correlation",
     "notice",
 )
 WORDS = ("alarm", "notice")  # columns of text
@@ -111,7 +111,7 @@ class Record:
             "innovation": float(scores.innovation.square().nanmean().sqrt()),
             "covered": float(scores.covered[0]),
             "alarm": " ".join("; ".join(step.alarms).split()),  # names of receivers may contain line breaks
-            "forgotten": step.forgotten,
+            "correlation": step.correlation,
             "notice": " ".join(step.notice.split()),
         }
         self._count(row)
@@ -127,7 +127,8 @@ class Record:
     def summary(self) -> Row:
         """Return the results as plain values."""
         changes = [
-            {"measurement": row["index"], "what": row["alarm"], "forgotten": row["forgotten"]} for row in self.alarms
+            {"measurement": row["index"], "what": row["alarm"], "correlation": row["correlation"]}
+            for row in self.alarms
         ]
         return {
             "source": self.source,

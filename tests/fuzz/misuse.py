@@ -207,7 +207,7 @@ MODELS: dict[str, Call] = {
     **{
         f"{name}.{method}(x)": lambda x, name=name, method=method: getattr(fitted(name), method)(x)
         for name in ("gp", "idw", "swiftwrf", "coarray", "nearest")
-        for method in ("fit", "predict", "synthesize", "update", "forget", "plot")
+        for method in ("fit", "predict", "synthesize", "update", "forget", "aged", "plot")
         if method != "fit" or name != "swiftwrf"
     },
     "gp.predict(grid=x)": lambda x: fitted("gp").predict(spectra().position, x),

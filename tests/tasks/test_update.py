@@ -1,4 +1,4 @@
-"""Updates equal a fit to all data with the same kernel; what is forgotten, saved and refused."""
+"""Updates equal a fit to all data with the same kernel; what is forgotten, aged, saved and refused."""
 
 from copy import copy
 from dataclasses import replace
@@ -107,12 +107,28 @@ def test_forgetting_what_was_learnt_restores_the_model(name):
 @pytest.mark.parametrize("name", PROCESSES)
 def test_a_saved_model_is_updated_as_the_one_in_memory(name, tmp_path):
     first, second = (data().subset(rows) for rows in (torch.arange(N, N + 5), torch.arange(N + 5, N + M)))
-    model = fitted(name).update(first)
+    model = fitted(name).aged(0.5).update(first)
     model.save(tmp_path / "model.safetensors")
     at = data().position[:5] + 0.03
     expected = model.update(second).synthesize(at)
     found = load(tmp_path / "model.safetensors").update(second).synthesize(at)
     torch.testing.assert_close(found, expected, rtol=0, atol=SIGNAL)
+
+
+def test_ageing_weighs_earlier_values_less(generator):
+    kernel, position = Kernel(noise=1e-2), torch.rand(20, 3, generator=generator, dtype=torch.float64)
+    value = torch.randn(20, 2, generator=generator, dtype=torch.float64)
+    aged = GaussianProcess.regress(kernel, position, value).aged(0.5)
+    new, more = torch.rand(3, 3, generator=generator, dtype=torch.float64), torch.ones(3, 2, dtype=torch.float64)
+    found = aged.updated(new, more)
+    time = torch.cat([torch.full((20,), 0.5), torch.ones(3)]).double()
+    ratio = torch.where(time[:, None] == time, 1.0, 0.5)
+    every = torch.cat([position, new])
+    covariance = kernel(every, every) * ratio + kernel.noise * torch.eye(23)
+    at = torch.rand(4, 3, generator=generator, dtype=torch.float64)
+    cross = kernel(at, every) * time
+    expected = cross @ torch.linalg.solve(covariance, torch.cat([value, more]))
+    torch.testing.assert_close(found.mean(at), expected)
 
 
 def test_an_update_beyond_the_exact_size_is_local(monkeypatch, generator):
@@ -144,6 +160,8 @@ def test_other_models_must_be_fitted_again(name):
 def test_wrong_spectra_are_refused():
     with pytest.raises(InputError, match="another grid"):
         fitted("coarray").update(simulated_room(n=2, grid=AngularGrid.hemisphere(7, 30)))
+    with pytest.raises(InputError, match="correlation"):
+        fitted("coarray").aged(0.0)
 
 
 @settings(max_examples=4, deadline=None)
