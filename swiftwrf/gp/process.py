@@ -189,6 +189,10 @@ class GaussianProcess:
         process = replace(self, known=self.known[kept], correlation=self.correlation[kept])
         return process.regressed(self.value[kept])
 
+    def with_kernel(self, kernel: Kernel) -> GaussianProcess:
+        """Return the process of the values with another kernel."""
+        return replace(self, kernel=kernel).regressed(self.value)
+
     def widened(self, count: int) -> GaussianProcess:
         """Return the process with some more columns of values, all 0."""
         coefficient, value = (functional.pad(x, (0, count)) for x in (self.coefficient, self.value))

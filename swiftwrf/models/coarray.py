@@ -111,6 +111,10 @@ class CoarrayModel(Linked, ProcessModel):
         score = torch.linalg.solve(component @ component.T, component @ change.T).T
         return torch.cat([score, (offset - self.offset).double()], dim=1)
 
+    def _weighted_values(self) -> Tensor:
+        weighted: Tensor = self.process.value[:, :-1] * self.component[1:].flatten(1).norm(dim=1)
+        return weighted
+
     def _spectra(self, score: Tensor, grid: AngularGrid) -> Tensor:
         """Return the spectra (b, H, W) of component scores with an offset (b, K + 1)."""
         one = torch.cat([torch.ones_like(score[:, :1]), score[:, :-1]], dim=1)

@@ -10,6 +10,7 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import folds
+from swiftwrf.data.store import Store
 from swiftwrf.gp import GaussianProcess, choose_kernel
 from swiftwrf.models.neighbours import MemoryModel
 from swiftwrf.models.process import ProcessModel
@@ -50,6 +51,9 @@ class GPModel(ProcessModel, MemoryModel):
 
     def _values(self, new: Spectra) -> Tensor:
         return torch.zeros(len(new), 0)  # the values are the spectra of the store
+
+    def _weighted_values(self) -> Store:
+        return self.store
 
     def _update(self, new: Spectra) -> None:
         super()._update(new)

@@ -12,14 +12,17 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
+from typing import Self
 
 import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
+from swiftwrf.data.splits import folds
+from swiftwrf.data.store import Store
 from swiftwrf.errors import InputError
-from swiftwrf.gp import GaussianProcess, Kernel, leave_folds_out, subsample
+from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel, leave_folds_out, subsample
 from swiftwrf.metrics import std_factor
 from swiftwrf.models.base import FieldModel
 from swiftwrf.runtime.checkpoint import expect
@@ -32,6 +35,7 @@ class ProcessModel(FieldModel):
     """Base class of field models that a Gaussian process of some values interpolates between the training positions.
 
     An update adds values to the process. Kernel, noise, mean spectrum, components and spread stay as fitted.
+    `with_chosen_kernel` chooses kernel and noise again.
     """
 
     updates = True
@@ -54,6 +58,41 @@ class ProcessModel(FieldModel):
         """Kernel of the process, lengths in [m]."""
         self.check_fitted()
         return self.process.kernel
+
+    def with_chosen_kernel(self, without: Tensor | None = None) -> Self:
+        """Return the model with the kernel and noise that predict held-out training spectra best. This model stays as it is.
+
+        Mean spectrum and components stay as fitted.
+
+        Args:
+            without: Numbers of training spectra that are forgotten first, int64. Defaults to none.
+
+        Raises:
+            InputError: As `forget`, or a model that cannot be updated.
+
+        Example:
+            >>> import swiftwrf, torch
+            >>> data = swiftwrf.simulated_room(n=60, grid=swiftwrf.AngularGrid.hemisphere(6, 12))
+            >>> model = swiftwrf.make_model("gp").fit(data.subset(torch.arange(15)))
+            >>> model.update(data.subset(torch.arange(15, 60))).with_chosen_kernel().kernel.noise > 0
+            True
+        """
+        model = self._copy() if without is None else self.forget(without)
+        position, before = model.process.known.cpu(), model.process.kernel
+        fold = folds(position, self.config.validation, self.config.seed)
+        model._set_process(model.process.with_kernel(choose_kernel(position, model._weighted_values(), fold)))
+        (rows,) = subsample(torch.arange(len(position)), rows=MAX_HELD_OUT)
+        old, new = (
+            torch.cat([part.variance for part in leave_folds_out(kernel, position, fold, rows)]).mean().sqrt()
+            for kernel in (before, model.process.kernel)
+        )
+        model._scale_std(float(old / new))  # of noisy values at held-out positions
+        return model
+
+    def _scale_std(self, factor: float) -> None:
+        """Multiply all standard deviations by a factor."""
+        if self.spread is not None:
+            self.spread = self.spread * factor
 
     def _set_spread(
         self,
@@ -109,6 +148,10 @@ class ProcessModel(FieldModel):
     @abstractmethod
     def _values(self, new: Spectra) -> Tensor:
         """Return the values (k, K) of the process that represent spectra."""
+
+    @abstractmethod
+    def _weighted_values(self) -> Tensor | Store:
+        """Return the values (n, ...) of the process, weighted such that their squared errors are those of the spectra."""
 
     def _update(self, new: Spectra) -> None:
         self.process = self.process.updated(self._process_position(new.position), self._values(new))

@@ -189,6 +189,9 @@ class SwiftWRF(ProcessModel):
         std = self.calibration * self.expected_error(position).float()
         return spectrum, std[:, None, None] * self._basis(grid).prior
 
+    def _scale_std(self, factor: float) -> None:
+        self.calibration *= factor
+
     @torch.inference_mode(False)  # a cached tensor must also serve calls with gradients
     @torch.no_grad()
     def _basis(self, grid: AngularGrid) -> Basis:
@@ -210,6 +213,10 @@ class SwiftWRF(ProcessModel):
         work = new.at_most(self.config.max_azimuths)
         basis = self._basis(work.grid)
         return (work.store[:].flatten(1).to(self.device) - basis.mean) @ basis.dual.T
+
+    def _weighted_values(self) -> Tensor:
+        weighted: Tensor = self.process.value / self._basis(self.grid).dual.norm(dim=1)  # of orthogonal components
+        return weighted.cpu()
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
         tensors, header = self.process.state()

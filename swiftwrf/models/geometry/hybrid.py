@@ -142,6 +142,10 @@ class HybridModel(ProcessModel):
         component = self.component[1:]
         return self._residual(new) @ component.T / component.square().sum(1)
 
+    def _weighted_values(self) -> Tensor:
+        weighted: Tensor = self.process.value * self.component[1:].norm(dim=1)
+        return weighted
+
     def _residual(self, new: Spectra) -> Tensor:
         """Return the residuals (k, pixels) of the paths and of the mean residual."""
         paths = torch.cat([self._paths(part) for part in new.position.split(self.batch)])

@@ -110,13 +110,13 @@ def test_standard_deviations_are_calibrated(built_in_room, floor_alone, name):
 
 
 @pytest.mark.parametrize("name", ["swiftwrf", "gp", "coarray"])
-def test_standard_deviations_follow_updates(built_in_room, name):
+def test_standard_deviations_follow_updates_and_another_kernel(built_in_room, name):
     train, test = built_in_room
     first = make_model(name).fit(train.subset(torch.arange(60)))
     both = first.update(train.subset(torch.arange(60, len(train))))
     before, after = (model.predict(test.position).std.mean() for model in (first, both))
     assert after < before
-    found = both.predict(test.position)
+    found = both.with_chosen_kernel().predict(test.position)
     assert 0.7 < covered(found.mean, found.std, test.spectrum).mean() < 0.9
 
 
