@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import torch
 from annotated_types import Gt, Lt
+from scipy import stats
 from scipy.cluster.vq import kmeans2
 from torch import Tensor
 
@@ -206,7 +207,7 @@ class Step:
         scores: Its scores before it was learnt, of length 1.
         alarms: Changes that it revealed, in words.
         correlation: Correlation of the fields before and after a change to which the model was adapted; None without one.
-        notice: That a room no longer explains the spectra, or that spectra were not learnt, in words; else empty.
+        notice: Another kernel, or that a room no longer explains the spectra, in words; empty without either.
 
     Example:
         >>> import swiftwrf
@@ -227,6 +228,9 @@ class Follower:
     """A fitted model that learns measurements one by one.
 
     An alarm of the innovations adapts models of spectra to the change, if these can forget spectra, and restarts the test.
+    Kernel and noise are chosen again whenever the model has learnt 30 measurements and a tenth of its data more, by all data
+    before these measurements. Others replace them if they predict these, each before it is learnt, with an error that is
+    lower by a paired t-test of the log errors. The level of the test is the false-alarm rate times their number.
 
     With a room and training spectra, a notice reports once if the room no longer explains the spectra. The planes of a
     geometry are refined whenever 10 positions are new; until then, its spectra wait.
@@ -261,6 +265,7 @@ class Follower:
         self.model: Any = model
         self.count = 0
         self.monitor = Monitor.of(model, train, false_alarm_rate)
+        self._unjudged: list[tuple[Spectra | Rssi, Scores]] = []  # measurements since the last choice of the kernel
         self.room: Monitor | None = None
         """test of the coherence of room and spectra; None without room or training spectra, and after its alarm"""
         self._found = model.room if isinstance(model, FieldModel) else None  # as it was before the test
@@ -298,6 +303,9 @@ class Follower:
             self._recent = [*self._recent, new][-500:]
             if alarms:
                 correlation = self._adapt(self.model, alarms[0])
+        if correlation is None and isinstance(self.model, ProcessModel | RssiModel):
+            self._unjudged.append((new, scores))
+            notices += self._choose_kernel(self.model)
         return Step(scores, tuple(words), correlation, "; ".join(notices))
 
     def _learn(self, new: Spectra | Rssi) -> list[str]:
@@ -316,12 +324,37 @@ class Follower:
         self.waiting = None
         return notices
 
+    def _choose_kernel(self, model: ProcessModel | RssiModel) -> list[str]:
+        """Choose the kernel again if enough measurements are new; return a notice if another one predicts better."""
+        count, n = len(self._unjudged), len(model.process.known if isinstance(model, ProcessModel) else model.anchor)
+        if count < max(30, 0.1 * (n - count)) or n - count < MIN_TRAINING:
+            return []
+        last, self._unjudged = self._unjudged, []
+        other = model.with_chosen_kernel(without=torch.arange(n - count, n))
+        old, new = model.kernel, other.kernel
+        if new == old:
+            return []
+        found = []
+        for one, _ in last:
+            found.append(score(other, one))
+            other = learnt(other, one)
+        gain = Scores.joined([scores for _, scores in last]).error.log() - Scores.joined(found).error.log()
+        better = stats.ttest_1samp(gain, 0.0, nan_policy="omit", alternative="greater")
+        rate = self.monitor.false_alarm_rate
+        if not better.pvalue < rate * count:
+            return []
+        self.model, self.monitor = other, Monitor.of(other, None, rate)
+        lengths = f"correlation length {old.correlation_length:.2g} -> {new.correlation_length:.2g} m"
+        change = f"{lengths}, noise {old.noise:.2g} -> {new.noise:.2g}"
+        return [f"kernel chosen again after {self.count} measurements: {change}"]
+
     def _adapt(self, model: ProcessModel, alarm: Alarm) -> float:
         """Adapt the model to a change, and calibrate the test with the next measurements."""
         n, learnt = min(alarm.at - alarm.since + 1, len(self._recent)), len(model.process.known)
         after = joined(self._recent[-n:])
         self.model, correlation = adapted(model.forget(torch.arange(learnt - n, learnt)), after)
         self.monitor = Monitor.of(self.model, None, self.monitor.false_alarm_rate)
+        self._unjudged = []
         return correlation
 
     def state(self) -> dict[str, Any]:

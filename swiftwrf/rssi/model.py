@@ -170,6 +170,7 @@ class RssiModel(SavedRssiPredictor):
         state = FitState(
             **rows,
             **prior,
+            measured=(~training.rssi.isnan()).to(training.rssi),
             middle=self.middle.clone(),
             field_variance=training.field_db.square(),
             noise_variance=training.noise_db.square(),
@@ -203,9 +204,7 @@ class RssiModel(SavedRssiPredictor):
 
     @single_thread()
     def _update(self, new: Rssi) -> None:
-        posterior = self._posterior
-        if posterior is None:
-            raise InputError(f"a predictor {self.name} cannot be updated; fit it again to all rows")
+        posterior = self._checked_posterior()
         if self.offsets is not None:
             new = self.offsets.removed(new)
         new, before = new.about(self.origin), posterior.linear
@@ -219,6 +218,55 @@ class RssiModel(SavedRssiPredictor):
         folded = self._posterior.folded()
         self.anchor, self.coefficient = folded.anchor.float(), folded.coefficient.float()
         self._uncertainty = self._uncertainty_of_rows()
+
+    def with_chosen_kernel(self, without: Tensor | None = None) -> Self:
+        """Return the model fitted again to all rows that it has learnt, with kernel, noise and mixing weights chosen again.
+
+        The rows follow from their residuals, the attenuation of floors is estimated again, and offsets stay as fitted. Rows
+        that were averaged in location bins are bins here, so that the scatter of single measurements is unknown: standard
+        deviations stay, too.
+
+        Args:
+            without: Numbers of rows that are forgotten first, in the order in which the model received them, int64. Defaults
+                to none.
+
+        Raises:
+            InputError: A model that cannot be updated, or fewer than 10 measurements.
+
+        Example:
+            >>> import swiftwrf
+            >>> model = RssiModel().fit(swiftwrf.rssi_room(n=60))
+            >>> len(model.with_chosen_kernel(without=torch.arange(10)).anchor)
+            50
+        """
+        self.check_fitted()
+        posterior = self._checked_posterior().folded()
+        kept = torch.ones(len(posterior.anchor), dtype=torch.bool)
+        if without is not None:
+            kept[without] = False
+        at, rssi, attenuation = self.region()[kept], posterior.rssi[kept], self.attenuation
+        rows = Rssi(
+            rssi if attenuation is None else rssi + attenuation.of(at),
+            at,
+            receiver_position=self.receiver_position,
+            receiver_names=self.receiver_names,
+            origin=self.origin,
+            floors=None if attenuation is None else attenuation.floors,
+        )
+        # the rows have lost their sessions
+        validation = "block" if self.config.validation == "session" else self.config.validation
+        model = type(self)(replace(self.config, validation=validation)).fit(rows)
+        model.offsets = self.offsets
+        state = posterior.state
+        # a mean of several measurements has a smaller variance than one measurement
+        if bool(((state.variance > 0) & (state.variance < 0.99 * state.noise_variance)).any()):
+            model.field_db, model.noise_db = self.field_db, self.noise_db
+        return model
+
+    def _checked_posterior(self) -> RssiPosterior:
+        if self._posterior is None:
+            raise InputError(f"a predictor {self.name} cannot be updated; fit it again to all rows")
+        return self._posterior
 
     @single_thread()
     def _predict(self, position: Tensor) -> tuple[Tensor, Tensor]:

@@ -40,6 +40,7 @@ class FitState:
         dual: Dual coefficients (n, R); 0 in bins that have no part in the fit.
         tangent: Slope of each head at the latent field, (n, R); 0 there.
         variance: Variance of the noise over the weight, (n, R) [dB^2]; 0 in bins that have no part in the fit.
+        measured: 1 where RSSI was measured and not only limited, (n, R).
         prior_level: Prior path-loss model, RSSI at 1 m, (R,) [dBm].
         prior_slope: Its slope, (R,) [dB a decade].
         prior_std: Prior standard deviation of level [dB] and slope [dB a decade], (R, 2).
@@ -51,6 +52,7 @@ class FitState:
     dual: Tensor
     tangent: Tensor
     variance: Tensor
+    measured: Tensor
     prior_level: Tensor
     prior_slope: Tensor
     prior_std: Tensor
@@ -61,7 +63,7 @@ class FitState:
     @classmethod
     def of(cls, tensors: dict[str, Tensor], n_receivers: int, n_bins: int) -> FitState:
         """Return the state in the tensors of a file, whose names begin with `fit.`."""
-        rows = ("dual", "tangent", "variance")
+        rows = ("dual", "tangent", "variance", "measured")
         sizes = {field.name: (n_bins, n_receivers) if field.name in rows else (n_receivers,) for field in fields(cls)}
         sizes["prior_std"] = (n_receivers, 2)
         expect(tensors, {f"fit.{name}": size for name, size in sizes.items()})
@@ -174,6 +176,7 @@ class RssiPosterior:
             dual=torch.cat([dual, new.dual.T]),
             tangent=torch.cat([old.tangent, new.tangent.T]),
             variance=torch.cat([old.variance, (new.variance / new.weight).T]),
+            measured=torch.cat([old.measured, (new.variance > 0).T.to(old.measured)]),
         )
         anchor = torch.cat([self.anchor, new.position])
         return RssiPosterior(state, anchor, self.receiver, self.kernel, self.table, self.huber)
@@ -182,6 +185,16 @@ class RssiPosterior:
     def coefficient(self) -> Tensor:
         """Coefficients of the kernel to the bins whose sum is the latent field, float64 (n, R) [dB]."""
         return self.state.field_variance * self.state.tangent * self.state.dual
+
+    @property
+    def rssi(self) -> Tensor:
+        """RSSI of the bins of the fit, from fitted values and residuals, float64 (n, R) [dBm]; nan where not detected."""
+        state = self.state
+        latent = self.kernel(self.anchor, self.anchor) @ self.coefficient
+        fitted = state.prior_level + state.prior_slope * log_distance(self.anchor, self.receiver)
+        fitted = fitted + (self._feature @ self._fitted)[..., 0].T
+        fitted = fitted + self.table(latent)[0] - self.table(torch.zeros_like(latent))[0]
+        return (fitted + state.variance * state.dual).where(state.measured > 0, torch.nan)
 
     def updated(self, position: Tensor, rssi: Tensor) -> RssiPosterior:
         """Return the posterior with more rows, RSSI (m, R) [dBm], nan where not detected, at positions (m, 3) [m]."""

@@ -206,6 +206,37 @@ def test_rssi_refuses_the_papers_head():
         paper.update(few)
 
 
+@pytest.mark.parametrize("name", PROCESSES)
+def test_a_chosen_kernel_is_that_of_a_fit(name):
+    """From another kernel, the choice by the values of the process is that by the spectra."""
+    model = fitted(name)
+    other = model._copy()
+    other._set_process(model.process.with_kernel(Kernel(0.01, matern12_weight=1.0, noise=0.1)))
+    found = other.with_chosen_kernel()
+    assert found.kernel.correlation_length == pytest.approx(model.with_chosen_kernel().kernel.correlation_length)
+    torch.testing.assert_close(found.process.value, model.process.value, rtol=1e-4, atol=1e-4)
+    if name != "hybrid":  # chooses its kernel before its mixing weight
+        assert found.kernel.correlation_length == pytest.approx(model.kernel.correlation_length, rel=0.02)
+    assert len(other.with_chosen_kernel(without=torch.arange(10)).process.known) == N - 10
+
+
+def test_rssi_follows_from_its_residuals():
+    model = fitted_rssi().update(floor().subset(torch.arange(60, 90)))
+    found = model._posterior.folded().rssi
+    missed = (found - floor().rssi_dbm).abs()
+    assert torch.equal(found.isnan(), floor().rssi_dbm.isnan())
+    assert missed[:60].nanmean() < 0.1
+    assert missed[60:].nanmean() < 0.5
+
+
+def test_rssi_with_a_chosen_kernel_is_a_fit_to_all_rows():
+    model = fitted_rssi().update(floor().subset(torch.arange(60, 90))).with_chosen_kernel()
+    whole, at = RssiModel().fit(floor()), floor().transmitter_position[:20] + 0.5
+    assert model.kernel.matern12_length == pytest.approx(whole.kernel.matern12_length)
+    assert model.kernel.noise == whole.kernel.noise
+    assert (model.predict(at).mean - whole.predict(at).mean).abs().mean() < 0.5
+
+
 def test_an_update_removes_the_attenuation_of_floors():
     model, new = fitted_rssi(), floor().subset(torch.arange(60, 90))
     below = copy(model)

@@ -101,6 +101,11 @@ def test_sessions_by_name():
         Rssi([[-60.0]] * 20, torch.rand(20, 3), session=names[:2])
 
 
+def test_kernel_is_chosen_again_without_sessions():
+    model = RssiModel(validation="session").fit(of_sessions(n=60))
+    assert len(model.with_chosen_kernel().anchor) == 60
+
+
 @pytest.mark.data
 def test_intervals_of_another_run_of_a_robot(measured_data):
     data = load_rssi(measured_data / "kolak")

@@ -142,7 +142,7 @@ def test_primitives_follow_their_scene_on_each_device(device):
     steps = [follower.step(new.subset(torch.tensor([number]))) for number in range(len(new))]
     assert any(step.correlation is not None for step in steps)
     assert follower.model.device.type == device
-    assert len(follower.model.process.known) == 112
+    assert len(follower.model.with_chosen_kernel().process.known) == 112
     on_cpu = make_model("swiftwrf", n_primitives=64).fit(train)
     expected, found = on_cpu.update(new).predict(new.position), model.update(new).predict(new.position)
     torch.testing.assert_close(found.mean.cpu(), expected.mean, atol=1e-3, rtol=0)
@@ -221,6 +221,39 @@ def test_a_follower_continues_after_the_model_has_grown():
 
 
 @cache
+def coarse(n, seed):
+    return simulated_room(n=n, seed=seed, grid=AngularGrid.hemisphere(10, 40))
+
+
+def followed(model, new):
+    follower = Follower(model)
+    return follower, [follower.step(new.subset(torch.tensor([i]))) for i in range(len(new))]
+
+
+@pytest.mark.parametrize("name", ["gp", "coarray"])
+def test_a_kernel_of_few_spectra_is_chosen_again(name):
+    train, new = (coarse(105, 0).subset(rows) for rows in (torch.arange(15), torch.arange(15, 105)))
+    model = make_model(name).fit(train)
+    follower, steps = followed(model, new)
+    notices = [step.notice for step in steps if step.notice]
+    assert len(notices) == 1
+    assert re.match(r"kernel chosen again after 60 measurements: correlation length 0\.\d+ -> 1\.9 m", notices[0])
+    assert follower.model.kernel.correlation_length > 10 * model.kernel.correlation_length
+    stale, _ = prequential(model, new)
+    error = torch.cat([step.scores.error for step in steps])
+    torch.testing.assert_close(error[:60], stale.error[:60])
+    assert error[60:].mean() < 0.97 * stale.error[60:].mean()
+
+
+def test_a_kernel_of_enough_spectra_stays():
+    data = coarse(170, 0)
+    model = make_model("coarray").fit(data.subset(torch.arange(80)))
+    follower, steps = followed(model, data.subset(torch.arange(80, 170)))
+    assert not any(step.notice for step in steps)
+    assert follower.model.kernel == model.kernel
+
+
+@cache
 def moved(n, seed):
     """The room with a wall that is 0.3 m away from its place."""
     return simulated_room(n=n, seed=seed, grid=GRID, room=ShoeboxRoom(size=(6.3, 5.0, 3.0)))
@@ -265,7 +298,7 @@ def test_a_notice_is_recorded(tmp_path):
     record, follower = Record("source", " [dB]"), Follower(RssiModel().fit(floor().subset(torch.arange(60))))
     for i in range(60, 62):
         step = follower.step(floor().subset(torch.tensor([i])))
-        record.append(tmp_path, record.add(i, replace(step, notice="the room is another one" if i == 61 else "")))
+        record.append(tmp_path, record.add(i, replace(step, notice="kernel chosen again" if i == 61 else "")))
     again = Record.read(tmp_path)
-    assert [(row["index"], row["notice"]) for row in again.notices] == [(61, "the room is another one")]
-    assert "The room is another one." in again.sentences()
+    assert [(row["index"], row["notice"]) for row in again.notices] == [(61, "kernel chosen again")]
+    assert "Kernel chosen again." in again.sentences()

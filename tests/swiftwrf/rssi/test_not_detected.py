@@ -195,6 +195,16 @@ def test_floors_and_offsets_need_a_column():
         estimate_offsets(replace(rssi_room(n=20), groups=pd.Series(["a", None] * 10, name="phone")))
 
 
+def test_another_kernel_keeps_the_limit_of_detection_of_a_building():
+    data = building(located=True)
+    model = RssiModel().fit(data)
+    found = model.with_chosen_kernel()
+    assert found.detection.limit == pytest.approx(model.detection.limit, abs=1)
+    at = data.transmitter_position
+    torch.testing.assert_close(found.predict(at).mean, model.predict(at).mean, atol=3, rtol=0)
+    assert ((found.predict_detection(at) > 0.5) == data.detected).double().mean() > 0.85
+
+
 def test_the_built_in_floor_misses_packets_at_random():
     model = RssiModel().fit(rssi_room(n=200))
     assert "of all packets are missed at any power" in model.detection.note(model.receiver_names)

@@ -417,6 +417,20 @@ def test_refuses():
         RssiMap.predict(model, region=torch.empty(0, 2))
 
 
+def test_another_kernel_keeps_the_intervals_of_rows_in_bins():
+    generator = torch.Generator().manual_seed(0)
+    position = torch.rand(1500, 3, generator=generator).double() * torch.tensor([30.0, 20.0, 0.0])
+    receiver = torch.tensor([[0.0, 0.0, 2.0], [30.0, 20.0, 2.0]]).double()
+    rssi = -40 - 25 * torch.cdist(position, receiver).log10() + 4 * torch.sin(position[:, :1] / 2)
+    rssi = rssi + 5 * torch.randn(1500, 2, generator=generator)
+    data = Rssi(rssi, position, receiver_position=receiver)
+    train, test = data.subset(torch.arange(1000)), data.subset(torch.arange(1000, 1500))
+    model = RssiModel(max_locations=150).fit(train)
+    for some in (model, model.with_chosen_kernel()):
+        low, high = some.predict(test.transmitter_position).interval(0.8)
+        assert 0.75 < ((low <= test.rssi_dbm) & (test.rssi_dbm <= high)).double().mean() < 0.85
+
+
 def test_a_receiver_that_is_nowhere_and_detects_nothing_has_the_mean_level():
     data = rssi_room(n=60)
     position, rssi = data.receiver_position.clone(), data.rssi_dbm.clone()
