@@ -19,7 +19,7 @@ from swiftwrf.choices import RSSI_PREDICTORS, NotDetected
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.rssi import PLACE
-from swiftwrf.data.splits import Validation
+from swiftwrf.data.splits import MIN_TRAINING, Validation
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import method_summary
 from swiftwrf.models.prediction import Prediction
@@ -33,7 +33,7 @@ from swiftwrf.rssi.paper import RssiPaperModel
 from swiftwrf.runtime.checkpoint import Saved, load
 from swiftwrf.runtime.registry import write_report
 from swiftwrf.runtime.steps import MODEL, Memo, Steps
-from swiftwrf.runtime.validation import Preset, checked
+from swiftwrf.runtime.validation import Fraction, Preset, checked
 
 Values = dict[str, Any]
 
@@ -95,6 +95,7 @@ class RssiComparison:
             without primitives have 0 `n_primitives`.
         left_out: Reason for each predictor that the data do not suffice for.
         predictors: Fitted predictors by name. Of those whose values `keep` had, the model alone.
+        by_rows: Mean absolute errors [dB] of the model and of "knn" by the number of training rows, a column for each.
         options: The split, the preset and the seed.
 
     Example:
@@ -109,6 +110,7 @@ class RssiComparison:
     values: Mapping[str, Values]
     left_out: dict[str, str]
     predictors: dict[str, RssiPredictor] = field(default_factory=dict)
+    by_rows: DataFrame = field(default_factory=DataFrame)
     options: Values = field(default_factory=dict)
 
     @property
@@ -214,6 +216,7 @@ def compare(
     reference: str | None = None,
     not_detected: NotDetected = "auto",
     validation: Validation | Literal["auto"] = "auto",
+    fewer: Sequence[Fraction] = (),
     device: torch.device | str = "cpu",
     keep: Memo | None = None,
     executor: Executor | None = None,
@@ -231,6 +234,7 @@ def compare(
         reference: Group whose offset is 0. Defaults to the most frequent one.
         not_detected: Meaning of an empty cell; see `RssiConfig`.
         validation: Folds that choose all settings: "random", "block" or "session". Defaults to those like the test rows.
+        fewer: Fractions of the training rows that the model and "knn" are fitted to, too, e.g. (0.25, 0.5).
         device: Device to compute on.
         keep: Results by the names of predictors, in a folder, and the model. A call with the same data and options
             continues after them.
@@ -261,35 +265,52 @@ def compare(
     own, predictors = model_of(train), dict[str, RssiPredictor]()
     parallel = None if executor is None else executor.map
 
-    def compute(_: None, folder: Path, name: str) -> Values:
-        predictor = predictors[name] = make_predictor(name, preset, **options)
+    def compute(_: None, folder: Path, name: str, rows: Tensor | None = None) -> Values:
+        predictor = make_predictor(name, preset, **options)
+        part, every = (train, pool) if rows is None else (train.subset(rows), pool.subset(rows))
         began = time.perf_counter()
-        predictor.fit(train, pool=pool, device=device, parallel=parallel, progress=progress)
+        predictor.fit(part, pool=every, device=device, parallel=parallel, progress=progress)
         fitted = time.perf_counter()
-        prediction, detected = predictor.predict_detected(test), test.detected
+        prediction = predictor.predict_detected(test)
         seconds = {"fit": fitted - began, "predict": time.perf_counter() - fitted}
-        if name == own and isinstance(predictor, Saved):
-            predictor.save(folder / MODEL)
         found = None  # shares of detected and of empty test cells that are predicted as such, if there are both kinds
-        if predictor.detection is not None and not bool(detected.all()) and not test.receiver_moves:
-            above = predictor.predict_detection(test.transmitter_position, offset) > 0.5
-            found = float(above[detected].double().mean()), float((~above)[~detected].double().mean())
-        error = (prediction.mean + offset - test.rssi_dbm)[detected].abs()
-        values = {"predicted": prediction.mean[detected], "median_db": float(error.quantile(0.5)), "detection": found}
-        values["std"] = None if prediction.std is None else prediction.std[detected]
-        return seconds | values | {"n_primitives": getattr(predictor, "n_primitives", 0)}
+        if rows is None:
+            predictors[name], detected = predictor, test.detected
+            if name == own and isinstance(predictor, Saved):
+                predictor.save(folder / MODEL)
+            if predictor.detection is not None and not bool(detected.all()) and not test.receiver_moves:
+                above = predictor.predict_detection(test.transmitter_position, offset) > 0.5
+                found = float(above[detected].double().mean()), float((~above)[~detected].double().mean())
+        std = None if prediction.std is None else prediction.std[test.detected]
+        error = (prediction.mean + offset - test.rssi_dbm)[test.detected].abs()
+        values = {"predicted": prediction.mean[test.detected], "std": std, "median_db": float(error.quantile(0.5))}
+        values["mean_db"] = float(error.mean())
+        return seconds | values | {"detection": found, "n_primitives": getattr(predictor, "n_primitives", 0)}
+
+    order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))
+    parts = [order[: round(fraction * len(train))].sort().values for fraction in fewer]
+    parts = [rows for rows in parts if int(train.detected[rows].sum(dim=0).min()) >= MIN_TRAINING]
+    studied = [name for name in (own, "knn") if name in names]
+
+    def study(_: None, folder: Path) -> Values:
+        less = {str(len(rows)): {name: compute(_, folder, name, rows)["mean_db"] for name in studied} for rows in parts}
+        return less | {str(len(train)): {name: values[name]["mean_db"] for name in studied}}
 
     with TemporaryDirectory(prefix="swiftwrf-") as temporary:
         memo = keep or Memo(Path(temporary))
         steps = Steps(None, memo)
         started = [steps.start(name, name, compute, name) for name in names]
+        if fewer:
+            steps.start("fewer rows", "fewer rows", study)
         values = {name: steps[name] for name in started}
+        by_rows = DataFrame.from_dict(steps["fewer rows"] if fewer else {}, orient="index")
         if own in names and own not in predictors:
             model = load(memo.folder / MODEL)
             assert isinstance(model, RssiModel | PairModel)
             predictors[own] = model
+    by_rows = by_rows.set_index(by_rows.index.astype(int)).rename_axis("n_train")
     used = {"split": split, "preset": preset, "seed": seed}
-    return RssiComparison(train, test, values, left_out, predictors, used)
+    return RssiComparison(train, test, values, left_out, predictors, by_rows, used)
 
 
 def pool_of(whole: Rssi, train: Rssi, test: Rssi, split: str, seed: int) -> Rssi:

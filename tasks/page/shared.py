@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pandas import DataFrame
 from torch import Tensor
@@ -41,6 +42,7 @@ def errors_section(
     quantity: str,
     caption: str,
     paragraphs: Sequence[str] = (),
+    panels: Sequence[Figure] = (),
 ) -> Section:
     """Return the table of all methods, and figures of those of the short table.
 
@@ -52,6 +54,7 @@ def errors_section(
         quantity: Name of the errors.
         caption: What the cells beside the errors mean.
         paragraphs: Sentences before the table.
+        panels: Errors against the number of measured positions, if they are known.
     """
     unit, short = answer.unit, [one for block in answer.short() for one in block]
     further = list(dict.fromkeys(column for one in answer.methods for column in one.cells))
@@ -80,9 +83,9 @@ def errors_section(
     figures.speed(axes, colours, points, "seconds to fit and apply", f"median {quantity} [{unit}]")
     text = (
         "Medians with 95 % intervals; the distribution of the errors, with a thin line at the median; the median against "
-        "the time that it takes."
+        f"the time that it takes{'; and the error against the number of measured positions' if panels else ''}."
     )
-    plot = Plot(f"errors-{name}", [dots, figure, cost], text, errors)
+    plot = Plot(f"errors-{name}", [dots, figure, cost, *panels], text, errors)
     return Section("", list(paragraphs), [Table(columns, rows, caption, frozenset([answer.chosen]))], [plot])
 
 

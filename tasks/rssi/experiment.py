@@ -27,6 +27,8 @@ from tasks.source import measured_rssi, offset_notes, split_notes
 from tasks.terminal import console, terminal
 from tasks.workers import connected
 
+FEWER = (0.125, 0.25, 0.5)  # of the training rows, for the figure of the error against their number
+
 
 def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     """Run the experiment and write its directory, or continue an interrupted one.
@@ -60,6 +62,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
                 not_detected=config.not_detected,
                 validation=config.validation,
                 reference=config.table.reference,
+                fewer=FEWER,
                 device=device,
                 keep=directory,
                 executor=cluster,
@@ -76,7 +79,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
 
 
 def _described(value: Row) -> str:
-    return f"{value['median_db']:.2f} dB"
+    return f"{value['median_db']:.2f} dB" if "median_db" in value else ""
 
 
 def _read_floor_plan(config: RssiTaskConfig, data: Rssi) -> FloorPlan | None:
@@ -136,6 +139,7 @@ def record(result: RssiComparison, folder: Path, notes: Sequence[str] = ()) -> R
         "model": result.model,
         "seconds": seconds[result.model],
         "interval": {"nominal": LEVEL, "coverage": result.coverage},
+        "by_rows": {str(n): {str(name): mean for name, mean in row.items()} for n, row in result.by_rows.iterrows()},
         "chosen": {
             "n_primitives": max(value["n_primitives"] for value in result.values.values()),
             "floor_attenuation_db": attenuation_db,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.metrics import paired_difference
@@ -98,6 +99,7 @@ def _errors(run: Records) -> Section:
         quantity="absolute error",
         caption=caption,
         paragraphs=[f"Left out: {reason}." for reason in run.metrics["left_out"].values()],
+        panels=_by_rows(run),
     )
 
 
@@ -203,6 +205,19 @@ def scatter_of_repeats(run: Records) -> float | None:
     repeats = same.count() - 1
     n = int(repeats.clip(lower=0).sum())
     return float(WIDTH_PER_STD * np.sqrt((same.var() * repeats).sum() / n)) if n >= MIN_REPEATS else None
+
+
+def _by_rows(run: Records) -> list[Figure]:
+    """Return the errors by the number of training rows, none if the rows are too few for parts of them."""
+    found = run.metrics["by_rows"]
+    if len(found) < 2:
+        return []
+    names = list(next(iter(found.values())))
+    figure, axes = figures.panel(5.6, 3.2)
+    lines = {name: ([int(n) for n in found], [row[name] for row in found.values()]) for name in names}
+    figures.curves(axes, COLOURS, lines, "training rows", "mean absolute error [dB]")
+    axes.set_ylim(0, None)
+    return [figure]
 
 
 def _differences(run: Records) -> list[Plot]:

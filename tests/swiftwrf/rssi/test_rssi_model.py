@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from unittest import mock
 
 import pytest
 import torch
@@ -18,11 +19,28 @@ from swiftwrf.rssi.mixing import mixing_weights
 from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, harmonics, log_distance
 from swiftwrf.rssi.regression import DIRECTIVITY_STD_DB, fit_receiver
 from swiftwrf.rssi.training import RssiTraining, bin_locations
+from swiftwrf.runtime.steps import Memo
 from swiftwrf.runtime.threads import threads_kept
 
 KERNEL = Kernel(4.0, 1.0, matern12_weight=0.6, noise=1.0)
 FIELD_DB, NOISE_DB, PATH_LOSS_STD_DB = 3.0, 2.0, 30.0
 CPU, FIRST = torch.device("cpu"), slice(0, 1)
+
+
+def test_errors_by_the_number_of_training_rows(monkeypatch, tmp_path):
+    kept = {name: RSSI_PREDICTORS[name] for name in ("swiftwrf", "mean", "knn")}
+    monkeypatch.setattr(RSSI_PREDICTORS, "_registered", kept)
+    room = rssi_room(n=200, seed=1)
+    asked = []
+    whole, found = compare(room, receivers=["6"]), compare(room, receivers=["6"], fewer=(0.01, 0.25, 0.5)).by_rows
+    with mock.patch.object(Memo, "begin", lambda _, name, title: asked.append(name)):
+        compare(room, receivers=["6"], fewer=(0.01,), keep=Memo(tmp_path))
+    assert list(found.columns) == ["swiftwrf", "knn"]
+    assert list(found.index) == [40, 80, 160]  # 2 rows determine nothing
+    errors = whole.summary()["mean"]
+    assert found.loc[160].to_dict() == pytest.approx(errors[["swiftwrf", "knn"]].to_dict())
+    assert whole.by_rows.empty
+    assert asked == ["swiftwrf", "mean", "knn", "fewer rows"]  # as many steps as a run announces
 
 
 def path_loss_only(n=60, noise=0.0, level=-50.0, exponent=2.0, seed=0):

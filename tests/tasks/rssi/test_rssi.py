@@ -103,6 +103,8 @@ def test_unknown_predictor():
     room = rssi_room(n=20)
     with pytest.raises(InputError, match="unknown predictor 'forest'"):
         compared(room, also=["forest"])
+    with pytest.raises(InputError, match="fewer must be a list, of which each is a number at least 0 and at most 1"):
+        compare(room, fewer=(-0.5,))
 
 
 def test_a_predictor_of_another_package(monkeypatch):
