@@ -330,14 +330,14 @@ class Follower:
         if count < max(30, 0.1 * (n - count)) or n - count < MIN_TRAINING:
             return []
         last, self._unjudged = self._unjudged, []
-        other = model.with_chosen_kernel(without=torch.arange(n - count, n))
+        other: Any = model.with_chosen_kernel(without=torch.arange(n - count, n))
         old, new = model.kernel, other.kernel
         if new == old:
             return []
         found = []
         for one, _ in last:
             found.append(score(other, one))
-            other = learnt(other, one)
+            other = other.update(one)
         gain = Scores.joined([scores for _, scores in last]).error.log() - Scores.joined(found).error.log()
         better = stats.ttest_1samp(gain, 0.0, nan_policy="omit", alternative="greater")
         rate = self.monitor.false_alarm_rate
