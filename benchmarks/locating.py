@@ -16,7 +16,7 @@ from record import kept, options, write_result
 from swiftwrf import Rssi, load_rssi, rssi_room
 from swiftwrf.datasets import DATA_SETS, fetch
 from swiftwrf.locate.baselines import LOCALIZERS
-from swiftwrf.locate.comparison import LocateComparison, LocateSplit, Trial
+from swiftwrf.locate.comparison import LocateComparison, LocateSplit
 
 RESULT = "locating_rssi"
 BUILT_IN = "floor"
@@ -62,10 +62,7 @@ def measure(data: Rssi, split: str, config: Config) -> dict[str, Any]:
     """
     measured = LocateSplit.of(data.receivers(["all"]), split, config.cells, config.seed)
     whole = LocateSplit.of(data, split, config.cells, config.seed)
-    values = {
-        trial: (whole if trial.localizer == "nearest" else measured).fit(trial)[1]
-        for trial in map(Trial, config.localizers)
-    }
+    values = {name: (whole if name == "nearest" else measured).fit(None, name) for name in config.localizers}
     result = LocateComparison(measured, values)
     return {
         "n_train": len(measured.train),
@@ -73,7 +70,7 @@ def measure(data: Rssi, split: str, config: Config) -> dict[str, Any]:
         "n_receivers": len(measured.train.receiver_names),
         "n_undetected": measured.n_undetected,
         "seed": config.seed,
-        "weights": values[Trial("posterior")]["weights"],
+        "weights": values["posterior"]["weights"],
         "cells": config.cells,
         "localizers": result.overall,
         "coverage": {str(level): fraction for level, fraction in result.coverage.items()},

@@ -43,7 +43,7 @@ SPLITS = {
 }
 TRANSMITTER = {"dcm-rssi": ("receiver",)}  # column with the second end of the link, where both ends move
 IDENTITY = "identity"
-OWN = ("swiftwrf", IDENTITY, "pairs", "blend")  # all others are baselines
+OWN = ("swiftwrf", IDENTITY, "pairs")  # all others are baselines
 Row = dict[str, Any]
 
 
@@ -54,7 +54,7 @@ class Config:
     sets: tuple[str, ...] = ()
     """data sets to measure. Defaults to all; the results of others are kept"""
     also: tuple[str, ...] = ()
-    """predictors that are compared only when named, e.g. blend, whose fit is slow"""
+    """predictors that are compared only when named, e.g. nerf2, whose fit is slow"""
     resume: bool = False
     """skip splits that the result contains"""
 

@@ -51,7 +51,6 @@ RSSI_PREDICTORS: Registry[Any] = Registry(
         "gp": "swiftwrf.rssi.baselines:GPPredictor",
         "pairs": "swiftwrf.rssi:PairModel",
         "knn_pairs": "swiftwrf.rssi.baselines:PairKNN",
-        "blend": "swiftwrf.rssi.baselines:Blend",
         "nerf2": "swiftwrf.comparison:NeRF2Rssi",
     },
 )

@@ -152,8 +152,8 @@ class RssiTaskConfig(Options):
     split: str = "random"
     """a split that comes with the data, or a seeded one: random, block, or place (a fifth of the receivers is held out)"""
     also: tuple[str, ...] = ()
-    """predictors that are compared only when named: nerf2 and blend take minutes; pairs and knn_pairs are for data with both
-    ends moving, where they are compared anyway"""
+    """predictors that are compared only when named: nerf2 takes minutes; pairs and knn_pairs are for data with both ends
+    moving, where they are compared anyway"""
     not_detected: NotDetected = "auto"
     """meaning of an empty cell: weak, the signal was below the limit of detection; unknown, it is ignored; auto decides for
     each receiver by the data"""

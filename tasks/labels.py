@@ -92,7 +92,6 @@ PREDICTORS = {
     ),
     "knn_pairs": Label("inverse-distance mean of the nearest pairs of positions", "#a0623a"),
     "nerf2": Label("a neural field for all receivers, its rays averaged (NeRF2)", "#4f8f2f"),
-    "blend": Label("a weighted mean of other predictors, weights by cross-validation", "#c04f9d"),
 }
 
 LOCALIZERS = {

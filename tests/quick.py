@@ -6,7 +6,7 @@ As a program it is the command line of a task, for tests that kill it: `python t
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, nullcontext, redirect_stderr, redirect_stdout
+from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -32,7 +32,6 @@ from swiftwrf import AngularGrid, MatchedField, Rssi, RssiModel, Spectra, rssi_r
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.errors import MAX_LENGTH
 from swiftwrf.locate import MatchedFieldConfig
-from swiftwrf.locate import comparison as locating
 from swiftwrf.models.geometry import furniture
 from swiftwrf.rssi import RssiConfig
 from swiftwrf.runtime.validation import configuration
@@ -123,7 +122,7 @@ def toys() -> tuple[Spectra, Rssi, Rssi]:
 
 @contextmanager
 def quick(drawn: bool = False) -> Iterator[None]:
-    """Few spectra, few steps, few methods, no planes; figures and studies of fewer receivers if asked for figures."""
+    """Few spectra, few steps, few methods, no planes; figures if asked for."""
     spectra, floor, located = toys()
     with (
         cheap(),
@@ -133,7 +132,6 @@ def quick(drawn: bool = False) -> Iterator[None]:
         mock.patch.object(rssi, "rssi_room", return_value=floor),
         mock.patch.object(locate, "rssi_room", return_value=located),
         one_example() if drawn else sketched(),
-        nullcontext() if drawn else mock.patch.multiple(locating, ROW_FRACTIONS=(), RECEIVER_FRACTIONS=()),
     ):
         yield
 

@@ -126,8 +126,6 @@ def test_every_block_of_the_tutorial_runs_and_prints_what_is_shown(part, tmp_pat
     monkeypatch.chdir(tmp_path)
     for place in ("augment.turbo.experiment", "augment.choose"):
         monkeypatch.setattr(f"{place}.candidates", lambda data: ["idw", "gp"])
-    for parts in ("ROW_FRACTIONS", "RECEIVER_FRACTIONS"):
-        monkeypatch.setattr(f"swiftwrf.locate.comparison.{parts}", ())
     for language, block, shown in FENCES.findall(part):
         if language == "python":
             exec(block, {})

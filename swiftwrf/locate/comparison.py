@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,16 +14,15 @@ from typing import Any
 import numpy as np
 import torch
 from pandas import DataFrame, concat
-from torch import Tensor
 
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.rssi import PLACE
 from swiftwrf.data.splits import matching_validation, places
 from swiftwrf.errors import InputError
-from swiftwrf.locate.baselines import LEVELS, LOCALIZERS, Localizer, PosteriorLocalizer
+from swiftwrf.locate.baselines import LEVELS, LOCALIZERS, PosteriorLocalizer
 from swiftwrf.locate.rssi import RssiLocator
-from swiftwrf.metrics import ErrorSummary, method_summary, summary
+from swiftwrf.metrics import method_summary, summary
 from swiftwrf.rssi import estimate_offsets
 from swiftwrf.runtime.checkpoint import load
 from swiftwrf.runtime.registry import write_report
@@ -31,42 +30,7 @@ from swiftwrf.runtime.steps import LOCATOR, Memo, Steps
 from swiftwrf.runtime.validation import checked
 
 MIN_ROWS = 20  # training rows that a receiver detected: five folds, of which four hold at least 10 rows
-ROW_FRACTIONS, RECEIVER_FRACTIONS = (0.1, 0.3), (0.25, 0.5)  # that are compared with everything
-STUDIED = ("posterior", "knn")
 Values = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Trial:
-    """One localizer on a part of the data.
-
-    Args:
-        localizer: Name in the registry.
-        rows: Fraction of the training rows.
-        receivers: Fraction of the receivers.
-    """
-
-    localizer: str
-    rows: float = 1.0
-    receivers: float = 1.0
-
-    @property
-    def name(self) -> str:
-        """Name of the localizer and of the part."""
-        rows = f"-rows{self.rows:g}" if self.rows < 1 else ""
-        return self.localizer + rows + (f"-receivers{self.receivers:g}" if self.receivers < 1 else "")
-
-    @property
-    def title(self) -> str:
-        """Name of the localizer and the part in words."""
-        parts = [f"{self.rows:.0%} of the rows"] * (self.rows < 1)
-        parts += [f"{self.receivers:.0%} of the receivers"] * (self.receivers < 1)
-        return f"{self.localizer}, {' and '.join(parts)}" if parts else self.localizer
-
-    @property
-    def is_whole(self) -> bool:
-        """True if the localizer has all training rows and receivers."""
-        return self.rows == 1 and self.receivers == 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,48 +87,20 @@ class LocateSplit:
             train, test = offsets.removed(train), offsets.removed(test)
         return cls(train, test, split, n_cells, seed, int((~kept).sum()))
 
-    def part(self, rows: float, receivers: float) -> tuple[Rssi, Rssi]:
-        """Return fractions of the training rows and of the receivers, and the test rows that these receivers detected."""
+    def fit(self, folder: Path | None, name: str) -> Values:
+        """Fit a localizer and locate the test rows. Return values for `LocateComparison`. A folder gets the locator."""
         train, test = self.train, self.test
-        if receivers < 1:
-            columns = self._drawn(len(train.receiver_names), receivers).tolist()
-            train, test = train.columns(columns), test.columns(columns)
-        if rows < 1:
-            train = train.subset(self._drawn(len(train), rows))
-        return train, test.subset(test.detected.any(dim=1))
-
-    def _drawn(self, n: int, fraction: float) -> Tensor:
-        order = torch.randperm(n, generator=torch.Generator().manual_seed(self.seed))
-        return order[: max(1, round(fraction * n))].sort().values
-
-    def trials(self) -> Iterator[Trial]:
-        """Yield every localizer on everything, then the studied ones on parts of rows and of receivers."""
-        yield from (Trial(name) for name in LOCALIZERS)
-        parts = [(rows, 1.0) for rows in ROW_FRACTIONS] + [(1.0, receivers) for receivers in RECEIVER_FRACTIONS]
-        sizes = {(len(self.train), len(self.train.receiver_names))}
-        for rows, receivers in parts:
-            train, test = self.part(rows, receivers)
-            size = len(train), len(train.receiver_names)
-            if size not in sizes and int(train.detected.any(dim=1).sum()) >= MIN_ROWS and len(test):
-                sizes.add(size)
-                yield from (Trial(name, rows, receivers) for name in STUDIED)
-
-    def fit(self, trial: Trial) -> tuple[Localizer, Values]:
-        """Fit a localizer and locate the test rows. Return the localizer, and values for `LocateComparison`."""
-        train, test = self.part(trial.rows, trial.receivers)
         validation = train.validation_for(self.split, test)
         if validation == "block" and self.split != "block":
             validation = matching_validation(train.transmitter_position, test.transmitter_position)
         options = {"validation": validation, "n_cells": self.n_cells, "seed": self.seed}
-        localizer = LOCALIZERS[trial.localizer](**options)
+        localizer = LOCALIZERS[name](**options)
         began = time.perf_counter()
         localizer.fit(train)
         fitted = time.perf_counter()
         located = localizer.locate(test.rssi_dbm)
         error = (located.position - test.transmitter_position).norm(dim=1)
         values: Values = {
-            "n_train": len(train),
-            "n_receivers": len(train.receiver_names),
             "seconds": {"fit": fitted - began, "predict": time.perf_counter() - fitted},
             "index": test.index,
             "truth": test.transmitter_position,
@@ -176,7 +112,9 @@ class LocateSplit:
         if isinstance(localizer, PosteriorLocalizer):
             weight = localizer.locator.weight.tolist()
             values["weights"] = dict(zip(("values", "detections", "fingerprints"), weight, strict=True))
-        return localizer, values
+            if folder is not None:
+                localizer.locator.save(folder / LOCATOR)
+        return values
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,24 +123,24 @@ class LocateComparison:
 
     Args:
         split: Training and test rows.
-        values: What `LocateSplit.fit` gave, by trial.
+        values: What `LocateSplit.fit` gave, by localizer.
         locator: Locator of all training rows.
 
     Example:
         >>> import swiftwrf
-        >>> split, trial = LocateSplit.of(swiftwrf.rssi_room(n=60), "random", 100, 0), Trial("mean")
-        >>> len(LocateComparison(split, {trial: split.fit(trial)[1]}).errors)
+        >>> split = LocateSplit.of(swiftwrf.rssi_room(n=60), "random", 100, 0)
+        >>> len(LocateComparison(split, {"mean": split.fit(None, "mean")}).errors)
         12
     """
 
     split: LocateSplit
-    values: Mapping[Trial, Values]
+    values: Mapping[str, Values]
     locator: RssiLocator | None = None
 
     @cached_property
     def errors(self) -> DataFrame:
-        """Position errors of the localizers with all data, a row for each method and test row."""
-        return concat([table for trial, table in self._tables.items() if trial.is_whole], ignore_index=True)
+        """Position errors, a row for each method and test row."""
+        return concat(map(self._table, self.values), ignore_index=True)
 
     def summary(self) -> DataFrame:
         """Return a row for each method: errors [m], and their mean difference to the posterior; see `method_summary`."""
@@ -224,37 +162,23 @@ class LocateComparison:
 
     @property
     def overall(self) -> dict[str, Any]:
-        """Position errors in space and in plan [m] of each localizer with all data, its seconds, and its floor hit rate.
+        """Position errors in space and in plan [m] of each localizer, its seconds, and its floor hit rate.
 
         The floor of an estimate is the one of the nearest height. Data without floors have no floor hit rate.
         """
         found: dict[str, Any] = {}
-        for trial, values in self.values.items():
-            if not trial.is_whole:
-                continue
-            table = self._tables[trial]
-            found[trial.localizer] = {
+        for name, table in self.errors.groupby("method", sort=False):
+            found[name] = {
                 "position_error_m": summary(table["position_error_m"], table["place"]),
                 "horizontal_error_m": summary(table["horizontal_error_m"], table["place"]),
-                "seconds": values["seconds"],
+                "seconds": self.values[name]["seconds"],
             }
             if "floor" in table:
-                found[trial.localizer]["floor_hit_rate"] = float((table["floor"] == table["truth_floor"]).mean())
+                found[name]["floor_hit_rate"] = float((table["floor"] == table["truth_floor"]).mean())
         return found
 
-    def studied(self, by: str) -> list[tuple[Trial, ErrorSummary]]:
-        """Return trials and their position errors [m] for fractions `by` "rows" or "receivers", with everything included."""
-        trials = [t for t in self.values if (t.receivers if by == "rows" else t.rows) == 1]
-        names = {trial.localizer for trial in trials if not trial.is_whole}
-        tables = ((t, self._tables[t]) for t in trials if t.localizer in names)
-        return [(t, summary(table["position_error_m"], table["place"])) for t, table in tables]
-
-    @cached_property
-    def _tables(self) -> dict[Trial, DataFrame]:
-        return {trial: self._table(trial) for trial in self.values}
-
-    def _table(self, trial: Trial) -> DataFrame:
-        values = self.values[trial]
+    def _table(self, name: str) -> DataFrame:
+        values = self.values[name]
         truth, estimate = (torch.as_tensor(values[name], dtype=torch.float64) for name in ("truth", "estimate"))
         away = estimate - truth
         columns: Values = {"index": values["index"], "place": places(truth, 2)}
@@ -271,7 +195,7 @@ class LocateComparison:
             columns |= {_radius(p): r for p, r in zip(LEVELS, radius.T, strict=True)}
             columns["ambiguous"] = values["ambiguous"]
         table = DataFrame({name: np.asarray(column) for name, column in columns.items()})
-        table.insert(0, "method", trial.localizer)
+        table.insert(0, "method", name)
         return table
 
 
@@ -292,8 +216,6 @@ def compare(
     executor: Executor | None = None,
 ) -> LocateComparison:
     """Fit every localizer to the training rows of a split, and locate the test rows.
-
-    Two localizers are also fitted to parts of the rows and of the receivers.
 
     Args:
         data: RSSI at receivers that stay where they are. Offsets between its groups, if it has any, are removed.
@@ -318,16 +240,8 @@ def compare(
     with TemporaryDirectory(prefix="swiftwrf-") as folder:
         memo = keep or Memo(Path(folder))
         steps = Steps(measured, memo, executor)
-        started = {trial: steps.start(trial.name, trial.title, _locate, trial) for trial in measured.trials()}
-        values = {trial: steps[name] for trial, name in started.items()}
+        started = [steps.start(name, name, LocateSplit.fit, name) for name in LOCALIZERS]
+        values = {name: steps[name] for name in started}
         locator = load(memo.folder / LOCATOR)
         assert isinstance(locator, RssiLocator)
         return LocateComparison(measured, values, locator)
-
-
-def _locate(split: LocateSplit, folder: Path, trial: Trial) -> Values:
-    """Return the values of a trial. The locator of all training rows is saved in a folder."""
-    localizer, values = split.fit(trial)
-    if isinstance(localizer, PosteriorLocalizer) and trial.is_whole:
-        localizer.locator.save(folder / LOCATOR)
-    return values

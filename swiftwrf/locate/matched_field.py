@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
 from typing import Annotated, ClassVar, Self
 
 import torch
@@ -28,9 +27,8 @@ from swiftwrf.locate.spectrum_likelihood import (
     Features,
     PathLikelihood,
     PathWaves,
-    PhaseLikelihood,
+    Screen,
     SpectrumFeatures,
-    Student,
     gain_features,
     room_features,
 )
@@ -87,7 +85,7 @@ class _Fit:
 
     room: GeometryModel
     gains: PathGains | None
-    phases: PhaseLikelihood
+    paths: PathLikelihood
 
     @property
     def features(self) -> tuple[Features, ...]:
@@ -99,18 +97,11 @@ class _Fit:
 
 @dataclass(frozen=True, eq=False)
 class _Likelihoods:
-    """Likelihoods that share a room and the frequencies relative to the carrier."""
+    """Likelihoods that share a room and the frequencies relative to the carrier, in the order of their weights."""
 
     room: GeometryModel
     frequency: Tensor
-    coarray: tuple[CoarrayLikelihood, ...]
-    phases: PhaseLikelihood
-    channel: tuple[ChannelLikelihood, ...]
-
-    @property
-    def parts(self) -> tuple[CoarrayLikelihood | PhaseLikelihood | ChannelLikelihood, ...]:
-        """All likelihoods, in the order of their weights."""
-        return *self.coarray, self.phases, *self.channel
+    parts: tuple[CoarrayLikelihood | ChannelLikelihood | PathLikelihood, ...]
 
     def __call__(self, position: Tensor, observed: SpectrumFeatures) -> Tensor:
         """Return log-likelihoods (k, n, m) of n observations at candidates (n, m, 3) [m]."""
@@ -123,55 +114,6 @@ class _Likelihoods:
 
         batches = torch.arange(n * m).split(BATCH_CANDIDATES // len(self.frequency))
         return torch.cat(parallel_map(of_batch, batches), dim=1).reshape(len(self.parts), n, m)
-
-
-@dataclass(frozen=True, eq=False)
-class _Screen:
-    """Likelihood of co-array numbers at all cells of the region, which chooses the cells that are searched.
-
-    Args:
-        whitened: Whitened predictions at the cells (m, F).
-        distribution: Distribution of their residuals.
-    """
-
-    whitened: Tensor
-    distribution: Student
-
-    @cached_property
-    def _squared(self) -> Tensor:
-        return self.whitened.square().sum(dim=1)
-
-    def log_likelihood(self, observed: SpectrumFeatures) -> Tensor:
-        """Return the log-likelihoods (n, m) of n observations, up to a constant of each."""
-        target = observed.coarray @ self.distribution.whitening
-        distance = torch.addmm(self._squared, target, self.whitened.T, alpha=-2)
-        return self.distribution.log_density(distance.add_(target.square().sum(dim=1, keepdim=True)).clamp_min_(0))
-
-
-@dataclass(frozen=True, eq=False)
-class _ChannelScreen:
-    """Likelihood of channels at all cells of the region.
-
-    Args:
-        predicted: Channels at the cells, complex64 (F, m, K), of one snapshot or of the first and the last.
-        likelihood: Likelihood of all snapshots.
-    """
-
-    predicted: Tensor
-    likelihood: ChannelLikelihood
-
-    @cached_property
-    def _power(self) -> Tensor:
-        return self.predicted.abs().square().sum(dim=2)
-
-    def log_likelihood(self, observed: SpectrumFeatures) -> Tensor:
-        """Return the log-likelihoods (n, m) of n observations, up to a constant of each."""
-        assert observed.channel is not None
-        count = observed.channel.shape[1]
-        channel = observed.channel[:, ends(count)].movedim(1, 0)  # (F, n, K)
-        match = (channel.conj() @ self.predicted.mT).abs().square().sum(dim=0)
-        power = channel.abs().square().sum(dim=2).T @ self._power.expand(len(channel), -1)
-        return self.likelihood.log_density(match / power.clamp_min(1e-30), observed.channel)
 
 
 class MatchedField(Configured, Saved):
@@ -254,7 +196,7 @@ class MatchedField(Configured, Saved):
             part = chosen.refined_on(phases).furnished_on(train.subset(kept))
             if self.n_snapshots:
                 return _Fit(part, None, PathLikelihood(part, torch.zeros(4 + part.reflectors.gain.shape[1])))
-            likelihood = PhaseLikelihood.fit([(part, PathWaves.at(part, train.position[kept]), features.subset(kept))])
+            likelihood = PathLikelihood.fit([(part, PathWaves.at(part, train.position[kept]), features.subset(kept))])
             return _Fit(part, fit_path_gains(part, phases, kernel, prior), likelihood)
 
         everything = torch.ones_like(fold, dtype=torch.bool)
@@ -271,7 +213,7 @@ class MatchedField(Configured, Saved):
                 missing[fold == number] = 1 - coherence(features.channel[fold == number], waves.channel)
         if self.n_snapshots:  # furniture is fitted more closely to the channels that determine it than to others
             variance = PathLikelihood.fit(held).log_variance
-            *parts, self._fit = (replace(f, phases=PathLikelihood(f.room, variance)) for f in (*parts, self._fit))
+            *parts, self._fit = (replace(f, paths=PathLikelihood(f.room, variance)) for f in (*parts, self._fit))
         self.floor = max(float(missing.median()), MIN_FLOOR)
         self.observed_power = float(features.coarray.square().mean())
         held_out = [train.position[fold == number] for number in range(FOLDS)]
@@ -284,48 +226,46 @@ class MatchedField(Configured, Saved):
         self._calibrate(train.position, features, fold, parts)
         return self
 
-    _screens: Sequence[_Screen | _ChannelScreen]
+    _screens: list[Screen]
+    """likelihoods at all cells, which choose the cells that are searched"""
 
     def _prepare(self) -> None:
-        """Compute what all spectra share: cells of the region and their predicted co-array numbers."""
+        """Compute what all spectra share: cells of the region and what is predicted there."""
         extent = self.region.extent
         spacing = self.config.spacing * self.room.array.wavelength
         count = math.prod((extent / spacing).clamp_min(1).tolist())
         self.cells = self.region.cells(int(min(max(count, 1), self.config.max_cells)))
         self.likelihoods = self._likelihoods(self._fit)
-        batches = self.cells.position.split(BATCH_CANDIDATES)
-        if self.likelihoods.channel:
-            (own,) = self.likelihoods.channel
+        batches, own = self.cells.position.split(BATCH_CANDIDATES), self.likelihoods.parts[-1]
+        if isinstance(own, ChannelLikelihood):
             frequency = self._frequency(self.room)[ends(len(self._frequency(self.room)))]
 
             def predicted(position: Tensor) -> Tensor:
                 return PathWaves.at(self.room, position, frequency).channel.movedim(1, 0)
 
-            self._screens = [_ChannelScreen(torch.cat(parallel_map(predicted, batches), dim=1), own)]
+            self._screens = [own.screen(torch.cat(parallel_map(predicted, batches), dim=1))]
             return
-        constant, varying = self.likelihoods.coarray
+        coarray = [part for part in self.likelihoods.parts if isinstance(part, CoarrayLikelihood)]
         assert self._fit.gains is not None
         # the mean of the path gains takes an eighth of the time of all their fields, and ranks cells nearly alike
-        features = constant.features, gain_features(self.room.array, self._fit.gains.averaged())
-        distributions = constant.distribution, varying.distribution
+        features = coarray[0].features, gain_features(self.room.array, self._fit.gains.averaged())
 
         def whitened(position: Tensor) -> list[Tensor]:
             waves = PathWaves.at(self.room, position)
-            return [part(waves) @ own.whitening for part, own in zip(features, distributions, strict=True)]
+            return [predict(waves) @ own.distribution.whitening for predict, own in zip(features, coarray, strict=True)]
 
         parts = zip(*parallel_map(whitened, batches), strict=True)
-        self._screens = [_Screen(torch.cat(part), own) for part, own in zip(parts, distributions, strict=True)]
+        self._screens = [own.screen(torch.cat(part)) for own, part in zip(coarray, parts, strict=True)]
 
     def _likelihoods(self, fit: _Fit, kept: Tensor | None = None) -> _Likelihoods:
-        residual = self.residual if kept is None else self.residual[:, kept]
-        frequency = self._frequency(fit.room)
         if self.n_snapshots:
-            return _Likelihoods(fit.room, frequency, (), fit.phases, (ChannelLikelihood(self.floor),))
+            return _Likelihoods(fit.room, self._frequency(fit.room), (fit.paths, ChannelLikelihood(self.floor)))
+        residual = self.residual if kept is None else self.residual[:, kept]
         coarray = (
             CoarrayLikelihood(predict, part, self.observed_power)
             for predict, part in zip(fit.features, residual, strict=True)
         )
-        return _Likelihoods(fit.room, frequency, tuple(coarray), fit.phases, ())
+        return _Likelihoods(fit.room, self._frequency(fit.room), (*coarray, fit.paths))
 
     def _frequency(self, room: GeometryModel) -> Tensor:
         """Return the frequencies of the kept snapshots relative to the carrier, (F,), one where all are at the carrier."""
@@ -362,7 +302,7 @@ class MatchedField(Configured, Saved):
             def evaluate(position: Tensor, part: SpectrumFeatures = part) -> Tensor:
                 return likelihoods(position, part)
 
-            total, *others = (screen.log_likelihood(part) for screen in self._screens)
+            total, *others = (screen(part) for screen in self._screens)
             for other in others:
                 total.add_(other)
             cells = best_cells(self.cells, total.neg_(), config.n_best, config.n_background, generator)
@@ -434,7 +374,7 @@ class MatchedField(Configured, Saved):
         """Return the fitted tensors by name, and plain values."""
         tensors, header = self.room.state()
         gains, values = self._fit.gains.state() if self._fit.gains else ({}, {})
-        own = {"statistics": self._fit.phases.log_variance, "residual": self.residual, "weight": self.weight}
+        own = {"statistics": self._fit.paths.log_variance, "residual": self.residual, "weight": self.weight}
         at, prior_values = self.region.state()
         frequency = None if self.frequency_hz is None else self.frequency_hz.tolist()
         channel = {"n_snapshots": self.n_snapshots, "frequency_hz": frequency, "floor": self.floor}
@@ -465,8 +405,7 @@ class MatchedField(Configured, Saved):
         if not locator.floor > 0 or (frequency is not None and len(frequency) != locator.n_snapshots):
             raise InputError("frequencies and missing coherence are not those of a fitted locator")
         locator.grid = room.grid
-        likelihood = PathLikelihood if is_channel else PhaseLikelihood
-        locator._fit = _Fit(room, gains, likelihood(room, tensors["statistics"]))
+        locator._fit = _Fit(room, gains, PathLikelihood(room, tensors["statistics"]))
         locator.residual, locator.weight = tensors["residual"], tensors["weight"]
         locator.region, locator.observed_power = Region.from_state(tensors, header), float(header["observed_power"])
         locator.inflation = read_inflation(header)

@@ -329,22 +329,14 @@ def inflation(posterior: Posterior, truth: Tensor, level: float = 0.8, margin: f
     corrects (split conformal calibration: V. Vovk, A. Gammerman and G. Shafer, "Algorithmic Learning in a Random World",
     2005).
 
-    Args:
-        posterior: Posterior of held-out observations.
-        truth: Their true positions, (n, 3) [m].
-        level: Nominal coverage.
-        margin: What is added to the fraction that the regions contain.
+    True positions are (n, 3) [m]; `margin` is added to the fraction.
     """
     ratio = (posterior.median - truth).norm(dim=1) / posterior.credible_radius(level).clamp_min(1e-9)
     return float(ratio.quantile(min(level + margin, 1.0)))
 
 
 def read_inflation(header: Header) -> float:
-    """Return the inflation of the header of a saved locator.
-
-    Raises:
-        InputError: A value that is not a number at least 0.
-    """
+    """Return the inflation of the header of a saved locator; refuse a value that is not a number at least 0."""
     value = header["inflation"]
     if not (isinstance(value, int | float) and 0 <= value < math.inf):
         raise InputError(f"inflation must be a number at least 0, got {value!r}")

@@ -177,11 +177,9 @@ class Region:
 
 
 def outside_mass(regions: list[Region], positions: list[Tensor]) -> float:
-    """Return the prior mass outside the neighbourhood of known positions, from held-out positions of each fold.
+    """Return the prior mass outside the neighbourhood of known positions.
 
-    Args:
-        regions: Region of the other folds' positions, one a fold.
-        positions: Held-out positions (n, 3) [m], one tensor a fold.
+    It follows from the held-out positions (n, 3) [m] of each fold and the region of the other folds' positions.
     """
     outside = sum(int((~region.is_near(at)).sum()) for region, at in zip(regions, positions, strict=True))
     total = sum(len(at) for at in positions)
@@ -191,12 +189,7 @@ def outside_mass(regions: list[Region], positions: list[Tensor]) -> float:
 def best_cells(cells: Cells, misfit: Tensor, most: int, others: int, generator: torch.Generator) -> Cells:
     """Return, for each observation, the cells of smallest misfit and a sample that represents all others.
 
-    Args:
-        cells: Cells (m,) of the region.
-        misfit: Misfit (n, m), any decreasing function of the likelihood.
-        most: Number of cells of smallest misfit.
-        others: Number of cells drawn among the others, whose volume they share.
-        generator: Source of randomness.
+    The misfit (n, m) is any decreasing function of the likelihood. Of `others` cells, each has a share of the volume left.
     """
     n, m = misfit.shape
     most = min(most, m)
@@ -223,14 +216,14 @@ def refined(cells: Cells, log_mass: Tensor, values: Tensor, evaluate: Evaluate, 
     """Split the cells of largest mass along every edge and evaluate their parts.
 
     Args:
-        cells: Cells (n, m) of each observation, all of the size of `cells.edge` or smaller.
+        cells: Cells (n, m) of each observation.
         log_mass: Logarithms of their masses under the present posterior, (n, m).
         values: Log-likelihoods (k, n, m) of k models.
-        evaluate: Gives values (k, n, s) at positions (n, s, 3).
+        evaluate: Function from positions (n, s, 3) to values (k, n, s).
         split: Number of cells of each observation that are split.
 
     Returns:
-        Cells (n, m) with the split ones replaced by their parts, the lightest left out, and their values.
+        As many cells, of which parts replace the split ones and the lightest, and their values.
     """
     n, m = log_mass.shape
     split = min(split, m)

@@ -96,11 +96,8 @@ class ValueLikelihood:
     def _log_density(self, total: Tensor, first: Tensor, second: Tensor, count: Tensor) -> Tensor:
         """Return the log-density, without the determinant of the maps' standard deviations.
 
-        Args:
-            total: Sum of the weights of the receivers, the inverse variances of the maps.
-            first: Weighted sum of the errors [dB].
-            second: Weighted sum of their squares.
-            count: Number of receivers.
+        `total`, `first` and `second` are sums over `count` receivers: of the weights, of weighted errors [dB], and of their
+        squares. Weights are the inverse variances of the maps.
         """
         variance = self.scale**2
         ratio = self.common_db**2 / variance
@@ -313,14 +310,7 @@ class FingerprintLikelihood:
 
     @classmethod
     def fit(cls, fingerprints: Fingerprints, votes: Votes, truth: Tensor, smallest_m: float) -> FingerprintLikelihood:
-        """Fit to the votes of held-out rows.
-
-        Args:
-            fingerprints: Training rows.
-            votes: Votes of `Fingerprints.vote` for n held-out rows.
-            truth: Their positions, (n, 3) [m].
-            smallest_m: Smallest scale [m].
-        """
+        """Fit to the votes of n held-out rows and their positions (n, 3) [m], with a smallest scale."""
         part = votes[0]
         rows, own = torch.arange(len(truth)), fingerprints.floor(truth)
         right = part[rows, own]

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.models.geometry.channels import coherence, field, waves
+from swiftwrf.models.geometry.channels import coherence, ends, field, waves
 from swiftwrf.models.geometry.fit import carrier_phases
 from swiftwrf.models.geometry.model import GeometryModel, kept_snapshots
 from swiftwrf.models.geometry.path_gains import PathGains
@@ -109,6 +109,7 @@ class PathWaves:
 
 
 Features = Callable[[PathWaves], Tensor]
+Screen = Callable[[SpectrumFeatures], Tensor]
 
 
 def room_features(array: PlanarArray) -> Features:
@@ -159,11 +160,7 @@ class Student:
         return matrix
 
     def log_density(self, distance: Tensor) -> Tensor:
-        """Return the log-density of squared whitened distances, without the determinants of scale and whitening.
-
-        Args:
-            distance: Squared distances, of any shape.
-        """
+        """Return the log-density of squared whitened distances of any shape, without the determinants."""
         f = len(self.scale)
         if math.isinf(self.degrees):
             normal: Tensor = -distance / 2 - f / 2 * math.log(2 * math.pi)
@@ -183,13 +180,9 @@ class Student:
 
 
 def covariance(residual: Tensor, shrinkage: Tensor, degrees: float, floor: float) -> Tensor:
-    """Return scale matrices (S, F, F) of residuals (n, F), shrunk to multiples of the identity.
+    """Return scale matrices (S, F, F) of residuals (n, F), shrunk to the identity by weights (S,), variances above `floor`.
 
-    Args:
-        residual: Residuals without gaps.
-        shrinkage: Weights of the identity, (S,).
-        degrees: Degrees of freedom, for which expectation maximisation weights the rows.
-        floor: Smallest variance.
+    Expectation maximisation weights the rows by the degrees of freedom.
     """
     n, f = residual.shape
     weight, identity = residual.new_ones(len(shrinkage), 1, n), torch.eye(f, dtype=residual.dtype)
@@ -221,11 +214,25 @@ class CoarrayLikelihood:
         away = (self.features(waves) - observed.coarray) @ self.distribution.whitening
         return self.distribution.log_density(away.square().sum(dim=1))
 
+    def screen(self, whitened: Tensor) -> Screen:
+        """Return the function from n observations to log-likelihoods (n, m), by whitened predictions (m, F) at m cells."""
+        squared = whitened.square().sum(dim=1)
 
-class PhaseLikelihood:
-    """Marginal likelihood of the element phases if path gains vary about their mean by a complex normal distribution.
+        def log_likelihood(observed: SpectrumFeatures) -> Tensor:
+            target = observed.coarray @ self.distribution.whitening
+            distance = torch.addmm(squared, target, whitened.T, alpha=-2)
+            distance = distance.add_(target.square().sum(dim=1, keepdim=True)).clamp_min_(0)
+            return self.distribution.log_density(distance)
 
-    The phase of the whole channel is unknown and integrated over.
+        return log_likelihood
+
+
+class PathLikelihood:
+    """Marginal likelihood of channels if path gains vary about their mean by a complex normal distribution.
+
+    A path has one gain at all frequencies. The phase of each snapshot is unknown, and so is a delay of the packet. It is
+    estimated relative to the expected field, given all snapshots. Phases by a spectrum are channels of one snapshot, of
+    which aliases are equally likely.
 
     Args:
         room: Room with P planes and further surfaces, and its paths.
@@ -275,35 +282,9 @@ class PhaseLikelihood:
 
     def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
         """Return log-likelihoods (m,) of m observations at m candidates, up to a constant of each observation."""
-        mean, wave, phases = waves.channel[:, 0], waves.wave[:, :, 0], observed.phases
-        power = (self._variance[:, None] * wave.abs().square()).sum(dim=1).mean(dim=1) + mean.abs().square().mean(dim=1)
-        total = power * (1 + self._diffuse + self._floor)
-        weighted = wave * self._variance.sqrt()[:, None]
-        spread = torch.einsum("msk,msl->mkl", weighted, weighted.conj()) / total[:, None, None]
-        rest = self._diffuse * self._isotropic + self._floor * torch.eye(wave.shape[2])
-        spread = spread + rest * (power / total)[:, None, None]
-        mean = mean / total.sqrt()[:, None]
-        root = torch.linalg.cholesky(spread)
-        white = torch.linalg.solve_triangular(root, torch.cat([mean[:, :, None], phases.mT], dim=2), upper=False)
-        m, x = white[..., :1], white[..., 1:]
-        match = 2 * (m.conj() * x).sum(dim=1).abs()
-        misfit = x.abs().square().sum(dim=1) + m.abs().square().sum(dim=1)
-        density = match + torch.special.i0e(match).log() - misfit
-        total_density: Tensor = density.logsumexp(dim=1) - 2 * root.diagonal(dim1=1, dim2=2).real.log().sum(dim=1)
-        return total_density
-
-
-class PathLikelihood(PhaseLikelihood):
-    """Marginal likelihood of channels at all frequencies under uncertain path gains, as `PhaseLikelihood` of phases.
-
-    A path has one gain at all frequencies. The phase of each snapshot is unknown, and so is a delay of the packet. It is
-    estimated relative to the expected field, given all snapshots.
-    """
-
-    def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
-        assert observed.channel is not None
-        channel = observed.channel / observed.channel.abs().square().mean((1, 2), keepdim=True).sqrt().clamp_min(1e-30)
-        count = channel.shape[1]  # snapshots at one frequency have the same waves
+        channel = observed.phases[:, :, None] if observed.channel is None else observed.channel[:, None]  # (m, T, F, K)
+        channel = channel / channel.abs().square().mean((2, 3), keepdim=True).sqrt().clamp_min(1e-30)
+        count = channel.shape[2]  # snapshots at one frequency have the same waves
         wave, mean = waves.wave.expand(-1, -1, count, -1), waves.channel.expand(-1, count, -1)
         variance = self._variance[:, None, None]
         power = (variance * wave.abs().square()).sum(1).mean((1, 2)) + mean.abs().square().mean((1, 2))
@@ -311,32 +292,33 @@ class PathLikelihood(PhaseLikelihood):
         scale = (1 + self._diffuse + self._floor).sqrt()
         whitening = torch.linalg.inv(root).mT * scale
         amount = power.rsqrt()[:, None, None] / scale  # so that the expected power is that of the observation
-        m, x = (mean * amount) @ whitening, channel @ whitening  # (m, F, K)
+        m, x = ((mean * amount) @ whitening)[:, None], channel @ whitening
         spread = ((wave * amount[..., None] * variance.sqrt()) @ whitening).flatten(2)  # (m, 1 + S, F K)
         gram = spread.conj() @ spread.mT + torch.eye(spread.shape[1])
         small = torch.linalg.cholesky(gram)
 
         def along(values: Tensor) -> Tensor:
-            match = spread.conj() @ values.flatten(1)[..., None]
+            match = spread.conj() @ values.flatten(2).mT
             found: Tensor = torch.linalg.solve_triangular(small, match, upper=False)
             return found
 
         expected, own = m, along(m)
-        for number in range(N_ALIGNED):
+        n_aligned = N_ALIGNED if count > 1 else 1
+        for number in range(n_aligned):
             x = x * (x.conj() * expected).sum(-1, keepdim=True).sgn().detach()
             other = along(x)
-            if number < N_ALIGNED - 1:
+            if number < n_aligned - 1:
                 change = torch.linalg.solve_triangular(small.mH, other - own, upper=True)
-                expected = m + (change.mT @ spread)[:, 0].view_as(m)
+                expected = m + (change.mT @ spread).view_as(x)
 
         def product(a: Tensor, b: Tensor, along_a: Tensor, along_b: Tensor) -> Tensor:
-            whole: Tensor = (a.conj() * b).sum((1, 2)) - (along_a.conj() * along_b).sum((1, 2))
+            whole: Tensor = (a.conj() * b).sum((2, 3)) - (along_a.conj() * along_b).sum(1)
             return whole
 
         match = 2 * product(m, x, own, other).abs()
         misfit = product(x, x, other, other).real + product(m, m, own, own).real
         volume = small.diagonal(dim1=1, dim2=2).real.log().sum(1) + count * (root.diagonal().real / scale).log().sum()
-        density: Tensor = match + torch.special.i0e(match).log() - misfit - 2 * volume
+        density: Tensor = (match + torch.special.i0e(match).log() - misfit).logsumexp(dim=1) - 2 * volume
         return density
 
 
@@ -363,3 +345,20 @@ class ChannelLikelihood:
     def log_density(self, coherence: Tensor, channel: Tensor) -> Tensor:
         """Return the log-likelihoods of coherences of any shape with channels (n, F, K)."""
         return -math.prod(channel.shape[1:]) * ((1 - coherence).clamp_min(0) + self.floor).log()
+
+    def screen(self, predicted: Tensor) -> Screen:
+        """Return the function from n observations to log-likelihoods (n, m), by channels at m cells.
+
+        Args:
+            predicted: Channels at the cells, complex64 (F, m, K), of one snapshot or of the first and the last.
+        """
+        predicted_power = predicted.abs().square().sum(dim=2)
+
+        def log_likelihood(observed: SpectrumFeatures) -> Tensor:
+            assert observed.channel is not None
+            channel = observed.channel[:, ends(observed.channel.shape[1])].movedim(1, 0)  # (F, n, K)
+            match = (channel.conj() @ predicted.mT).abs().square().sum(dim=0)
+            power = channel.abs().square().sum(dim=2).T @ predicted_power.expand(len(channel), -1)
+            return self.log_density(match / power.clamp_min(1e-30), observed.channel)
+
+        return log_likelihood

@@ -337,7 +337,8 @@ class SavedRssiPredictor(RssiPredictor, Saved):
         position = to_tensor("receiver_position", [at or [0.0] * 3 for at in known], torch.float64, shape)
         predictor.receiver_position = position.where(located[:, None], torch.nan)
         predictor.origin = GeodeticOrigin(*map(float, header["origin"])) if header.get("origin") else None
-        predictor.attenuation = FloorAttenuation.from_plain(header.get("attenuation"))
+        attenuation = header.get("attenuation")
+        predictor.attenuation = from_plain(FloorAttenuation, attenuation) if attenuation else None
         predictor.offsets = Offsets(**header["offsets"]) if header.get("offsets") else None
         curve = header.get("detection")
         predictor.detection = Detection.from_plain(curve, len(known)) if curve else None

@@ -1,4 +1,4 @@
-"""Baselines for RSSI: the mean, path-loss models, neighbours, Gaussian processes, and a blend of several predictors."""
+"""Baselines for RSSI: the mean, path-loss models, neighbours and Gaussian processes."""
 
 from __future__ import annotations
 
@@ -16,19 +16,13 @@ from sklearn.gaussian_process.kernels import ConstantKernel, Kernel, Matern, Whi
 from sklearn.neighbors import KNeighborsRegressor, NearestNeighbors
 from torch import Tensor, from_numpy
 
-from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.data import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
-from swiftwrf.errors import InputError
-from swiftwrf.models.base import CPU, FieldConfig
-from swiftwrf.rssi.base import Map, RssiPredictor, columns_of
-from swiftwrf.rssi.comparison import make_predictor
+from swiftwrf.rssi.base import RssiPredictor, columns_of
 from swiftwrf.rssi.detection import Detection
-from swiftwrf.rssi.mixing import mixing_weights
 from swiftwrf.rssi.pairs import PairPredictor
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, fit_path_losses, log_distance
 from swiftwrf.runtime.threads import parallel_map
-from swiftwrf.runtime.validation import configuration
 
 MAX_TREE_COLUMNS = 15  # of coordinates whose neighbours a tree finds
 NEIGHBOUR_COUNTS = (1, 3, 5, 8, 12, 20, 40, 80, 120)
@@ -228,55 +222,3 @@ class PairKNN(PairPredictor):
         if not len(pair):  # scikit-learn refuses it
             return pair.new_zeros(0), None
         return from_numpy(self._regressor.predict(pair.detach().numpy())), None
-
-
-@configuration
-class BlendConfig(FieldConfig):
-    """Options of `Blend`."""
-
-    members: tuple[str, ...] = ("swiftwrf", "gp", "knn", "mri_residual")
-    """names of the predictors; those whose requirements the data do not meet are left out"""
-
-
-class Blend(RssiPredictor):
-    """A weighted mean of other predictors, weights by cross-validation.
-
-    The weights, the same at all receivers, have the lowest mean absolute error on held-out training rows (stacking).
-    """
-
-    name = "blend"
-    config_type = BlendConfig
-    slow = True
-
-    weights: dict[str, float]
-    """weight of each member, set by `fit`"""
-
-    def _fit(
-        self, train: Rssi, *, pool: Rssi, device: torch.device = CPU, parallel: Map | None = None, **_: Any
-    ) -> None:
-        def member(name: str, kept: Tensor) -> RssiPredictor:
-            """Return a member, fitted to the kept rows (rows,)."""
-            rows = kept.nonzero()[:, 0]
-            options = {"validation": self.config.validation, "seed": self.config.seed}
-            unfitted = make_predictor(name, **options)
-            return unfitted.fit(train.subset(rows), pool=pool.subset(rows), device=device, parallel=parallel)
-
-        names = [name for name in self.config.members if not RSSI_PREDICTORS[name].lacking(train)]
-        if not names:
-            raise InputError(
-                f"no member of {self.name} can be fitted to {train.name}; name others, got {self.config.members}"
-            )
-        fold = folds(train.transmitter_position, self.config.validation, self.config.seed, session=train.session)
-        held_out = torch.full((len(names), *train.rssi_dbm.shape), torch.nan, dtype=torch.float64)
-        for number in fold.unique():
-            out = fold == number
-            position = train.transmitter_position[out]
-            for i, name in enumerate(names):
-                held_out[i, out] = member(name, ~out).predict(position).mean.double()
-        self.weights = dict(zip(names, mixing_weights(held_out, train.rssi_dbm).tolist(), strict=True))
-        every = torch.ones_like(fold, dtype=torch.bool)
-        self._members = {name: member(name, every) for name in names if self.weights[name] > 0}
-
-    def _predict(self, position: Tensor) -> tuple[Tensor, None]:
-        parts = [self.weights[name] * member.predict(position).mean.double() for name, member in self._members.items()]
-        return torch.stack(parts).sum(dim=0), None

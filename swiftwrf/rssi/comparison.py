@@ -229,7 +229,7 @@ def compare(
         receivers: Names of receivers, numbers counted from 1, or "all".
         split: Split that comes with the data, or a seeded one: random, block, or place.
         seed: Seed of everything random.
-        also: Predictors that are compared only when named, e.g. "blend".
+        also: Predictors that are compared only when named, e.g. "nerf2".
         preset: "quick", or "paper" for published settings.
         reference: Group whose offset is 0. Defaults to the most frequent one.
         not_detected: Meaning of an empty cell; see `RssiConfig`.

@@ -113,7 +113,7 @@ class Detection:
             said.append(f"{where} empty cells say nothing")
         return ", ".join(said)
 
-    def columns(self, number: Tensor) -> Self:
+    def columns(self, number: Tensor | slice) -> Self:
         """Return the curve of some receivers."""
         return replace(self, missed=self.missed[number], is_limit=self.is_limit[number])
 
@@ -129,12 +129,7 @@ class Detection:
         return cls(float(values["limit"]), float(values["width"]), missed, is_limit)
 
     def given_detection(self, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean [dBm] and standard deviation [dB] of the power of packets that were detected, each (n, R).
-
-        Args:
-            mean: Mean of the power of all packets, (n, R) [dBm].
-            std: Its standard deviation (n, R) [dB].
-        """
+        """Return mean [dBm] and standard deviation [dB] of the power of detected packets, by those of all, each (n, R)."""
         spread = (std.square() + self.width**2).sqrt()
         z = (mean - self.limit) / spread
         hazard = (-z.square() / 2 - math.log(2 * math.pi) / 2 - torch.special.log_ndtr(z)).exp()
@@ -165,18 +160,9 @@ class DetectionField:
     def fit(
         cls, kernel: Kernel, position: Tensor, detected: Tensor, fold: Tensor, level: Tensor, limit: float
     ) -> Self | None:
-        """Fit to bins, with what a model without a bin's fold predicts of it.
+        """Fit to bins, detected or not, bool (n, R), with held-out predictions `level` of their power, (n, R) [dBm].
 
-        Args:
-            kernel: Kernel of the process.
-            position: Positions of the bins, (n, 3) [m].
-            detected: Whether a receiver detects something in a bin, bool (n, R).
-            fold: Cross-validation fold of each bin, (n,).
-            level: Held-out prediction of the received power, (n, R) [dBm].
-            limit: See above.
-
-        Returns:
-            The field; None if every cell is detected.
+        The result is None if every cell is detected.
         """
         if bool(detected.all()):
             return None
@@ -221,10 +207,6 @@ def empty_given(z: Tensor, missed: Tensor) -> tuple[Tensor, Tensor]:
     """Return how an empty cell changes a power that is z standard deviations below the limit.
 
     With p = missed + (1 - missed) Phi(z), the probability of the empty cell, also for z far below 0:
-
-    Args:
-        z: Limit less mean of the power, in standard deviations.
-        missed: Share of random misses.
 
     Returns:
         (1 - missed) phi(z) / p, the derivative of log p by z, and (1 - missed) Phi(z) / p, the probability that the cell is

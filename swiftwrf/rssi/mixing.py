@@ -39,14 +39,15 @@ def check_comparable(held_out: Tensor, measured: Tensor) -> None:
         )
 
 
-def mixing_weights(held_out: Tensor, measured: Tensor, shrinkage: float = 0.0) -> Tensor:
+def mixing_weights(held_out: Tensor, measured: Tensor, shrinkage: float = 0.05) -> Tensor:
     """Return the weights of the weighted mean of predictors with the lowest mean absolute error on held-out rows.
 
     Args:
         held_out: Held-out predictions (predictors, rows, R) [dBm], nan where there is none.
         measured: Measurements (rows, R) [dBm], nan where not detected.
         shrinkage: Ridge penalty on the distance of the weights to those of the first predictor alone, relative to the mean
-            squared error of a predictor. It steadies weights that few folds determine.
+            squared error of a predictor. It steadies weights that few folds determine. The default is by nested
+            cross-validation.
 
     Returns:
         Non-negative weights of sum 1, float64 (predictors,).

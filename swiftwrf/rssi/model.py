@@ -100,53 +100,38 @@ class RssiModel(SavedRssiPredictor):
     _posterior: RssiPosterior | None
     """least squares of the fit, which `update` continues; None for `RssiPaperModel`"""
 
-    def _fit(self, train: Rssi, *, pool: Rssi, shift: Tensor, curve: Detection | None, **arguments: Any) -> None:
-        training = prepare(train, pool, self.config, shift, curve)
-        found = self._receivers(training, **arguments)
-        held_out = _held_out_predictors(training, found)
-        weight = self._mixing_weights(train, pool, training, held_out[0], (shift, curve), **arguments)
-        self._assemble(train, training, found, held_out, weight)
-
-    def _receivers(
+    def _fit(
         self,
-        training: RssiTraining,
+        train: Rssi,
+        *,
+        pool: Rssi,
+        shift: Tensor,
+        curve: Detection | None,
         device: torch.device = CPU,
         parallel: Map | None = None,
         progress: bool = False,
         **_: Any,
-    ) -> dict[str, Tensor]:
-        """Fit each receiver, and return the tensors of `fit_receiver` for all of them."""
+    ) -> None:
+        own, often = columns_of(train.receiver_names, pool), often_detected(pool)
+        (often,) = subsample(often, rows=MAX_KERNEL_RECEIVERS)
+        # receivers that determine the mixing weights are fitted, too: predictions do not depend on the receivers of `train`
+        every = torch.cat([own, often[~torch.isin(often, own)]])
+        training = prepare(pool.columns(every.tolist()), pool, self.config, shift, curve)
         task = partial(fit_receiver, data=training, config=self.config, device=device)
-        parts = [slice(r, r + 1) for r in range(len(training.receiver_names))]
+        parts = [slice(r, r + 1) for r in range(len(every))]
         with progress_bar(progress) as bar:
             fits = (parallel or _in_threads)(task, parts)
             results = list(bar.track(fits, total=len(parts), description="receivers"))
-        return {name: torch.cat([result[name] for result in results]) for name in results[0]}
-
-    def _mixing_weights(
-        self,
-        train: Rssi,
-        pool: Rssi,
-        training: RssiTraining,
-        predictors: Tensor,
-        removed: tuple[Tensor, Detection | None],
-        **arguments: Any,
-    ) -> Tensor:
-        """Return the weights (4,) of the field and the simpler predictors with the lowest error on held-out rows.
-
-        The weights are those of all receivers: the few folds determine no weights for each of them. They follow from the
-        receivers of the pool, so that a receiver's prediction is the same whichever others are fitted with it.
-        """
-        some = pool.columns(subsample(often_detected(pool), rows=MAX_KERNEL_RECEIVERS)[0].tolist())
-        if set(some.receiver_names) <= set(train.receiver_names):
-            predictors = predictors[:, :, columns_of(some.receiver_names, train)]
-        else:
-            others = prepare(some, pool, self.config, *removed, training)
-            predictors = _held_out_predictors(others, self._receivers(others, **arguments | {"progress": False}))[0]
-        predicted = predictors[:, training.bin_of_row]
-        if not comparable(predicted, some.rssi_dbm).any():
-            return FIELD_ALONE
-        return mixing_weights(predicted, some.rssi_dbm, 0.05)  # by nested cross-validation
+        found = {name: torch.cat([result[name] for result in results]) for name in results[0]}
+        predictors, std = _held_out_predictors(training, found)
+        predictors, std, mine = predictors[:, training.bin_of_row], std[training.bin_of_row], slice(len(own))
+        # one set of weights for all receivers: the few folds determine none for each of them
+        columns = [every.tolist().index(c) for c in often.tolist()]
+        predicted, measured = predictors[..., columns], pool.rssi_dbm[:, often]
+        is_comparable = bool(comparable(predicted, measured).any())
+        weight = mixing_weights(predicted, measured) if is_comparable else FIELD_ALONE
+        found = {name: value[mine] for name, value in found.items()}
+        self._assemble(train, training.columns(mine), found, (predictors[..., mine], std[:, mine]), weight)
 
     @single_thread()
     def _assemble(
@@ -159,10 +144,9 @@ class RssiModel(SavedRssiPredictor):
     ) -> None:
         """Mix the fits of all receivers with the simpler predictors by weights (4,), and calibrate the deviation."""
         predictors, std = held_out
-        check_comparable(predictors[:, training.bin_of_row], train.rssi_dbm)
+        check_comparable(predictors, train.rssi_dbm)
         predicted = torch.einsum("k,knr->nr", weight[weight > 0], predictors[weight > 0])
-        of_row = training.bin_of_row
-        scale = interval_scale(predicted[of_row], std[of_row], train.rssi_dbm)
+        scale = interval_scale(predicted, std, train.rssi_dbm)
 
         def mixed(own: Tensor, baselines: Tensor) -> Tensor:
             return weight @ torch.cat([own[None], baselines])

@@ -8,9 +8,7 @@ linear in the number of floors. Groups are devices, channels or any other betwee
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -44,15 +42,6 @@ class FloorAttenuation:
     floors: Floors
     receiver_floor: tuple[int, ...]
     db: float
-
-    @classmethod
-    def from_plain(cls, values: Mapping[str, Any] | None) -> Self | None:
-        """Return the attenuation of plain values, None without any."""
-        if not values:
-            return None
-        names, heights = (tuple(values["floors"][field]) for field in ("names", "height_m"))
-        floors = Floors(tuple(map(str, names)), tuple(map(float, heights)))
-        return cls(floors, tuple(map(int, values["receiver_floor"])), float(values["db"]))
 
     def of(self, position: Tensor) -> Tensor:
         """Return the RSSI that the floors take from transmitters (n, 3) at each receiver, float64 (n, R) [dB]."""

@@ -12,9 +12,8 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from dataclasses import asdict, dataclass
-from functools import cached_property
 from statistics import NormalDist
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -26,7 +25,7 @@ from swiftwrf.gp import GaussianProcess, Kernel, candidates
 from swiftwrf.gp.process import N_NEIGHBOURS, local_weights
 from swiftwrf.models.base import FieldConfig
 from swiftwrf.models.prediction import Prediction
-from swiftwrf.positions import Neighbours, check_positions, distance
+from swiftwrf.positions import Neighbours, check_positions, distance, nearest
 from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiPredictor, SavedRssiPredictor
 from swiftwrf.rssi.mixing import LEVEL, rounding_std
 from swiftwrf.rssi.path_loss import MIN_DISTANCE_M, fit_path_loss
@@ -36,6 +35,7 @@ from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import configuration
 
 RELATIVE_NOISE_VARIANCES = (0.03, 0.1, 0.3, 1.0, 3.0)  # variance of a measurement relative to that of the field
+RATIOS = (0.5, 1.0, 2.0)  # of distances that the transmitter moves to equivalent ones of the receiver
 MAX_HELD_OUT = 500  # pairs that choose the kernel; more do not change it
 
 
@@ -91,16 +91,12 @@ class PairPathLoss:
         level = (right[:, 0] - normal[:, 0, 1] * slope) / normal[:, 0, 0]
         return cls(shared, place, torch.stack([level - slope * centre, slope], dim=1))
 
-    @cached_property
-    def _places(self) -> Neighbours:
-        return Neighbours(self.place)
-
     def __call__(self, pair: Tensor) -> Tensor:
         """Return the RSSI (m,) [dBm] at pairs (m, 6) [m]; at places without a correction by the shared model."""
         values = self.shared.expand(len(pair), 2)
         if len(self.place) and len(pair):
-            away, nearest = (found[:, 0] for found in self._places(pair[:, 3:], 1))
-            values = values + self.correction[nearest].where(away[:, None] < 1e-3, 0.0)
+            away, number = (found[:, 0] for found in nearest(pair[:, 3:], self.place, 1))
+            values = values + self.correction[number].where(away[:, None] < 1e-3, 0.0)
         return values[:, 0] + values[:, 1] * _pair_log_distance(pair)
 
 
@@ -199,40 +195,16 @@ class PairPredictor(RssiPredictor):
         return Prediction(mean if self.attenuation is None else mean + self.attenuation.between(*ends).to(mean), std)
 
 
-class Metric(NamedTuple):
-    """Coordinates in which pairs are near to each other.
-
-    Args:
-        ratio: Factor of the receiver's coordinates.
-        reciprocal: Whether both ends are alike, so that exchanging them changes nothing.
-    """
-
-    ratio: float = 1.0
-    reciprocal: bool = False
-
-    def coordinates(self, pair: Tensor) -> Tensor:
-        """Return the coordinates of pairs (m, 6)."""
-        return pair * pair.new_tensor([1.0] * 3 + [self.ratio] * 3)
-
-    def known(self, pair: Tensor) -> Tensor:
-        """Return the coordinates of measured pairs (m, 6), and of the exchanged ones after them if they are reciprocal."""
-        own = self.coordinates(pair)
-        return torch.cat([own, own.roll(3, dims=1)]) if self.reciprocal else own
-
-    def values(self, value: Tensor) -> Tensor:
-        """Return the values (m,) of `known`."""
-        return value.repeat(1 + self.reciprocal)
-
-
-# distances that the receiver moves, relative to an equivalent one of the transmitter, and both ends alike
-METRICS = (Metric(0.5), Metric(1.0), Metric(2.0), Metric(reciprocal=True))
+def scaled(pair: Tensor, ratio: float) -> Tensor:
+    """Return pairs (m, 6), the receiver's coordinates times a ratio: coordinates in which pairs are near to each other."""
+    return pair * pair.new_tensor([1.0] * 3 + [ratio] * 3)
 
 
 class PairModel(PairPredictor, SavedRssiPredictor):
     """A path-loss model in the distance of both ends, and a Gaussian process over both positions.
 
-    A prediction conditions on the nearest 64 pairs (local Gaussian process). Lengths, noise, the ratio of the ends' lengths
-    and reciprocity are those with the lowest error at held-out pairs, which also calibrate the standard deviation.
+    A prediction conditions on the nearest 64 pairs (local Gaussian process). Lengths, noise and the ratio of the ends'
+    lengths are those with the lowest error at held-out pairs, which also calibrate the standard deviation.
 
     Example:
         >>> import swiftwrf
@@ -247,8 +219,8 @@ class PairModel(PairPredictor, SavedRssiPredictor):
 
     kernel: Kernel
     """kernel of the field, lengths in [m]"""
-    metric: Metric
-    """how distances of both ends count"""
+    ratio: float
+    """factor of the receiver's coordinates, by which distances of both ends count"""
     path_loss: PairPathLoss
     """path-loss model, of all receivers or of each place"""
     pair: Tensor
@@ -270,31 +242,29 @@ class PairModel(PairPredictor, SavedRssiPredictor):
         for number in fold[sample].unique().tolist():
             kept = fold != number
             held_out[number] = rssi - PairPathLoss.fit(pair[kept], rssi[kept], not self.config.new_places)(pair)
-        choices = [choice for metric in METRICS for choice in self._judged(metric, fold, sample, held_out)]
-        _, self.metric, self.kernel, score = min(choices, key=lambda choice: choice[0])
+        choices = [choice for ratio in RATIOS for choice in self._judged(ratio, fold, sample, held_out)]
+        _, self.ratio, self.kernel, score = min(choices, key=lambda choice: choice[0])
         scale = score.quantile(LEVEL)[None] / NormalDist().inv_cdf((1 + LEVEL) / 2)
         self.scale_db = scale.clamp_min(rounding_std(rssi) / self.kernel.noise**0.5)
         self._precompute()
 
     def _judged(
-        self, metric: Metric, fold: Tensor, sample: Tensor, held_out: dict[int, Tensor]
-    ) -> list[tuple[float, Metric, Kernel, Tensor]]:
+        self, ratio: float, fold: Tensor, sample: Tensor, held_out: dict[int, Tensor]
+    ) -> list[tuple[float, float, Kernel, Tensor]]:
         """Return kernels with their mean absolute error at held-out pairs, and the errors by their relative deviations."""
         n_near = min(N_NEIGHBOURS, int((fold[:, None] != fold.unique()).sum(dim=0).min()))
-        between, across, value, residual = [], [], [], []
+        between, across, value, residual, coordinates = [], [], [], [], scaled(self.pair, ratio)
         for number, own in held_out.items():
             out, kept = sample[fold[sample] == number], fold != number
-            known, query = metric.known(self.pair[kept]), metric.coordinates(self.pair[out])
+            known, query = coordinates[kept], coordinates[out]
             near = Neighbours(known)(query, n_near)[1]
             between.append(distance(known[near], known[near]))
             across.append(distance(query[:, None], known[near])[:, 0])
-            value.append(metric.values(own[kept])[near])
+            value.append(own[kept][near])
             residual.append(own[out])
         r_between, r_across, values, truth = (torch.cat(parts) for parts in (between, across, value, residual))
         # rough fields only, as in the model of each receiver
-        kernels = [
-            k for k in candidates(metric.coordinates(self.pair), RELATIVE_NOISE_VARIANCES) if k.matern12_weight == 1
-        ]
+        kernels = [k for k in candidates(coordinates, RELATIVE_NOISE_VARIANCES) if k.matern12_weight == 1]
         judged = []
         for length in sorted({kernel.matern12_length for kernel in kernels}):
             shape = Kernel(length, matern12_weight=1.0)
@@ -303,7 +273,7 @@ class PairModel(PairPredictor, SavedRssiPredictor):
                 weight, variance = local_weights(covariance, cross, kernel.noise)
                 error = (truth - (weight * values).sum(dim=1)).abs()
                 score = error / (variance + kernel.noise).sqrt()
-                judged.append((float(error.mean()), metric, kernel, score))
+                judged.append((float(error.mean()), ratio, kernel, score))
         return judged
 
     def region(self) -> Tensor:
@@ -311,12 +281,12 @@ class PairModel(PairPredictor, SavedRssiPredictor):
         return self.pair[:, :3]
 
     def _precompute(self) -> None:
-        known, value = self.metric.known(self.pair), self.metric.values(self.residual)
-        self._process = GaussianProcess(self.kernel, known, value[:, None], exact=False)
+        known = scaled(self.pair, self.ratio)
+        self._process = GaussianProcess(self.kernel, known, self.residual[:, None], exact=False)
 
     @single_thread()
     def _at_pairs(self, pair: Tensor) -> tuple[Tensor, Tensor]:
-        field, variance = self._process.local(self.metric.coordinates(pair))
+        field, variance = self._process.local(scaled(pair, self.ratio))
         return self.path_loss(pair) + field[:, 0], self.scale_db * (variance + self.kernel.noise).sqrt()
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
@@ -324,15 +294,14 @@ class PairModel(PairPredictor, SavedRssiPredictor):
         own = {"pair": self.pair, "residual": self.residual, "scale_db": self.scale_db}
         loss = self.path_loss
         tensors = own | {"path_loss": loss.shared, "place": loss.place, "correction": loss.correction}
-        return tensors, self._header() | {"kernel": asdict(self.kernel), "metric": self.metric}
+        return tensors, self._header() | {"kernel": asdict(self.kernel), "ratio": self.ratio}
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
         model = cls._of_header(header)
-        model.kernel, (ratio, reciprocal) = Kernel(**header["kernel"]), header["metric"]
-        model.metric = Metric(float(ratio), bool(reciprocal))
-        if not (0 < model.metric.ratio < math.inf and model.receiver_position.isfinite().all()):
-            raise InputError("its metric or a position of its receivers is not finite")
+        model.kernel, model.ratio = Kernel(**header["kernel"]), float(header["ratio"])
+        if not (0 < model.ratio < math.inf and model.receiver_position.isfinite().all()):
+            raise InputError("its ratio or a position of its receivers is not finite")
         n_pairs, n_places = len(tensors["pair"]), len(tensors["place"])
         shapes = {"pair": (n_pairs, 6), "residual": (n_pairs,), "scale_db": (1,)}
         files.expect(tensors, shapes | {"path_loss": (2,), "place": (n_places, 3), "correction": (n_places, 2)})

@@ -137,7 +137,7 @@ class PathLosses(NamedTuple):
     detection: Detection | None
     floor_db: Tensor
 
-    def columns(self, number: Tensor) -> PathLosses:
+    def columns(self, number: Tensor | slice) -> PathLosses:
         """Return the path loss of some receivers."""
         own, shared = (PathLoss(*(value[number] for value in model)) for model in (self.own, self.shared))
         detection = self.detection and self.detection.columns(number)

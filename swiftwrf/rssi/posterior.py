@@ -1,12 +1,12 @@
 """Update of an RSSI fit with more rows: the weighted least squares that the fit ended in, bordered by the new rows.
 
-At the end of `swiftwrf.rssi.regression.solve` the rows of one receiver have the covariance C + F F^T with
+At the end of `swiftwrf.rssi.regression.solve` the rows of one receiver have the covariance
 
-    C = (slope slope^T) * covariance of the latent field + diag(noise / weight),    F = scaled regressors of the path loss.
+    (slope slope^T) * covariance of the latent field + F F^T + diag(noise / weight)
 
-The inverse of C, and the posterior covariance B of the regressors' coefficients, are computed once. A new row then costs
-one product with inv(C). Slopes and weights of the rows of the fit stay. Those of new rows are found with all new rows
-together, so their order has no effect.
+with the scaled regressors F of the path loss. Its inverse is computed once. A new row then costs one product with it.
+Slopes and weights of the rows of the fit stay. Those of new rows are found with all new rows together, so their order has no
+effect.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from torch.nn import functional
 
 from swiftwrf.gp import Kernel
 from swiftwrf.rssi.head import HeadTable
-from swiftwrf.rssi.path_loss import N_HARMONICS, harmonics, log_distance
+from swiftwrf.rssi.path_loss import harmonics, log_distance
 from swiftwrf.rssi.regression import WEIGHT_TOLERANCE, coefficient_scale, regressors
 from swiftwrf.runtime.checkpoint import expect
 
@@ -80,7 +80,6 @@ class NewRows:
         tangent: Slopes of the heads (R, m); 0 where not detected.
         variance: Variance of the noise (R, m) [dB^2]; 0 where not detected.
         influence: Effect of each new dual coefficient on those of the fit, float32 (R, m, n).
-        gain: Its effect on the coefficients of the regressors, (R, m, k).
         covariance: Covariance of the errors without noise, (R, m, m).
         weight: Robust weights (R, m).
         dual: Dual coefficients (R, m).
@@ -91,7 +90,6 @@ class NewRows:
     tangent: Tensor
     variance: Tensor
     influence: Tensor
-    gain: Tensor
     covariance: Tensor
     weight: Tensor
     dual: Tensor
@@ -101,8 +99,7 @@ class NewRows:
         """Return no rows."""
         row = torch.zeros(n_receivers, 0, dtype=torch.float64)
         square, influence = row[..., None].expand(-1, 0, 0), torch.zeros(n_receivers, 0, n_bins)
-        gain = row.new_zeros(n_receivers, 0, 2 + N_HARMONICS)
-        return cls(row.new_zeros(0, 3), row, row, row, influence, gain, square, row, row)
+        return cls(row.new_zeros(0, 3), row, row, row, influence, square, row, row)
 
     def solved(self, huber: float) -> NewRows:
         """Return the rows with weights and dual coefficients by iteratively reweighted least squares."""
@@ -141,19 +138,16 @@ class RssiPosterior:
         return self._regressors(self.anchor) * (self.state.variance > 0).T[..., None]
 
     @cached_property
-    def _base(self) -> tuple[list[Any], Tensor, Tensor]:
-        """Inverses of C, float32 (n, n) for each receiver; inv(C) F (R, n, k); and B (R, k, k)."""
-        covariance = self.kernel(self.anchor, self.anchor)
-        inverses, products, posteriors = [], [], []
+    def _inverses(self) -> list[Any]:
+        """Inverse covariance of the rows of each receiver, float32 (n, n)."""
+        covariance, found = self.kernel(self.anchor, self.anchor), []
         for r, feature in enumerate(self._feature):
             variance, slope = self.state.variance[:, r], self.state.tangent[:, r]
-            whole = self.state.field_variance[r] * slope[:, None] * covariance * slope
+            whole = self.state.field_variance[r] * slope[:, None] * covariance * slope + feature @ feature.T
             whole.diagonal().add_(variance.where(variance > 0, 1.0))
-            factor = torch.linalg.cholesky(whole)
-            inverses.append(np.asfortranarray(torch.cholesky_inverse(factor).float().numpy()))  # as BLAS reads it
-            products.append(torch.cholesky_solve(feature, factor))
-            posteriors.append(torch.linalg.inv(torch.eye(feature.shape[1]).double() + feature.T @ products[-1]))
-        return inverses, torch.stack(products), torch.stack(posteriors)
+            inverse = torch.cholesky_inverse(torch.linalg.cholesky(whole)).float()
+            found.append(np.asfortranarray(inverse.numpy()))  # as BLAS reads it
+        return found
 
     @cached_property
     def _fitted(self) -> Tensor:
@@ -168,7 +162,8 @@ class RssiPosterior:
     @property
     def linear(self) -> Tensor:
         """Change of level at 1 m, slope and directivity from the prior path-loss model, float64 (R, k) [dB]."""
-        coefficient = self._fitted + self.new.gain.mT @ self.new.dual[..., None]
+        new, dual = self._regressors(self.new.position), self.new.dual[..., None]
+        coefficient = self._fitted + (new - self.new.influence.double() @ self._feature).mT @ dual
         change = coefficient[..., 0] * coefficient_scale(self.state.prior_std)
         return torch.cat([change[:, :1] - change[:, 1:2] * self.state.middle[:, None], change[:, 1:]], dim=1)
 
@@ -213,31 +208,26 @@ class RssiPosterior:
         predicted = state.prior_level + state.prior_slope * log_distance(position, self.receiver)
         predicted = predicted + (feature @ self._fitted)[..., 0].T + head - self.table(torch.zeros_like(latent))[0]
         tangent = tangent.T * detected
-        inverses, product, posterior = self._base
+        feature = feature * detected[..., None]
         scaled = (state.field_variance[:, None] * tangent)[..., None]  # (R, m, 1)
-        own = scaled * cross * state.tangent.T[:, None]  # covariances with the bins by the latent field, (R, m, n)
+        # covariances with the bins, (R, m, n)
+        own = scaled * cross * state.tangent.T[:, None] + feature @ self._feature.mT
         # half of each inverse is read, because its time in memory is most of the time of a row
-        white = [
-            np.stack([ssymv(1.0, p, x, lower=1) for x in c]) for p, c in zip(inverses, own.float().numpy(), strict=True)
-        ]
-        left = feature * detected[..., None] - own @ product  # regressors that the bins do not explain, (R, m, k)
-        gain = left @ posterior
-        influence = torch.from_numpy(np.stack(white)) + (gain @ product.mT).float()
+        pairs = zip(self._inverses, own.float().numpy(), strict=True)
+        influence = torch.from_numpy(np.stack([np.stack([ssymv(1.0, p, x, lower=1) for x in c]) for p, c in pairs]))
         new = NewRows(
             position=torch.cat([self.new.position, position]),
             error=torch.cat([self.new.error, (rssi - predicted).T.where(detected, 0.0)], dim=1),
             tangent=torch.cat([self.new.tangent, tangent], dim=1),
             variance=torch.cat([self.new.variance, state.noise_variance[:, None] * detected], dim=1),
             influence=torch.cat([self.new.influence, influence], dim=1),
-            gain=torch.cat([self.new.gain, gain], dim=1),
             covariance=self.new.covariance,
             weight=functional.pad(self.new.weight, (0, len(position)), value=1.0),
             dual=self.new.dual,
         )
-        # c_i inv(C) c_j = c_i influence_j - (c_i inv(C) F) gain_j
         prior = scaled * self.kernel(position, new.position) * new.tangent[:, None]
-        explained = (own.float() @ new.influence.mT).double() - own @ product @ new.gain.mT
-        border = prior - explained + left @ new.gain.mT  # (R, m, all new)
+        prior = prior + feature @ (self._regressors(new.position) * (new.variance > 0)[..., None]).mT
+        border = prior - (own.float() @ new.influence.mT).double()  # (R, m, all new)
         covariance = functional.pad(self.new.covariance, (0, len(position), 0, len(position)))
         covariance[:, -len(position) :] = border
         covariance[..., -len(position) :] = border.mT

@@ -48,21 +48,21 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
     Raises:
         FitError: A system that cannot be solved, for positions or values beyond any measurement.
     """
-    rssi, receiver, limit = data.rssi[:, some][:, 0], data.receiver[some], data.limit[:, some][:, 0]
-    loss = data.path_loss.columns(torch.arange(len(data.receiver_names))[some])
+    data = data.columns(some)
+    rssi, limit, loss = data.rssi[:, 0], data.limit[:, 0], data.path_loss
     prior, std = loss.shared, loss.std[0].clone()
-    distance = log_distance(data.position, receiver)
+    distance = log_distance(data.position, data.receiver)
     used = (~rssi.isnan() | ~limit.isnan()).nonzero()[:, 0]
     error, dual, tangent, variance = (torch.zeros_like(rssi) for _ in range(4))
-    feature = regressors(distance, harmonics(data.position, receiver), loss.middle, std[None])[0]
+    feature = regressors(distance, harmonics(data.position, data.receiver), loss.middle, std[None])[0]
     linear, covariance = torch.zeros(feature.shape[1]).double(), std.square().diag()
     if len(used):
         at, weak = data.position[used].to(device), limit[used].isnan().logical_not()
-        prior_covariance = float(data.field_db[some]) ** 2 * data.kernel(at, at)
-        noise_db = (data.noise_db[some] / data.count[used, some][:, 0].clamp_min(1).sqrt()).to(device)
+        prior_covariance = float(data.field_db) ** 2 * data.kernel(at, at)
+        noise_db = (data.noise_db / data.count[used, 0].clamp_min(1).sqrt()).to(device)
         detection = loss.detection
         censored = None if detection is None or not weak.any() else (detection.width, float(detection.missed))
-        rest = prior_covariance, noise_db, HeadTable(data.rendered[some].to(device)), config.huber, censored
+        rest = prior_covariance, noise_db, HeadTable(data.rendered.to(device)), config.huber, censored
 
         def solved() -> tuple[Tensor, ...]:
             value = (rssi.where(limit.isnan(), limit) - prior(distance)[:, 0])[used].to(device)
@@ -84,7 +84,7 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
                 error[used[part]] = held_out_errors(precision, found[0][:, None], part.to(device))[:, 0].cpu()
         except torch.linalg.LinAlgError as reason:  # type: ignore[attr-defined]
             raise FitError(
-                f"the RSSI fit of receiver {data.receiver_names[some][0]!r} broke ({reason}); are its values sane?"
+                f"the RSSI fit of receiver {data.receiver_names[0]!r} broke ({reason}); are its values sane?"
             ) from None
         dual[used], tangent[used], variance[used], target = (x.cpu() for x in found)
         linear = dual @ feature * coefficient_scale(std[None])[0]
@@ -97,11 +97,11 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
         "prior_slope": prior.slope,
         "prior_std": std[None],
         "directivity": linear[None, 2:],
-        "coefficient": float(data.field_db[some]) ** 2 * (tangent * dual)[None],
+        "coefficient": float(data.field_db) ** 2 * (tangent * dual)[None],
         "dual": dual[None],
         "tangent": tangent[None],
         "variance": variance[None],
-        "rendered": data.rendered[some],
+        "rendered": data.rendered,
         "held_out": (prior(distance)[:, 0] - error).where(variance > 0, torch.nan)[None],
     }
 
@@ -114,14 +114,7 @@ def coefficient_scale(std: Tensor) -> Tensor:
 def regressors(distance: Tensor, bearing: Tensor, middle: Tensor, std: Tensor) -> Tensor:
     """Return the regressors of level, slope and directivity, scaled by the standard deviations of their coefficients.
 
-    Args:
-        distance: log10 of the distances [m], (n, R).
-        bearing: Harmonics of the directions, (n, R, 8).
-        middle: log10 of the distance at which levels are compared, (R,).
-        std: Prior standard deviation of level and slope, (R, 2).
-
-    Returns:
-        float64 (R, n, 10).
+    They are float64 (R, n, 10), at log10 distances (n, R) and harmonics (n, R, 8). For the rest see `PathLosses`.
     """
     apart = (distance - middle)[..., None]
     feature = torch.cat([torch.ones_like(apart), apart, bearing], dim=-1) * coefficient_scale(std)
@@ -200,12 +193,7 @@ def solve(
 def _site(mean: Tensor, variance: Tensor, limit: Tensor, noise: Tensor, censored: tuple[float, float]) -> Tensor:
     """Return precision and precision times value, (2, n), that match the likelihood of empty cells; 0 if not concave.
 
-    Args:
-        mean: Mean of each value by all others, (n,) [dB].
-        variance: Its variance without noise [dB^2].
-        limit: Upper limits [dB].
-        noise: Variance of the noise [dB^2].
-        censored: See `solve`.
+    `mean` [dB] and `variance` [dB^2] are those of each value by all others, without noise, (n,).
     """
     width, missed = censored
     std = (variance + noise + width**2).sqrt()
@@ -254,12 +242,7 @@ def held_out_std(
 ) -> Tensor:
     """Return the standard deviations (n, R) [dB] that models without a bin's fold predict, before they are calibrated.
 
-    Args:
-        bins: Training rows by location bin.
-        kernel: Kernel of the latent field.
-        prior_db: Standard deviations of latent field and noise, each (R,) [dB].
-        middle: See `Uncertainty`.
-        covariance: See `Uncertainty`.
+    `prior_db` are the standard deviations of latent field and noise, each (R,) [dB]; the rest is as in `Uncertainty`.
     """
     (field_db, noise_db), std = prior_db, torch.empty_like(bins.rssi)
     for number in bins.fold.unique():

@@ -62,7 +62,6 @@ class RssiTraining(Bins):
             receivers with fewer than 10 measured bins.
         field_db: Prior standard deviation of the latent field, (R,) [dB].
         noise_db: Standard deviation of one measurement about it, (R,) [dB].
-        losses: Path loss of all receivers of the pool, from all bins and without each fold.
         baselines: Path-loss models of the simple predictors, (3, R): that of each receiver, that of all receivers, and the
             mean of each receiver.
         baseline_held_out: Their predictions of held-out bins, (3, n, R) [dBm].
@@ -76,25 +75,26 @@ class RssiTraining(Bins):
     limit: Tensor
     field_db: Tensor
     noise_db: Tensor
-    losses: list[PathLosses]
     baselines: PathLoss
     baseline_held_out: Tensor
 
+    def columns(self, number: slice) -> RssiTraining:
+        """Return the training data of some receivers."""
+        names = ("rssi", "count", "shift", "limit", "field_db", "noise_db", "baseline_held_out")
+        return replace(
+            self,
+            receiver_names=self.receiver_names[number],
+            receiver=self.receiver[number],
+            rendered=self.rendered[number],
+            path_loss=self.path_loss.columns(number),
+            baselines=PathLoss(*(value[:, number] for value in self.baselines)),
+            **{name: getattr(self, name)[..., number] for name in names},
+        )
+
 
 @single_thread()
-def prepare(
-    train: Rssi,
-    pool: Rssi,
-    config: RssiConfig,
-    shift: Tensor,
-    curve: Detection | None,
-    like: RssiTraining | None = None,
-) -> RssiTraining:
-    """Average the rows by location bin, fit the path-loss models and choose the kernel.
-
-    The arguments are those of `RssiPredictor._fit`. With `like`, training data of the same pool, their kernel
-    and path losses are taken.
-    """
+def prepare(train: Rssi, pool: Rssi, config: RssiConfig, shift: Tensor, curve: Detection | None) -> RssiTraining:
+    """Average the rows by location bin, fit the path-loss models and choose the kernel; see `RssiPredictor._fit`."""
     bins = binned(train, config)
     rssi, fold, every = bins.rssi, bins.fold, bin_locations(pool, config.max_locations)[1]
     receiver, own = pool.receiver_position.double() - bins.centre, columns_of(train.receiver_names, pool)
@@ -110,24 +110,16 @@ def prepare(
         return PathLoss(*(torch.stack(values) for values in zip(loss.own, loss.shared, level, strict=True)))
 
     kept = [torch.ones_like(fold, dtype=torch.bool), *(fold != number for number in fold.unique())]
-    if like is None:
-        everything = fit(kept[0], curve)
-        losses = [everything, *(fit(rows, everything.detection) for rows in kept[1:])]
-    else:
-        losses = like.losses
-        everything = losses[0]
+    everything = fit(kept[0], curve)
+    losses = [everything, *(fit(rows, everything.detection) for rows in kept[1:])]
     baselines, *partial = map(simple, losses, kept)
     distance = log_distance(bins.position, bins.receiver)
     held_out = torch.empty(3, *distance.shape, dtype=torch.float64)
     for baseline, rows in zip(partial, kept[1:], strict=True):
         held_out[:, ~rows] = baseline(distance[~rows])
-    pool_residual = every - everything.own(log_distance(bins.position, receiver))
-    if like is None:
-        residual = pool_residual[:, often_detected(pool)]
-        kernel, helps = choose_residual_kernel(bins.position, residual, fold, train.floors is not None)
-        n_primitives = config.n_primitives if helps else 0
-    else:
-        kernel, n_primitives = like.kernel, like.n_primitives
+    residual = (every - everything.own(log_distance(bins.position, receiver)))[:, often_detected(pool)]
+    kernel, helps = choose_residual_kernel(bins.position, residual, fold, train.floors is not None)
+    n_primitives = config.n_primitives if helps else 0
     loss = everything.columns(own)
     field_db, noise_db = prior_std(loss.variance, kernel if n_primitives else None)
     heads = [Head(name, n_primitives, config.seed).requires_grad_(False) for name in bins.receiver_names]
@@ -141,7 +133,6 @@ def prepare(
         limit=_limits(rssi, loss, distance, shift[:, own]),
         field_db=field_db,
         noise_db=noise_db,
-        losses=losses,
         baselines=baselines,
         baseline_held_out=held_out,
     )
@@ -194,10 +185,6 @@ def prior_std(variance: Tensor, kernel: Kernel | None) -> tuple[Tensor, Tensor]:
 def bin_locations(rows: Rssi, max_locations: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Average measurements by location bin: each row by itself, or in the cubes of a grid if there are too many rows.
 
-    Args:
-        rows: Measurements.
-        max_locations: Largest number of bins.
-
     Returns:
         Mean position (n, 3) [m], mean RSSI (n, R) [dBm] (nan where not detected), the number of measurements in each mean
         (n, R), and the bin of each row (rows,).
@@ -226,11 +213,7 @@ def choose_residual_kernel(
 ) -> tuple[Kernel, bool]:
     """Choose the kernel with the lowest mean absolute error on held-out residuals of the path-loss model.
 
-    Args:
-        position: Positions of the bins (n, 3) [m].
-        residual: Residuals (n, R) [dB], nan where not detected.
-        fold: Cross-validation fold of each bin, (n,).
-        has_floors: Whether differences in height may count more than horizontal ones.
+    Residuals are (n, R) [dB], nan where not detected. With floors, differences in height may count more than others.
 
     Returns:
         The kernel, and whether its error is lower than that of no field at all.

@@ -147,7 +147,9 @@ def load(path: str | Path) -> Saved:
     with suppress(OSError, SafetensorError, TypeError), safe_open(path, framework="pt") as file:
         if (file.metadata() or {}).get("kind") not in Saved.kinds:
             _import_kinds()
-    return restore(path, *Saved.kinds)[0]
+    kind, tensors, header = read(path, *Saved.kinds)
+    with refusing(f"{path} is no {kind} that can be used"):
+        return Saved.kinds[kind].from_state(tensors, header)
 
 
 def _import_kinds() -> None:
@@ -157,17 +159,6 @@ def _import_kinds() -> None:
     for point in (point for group in ("swiftwrf.models", "swiftwrf.estimators") for point in entry_points(group=group)):
         with suppress(Exception):  # code of another package may raise anything
             point.load()
-
-
-def restore(path: str | Path, *kinds: str) -> tuple[Saved, Header]:
-    """Return the saved model of one of these kinds, and its header.
-
-    Raises:
-        InputError: Not such a file, or content that does not match.
-    """
-    kind, tensors, header = read(path, *kinds)
-    with refusing(f"{path} is no {kind} that can be used"):
-        return Saved.kinds[kind].from_state(tensors, header), header
 
 
 @contextmanager

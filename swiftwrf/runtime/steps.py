@@ -39,19 +39,15 @@ class Memo:
         self.folder = folder
         (folder / STEPS).mkdir(parents=True, exist_ok=True)
 
-    def holds(self, name: str) -> bool:
-        """Return True if the result of a step is kept."""
-        return (self.folder / STEPS / f"{name}.json").exists()
-
     def kept(self, name: str) -> Row | None:
         """Return the kept result of a step, or None.
 
         Raises:
             InputError: The kept result is damaged.
         """
-        if not self.holds(name):
-            return None
         file = self.folder / STEPS / f"{name}.json"
+        if not file.exists():
+            return None
         try:
             value = json.loads(file.read_text(encoding="utf-8"))["value"]
         except (ValueError, TypeError, LookupError):

@@ -10,7 +10,7 @@ import numpy as np
 from augment.suggest import suggest_positions
 from swiftwrf import Rssi, rssi_room
 from swiftwrf.data.coordinates import degree_columns
-from swiftwrf.locate.comparison import LocateComparison, Trial, compare
+from swiftwrf.locate.comparison import LocateComparison, compare
 from swiftwrf.runtime.durable import write_npz
 from tasks.configs import LocateConfig
 from tasks.directory import Run
@@ -101,22 +101,8 @@ def record(result: LocateComparison, folder: Path) -> Row:
         "n_undetected": split.n_undetected,
         "overall": result.overall,
         "calibration": {str(level): fraction for level, fraction in result.coverage.items()},
-        "weights": result.values[Trial(OWN)]["weights"],
-        "by_rows": _studies(result, "rows"),
-        "by_receivers": _studies(result, "receivers"),
+        "weights": result.values[OWN]["weights"],
     }
-
-
-def _studies(result: LocateComparison, by: str) -> list[Row]:
-    return [
-        {
-            "localizer": trial.localizer,
-            "n_train": result.values[trial]["n_train"],
-            "n_receivers": result.values[trial]["n_receivers"],
-            "position_error_m": error,
-        }
-        for trial, error in result.studied(by)
-    ]
 
 
 def posterior_maps(result: LocateComparison) -> dict[str, Any]:

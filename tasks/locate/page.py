@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
-from pandas import DataFrame, concat
+from pandas import DataFrame
 from scipy.stats import binomtest
 
 from swiftwrf.locate.baselines import LOCALIZERS
@@ -19,7 +18,6 @@ from swiftwrf.plotting import corners_of
 from tasks import labels
 from tasks.answer import Answer, Method, NextStep
 from tasks.page import figures
-from tasks.page.figures import DASHES, MAX_CURVES
 from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of
 from tasks.page.records import Records, notes
 from tasks.page.shared import (
@@ -58,7 +56,7 @@ def page(runs: list[Records]) -> Page:
     sections = [
         sections_of("Where was it?", runs, lambda run: _posteriors(run, several=len(runs) > 1)),
         sections_of("Errors", runs, _errors, labels.meanings(LOCALIZERS, labels.LOCALIZERS)),
-        sections_of("How sure is it?", runs, lambda run: Section("", plots=[_calibration(run), *_studies(run)])),
+        sections_of("How sure is it?", runs, lambda run: Section("", plots=[_calibration(run)])),
         limits(runs[0], *LIMITS),
     ]
     if any(run.arrays(SUGGESTED) for run in runs):
@@ -145,7 +143,9 @@ def _calibration(run: Records) -> Plot:
     data = DataFrame(rows, columns=["nominal", "measured", "low", "high"])
     figure, axes = figures.panel(5, 3.2)
     axes.plot([0, 1], [0, 1], color=figures.RULE, linewidth=1)
-    _with_bars(axes, OWN, data, "nominal", "measured")
+    bars = np.clip([data["measured"] - data["low"], data["high"] - data["measured"]], 0, None)
+    style: dict[str, Any] = {"color": labels.colour(COLOURS, OWN), "linewidth": 1.4, "elinewidth": 0.8}
+    axes.errorbar(data["nominal"], data["measured"], yerr=bars, marker="o", markersize=4, label=OWN, **style)
     axes.set(xlim=(0, 1), ylim=(0, 1))
     axes.set(xlabel="probability of the credible region", ylabel="fraction of test positions inside")
     weights = ", ".join(f"{name} {weight:.2f}" for name, weight in run.metrics["weights"].items())
@@ -155,45 +155,6 @@ def _calibration(run: Records) -> Plot:
         f"likelihoods, which maximise the density at held-out training positions: {weights}."
     )
     return Plot(f"calibration-{run.file_name}", [figure], caption, data)
-
-
-def _studies(run: Records) -> list[Plot]:
-    """Return the median error against the numbers of training rows and of receivers, as far as they were varied."""
-    tables, panels = [], []
-    for found, x, label in (
-        (run.metrics["by_rows"], "n_train", "training rows"),
-        (run.metrics["by_receivers"], "n_receivers", "receivers"),
-    ):
-        if not found:
-            continue
-        table = DataFrame([{**study, **study["position_error_m"]} for study in found]).drop(columns="position_error_m")
-        figure, ax = figures.panel(3.6, 3.2)
-        names = list(table["localizer"].unique())[:MAX_CURVES]
-        for dashes, name in zip(DASHES, names, strict=False):
-            _with_bars(ax, str(name), table[table["localizer"] == name].sort_values(x), x, "median", line=dashes)
-        ax.set(xlabel=label, ylabel="median position error [m]", ylim=(0, None))
-        figures.legend_below(ax)
-        tables.append(table)
-        panels.append(figure)
-    if not panels:
-        return []
-    caption = (
-        "Median position error (bars: 95 % interval) of localizers fitted to a random part of the training rows, and with a "
-        "random part of the receivers."
-    )
-    return [Plot(f"studies-{run.file_name}", panels, caption, concat(tables).drop_duplicates())]
-
-
-def _with_bars(axes: Axes, name: str, data: DataFrame, x: str, y: str, line: Any = "") -> None:
-    """Draw a localizer's values with their intervals, columns low and high."""
-    bars = np.clip([data[y] - data["low"], data["high"] - data[y]], 0, None)
-    style: dict[str, Any] = {
-        "color": labels.colour(COLOURS, name),
-        "linestyle": line,
-        "linewidth": 1.4,
-        "elinewidth": 0.8,
-    }
-    axes.errorbar(data[x], data[y], yerr=bars, marker="o", markersize=4, label=name, **style)
 
 
 def _posteriors(run: Records, several: bool) -> Section:

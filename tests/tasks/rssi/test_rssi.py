@@ -27,7 +27,7 @@ from swiftwrf.comparison.nerf2 import NeRF2RssiConfig
 from swiftwrf.data.splits import folds
 from swiftwrf.metrics import paired_difference
 from swiftwrf.rssi import RssiPredictor, compare
-from swiftwrf.rssi.baselines import NEIGHBOUR_COUNTS, Blend, BlendConfig
+from swiftwrf.rssi.baselines import NEIGHBOUR_COUNTS
 from swiftwrf.rssi.comparison import compared, make_predictor, pool_of
 from swiftwrf.runtime import registry
 from tasks.report import merge
@@ -60,11 +60,10 @@ def test_shared_path_loss_model_is_of_all_receivers_of_the_pool():
 
 @pytest.fixture(autouse=True)
 def short_fits(monkeypatch):
-    """Fields and blends that are fitted in a second."""
+    """Fields that are fitted in a second."""
     size = {"width": 16, "bands": 2, "samples": 4, "azimuths": 4, "elevations": 2}
     config = NeRF2RssiConfig(**size, steps=220, rate=3e-2)
     monkeypatch.setattr(NeRF2Rssi, "config_type", with_defaults(config))
-    monkeypatch.setattr(Blend, "config_type", with_defaults(BlendConfig(members=("knn", "mri_residual"))))
 
 
 @pytest.mark.parametrize("name", list(RSSI_PREDICTORS))
@@ -104,8 +103,6 @@ def test_unknown_predictor():
     room = rssi_room(n=20)
     with pytest.raises(InputError, match="unknown predictor 'forest'"):
         compared(room, also=["forest"])
-    with pytest.raises(InputError, match="no member of blend can be fitted to simulated-floor"):
-        Blend(members=()).fit(room)
     with pytest.raises(InputError, match="fewer must be a list, of which each is a number at least 0 and at most 1"):
         compare(room, fewer=(-0.5,))
 
@@ -154,7 +151,7 @@ def test_whole_run(small, tmp_path):
     Image.new("RGB", (40, 30), "white").save(plan)
     floor = ("--floor-plan", plan, "--floor-extent", 0, 20, 0, 16)
     with quick.sketched():
-        assert run("--rx", "1", "receiver06", *floor, "--also", "nerf2", "blend", "--out", tmp_path / "run") == 0
+        assert run("--rx", "1", "receiver06", *floor, "--also", "nerf2", "--out", tmp_path / "run") == 0
     out = tmp_path / "run"
     metrics = json.loads((out / "metrics.json").read_text(), parse_constant=lambda name: pytest.fail(name))
     assert (metrics["task"], metrics["data"], metrics["split"]) == ("rssi", "simulated-floor", "random")
@@ -255,21 +252,6 @@ def test_neighbours_are_those_that_a_grid_search_chooses():
         search = GridSearchCV(KNeighborsRegressor(), grid, scoring="neg_mean_absolute_error", cv=PredefinedSplit(own))
         found = predictor._regressor(x, y, own)
         assert {"n_neighbors": found.n_neighbors, "weights": found.weights} == search.fit(x, y).best_params_
-
-
-def test_a_blend_takes_the_member_that_is_right():
-    data = path_loss_only()
-    blended = Blend(members=("mri_receiver", "mean")).fit(data)
-    assert blended.weights == pytest.approx({"mri_receiver": 1, "mean": 0}, abs=1e-6)
-    torch.testing.assert_close(blended.predict(data.transmitter_position).mean, data.rssi_dbm, atol=1e-3, rtol=0)
-
-
-def test_a_blend_weighs_noisy_members():
-    train, test = rssi_room(n=200).receivers(["1", "2"]).split()
-    blended = Blend(members=("knn", "mri_receiver")).fit(train)
-    assert sum(blended.weights.values()) == pytest.approx(1)
-    assert min(blended.weights.values()) > 0.05
-    assert blended.predict(test.transmitter_position).mean.shape == test.rssi_dbm.shape
 
 
 @pytest.mark.parametrize(("rows", "known"), [(1, False), (9, False), (10, True)])
