@@ -210,9 +210,20 @@ def test_small_hard_cases(device, case, cutoff):
     assert_close(chosen, cutoff, device)
 
 
-@pytest.mark.parametrize("cutoff", [None, 1e-4])
-@pytest.mark.parametrize("per_position", [False, True])
-@pytest.mark.parametrize(("shape", "n"), [((7, 12), 33), ((16, 16), 50), ((17, 33), 100), ((30, 120), 40)])
+# every pair of shape, widths and cutoff, not every triple
+@pytest.mark.parametrize(
+    ("shape", "n", "per_position", "cutoff"),
+    [
+        ((7, 12), 33, True, None),
+        ((7, 12), 33, False, 1e-4),
+        ((16, 16), 50, True, 1e-4),
+        ((16, 16), 50, False, None),
+        ((17, 33), 100, True, None),
+        ((17, 33), 100, False, 1e-4),
+        ((30, 120), 40, True, 1e-4),
+        ((30, 120), 40, False, None),
+    ],
+)
 @pytest.mark.usefixtures("poisoned")
 def test_agrees_with_the_reference(device, shape, n, per_position, cutoff):
     grid = AngularGrid.hemisphere(*shape)
