@@ -137,7 +137,7 @@ def test_pixels_of_a_spectrum_lie_at_their_directions():
 
 
 @pytest.mark.parametrize(
-    "values", [[], [0.0], [0.1, 2.0, 30.0], [0.0] * 9, [0.2, 0.1 + 0.1, 0.3 - 0.1, 0.2], [-3.0] * 2], ids=len
+    "values", [[], [0.0], [0.0] * 9, [0.2, 0.1 + 0.1, 0.3 - 0.1, 0.2], [-3.0] * 2], ids=len
 )
 def test_figures_of_constant_empty_and_single_values(values):
     values, n = np.array(values), len(values)
