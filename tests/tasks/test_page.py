@@ -136,9 +136,7 @@ def test_pixels_of_a_spectrum_lie_at_their_directions():
     np.testing.assert_allclose(centre, next(iter(ring)), atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    "values", [[], [0.0], [0.0] * 9, [0.2, 0.1 + 0.1, 0.3 - 0.1, 0.2], [-3.0] * 2], ids=len
-)
+@pytest.mark.parametrize("values", [[], [0.0], [0.0] * 9, [0.2, 0.1 + 0.1, 0.3 - 0.1, 0.2], [-3.0] * 2], ids=len)
 def test_figures_of_constant_empty_and_single_values(values):
     values, n = np.array(values), len(values)
     position = torch.tensor(np.outer(np.arange(n), [0.2, 0.0, 0.0])) + torch.tensor([0.0, 0.0, 1.0])  # a regular grid
