@@ -2,6 +2,8 @@
 
 import os
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack
+from functools import partial
 from pathlib import Path
 from unittest import mock
 
@@ -68,32 +70,23 @@ def measured_data() -> Path:
     return Path(os.environ["SWIFTWRF_DATA"])
 
 
-@pytest.fixture
-def small_published() -> Iterator[None]:
-    """Small methods of comparison during a test."""
-    with small.small_published():
-        yield
+def during_a_test(*contexts: Callable[[], AbstractContextManager[None]]) -> Callable[..., object]:
+    """Return a fixture that is in these contexts."""
+
+    @pytest.fixture
+    def entered() -> Iterator[None]:
+        with ExitStack() as stack:
+            for context in contexts:
+                stack.enter_context(context())
+            yield
+
+    return entered
 
 
-@pytest.fixture
-def short_searches() -> Iterator[None]:
-    """Short searches for rooms during a test."""
-    with small.short_searches():
-        yield
-
-
-@pytest.fixture
-def short_fits() -> Iterator[None]:
-    """Few kernels, folds and steps of path gains during a test."""
-    with small.few_kernels(), small.few_folds(), small.short_path_gains():
-        yield
-
-
-@pytest.fixture
-def floor_alone() -> Iterator[None]:
-    """The floor as the only plane that any search for a room finds, without a search."""
-    with small.known_planes(small.FLOOR):
-        yield
+small_published = during_a_test(small.small_published)
+short_searches = during_a_test(small.short_searches)
+short_fits = during_a_test(small.few_kernels, small.few_folds, small.short_path_gains)
+floor_alone = during_a_test(partial(small.known_planes, small.FLOOR))  # the only plane that any search finds
 
 
 @pytest.fixture

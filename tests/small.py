@@ -102,7 +102,10 @@ def short_searches() -> Iterator[None]:
 def short_path_gains() -> Iterator[None]:
     """Fit path gains of one prior in few steps; their accuracy has its own tests."""
     priors = {"tight": replace(PRIORS["tight"], steps=15)}
-    with mock.patch("swiftwrf.models.geometry.path_gains.PRIORS", priors):
+    with (
+        mock.patch("swiftwrf.models.geometry.path_gains.PRIORS", priors),
+        mock.patch("swiftwrf.locate.matched_field.PRIORS", priors),
+    ):
         yield
 
 

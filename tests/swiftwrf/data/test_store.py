@@ -238,7 +238,7 @@ def fitted(name, train):
 
 
 @pytest.mark.parametrize("name", ["gp", "coarray", "swiftwrf", "idw", "nearest"])
-def test_what_is_not_exact_predicts_nearly_as_well(name, exact):
+def test_what_is_not_exact_predicts_nearly_as_well(name, exact, short_fits):
     data = simulated_room(n=400, grid=AngularGrid.hemisphere(8, 32))
     train, test = data.split()
     score = []
@@ -250,7 +250,7 @@ def test_what_is_not_exact_predicts_nearly_as_well(name, exact):
 
 
 @pytest.mark.parametrize("name", ["coarray", "swiftwrf"])
-def test_models_of_many_spectra_come_back_from_their_files(name, exact, tmp_path):
+def test_models_of_many_spectra_come_back_from_their_files(name, exact, short_fits, tmp_path):
     data = simulated_room(n=400, grid=AngularGrid.hemisphere(8, 32))
     exact(240)
     model = fitted(name, data)

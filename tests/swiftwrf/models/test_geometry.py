@@ -304,6 +304,7 @@ def test_positions_in_a_plane_leave_no_plane_certain():
         max_order=2,
     )
     assert not any(p.certain for p in model.planes)
+    assert "the positions lie on a plane" in model.conclusion
     assert all(error < 3 * std for error, std in errors(model, SIX) if model.planes)
 
 

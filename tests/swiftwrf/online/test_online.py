@@ -39,6 +39,11 @@ def floor():
 
 
 @cache
+def radio_maps():
+    return RssiModel().fit(floor().subset(torch.arange(60)))
+
+
+@cache
 def walls():
     """The built-in room with its walls as they are."""
     return GeometryModel.of_planes(spectra(72, 0), built_in_walls())
@@ -162,7 +167,7 @@ def test_a_follower_adapts_and_goes_on():
 @pytest.fixture
 def model_file(tmp_path):
     file = tmp_path / "model.safetensors"
-    RssiModel().fit(floor().subset(torch.arange(60))).save(file)
+    radio_maps().save(file)
     return file
 
 
@@ -193,8 +198,7 @@ def test_wrong_options_are_refused(arguments, says, capsys):
 
 
 def test_a_record_is_cut_to_what_the_model_has_learnt(tmp_path):
-    record, model = Record("source", " [dB]"), RssiModel().fit(floor().subset(torch.arange(60)))
-    follower = Follower(model)
+    record, follower = Record("source", " [dB]"), Follower(radio_maps())
     for i in range(60, 63):
         record.append(tmp_path, record.add(i, follower.step(floor().subset(torch.tensor([i])))))
     with (tmp_path / "measurements.csv").open("a") as file:
@@ -295,7 +299,7 @@ def test_a_followed_geometry_is_refined_with_every_ten_spectra():
 
 
 def test_a_notice_is_recorded(tmp_path):
-    record, follower = Record("source", " [dB]"), Follower(RssiModel().fit(floor().subset(torch.arange(60))))
+    record, follower = Record("source", " [dB]"), Follower(radio_maps())
     for i in range(60, 62):
         step = follower.step(floor().subset(torch.tensor([i])))
         record.append(tmp_path, record.add(i, replace(step, notice="kernel chosen again" if i == 61 else "")))

@@ -31,7 +31,6 @@ from swiftwrf.rasterize import cuda, operators
 SHIM = Path(__file__).parents[2] / "cuda_shim"
 rasterize_package = sys.modules[rasterize.__module__]
 KERNELS = {"find_reach", "rasterize", "rasterize_backward"}
-SANITIZERS = os.environ.get("CUDA_SHIM_SANITIZERS", "")  # set by `test_sanitizers_find_nothing` in its child process
 
 
 # ---------------------------------------------------------------------------------------------------------- compilation
@@ -138,7 +137,7 @@ def build(library, *options):
 def shim(tmp_path_factory):
     """Let the operators render CPU tensors with the CUDA backend."""
     library = tmp_path_factory.mktemp("shim") / "rasterize.so"
-    build(library, *([f"-fsanitize={SANITIZERS}", "-fno-sanitize-recover=all", "-O1"] if SANITIZERS else ["-O2"]))
+    build(library, "-O2")
     on_cpu, on_gpu = KernelsOnCpu(library), cuda.kernels
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(operators.BACKENDS, "cpu", cuda.__name__)
@@ -146,13 +145,25 @@ def shim(tmp_path_factory):
         yield
 
 
-@pytest.mark.usefixtures("architectures")
-def test_cuda_bindings_launch_the_kernels_on_a_stand_in_for_the_driver(tmp_path):
-    build(tmp_path / "libcuda.so.1", "-O2", "-fvisibility=hidden", str(SHIM / "driver.cpp"))
+@pytest.mark.long
+@pytest.mark.usefixtures("architectures", "shim")
+def test_cuda_bindings_launch_the_kernels_on_a_stand_in_for_the_driver_and_sanitizers_find_nothing(tmp_path):
+    """Without the sanitizers if g++ comes without them."""
+    names = [["g++", f"-print-file-name=lib{name}.so"] for name in ("asan", "ubsan")]
+    runtime = [subprocess.run(name, capture_output=True, text=True, check=True).stdout.strip() for name in names]
+    sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    if not all(Path(library).is_absolute() for library in runtime):
+        sanitizers, runtime = [], []
+    build(tmp_path / "libcuda.so.1", "-O1", "-fvisibility=hidden", *sanitizers, str(SHIM / "driver.cpp"))
+    environment = os.environ | {
+        "LD_LIBRARY_PATH": str(tmp_path),
+        "PYTHONPATH": os.pathsep.join(sys.path),
+        "LD_PRELOAD": " ".join(runtime),
+        "ASAN_OPTIONS": "detect_leaks=0",  # Python's own
+    }
     command = [sys.executable, str(SHIM / "launch.py")]
-    environment = os.environ | {"LD_LIBRARY_PATH": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 0, done.stderr[-8000:]
     assert done.stdout.startswith("cuModuleGetFunction failed with CUDA_ERROR_NOT_FOUND; use backend='reference'")
 
 
@@ -199,9 +210,20 @@ def test_small_hard_cases(device, case, cutoff):
     assert_close(chosen, cutoff, device)
 
 
-@pytest.mark.parametrize("cutoff", [None, 1e-4])
-@pytest.mark.parametrize("per_position", [False, True])
-@pytest.mark.parametrize(("shape", "n"), [((7, 12), 33), ((16, 16), 50), ((17, 33), 100), ((30, 120), 40)])
+# every pair of shape, widths and cutoff, not every triple
+@pytest.mark.parametrize(
+    ("shape", "n", "per_position", "cutoff"),
+    [
+        ((7, 12), 33, True, None),
+        ((7, 12), 33, False, 1e-4),
+        ((16, 16), 50, True, 1e-4),
+        ((16, 16), 50, False, None),
+        ((17, 33), 100, True, None),
+        ((17, 33), 100, False, 1e-4),
+        ((30, 120), 40, True, 1e-4),
+        ((30, 120), 40, False, None),
+    ],
+)
 @pytest.mark.usefixtures("poisoned")
 def test_agrees_with_the_reference(device, shape, n, per_position, cutoff):
     grid = AngularGrid.hemisphere(*shape)
@@ -309,41 +331,6 @@ def test_a_primitive_that_is_not_a_number_shows():
     mean, cholesky, weight = (x.detach() for x in random_scene(4, 1))
     mean[0, 1, 0] = float("nan")
     assert operators.field(mean, cholesky, weight, AngularGrid.hemisphere(17, 33), 1e-4).isnan().any()
-
-
-@pytest.mark.long
-@pytest.mark.skipif(bool(SANITIZERS), reason="is running under them")
-@pytest.mark.usefixtures("shim")
-def test_sanitizers_find_nothing():
-    runtime = [
-        subprocess.run(
-            ["g++", f"-print-file-name=lib{name}.so"], capture_output=True, text=True, check=True
-        ).stdout.strip()
-        for name in ("asan", "ubsan")
-    ]
-    if not all(Path(library).is_absolute() for library in runtime):
-        pytest.skip("g++ comes without its sanitizers")
-    environment = os.environ | {
-        "LD_PRELOAD": " ".join(runtime),
-        "ASAN_OPTIONS": "detect_leaks=0",  # Python's own
-        "CUDA_SHIM_SANITIZERS": "address,undefined",
-    }
-    # conftest.py takes a third of the time
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-x",
-        "-p",
-        "no:cacheprovider",
-        "-o",
-        "addopts=",
-        "--noconftest",
-        __file__,
-    ]
-    chosen = ["-k", "(small and not pixel and not pairs or 100-True-0.0001 or 100-False-None) and not gpu"]
-    run = subprocess.run([*command, *chosen], env=environment, capture_output=True, text=True, check=False)
-    assert run.returncode == 0, run.stdout[-4000:] + run.stderr[-4000:]
 
 
 # ------------------------------------------------------------------------------------------------------------ on a GPU

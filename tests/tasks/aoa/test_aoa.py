@@ -111,7 +111,7 @@ def test_aann_learns_a_toy():
     for i in range(16):
         spectrum[i, 4:10, 16 * (i % 4) : 16 * (i % 4) + 8] = 1
     train = labelled(spectrum, label, AngularGrid.hemisphere(16, 64))
-    network = AANN(steps=30, batch=8, rate=1e-3, max_azimuths=0).fit(train)
+    network = AANN(steps=20, batch=8, rate=1e-3, max_azimuths=0).fit(train)
     constant = Constant().fit(train)
     errors = [angle_errors(e.predict(spectrum), label)["great_circle"].mean() for e in (network, constant)]
     assert errors[0] < 0.5 * errors[1]
@@ -263,7 +263,7 @@ def test_batches_are_at_most_half_of_what_trains(room, monkeypatch, spectra, bat
 @pytest.mark.long
 def test_kernel_regression_on_the_features_is_better_than_the_head_after_a_short_training():
     """On spectra that neither has seen."""
-    room = simulated_room(n=300, grid=AngularGrid.hemisphere(10, 40))
+    room = simulated_room(n=200, grid=AngularGrid.hemisphere(10, 40))
     train, test = room.split("random")
     network = AANNKernel(steps=5).fit(Mixed.measured(train))
     estimates = (network.predict(test.spectrum), AANN.predict(network, test.spectrum))

@@ -1,7 +1,7 @@
 """Matched-field processing in the angle-of-arrival task: positions, keys, resumption, and the choice of the estimator."""
 
 import json
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import replace
 from unittest import mock
@@ -11,17 +11,16 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from quick import FEW_CELLS, QuickNetwork, command, sketched
+from quick import cheap, command, sketched
 from rooms import mirror_room
-from small import few_folds, known_planes, short_path_gains, with_defaults
+from small import known_planes
 
 from augment import cross_validation
 from augment.cross_validation import LOCATOR
-from augment.estimators import ESTIMATORS
-from augment.turbo.condition import LOCATED, NETWORKS
+from augment.turbo.condition import LOCATED
 from augment.turbo.stages import containing_level
 from swiftwrf import MatchedField, load
-from swiftwrf.locate import Posterior, matched_field
+from swiftwrf.locate import Posterior
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry.model import fingerprint
 from swiftwrf.models.geometry.planes import Plane
@@ -58,30 +57,21 @@ def fit_once(self, train, *, room=None, progress=False):
 
 @contextmanager
 def quickly(data, planes=PLANES):
-    """Shorten what has its own tests: the search for the room, which gives these planes, the network, and the locator."""
+    """Cheap parts, these planes in place of a search for the room, and few candidates."""
 
-    with ExitStack() as patches:
-        for patch in (
-            known_planes(*(Plane(normal, offset, -0.6) for normal, offset in planes.items())),
-            mock.patch.object(matched_field, "MatchedFieldConfig", with_defaults(FEW_CELLS)),
-            mock.patch.object(cross_validation, "FOLD_LOCATOR", FEW_CELLS),
-            mock.patch.object(experiment, "simulated_room", return_value=data),
-            sketched(),
-            mock.patch.object(MatchedField, "fit", fit_once),
-            few_folds(),
-            short_path_gains(),
-            mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
-            *(
-                mock.patch(f"{place}.candidates", lambda data: [n for n in ("idw", "geometry") if not lacking(n, data)])
-                for place in ("augment.turbo.experiment", "augment.choose")
-            ),
-        ):
-            patches.enter_context(patch)
+    def few(data):
+        return [name for name in ("idw", "geometry") if not FIELD_MODELS[name].lacking(data)]
+
+    with (
+        cheap(),
+        sketched(),
+        known_planes(*(Plane(normal, offset, -0.6) for normal, offset in planes.items())),
+        mock.patch.object(experiment, "simulated_room", return_value=data),
+        mock.patch.object(MatchedField, "fit", fit_once),
+        mock.patch("augment.turbo.experiment.candidates", few),
+        mock.patch("augment.choose.candidates", few),
+    ):
         yield
-
-
-def lacking(name, data):
-    return FIELD_MODELS[name].lacking(data)
 
 
 def mix_of(folder):
