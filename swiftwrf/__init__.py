@@ -39,9 +39,7 @@ if TYPE_CHECKING:
     from swiftwrf.locate import RssiLocator as RssiLocator
     from swiftwrf.models.base import FieldModel as FieldModel
     from swiftwrf.models.base import make_model as make_model
-    from swiftwrf.models.coarray import CoarrayModel as CoarrayModel
     from swiftwrf.models.geometry import GeometryModel as GeometryModel
-    from swiftwrf.models.geometry import HybridModel as HybridModel
     from swiftwrf.models.prediction import Prediction as Prediction
     from swiftwrf.models.swiftwrf import SwiftWRF as SwiftWRF
     from swiftwrf.models.swiftwrf import fit as fit
@@ -64,8 +62,7 @@ import_lazily(
         "swiftwrf.errors": ("FitError", "InputError"),
         "swiftwrf.locate": ("MatchedField", "RssiLocator"),
         "swiftwrf.models.base": ("FieldModel", "make_model"),
-        "swiftwrf.models.coarray": ("CoarrayModel",),
-        "swiftwrf.models.geometry": ("GeometryModel", "HybridModel"),
+        "swiftwrf.models.geometry": ("GeometryModel",),
         "swiftwrf.models.prediction": ("Prediction",),
         "swiftwrf.models.swiftwrf": ("SwiftWRF", "fit"),
         "swiftwrf.predicting": ("predict",),

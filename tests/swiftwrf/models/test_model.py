@@ -6,13 +6,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from swiftwrf import AngularGrid, CoarrayModel, InputError, SwiftWRF, fit, load, load_spectra
+from swiftwrf import AngularGrid, InputError, SwiftWRF, fit, load, load_spectra
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.store import Store
 from swiftwrf.metrics import psnr, ssim
 from swiftwrf.models import coarray
 from swiftwrf.models import swiftwrf as module
-from swiftwrf.models.coarray import basis, differences
+from swiftwrf.models.coarray import CoarrayModel, basis, differences
 from swiftwrf.models.swiftwrf_paper import SwiftWRFPaperConfig
 from swiftwrf.rasterize import rasterize_magnitude
 from swiftwrf.runtime import checkpoint

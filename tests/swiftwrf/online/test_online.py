@@ -9,10 +9,11 @@ import pytest
 import torch
 from rooms import built_in_walls, room_with_box
 
-from swiftwrf import AngularGrid, GeometryModel, HybridModel, InputError, RssiModel, load, make_model
+from swiftwrf import AngularGrid, GeometryModel, InputError, RssiModel, load, make_model
 from swiftwrf.data.simulated import ShoeboxRoom, rssi_room, simulated_room
 from swiftwrf.data.writing import write_rssi
 from swiftwrf.metrics import psnr
+from swiftwrf.models.geometry import HybridModel
 from swiftwrf.models.geometry.planes import Plane
 from swiftwrf.online import Follower, Monitor, adapted, alarm_threshold, prequential, score
 from swiftwrf.online.follower import joined, unexplained

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from swiftwrf import CoarrayModel, InputError, load
+from swiftwrf import InputError, load
+from swiftwrf.models.coarray import CoarrayModel
 from swiftwrf.models.swiftwrf_paper import SwiftWRFPaper
 from swiftwrf.runtime.checkpoint import read, write
 
