@@ -27,6 +27,7 @@ from swiftwrf.locate.spectrum_likelihood import (
     Features,
     PathLikelihood,
     PathWaves,
+    PhaseLikelihood,
     Screen,
     SpectrumFeatures,
     gain_features,
@@ -85,7 +86,7 @@ class _Fit:
 
     room: GeometryModel
     gains: PathGains | None
-    paths: PathLikelihood
+    paths: PhaseLikelihood
 
     @property
     def features(self) -> tuple[Features, ...]:
@@ -101,7 +102,7 @@ class _Likelihoods:
 
     room: GeometryModel
     frequency: Tensor
-    parts: tuple[CoarrayLikelihood | ChannelLikelihood | PathLikelihood, ...]
+    parts: tuple[CoarrayLikelihood | ChannelLikelihood | PhaseLikelihood, ...]
 
     def __call__(self, position: Tensor, observed: SpectrumFeatures) -> Tensor:
         """Return log-likelihoods (k, n, m) of n observations at candidates (n, m, 3) [m]."""
@@ -196,7 +197,7 @@ class MatchedField(Configured, Saved):
             part = chosen.refined_on(phases).furnished_on(train.subset(kept))
             if self.n_snapshots:
                 return _Fit(part, None, PathLikelihood(part, torch.zeros(4 + part.reflectors.gain.shape[1])))
-            likelihood = PathLikelihood.fit([(part, PathWaves.at(part, train.position[kept]), features.subset(kept))])
+            likelihood = PhaseLikelihood.fit([(part, PathWaves.at(part, train.position[kept]), features.subset(kept))])
             return _Fit(part, fit_path_gains(part, phases, kernel, prior), likelihood)
 
         everything = torch.ones_like(fold, dtype=torch.bool)
@@ -405,7 +406,8 @@ class MatchedField(Configured, Saved):
         if not locator.floor > 0 or (frequency is not None and len(frequency) != locator.n_snapshots):
             raise InputError("frequencies and missing coherence are not those of a fitted locator")
         locator.grid = room.grid
-        locator._fit = _Fit(room, gains, PathLikelihood(room, tensors["statistics"]))
+        likelihood = PathLikelihood if is_channel else PhaseLikelihood
+        locator._fit = _Fit(room, gains, likelihood(room, tensors["statistics"]))
         locator.residual, locator.weight = tensors["residual"], tensors["weight"]
         locator.region, locator.observed_power = Region.from_state(tensors, header), float(header["observed_power"])
         locator.inflation = read_inflation(header)

@@ -227,12 +227,10 @@ class CoarrayLikelihood:
         return log_likelihood
 
 
-class PathLikelihood:
-    """Marginal likelihood of channels if path gains vary about their mean by a complex normal distribution.
+class PhaseLikelihood:
+    """Marginal likelihood of the element phases if path gains vary about their mean by a complex normal distribution.
 
-    A path has one gain at all frequencies. The phase of each snapshot is unknown, and so is a delay of the packet. It is
-    estimated relative to the expected field, given all snapshots. Phases by a spectrum are channels of one snapshot, of
-    which aliases are equally likely.
+    The phase of the whole channel is unknown and integrated over.
 
     Args:
         room: Room with P planes and further surfaces, and its paths.
@@ -282,9 +280,35 @@ class PathLikelihood:
 
     def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
         """Return log-likelihoods (m,) of m observations at m candidates, up to a constant of each observation."""
-        channel = observed.phases[:, :, None] if observed.channel is None else observed.channel[:, None]  # (m, T, F, K)
-        channel = channel / channel.abs().square().mean((2, 3), keepdim=True).sqrt().clamp_min(1e-30)
-        count = channel.shape[2]  # snapshots at one frequency have the same waves
+        mean, wave, phases = waves.channel[:, 0], waves.wave[:, :, 0], observed.phases
+        power = (self._variance[:, None] * wave.abs().square()).sum(dim=1).mean(dim=1) + mean.abs().square().mean(dim=1)
+        total = power * (1 + self._diffuse + self._floor)
+        weighted = wave * self._variance.sqrt()[:, None]
+        spread = torch.einsum("msk,msl->mkl", weighted, weighted.conj()) / total[:, None, None]
+        rest = self._diffuse * self._isotropic + self._floor * torch.eye(wave.shape[2])
+        spread = spread + rest * (power / total)[:, None, None]
+        mean = mean / total.sqrt()[:, None]
+        root = torch.linalg.cholesky(spread)
+        white = torch.linalg.solve_triangular(root, torch.cat([mean[:, :, None], phases.mT], dim=2), upper=False)
+        m, x = white[..., :1], white[..., 1:]
+        match = 2 * (m.conj() * x).sum(dim=1).abs()
+        misfit = x.abs().square().sum(dim=1) + m.abs().square().sum(dim=1)
+        density = match + torch.special.i0e(match).log() - misfit
+        total_density: Tensor = density.logsumexp(dim=1) - 2 * root.diagonal(dim1=1, dim2=2).real.log().sum(dim=1)
+        return total_density
+
+
+class PathLikelihood(PhaseLikelihood):
+    """Marginal likelihood of channels at all frequencies under uncertain path gains, as `PhaseLikelihood` of phases.
+
+    A path has one gain at all frequencies. The phase of each snapshot is unknown, and so is a delay of the packet. It is
+    estimated relative to the expected field, given all snapshots.
+    """
+
+    def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
+        assert observed.channel is not None
+        channel = observed.channel / observed.channel.abs().square().mean((1, 2), keepdim=True).sqrt().clamp_min(1e-30)
+        count = channel.shape[1]  # snapshots at one frequency have the same waves
         wave, mean = waves.wave.expand(-1, -1, count, -1), waves.channel.expand(-1, count, -1)
         variance = self._variance[:, None, None]
         power = (variance * wave.abs().square()).sum(1).mean((1, 2)) + mean.abs().square().mean((1, 2))
@@ -292,33 +316,32 @@ class PathLikelihood:
         scale = (1 + self._diffuse + self._floor).sqrt()
         whitening = torch.linalg.inv(root).mT * scale
         amount = power.rsqrt()[:, None, None] / scale  # so that the expected power is that of the observation
-        m, x = ((mean * amount) @ whitening)[:, None], channel @ whitening
+        m, x = (mean * amount) @ whitening, channel @ whitening  # (m, F, K)
         spread = ((wave * amount[..., None] * variance.sqrt()) @ whitening).flatten(2)  # (m, 1 + S, F K)
         gram = spread.conj() @ spread.mT + torch.eye(spread.shape[1])
         small = torch.linalg.cholesky(gram)
 
         def along(values: Tensor) -> Tensor:
-            match = spread.conj() @ values.flatten(2).mT
+            match = spread.conj() @ values.flatten(1)[..., None]
             found: Tensor = torch.linalg.solve_triangular(small, match, upper=False)
             return found
 
         expected, own = m, along(m)
-        n_aligned = N_ALIGNED if count > 1 else 1
-        for number in range(n_aligned):
+        for number in range(N_ALIGNED):
             x = x * (x.conj() * expected).sum(-1, keepdim=True).sgn().detach()
             other = along(x)
-            if number < n_aligned - 1:
+            if number < N_ALIGNED - 1:
                 change = torch.linalg.solve_triangular(small.mH, other - own, upper=True)
-                expected = m + (change.mT @ spread).view_as(x)
+                expected = m + (change.mT @ spread)[:, 0].view_as(m)
 
         def product(a: Tensor, b: Tensor, along_a: Tensor, along_b: Tensor) -> Tensor:
-            whole: Tensor = (a.conj() * b).sum((2, 3)) - (along_a.conj() * along_b).sum(1)
+            whole: Tensor = (a.conj() * b).sum((1, 2)) - (along_a.conj() * along_b).sum((1, 2))
             return whole
 
         match = 2 * product(m, x, own, other).abs()
         misfit = product(x, x, other, other).real + product(m, m, own, own).real
         volume = small.diagonal(dim1=1, dim2=2).real.log().sum(1) + count * (root.diagonal().real / scale).log().sum()
-        density: Tensor = (match + torch.special.i0e(match).log() - misfit).logsumexp(dim=1) - 2 * volume
+        density: Tensor = match + torch.special.i0e(match).log() - misfit - 2 * volume
         return density
 
 

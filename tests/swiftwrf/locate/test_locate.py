@@ -19,7 +19,7 @@ from swiftwrf.locate import posterior as module
 from swiftwrf.locate.posterior import normalised, pooled_weights
 from swiftwrf.locate.region import Cells, best_cells, refined
 from swiftwrf.locate.rssi_likelihood import METRICS, DetectionLikelihood, Fingerprints, ValueLikelihood
-from swiftwrf.locate.spectrum_likelihood import BOUNDS, CoarrayLikelihood, PathLikelihood, PathWaves, SpectrumFeatures
+from swiftwrf.locate.spectrum_likelihood import BOUNDS, CoarrayLikelihood, PathWaves, PhaseLikelihood, SpectrumFeatures
 from swiftwrf.models.geometry import GeometryModel, Plane
 from swiftwrf.models.geometry.path_gains import PathGains
 
@@ -413,7 +413,7 @@ def test_variances_of_phases_that_no_room_explains_stay_finite():
     room = GeometryModel.of_planes(data, [Plane(*plane, gain=0.6) for plane in six.items()], order=3)
     assert data.array is not None
     features = SpectrumFeatures.of(data.store.batches(), data.array, data.grid, 0)
-    likelihood = PathLikelihood.fit([(room, PathWaves.at(room, data.position), features)])
+    likelihood = PhaseLikelihood.fit([(room, PathWaves.at(room, data.position), features)])
     assert bool((likelihood.log_variance >= BOUNDS[0] - 1e-4).all())
     assert bool((likelihood.log_variance <= BOUNDS[1] + 1e-4).all())
     assert bool(likelihood(PathWaves.at(room, data.position), features).isfinite().all())
