@@ -81,10 +81,12 @@ def read_text(file: Path) -> str:
         size = file.stat().st_size
     if size > MAX_TEXT_BYTES:
         raise InputError(f"{file} has {size} bytes; a table or list has at most {MAX_TEXT_BYTES}")
-    with refusing_broken(file, "a text in UTF-8"):
+    try:
         text = read_bytes(file).decode("utf-8-sig")
-        if "\0" in text:
-            raise ValueError("it holds zero bytes")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{file} is no text in UTF-8 (byte {error.start + 1}); save it in that encoding") from None
+    if "\0" in text:
+        raise InputError(f"{file} is no text in UTF-8: it holds zero bytes; save it in that encoding")
     return text
 
 

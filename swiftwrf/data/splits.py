@@ -59,10 +59,12 @@ def _read_indices(file: Path, n: int, first: int) -> list[int]:
     for line, text in enumerate(read_text(file).split(), start=1):
         digits = text.lstrip("0") or "0"
         if not (text.isascii() and text.isdecimal() and len(digits) <= 18):
-            raise InputError(f"{file} entry {line} is {text!r}, which is no whole number")
+            raise InputError(f"{file} entry {line} is {text!r}; expected a whole number, {first} to {n - 1 + first}")
         row = int(digits) - first
         if not 0 <= row < n:
-            raise InputError(f"{file} entry {line} is {text}; expected {first} to {n - 1 + first}")
+            raise InputError(
+                f"{file} entry {line} is {text}; expected {first} to {n - 1 + first}, the measurements there are"
+            )
         if row in rows:
             raise InputError(f"{file} lists index {text} twice; each measurement belongs to a part once")
         rows[row] = None

@@ -64,7 +64,7 @@ def other_readings(data: Snapshots, away: Tensor) -> Iterator[tuple[str, float, 
 def _element_orders(array: PlanarArray) -> dict[str, Tensor]:
     """Return the order (K,) of the channels if elements of a lattice are given along its other axis, by description."""
     tolerance = 1e-3 * array.wavelength  # between coordinates of elements in one row or column
-    sites = [(array.element[:, axis] / tolerance).round().unique(return_inverse=True)[1] for axis in (0, 1)]
+    sites = [_ranks(array.element[:, axis], tolerance) for axis in (0, 1)]
     columns, rows = (int(rank.max()) + 1 for rank in sites)
     if columns * rows != len(array.element) or min(rows, columns) < 2:
         return {}
@@ -79,6 +79,14 @@ def _element_orders(array: PlanarArray) -> dict[str, Tensor]:
         given = (sequence.T if row_wise else sequence).flatten()  # lattice site of each channel
         orders[name + end] = given.argsort()[declared]
     return {meaning: order for meaning, order in orders.items() if not torch.equal(order, torch.arange(len(order)))}
+
+
+def _ranks(values: Tensor, tolerance: float) -> Tensor:
+    """Return the rank of each value among the distinct ones."""
+    ordered, order = values.sort()
+    rank = torch.empty_like(order)
+    rank[order] = functional.pad((ordered.diff() > tolerance).long().cumsum(0), (1, 0))
+    return rank
 
 
 def wave_from(data: Snapshots, away: Tensor) -> Tensor:

@@ -23,7 +23,7 @@ from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.phase_retrieval import correlations, retrieve_phases
 from swiftwrf.models.link import Link
 from swiftwrf.models.process import ProcessModel
-from swiftwrf.online.scores import ALLOWANCE, Alarm, Scores, alarm_threshold, score
+from swiftwrf.online.scores import ALLOWANCE, Alarm, Scores, alarm_threshold, learnt, score
 from swiftwrf.positions import nearest
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.runtime.validation import checked
@@ -262,8 +262,7 @@ class Follower:
         train: Spectra | Rssi | None = None,
         false_alarm_rate: FalseAlarmRate = 1e-4,
     ) -> None:
-        self.model: Any = model
-        self.count = 0
+        self.model, self.count = model, 0
         self.monitor = Monitor.of(model, train, false_alarm_rate)
         self._unjudged: list[tuple[Spectra | Rssi, Scores]] = []  # measurements since the last choice of the kernel
         self.room: Monitor | None = None
@@ -311,12 +310,12 @@ class Follower:
     def _learn(self, new: Spectra | Rssi) -> list[str]:
         """Learn a measurement. A geometry learns it with those that wait; return a notice if it gives them up."""
         if not isinstance(self.model, GeometryModel) or not isinstance(new, Spectra):
-            self.model = self.model.update(new)
+            self.model = learnt(self.model, new)
             return []
         self.waiting = waiting = new if self.waiting is None else joined([self.waiting, new])
         notices = []
         try:
-            self.model = self.model.update(waiting)
+            self.model = learnt(self.model, waiting)
         except InputError as error:  # fewer than 10 positions, or spectra that do not fit the array
             if len(waiting) < 5 * MIN_TRAINING:
                 return []
@@ -330,14 +329,14 @@ class Follower:
         if count < max(30, 0.1 * (n - count)) or n - count < MIN_TRAINING:
             return []
         last, self._unjudged = self._unjudged, []
-        other: Any = model.with_chosen_kernel(without=torch.arange(n - count, n))
+        other = model.with_chosen_kernel(without=torch.arange(n - count, n))
         old, new = model.kernel, other.kernel
         if new == old:
             return []
         found = []
         for one, _ in last:
             found.append(score(other, one))
-            other = other.update(one)
+            other = learnt(other, one)
         gain = Scores.joined([scores for _, scores in last]).error.log() - Scores.joined(found).error.log()
         better = stats.ttest_1samp(gain, 0.0, nan_policy="omit", alternative="greater")
         rate = self.monitor.false_alarm_rate

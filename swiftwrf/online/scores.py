@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import torch
 from scipy.optimize import brentq
@@ -96,6 +96,13 @@ def score(model: FieldModel | RssiPredictor, new: Spectra | Rssi) -> Scores:
     return Scores(position, error.cpu(), innovation.cpu(), covered.flatten(1).nanmean(dim=1).cpu())
 
 
+def learnt(model: Model, new: Spectra | Rssi) -> Model:
+    """Return the model after an update with measurements of its kind."""
+    update: Any = model.update
+    found: Model = update(new)
+    return found
+
+
 @checked
 def prequential(model: Model, new: Spectra | Rssi, batch: PositiveInt = 1) -> tuple[Scores, Model]:
     """Score measurements in order, each before the model learns it.
@@ -119,12 +126,12 @@ def prequential(model: Model, new: Spectra | Rssi, batch: PositiveInt = 1) -> tu
         >>> len(scores), len(model.anchor)
         (20, 80)
     """
-    parts, learning = [], cast(Any, model)  # learns measurements of its kind
+    parts = []
     for rows in torch.arange(len(new)).split(batch):
         some = new.subset(rows)
-        parts.append(score(learning, some))
-        learning = learning.update(some)
-    return Scores.joined(parts), learning
+        parts.append(score(model, some))
+        model = learnt(model, some)
+    return Scores.joined(parts), model
 
 
 def alarm_threshold(rate: float, n_series: int = 1) -> float:

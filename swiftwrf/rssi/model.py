@@ -126,7 +126,7 @@ class RssiModel(SavedRssiPredictor):
         predictors, std = _held_out_predictors(training, found)
         predictors, std, mine = predictors[:, training.bin_of_row], std[training.bin_of_row], slice(len(own))
         # one set of weights for all receivers: the few folds determine none for each of them
-        columns = [every.tolist().index(c) for c in often.tolist()]
+        columns = list(map(every.tolist().index, often.tolist()))
         predicted, measured = predictors[..., columns], pool.rssi_dbm[:, often]
         is_comparable = bool(comparable(predicted, measured).any())
         weight = mixing_weights(predicted, measured) if is_comparable else FIELD_ALONE
