@@ -37,7 +37,6 @@ from fuzz.commands import config_file
 from fuzz.misuse import CALLS, misuse
 from swiftwrf import (
     AngularGrid,
-    CoarrayModel,
     MatchedField,
     Rssi,
     RssiLocator,
@@ -55,6 +54,7 @@ from swiftwrf.comparison import NeRF2Rssi
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.gp import Kernel
 from swiftwrf.models import FIELD_MODELS
+from swiftwrf.models.coarray import CoarrayModel
 from swiftwrf.models.geometry import GeometryModel, HybridModel
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.geometry.path_gains import fit_path_gains

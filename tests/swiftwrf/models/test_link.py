@@ -11,7 +11,6 @@ from swiftwrf import (
     FieldModel,
     FitError,
     GeometryModel,
-    HybridModel,
     InputError,
     MatchedField,
     PairModel,
@@ -23,6 +22,7 @@ from swiftwrf import (
     rssi_room,
 )
 from swiftwrf.array.planar import PlanarArray
+from swiftwrf.models.geometry import HybridModel
 from swiftwrf.online import Follower, score
 
 FLOOR = rssi_room(n=100)
