@@ -30,6 +30,7 @@ from swiftwrf.locate.spectrum_likelihood import (
     PhaseLikelihood,
     Screen,
     SpectrumFeatures,
+    channels_beside,
     gain_features,
     room_features,
 )
@@ -48,9 +49,12 @@ FOLDS = 5
 START_WEIGHTS = (0.05, 0.05, 0.3)  # of the likelihoods, by which the calibration searches
 START_WEIGHTS_CHANNEL = (0.5, 0.05)
 CHANNEL_SPLITS = 3  # times as many cells are split for channels, whose likelihood is narrower than a cell
+CHANNEL_CELLS = 8  # times as many first cells for channels, which are not computed at each of them
+CHANNEL_PARTS = 4  # along each edge of a cell with paths of its own
 MIN_FLOOR = 1e-4  # of missing coherence, by rounding
 MIN_SPECTRA = 15
 BATCH_CANDIDATES = 2048  # whose waves are computed together: as many as a processor's cache holds
+BATCH_CELLS = 256  # the same with parts
 
 
 @configuration
@@ -65,7 +69,7 @@ class MatchedFieldConfig:
     spacing: Annotated[float, Ge(0.02)] = 0.1
     """spacing of the first cells, in wavelengths"""
     max_cells: Annotated[int, Ge(1), Le(4_000_000)] = 400_000
-    """number of first cells at most"""
+    """number of first cells at most, of channels 8 times as many"""
     n_best: Annotated[int, Ge(1), Le(100_000)] = 300
     """cells of largest mass that are kept for each spectrum"""
     n_background: Annotated[int, Ge(0), Le(100_000)] = 100
@@ -232,20 +236,23 @@ class MatchedField(Configured, Saved):
 
     def _prepare(self) -> None:
         """Compute what all spectra share: cells of the region and what is predicted there."""
-        extent = self.region.extent
+        extent, limit = self.region.extent, self.config.max_cells
         spacing = self.config.spacing * self.room.array.wavelength
         count = math.prod((extent / spacing).clamp_min(1).tolist())
-        self.cells = self.region.cells(int(min(max(count, 1), self.config.max_cells)))
         self.likelihoods = self._likelihoods(self._fit)
-        batches, own = self.cells.position.split(BATCH_CANDIDATES), self.likelihoods.parts[-1]
+        own = self.likelihoods.parts[-1]
         if isinstance(own, ChannelLikelihood):
+            whole = self.region.cells(int(max(min(count, CHANNEL_CELLS * limit) / CHANNEL_PARTS ** len(extent), 1)))
+            self.cells, away = whole.cut(CHANNEL_PARTS), whole.centres(CHANNEL_PARTS)
             frequency = self._frequency(self.room)[ends(len(self._frequency(self.room)))]
 
             def predicted(position: Tensor) -> Tensor:
-                return PathWaves.at(self.room, position, frequency).channel.movedim(1, 0)
+                return channels_beside(self.room, position, away, frequency).movedim(1, 0).contiguous()
 
-            self._screens = [own.screen(torch.cat(parallel_map(predicted, batches), dim=1))]
+            self._screens = [own.screen(parallel_map(predicted, whole.position.split(BATCH_CELLS)))]
             return
+        self.cells = self.region.cells(int(min(max(count, 1), limit)))
+        batches = self.cells.position.split(BATCH_CANDIDATES)
         coarray = [part for part in self.likelihoods.parts if isinstance(part, CoarrayLikelihood)]
         assert self._fit.gains is not None
         # the mean of the path gains takes an eighth of the time of all their fields, and ranks cells nearly alike

@@ -43,6 +43,19 @@ class Cells:
         """Length of the longest edge of a cell of level 0 [m]."""
         return float(self.edge.norm(dim=1).max()) if len(self.edge) else 0.0
 
+    def centres(self, parts: int) -> Tensor:
+        """Return the centres of the parts of a cell of level 0 if each edge is cut, from its centre, (parts^d, 3) [m]."""
+        line = (torch.arange(parts, dtype=torch.float64) + 0.5) / parts - 0.5
+        along = torch.tensor(list(itertools.product(line.tolist(), repeat=len(self.edge))), dtype=torch.float64)
+        return along.reshape(-1, len(self.edge)) @ self.edge
+
+    def cut(self, parts: int) -> Cells:
+        """Return cells (m,) of level 0 with each edge cut in equal parts, those of one cell after the other."""
+        away = self.centres(parts)
+        volume = (self.log_volume - math.log(len(away))).repeat_interleave(len(away))
+        position = (self.position[:, None] + away).flatten(0, 1)
+        return Cells(position, volume, self.edge / parts, torch.zeros_like(volume))
+
 
 @dataclass(frozen=True, eq=False)
 class Region:
@@ -228,16 +241,15 @@ def refined(cells: Cells, log_mass: Tensor, values: Tensor, evaluate: Evaluate, 
     n, m = log_mass.shape
     split = min(split, m)
     chosen = log_mass.topk(split, dim=1).indices
-    d = len(cells.edge)
-    signs = torch.tensor(list(itertools.product((-0.25, 0.25), repeat=d)), dtype=torch.float64).reshape(-1, d)
+    away = cells.centres(2)
     parent = cells.position.gather(1, chosen[..., None].expand(-1, -1, 3))
     level = cells.level.gather(1, chosen)
-    part = (parent[:, :, None] + 2.0 ** -level[..., None, None] * (signs @ cells.edge)).reshape(n, -1, 3)
+    part = (parent[:, :, None] + 2.0 ** -level[..., None, None] * away).reshape(n, -1, 3)
 
     def repeated(value: Tensor) -> Tensor:
-        return value[..., None].expand(-1, -1, len(signs)).reshape(n, -1)
+        return value[..., None].expand(-1, -1, len(away)).reshape(n, -1)
 
-    part_volume = repeated(cells.log_volume.gather(1, chosen) - math.log(len(signs)))
+    part_volume = repeated(cells.log_volume.gather(1, chosen) - math.log(len(away)))
     part_values = evaluate(part)
     rest = log_mass.scatter(1, chosen, -torch.inf).argsort(dim=1, descending=True)[:, : m - split]
     position = torch.cat([part, cells.position.gather(1, rest[..., None].expand(-1, -1, 3))], dim=1)

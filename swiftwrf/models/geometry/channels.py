@@ -37,11 +37,17 @@ def waves(planes: PlaneSet, scene: PhaseObservations, frequency: Tensor) -> Tens
         scene: Positions.
         frequency: Frequencies relative to the carrier, (F,).
     """
-    source, there = scene.transmitter[None], torch.ones(1, 1)
+    there = torch.ones(1, 1)
     if planes.sequence:
-        source, exists = torch.cat([source, images(scene, planes)[0]]), visibility(scene, planes)[0]
+        exists = visibility(scene, planes)[0]
         there = torch.cat([torch.ones_like(exists[:1]), exists])
-    return (scene.waves(source, frequency) * there[..., None, None]).transpose(0, 1)
+    return (scene.waves(sources(planes, scene), frequency) * there[..., None, None]).transpose(0, 1)
+
+
+def sources(planes: PlaneSet, scene: PhaseObservations) -> Tensor:
+    """Return the transmitter and its images in the planes of one room, float64 (1 + S, n or 1, 3) [m]."""
+    direct = scene.transmitter[None]
+    return torch.cat([direct, images(scene, planes)[0]]) if planes.sequence else direct
 
 
 @dataclass(frozen=True, eq=False)

@@ -104,6 +104,16 @@ def test_splitting_cells_keeps_their_mass_and_finds_a_narrow_peak():
     assert found.log_volume.exp().sum() <= volume + 1e-12
 
 
+def test_cut_cells_fill_the_cells_that_were_cut():
+    cells = Region(torch.rand(20, 3, generator=torch.Generator().manual_seed(0))).cells(30)
+    parts = cells.cut(3)
+    assert torch.allclose(parts.position.unflatten(0, (-1, 27)).mean(dim=1), cells.position)
+    assert torch.allclose(parts.log_volume.unflatten(0, (-1, 27)).logsumexp(dim=1), cells.log_volume)
+    assert torch.allclose(3 * parts.edge, cells.edge)
+    gap = torch.cdist(parts.position, parts.position).fill_diagonal_(torch.inf).amin(dim=1)
+    assert torch.allclose(gap, parts.edge.norm(dim=1).min().expand_as(gap))
+
+
 def test_background_cells_stand_for_all_others():
     position = torch.arange(100, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0, 0])
     volume = torch.full((100,), -math.log(100), dtype=torch.float64)

@@ -14,7 +14,7 @@ from swiftwrf import AngularGrid, InputError, MatchedField, Spectra, load, simul
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data import PropagationPaths, Snapshots
 from swiftwrf.data.store import Store
-from swiftwrf.locate.spectrum_likelihood import PathLikelihood, PathWaves, SpectrumFeatures
+from swiftwrf.locate.spectrum_likelihood import PathLikelihood, PathWaves, SpectrumFeatures, channels_beside
 from swiftwrf.models.geometry import GeometryModel, Plane, furniture
 from swiftwrf.models.geometry.channels import Channels, coherence, field, waves
 from swiftwrf.models.geometry.fit import observe
@@ -225,6 +225,20 @@ def test_positions_are_located_by_noisy_packets_through_furniture(furnished_room
     assert torch.equal(again.log_weight, posterior.log_weight)
     with pytest.raises(InputError, match="was fitted to channels"):
         locator.locate(test.spectrum)
+
+
+@pytest.mark.parametrize("moving", ["transmitter", "receiver"])
+def test_channels_beside_positions_follow_from_the_paths_there(moving):
+    data, walls = measured(0.0, moving, n=10)
+    frequency = data.frequency_hz * data.array.wavelength / LIGHT_SPEED
+    line = 0.15 * data.array.wavelength * torch.tensor([-1.0, 1.0], dtype=torch.float64)
+    away = torch.cartesian_prod(line, line, line)
+    exact = PathWaves.at(walls, (data.position[:, None] + away).flatten(0, 1), frequency).channel
+    beside = coherence(channels_beside(walls, data.position, away, frequency), exact)
+    assert beside.median() > 0.95
+    assert beside.quantile(0.1) > 0.9  # where the paths nearly cancel, small changes of their angles count
+    unmoved = PathWaves.at(walls, data.position.repeat_interleave(8, 0), frequency).channel
+    assert coherence(unmoved, exact).median() < 0.8  # the field changes over these distances
 
 
 def test_the_likelihood_of_channels_is_a_normal_distribution_that_no_delay_or_phase_changes():
