@@ -35,6 +35,7 @@ CARRIER = torch.ones(1, dtype=torch.float64)  # frequency relative to the carrie
 DEGREES = (3.0, 5.0, 10.0, 30.0, math.inf)  # degrees of freedom of Student distributions that are compared
 SHRINKAGES = (0.05, 0.1, 0.2, 0.4, 0.7)  # of scale matrices to multiples of the identity, that are compared
 N_ALIGNED = 3  # iterations of the phases of snapshots and the expected field
+SCALES = (0.1, 1.0, 10.0)  # of the variances of path gains and scattering at a position
 BOUNDS = (-10.0, 6.0)  # of the logarithms of variances: products of four of them stay within float32
 
 
@@ -91,17 +92,19 @@ class PathWaves:
         position: Candidate positions, float64 (m, 3) [m].
         wave: Wave of the direct path and of each image at each frequency and element, complex64 (m, 1 + S, F, K).
         gain: Gains of the paths, (m, 1 + S).
+        frequency: Frequencies relative to the carrier, (F,).
     """
 
     position: Tensor
     wave: Tensor
     gain: Tensor
+    frequency: Tensor
 
     @classmethod
     def at(cls, room: GeometryModel, position: Tensor, frequency: Tensor = CARRIER) -> PathWaves:
         """Compute the waves at positions (m, 3) [m] and frequencies (F,) relative to the carrier."""
         scene = room.scene(position)
-        return cls(position, waves(room.reflectors, scene, frequency), room.gains(scene))
+        return cls(position, waves(room.reflectors, scene, frequency), room.gains(scene), frequency)
 
     @cached_property
     def channel(self) -> Tensor:
@@ -332,38 +335,98 @@ class PhaseLikelihood:
 class PathLikelihood(PhaseLikelihood):
     """Marginal likelihood of channels at all frequencies under uncertain path gains, as `PhaseLikelihood` of phases.
 
-    A path has one gain at all frequencies. The phase of each snapshot is unknown, and so is a delay of the packet. It is
-    estimated relative to the expected field, given all snapshots.
+    A path has one gain at all frequencies. So has scattering, along paths that are longer than the direct one as those of
+    the images are. A room explains some positions much worse than others, so the variances of gains and scattering have a
+    common factor at each position, one of `SCALES`. The phase of each snapshot is unknown, and so is a delay of the packet.
+    It is estimated relative to the expected field, given all snapshots.
     """
+
+    def __init__(self, room: GeometryModel, log_variance: Tensor) -> None:
+        super().__init__(room, log_variance)
+        scene = room.scene(room.region()[:1])
+        length = (sources(room.reflectors, scene) - scene.receiver).norm(dim=-1)[:, 0]
+        self._detour_rad = scene.wavenumber * float((length - length[0]).square().mean().sqrt())
+        self._over_element, self._basis = torch.linalg.eigh(self._isotropic)
 
     def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
         assert observed.channel is not None
         channel = observed.channel / observed.channel.abs().square().mean((1, 2), keepdim=True).sqrt().clamp_min(1e-30)
         count = channel.shape[1]  # snapshots at one frequency have the same waves
-        wave, mean = waves.wave.expand(-1, -1, count, -1), waves.channel.expand(-1, count, -1)
-        variance = self._variance[:, None, None]
-        power = (variance * wave.abs().square()).sum(1).mean((1, 2)) + mean.abs().square().mean((1, 2))
-        root = torch.linalg.cholesky(self._diffuse * self._isotropic + self._floor * torch.eye(wave.shape[-1]))
-        scale = (1 + self._diffuse + self._floor).sqrt()
-        whitening = torch.linalg.inv(root).mT * scale
-        amount = power.rsqrt()[:, None, None] / scale  # so that the expected power is that of the observation
-        m, x = (mean * amount) @ whitening, channel @ whitening  # (m, F, K)
-        spread = ((wave * amount[..., None] * variance.sqrt()) @ whitening).flatten(2)  # (m, 1 + S, F K)
+        x, mean = channel @ self._basis, waves.channel.expand(-1, count, -1) @ self._basis
+        wave = waves.wave.expand(-1, -1, count, -1) @ self._basis
+        at_mean = _Whitened.of(mean, wave, self._variance, self._diffuse * self._over_element, self._floor)
+        x = x * at_mean.phases(x)
+        # scattering has the covariance of frequencies times that of elements, and the eigenvectors of both whiten it
+        frequency = waves.frequency.expand(count)
+        apart = self._detour_rad * (frequency[:, None] - frequency).float()
+        over_frequency, turn = torch.linalg.eigh((-apart.square() / 2).exp())
+        turn = turn.T.to(x.dtype)
+        x, mean, wave = turn @ x, turn @ mean, turn @ wave
+        scattered = self._diffuse * over_frequency[:, None] * self._over_element
+        densities = [
+            _Whitened.of(mean, wave, scale * self._variance, scale * scattered, self._floor).log_density(x)
+            for scale in SCALES
+        ]
+        density: Tensor = torch.stack(densities).logsumexp(dim=0)
+        return density
+
+
+@dataclass(frozen=True, eq=False)
+class _Whitened:
+    """Complex normal distribution of channels (F, K) at m candidates, scaled so that noise and scattering are white.
+
+    Args:
+        whitening: Factors of the observed channels (F or 1, K).
+        mean: Expected channels (m, F, K).
+        spread: Waves of the paths by the standard deviations of their gains, (m, 1 + S, F K).
+        root: Cholesky factors of I + spread^* spread^T, (m, 1 + S, 1 + S).
+    """
+
+    whitening: Tensor
+    mean: Tensor
+    spread: Tensor
+    root: Tensor
+
+    @classmethod
+    def of(cls, mean: Tensor, wave: Tensor, variance: Tensor, scattered: Tensor, floor: Tensor) -> Self:
+        """Return the distribution of channels of unit expected power.
+
+        Args:
+            mean: Expected channels (m, F, K).
+            wave: Waves of the paths (m, 1 + S, F, K).
+            variance: Variances of their gains (1 + S,).
+            scattered: Variances of scattering (F or 1, K), relative to the power of the paths.
+            floor: Variance of the noise, relative to the same.
+        """
+        paths = mean.abs().square().mean((1, 2)) + (variance[:, None, None] * wave.abs().square()).sum(1).mean((1, 2))
+        rest = scattered.clamp_min(0) + floor
+        whitening = ((1 + rest.mean()) / rest).sqrt()
+        amount = (paths * (1 + rest.mean())).rsqrt()[:, None, None]
+        spread = (wave * (amount[..., None] * variance.sqrt()[:, None, None]) * whitening).flatten(2)
         gram = spread.conj() @ spread.mT + torch.eye(spread.shape[1])
-        small = torch.linalg.cholesky(gram)
+        return cls(whitening, mean * amount * whitening, spread, torch.linalg.cholesky(gram))
 
-        def along(values: Tensor) -> Tensor:
-            match = spread.conj() @ values.flatten(1)[..., None]
-            found: Tensor = torch.linalg.solve_triangular(small, match, upper=False)
-            return found
+    def _along(self, values: Tensor) -> Tensor:
+        match = self.spread.conj() @ values.flatten(1)[..., None]
+        found: Tensor = torch.linalg.solve_triangular(self.root, match, upper=False)
+        return found
 
-        expected, own = m, along(m)
+    def phases(self, x: Tensor) -> Tensor:
+        """Return the phasors (m, F, 1) by which the snapshots of channels x (m, F, K) agree with the expected field."""
+        x = x * self.whitening
+        expected, own, total = self.mean, self._along(self.mean), torch.ones_like(x[..., :1])
         for number in range(N_ALIGNED):
-            x = x * (x.conj() * expected).sum(-1, keepdim=True).sgn().detach()
-            other = along(x)
+            phase = (x.conj() * expected).sum(-1, keepdim=True).sgn().detach()
+            x, total = x * phase, total * phase
             if number < N_ALIGNED - 1:
-                change = torch.linalg.solve_triangular(small.mH, other - own, upper=True)
-                expected = m + (change.mT @ spread)[:, 0].view_as(m)
+                change = torch.linalg.solve_triangular(self.root.mH, self._along(x) - own, upper=True)
+                expected = self.mean + (change.mT @ self.spread)[:, 0].view_as(self.mean)
+        return total
+
+    def log_density(self, x: Tensor) -> Tensor:
+        """Return the log-densities of channels x (m, F, K) with an unknown common phase, up to a constant, (m,)."""
+        m, x = self.mean, x * self.whitening
+        own, other = self._along(m), self._along(x)
 
         def product(a: Tensor, b: Tensor, along_a: Tensor, along_b: Tensor) -> Tensor:
             whole: Tensor = (a.conj() * b).sum((1, 2)) - (along_a.conj() * along_b).sum((1, 2))
@@ -371,7 +434,7 @@ class PathLikelihood(PhaseLikelihood):
 
         match = 2 * product(m, x, own, other).abs()
         misfit = product(x, x, other, other).real + product(m, m, own, own).real
-        volume = small.diagonal(dim1=1, dim2=2).real.log().sum(1) + count * (root.diagonal().real / scale).log().sum()
+        volume = self.root.diagonal(dim1=1, dim2=2).real.log().sum(1) - self.whitening.log().expand(x.shape[1:]).sum()
         density: Tensor = match + torch.special.i0e(match).log() - misfit - 2 * volume
         return density
 

@@ -14,9 +14,9 @@ from swiftwrf import AngularGrid, InputError, MatchedField, Spectra, load, simul
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data import PropagationPaths, Snapshots
 from swiftwrf.data.store import Store
-from swiftwrf.locate.spectrum_likelihood import PathLikelihood, PathWaves, SpectrumFeatures, channels_beside
+from swiftwrf.locate.spectrum_likelihood import SCALES, PathLikelihood, PathWaves, SpectrumFeatures, channels_beside
 from swiftwrf.models.geometry import GeometryModel, Plane, furniture
-from swiftwrf.models.geometry.channels import Channels, coherence, field, waves
+from swiftwrf.models.geometry.channels import Channels, coherence, field, sources, waves
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.geometry.furniture import Furniture
 from swiftwrf.models.geometry.images import PlaneSet, images
@@ -253,20 +253,29 @@ def test_the_likelihood_of_channels_is_a_normal_distribution_that_no_delay_or_ph
 
     known, (_, diffuse, floor) = at.channel, log_variance[-3:].exp().double()
     wave, mean, variance = at.wave.flatten(2).cdouble(), known.flatten(1).cdouble(), likelihood._variance.double()
-    power = (variance[:, None] * wave.abs().square()).sum(1).mean(1) + mean.abs().square().mean(1)
-    noise = (diffuse * likelihood._isotropic + floor * torch.eye(16)) / (1 + diffuse + floor)
-    total = power * (1 + diffuse + floor)
-    covariance = torch.einsum("nsk,nsl,s->nkl", wave, wave.conj(), variance.cdouble()) / total[:, None, None]
-    covariance = covariance + torch.block_diag(*[noise.cdouble()] * 4)
-    mean = mean / total.sqrt()[:, None]
     x = mean / mean.abs().square().mean(1, keepdim=True).sqrt()
+    scene = walls.scene(walls.region()[:1])
+    length = (sources(walls.reflectors, scene) - scene.receiver).norm(dim=-1)[:, 0]
+    detour = (length - length[0]).square().mean().sqrt() * scene.wavenumber
+    over_frequency = (-(detour * (frequency[:, None] - frequency)).square() / 2).exp()
+    scattered = torch.kron(over_frequency, likelihood._isotropic.real.double())
+    densities = []
+    for scale in SCALES:  # of the variances of gains and scattering
+        power = scale * (variance[:, None] * wave.abs().square()).sum(1).mean(1) + mean.abs().square().mean(1)
+        noise = (scale * diffuse * scattered + floor * torch.eye(64)) / (1 + scale * diffuse + floor)
+        total = power * (1 + scale * diffuse + floor)
+        covariance = (
+            torch.einsum("nsk,nsl,s->nkl", wave, wave.conj(), scale * variance.cdouble()) / total[:, None, None]
+        )
+        covariance, m = covariance + noise, mean / total.sqrt()[:, None]
 
-    def product(a, b):
-        return (a.conj() * torch.linalg.solve(covariance, b)).sum(1)
+        def product(a, b, covariance=covariance):
+            return (a.conj() * torch.linalg.solve(covariance, b)).sum(1)
 
-    match = 2 * product(mean, x).abs()
-    expected = match + torch.special.i0e(match).log() - (product(x, x) + product(mean, mean)).real
-    expected = expected - torch.linalg.slogdet(covariance).logabsdet
+        match = 2 * product(m, x).abs()
+        density = match + torch.special.i0e(match).log() - (product(x, x) + product(m, m)).real
+        densities.append(density - torch.linalg.slogdet(covariance).logabsdet)
+    expected = torch.stack(densities).logsumexp(dim=0)
     assert torch.allclose(value(known).double(), expected, atol=0.15)  # the estimated phases fit slightly better
     turn = torch.rand(6, 4, 1, generator=torch.Generator().manual_seed(0))
     assert torch.allclose(value(known * torch.polar(torch.ones(6, 4, 1), 7 * turn)), value(known), atol=0.05)
