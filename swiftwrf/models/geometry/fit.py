@@ -17,7 +17,7 @@ from swiftwrf.data.splits import MIN_TRAINING, folds
 from swiftwrf.errors import InputError
 from swiftwrf.gp import subsample
 from swiftwrf.models.base import FieldConfig
-from swiftwrf.models.geometry.images import PhaseObservations, PlaneSet
+from swiftwrf.models.geometry.images import SIDES, PhaseObservations, PlaneSet, phase_period_m
 from swiftwrf.models.geometry.phase_retrieval import correlations, retrieve_phases
 from swiftwrf.models.geometry.planes import (
     MAX_ORDER,
@@ -46,6 +46,7 @@ from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, configuration
 
 FURTHER_SIGNIFICANCE = 4.0  # standard errors for a plane of any orientation, of which far more are tried
+DIELECTRIC_GAIN = 0.4  # modulus at normal incidence that a fit starts from: a relative permittivity of 5.4
 N_FINAL = 400  # positions of the last moves of a search; fewer do not separate planes from aliases in furnished rooms
 
 
@@ -111,6 +112,8 @@ def search_room(train: Spectra, config: GeometryConfig, progress: bool) -> RoomE
         room = _with_weak_planes(room, scene, some, splits, signs, config)
         room = _with_further_planes(room, scene, some, splits, config)
         room = _with_order(room, splits, config)
+        if train.channel is not None:
+            room = with_dielectrics(room, scene, splits, config)
     final = refine(observed, room.shifted(used.fixed_position))
     return assess(used, observed, final, score, config.search_distance_m, config.certainty)
 
@@ -310,3 +313,31 @@ def _with_order(room: PlaneSet, splits: Splits, config: GeometryConfig) -> Plane
         if not len(score) or advantage(held, score) > config.significance:
             best, score = tried, held
     return best
+
+
+def with_dielectrics(room: PlaneSet, scene: PhaseObservations, splits: Splits, config: GeometryConfig) -> PlaneSet:
+    """Make all planes dielectrics if this explains held-out positions significantly better than constant gains.
+
+    Floor and ceiling have gains of both signs: negative, as those of walls, at grazing incidence, otherwise positive. A
+    constant negative gain leads to an offset half a phase period away. Such planes are tried on either side, too.
+
+    Args:
+        room: Planes of constant gain.
+        scene: Observed phases.
+        splits: Kept and held-out positions.
+        config: Options, of which the significance counts.
+    """
+    signs = 2 * SIDES[:, 2].square().float() - 1
+    sign = signs[room.side]
+    gain = sign * room.gain.abs().clamp_min(DIELECTRIC_GAIN)
+    dielectric = torch.ones(room.gain.shape[1], dtype=torch.bool)
+    best = refine(scene, replace(room, gain=gain, dielectric=dielectric), signs=signs)
+    for plane in (sign * room.gain < 0)[0].nonzero()[:, 0].tolist():
+        tried = [best]
+        for half_period in (-0.5, 0.5):
+            offset, gain = best.offset.clone(), best.gain.clone()
+            offset[0, plane] = room.offset[0, plane] + half_period * phase_period_m(scene, room, plane)
+            gain[0, plane] = sign[0, plane] * DIELECTRIC_GAIN
+            tried.append(replace(best, offset=offset, gain=gain))
+        best = min(refine_all(scene, tried, signs=signs), key=lambda r: float(r.score))
+    return best if advantage(*_held_out([best, room], splits, 8)) > config.significance else room

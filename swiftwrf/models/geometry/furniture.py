@@ -3,12 +3,13 @@
 Surfaces of limited extent, such as table tops, are planes that reflect in some cells only.
 The path of an image reflects at planes w in cells c and crosses voxels v along lengths l_v. Its gain
 
-    a = exp(-sum_v absorption_v l_v) prod_w sign_w reflectivity_wc
+    a = exp(-sum_v absorption_v l_v) prod_w sign_w reflectivity_wc f_w
 
-depends on the position, because furniture hides paths from parts of a room. Measured channels x and the field h of the gains
-determine absorption and reflectivity: the mean of 1 - coherence(x, h) and a penalty are minimised. The penalty contains the
-total variation (L. I. Rudin, S. Osher and E. Fatemi, Physica D 60, 1992). Held-out positions choose its weight and the size
-of the voxels, and decide whether furniture explains the channels better than planes alone.
+depends on the position, because furniture hides paths from parts of a room. The factor f_w depends on the angle of incidence
+if the plane is a dielectric. Otherwise it is 1. Measured channels x and the field h of the gains determine absorption and
+reflectivity: the mean of 1 - coherence(x, h) and a penalty are minimised. The penalty contains the total variation
+(L. I. Rudin, S. Osher and E. Fatemi, Physica D 60, 1992). Held-out positions choose its weight and the size of the voxels,
+and decide whether furniture explains the channels better than planes alone.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from torch.nn.functional import softplus
 from swiftwrf.errors import InputError
 from swiftwrf.models.geometry.channels import Channels, coherence, field, waves
 from swiftwrf.models.geometry.images import MAX_COSINE, PhaseObservations, PlaneSet, Sequence, mirror
-from swiftwrf.models.geometry.planes import Plane, advantage, log_explained, plane_set
+from swiftwrf.models.geometry.planes import Plane, advantage, log_explained, plane_set, robust_advantage
 from swiftwrf.models.geometry.surfaces import find_surfaces
 from swiftwrf.plotting import Axes, corners_of, hatch, plan_map
 from swiftwrf.runtime.checkpoint import Header, expect
@@ -45,7 +46,7 @@ SETTINGS = ((2.0, 1e-3), (1.0, 1e-3), (2.0, 3e-3), (2.0, 3e-4))
 SIGNIFICANCE = 2.5  # standard errors by which furniture must explain held-out channels better
 SURFACE_SIGNIFICANCE = 2.5  # the same of each surface
 MAX_CHOICE = 200  # positions that choose the settings
-MIN_HELD_OUT = 60  # positions in the folds that are held out for it, if there are as many
+MIN_HELD_OUT = 60  # positions in the folds that are held out to choose, if there are as many; all folds decide
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +57,8 @@ class Furniture:
         low: Corner of the first voxel, float64 (3,) [m].
         voxel_m: Edge of the voxels [m].
         absorption: Absorption of the amplitude, float32 (X, Y, Z) [1 / m].
-        reflectivity: Modulus of the reflection gain of each plane by cells, float32 (P, cells). Cells are voxels projected
-            along the axis that is closest to the normal.
+        reflectivity: Modulus of the reflection gain of each plane by cells, float32 (P, cells), at normal incidence. Cells
+            are voxels projected along the axis that is closest to the normal.
         crossed_m: Length of the measured paths in each voxel, float32 (X, Y, Z) [m]. Where it is 0, absorption is unknown.
         penalty: Weight of the penalty that held-out positions chose.
         surfaces: Reflecting surfaces besides the planes of the room, after which their rows of `reflectivity` come.
@@ -146,7 +147,7 @@ class Furniture:
             found = padded.index_select(0, group.voxel.flatten()).view(group.voxel.shape)
             return (-found.sum(-1) * group.step_m).exp()
 
-        return _gains(self._crossings(planes, scene), planes, transmission, self.reflectivity)
+        return _gains(self._crossings(planes, scene), _factor(planes, scene), transmission, self.reflectivity)
 
     def in_plan(self, low_m: float = -math.inf, high_m: float = math.inf) -> tuple[Floats, Floats, Floats]:
         """Return what stands between two heights, seen from above.
@@ -292,13 +293,20 @@ def _straight(start: Tensor, ray: Tensor, at: Tensor) -> Tensor:
 
 
 def _gains(
-    crossings: list[_Crossings], planes: PlaneSet, transmission: Callable[[_Crossings], Tensor], reflectivity: Tensor
+    crossings: list[_Crossings], factor: Tensor, transmission: Callable[[_Crossings], Tensor], reflectivity: Tensor
 ) -> Tensor:
     """Return the gains (n, 1 + S) of all paths; `transmission` gives those of a group without its reflections, (n, S)."""
-    sign = replace(planes, gain=planes.gain.sign()).image_gain[0] if planes.sequence else torch.ones(0)
     gain = [transmission(group) * reflectivity.flatten()[group.cell].prod(-1) * group.exists for group in crossings]
     order = torch.cat([group.image for group in crossings]).argsort()
-    return torch.cat(gain, dim=1)[:, order] * torch.cat([torch.ones(1), sign])
+    return torch.cat(gain, dim=1)[:, order] * factor
+
+
+def _factor(planes: PlaneSet, scene: PhaseObservations) -> Tensor:
+    """Return the gains of all paths of reflectivity 1 without absorption, (n or 1, 1 + S)."""
+    if not planes.sequence:
+        return torch.ones(1, 1)
+    sign = replace(planes, gain=planes.gain.sign()).image_gain[0]
+    return torch.nn.functional.pad(planes.angular_factor(scene)[0].T * sign, (1, 0), value=1.0)
 
 
 class _Depth(torch.autograd.Function):
@@ -340,7 +348,7 @@ def orders(sequence: tuple[Sequence, ...], normal: tuple[tuple[float, ...], ...]
 def fit_furniture(planes: PlaneSet, measured: Channels, start: Furniture) -> Furniture:
     """Fit absorption and reflectivity to measured channels, with voxels, penalty and surfaces of `start`."""
     scene, observed = measured.scene, measured.value
-    wave = waves(planes, scene, measured.frequency)
+    wave, factor = waves(planes, scene, measured.frequency), _factor(planes, scene)
     crossings = start._crossings(planes, scene)
     shape = [size + 2 for size in start.absorption.shape]
     parts = [group.lengths(math.prod(shape)) for group in crossings]
@@ -362,7 +370,7 @@ def fit_furniture(planes: PlaneSet, measured: Channels, start: Furniture) -> Fur
             depth: Tensor = _Depth.apply(values, *sparse[id(group)])
             return (-depth).exp().view_as(group.step_m)
 
-        gain = _gains(crossings, planes, transmission, reflectivity)
+        gain = _gains(crossings, factor, transmission, reflectivity)
         penalty = 10 * start.voxel_m**3 * absorption.sum() + area * _variation(absorption)
         for number, (axis, values) in enumerate(zip(normal.abs().argmax(-1).tolist(), reflectivity, strict=True)):
             sides = [size for other, size in enumerate(absorption.shape) if other != axis]
@@ -385,13 +393,13 @@ def fit_furniture(planes: PlaneSet, measured: Channels, start: Furniture) -> Fur
 
 @single_thread()
 def find_furniture(
-    planes: PlaneSet, constant: Tensor, measured: Channels, corners: Tensor, fold: Tensor
+    planes: PlaneSet, free: Tensor, measured: Channels, corners: Tensor, fold: Tensor
 ) -> Furniture | None:
     """Estimate what stands in a room; None if it does not explain held-out channels better than planes alone.
 
     Args:
         planes: Planes of one room.
-        constant: Gains of the paths without furniture, (1 + S,).
+        free: Gains of the paths without furniture, (n, 1 + S).
         measured: Measured channels.
         corners: Points (m, 3) [m] that the voxels surround, besides the measured positions.
         fold: Fold of each position.
@@ -408,44 +416,49 @@ def find_furniture(
         empty.append(Furniture(low, voxel, torch.zeros(shape), cells, torch.zeros(shape), penalty))
     some = torch.linspace(0, len(fold) - 1, min(MAX_CHOICE, len(fold))).long()
     chosen, fold = measured.subset(some), fold[some]
-    numbers = fold.unique()[: max(2, math.ceil(MIN_HELD_OUT * len(fold.unique()) / len(fold)))]
-    splits = [((fold != number).nonzero()[:, 0], (fold == number).nonzero()[:, 0]) for number in numbers]
+    splits = [((fold != number).nonzero()[:, 0], (fold == number).nonzero()[:, 0]) for number in fold.unique()]
+    few = max(2, math.ceil(MIN_HELD_OUT * len(splits) / len(fold)))
 
     def fitted(task: tuple[Furniture, tuple[Tensor, Tensor]]) -> Furniture:
         start, (kept, _) = task
         return fit_furniture(start.joined(planes), chosen.subset(kept), start)
 
-    def explained(furniture: list[Furniture]) -> Tensor:
-        """Return how well furniture, fitted without each fold, explains the channels of the fold."""
+    def coherences(furniture: list[Furniture]) -> Tensor:
+        """Return the coherence at positions of the first folds of furniture that is fitted without each of these folds."""
         found = []
-        for each, (_, held) in zip(furniture, splits, strict=True):
+        for each, (_, held) in zip(furniture, splits, strict=False):
             test, both = chosen.subset(held), each.joined(planes)
-            found.append(log_explained(test.coherence(both, each.gains(both, test.scene))))
+            found.append(test.coherence(both, each.gains(both, test.scene)))
         return torch.cat(found)
 
-    fits = parallel_map(fitted, [(start, split) for start in empty for split in splits])
-    with_furniture = [explained(fits[row : row + len(splits)]) for row in range(0, len(fits), len(splits))]
-    best = max(range(len(empty)), key=lambda row: float(with_furniture[row].mean()))
-    held = chosen.subset(torch.cat([held for _, held in splits]))
-    alone = log_explained(held.coherence(planes, constant.expand(len(held.value), -1)))
-    is_furnished = advantage(with_furniture[best], alone) > SIGNIFICANCE
+    fits = [parallel_map(fitted, [(start, split) for split in splits[:few]]) for start in empty]
+    best = max(range(len(empty)), key=lambda row: float(log_explained(coherences(fits[row])).mean()))
+    with_furniture = coherences(fits[best] + parallel_map(fitted, [(empty[best], split) for split in splits[few:]]))
+    held = torch.cat([held for _, held in splits])
+    alone = chosen.subset(held).coherence(planes, free[some][held])
+    is_furnished = robust_advantage(with_furniture, alone) > SIGNIFICANCE
     # without furniture a strong penalty is best, but leaves too much in the residual to find walls that are hidden at times
     best = best if is_furnished else 0
     found = fit_furniture(planes, measured, empty[best])
     surfaces = find_surfaces(planes, found.gains(planes, measured.scene), measured, low, high)
     if surfaces:
-        wider = empty[best].with_surfaces(surfaces)
-        fits = parallel_map(fitted, [(wider, split) for split in splits])
-        whole, n = explained(fits), planes.gain.shape[1]
+        wider, n = empty[best].with_surfaces(surfaces), planes.gain.shape[1]
+        wider_fits = parallel_map(fitted, [(wider, split) for split in splits])
+        whole = coherences(wider_fits)
         kept = [
             surface
             for row, surface in enumerate(surfaces)
-            if advantage(whole, explained([fit.with_reflectivity(n + row, 0.0) for fit in fits])) > SURFACE_SIGNIFICANCE
+            if _log_advantage(whole, coherences([fit.with_reflectivity(n + row, 0.0) for fit in wider_fits]))
+            > SURFACE_SIGNIFICANCE
         ]
-        if kept and min(advantage(whole, other) for other in (with_furniture[best], alone)) > SIGNIFICANCE:
+        if kept and min(_log_advantage(whole, other) for other in (with_furniture, alone)) > SIGNIFICANCE:
             wider = empty[best].with_surfaces(kept)
             return fit_furniture(wider.joined(planes), measured, wider)
     return found if is_furnished else None
+
+
+def _log_advantage(a: Tensor, b: Tensor) -> float:
+    return advantage(log_explained(a), log_explained(b))
 
 
 def _variation(values: Tensor) -> Tensor:

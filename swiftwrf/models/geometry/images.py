@@ -41,6 +41,7 @@ class PlaneSet:
         gain: Reflection gains, float32 (B, P).
         order: Highest number of reflections of an image.
         only: Sequences of reflections of the images to compute. Defaults to all up to the order.
+        dielectric: Planes whose gains depend on the angle of incidence, bool (P,), see `Plane`. Defaults to none.
         score: 1 - the mean coherence of each room with the positions where it was last refined, (B,) or nan.
     """
 
@@ -50,6 +51,7 @@ class PlaneSet:
     order: int = 2
     only: tuple[Sequence, ...] | None = None
     score: Tensor = UNKNOWN
+    dielectric: Tensor | None = None
 
     @classmethod
     def on_sides(cls, planes: dict[int, tuple[float, float]], order: int = 2, score: float = math.nan) -> PlaneSet:
@@ -83,6 +85,24 @@ class PlaneSet:
             found.append(last)
         return torch.cat(found, dim=1)[:, tree.rows]
 
+    def angular_factor(self, scene: PhaseObservations) -> Tensor:
+        """Return the gain of each image at the positions of a scene, divided by `image_gain`, (B, S, n or 1)."""
+        if self.dielectric is None:
+            return torch.ones(1, len(self.sequence), 1)
+        return (self.plane_factor(scene) ** reflections(self.sequence, self.gain.shape[1])[..., None]).prod(1)
+
+    def plane_factor(self, scene: PhaseObservations) -> Tensor:
+        """Return the gain of each plane on the path of each image, divided by `gain`, (B, P, S, n or 1).
+
+        The ray of the image determines the angles at all planes if these are parallel or perpendicular.
+        """
+        if self.dielectric is None:
+            return torch.ones(1, 1, 1, 1)
+        ray = (images(scene, self) - scene.receiver).float()
+        ray = torch.nn.functional.normalize(ray, dim=-1)[:, None]
+        factor = _fresnel_factor(self.gain[..., None, None], self.normal.float()[:, :, None, None], ray)
+        return factor.where(self.dielectric[:, None, None], 1.0)
+
     def shifted(self, by: Tensor) -> PlaneSet:
         """Return the planes in coordinates whose origin is at `-by` (3,) [m]."""
         return replace(self, offset=self.offset + self.normal @ by)
@@ -90,12 +110,17 @@ class PlaneSet:
     def without(self, plane: int) -> PlaneSet:
         """Return the other planes."""
         keep = [i for i in range(self.normal.shape[1]) if i != plane]
-        return replace(self, normal=self.normal[:, keep], offset=self.offset[:, keep], gain=self.gain[:, keep])
+        dielectric = None if self.dielectric is None else self.dielectric[keep]
+        normal, offset, gain = (values[:, keep] for values in (self.normal, self.offset, self.gain))
+        return replace(self, normal=normal, offset=offset, gain=gain, dielectric=dielectric)
 
     def joined(self, other: PlaneSet) -> PlaneSet:
-        """Return these planes with those of another set."""
+        """Return these planes with those of another set, whose gains are constant."""
         normal, offset = torch.cat([self.normal, other.normal], dim=1), torch.cat([self.offset, other.offset], dim=1)
-        return replace(self, normal=normal, offset=offset, gain=torch.cat([self.gain, other.gain], dim=1))
+        gain, dielectric = torch.cat([self.gain, other.gain], dim=1), self.dielectric
+        if dielectric is not None:
+            dielectric = torch.nn.functional.pad(dielectric, (0, other.gain.shape[1]))
+        return replace(self, normal=normal, offset=offset, gain=gain, dielectric=dielectric)
 
     def field(self, scene: PhaseObservations) -> Tensor:
         """Return the field with the direct wave at the positions of a scene, (n, 2 K, B)."""
@@ -299,6 +324,39 @@ def tree_of(sequence: tuple[Sequence, ...]) -> Tree:
     return Tree(levels, torch.tensor([row[s] for s in sequence]))
 
 
+@lru_cache(maxsize=1024)
+def reflections(sequence: tuple[Sequence, ...], planes: int) -> Tensor:
+    """Return how many times each plane reflects each sequence, (P, S)."""
+    return torch.tensor([[float(s.count(plane)) for s in sequence] for plane in range(planes)])
+
+
+def _fresnel_factor(gain: Tensor, normal: Tensor, ray: Tensor) -> Tensor:
+    """Return the Fresnel reflection coefficient of vertically polarised waves, relative to that at normal incidence.
+
+    The components of the electric field perpendicular and parallel to the plane of incidence are reflected by
+
+        r_s = (root - c) / (root + c),    r_p = (e c - root) / (e c + root),    root = sqrt(e - 1 + c^2),
+
+    with cosine c of the angle of incidence and relative permittivity e. The polarisation that the reflection turns away
+    from the vertical is lost.
+
+    Args:
+        gain: Gain g at normal incidence, which determines the permittivity, sqrt(e) = (1 + |g|) / (1 - |g|).
+        normal: Unit normal of the plane, (..., 3).
+        ray: Unit vector along the ray, (..., 3).
+    """
+    gain = gain.abs().clamp(0.02, 0.98)
+    permittivity = ((1 + gain) / (1 - gain)).square()
+    cosine = (ray * normal).sum(-1).abs()
+    across = (ray[..., 0] * normal[..., 1] - ray[..., 1] * normal[..., 0]).square()
+    # fraction of the power that is perpendicular to the plane of incidence; any at normal incidence
+    across = (across / ((1 - cosine.square()) * (1 - ray[..., 2].square())).clamp_min(1e-6)).clamp_max(1.0)
+    root = (permittivity - 1 + cosine.square()).sqrt()
+    perpendicular = (root - cosine) / (root + cosine)
+    parallel = (permittivity * cosine - root) / (permittivity * cosine + root)
+    return (across * perpendicular + (1 - across) * parallel) / gain
+
+
 def mirror(source: Tensor, normal: Tensor, offset: Tensor) -> Tensor:
     """Return sources (3, ...) [m] mirrored in planes normal . x = offset; the shapes (3, ...) and (...) broadcast.
 
@@ -329,7 +387,8 @@ def field(scene: PhaseObservations, planes: PlaneSet) -> Tensor:
     if not planes.sequence:
         return torch.zeros(len(scene), 2 * len(scene.element), len(planes.offset))
     ray = (images(scene, planes) - scene.receiver).permute(3, 1, 2, 0).float().contiguous()
-    strength = (planes.image_gain[..., None] * visibility(scene, planes)).permute(1, 2, 0)
+    gain = planes.image_gain[..., None] * planes.angular_factor(scene)
+    strength = (gain * visibility(scene, planes)).permute(1, 2, 0)
     size = max(1, 2**15 // max(1, ray[0, 0].numel()))  # there may be no rooms
     total = torch.zeros(())
     for some, part in zip(ray.split(size, dim=1), strength.split(size), strict=True):

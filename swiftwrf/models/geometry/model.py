@@ -119,8 +119,8 @@ class GeometryModel(Linked, FieldModel):
         self.furniture = None
         if train.channel is not None and self.planes:
             measured, fold = self.channels(train), folds(train.position, self.config.validation, self.config.seed)
-            constant = self.gains(measured.scene)[0]
-            self.furniture = find_furniture(self.tensors(), constant, measured, self.region(), fold)
+            free = self.gains(measured.scene)
+            self.furniture = find_furniture(self.tensors(), free, measured, self.region(), fold)
 
     def furnished_on(self, train: Spectra) -> Self:
         """Return the room with its furniture fitted to the channels of other spectra, without another choice of options."""
@@ -210,8 +210,10 @@ class GeometryModel(Linked, FieldModel):
         room = self.reflectors
         if self.furniture is not None:
             return self.furniture.gains(room, scene)
-        constant = torch.cat([torch.ones(1), room.image_gain[0]]) if room.sequence else torch.ones(1)
-        return constant.expand(len(scene), -1)
+        if not room.sequence:
+            return torch.ones(len(scene), 1)
+        reflected = room.image_gain[0] * room.angular_factor(scene)[0].T
+        return torch.nn.functional.pad(reflected, (1, 0), value=1.0).expand(len(scene), -1)
 
     @checked
     def paths(self, position: Numbers) -> pd.DataFrame:

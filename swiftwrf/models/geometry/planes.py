@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
 from typing import Annotated, Any
 
 import torch
@@ -20,6 +19,7 @@ from swiftwrf.models.geometry.images import (
     images,
     mirror,
     phase_period_m,
+    reflections,
     tree_of,
     visibility,
 )
@@ -38,9 +38,10 @@ class Plane:
     Args:
         normal: Unit vector out of the room.
         offset_m: Offset [m].
-        gain: Reflection gain (amplitude) with its sign.
+        gain: Reflection gain (amplitude) with its sign, of a dielectric that at normal incidence.
         std_mm: Standard deviation of the offset [mm].
         certain: No alternative offset explains the spectra nearly as well, and held-out spectra need the plane.
+        dielectric: The gain depends on the angle of incidence by Fresnel's equations for vertically polarised antennas.
 
     Raises:
         InputError: A normal that is no unit vector, or a number that is not finite.
@@ -51,6 +52,7 @@ class Plane:
     gain: float
     std_mm: NonNegativeFloat = 0.0
     certain: bool = True
+    dielectric: bool = False
 
     def check(self) -> None:
         """Refuse a normal of another length and infinite numbers."""
@@ -103,7 +105,8 @@ def plane_set(planes: list[Plane], order: int) -> PlaneSet:
     """Return the planes of one room as tensors."""
     normal = torch.tensor([p.normal for p in planes], dtype=torch.float64).reshape(1, -1, 3)
     offset = torch.tensor([[p.offset_m for p in planes]], dtype=torch.float64)
-    return PlaneSet(normal, offset, torch.tensor([[p.gain for p in planes]]), order)
+    dielectric = torch.tensor([p.dielectric for p in planes]) if any(p.dielectric for p in planes) else None
+    return PlaneSet(normal, offset, torch.tensor([[p.gain for p in planes]]), order, dielectric=dielectric)
 
 
 def phase_jacobian(scene: PhaseObservations, planes: PlaneSet, movement: Tensor) -> tuple[Tensor, Tensor]:
@@ -124,7 +127,7 @@ def phase_jacobian(scene: PhaseObservations, planes: PlaneSet, movement: Tensor)
     """
     ray = (images(scene, planes) - scene.receiver).permute(3, 0, 1, 2).float().contiguous()
     phase, length = scene.phases(ray)
-    amplitude = planes.image_gain[..., None] * visibility(scene, planes) / length
+    amplitude = planes.image_gain[..., None] * planes.angular_factor(scene) * visibility(scene, planes) / length
     wave = torch.complex(phase.cos() * amplitude, phase.sin() * amplitude)  # (K, B, S, n)
     total = scene.wave(scene.transmitter).T[:, None] + wave.sum(2)
     safe = torch.where(total.abs() < MIN_FIELD, torch.full_like(total, MIN_FIELD), total)
@@ -136,10 +139,9 @@ def phase_jacobian(scene: PhaseObservations, planes: PlaneSet, movement: Tensor)
     moved = torch.zeros(())
     for e, u, dx in zip(scene.element.T, unit, movement, strict=True):
         moved = moved + _over_images((real * e[:, None, None, None]).addcmul_(along, u, value=-1), dx)
-    gain = planes.gain
-    safe_gain = torch.where(gain.abs() < MIN_GAIN, torch.full_like(gain, MIN_GAIN), gain)
-    scaled = (_reflections(planes.sequence, gain.shape[1]) / safe_gain[..., None]) @ imaginary
-    return total, torch.cat([moved[:, :, : gain.shape[1]], scaled, moved[:, :, gain.shape[1] :]], dim=2)
+    scaled = _over_images(imaginary, _log_gain_slope(planes, scene))
+    n_planes = planes.gain.shape[1]
+    return total, torch.cat([moved[:, :, :n_planes], scaled, moved[:, :, n_planes:]], dim=2)
 
 
 def _over_images(values: Tensor, weights: Tensor) -> Tensor:
@@ -149,10 +151,19 @@ def _over_images(values: Tensor, weights: Tensor) -> Tensor:
     return torch.einsum("kbsn,brsn->kbrn", values, weights)
 
 
-@lru_cache(maxsize=1024)
-def _reflections(sequence: tuple[Sequence, ...], planes: int) -> Tensor:
-    """Return how many times each plane reflects each sequence, (P, S)."""
-    return torch.tensor([[float(s.count(plane)) for s in sequence] for plane in range(planes)])
+def _log_gain_slope(planes: PlaneSet, scene: PhaseObservations) -> Tensor:
+    """Return the derivatives of the logarithms of the images' gains with respect to those of planes, (B, P, S, n or 1)."""
+    count, gain, step = (
+        reflections(planes.sequence, planes.gain.shape[1])[..., None],
+        planes.gain[..., None, None],
+        1e-3,
+    )
+    here = gain * planes.plane_factor(scene)
+    safe = torch.where(here.abs() < MIN_GAIN, torch.full_like(here, MIN_GAIN), here)
+    if planes.dielectric is None:
+        return count / safe
+    beside = (gain + step) * replace(planes, gain=planes.gain + step).plane_factor(scene)
+    return count * (beside - here) / (step * safe)
 
 
 def image_jacobian(planes: PlaneSet, transmitter: Tensor, tilt: bool = False) -> Tensor:
@@ -269,7 +280,8 @@ def refine_all(scene: PhaseObservations, rooms: list[PlaneSet], steps: int = 10,
         normal, offset, gain = (
             torch.cat([getattr(rooms[i], name) for i in numbers]) for name in ("normal", "offset", "gain")
         )
-        together = refine(scene, PlaneSet(normal, offset, gain, only=sequence), steps, **options)
+        start = replace(rooms[numbers[0]], normal=normal, offset=offset, gain=gain, only=sequence)
+        together = refine(scene, start, steps, **options)
         parts = (t.split(1) for t in (together.normal, together.offset, together.gain, together.score))
         for number, n, o, g, score in zip(numbers, *parts, strict=True):
             found[number] = replace(rooms[number], normal=n, offset=o, gain=g, score=score)

@@ -21,12 +21,12 @@ from swiftwrf.models.geometry.images import PlaneSet, mirror
 from swiftwrf.models.geometry.planes import Plane
 from swiftwrf.runtime.threads import parallel_map
 
-MAX_SURFACES = 6
+MAX_SURFACES = 8
 MAX_STARTS = 40  # local maxima that are followed
-SIGNIFICANCE = 2.0  # standard errors of the improvement; more than chance, because furniture that is fitted decides
+SIGNIFICANCE = 1.0  # standard errors of the improvement; little, because held-out positions decide
 START_GAIN = 0.12
 RARITY = 1.2  # factor by which a sign that most planes do not have must explain more; a small shift may imitate it
-SIDE_LOBE = 0.2  # of the strongest improvement: less may be left of a surface that is modelled imperfectly
+SIDE_LOBE = 0.05  # of the strongest improvement: less may be left of a surface that is modelled imperfectly
 MARGIN = 2.0  # wavelengths beyond the voxels
 OPEN_MARGIN_M = 3.0  # the same on a side without a plane, whose wall may be one that is hidden from most positions
 STEP = 1 / 12  # of the offsets of the scan, in wavelengths

@@ -75,7 +75,9 @@ def assess(
         away = reach if all_lost else distance if lead <= certainty else 0.0
         x, y, z = room.normal[0, i].tolist()
         offset, gain = float(room.offset[0, i]), float(room.gain[0, i])
-        planes.append(Plane((x, y, z), offset, gain, 1000 * max(std[i], away), not (lost[i] or all_lost)))
+        dielectric = room.dielectric is not None and bool(room.dielectric[i])
+        std_mm, certain = 1000 * max(std[i], away), not (lost[i] or all_lost)
+        planes.append(Plane((x, y, z), offset, gain, std_mm, certain, dielectric))
     conclusion = f"{len(planes)} planes, {sum(plane.certain for plane in planes)} of them certain{reason}"
     return RoomEstimate(planes, room.order, score, unexplained, conclusion, covariance)
 
@@ -100,9 +102,8 @@ def _nearest_alternative(
     offset = room.offset.repeat(len(beside), 1)
     offset[:, plane] += beside
     rest, own = ([s for s in room.sequence if (plane in s) == of_plane] for of_plane in (False, True))
-    scanned = PlaneSet(
-        room.normal.expand(len(offset), -1, -1), offset, room.gain.expand(len(offset), -1), only=tuple(own)
-    )
+    normal, gain = room.normal.expand(len(offset), -1, -1), room.gain.expand(len(offset), -1)
+    scanned = replace(room, normal=normal, offset=offset, gain=gain, only=tuple(own))
     value = scene.score(replace(room, only=tuple(rest)).field(scene) + field(scene, scanned))
     moved = room.offset.clone()
     moved[:, plane] += beside[value.argmin()]

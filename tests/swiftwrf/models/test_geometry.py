@@ -333,7 +333,7 @@ def test_the_same_seed_finds_the_same_room(noisy):
 def test_json_and_images_describe_the_room(room):
     content = room.to_json()
     assert set(content) == {"planes", "order", "score_held_out", "unexplained"}
-    assert set(content["planes"][0]) == {"normal", "offset_m", "gain", "std_mm", "certain"}
+    assert set(content["planes"][0]) == {"normal", "offset_m", "gain", "std_mm", "certain", "dielectric"}
     position, gain, order = room.image_sources()
     assert len(position) == len(gain) == len(order) == 25
     assert torch.equal(position[0], room.fixed_position)
