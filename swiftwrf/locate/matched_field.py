@@ -48,7 +48,6 @@ from swiftwrf.runtime.validation import Configured, NonNegativeInt, PositiveInt,
 FOLDS = 5
 START_WEIGHTS = (0.05, 0.05, 0.3)  # of the likelihoods, by which the calibration searches
 START_WEIGHTS_CHANNEL = (0.5, 0.05)
-CHANNEL_SPLITS = 3  # times as many cells are split for channels, whose likelihood is narrower than a cell
 CHANNEL_CELLS = 8  # times as many first cells for channels, which are not computed at each of them
 CHANNEL_PARTS = 4  # along each edge of a cell with paths of its own
 MIN_FLOOR = 1e-4  # of missing coherence, by rounding
@@ -303,7 +302,6 @@ class MatchedField(Configured, Saved):
         """Yield cells (b, m) and log-likelihoods (k, b, m) of some observations at a time."""
         generator = torch.Generator().manual_seed(self.config.seed)
         config = self.config
-        n_split = config.n_split * (CHANNEL_SPLITS if self.n_snapshots else 1)
         for rows in torch.arange(len(observed)).split(16):  # likelihoods at all cells: 26 MB at most
             part = observed.subset(rows)
 
@@ -316,7 +314,7 @@ class MatchedField(Configured, Saved):
             cells = best_cells(self.cells, total.neg_(), config.n_best, config.n_background, generator)
             values = evaluate(cells.position)
             for _ in range(config.n_rounds):
-                cells, values = refined(cells, self._log_mass(cells, values), values, evaluate, n_split)
+                cells, values = refined(cells, self._log_mass(cells, values), values, evaluate, config.n_split)
             yield cells, values
 
     def _log_mass(self, cells: Cells, values: Tensor) -> Tensor:
