@@ -91,6 +91,7 @@ def _descend(phase: Tensor, observed: Tensor, a: Tensor, b: Tensor, lag: Tensor)
     difference[torch.arange(len(a)), a], difference[torch.arange(len(a)), b] = 1, -1
     gather = torch.zeros(int(lag.max()) + 1, len(a), dtype=torch.float64)
     gather[lag, torch.arange(len(a))] = 1 / k**2
+    slope = (gather.T[:, :, None] * difference[:, None]).flatten(1)  # from products to derivatives by each phase
 
     def residual(x: Tensor) -> tuple[Tensor, Tensor]:
         product = torch.polar(torch.ones(n, len(a), dtype=torch.float64), x @ difference.T)
@@ -99,8 +100,8 @@ def _descend(phase: Tensor, observed: Tensor, a: Tensor, b: Tensor, lag: Tensor)
     damping = torch.full((n,), 1e-2, dtype=torch.float64)
     product, missed = residual(phase)
     for _ in range(40):
-        jacobian = torch.einsum("lp,np,pk->nlk", gather.to(product.dtype), 1j * product, difference.to(product.dtype))
-        jacobian = torch.view_as_real(jacobian).permute(0, 1, 3, 2).flatten(1, 2)
+        jacobian = torch.view_as_real(1j * product).mT @ slope
+        jacobian = jacobian.unflatten(2, (-1, k)).transpose(1, 2).flatten(1, 2)
         normal = jacobian.mT @ jacobian
         normal = normal + (damping * normal.diagonal(dim1=1, dim2=2).mean(1) + 1e-15)[:, None, None] * torch.eye(k)
         step = -torch.linalg.solve(normal, (jacobian.mT @ missed[..., None]))[..., 0]
