@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.data.store import Store
-from swiftwrf.gp.process import N_NEIGHBOURS, Kernel, candidates, leave_folds_out, local_weights
+from swiftwrf.gp.process import N_NEIGHBOURS, Kernel, candidates, held_out_errors, leave_folds_out, local_weights
 from swiftwrf.positions import Neighbours, distance
 from swiftwrf.runtime.threads import single_thread
 
@@ -54,11 +54,14 @@ def choose_kernel(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> K
 
 def _held_out_errors(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> Callable[[Kernel], Tensor]:
     """Return the function from a kernel to the squared errors (n,) of all spectra, each predicted without its fold."""
-    gram = inner_products(spectrum[:])
+    gram, apart = inner_products(spectrum[:]), distance(position.double(), position.double())
+    groups = [(fold == number).nonzero()[:, 0] for number in fold.unique()]
 
     def evaluate(kernel: Kernel) -> Tensor:
-        parts = leave_folds_out(kernel, position, fold)
-        return torch.cat([squared_errors(gram, part.out, part.kept, part.weight) for part in parts])
+        precision = torch.linalg.inv(kernel.at(apart) + kernel.noise * torch.eye(len(apart)))
+        # weights of all rows in the error of each row: 1 of the row itself, negative ones of those that predict it
+        weight = torch.cat([held_out_errors(precision, precision, out) for out in groups])
+        return ((weight @ gram) * weight).sum(1)
 
     return evaluate
 
