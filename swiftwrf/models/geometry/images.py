@@ -368,11 +368,14 @@ def mirror(source: Tensor, normal: Tensor, offset: Tensor) -> Tensor:
 def images(scene: PhaseObservations, planes: PlaneSet) -> Tensor:
     """Return the image positions, float64 (B, S, n or 1, 3) [m]."""
     normal, offset, tree = planes.normal, planes.offset, tree_of(planes.sequence)
-    last, found = scene.transmitter.T[:, None, None].expand(-1, len(normal), 1, -1), []
+    # the origin and the ends of the unit vectors are mirrored, and positions follow by one product
+    frame = torch.cat([torch.zeros(3, 1), torch.eye(3)], dim=1).double()
+    last, found = frame[:, None, None].expand(-1, len(normal), 1, -1), []
     for parent, plane in tree.levels:
         last = mirror(last[:, :, parent], normal[:, plane].movedim(-1, 0)[..., None], offset[:, plane, None])
         found.append(last)
-    return torch.cat(found, dim=2)[:, :, tree.rows].movedim(0, -1)
+    origin, ends = torch.cat(found, dim=2)[:, :, tree.rows].split([1, 3], dim=-1)
+    return (origin + (ends - origin) @ scene.transmitter.T).movedim(0, -1)
 
 
 def phase_period_m(scene: PhaseObservations, room: PlaneSet, plane: int) -> float:
@@ -394,7 +397,7 @@ def field(scene: PhaseObservations, planes: PlaneSet) -> Tensor:
     for some, part in zip(ray.split(size, dim=1), strength.split(size), strict=True):
         phase, length = scene.phases(some)
         amplitude = part / length
-        total = total + torch.stack([(phase.cos() * amplitude).sum(1), (phase.sin() * amplitude).sum(1)])
+        total = total + torch.stack([phase.cos().mul_(amplitude).sum(1), phase.sin_().mul_(amplitude).sum(1)])
     return total.permute(2, 0, 1, 3).flatten(1, 2)
 
 
