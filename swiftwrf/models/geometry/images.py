@@ -26,6 +26,7 @@ N_POSITIONS = 36  # that many rooms are scored at
 MAX_DISTANCE_M = 1e7  # from the fixed end; beyond, only the direction counts, because rounding destroys the phases
 # outward normals
 SIDES = torch.tensor([[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], dtype=torch.float64)
+FRAME = torch.cat([torch.zeros(3, 1), torch.eye(3)], dim=1).double()  # origin and ends of the unit vectors, (3, 4)
 UNKNOWN = torch.tensor([math.nan])  # score of a room that was not refined
 
 Sequence = tuple[int, ...]
@@ -369,8 +370,7 @@ def images(scene: PhaseObservations, planes: PlaneSet) -> Tensor:
     """Return the image positions, float64 (B, S, n or 1, 3) [m]."""
     normal, offset, tree = planes.normal, planes.offset, tree_of(planes.sequence)
     # the origin and the ends of the unit vectors are mirrored, and positions follow by one product
-    frame = torch.cat([torch.zeros(3, 1), torch.eye(3)], dim=1).double()
-    last, found = frame[:, None, None].expand(-1, len(normal), 1, -1), []
+    last, found = FRAME[:, None, None].expand(-1, len(normal), 1, -1), []
     for parent, plane in tree.levels:
         last = mirror(last[:, :, parent], normal[:, plane].movedim(-1, 0)[..., None], offset[:, plane, None])
         found.append(last)
