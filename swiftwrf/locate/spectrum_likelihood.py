@@ -315,12 +315,12 @@ class PhaseLikelihood:
     def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
         """Return log-likelihoods (m,) of m observations at m candidates, up to a constant of each observation."""
         mean, wave, phases = waves.channel[:, 0], waves.wave[:, :, 0], observed.phases
-        power = (self._variance[:, None] * wave.abs().square()).sum(dim=1).mean(dim=1) + mean.abs().square().mean(dim=1)
-        total = power * (1 + self._diffuse + self._floor)
         weighted = wave * self._variance.sqrt()[:, None]
-        spread = torch.einsum("msk,msl->mkl", weighted, weighted.conj()) / total[:, None, None]
+        spread = torch.einsum("msk,msl->mkl", weighted, weighted.conj())
+        power = spread.diagonal(dim1=1, dim2=2).real.mean(dim=1) + mean.abs().square().mean(dim=1)
+        total = power * (1 + self._diffuse + self._floor)
         rest = self._diffuse * self._isotropic + self._floor * torch.eye(wave.shape[2])
-        spread = spread + rest * (power / total)[:, None, None]
+        spread = (spread + rest * power[:, None, None]) / total[:, None, None]
         mean = mean / total.sqrt()[:, None]
         root = torch.linalg.cholesky(spread)
         white = torch.linalg.solve_triangular(root, torch.cat([mean[:, :, None], phases.mT], dim=2), upper=False)

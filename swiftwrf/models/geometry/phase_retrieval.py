@@ -25,9 +25,11 @@ def autocorrelation(channel: Tensor, array: PlanarArray) -> Tensor:
     """Return r(l) = sum of h_a conj(h_b) over the pairs with difference l, divided by K^2, (..., K) to (..., P)."""
     a, b, lag = pairs(array)
     element = channel.movedim(-1, 0).contiguous()
-    same = [lag == number for number in range(int(lag.max()) + 1)]
-    products = [torch.linalg.vecdot(element[b[some]], element[a[some]], dim=0) for some in same]
-    return torch.stack(products, dim=-1) / channel.shape[-1] ** 2
+    conjugate = element.conj().resolve_conj()
+    total = element.new_zeros(int(lag.max()) + 1, *element.shape[1:])
+    for first, second, number in zip(a.tolist(), b.tolist(), lag.tolist(), strict=True):
+        total[number].addcmul_(element[first], conjugate[second])
+    return total.movedim(0, -1) / channel.shape[-1] ** 2
 
 
 def correlations(spectra: Spectra) -> Tensor:
