@@ -148,7 +148,8 @@ def _dual_coefficients(kernel: NDArray[Any], target: NDArray[Any], alpha: float)
     interpolates the targets, a large one gives the targets themselves, and constant targets are reproduced exactly.
     """
     sums = kernel.sum(axis=1)
-    factor = cho_factor(kernel + np.diag(alpha * sums), lower=True, overwrite_a=True, check_finite=False)
+    by_columns = (kernel + np.diag(alpha * sums)).T  # the symmetric matrix in LAPACK's order, which needs no copy
+    factor = cho_factor(by_columns, lower=True, overwrite_a=True, check_finite=False)
     dual: NDArray[Any] = cho_solve(factor, sums[:, None] * target, check_finite=False)
     return (1 + alpha) * dual
 
