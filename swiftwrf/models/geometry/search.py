@@ -127,18 +127,15 @@ class SteeringResponses:
         stay, move = base + self._among(first, left), self._among(second, right)
         pairs = {j: [i for i in first if (i, j) in self.double] for j in second}
         crossed = [j for j, some in pairs.items() if some]
-        chosen = [functional.one_hot(right[j - half], size[j]).T for j in crossed]
+        if crossed:
+            rows_of = ([self.double[i, j].index_select(2, left[i]) for i in pairs[j]] for j in crossed)
+            between = torch.cat([torch.stack(waves).sum(0) for waves in rows_of], dim=-1)
+            chosen = torch.cat([functional.one_hot(right[j - half], size[j]).T for j in crossed]).float()
         found = []
         for rows in torch.arange(left.shape[1]).split(max(1, 1000 // right.shape[1])):
             total = stay.expand(-1, -1, left.shape[1])[:, :, rows, None] + move[:, :, None]
-            between = [
-                sum((self.double[i, j].index_select(2, left[i, rows]) for i in pairs[j]), start=torch.zeros(()))
-                for j in crossed
-            ]
-            if len(second) > 1 and between:
-                between = [torch.cat(between, dim=-1) @ torch.cat(chosen).float()]
-            for waves in between:
-                total += waves
+            if crossed:
+                total += between[:, :, rows] @ chosen
             found.append(scene.score(total.flatten(2)))
         return torch.cat(found).reshape(size)
 
