@@ -375,7 +375,8 @@ def images(scene: PhaseObservations, planes: PlaneSet) -> Tensor:
         last = mirror(last[:, :, parent], normal[:, plane].movedim(-1, 0)[..., None], offset[:, plane, None])
         found.append(last)
     origin, ends = torch.cat(found, dim=2)[:, :, tree.rows].split([1, 3], dim=-1)
-    return (origin + (ends - origin) @ scene.transmitter.T).movedim(0, -1)
+    position: Tensor = origin + (ends - origin) @ scene.transmitter.T
+    return position.movedim(0, -1)
 
 
 def phase_period_m(scene: PhaseObservations, room: PlaneSet, plane: int) -> float:
