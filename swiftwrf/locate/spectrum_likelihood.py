@@ -354,17 +354,19 @@ class PathLikelihood(PhaseLikelihood):
         count = channel.shape[1]  # snapshots at one frequency have the same waves
         x, mean = channel @ self._basis, waves.channel.expand(-1, count, -1) @ self._basis
         wave = waves.wave.expand(-1, -1, count, -1) @ self._basis
-        at_mean = _Whitened.of(mean, wave, self._variance, self._diffuse * self._over_element, self._floor)
-        x = x * at_mean.phases(x)
+        power = torch.view_as_real(wave).square().sum((2, 3, 4)) / wave[0, 0].numel()  # which no rotation changes
+        paths = wave, power
+        one = _Whitened.of(mean, paths, self._variance, self._diffuse * self._over_element, self._floor)
+        x = x * one.phases(x)
         # scattering has the covariance of frequencies times that of elements, and the eigenvectors of both whiten it
         frequency = waves.frequency.expand(count)
         apart = self._detour_rad * (frequency[:, None] - frequency).float()
         over_frequency, turn = torch.linalg.eigh((-apart.square() / 2).exp())
         turn = turn.T.to(x.dtype)
-        x, mean, wave = turn @ x, turn @ mean, turn @ wave
+        x, mean, paths = turn @ x, turn @ mean, (turn @ wave, power)
         scattered = self._diffuse * over_frequency[:, None] * self._over_element
         densities = [
-            _Whitened.of(mean, wave, scale * self._variance, scale * scattered, self._floor).log_density(x)
+            _Whitened.of(mean, paths, scale * self._variance, scale * scattered, self._floor).log_density(x)
             for scale in SCALES
         ]
         density: Tensor = torch.stack(densities).logsumexp(dim=0)
@@ -378,36 +380,40 @@ class _Whitened:
     Args:
         whitening: Factors of the observed channels (F or 1, K).
         mean: Expected channels (m, F, K).
-        spread: Waves of the paths by the standard deviations of their gains, (m, 1 + S, F K).
-        root: Cholesky factors of I + spread^* spread^T, (m, 1 + S, 1 + S).
+        wave: Waves of the paths (m, 1 + S, F K).
+        std: Standard deviations of their gains (m, 1 + S).
+        root: Cholesky factors of I + s s^H, (m, 1 + S, 1 + S), with the waves s of one standard deviation.
     """
 
     whitening: Tensor
     mean: Tensor
-    spread: Tensor
+    wave: Tensor
+    std: Tensor
     root: Tensor
 
     @classmethod
-    def of(cls, mean: Tensor, wave: Tensor, variance: Tensor, scattered: Tensor, floor: Tensor) -> Self:
+    def of(cls, mean: Tensor, paths: tuple[Tensor, Tensor], variance: Tensor, scattered: Tensor, floor: Tensor) -> Self:
         """Return the distribution of channels of unit expected power.
 
         Args:
             mean: Expected channels (m, F, K).
-            wave: Waves of the paths (m, 1 + S, F, K).
+            paths: Waves of the paths (m, 1 + S, F, K) and their powers (m, 1 + S).
             variance: Variances of their gains (1 + S,).
             scattered: Variances of scattering (F or 1, K), relative to the power of the paths.
             floor: Variance of the noise, relative to the same.
         """
-        paths = mean.abs().square().mean((1, 2)) + (variance[:, None, None] * wave.abs().square()).sum(1).mean((1, 2))
+        wave, power = paths
         rest = scattered.clamp_min(0) + floor
         whitening = ((1 + rest.mean()) / rest).sqrt()
-        amount = (paths * (1 + rest.mean())).rsqrt()[:, None, None]
-        spread = (wave * (amount[..., None] * variance.sqrt()[:, None, None]) * whitening).flatten(2)
-        gram = spread.conj() @ spread.mT + torch.eye(spread.shape[1])
-        return cls(whitening, mean * amount * whitening, spread, torch.linalg.cholesky(gram))
+        total = torch.view_as_real(mean).square().sum((1, 2, 3)) / mean[0].numel() + power @ variance
+        amount = (total * (1 + rest.mean())).rsqrt()[:, None]
+        wave, std = (wave * whitening).flatten(2), amount * variance.sqrt()
+        gram = (wave @ wave.mH) * (std[:, :, None] * std[:, None]) + torch.eye(wave.shape[1])
+        return cls(whitening, mean * amount[..., None] * whitening, wave, std, torch.linalg.cholesky(gram))
 
     def _along(self, values: Tensor) -> Tensor:
-        match = self.spread.conj() @ values.flatten(1)[..., None]
+        """Return L^-1 s v^*, (m, 1 + S, 1), of values v (m, F, K), with the root L and the waves s."""
+        match = self.std[..., None] * (self.wave @ values.flatten(1).conj()[..., None])
         found: Tensor = torch.linalg.solve_triangular(self.root, match, upper=False)
         return found
 
@@ -420,7 +426,8 @@ class _Whitened:
             x, total = x * phase, total * phase
             if number < N_ALIGNED - 1:
                 change = torch.linalg.solve_triangular(self.root.mH, self._along(x) - own, upper=True)
-                expected = self.mean + (change.mT @ self.spread)[:, 0].view_as(self.mean)
+                change = (change * self.std[..., None]).mH @ self.wave
+                expected = self.mean + change[:, 0].view_as(self.mean)
         return total
 
     def log_density(self, x: Tensor) -> Tensor:
@@ -429,7 +436,7 @@ class _Whitened:
         own, other = self._along(m), self._along(x)
 
         def product(a: Tensor, b: Tensor, along_a: Tensor, along_b: Tensor) -> Tensor:
-            whole: Tensor = (a.conj() * b).sum((1, 2)) - (along_a.conj() * along_b).sum((1, 2))
+            whole: Tensor = (a.conj() * b).sum((1, 2)) - (along_a * along_b.conj()).sum((1, 2))
             return whole
 
         match = 2 * product(m, x, own, other).abs()
