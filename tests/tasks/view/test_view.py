@@ -177,7 +177,7 @@ def test_measurements_that_changed_or_went_are_not_shown(aoa_run, tmp_path):
 def test_room_of_another_model_on_the_same_spectra(aoa_run, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(aoa_run, folder)
-    plane = {"normal": [1.0, 0, 0], "offset_m": 6.0, "gain": -0.5, "std_mm": 1.0, "certain": True}
+    plane = {"normal": [1.0, 0, 0], "offset_m": 6.0, "gain": -0.5, "std_mm": 1.0, "certain": True, "dielectric": True}
     (folder / "geometry-mix1.json").write_text(json.dumps({"planes": [plane]}))
     shown = plane | {"normal": tuple(plane["normal"])}
     assert [loaded.planes for loaded in open_source(folder).models] == [[], [shown]]
