@@ -153,15 +153,12 @@ def _over_images(values: Tensor, weights: Tensor) -> Tensor:
 
 def _log_gain_slope(planes: PlaneSet, scene: PhaseObservations) -> Tensor:
     """Return the derivatives of the logarithms of the images' gains with respect to those of planes, (B, P, S, n or 1)."""
-    count, gain, step = (
-        reflections(planes.sequence, planes.gain.shape[1])[..., None],
-        planes.gain[..., None, None],
-        1e-3,
-    )
+    count, gain = reflections(planes.sequence, planes.gain.shape[1])[..., None], planes.gain[..., None, None]
     here = gain * planes.plane_factor(scene)
     safe = torch.where(here.abs() < MIN_GAIN, torch.full_like(here, MIN_GAIN), here)
     if planes.dielectric is None:
         return count / safe
+    step = 1e-3
     beside = (gain + step) * replace(planes, gain=planes.gain + step).plane_factor(scene)
     return count * (beside - here) / (step * safe)
 
