@@ -302,7 +302,7 @@ class MatchedField(Configured, Saved):
         """Yield cells (b, m) and log-likelihoods (k, b, m) of some observations at a time."""
         generator = torch.Generator().manual_seed(self.config.seed)
         config = self.config
-        for rows in torch.arange(len(observed)).split(16):  # likelihoods at all cells: 26 MB at most
+        for rows in torch.arange(len(observed)).split(16):  # likelihoods at all cells: 26 MB at most, of channels 205
             part = observed.subset(rows)
 
             def evaluate(position: Tensor, part: SpectrumFeatures = part) -> Tensor:

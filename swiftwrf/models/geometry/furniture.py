@@ -30,7 +30,7 @@ from torch.nn.functional import softplus
 from swiftwrf.errors import InputError
 from swiftwrf.models.geometry.channels import Channels, coherence, field, waves
 from swiftwrf.models.geometry.images import MAX_COSINE, PhaseObservations, PlaneSet, Sequence, mirror
-from swiftwrf.models.geometry.planes import Plane, advantage, log_explained, plane_set, robust_advantage
+from swiftwrf.models.geometry.planes import Plane, log_advantage, log_explained, plane_set, robust_advantage
 from swiftwrf.models.geometry.surfaces import find_surfaces
 from swiftwrf.plotting import Axes, corners_of, hatch, plan_map
 from swiftwrf.runtime.checkpoint import Header, expect
@@ -448,17 +448,13 @@ def find_furniture(
         kept = [
             surface
             for row, surface in enumerate(surfaces)
-            if _log_advantage(whole, coherences([fit.with_reflectivity(n + row, 0.0) for fit in wider_fits]))
+            if log_advantage(whole, coherences([fit.with_reflectivity(n + row, 0.0) for fit in wider_fits]))
             > SURFACE_SIGNIFICANCE
         ]
-        if kept and min(_log_advantage(whole, other) for other in (with_furniture, alone)) > SIGNIFICANCE:
+        if kept and min(log_advantage(whole, other) for other in (with_furniture, alone)) > SIGNIFICANCE:
             wider = empty[best].with_surfaces(kept)
             return fit_furniture(wider.joined(planes), measured, wider)
     return found if is_furnished else None
-
-
-def _log_advantage(a: Tensor, b: Tensor) -> float:
-    return advantage(log_explained(a), log_explained(b))
 
 
 def _variation(values: Tensor) -> Tensor:

@@ -311,12 +311,17 @@ def log_explained(coherence: Tensor) -> Tensor:
     return -(1 - coherence + MIN_MISSING).log()
 
 
+def log_advantage(a: Tensor, b: Tensor) -> float:
+    """Return the `advantage` of coherences a over b by `log_explained`."""
+    return advantage(log_explained(a), log_explained(b))
+
+
 def robust_advantage(a: Tensor, b: Tensor) -> float:
-    """Return the larger `advantage` of coherences a over b, linear or by `log_explained`.
+    """Return the larger of `advantage` and `log_advantage` of coherences a over b.
 
     Linear differences are skewed if spectra are few. Logarithms hide improvements of badly explained spectra.
     """
-    return max(advantage(a, b), advantage(log_explained(a), log_explained(b)))
+    return max(advantage(a, b), log_advantage(a, b))
 
 
 def sign_alternatives(scene: PhaseObservations, room: PlaneSet, plane: int = -1) -> list[PlaneSet]:
