@@ -6,6 +6,7 @@ package. Options are parsed and checked before the modules that compute are impo
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from collections.abc import Sequence
@@ -88,10 +89,15 @@ def run_command(name: str, options: Sequence[str], program: str) -> int:
         # threads that share a loop wait busily for milliseconds by default, which makes the steps of a network up to eight
         # times slower if other work uses the same cores; libgomp reads the variable when torch is loaded
         os.environ.setdefault("GOMP_SPINCOUNT", "30000")
-    from tasks.command_line import command_line
+    gc.disable()  # loading libraries leaves no garbage, and to look for it takes a fifth of the time
+    try:
+        from tasks.command_line import command_line
 
-    config_type = getattr(import_module("tasks.configs"), COMMANDS[name].options)
-    return command_line(program, config_type, partial(run_task, name), options)
+        config_type = getattr(import_module("tasks.configs"), COMMANDS[name].options)
+        return command_line(program, config_type, partial(run_task, name), options)
+    finally:
+        gc.enable()
+        gc.freeze()  # the end of the interpreter would look through all objects for a second
 
 
 def run_task(name: str, config: Any, *folder: Path) -> None:
@@ -99,4 +105,6 @@ def run_task(name: str, config: Any, *folder: Path) -> None:
     from tasks.preload import preload
 
     preload(PRELOADED.get(name, ()) if getattr(config, "processes", None) != 1 else ())
-    import_module(COMMANDS[name].module).run(config, *folder)
+    module = import_module(COMMANDS[name].module)
+    gc.enable()
+    module.run(config, *folder)

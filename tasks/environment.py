@@ -10,6 +10,7 @@ import subprocess
 import sys
 from contextlib import suppress
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -94,6 +95,7 @@ def environment(device: torch.device, source: dict[str, str], processes: int = 1
     }
 
 
+@cache  # looked up at every step of a run
 def packages() -> dict[str, str]:
     """Return the versions of this project and of the libraries on which results depend."""
     found = {}

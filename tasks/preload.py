@@ -6,6 +6,7 @@ is a fork of that server.
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -47,9 +48,16 @@ def preload(modules: Sequence[str]) -> None:
     if SERVED and modules and several:
         from multiprocessing import forkserver
 
-        forkserver.set_forkserver_preload(list(modules))
+        forkserver.set_forkserver_preload(["tasks.server", *modules])
         forkserver.ensure_running()
         _is_served = True
+
+
+def begin() -> None:
+    """Prepare a process: the run ends it, and it collects the garbage that it makes itself."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    gc.freeze()
+    gc.enable()
 
 
 def served_map(function: Callable[..., Result], *items: Iterable[Any]) -> list[Result]:
@@ -57,6 +65,5 @@ def served_map(function: Callable[..., Result], *items: Iterable[Any]) -> list[R
     if not _is_served:
         return list(map(function, *items))
     number = min(os.cpu_count() or 1, MAX_PROCESSES)
-    ignored = signal.SIGINT, signal.SIG_IGN  # the run itself ends its processes
-    with ProcessPoolExecutor(number, process_context(), signal.signal, ignored) as processes, without_main():
+    with ProcessPoolExecutor(number, process_context(), begin) as processes, without_main():
         return list(processes.map(function, *items))

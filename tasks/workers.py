@@ -32,7 +32,7 @@ from swiftwrf.runtime.steps import POLL_S, STEPS
 from swiftwrf.runtime.threads import set_threads, to_device
 from tasks.directory import Run
 from tasks.environment import machine, packages
-from tasks.preload import process_context, without_main
+from tasks.preload import begin, process_context, without_main
 from tasks.terminal import console
 
 CONNECT_S = 5  # until a scheduler has answered
@@ -176,7 +176,7 @@ def _begin() -> None:
             run.join()
         os._exit(1)
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run itself ends its processes
+    begin()
     threading.Thread(target=end_with_the_run, daemon=True).start()
     silent()
 

@@ -1,5 +1,6 @@
 """The console script: its sub-commands, its speed, where it may be started, and command lines that cannot be."""
 
+import gc
 import os
 import re
 import resource
@@ -45,6 +46,14 @@ def test_help_lists_every_command_at_once(tmp_path):
     assert done.returncode == 0
     listed = re.findall(r"^  (\w+) +\S", done.stdout, flags=re.MULTILINE)
     assert listed == [*COMMANDS]
+
+
+def test_garbage_is_collected_while_and_after_a_command_runs(monkeypatch):
+    collected = []
+    monkeypatch.setattr("tasks.inspect.run", lambda config: collected.append(gc.isenabled()))
+    assert main(["inspect", "room"]) == 0
+    assert collected == [True]
+    assert gc.isenabled()
 
 
 @pytest.mark.parametrize("arguments", [("--help",), ("inspect", "--help")])

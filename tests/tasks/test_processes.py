@@ -62,10 +62,11 @@ def test_a_map_is_computed_in_forks_of_the_server_if_there_is_one(modules):
         from tasks.preload import preload, served_map
         preload({modules!r}.split())
         print(served_map(pow, [2, 3], [3, 2]), served_map(eval, ["__import__('os').getpid()"]) == [os.getpid()])
+        print(served_map(eval, ["__import__('gc').isenabled()"]))  # the server itself collects no garbage
     """
     threads = os.environ | {"OMP_NUM_THREADS": "2"}
     done = subprocess.run([sys.executable, "-c", code], env=threads, capture_output=True, text=True, check=False)
-    assert (done.stdout, done.stderr) == (f"[8, 9] {not modules}\n", "")
+    assert (done.stdout, done.stderr) == (f"[8, 9] {not modules}\n[True]\n", "")
 
 
 KILLED = "was killed, probably because memory was short; continue with one process: .* --processes 1"
