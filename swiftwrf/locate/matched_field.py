@@ -17,7 +17,7 @@ from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.spectra import Spectra, check_training, direction_of_link
 from swiftwrf.data.splits import places
 from swiftwrf.errors import InputError, with_article
-from swiftwrf.gp import subsample
+from swiftwrf.gp import GaussianProcess, choose_kernel, subsample
 from swiftwrf.locate.posterior import Posterior, inflation, normalised, pooled_weights, read_inflation
 from swiftwrf.locate.region import Cells, Region, best_cells, outside_mass, refined
 from swiftwrf.locate.spectrum_likelihood import (
@@ -30,8 +30,11 @@ from swiftwrf.locate.spectrum_likelihood import (
     PhaseLikelihood,
     Screen,
     SpectrumFeatures,
+    channel_numbers,
     channels_beside,
     gain_features,
+    nearby_features,
+    nearby_numbers,
     room_features,
 )
 from swiftwrf.models.base import FieldModel
@@ -46,14 +49,16 @@ from swiftwrf.runtime.threads import parallel_map
 from swiftwrf.runtime.validation import Configured, NonNegativeInt, PositiveInt, all_or_nothing, checked, configuration
 
 FOLDS = 5
+NEARBY = "nearby."  # prefix of the names in a file
 START_WEIGHTS = (0.05, 0.05, 0.3)  # of the likelihoods, by which the calibration searches
-START_WEIGHTS_CHANNEL = (0.5, 0.05)
+START_WEIGHTS_CHANNEL = (0.5, 0.05, 0.05)
 CHANNEL_CELLS = 8  # times as many first cells for channels, which are not computed at each of them
 CHANNEL_PARTS = 4  # along each edge of a cell with paths of its own
 MIN_FLOOR = 1e-4  # of missing coherence, by rounding
 MIN_SPECTRA = 15
 BATCH_CANDIDATES = 2048  # whose waves are computed together: as many as a processor's cache holds
 BATCH_CELLS = 256  # the same with parts
+MAX_KEPT_NUMBERS = 2**25  # co-array numbers of channels at all cells: 134 MB
 
 
 @configuration
@@ -85,18 +90,20 @@ class MatchedFieldConfig:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """A room and, of spectra, path gains, fitted to some of the data. Furniture has the place of path gains for channels."""
+    """A room fitted to some of the data and what predicts co-array numbers: path gains of spectra, channels nearby."""
 
     room: GeometryModel
-    gains: PathGains | None
     paths: PhaseLikelihood
+    gains: PathGains | None = None
+    nearby: GaussianProcess | None = None
 
     @property
     def features(self) -> tuple[Features, ...]:
-        """Co-array numbers by constant and by position-dependent path gains; none for channels."""
-        if self.gains is None:
-            return ()
-        return room_features(self.room.array), gain_features(self.room.array, self.gains)
+        """Predicted co-array numbers."""
+        array = self.room.array
+        if self.nearby is not None:
+            return (nearby_features(array, self.nearby),)
+        return (room_features(array), gain_features(array, self.gains)) if self.gains else ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,9 +131,10 @@ class MatchedField(Configured, Saved):
     """Posterior over the position of the moving end, given a spectrum.
 
     Three likelihoods of spectra are pooled: co-array numbers predicted by constant path gains, by position-dependent path
-    gains, and element phases under uncertain path gains. Of channels, those under uncertain and constant path gains are. The
-    covariances come from held-out positions, and so do the weights, which maximise the posterior density there. This also
-    calibrates the posterior.
+    gains, and element phases under uncertain path gains. Those of channels are: channels under uncertain and under constant
+    path gains, and co-array numbers predicted by constant path gains and measured channels nearby. The covariances come
+    from held-out positions, and so do the weights, which maximise the posterior density there. This also calibrates the
+    posterior.
 
     Args:
         config: Options as one object. Defaults to `MatchedFieldConfig()`.
@@ -186,7 +194,7 @@ class MatchedField(Configured, Saved):
             features = SpectrumFeatures.of(train.store.batches(), own.array, train.grid, self.config.seed)
         else:
             self.n_snapshots = train.channel.shape[1]
-            features = SpectrumFeatures.of_channels(train.channel, train.frequency_hz, own.array)
+            features = SpectrumFeatures.of_channels(train.channel, own.array)
         scene, rows = observe(train, GeometryConfig(seed=self.config.seed))
         fold = places(train.position, FOLDS) % FOLDS
         chosen, prior = own, next(iter(PRIORS))
@@ -199,12 +207,31 @@ class MatchedField(Configured, Saved):
             phases = scene.subset(kept[rows].nonzero()[:, 0])
             part = chosen.refined_on(phases).furnished_on(train.subset(kept))
             if self.n_snapshots:
-                return _Fit(part, None, PathLikelihood(part, torch.zeros(4 + part.reflectors.gain.shape[1])))
+                return _Fit(part, PathLikelihood(part, torch.zeros(4 + part.reflectors.gain.shape[1])))
             likelihood = PhaseLikelihood.fit([(part, PathWaves.at(part, train.position[kept]), features.subset(kept))])
-            return _Fit(part, fit_path_gains(part, phases, kernel, prior), likelihood)
+            return _Fit(part, likelihood, fit_path_gains(part, phases, kernel, prior))
 
         everything = torch.ones_like(fold, dtype=torch.bool)
         *parts, self._fit = parallel_map(fitted, [*(fold != number for number in range(FOLDS)), everything])
+        if self.n_snapshots:
+
+            def left(fit: _Fit, rows: Tensor) -> Tensor:
+                waves = PathWaves.at(fit.room, train.position[rows], self._frequency(fit.room))
+                return features.coarray[rows] - channel_numbers(waves.channel, own.array)
+
+            out = torch.empty_like(features.coarray)  # of every channel by the room without its fold
+            for number, part in enumerate(parts):
+                out[fold == number] = left(part, fold == number)
+            nearby = choose_kernel(train.position, out[:, None], fold)
+
+            def corrected(fit: _Fit, kept: Tensor) -> _Fit:
+                return replace(
+                    fit,
+                    nearby=GaussianProcess.regress(nearby, train.position[kept], left(fit, kept), dtype=torch.float32),
+                )
+
+            parts = [corrected(part, fold != number) for number, part in enumerate(parts)]
+            self._fit = corrected(self._fit, everything)
         # of every spectrum, by the fit without its fold
         self.residual = torch.empty(len(self._fit.features), *features.coarray.shape)
         missing, held = torch.ones(len(train)), []
@@ -212,7 +239,8 @@ class MatchedField(Configured, Saved):
             waves = PathWaves.at(part.room, train.position[fold == number], self._frequency(part.room))
             held.append((part.room, waves, features.subset(fold == number)))
             for kind, predict in enumerate(part.features):
-                self.residual[kind, fold == number] = predict(waves) - features.coarray[fold == number]
+                predicted, std = predict(waves)
+                self.residual[kind, fold == number] = (predicted - features.coarray[fold == number]) / std[:, None]
             if features.channel is not None:
                 missing[fold == number] = 1 - coherence(features.channel[fold == number], waves.channel)
         if self.n_snapshots:  # furniture is fitted more closely to the channels that determine it than to others
@@ -248,7 +276,21 @@ class MatchedField(Configured, Saved):
             def predicted(position: Tensor) -> Tensor:
                 return channels_beside(self.room, position, away, frequency).movedim(1, 0).contiguous()
 
-            self._screens = [own.screen(parallel_map(predicted, whole.position.split(BATCH_CELLS)))]
+            channels = parallel_map(predicted, whole.position.split(BATCH_CELLS))
+            self._screens = [own.screen(channels)]
+            near, process = self.likelihoods.parts[1], self._fit.nearby
+            assert isinstance(near, CoarrayLikelihood)
+            assert process is not None
+            if len(self.cells.position) * len(near.distribution.scale) <= MAX_KEPT_NUMBERS:
+
+                def corrected(cells: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+                    channel, position = cells
+                    numbers, std = nearby_numbers(channel.movedim(0, 1), position, self.room.array, process)
+                    return numbers @ near.distribution.whitening, std
+
+                positions = self.cells.position.split([channel.shape[1] for channel in channels])
+                numbers, std = zip(*parallel_map(corrected, zip(channels, positions, strict=True)), strict=True)
+                self._screens.append(near.screen(torch.cat(numbers), torch.cat(std)))
             return
         self.cells = self.region.cells(int(min(max(count, 1), limit)))
         batches = self.cells.position.split(BATCH_CANDIDATES)
@@ -259,20 +301,24 @@ class MatchedField(Configured, Saved):
 
         def whitened(position: Tensor) -> list[Tensor]:
             waves = PathWaves.at(self.room, position)
-            return [predict(waves) @ own.distribution.whitening for predict, own in zip(features, coarray, strict=True)]
+            return [
+                predict(waves)[0] @ own.distribution.whitening for predict, own in zip(features, coarray, strict=True)
+            ]
 
         parts = zip(*parallel_map(whitened, batches), strict=True)
-        self._screens = [own.screen(torch.cat(part)) for own, part in zip(coarray, parts, strict=True)]
+        ones = torch.ones(len(self.cells.position))
+        self._screens = [own.screen(torch.cat(part), ones) for own, part in zip(coarray, parts, strict=True)]
 
     def _likelihoods(self, fit: _Fit, kept: Tensor | None = None) -> _Likelihoods:
-        if self.n_snapshots:
-            return _Likelihoods(fit.room, self._frequency(fit.room), (fit.paths, ChannelLikelihood(self.floor)))
         residual = self.residual if kept is None else self.residual[:, kept]
-        coarray = (
+        coarray = [
             CoarrayLikelihood(predict, part, self.observed_power)
             for predict, part in zip(fit.features, residual, strict=True)
-        )
-        return _Likelihoods(fit.room, self._frequency(fit.room), (*coarray, fit.paths))
+        ]
+        frequency = self._frequency(fit.room)
+        if self.n_snapshots:
+            return _Likelihoods(fit.room, frequency, (fit.paths, *coarray, ChannelLikelihood(self.floor)))
+        return _Likelihoods(fit.room, frequency, (*coarray, fit.paths))
 
     def _frequency(self, room: GeometryModel) -> Tensor:
         """Return the frequencies of the kept snapshots relative to the carrier, (F,), one where all are at the carrier."""
@@ -343,7 +389,7 @@ class MatchedField(Configured, Saved):
                 )
             shape = None, self.n_snapshots, len(room.array.element)
             channel = to_tensor("channel", channel, torch.complex64, shape)
-            observed = SpectrumFeatures.of_channels(channel, self.frequency_hz, room.array)
+            observed = SpectrumFeatures.of_channels(channel, room.array)
         else:
             values = spectrum.spectrum if isinstance(spectrum, Spectra) else spectrum
             magnitude = to_tensor("spectra", values, torch.float32, (None, *self.grid.shape))
@@ -379,8 +425,9 @@ class MatchedField(Configured, Saved):
     def state(self) -> tuple[dict[str, Tensor], Header]:
         """Return the fitted tensors by name, and plain values."""
         tensors, header = self.room.state()
-        gains, values = self._fit.gains.state() if self._fit.gains else ({}, {})
-        own = {"statistics": self._fit.paths.log_variance, "residual": self.residual, "weight": self.weight}
+        fit = self._fit
+        gains, values = fit.gains.state() if fit.gains else fit.nearby.state(NEARBY) if fit.nearby else ({}, {})
+        own = {"statistics": fit.paths.log_variance, "residual": self.residual, "weight": self.weight}
         at, prior_values = self.region.state()
         frequency = None if self.frequency_hz is None else self.frequency_hz.tolist()
         channel = {"n_snapshots": self.n_snapshots, "frequency_hz": frequency, "floor": self.floor}
@@ -397,22 +444,25 @@ class MatchedField(Configured, Saved):
         n, known = tensors["residual"].shape[1], len(tensors["region"])
         shapes = {
             "statistics": (4 + room.reflectors.gain.shape[1],),
-            "residual": (0 if is_channel else 2, n, features),
+            "residual": (1 if is_channel else 2, n, features),
             "region": (known, 3),
-            "weight": (2 if is_channel else 3,),
+            "weight": (3,),
         }
         expect(tensors, shapes)
         if n < MIN_SPECTRA or bool((tensors["statistics"].abs() > 30).any()):
             raise InputError("residuals, positions or variances are not those of a fitted locator")
-        gains = None if is_channel else PathGains.from_state(tensors, header, room)
         frequency = header["frequency_hz"]
         locator.n_snapshots, locator.floor = int(header["n_snapshots"]), float(header["floor"])
         locator.frequency_hz = None if frequency is None else torch.tensor(frequency, dtype=torch.float64)
         if not locator.floor > 0 or (frequency is not None and len(frequency) != locator.n_snapshots):
             raise InputError("frequencies and missing coherence are not those of a fitted locator")
         locator.grid = room.grid
-        likelihood = PathLikelihood if is_channel else PhaseLikelihood
-        locator._fit = _Fit(room, gains, likelihood(room, tensors["statistics"]))
+        if is_channel:
+            nearby = GaussianProcess.from_state(tensors, header, torch.float32, prefix=NEARBY)
+            locator._fit = _Fit(room, PathLikelihood(room, tensors["statistics"]), nearby=nearby)
+        else:
+            gains = PathGains.from_state(tensors, header, room)
+            locator._fit = _Fit(room, PhaseLikelihood(room, tensors["statistics"]), gains)
         locator.residual, locator.weight = tensors["residual"], tensors["weight"]
         locator.region, locator.observed_power = Region.from_state(tensors, header), float(header["observed_power"])
         locator.inflation = read_inflation(header)

@@ -4,7 +4,8 @@ A spectrum of K elements is exactly a few dozen co-array numbers, and its channe
 retrieval. Both are compared with predictions straight from the channel; no spectrum is rendered. Searching the position
 whose predicted field matches the observed one is matched-field processing (A. B. Baggeroer, W. A. Kuperman and
 P. N. Mikhalevsky, IEEE J. Oceanic Eng. 18, 1993; with uncertain surroundings: A. M. Richardson and L. W. Nolte,
-J. Acoust. Soc. Am. 89, 1991). A measured channel gives both features directly, and its amplitudes and subcarriers, too.
+J. Acoust. Soc. Am. 89, 1991). A measured channel is compared with its amplitudes and subcarriers. Where channels are
+measured densely, a Gaussian process of their co-array numbers about those of the room predicts what the room does not.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
+from swiftwrf.gp import GaussianProcess
 from swiftwrf.models.geometry.channels import coherence, ends, field, sources, waves
-from swiftwrf.models.geometry.fit import carrier_phases
 from swiftwrf.models.geometry.model import GeometryModel, kept_snapshots
 from swiftwrf.models.geometry.path_gains import PathGains
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation, coarray_numbers, retrieve_phases
@@ -44,14 +45,14 @@ class SpectrumFeatures:
     """Features of the channel that a spectrum determines, and the channel itself where it is measured.
 
     Args:
-        coarray: Real and imaginary parts of the co-array numbers, float32 (n, F).
-        phases: Element phasors of unit modulus at the carrier and their indistinguishable aliases, complex64 (n, T, K). T is
-            2 if there are aliases.
-        channel: Measured channels, complex64 (n, F, K), or None.
+        coarray: Real and imaginary parts of the co-array numbers, float32 (n, F), of channels with amplitudes.
+        phases: Element phasors of unit modulus of spectra and their indistinguishable aliases, complex64 (n, T, K). T is 2
+            if there are aliases.
+        channel: Measured channels, complex64 (n, F, K).
     """
 
     coarray: Tensor
-    phases: Tensor
+    phases: Tensor | None = None
     channel: Tensor | None = None
 
     @classmethod
@@ -64,16 +65,15 @@ class SpectrumFeatures:
         return cls(real_parts(numbers), torch.stack(aliases, dim=1).to(torch.complex64))
 
     @classmethod
-    def of_channels(cls, channel: Tensor, frequency_hz: Tensor | None, array: PlanarArray) -> SpectrumFeatures:
-        """Compute the features of channels (n, S, K) at frequencies (S,) [Hz]."""
-        carrier = carrier_phases(channel, frequency_hz, array)
+    def of_channels(cls, channel: Tensor, array: PlanarArray) -> SpectrumFeatures:
+        """Compute the features of channels (n, S, K)."""
         kept = channel[:, kept_snapshots(channel.shape[1])]
-        return cls(real_parts(autocorrelation(carrier, array)), carrier[:, None], kept)
+        return cls(channel_numbers(kept, array), channel=kept)
 
     def subset(self, rows: Tensor) -> SpectrumFeatures:
         """Return the features of some of the spectra."""
-        channel = None if self.channel is None else self.channel[rows]
-        return SpectrumFeatures(self.coarray[rows], self.phases[rows], channel)
+        phases, channel = (None if x is None else x[rows] for x in (self.phases, self.channel))
+        return SpectrumFeatures(self.coarray[rows], phases, channel)
 
     def __len__(self) -> int:
         return len(self.coarray)
@@ -82,6 +82,12 @@ class SpectrumFeatures:
 def real_parts(numbers: Tensor) -> Tensor:
     """Return complex numbers (..., P) as float32 (..., 2 P)."""
     return torch.view_as_real(numbers).flatten(-2).float()
+
+
+def channel_numbers(channel: Tensor, array: PlanarArray) -> Tensor:
+    """Return the mean co-array numbers of the snapshots of channels (n, F, K), scaled to unit power, float32 (n, 2 P)."""
+    power = channel.abs().square().mean((1, 2), keepdim=True).clamp_min(1e-30)
+    return real_parts(autocorrelation(channel * power.rsqrt(), array).mean(dim=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,23 +148,51 @@ def channels_beside(room: GeometryModel, position: Tensor, away: Tensor, frequen
     return channel
 
 
-Features = Callable[[PathWaves], Tensor]
+Features = Callable[[PathWaves], tuple[Tensor, Tensor]]
+"""from waves of m positions to co-array numbers, float32 (m, F), and relative standard deviations of their errors, (m,)"""
 Screen = Callable[[SpectrumFeatures], Tensor]
 
 
 def room_features(array: PlanarArray) -> Features:
-    """Return a function from waves of m positions to co-array numbers by constant path gains, float32 (m, F)."""
-    return lambda waves: real_parts(autocorrelation(waves.channel[:, 0].sgn(), array))
+    """Return co-array numbers by constant path gains, as a function of waves."""
+
+    def features(waves: PathWaves) -> tuple[Tensor, Tensor]:
+        return real_parts(autocorrelation(waves.channel[:, 0].sgn(), array)), torch.ones(len(waves.position))
+
+    return features
 
 
 def gain_features(array: PlanarArray, gains: PathGains) -> Features:
-    """Return a function from waves of m positions to co-array numbers by position-dependent path gains, float32 (m, F)."""
+    """Return co-array numbers by position-dependent path gains, as a function of waves."""
 
-    def features(waves: PathWaves) -> Tensor:
+    def features(waves: PathWaves) -> tuple[Tensor, Tensor]:
         channel = (waves.gain[:, None] + gains.change(waves.position)) @ waves.wave[:, :, 0]
-        return real_parts(autocorrelation(channel.sgn(), array).mean(dim=1))
+        return real_parts(autocorrelation(channel.sgn(), array).mean(dim=1)), torch.ones(len(waves.position))
 
     return features
+
+
+def nearby_features(array: PlanarArray, process: GaussianProcess) -> Features:
+    """Return co-array numbers of channels by constant path gains and measured channels nearby, as a function of waves."""
+    return lambda waves: nearby_numbers(waves.channel, waves.position, array, process)
+
+
+def nearby_numbers(
+    channel: Tensor, position: Tensor, array: PlanarArray, process: GaussianProcess
+) -> tuple[Tensor, Tensor]:
+    """Return co-array numbers of predicted channels, corrected by measured channels nearby.
+
+    Args:
+        channel: Predicted channels (m, F, K).
+        position: Their positions (m, 3) [m].
+        array: Array of the channels.
+        process: Process of the differences of measured from predicted numbers.
+
+    Returns:
+        Numbers, float32 (m, 2 P), and the relative standard deviations of their errors, (m,).
+    """
+    std = (process.variance(position) + process.kernel.noise).sqrt().float()
+    return channel_numbers(channel, array) + process.mean(position).float(), std
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,8 +268,8 @@ class CoarrayLikelihood:
     """Student likelihood of the co-array numbers, with the covariance of held-out residuals.
 
     Args:
-        features: Function from waves of m positions to predicted co-array numbers (m, F).
-        residual: Held-out residuals (n, F), predicted minus observed.
+        features: Predicted co-array numbers.
+        residual: Held-out residuals (n, F), predicted minus observed, over their relative standard deviations.
         power: Mean square of the observed numbers.
     """
 
@@ -245,18 +279,24 @@ class CoarrayLikelihood:
 
     def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
         """Return log-likelihoods (m,) of m observations at m candidates, up to a constant of each observation."""
-        away = (self.features(waves) - observed.coarray) @ self.distribution.whitening
-        return self.distribution.log_density(away.square().sum(dim=1))
+        predicted, std = self.features(waves)
+        away = (predicted - observed.coarray) @ self.distribution.whitening / std[:, None]
+        density: Tensor = self.distribution.log_density(away.square().sum(dim=1)) - away.shape[1] * std.log()
+        return density
 
-    def screen(self, whitened: Tensor) -> Screen:
+    def screen(self, whitened: Tensor, std: Tensor) -> Screen:
         """Return the function from n observations to log-likelihoods (n, m), by whitened predictions (m, F) at m cells."""
-        squared = whitened.square().sum(dim=1)
+        squared, precision, volume = (
+            whitened.square().sum(dim=1),
+            std.square().reciprocal(),
+            whitened.shape[1] * std.log(),
+        )
 
         def log_likelihood(observed: SpectrumFeatures) -> Tensor:
             target = observed.coarray @ self.distribution.whitening
             distance = torch.addmm(squared, target, whitened.T, alpha=-2)
-            distance = distance.add_(target.square().sum(dim=1, keepdim=True)).clamp_min_(0)
-            return self.distribution.log_density(distance)
+            distance = distance.add_(target.square().sum(dim=1, keepdim=True)).clamp_min_(0).mul_(precision)
+            return self.distribution.log_density(distance).sub_(volume)
 
         return log_likelihood
 
@@ -314,6 +354,7 @@ class PhaseLikelihood:
 
     def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
         """Return log-likelihoods (m,) of m observations at m candidates, up to a constant of each observation."""
+        assert observed.phases is not None
         mean, wave, phases = waves.channel[:, 0], waves.wave[:, :, 0], observed.phases
         weighted = wave * self._variance.sqrt()[:, None]
         spread = torch.einsum("msk,msl->mkl", weighted, weighted.conj())

@@ -227,6 +227,22 @@ def test_positions_are_located_by_noisy_packets_through_furniture(furnished_room
         locator.locate(test.spectrum)
 
 
+def test_dense_channels_locate_where_the_room_explains_little():
+    data, walls = measured(0.0, n=50)
+    generator = torch.Generator().manual_seed(0)
+    away = torch.rand(50, 3, generator=generator, dtype=torch.float64) * torch.tensor([0.3, 0.3, 0.0])
+    position = data.position.mean(dim=0) + away
+    unknown = torch.polar(torch.ones(16), 2.0 * torch.randn(16, generator=generator))  # of each element
+    channel = walls.channel(position, data.frequency_hz[:1]) * unknown
+    store = Store(data.array.spectrum(channel, data.grid))
+    data = replace(data, position=position, channel=channel, frequency_hz=None, store=store)
+    train, test = data.subset(torch.arange(40)), data.subset(torch.arange(40, 50))
+    cells = {"n_best": 15, "n_background": 8, "n_split": 8, "max_cells": 4000, "n_rounds": 2, "n_calibration": 12}
+    posterior = MatchedField(**cells).fit(train, room=walls).locate(test)
+    error = (posterior.median - test.position).norm(dim=1)
+    assert float(error.median()) < 0.1 * test.array.wavelength
+
+
 @pytest.mark.parametrize("moving", ["transmitter", "receiver"])
 def test_channels_beside_positions_follow_from_the_paths_there(moving):
     data, walls = measured(0.0, moving, n=10)
@@ -249,7 +265,7 @@ def test_the_likelihood_of_channels_is_a_normal_distribution_that_no_delay_or_ph
     likelihood = PathLikelihood(walls, log_variance)
 
     def value(channel):
-        return likelihood(at, SpectrumFeatures.of_channels(channel, data.frequency_hz, data.array))
+        return likelihood(at, SpectrumFeatures.of_channels(channel, data.array))
 
     known, (_, diffuse, floor) = at.channel, log_variance[-3:].exp().double()
     wave, mean, variance = at.wave.flatten(2).cdouble(), known.flatten(1).cdouble(), likelihood._variance.double()
