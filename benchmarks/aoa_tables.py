@@ -1,4 +1,4 @@
-"""Tables of angle of arrival, and the planes that its runs found."""
+"""Tables of directions and positions by spectra and channels, and the planes that runs found."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from record import RESULTS, load, markdown
 from augment.turbo.condition import FULL_NETWORK, LOCATED, MEASURED_NETWORK, Condition, conditions_of
 from augment.turbo.condition import headline as chosen
 from swiftwrf.metrics import ChangeMetrics
+
+SPECTRA = ("locating_rooms", "locating_newrf")  # results of locating_aoa.py
 
 
 def aoa_shares() -> list[tuple[str, dict[str, Any], dict[str, Any]]]:
@@ -89,3 +91,40 @@ def _error_mm(planes: list[dict[str, Any]], side: int, offset: float) -> float |
     outward = 1 if side % 2 else -1
     own = [outward * plane["offset_m"] for plane in planes if outward * plane["normal"][side // 2] > PARALLEL]
     return min((1000 * abs(found - offset) for found in own), default=None)
+
+
+def locating_spectra() -> str:
+    """Return position errors of matched-field processing, medians over the draws."""
+    rows = []
+    for name in SPECTRA:
+        for scene, fractions in load(name).get("scenes", {}).items():
+            for fraction, entry in fractions.items():
+                found, n = entry["median"], str(len(entry["draws"]))
+                error = f"{found['position_m']['median']:.3f} / {found['position_m']['p90']:.3f}"
+                rows.append([scene, f"{float(fraction):.0%}", n, error, f"{found['coverage_80']:.0%}"])
+    return markdown(["scene", "measured", "random choices", "position [m]", "80 % regions hold"], rows)
+
+
+def channels() -> str:
+    """Return errors of matched fields on channels, and coherence and errors of channels predicted at unseen positions."""
+    rows = []
+    files = sorted(RESULTS.glob("channels_*.json"))  # channels_ and the number of subcarriers, then perhaps the scene
+    for name, scene, fractions in [(f.stem, *item) for f in files for item in load(f.stem)["scenes"].items()]:
+        for fraction, found in fractions.items():
+            row = found["median"]
+            error = [f"{row[key]['median']:.2g} / {row[key]['p90']:.2g}" for key in ("angle_deg", "position_m")]
+            predicted = [
+                f"{own['coherence']:.2f}" + (f" / {own['nmse_db']:+.1f}" if "nmse_db" in own else "")
+                for name in ("nearest", "gaussian_process", "planes", "furniture")
+                if (own := row["channel"].get(name))
+            ]
+            what = [scene, f"{float(fraction):.0%}", name.split("_")[1], str(len(found["draws"]))]
+            others = {key: own for key, own in row.items() if key.endswith("_angle_deg")}
+            best = min(others, key=lambda key: float(others[key]["median"]), default="")
+            other = (
+                f"{others[best]['median']:.2g} ({best.removesuffix('_angle_deg').replace('_', ' ')})" if best else ""
+            )
+            rows.append([*what, *error, other, f"{row['coverage_80']:.0%}", *predicted])
+    columns = ["scene", "measured", "subcarriers", "draws", "angle [deg]", "position [m]", "best other angle [deg]"]
+    predictors = ["nearest", "Gaussian process", "planes", "planes and furniture"]
+    return markdown([*columns, "80 % regions hold", *predictors], rows)

@@ -7,8 +7,12 @@ them, a delay and a phase of each packet. --rooms adds furnished rooms, one a dr
 
 python benchmarks/locating_aoa.py --scenes --rooms 10 --subcarriers 8 --bandwidth 20e6 --snr-db 20 --n-test 60 --kernel
 
-The split is the random one of seed 0. Draws differ in the spectra that count as measured. Test spectra take no part in any
-fit.
+Measured channels, of RFID tags on other days:
+
+python benchmarks/locating_aoa.py --scenes --data /data/adarf-d1 --split published --round-trip --fractions 0.5 --kernel
+
+The split is the random one of seed 0 unless another is given. Draws differ in the spectra that count as measured. Test
+spectra take no part in any fit.
 """
 
 from __future__ import annotations
@@ -74,6 +78,10 @@ class Config:
     """distance of the first and the last of them [Hz]"""
     rooms: int = 0
     """number of furnished rooms that are traced"""
+    split: Literal["random", "published"] = "random"
+    """split of training and test spectra"""
+    round_trip: bool = False
+    """phases are those of the way there and back"""
     snr_db: float | None = None
     """signal-to-noise ratio of each packet, whose delay and phase are random [dB]; no impairment by default"""
     n_test: int | None = None
@@ -93,12 +101,13 @@ def main(config: Config) -> None:
     for name, draws in scenes(config):
         rows: dict[str, list[Row]] = {fraction_key(fraction): [] for fraction in config.fractions}
         for draw, data in enumerate(draws):
-            train, test = (data if config.snr_db is None else impaired(data, config.snr_db, draw)).split("random")
+            train, test = (data if config.snr_db is None else impaired(data, config.snr_db, draw)).split(config.split)
             test = test.subset(torch.arange(min(len(test), config.n_test or len(test))))
+            coherent = config.subcarriers is not None and config.snr_db is None
             for fraction in config.fractions:
                 own = rows[fraction_key(fraction)]
                 measured = withhold(train, fraction, draw)[0]
-                own.append(measure(measured, test, draw, config.kernel, coherent=config.snr_db is None))
+                own.append(measure(measured, test, draw, config.kernel, coherent))
                 print(name, fraction, own[-1], flush=True)
             found[name] = {key: {"median": median_of(own), "draws": own} for key, own in rows.items()}
             write_result(config.name, {"scenes": found}, folder=config.out)
@@ -110,8 +119,8 @@ def scenes(config: Config) -> Iterator[tuple[str, Iterable[Spectra]]]:
         yield name, repeat(simulated_room(moving="transmitter" if name == "room" else "receiver"), config.draws)
     where = "" if config.snr_db is None else f", {(config.bandwidth or 0) / 1e6:g} MHz, {config.snr_db:g} dB"
     for folder in config.data:
-        data = load_spectra(folder, subcarriers=config.subcarriers, bandwidth=config.bandwidth)
-        yield folder.name + where, repeat(data, config.draws)
+        options = {"subcarriers": config.subcarriers, "bandwidth": config.bandwidth, "round_trip": config.round_trip}
+        yield folder.name + where, repeat(load_spectra(folder, **options), config.draws)
     if config.rooms:
         yield "furnished rooms" + where, map(partial(furnished_room, config), range(config.rooms))
 

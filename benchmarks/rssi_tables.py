@@ -5,9 +5,8 @@ from __future__ import annotations
 from statistics import mean
 from typing import Any
 
-from record import RESULTS, load, markdown
+from record import load, markdown
 
-SPECTRA = ("locating_rooms", "locating_newrf")  # results of locating_aoa.py
 RELEVANT_DB = 0.02  # difference of medians below which predictors are level
 
 
@@ -33,25 +32,6 @@ def rssi_glance() -> str:
         )
     columns = ["data, split", "training / test rows", "best baseline", "model", "difference of medians"]
     return markdown([*columns, "mean difference [95 %]", "80 % interval covers"], rows)
-
-
-def channels() -> str:
-    """Return errors of matched fields on channels, and coherence and errors of channels predicted at unseen positions."""
-    rows = []
-    files = sorted(RESULTS.glob("channels_*.json"))  # channels_ and the number of subcarriers, then perhaps the scene
-    for name, scene, fractions in [(f.stem, *item) for f in files for item in load(f.stem)["scenes"].items()]:
-        for fraction, found in fractions.items():
-            row = found["median"]
-            error = [f"{row[key]['median']:.2g} / {row[key]['p90']:.2g}" for key in ("angle_deg", "position_m")]
-            predicted = [
-                f"{own['coherence']:.2f}" + (f" / {own['nmse_db']:+.1f}" if "nmse_db" in own else "")
-                for name in ("nearest", "gaussian_process", "planes", "furniture")
-                if (own := row["channel"].get(name))
-            ]
-            what = [scene, f"{float(fraction):.0%}", name.split("_")[1], str(len(found["draws"]))]
-            rows.append([*what, *error, f"{row['coverage_80']:.0%}", *predicted])
-    columns = ["scene", "measured", "subcarriers", "draws", "angle [deg]", "position [m]", "80 % regions hold"]
-    return markdown([*columns, "nearest", "Gaussian process", "planes", "planes and furniture"], rows)
 
 
 def not_detected() -> str:
@@ -85,18 +65,6 @@ def _outcome(difference_db: float) -> str:
 
 def _interval(difference: dict[str, Any]) -> str:
     return f"{difference['mean']:+.2f} [{difference['low']:+.2f}, {difference['high']:+.2f}]"
-
-
-def locating_spectra() -> str:
-    """Return position errors of matched-field processing, medians over the draws."""
-    rows = []
-    for name in SPECTRA:
-        for scene, fractions in load(name).get("scenes", {}).items():
-            for fraction, entry in fractions.items():
-                found, n = entry["median"], str(len(entry["draws"]))
-                error = f"{found['position_m']['median']:.3f} / {found['position_m']['p90']:.3f}"
-                rows.append([scene, f"{float(fraction):.0%}", n, error, f"{found['coverage_80']:.0%}"])
-    return markdown(["scene", "measured", "random choices", "position [m]", "80 % regions hold"], rows)
 
 
 # mean 3D error [m] and right floors of published methods on the same rows, best first: 1-NN of the comparisons by
