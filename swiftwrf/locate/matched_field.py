@@ -18,17 +18,10 @@ from swiftwrf.data.spectra import Spectra, check_training, direction_of_link
 from swiftwrf.data.splits import places
 from swiftwrf.errors import InputError, with_article
 from swiftwrf.gp import GaussianProcess, choose_kernel, subsample
-from swiftwrf.locate.posterior import Posterior, inflation, normalised, pooled_weights, read_inflation
-from swiftwrf.locate.region import Cells, Region, best_cells, outside_mass, refined
-from swiftwrf.locate.spectrum_likelihood import (
+from swiftwrf.locate.features import (
     CARRIER,
-    ChannelLikelihood,
-    CoarrayLikelihood,
     Features,
-    PathLikelihood,
     PathWaves,
-    PhaseLikelihood,
-    Screen,
     SpectrumFeatures,
     channel_numbers,
     channels_beside,
@@ -36,6 +29,15 @@ from swiftwrf.locate.spectrum_likelihood import (
     nearby_features,
     nearby_numbers,
     room_features,
+)
+from swiftwrf.locate.posterior import Posterior, inflation, normalised, pooled_weights, read_inflation
+from swiftwrf.locate.region import Cells, Region, best_cells, outside_mass, refined
+from swiftwrf.locate.spectrum_likelihood import (
+    ChannelLikelihood,
+    CoarrayLikelihood,
+    PathLikelihood,
+    PhaseLikelihood,
+    Screen,
 )
 from swiftwrf.models.base import FieldModel
 from swiftwrf.models.geometry import GeometryModel

@@ -1,18 +1,15 @@
-"""Likelihoods by the room that was found: co-array numbers, element phases under uncertain path gains, and channels.
+"""Likelihoods of spectra and channels by the room that was found.
 
-A spectrum of K elements is exactly a few dozen co-array numbers, and its channel's phases follow from these by phase
-retrieval. Both are compared with predictions straight from the channel; no spectrum is rendered. Searching the position
-whose predicted field matches the observed one is matched-field processing (A. B. Baggeroer, W. A. Kuperman and
-P. N. Mikhalevsky, IEEE J. Oceanic Eng. 18, 1993; with uncertain surroundings: A. M. Richardson and L. W. Nolte,
-J. Acoust. Soc. Am. 89, 1991). A measured channel is compared with its amplitudes and subcarriers. Where channels are
-measured densely, a Gaussian process of their co-array numbers about those of the room predicts what the room does not.
+Searching the position whose predicted field matches the observed one is matched-field processing (A. B. Baggeroer,
+W. A. Kuperman and P. N. Mikhalevsky, IEEE J. Oceanic Eng. 18, 1993; with uncertain surroundings: A. M. Richardson and
+L. W. Nolte, J. Acoust. Soc. Am. 89, 1991).
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
@@ -23,176 +20,18 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor
 
-from swiftwrf.array.angles import AngularGrid
-from swiftwrf.array.planar import PlanarArray
-from swiftwrf.gp import GaussianProcess
-from swiftwrf.models.geometry.channels import coherence, ends, field, sources, waves
-from swiftwrf.models.geometry.model import GeometryModel, kept_snapshots
-from swiftwrf.models.geometry.path_gains import PathGains
-from swiftwrf.models.geometry.phase_retrieval import autocorrelation, coarray_numbers, retrieve_phases
+from swiftwrf.locate.features import Features, PathWaves, SpectrumFeatures
+from swiftwrf.models.geometry.channels import coherence, ends, sources
+from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.runtime.threads import parallel_map
 
-CARRIER = torch.ones(1, dtype=torch.float64)  # frequency relative to the carrier
 DEGREES = (3.0, 5.0, 10.0, 30.0, math.inf)  # degrees of freedom of Student distributions that are compared
 SHRINKAGES = (0.05, 0.1, 0.2, 0.4, 0.7)  # of scale matrices to multiples of the identity, that are compared
 N_ALIGNED = 3  # iterations of the phases of snapshots and the expected field
 SCALES = (0.1, 1.0, 10.0)  # of the variances of path gains and scattering at a position
 BOUNDS = (-10.0, 6.0)  # of the logarithms of variances: products of four of them stay within float32
 
-
-@dataclass(frozen=True, eq=False)
-class SpectrumFeatures:
-    """Features of the channel that a spectrum determines, and the channel itself where it is measured.
-
-    Args:
-        coarray: Real and imaginary parts of the co-array numbers, float32 (n, F), of channels with amplitudes.
-        phases: Element phasors of unit modulus of spectra and their indistinguishable aliases, complex64 (n, T, K). T is 2
-            if there are aliases.
-        channel: Measured channels, complex64 (n, F, K).
-    """
-
-    coarray: Tensor
-    phases: Tensor | None = None
-    channel: Tensor | None = None
-
-    @classmethod
-    def of(cls, spectra: Iterable[Tensor], array: PlanarArray, grid: AngularGrid, seed: int = 0) -> SpectrumFeatures:
-        """Compute the features of spectra, batches (b, H, W) of magnitudes."""
-        numbers = coarray_numbers(spectra, array, grid)
-        channel, _ = retrieve_phases(numbers, array, seed)
-        opposite = array.opposite
-        aliases = [channel] if opposite is None else [channel, channel.conj()[:, opposite]]
-        return cls(real_parts(numbers), torch.stack(aliases, dim=1).to(torch.complex64))
-
-    @classmethod
-    def of_channels(cls, channel: Tensor, array: PlanarArray) -> SpectrumFeatures:
-        """Compute the features of channels (n, S, K)."""
-        kept = channel[:, kept_snapshots(channel.shape[1])]
-        return cls(channel_numbers(kept, array), channel=kept)
-
-    def subset(self, rows: Tensor) -> SpectrumFeatures:
-        """Return the features of some of the spectra."""
-        phases, channel = (None if x is None else x[rows] for x in (self.phases, self.channel))
-        return SpectrumFeatures(self.coarray[rows], phases, channel)
-
-    def __len__(self) -> int:
-        return len(self.coarray)
-
-
-def real_parts(numbers: Tensor) -> Tensor:
-    """Return complex numbers (..., P) as float32 (..., 2 P)."""
-    return torch.view_as_real(numbers).flatten(-2).float()
-
-
-def channel_numbers(channel: Tensor, array: PlanarArray) -> Tensor:
-    """Return the mean co-array numbers of the snapshots of channels (n, F, K), scaled to unit power, float32 (n, 2 P)."""
-    power = channel.abs().square().mean((1, 2), keepdim=True).clamp_min(1e-30)
-    return real_parts(autocorrelation(channel * power.rsqrt(), array).mean(dim=1))
-
-
-@dataclass(frozen=True, eq=False)
-class PathWaves:
-    """Waves of the paths of a room at candidate positions, which all likelihoods share.
-
-    Args:
-        position: Candidate positions, float64 (m, 3) [m].
-        wave: Wave of the direct path and of each image at each frequency and element, complex64 (m, 1 + S, F, K).
-        gain: Gains of the paths, (m, 1 + S).
-        frequency: Frequencies relative to the carrier, (F,).
-    """
-
-    position: Tensor
-    wave: Tensor
-    gain: Tensor
-    frequency: Tensor
-
-    @classmethod
-    def at(cls, room: GeometryModel, position: Tensor, frequency: Tensor = CARRIER) -> PathWaves:
-        """Compute the waves at positions (m, 3) [m] and frequencies (F,) relative to the carrier."""
-        scene = room.scene(position)
-        return cls(position, waves(room.reflectors, scene, frequency), room.gains(scene), frequency)
-
-    @cached_property
-    def channel(self) -> Tensor:
-        """Channel of each element by the room's path gains, complex64 (m, F, K)."""
-        return field(self.gain, self.wave)
-
-
-def channels_beside(room: GeometryModel, position: Tensor, away: Tensor, frequency: Tensor) -> Tensor:
-    """Return channels at positions beside others, by the lengths of the paths to first order and gains that do not change.
-
-    This takes a small part of the time of `PathWaves`, and suffices to choose candidates.
-
-    Args:
-        room: Room with S images.
-        position: Positions, float64 (m, 3) [m].
-        away: Vectors from each of them to C positions beside it, float64 (C, 3) [m].
-        frequency: Frequencies relative to the carrier, (F,).
-
-    Returns:
-        Channels, complex64 (m C, F, K).
-    """
-    here = PathWaves.at(room, position, frequency)
-
-    def rays(at: Tensor) -> Tensor:
-        scene = room.scene(at)
-        return sources(room.reflectors, scene) - scene.receiver
-
-    ray = rays(position)
-    unit = ray / ray.norm(dim=-1, keepdim=True).clamp_min(1e-12)
-    steps = torch.eye(3, dtype=torch.float64)
-    slope = torch.stack([((rays(position + step) - ray) * unit).sum(-1) for step in steps], dim=-1)  # (1 + S, m, 3)
-    phase = -math.tau / room.array.wavelength * (slope @ away.T).permute(1, 2, 0).float()
-    turned = torch.polar(here.gain[:, None].expand_as(phase).contiguous(), phase)
-    channel: Tensor = (turned @ here.wave.flatten(2)).flatten(0, 1).unflatten(1, here.wave.shape[2:])
-    return channel
-
-
-Features = Callable[[PathWaves], tuple[Tensor, Tensor]]
-"""from waves of m positions to co-array numbers, float32 (m, F), and relative standard deviations of their errors, (m,)"""
 Screen = Callable[[SpectrumFeatures], Tensor]
-
-
-def room_features(array: PlanarArray) -> Features:
-    """Return co-array numbers by constant path gains, as a function of waves."""
-
-    def features(waves: PathWaves) -> tuple[Tensor, Tensor]:
-        return real_parts(autocorrelation(waves.channel[:, 0].sgn(), array)), torch.ones(len(waves.position))
-
-    return features
-
-
-def gain_features(array: PlanarArray, gains: PathGains) -> Features:
-    """Return co-array numbers by position-dependent path gains, as a function of waves."""
-
-    def features(waves: PathWaves) -> tuple[Tensor, Tensor]:
-        channel = (waves.gain[:, None] + gains.change(waves.position)) @ waves.wave[:, :, 0]
-        return real_parts(autocorrelation(channel.sgn(), array).mean(dim=1)), torch.ones(len(waves.position))
-
-    return features
-
-
-def nearby_features(array: PlanarArray, process: GaussianProcess) -> Features:
-    """Return co-array numbers of channels by constant path gains and measured channels nearby, as a function of waves."""
-    return lambda waves: nearby_numbers(waves.channel, waves.position, array, process)
-
-
-def nearby_numbers(
-    channel: Tensor, position: Tensor, array: PlanarArray, process: GaussianProcess
-) -> tuple[Tensor, Tensor]:
-    """Return co-array numbers of predicted channels, corrected by measured channels nearby.
-
-    Args:
-        channel: Predicted channels (m, F, K).
-        position: Their positions (m, 3) [m].
-        array: Array of the channels.
-        process: Process of the differences of measured from predicted numbers.
-
-    Returns:
-        Numbers, float32 (m, 2 P), and the relative standard deviations of their errors, (m,).
-    """
-    std = (process.variance(position) + process.kernel.noise).sqrt().float()
-    return channel_numbers(channel, array) + process.mean(position).float(), std
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,10 +16,11 @@ from swiftwrf.data.coordinates import Floors
 from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.locate import MatchedField, Posterior, Region, RssiLocator, smoothed
 from swiftwrf.locate import posterior as module
+from swiftwrf.locate.features import PathWaves, SpectrumFeatures
 from swiftwrf.locate.posterior import normalised, pooled_weights
 from swiftwrf.locate.region import Cells, best_cells, refined
 from swiftwrf.locate.rssi_likelihood import METRICS, DetectionLikelihood, Fingerprints, ValueLikelihood
-from swiftwrf.locate.spectrum_likelihood import BOUNDS, CoarrayLikelihood, PathWaves, PhaseLikelihood, SpectrumFeatures
+from swiftwrf.locate.spectrum_likelihood import BOUNDS, CoarrayLikelihood, PhaseLikelihood
 from swiftwrf.models.geometry import GeometryModel, Plane
 from swiftwrf.models.geometry.path_gains import PathGains
 

@@ -14,7 +14,8 @@ from swiftwrf import AngularGrid, InputError, MatchedField, Spectra, load, simul
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data import PropagationPaths, Snapshots
 from swiftwrf.data.store import Store
-from swiftwrf.locate.spectrum_likelihood import SCALES, PathLikelihood, PathWaves, SpectrumFeatures, channels_beside
+from swiftwrf.locate.features import PathWaves, SpectrumFeatures, channels_beside
+from swiftwrf.locate.spectrum_likelihood import SCALES, PathLikelihood
 from swiftwrf.models.geometry import GeometryModel, Plane, furniture
 from swiftwrf.models.geometry.channels import Channels, coherence, field, sources, waves
 from swiftwrf.models.geometry.fit import observe
