@@ -115,18 +115,25 @@ class _Likelihoods:
     room: GeometryModel
     frequency: Tensor
     parts: tuple[CoarrayLikelihood | ChannelLikelihood | PhaseLikelihood, ...]
+    weight: Tensor
 
     def __call__(self, position: Tensor, observed: SpectrumFeatures) -> Tensor:
-        """Return log-likelihoods (k, n, m) of n observations at candidates (n, m, 3) [m]."""
+        """Return log-likelihoods (k, n, m) of n observations at candidates (n, m, 3) [m], 0 for those of weight 0."""
         n, m, _ = position.shape
         at, owner = position.reshape(-1, 3), torch.arange(n).repeat_interleave(m)
 
         def of_batch(rows: Tensor) -> Tensor:
             waves, target = PathWaves.at(self.room, at[rows], self.frequency), observed.subset(owner[rows])
-            return torch.stack([part(waves, target) for part in self.parts])
+            none = torch.zeros(len(rows))
+            counted = zip(self.parts, self.weight.tolist(), strict=True)
+            return torch.stack([part(waves, target) if weight > 0 else none for part, weight in counted])
 
         batches = torch.arange(n * m).split(BATCH_CANDIDATES // len(self.frequency))
         return torch.cat(parallel_map(of_batch, batches), dim=1).reshape(len(self.parts), n, m)
+
+    def log_mass(self, cells: Cells, values: Tensor) -> Tensor:
+        """Return the logarithms of the posterior masses of cells (n, m) with log-likelihoods (k, n, m)."""
+        return normalised(torch.einsum("k,knm->nm", self.weight, values.double()) + cells.log_volume)
 
 
 class MatchedField(Configured, Saved):
@@ -253,13 +260,15 @@ class MatchedField(Configured, Saved):
         held_out = [train.position[fold == number] for number in range(FOLDS)]
         others = [Region(train.position[fold != number]) for number in range(FOLDS)]
         self.region = region or Region(train.position, outside=outside_mass(others, held_out))
-        self._prepare()
         # weights by which the calibration searches
         weights = START_WEIGHTS if self.n_snapshots == 0 else START_WEIGHTS_CHANNEL
         self.weight, self.inflation = torch.tensor(weights, dtype=torch.float64), 1.0
+        self._prepare()
         self._calibrate(train.position, features, fold, parts)
+        self.likelihoods = replace(self.likelihoods, weight=self.weight)
         return self
 
+    likelihoods: _Likelihoods
     _screens: list[Screen]
     """likelihoods at all cells, which choose the cells that are searched"""
 
@@ -319,8 +328,8 @@ class MatchedField(Configured, Saved):
         ]
         frequency = self._frequency(fit.room)
         if self.n_snapshots:
-            return _Likelihoods(fit.room, frequency, (fit.paths, *coarray, ChannelLikelihood(self.floor)))
-        return _Likelihoods(fit.room, frequency, (*coarray, fit.paths))
+            return _Likelihoods(fit.room, frequency, (fit.paths, *coarray, ChannelLikelihood(self.floor)), self.weight)
+        return _Likelihoods(fit.room, frequency, (*coarray, fit.paths), self.weight)
 
     def _frequency(self, room: GeometryModel) -> Tensor:
         """Return the frequencies of the kept snapshots relative to the carrier, (F,), one where all are at the carrier."""
@@ -362,11 +371,8 @@ class MatchedField(Configured, Saved):
             cells = best_cells(self.cells, total.neg_(), config.n_best, config.n_background, generator)
             values = evaluate(cells.position)
             for _ in range(config.n_rounds):
-                cells, values = refined(cells, self._log_mass(cells, values), values, evaluate, config.n_split)
+                cells, values = refined(cells, likelihoods.log_mass(cells, values), values, evaluate, config.n_split)
             yield cells, values
-
-    def _log_mass(self, cells: Cells, values: Tensor) -> Tensor:
-        return normalised(torch.einsum("k,knm->nm", self.weight, values.double()) + cells.log_volume)
 
     @torch.no_grad()
     def locate(self, spectrum: Numbers | Spectra) -> Posterior:
@@ -398,7 +404,7 @@ class MatchedField(Configured, Saved):
             observed = SpectrumFeatures.of([magnitude], room.array, self.grid, self.config.seed)
         parts = list(self._searched(observed, self.likelihoods))
         position = torch.cat([cells.position for cells, _ in parts])
-        log_weight = torch.cat([self._log_mass(cells, values) for cells, values in parts])
+        log_weight = torch.cat([self.likelihoods.log_mass(cells, values) for cells, values in parts])
         # within half a wavelength the field changes too little for a second mode
         width = self.room.array.wavelength / 2
         return Posterior(position, log_weight, self._resolution_m, self.inflation, width)
