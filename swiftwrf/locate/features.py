@@ -177,5 +177,6 @@ def nearby_numbers(
     Returns:
         Numbers, float32 (m, 2 P), and the relative standard deviations of their errors, (m,).
     """
-    std = (process.variance(position) + process.kernel.noise).sqrt().float()
-    return channel_numbers(channel, array) + process.mean(position).float(), std
+    exact = process.is_exact  # else both follow from the same neighbours
+    mean, variance = (process.mean(position), process.variance(position)) if exact else process.local(position)
+    return channel_numbers(channel, array) + mean.float(), (variance + process.kernel.noise).sqrt().float()

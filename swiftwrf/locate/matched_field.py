@@ -223,24 +223,7 @@ class MatchedField(Configured, Saved):
         everything = torch.ones_like(fold, dtype=torch.bool)
         *parts, self._fit = parallel_map(fitted, [*(fold != number for number in range(FOLDS)), everything])
         if self.n_snapshots:
-
-            def left(fit: _Fit, rows: Tensor) -> Tensor:
-                waves = PathWaves.at(fit.room, train.position[rows], self._frequency(fit.room))
-                return features.coarray[rows] - channel_numbers(waves.channel, own.array)
-
-            out = torch.empty_like(features.coarray)  # of every channel by the room without its fold
-            for number, part in enumerate(parts):
-                out[fold == number] = left(part, fold == number)
-            nearby = choose_kernel(train.position, out[:, None], fold)
-
-            def corrected(fit: _Fit, kept: Tensor) -> _Fit:
-                return replace(
-                    fit,
-                    nearby=GaussianProcess.regress(nearby, train.position[kept], left(fit, kept), dtype=torch.float32),
-                )
-
-            parts = [corrected(part, fold != number) for number, part in enumerate(parts)]
-            self._fit = corrected(self._fit, everything)
+            *parts, self._fit = self._with_nearby(train.position, features, fold, [*parts, self._fit])
         # of every spectrum, by the fit without its fold
         self.residual = torch.empty(len(self._fit.features), *features.coarray.shape)
         missing, held = torch.ones(len(train)), []
@@ -267,6 +250,32 @@ class MatchedField(Configured, Saved):
         self._calibrate(train.position, features, fold, parts)
         self.likelihoods = replace(self.likelihoods, weight=self.weight)
         return self
+
+    def _with_nearby(
+        self, position: Tensor, features: SpectrumFeatures, fold: Tensor, fits: list[_Fit]
+    ) -> Iterator[_Fit]:
+        """Yield fits with the process of the difference of measured channels from their rooms.
+
+        Args:
+            position: Positions of the channels (n, 3) [m].
+            features: Their features.
+            fold: Their folds (n,).
+            fits: Fits without each fold, and to all channels.
+        """
+
+        def difference(fit: _Fit, rows: Tensor) -> Tensor:
+            batches = position[rows].split(BATCH_CANDIDATES)
+            channels = (PathWaves.at(fit.room, at, self._frequency(fit.room)).channel for at in batches)
+            return features.coarray[rows] - torch.cat([channel_numbers(own, fit.room.array) for own in channels])
+
+        held_out = torch.empty_like(features.coarray)
+        for number in range(FOLDS):
+            held_out[fold == number] = difference(fits[number], fold == number)
+        kernel = choose_kernel(position, held_out[:, None], fold)
+        for number, fit in enumerate(fits):
+            kept = fold != number  # all channels for the last
+            process = GaussianProcess.regress(kernel, position[kept], difference(fit, kept), dtype=torch.float32)
+            yield replace(fit, nearby=process)
 
     likelihoods: _Likelihoods
     _screens: list[Screen]
@@ -299,8 +308,9 @@ class MatchedField(Configured, Saved):
                     numbers, std = nearby_numbers(channel.movedim(0, 1), position, self.room.array, process)
                     return numbers @ near.distribution.whitening, std
 
-                positions = self.cells.position.split([channel.shape[1] for channel in channels])
-                numbers, std = zip(*parallel_map(corrected, zip(channels, positions, strict=True)), strict=True)
+                some = [part for channel in channels for part in channel.split(BATCH_CANDIDATES, dim=1)]
+                positions = self.cells.position.split([part.shape[1] for part in some])
+                numbers, std = zip(*parallel_map(corrected, zip(some, positions, strict=True)), strict=True)
                 self._screens.append(near.screen(torch.cat(numbers), torch.cat(std)))
             return
         self.cells = self.region.cells(int(min(max(count, 1), limit)))
