@@ -9,11 +9,8 @@ from __future__ import annotations
 import os
 import secrets
 import shutil
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
-from urllib.parse import quote
+from typing import Any
 
 import pandas as pd
 
@@ -25,55 +22,23 @@ from swiftwrf.runtime.durable import cache_folder, refusing_unwritable, rename, 
 FOLDER = "SWIFTWRF_DATA"  # environment variable with a folder of converted data sets
 
 
-@dataclass(frozen=True)
-class DataSet:
-    """A public data set, pinned to one commit of a repository on GitHub.
+def _read_sets(folder: Path) -> pd.DataFrame:
+    """Return the data sets: sets.csv describes them, checksums/NAME.txt has path and sha256 of each raw file.
 
-    Args:
-        kind: What it holds: "spectra" or "rssi".
-        content: What was measured, one sentence.
-        repository: Owner and name on GitHub.
-        commit: Commit of the raw files.
-        licence: Licence of the data.
-        citation: Authors, title, year.
-        convert: Writes the toolkit's layout (second folder) from the raw files (first folder).
-        checksums: File with path and sha256 of each raw file.
-
-    Example:
-        >>> DATA_SETS["kolak"].url
-        'https://raw.githubusercontent.com/marckolak/ble-rss-fingerprints-calib2021/0a69aaa7006909d3f8f9f3a14fcba9405d404fa5/'
+    Columns are those of the file, the function that converts the raw files (first folder) to the toolkit's layout (second
+    folder), the addresses of the repository (source) and of the raw files (url), and the file of checksums.
     """
-
-    kind: Literal["spectra", "rssi"]
-    content: str
-    repository: str
-    commit: str
-    licence: str
-    citation: str
-    convert: Callable[[Path, Path], None]
-    checksums: Path
-
-    @property
-    def source(self) -> str:
-        """Address of the repository."""
-        return f"https://github.com/{self.repository}"
-
-    @property
-    def url(self) -> str:
-        """Address that the paths of the raw files are appended to."""
-        return f"https://raw.githubusercontent.com/{quote(self.repository)}/{self.commit}/"
+    sets = pd.read_csv(folder / "sets.csv")
+    return sets.assign(
+        convert=[getattr(conversions, function) for function in sets["convert"]],
+        source="https://github.com/" + sets["repository"],
+        url="https://raw.githubusercontent.com/" + sets["repository"] + "/" + sets["commit"] + "/",
+        checksums=[folder / "checksums" / f"{name.replace('/', '-')}.txt" for name in sets["name"]],
+    )
 
 
-def _read_sets(folder: Path) -> dict[str, DataSet]:
-    """Return the data sets by name: sets.csv describes them, checksums/NAME.txt lists their raw files."""
-    sets = {}
-    for name, row in pd.read_csv(folder / "sets.csv", index_col="name").to_dict("index").items():
-        convert, checksums = getattr(conversions, row.pop("convert")), f"{str(name).replace('/', '-')}.txt"
-        sets[str(name)] = DataSet(**row, convert=convert, checksums=folder / "checksums" / checksums)
-    return sets
-
-
-DATA_SETS = _read_sets(Path(__file__).parent)
+SETS = _read_sets(Path(__file__).parent)
+DATA_SETS: dict[str, Any] = {row.name: row for row in SETS.itertuples(index=False)}
 
 
 def catalogue() -> pd.DataFrame:
@@ -83,9 +48,7 @@ def catalogue() -> pd.DataFrame:
         >>> catalogue().loc["tetam-tracks", "licence"]
         'CC0 1.0'
     """
-    columns = ("kind", "licence", "source", "content")
-    rows = {name: [getattr(found, column) for column in columns] for name, found in DATA_SETS.items()}
-    return pd.DataFrame.from_dict(rows, orient="index", columns=list(columns))
+    return SETS.set_index("name")[["kind", "licence", "source", "content"]].rename_axis(None)
 
 
 def fetch(name: str) -> Path:
@@ -113,7 +76,7 @@ def fetch(name: str) -> Path:
     folder = cache_folder() / "datasets" / name
     if not folder.is_dir():
         with refusing_unwritable(folder.parent):
-            _convert(name, DATA_SETS[name], folder)
+            _convert(DATA_SETS[name], folder)
     return folder
 
 
@@ -123,14 +86,16 @@ def load(name: str) -> Spectra | Rssi:
     return load_spectra(folder) if DATA_SETS[name].kind == "spectra" else load_rssi(folder)
 
 
-def _convert(name: str, data: DataSet, folder: Path) -> None:
+def _convert(data: Any, folder: Path) -> None:
     """Download and convert a data set; the folder appears when it is complete."""
-    raw = _download(name, data)
+    raw = _download(data)
     unfinished = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}")
     unfinished.mkdir(parents=True)
     try:
         data.convert(raw, unfinished)
-        page = f"# {name}\n\n{data.content}\n\nSource: {data.url}\nLicence: {data.licence}\nCite: {data.citation}\n"
+        page = (
+            f"# {data.name}\n\n{data.content}\n\nSource: {data.url}\nLicence: {data.licence}\nCite: {data.citation}\n"
+        )
         write_text(unfinished / "README.md", f"{page}Converted from the raw files by swiftwrf.datasets.\n")
         if not folder.exists():
             rename(unfinished, folder)
@@ -138,10 +103,10 @@ def _convert(name: str, data: DataSet, folder: Path) -> None:
         shutil.rmtree(unfinished, ignore_errors=True)
 
 
-def _download(name: str, data: DataSet) -> Path:
+def _download(data: Any) -> Path:
     """Return the folder of the raw files."""
-    folder = cache_folder() / "datasets" / "raw" / name
-    pooch = optional_module("pooch", f"data set {name} is downloaded by pooch", "data")
+    folder: Path = cache_folder() / "datasets" / "raw" / data.name
+    pooch = optional_module("pooch", f"data set {data.name} is downloaded by pooch", "data")
     pooch.get_logger().setLevel("WARNING")
     source = pooch.create(folder, data.url)
     source.load_registry(data.checksums)
@@ -153,6 +118,6 @@ def _download(name: str, data: DataSet) -> Path:
                 raise
             reason = "its checksum differs" if isinstance(error, ValueError) else "it cannot be downloaded"
             raise InputError(
-                f"data set {name}: {reason}: {source.get_url(file)}; put the file at {folder / file}"
+                f"data set {data.name}: {reason}: {source.get_url(file)}; put the file at {folder / file}"
             ) from None
     return folder

@@ -6,7 +6,6 @@ import json
 import pickle
 import sys
 import threading
-from dataclasses import dataclass, replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
@@ -18,16 +17,9 @@ from quick import command, said
 from scipy.io import savemat
 
 from swiftwrf import InputError, Rssi, Spectra, datasets, load_rssi, load_spectra
-from swiftwrf.datasets import DATA_SETS, DataSet, conversions
+from swiftwrf.datasets import DATA_SETS, conversions
 
 pytest.importorskip("pooch", reason="needs the extra data")
-
-
-@dataclass(frozen=True)
-class LocalSet(DataSet):
-    """A data set of a server of this machine."""
-
-    url: str = ""  # type: ignore[misc]
 
 
 class Quiet(SimpleHTTPRequestHandler):
@@ -67,8 +59,7 @@ def served(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.delenv("SWIFTWRF_DATA", raising=False)
     address = f"http://127.0.0.1:{server.server_port}/"
-    known = {f: getattr(DATA_SETS["kolak"], f) for f in DataSet.__dataclass_fields__}
-    toy = LocalSet(**(known | {"checksums": tmp_path / "sums.txt", "url": address}))
+    toy = DATA_SETS["kolak"]._replace(name="toy", checksums=tmp_path / "sums.txt", url=address)
     monkeypatch.setitem(DATA_SETS, "toy", toy)
     yield server
     server.shutdown()
@@ -128,7 +119,7 @@ def test_a_conversion_that_fails_leaves_nothing(served, tmp_path, monkeypatch):
         (out / "half").touch()
         raise InputError("no")
 
-    monkeypatch.setitem(DATA_SETS, "toy", replace(DATA_SETS["toy"], convert=fail))
+    monkeypatch.setitem(DATA_SETS, "toy", DATA_SETS["toy"]._replace(convert=fail))
     with pytest.raises(InputError, match=r"^no$"):
         datasets.fetch("toy")
     assert [path.name for path in (tmp_path / "cache" / "swiftwrf" / "datasets").iterdir()] == ["raw"]
