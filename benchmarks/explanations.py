@@ -41,9 +41,8 @@ def main(asked: Config) -> None:
 
 def causes(data: Snapshots) -> list[str]:
     """Return the causes that are named of an error of frames, elements or labels."""
-    report = check_frames(data.spectra(diagnosis.GRID), data)
-    assert report is not None
-    return [*report.explanations, *(["constant rotation of"] if report.turn_deg else [])]
+    numbers = check_frames(data.spectra(diagnosis.GRID), data)[2]
+    return [*numbers["explanations"], *(["constant rotation of"] if numbers["turn_deg"] else [])]
 
 
 def is_right(name: str, seed: int) -> bool:

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -48,7 +48,10 @@ from swiftwrf.diagnostics.elements import (
 )
 from swiftwrf.errors import ranges
 
+Frame = Literal["unknown", "fits", "in part", "explained", "turned", "undecided"]
 MIN_CLEAR_POSITIONS = 20  # with line of sight, to check frames
+MIN_SPAN_DEG = 10.0  # between lines of sight, to check frames
+MAX_END_OFFSET = 1e-3  # of normalised coordinates from the ends of their interval
 MIN_EVIDENCE = 0.15  # agreement above chance to accept a frame, and above the declared frame to prefer another one
 # angle of a constant rotation that is reported, and the largest difference between those of two halves of the positions
 MIN_TURN = math.radians(5)
@@ -78,45 +81,6 @@ AZIMUTH_ERRORS = {  # maps from x, y of the line of sight to those of the peaks
     "azimuths of the spectra count from -y instead of x (or the array's x axis is at -y)": ((0, -1), (1, 0)),
     "azimuths turn clockwise from y, as on a compass (or the array's x and y are swapped)": ((0, 1), (1, 0)),
 }
-
-
-@dataclass(frozen=True)
-class FrameReport:
-    """Result of `check_frames`.
-
-    Args:
-        agreement: Agreement in the declared frame, in [0, 1].
-        chance: Chance level of the agreement.
-        angle_deg: Median angle between peak and line of sight [deg].
-        limit_deg: Median angle up to which this array's peaks are in one frame with the lines of sight [deg].
-        elsewhere: Fraction of the positions with a peak beyond three times that angle.
-        span_deg: Median angle between the lines of sight of two positions [deg].
-        peak_span_deg: Median angle between the peaks of two positions [deg].
-        behind: Fraction of the lines of sight that lie behind the array. 0 for a linear array, which has no front.
-        explanations: Errors with clearly more agreement than the declared frame, in words; several are not distinguished.
-        turn_deg: Constant rotation with more agreement, as a rotation vector in array coordinates [deg], or None.
-    """
-
-    agreement: float
-    chance: float
-    angle_deg: float
-    limit_deg: float
-    elsewhere: float
-    span_deg: float
-    peak_span_deg: float
-    behind: float
-    explanations: tuple[str, ...]
-    turn_deg: tuple[float, float, float] | None
-
-    @property
-    def follows(self) -> bool:
-        """True if peaks follow the line of sight more than by chance, and no other frame does clearly better."""
-        return self.agreement - self.chance >= MIN_EVIDENCE and not self.explanations and self.turn_deg is None
-
-    @property
-    def fits(self) -> bool:
-        """True if the declared frame explains most peaks, and no other frame does clearly better."""
-        return self.follows and self.angle_deg <= self.limit_deg and self.elsewhere <= MAX_ELSEWHERE
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +149,7 @@ class _Hypothesis:
         return float(self.evidence.mean()) - COST * self.free
 
 
-def check_frames(spectra: Spectra, snapshots: Snapshots | None = None) -> FrameReport | None:
+def check_frames(spectra: Spectra, snapshots: Snapshots | None = None) -> tuple[Frame, str, dict[str, Any]]:
     """Compare the peaks of the spectra with the lines of sight, in the declared frame and in others.
 
     Args:
@@ -193,21 +157,102 @@ def check_frames(spectra: Spectra, snapshots: Snapshots | None = None) -> FrameR
         snapshots: Snapshots that the spectra were computed from, to try other orders of their elements and axes.
 
     Returns:
-        The report, or None with fewer than 20 such positions or an unknown frame.
+        The result in a word and in words, and numbers by name. "unknown" with fewer than 20 such positions or an unknown
+        frame.
 
     Example:
         >>> from swiftwrf.data.simulated import simulated_room
-        >>> check_frames(simulated_room(n=40)).fits
-        True
+        >>> check_frames(simulated_room(n=40))[0]
+        'fits'
     """
     rows = spectra.line_of_sight.nonzero()[:, 0]
     if len(rows) < MIN_CLEAR_POSITIONS or spectra.fixed_position is None or spectra.rotation is None:
-        return None
+        needed = f"the fixed end, the orientation and {MIN_CLEAR_POSITIONS} positions with line of sight"
+        return "unknown", f"Frames cannot be checked: that needs {needed}.", {}
     rows = rows[some_rows(len(rows), 300)]
     sign = 1.0 if spectra.moving == "transmitter" else -1.0
     frame = _Frame(spectra.position[rows], spectra.fixed_position, spectra.rotation, sign, spectra.array)
     peak, direction = frame.peaks(spectra.store[rows], spectra.grid), frame.direction()
     agreement, chance = _agreement(direction, peak)
+    explanations, turn_deg = _explanations(spectra, rows, frame, peak, snapshots)
+    angle_deg, limit_deg = _nearest(direction, peak).rad2deg(), 10.0
+    if spectra.array is not None:  # up to which this array's peaks are in one frame with the lines of sight
+        pixel = math.degrees(max(spectra.grid.elevation_step, spectra.grid.azimuth_step))
+        limit_deg = min(limit_deg, math.degrees(spectra.array.resolution) + pixel / 2)
+    median_deg, elsewhere = float(angle_deg.median()), float((angle_deg > 3 * limit_deg).double().mean())
+    span_deg, peak_span_deg = _span_deg(direction), _span_deg(peak[:, 0])
+    follows = agreement - chance >= MIN_EVIDENCE and not explanations and turn_deg is None
+    fits = follows and median_deg <= limit_deg and elsewhere <= MAX_ELSEWHERE
+    result: Frame
+    if not fits and (filled := _normalised(spectra.position)):
+        result = "explained"
+        text = f". All coordinates fill {filled} exactly, so positions look normalised; give metres"
+    elif explanations:
+        result, text = "explained", f". That would fit if {'; or if '.join(explanations)}"
+    elif turn_deg:
+        angle = math.hypot(*turn_deg)
+        axis = ", ".join(f"{a / angle:.2f}" for a in turn_deg)
+        result, text = (
+            "turned",
+            (
+                f". A constant rotation of {angle:.0f} degrees about ({axis}) in array coordinates would mend most of it: "
+                "is the orientation right?"
+            ),
+        )
+    elif fits:
+        result, text = "fits", " and follow it: positions, orientation and angles are in one frame"
+    elif span_deg < MIN_SPAN_DEG:
+        result, text = (
+            "undecided",
+            (
+                f". All lines of sight have nearly one direction ({span_deg:.1f} degrees between two, median), so frames "
+                "cannot be checked"
+            ),
+        )
+    elif peak_span_deg < span_deg / 4:
+        result, text = (
+            "undecided",
+            (
+                f". The spectra hardly differ: two peaks are {peak_span_deg:.1f} degrees apart, two lines of sight "
+                f"{span_deg:.1f} degrees (medians)"
+            ),
+        )
+    elif follows:
+        result, text = (
+            "in part",
+            (
+                f". They follow it in part: one frame reaches {limit_deg:.0f} degrees with this array, and "
+                f"{elsewhere:.0%} of the peaks are elsewhere. The rest is unexplained, e.g. reflections or wrong labels"
+            ),
+        )
+    else:
+        result, text = (
+            "undecided",
+            (
+                " and do not follow it in any frame that was tried: unexplained, e.g. reflections are stronger, or the "
+                "elements' phases are not calibrated"
+            ),
+        )
+    by = ", by the angle to the array's axis" if frame.linear else ""
+    numbers = {
+        "peak_to_line_of_sight_deg": median_deg,
+        "agreement": agreement,
+        "agreement_by_chance": chance,
+        "behind_share": 0.0 if frame.linear else float((frame.away()[:, 2] < 0).double().mean()),
+        "frame": result,
+        "explanations": explanations,
+        "turn_deg": turn_deg,
+    }
+    return result, f"Peaks are {median_deg:.1f} degrees beside the line of sight (median{by}){text}.", numbers
+
+
+def _explanations(
+    spectra: Spectra, rows: Tensor, frame: _Frame, peak: Tensor, snapshots: Snapshots | None
+) -> tuple[list[str], tuple[float, ...] | None]:
+    """Return errors with clearly more evidence than the declared frame at some rows, in words, and a constant rotation.
+
+    Several errors are not distinguished. The rotation is a rotation vector in array coordinates [deg].
+    """
     seen = None if snapshots is None else snapshots.subset(rows)
     declared = float(_evidence(frame.away(), frame, peak, seen).mean())
     time = None if snapshots is None else snapshots.time
@@ -215,25 +260,26 @@ def check_frames(spectra: Spectra, snapshots: Snapshots | None = None) -> FrameR
     for name, found in _hypotheses(spectra, rows, frame, peak, seen, time):
         tried[name] = max(found, tried.get(name, found), key=lambda each: each.score)
     best, names = best_explanations({name: each.score for name, each in tried.items()}, TIE)
-    is_clear = best - declared >= (MIN_EVIDENCE if seen is None else MIN_POWER)
-    explained = [name for name in names if is_clear and name != UNCALIBRATED and _reaches(tried[name], seen)]
+    if best - declared < (MIN_EVIDENCE if seen is None else MIN_POWER):
+        return [], None
+    explained = [name for name in names if name != UNCALIBRATED and _reaches(tried[name], seen)]
     turn = next((tried[name].turn for name in explained if tried[name].turn is not None), None)
-    angle_deg, limit_deg = _nearest(direction, peak).rad2deg(), 10.0
-    if spectra.array is not None:
-        pixel = math.degrees(max(spectra.grid.elevation_step, spectra.grid.azimuth_step))
-        limit_deg = min(limit_deg, math.degrees(spectra.array.resolution) + pixel / 2)
-    return FrameReport(
-        agreement=agreement,
-        chance=chance,
-        angle_deg=float(angle_deg.median()),
-        limit_deg=limit_deg,
-        elsewhere=float((angle_deg > 3 * limit_deg).double().mean()),
-        span_deg=_span_deg(direction),
-        peak_span_deg=_span_deg(peak[:, 0]),
-        behind=0.0 if frame.linear else float((frame.away()[:, 2] < 0).double().mean()),
-        explanations=tuple(name for name in explained if tried[name].turn is None),
-        turn_deg=None if turn is None else tuple(np.degrees(turn).tolist()),
-    )
+    in_words = [name for name in explained if tried[name].turn is None]
+    return in_words, None if turn is None else tuple(np.degrees(turn).tolist())
+
+
+def _normalised(position: Tensor) -> str:
+    """Return the interval that every coordinate of positions (n, 3) fills exactly, as normalised ones do, or an empty text.
+
+    Coordinates without extent are left out; one coordinate alone is no evidence.
+    """
+    low, high = position.amin(dim=0), position.amax(dim=0)
+    varying = high > low
+    for name, start in (("[-1, 1]", -1.0), ("[0, 1]", 0.0)):
+        ends = torch.cat([low[varying] - start, high[varying] - 1])
+        if int(varying.sum()) >= 2 and bool((ends.abs() <= MAX_END_OFFSET).all()):
+            return name
+    return ""
 
 
 def _evidence(away: Tensor, frame: _Frame, peak: Tensor, seen: Snapshots | None) -> Tensor:

@@ -16,7 +16,7 @@ from swiftwrf.data.powers import has_frequent_edge
 from swiftwrf.data.splits import MAX_REPEATED, MIN_TRAINING, repeated_fraction
 from swiftwrf.diagnostics.calibration import calibrate
 from swiftwrf.diagnostics.elements import in_noise, noisy_elements
-from swiftwrf.diagnostics.frames import MIN_CLEAR_POSITIONS, FrameReport, check_frames
+from swiftwrf.diagnostics.frames import Frame, check_frames
 from swiftwrf.diagnostics.path_loss import check_path_loss
 from swiftwrf.errors import InputError, listed
 from swiftwrf.positions import nearest
@@ -26,12 +26,9 @@ from swiftwrf.runtime.validation import checked
 Level = Literal["fact", "warning"]
 SMOOTH, ROUGH = 0.25, 0.5  # wavelengths between neighbours: below, fields are smooth; above, fringes are lost
 SPARSE = 2.0  # wavelengths between neighbours, beyond which a search for a room finds few of its planes or none
-MAX_END_OFFSET = 1e-3  # of normalised coordinates from the ends of their interval
 MAX_EXTENT_M = 1000.0  # beyond, coordinates may be millimetres or pixels
 MIN_GAIN = 0.1  # of a recommended calibration, in the fraction of the power along the line of sight
-MIN_SPAN_DEG = 10.0  # between lines of sight, to check frames
 MIN_BEHIND = 0.01  # share of the lines of sight behind the array that is reported
-Frame = Literal["unknown", "fits", "in part", "explained", "turned", "undecided"]
 MAX_LEVEL_DBM = 10.0  # at 1 m, which no usual transmitter reaches
 MIN_EXPLAINED, MIN_SPREAD_DB = 0.15, 1.0  # of offsets that are proposed
 
@@ -144,20 +141,6 @@ def _check_positions(position: Tensor, findings: Findings, wavelength: float | N
         findings.warn(f"{text}: interpolators see no fringes between such positions; {geometry}.")
 
 
-def _normalised(position: Tensor) -> str:
-    """Return the interval that every coordinate of positions (n, 3) fills exactly, as normalised ones do, or an empty text.
-
-    Coordinates without extent are left out; one coordinate alone is no evidence.
-    """
-    low, high = position.amin(dim=0), position.amax(dim=0)
-    varying = high > low
-    for name, start in (("[-1, 1]", -1.0), ("[0, 1]", 0.0)):
-        ends = torch.cat([low[varying] - start, high[varying] - 1])
-        if int(varying.sum()) >= 2 and bool((ends.abs() <= MAX_END_OFFSET).all()):
-            return name
-    return ""
-
-
 def _add_splits(data: Spectra | Snapshots | Rssi, findings: Findings) -> None:
     """Report the splits that came with the measurements."""
     for name, (train, test) in data.named_splits.items():
@@ -243,71 +226,18 @@ def _check_calibration(data: Snapshots, findings: Findings) -> None:
 
 def _check_peaks(data: Spectra, findings: Findings, snapshots: Snapshots | None) -> Frame:
     """Report whether the peaks of the spectra follow the lines of sight, and return the result in a word."""
-    report = check_frames(data, snapshots)
-    if report is None:
-        findings.warn(
-            "Frames cannot be checked: that needs the fixed end, the orientation and "
-            f"{MIN_CLEAR_POSITIONS} positions with line of sight."
-        )
-        return "unknown"
-    frame, text = _in_words(data, report)
-    if frame != "explained" and report.behind >= MIN_BEHIND:
+    frame, text, numbers = check_frames(data, snapshots)
+    behind = numbers.get("behind_share", 0.0)
+    if frame != "explained" and behind >= MIN_BEHIND:
         where = "of the positions lie" if data.moving == "transmitter" else "of the positions have the transmitter"
-        behind = f"{report.behind:.0%} {where} behind the array, and their directions are folded to its front"
-        if report.behind > 1 - MIN_BEHIND:
-            findings.add(f"{behind}.")
+        folded = f"{behind:.0%} {where} behind the array, and their directions are folded to its front"
+        if behind > 1 - MIN_BEHIND:
+            findings.add(f"{folded}.")
         else:
-            findings.warn(f"{behind}: two places share one label.")
-    linear = data.array is not None and data.array.axis is not None
-    by = ", by the angle to the array's axis" if linear else ""
+            findings.warn(f"{folded}: two places share one label.")
     add = findings.add if frame in ("fits", "in part") else findings.warn
-    add(
-        f"Peaks are {report.angle_deg:.1f} degrees beside the line of sight (median{by}){text}.",
-        peak_to_line_of_sight_deg=report.angle_deg,
-        agreement=report.agreement,
-        agreement_by_chance=report.chance,
-        behind_share=report.behind,
-        frame=frame,
-        explanations=list(report.explanations),
-        turn_deg=report.turn_deg,
-    )
+    add(text, **numbers)
     return frame
-
-
-def _in_words(data: Spectra, report: FrameReport) -> tuple[Frame, str]:
-    """Return the error that explains the peaks, or else how far they agree with the lines of sight, in words."""
-    if not report.fits and (filled := _normalised(data.position)):
-        return "explained", f". All coordinates fill {filled} exactly, so positions look normalised; give metres"
-    if report.explanations:
-        return "explained", f". That would fit if {'; or if '.join(report.explanations)}"
-    if report.turn_deg:
-        angle = sum(a * a for a in report.turn_deg) ** 0.5
-        axis = ", ".join(f"{a / angle:.2f}" for a in report.turn_deg)
-        return "turned", (
-            f". A constant rotation of {angle:.0f} degrees about ({axis}) in array coordinates would mend most of it: "
-            "is the orientation right?"
-        )
-    if report.fits:
-        return "fits", " and follow it: positions, orientation and angles are in one frame"
-    if report.span_deg < MIN_SPAN_DEG:
-        return "undecided", (
-            f". All lines of sight have nearly one direction ({report.span_deg:.1f} degrees between two, median), so frames "
-            "cannot be checked"
-        )
-    if report.peak_span_deg < report.span_deg / 4:
-        return "undecided", (
-            f". The spectra hardly differ: two peaks are {report.peak_span_deg:.1f} degrees apart, two lines of sight "
-            f"{report.span_deg:.1f} degrees (medians)"
-        )
-    if report.follows:
-        return "in part", (
-            f". They follow it in part: one frame reaches {report.limit_deg:.0f} degrees with this array, and "
-            f"{report.elsewhere:.0%} of the peaks are elsewhere. The rest is unexplained, e.g. reflections or wrong labels"
-        )
-    return "undecided", (
-        " and do not follow it in any frame that was tried: unexplained, e.g. reflections are stronger, or the elements' "
-        "phases are not calibrated"
-    )
 
 
 def _check_rssi(data: Rssi, findings: Findings) -> None:
