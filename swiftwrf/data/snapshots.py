@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from swiftwrf.array.angles import AngularGrid, ArrayPose
 from swiftwrf.array.beamforming import PHASE
@@ -104,8 +105,7 @@ class Snapshots(PositionedData):
     @property
     def direction(self) -> Tensor:
         """Unit vectors of `away`, (n, 3)."""
-        direction: Tensor = self.away / self.away.norm(dim=1, keepdim=True)
-        return direction
+        return functional.normalize(self.away, dim=1)
 
     def spectra(self, grid: AngularGrid | tuple[int, int] | None = None, beamformer: str = PHASE) -> Spectra:
         """Return the spectra of the array, from all snapshots of a position together.

@@ -19,11 +19,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
+from torch.nn import functional
 
 from swiftwrf.array.angles import angular_distance, wrap
 from swiftwrf.array.beamforming import of_unit_power, unit
@@ -152,16 +153,15 @@ def calibrate(train: Snapshots) -> Calibration:
             f"{math.degrees(MAX_TURN):.0f} degrees; a calibration needs at least {MIN_TRAINING} (is the frame right?)"
         )
     phase_std, turn_std = problem.standard_errors(found)
-    wide, loose = turn_std.max() > math.radians(3), (phase_std > math.radians(30)).nonzero()[:, 0].tolist()
-    if wide or loose:
-        turn_deg, phase_deg = (math.degrees(float(std.max())) for std in (turn_std, phase_std))
-        open_ones = []
-        if wide:
-            axis = "xyz"[int(turn_std.argmax())]
-            open_ones.append(f"the rotation about its {axis} axis (standard error {turn_deg:.1f} degrees)")
-        if loose:
-            error = f"standard error {phase_deg:.1f} degrees"
-            open_ones.append(f"the phases of elements {ranges(loose)}, counted from 0 ({error})")
+    turn_deg, phase_deg = (math.degrees(float(std.max())) for std in (turn_std, phase_std))
+    open_ones = []
+    if turn_deg > 3:
+        axis = "xyz"[int(turn_std.argmax())]
+        open_ones.append(f"the rotation about its {axis} axis (standard error {turn_deg:.1f} degrees)")
+    if loose := (phase_std > math.radians(30)).nonzero()[:, 0].tolist():
+        error = f"standard error {phase_deg:.1f} degrees"
+        open_ones.append(f"the phases of elements {ranges(loose)}, counted from 0 ({error})")
+    if open_ones:
         mean = problem.direction.mean(dim=0).expand_as(problem.direction)
         cone = float(angular_distance(problem.direction, mean).median())
         reason = "phases change from position to position as no direct path explains"
@@ -179,8 +179,7 @@ def calibrate(train: Snapshots) -> Calibration:
     return Calibration(wrap(found.phase - found.phase[0]), phase_std, found.turn, turn_std, before, after, clear)
 
 
-@dataclass(frozen=True, eq=False)
-class _Found:
+class _Found(NamedTuple):
     phase: Tensor  # (K,)
     turn: Tensor  # (3,)
 
@@ -203,8 +202,7 @@ class _Problem:
     @property
     def direction(self) -> Tensor:
         """Unit vectors of the line of sight, (n, 3)."""
-        direction: Tensor = self.away / self.away.norm(dim=1, keepdim=True)
-        return direction
+        return functional.normalize(self.away, dim=1)
 
     def subset(self, rows: Tensor) -> _Problem:
         values = {name: getattr(self, name)[rows] for name in ("position", "away", "covariance", "strongest")}
@@ -218,15 +216,11 @@ class _Problem:
         line = torch.arange(-MAX_TURN, MAX_TURN + step / 2, step, dtype=torch.float64)
         turns = torch.cartesian_prod(line, line, line)
         turns = turns[turns.norm(dim=1) <= MAX_TURN + 1e-9]
-        best, found = -math.inf, None
-        for turn in turns:
-            steering = few._steering(turn)
-            total = torch.einsum("nab,na,nb->ab", few.covariance, steering.conj(), steering)
-            power, vector = torch.linalg.eigh(total)  # the phases that maximise the power along the line of sight
-            if float(power[-1]) > best:
-                best, found = float(power[-1]), _Found(vector[:, -1].angle(), turn)
-        assert found is not None
-        return found
+        steering = (few._steering(turn) for turn in turns)
+        totals = torch.stack([torch.einsum("nab,na,nb->ab", few.covariance, a.conj(), a) for a in steering])
+        power, vector = torch.linalg.eigh(totals)  # the phases that maximise the power along the line of sight
+        best = int(power[:, -1].argmax())
+        return _Found(vector[best, :, -1].angle(), turns[best])
 
     def descend(self, found: _Found) -> _Found:
         """Minimise the residual phases by Gauss-Newton steps, reweighted in each."""
@@ -270,7 +264,7 @@ class _Problem:
     def _steering(self, turn: Tensor) -> Tensor:
         away = self.away @ rotation_matrix(turn)
         return unit_phasor(
-            self.array.phase_at(away) if self.curved else self.array.phase(away / away.norm(dim=1, keepdim=True))
+            self.array.phase_at(away) if self.curved else self.array.phase(functional.normalize(away, dim=1))
         )
 
     def standard_errors(self, found: _Found) -> tuple[Tensor, Tensor]:

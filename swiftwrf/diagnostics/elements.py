@@ -23,13 +23,8 @@ from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.errors import listed
 
-NOISE = "elements {listed}, counted from 0, hold noise: their phase follows no other element (--drop-elements {option})"
 MIN_SCALE = 0.06  # of wavelengths, relative to the declared one and to its half
 ORDERS = 40  # from which the order of the elements is searched
-ROUND_TRIP = (
-    "the phases are those of the way there and back, as of RFID and backscatter (--round-trip); elements are then "
-    "{spacing:.2f} wavelengths apart{ambiguous}"
-)
 
 
 def other_readings(data: Snapshots, away: Tensor) -> Iterator[tuple[str, float, Snapshots]]:
@@ -46,7 +41,8 @@ def other_readings(data: Snapshots, away: Tensor) -> Iterator[tuple[str, float, 
         yield f"the axes of elements and subcarriers are swapped: {remedy}", 0, swapped
     halved = PlanarArray(array.element, array.wavelength / 2)
     ambiguous = ", so directions are ambiguous" if halved.spacing_wavelengths > 0.51 else ""
-    meaning = ROUND_TRIP.format(spacing=halved.spacing_wavelengths, ambiguous=ambiguous)
+    apart = f"elements are then {halved.spacing_wavelengths:.2f} wavelengths apart{ambiguous}"
+    meaning = f"the phases are those of the way there and back, as of RFID and backscatter (--round-trip); {apart}"
     yield meaning, 0, replace(data, array=halved)
     scales = torch.logspace(math.log10(0.38), math.log10(3.5), 50, dtype=torch.float64).tolist()
     scaled = {scale: replace(data, array=PlanarArray(array.element, array.wavelength / scale)) for scale in scales}
@@ -159,7 +155,9 @@ def noisy_elements(data: Snapshots, away: Tensor) -> list[int]:
 
 def in_noise(elements: list[int]) -> str:
     """Return in words that elements, counted from 0, hold noise."""
-    return NOISE.format(listed=", ".join(map(str, elements)), option=" ".join(map(str, elements)))
+    names = list(map(str, elements))
+    remedy = f"(--drop-elements {' '.join(names)})"
+    return f"elements {', '.join(names)}, counted from 0, hold noise: their phase follows no other element {remedy}"
 
 
 def sloped(data: Snapshots, away: Tensor) -> Tensor:
@@ -189,12 +187,12 @@ def flipping_elements(data: Snapshots, away: Tensor) -> tuple[list[int], Tensor]
 
     Elements count from 0. Of two groups that flip against each other, the larger one counts as steady.
     """
-    channel, steering = unit_channel(data), wave_from(data, away)
-    residual = channel * steering[:, None].conj()
+    channel, wave = unit_channel(data), wave_from(data, away)
+    residual = channel * wave[:, None].conj()
     plain, doubled = (residual.pow(power).mean(dim=-1).abs().square() for power in (1, 2))
     sign, mended = _without_flips(residual)
     # pairings of channels with lines of sight of other positions
-    rolled = (steering.roll(shift, 0) for shift in {max(1, len(data) * k // 6) for k in range(1, 6)})
+    rolled = (wave.roll(shift, 0) for shift in {max(1, len(data) * k // 6) for k in range(1, 6)})
     chance = torch.stack([_without_flips(channel * other[:, None].conj())[1].mean() for other in rolled]).mean()
     gain = min(mended.mean() - plain.mean(), mended.mean() - chance)
     # fractions of the power along the line of sight; flips do not change that of the squared channel
