@@ -202,39 +202,12 @@ def _is_apart(others: Floats, same: Floats) -> bool:
     return of_no_height or distance > FAR_RATIO * spacing or (more_often and distance > spacing)
 
 
-def plain_degrees(label: object, names: tuple[str, str], xy: Floats) -> tuple[Floats, list[str]]:
-    """Return longitudes and latitudes (n, 2) [deg] that may be in units of 1e-7 degrees or ddmm.mmmm, and a note on these.
-
-    Raises:
-        InputError: Values that may be ddmm.mmmm or metres.
-
-    Example:
-        >>> plain_degrees("walk.csv", ("lon", "lat"), np.array([[850.5, 4730.0]]))[0].round(4)
-        array([[ 8.8417, 47.5   ]])
-    """
-    columns = f"columns {names[0]} and {names[1]}"
-    size = np.abs(xy)
-    if (size <= 180).all() or not np.isfinite(size).all():  # refused later
-        return xy, []
-    if bool((xy % 1 == 0).all()) and (size <= (180e7, 90e7)).all() and size.min(axis=0).max() >= 1e7:
-        return xy / 1e7, [f"{columns} count 1e-7 degrees, which are converted to degrees"]
-    whole, minutes = np.divmod(size, 100)
-    extent = float(np.ptp(xy, axis=0).max())
-    if (minutes >= 60).any() or (whole > (180, 90)).any() or extent > MAX_EXTENT_MINUTES:
-        return xy, []
-    if extent > MIN_EXTENT_M:
-        raise InputError(
-            f"{label}: {columns} may be degrees and minutes (ddmm.mmmm) or metres; convert them to degrees, or give "
-            "--coordinates metres"
-        )
-    degrees = np.sign(xy) * (whole + minutes / 60)
-    return degrees, [f"{columns} count degrees and minutes (ddmm.mmmm), which are converted to degrees"]
-
-
 def degrees_in(
     label: object, names: tuple[str, str], xy: Floats, named: bool, asked: Coordinates | None
-) -> Floats | None:
-    """Return latitudes and longitudes (n, 2) [deg], None if the coordinates are metres.
+) -> tuple[Floats | None, list[str]]:
+    """Return latitudes and longitudes (n, 2) [deg], None if the coordinates are metres, and a note on their unit.
+
+    Coordinates that are named after degrees may count 1e-7 degrees, or degrees and minutes (ddmm.mmmm).
 
     Args:
         label: Name of the table, for messages.
@@ -244,34 +217,51 @@ def degrees_in(
         asked: What the user states.
 
     Raises:
-        InputError: Values that are no degrees though the user states it, or that may be either.
+        InputError: Values that are no degrees though the user states it, or that may be either, or may be ddmm.mmmm.
 
     Example:
-        >>> degrees_in("walk.csv", ("x", "y"), np.array([[11.0, 48.0], [11.0, 48.001]]), False, None)[1].tolist()
+        >>> degrees_in("walk.csv", ("x", "y"), np.array([[11.0, 48.0], [11.0, 48.001]]), False, None)[0][1].tolist()
         [48.001, 11.0]
+        >>> degrees_in("walk.csv", ("lon", "lat"), np.array([[850.5, 4730.0]]), True, None)[0].round(4)
+        array([[47.5   ,  8.8417]])
     """
-    columns = f"{label}: columns {names[0]} and {names[1]}"
-    if asked == "metres":
-        return None
+    columns, notes = f"columns {names[0]} and {names[1]}", list[str]()
+    if asked == "metres" or not np.isfinite(xy).all():  # which is refused later
+        return None, notes
+    size = np.abs(xy)
+    if named and (size > 180).any():
+        whole, minutes = np.divmod(size, 100)
+        extent = float(np.ptp(xy, axis=0).max())
+        if bool((xy % 1 == 0).all()) and (size <= (180e7, 90e7)).all() and size.min(axis=0).max() >= 1e7:
+            xy = xy / 1e7
+            notes.append(f"{columns} count 1e-7 degrees, which are converted to degrees")
+        elif not ((minutes >= 60).any() or (whole > (180, 90)).any() or extent > MAX_EXTENT_MINUTES):
+            if extent > MIN_EXTENT_M:
+                raise InputError(
+                    f"{label}: {columns} may be degrees and minutes (ddmm.mmmm) or metres; convert them to degrees, or "
+                    "give --coordinates metres"
+                )
+            xy = np.sign(xy) * (whole + minutes / 60)
+            notes.append(f"{columns} count degrees and minutes (ddmm.mmmm), which are converted to degrees")
     swapped = not named and bool((np.abs(xy[:, 1]) > 90).any())
     degrees = xy if swapped else xy[:, ::-1]
     if not (np.abs(degrees) <= (90, 180)).all():
         if asked == "degrees" or (named and (np.abs(degrees) <= 180).all()):
             raise InputError(
-                f"{columns} hold latitudes beyond 90 degrees; are they swapped? Name them with columns latitude=NAME "
-                "longitude=NAME"
+                f"{label}: {columns} hold latitudes beyond 90 degrees; are they swapped? Name them with columns "
+                "latitude=NAME longitude=NAME"
             )
-        return None
+        return None, notes
     east = (degrees[:, 1] - degrees[0, 1] + 180) % 360  # on either side of the antimeridian
     extent, distance = float(max(np.ptp(degrees[:, 0]), np.ptp(east))), float(np.abs(xy).max())
     if asked == "degrees" or (named and extent <= MAX_EXTENT_DEG):
-        return degrees
+        return degrees, notes
     if not named and (distance <= FAR_RATIO * extent or extent == 0 or extent > MAX_EXTENT_DEG):
-        return None
+        return None, notes
     if not named and extent <= 0.05:  # a walk in degrees (5 km), and none in metres (5 cm)
-        return degrees
+        return degrees, notes
     raise InputError(
-        f"{columns} extend over {extent:.3g} and may be degrees or metres; choose --coordinates degrees or "
+        f"{label}: {columns} extend over {extent:.3g} and may be degrees or metres; choose --coordinates degrees or "
         "--coordinates metres"
     )
 
@@ -342,16 +332,3 @@ def floor_numbers(names: Sequence[str]) -> Floats:
         return FLOOR_NAMES[word] if word in FLOOR_NAMES else float(digits[0]) if len(digits) == 1 else math.nan
 
     return np.array([number(name) for name in names], dtype=np.float64)
-
-
-def height_of_floors(z: Floats, floor: Floats) -> Floats:
-    """Return heights in the building (n,) [m] of heights that may count from the floor, by the floor's number (n,).
-
-    Example:
-        >>> height_of_floors(np.array([1.0, 1.2]), np.array([0.0, 1.0]))
-        array([1. , 5.2])
-    """
-    known = ~(np.isnan(floor) | np.isnan(z))
-    numbers = np.unique(floor[known])
-    heights = np.array([np.median(z[known & (floor == number)]) for number in numbers])
-    return z + STOREY_M * floor if len(numbers) > 1 and np.diff(heights).max() < MIN_STOREY_M else z

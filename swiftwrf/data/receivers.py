@@ -83,20 +83,6 @@ def pool_names(names: Sequence[str], by: str) -> list[str]:
     return [name if match is None else match.group(1) for name, match in zip(names, found, strict=True)]
 
 
-def pooled(rssi: Floats, pools: Sequence[str]) -> tuple[list[str], Floats]:
-    """Return P access points in order of their first radio, and their RSSI (n, P) [dBm] from that of R radios (n, R).
-
-    It is the mean power of those radios of the access point that detected the transmitter.
-
-    Example:
-        >>> pooled(np.array([[-50.0, -50.0], [-60.0, np.nan]]), ["hall", "hall"])
-        (['hall'], array([[-50.],
-               [-60.]]))
-    """
-    power = pd.DataFrame(10 ** (rssi.T / 10)).groupby(list(pools), sort=False).mean()  # without nan
-    return list(power.index), 10 * np.log10(power.to_numpy().T)
-
-
 def read_receivers(
     file: Path, names: Sequence[str], origin: GeodeticOrigin | None, frame: PlanFrame
 ) -> tuple[Tensor, list[str]]:

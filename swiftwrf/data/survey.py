@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from swiftwrf.data.cells import CLOCK_ONLY, UNITS, column_of_numbers, parsed, plain_name, seconds, text_of, unit_of
 from swiftwrf.data.columns import GEODETIC, candidates, check_receiver_known, column_of, find_roles, receiver_columns
 from swiftwrf.data.coordinates import (
+    MIN_STOREY_M,
     STOREY_M,
     Coordinates,
     GeodeticOrigin,
@@ -29,12 +30,10 @@ from swiftwrf.data.coordinates import (
     floor_numbers,
     floors_of,
     frame_of,
-    height_of_floors,
-    plain_degrees,
     without_fix,
 )
 from swiftwrf.data.powers import MIN_REPEATS, check_powers, end_of_scale, find_fillers, without_fillers
-from swiftwrf.data.receivers import plain_receiver, pool_names, pooled, read_receivers
+from swiftwrf.data.receivers import plain_receiver, pool_names, read_receivers
 from swiftwrf.errors import InputError, listed
 from swiftwrf.positions import cells, check_positions
 from swiftwrf.runtime.validation import PositiveFloat, configuration
@@ -111,7 +110,8 @@ def read_survey(
     notes += filled + end_of_scale(rssi)
     if options.pool_by is not None:
         n_radios = len(names)
-        names, rssi = pooled(rssi, survey.pools(names, options.pool_by))
+        power = pd.DataFrame(10 ** (rssi.T / 10)).groupby(survey.pools(names, options.pool_by), sort=False).mean()
+        names, rssi = list(power.index), 10 * np.log10(power.to_numpy().T)  # mean of the powers that were detected
         notes.append(
             f"{n_radios} radios are pooled into {len(names)} receivers by {options.pool_by}: mean of their powers"
         )
@@ -301,8 +301,9 @@ class _Survey:
             notes.append("there is no height, so z is 0 m everywhere")
         position = frame.to_world(np.stack([x, y, z], axis=1))
         if "z" in roles and "floor" in roles and not unknown:
-            own, position[:, 2] = position[:, 2].copy(), height_of_floors(position[:, 2], floor)
-            if (position[:, 2] != own)[~np.isnan(own)].any():
+            heights = pd.Series(position[:, 2]).groupby(floor).median().dropna()  # in the order of floors
+            if len(heights) > 1 and heights.diff().max() < MIN_STOREY_M:
+                position[:, 2] += STOREY_M * floor
                 notes.append(
                     f"heights count from the floor, so each floor of column {roles['floor']} adds {STOREY_M:g} m"
                 )
@@ -314,15 +315,12 @@ class _Survey:
         position, origin = coordinate.reshape(-1, 3), None
         both = roles.get("x") or roles["longitude"], roles.get("y") or roles["latitude"]
         named = "longitude" in roles and "latitude" in roles
-        if named and asked != "metres":
-            plain, notes = plain_degrees(label, both, position[:, :2])
-            position = np.column_stack([plain, position[:, 2]])
-            self.notes += notes
-        check_positions(position, f"positions of {label}")
-        if (degrees := degrees_in(label, both, position[:, :2], named, asked)) is not None:
+        degrees, notes = degrees_in(label, both, position[:, :2], named, asked)
+        self.notes += notes
+        if degrees is not None:
             origin = GeodeticOrigin.amid(degrees)
             x, y = both
-            if np.abs(position[:, 1]).max() > 90:  # only a longitude does
+            if not named and np.abs(position[:, 1]).max() > 90:  # only a longitude does
                 x, y = y, x
             self.notes.append(f"longitude {x} and latitude {y} are projected to local metres about {origin}")
             position = np.column_stack([origin.to_metres(degrees), position[:, 2]])
@@ -333,6 +331,7 @@ class _Survey:
                     f"y spans {depth:.1f} m and z {height:.1f} m; if y is the height, give --up y, and else this stands as "
                     "it is"
                 )
+        check_positions(position, f"positions of {label}")
         return position.reshape(len(coordinate), -1), origin
 
     def times(self, rows: NDArray[np.int64], position: Floats) -> Floats | None:
@@ -494,9 +493,8 @@ def _as_receivers(label: object, rssi: Floats, ends: Floats) -> tuple[list[str],
     if len(np.unique(own, axis=0)) < len(np.unique(other, axis=0)):
         own, other = other, own
     place, edge = cells(torch.from_numpy(other), 500)  # each has a column of RSSI
-    n = int(place.max()) + 1
-    count = np.bincount(place.numpy(), minlength=n)
-    position = np.stack([np.bincount(place.numpy(), axis, minlength=n) / count for axis in other.T], axis=1)
+    position = pd.DataFrame(other).groupby(place.numpy()).mean().to_numpy()
+    n = len(position)
     notes = [f"both ends move; {n} positions of one of them count as receivers place1 to place{n}"]
     if edge:
         notes.append(f"its positions are averaged in cubes of {edge:.3g} m")

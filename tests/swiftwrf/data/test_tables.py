@@ -240,6 +240,7 @@ def test_degrees_in_other_units(table, unit, at):
     data = Rssi.from_frame(table.assign(latitude=values[:, 0], longitude=values[:, 1]).drop(columns=["x", "y"]))
     is_read_as(data, table, atol=0.03)
     assert noted(data, "converted to degrees")
+    assert noted(data, "longitude longitude and latitude latitude are projected")
 
 
 def test_degrees_with_letters(table):
