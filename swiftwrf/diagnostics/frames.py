@@ -431,27 +431,27 @@ def _labels(
         by_text = torch.tensor(sorted(range(n), key=lambda row: str(row + start)))
         for order in (by_text, by_text.argsort()):
             yield mixed, position[order], 0
-    late = max(shifts(n), key=lambda late: score(earlier(position, late)))
-    yield delay(late, time), earlier(position, late), 1
+    meaning, moved = best_delay(position, time, score)
+    yield meaning, moved, 1
 
 
-def shifts(n: int) -> list[int]:
-    """Return numbers of rows, but 0, by which n positions may be late: all small ones and some of the larger ones."""
-    some = sorted({min(step, round(1.1**step)) for step in range(1, 60)})
-    return [sign * late for late in some if late <= n // 5 for sign in (1, -1)]
+def best_delay(position: Tensor, time: Tensor | None, score: Callable[[Tensor], float]) -> tuple[str, Tensor]:
+    """Return in words, and the positions (n, 3) without, the delay of the positions with the highest score.
 
-
-def earlier(position: Tensor, late: int) -> Tensor:
-    """Return the position (n, 3) of the row that is `late` rows earlier than each, at the ends the nearest one."""
-    return position[(torch.arange(len(position)) - late).clamp(0, len(position) - 1)]
-
-
-def delay(late: int, time: Tensor | None) -> str:
-    """Return in words that positions are some rows late, and how many seconds if times are known."""
+    All small numbers of rows and some of the larger ones are tried. The delay is in seconds, too, if times are known.
+    """
+    n = len(position)
+    steps = (late for late in sorted({min(step, round(1.1**step)) for step in range(1, 60)}) if late <= n // 5)
+    shifts = [sign * late for late in steps for sign in (1, -1)]
+    rows = torch.arange(n)
+    moved = {late: position[(rows - late).clamp(0, n - 1)] for late in shifts}  # at the ends the nearest one
+    late = max(moved, key=lambda late: score(moved[late]))
     step = None if time is None else abs(late) * float(time.diff().nanmedian())
-    rows = f"{abs(late)} row{'s' if abs(late) > 1 else ''}"
-    by = rows if not step or not step > 0 else f"{step:.2g} s ({rows})"
-    return f"positions and radio differ in time: the positions are {by} {'late' if late > 0 else 'early'}"
+    by = f"{abs(late)} row{'s' if abs(late) > 1 else ''}"
+    if step and step > 0:
+        by = f"{step:.2g} s ({by})"
+    side = "late" if late > 0 else "early"
+    return f"positions and radio differ in time: the positions are {by} {side}", moved[late]
 
 
 def _frames(frame: _Frame) -> Iterator[tuple[str, _Frame]]:

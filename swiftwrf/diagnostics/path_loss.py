@@ -16,7 +16,7 @@ from torch import Tensor
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.diagnostics.elements import some_rows
-from swiftwrf.diagnostics.frames import best_explanations, best_mirror, delay, earlier, linear_errors, shifts
+from swiftwrf.diagnostics.frames import best_delay, best_explanations, best_mirror, linear_errors
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, log_distance
 
 MIN_EXPLAINED = 0.25  # of the variance, by an error that is named
@@ -70,10 +70,9 @@ def check_path_loss(data: Rssi) -> PathLossReport | None:
     for axis in varying:
         meaning, mirrored = best_mirror(place, located, axis, lambda p: _explained(p, data), refined=True)
         fitted[meaning] = _explained(mirrored, data)
-    delays = {late: _explained(earlier(walk.transmitter_position, late)[rows], data) for late in shifts(len(walk))}
-    if delays:
-        late = max(delays, key=delays.__getitem__)
-        fitted[delay(late, walk.time)] = delays[late]
+    if len(walk) >= 5:  # a delay is at most a fifth of the rows
+        meaning, moved = best_delay(walk.transmitter_position, walk.time, lambda p: _explained(p[rows], data))
+        fitted[meaning] = _explained(moved[rows], data)
     best = max(found.values(), default=0.0)
     found |= {meaning: value for meaning, value in fitted.items() if value >= best + TIE}
     best, names = best_explanations(found, TIE)
