@@ -14,13 +14,13 @@ from swiftwrf.data import Rssi, Snapshots, Spectra
 from swiftwrf.data.dataset import Labelled
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
 from swiftwrf.data.formats.paths import read_paths
-from swiftwrf.data.rasters import Cells, write_geojson, write_geotiff, write_world_file
 from swiftwrf.data.writing import write_deepmimo, write_mat, write_rssi, write_spectra
 from swiftwrf.diagnostics.calibration import Calibration, calibrate
 from swiftwrf.errors import with_article
 from swiftwrf.locate import RssiLocator
 from swiftwrf.rssi.base import RssiPredictor
 from swiftwrf.rssi.maps import RssiMap
+from swiftwrf.rssi.rasters import write_geojson, write_geotiff, write_world_file
 from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.durable import replacing, write_json
 from tasks.configs import FILES, MAP_FILES, ConvertConfig
@@ -176,19 +176,17 @@ def write_file(data: Labelled, file: Path) -> str:
 
 
 def _write_map(data: RssiMap, file: Path) -> str:
-    cells = Cells(data.x, data.y, data.cell, data.origin)
-    bands = dict(zip(data.receiver_names, data.mean, strict=True))
-    described = f"map of {len(cells.y)} x {len(cells.x)} cells of {data.cell:.3g} m"
+    described = f"map of {len(data.y)} x {len(data.x)} cells of {data.cell:.3g} m"
     match file.suffix.lower():
         case ".tif":
-            write_geotiff(file, bands, cells)
+            write_geotiff(file, data)
             return f"{described}, a band a receiver"
         case ".geojson":
-            write_geojson(file, bands, cells)
+            write_geojson(file, data)
             return described
     strongest = data.mean.max(axis=0)
     low, high = np.percentile(strongest, (1, 99)).tolist()
     with replacing(file) as temporary:
         colour_image(strongest[::-1], "viridis", low, max(high, low + 1)).save(temporary, "PNG")
-    write_world_file(file.with_suffix(WORLD_FILE), cells)
+    write_world_file(file.with_suffix(WORLD_FILE), data)
     return f"{described}, strongest RSSI from {low:.0f} dBm (dark) to {high:.0f} dBm (bright)"

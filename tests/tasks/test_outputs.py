@@ -21,10 +21,10 @@ from sklearn.neighbors import KNeighborsRegressor
 
 from swiftwrf import AngularGrid, InputError, RssiModel, Spectra, load_spectra, make_model, rssi_room, simulated_room
 from swiftwrf.data.coordinates import GeodeticOrigin
-from swiftwrf.data.rasters import Cells, write_geojson, write_geotiff, write_world_file
 from swiftwrf.data.simulated import ShoeboxRoom
 from swiftwrf.data.writing import write_deepmimo, write_mat, write_paths, write_rssi, write_spectra
 from swiftwrf.rssi.maps import RssiMap
+from swiftwrf.rssi.rasters import write_geojson, write_geotiff, write_world_file
 
 GRID = AngularGrid.hemisphere(8, 32)
 ORIGIN = GeodeticOrigin(48.1, 11.6)
@@ -153,7 +153,7 @@ def geokeys(tags):
 
 def test_a_geotiff_has_values_place_and_projection(geodetic, tmp_path):
     one = RssiMap.predict(geodetic, cell=1.5).receivers(geodetic.receiver_names[:1])
-    write_geotiff(tmp_path / "a.tif", {"hall & <stairs>": one.mean[0]}, Cells(one.x, one.y, one.cell, ORIGIN))
+    write_geotiff(tmp_path / "a.tif", replace(one, receiver_names=("hall & <stairs>",), origin=ORIGIN))
     with Image.open(tmp_path / "a.tif") as image:
         tags = dict(image.tag_v2)
         np.testing.assert_array_equal(np.asarray(image), one.mean[0, ::-1])
@@ -168,8 +168,7 @@ def test_a_geotiff_has_values_place_and_projection(geodetic, tmp_path):
 def test_the_pixels_of_several_bands_hold_their_values(model, tmp_path):
     """Pillow reads the tags of several bands of float32, not their pixels."""
     chart = RssiMap.predict(model, cell=1.0)
-    bands = dict(zip(chart.receiver_names, chart.mean, strict=True))
-    write_geotiff(tmp_path / "a.tif", bands, Cells(chart.x, chart.y, chart.cell))
+    write_geotiff(tmp_path / "a.tif", chart)
     content = (tmp_path / "a.tif").read_bytes()
     tags = ImageFileDirectory_v2(content[:8])
     stream = io.BytesIO(content)
@@ -222,14 +221,18 @@ def test_an_image_has_a_world_file(geodetic, model, with_origin, tmp_path):
     assert np.corrcoef(luminance.ravel(), strongest.ravel())[0, 1] > 0.95
 
 
+def chart_of(x, y, cell, rssi, origin=None):
+    rssi = np.array(rssi, dtype=np.float32).reshape(1, len(y), len(x))
+    return RssiMap(np.array(x), np.array(y), 1.0, cell, rssi, rssi, rssi, ("hall",), origin)
+
+
 def test_a_world_file_of_one_cell_has_its_size(tmp_path):
-    write_world_file(tmp_path / "a.pgw", Cells(np.array([3.0]), np.array([4.0]), 2.0))
+    write_world_file(tmp_path / "a.pgw", chart_of([3.0], [4.0], 2.0, [-50.0]))
     assert list(map(float, (tmp_path / "a.pgw").read_text().split())) == [2, 0, 0, -2, 3, 4]
 
 
 def test_cells_without_a_value_are_null_in_geojson(tmp_path):
-    cells = Cells(np.array([0.0, 1.0]), np.array([0.0]), 1.0, ORIGIN)
-    write_geojson(tmp_path / "a.geojson", {"hall": np.array([[np.nan, -50.126]])}, cells)
+    write_geojson(tmp_path / "a.geojson", chart_of([0.0, 1.0], [0.0], 1.0, [np.nan, -50.126], ORIGIN))
     values = [f["properties"]["hall"] for f in json.loads((tmp_path / "a.geojson").read_text())["features"]]
     assert values == [None, -50.13]
 

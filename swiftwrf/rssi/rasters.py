@@ -9,65 +9,47 @@ from __future__ import annotations
 import io
 import json
 import zlib
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from xml.sax.saxutils import escape
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.errors import InputError
+from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.runtime.durable import write_bytes, write_text
 
-Floats = NDArray[np.floating]
 DEGREE_DECIMALS = 8  # of coordinates in GeoJSON: 1 mm
 SHORT, LONG, DOUBLE, ASCII = 3, 4, 12, 2  # types of TIFF values
 USER_DEFINED, WGS84, METRE, DEGREE, AZIMUTHAL_EQUIDISTANT = 32767, 4326, 9001, 9102, 12  # codes of GeoTIFF 1.1
 
 
-class Cells(NamedTuple):
-    """Square cells of a map.
-
-    Args:
-        x: Centres of the columns, ascending, (columns,) [m].
-        y: Centres of the rows, ascending, (rows,) [m].
-        edge: Edge of a cell [m].
-        origin: Latitude and longitude of x = y = 0. None for local metres.
-    """
-
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
-    edge: float
-    origin: GeodeticOrigin | None = None
-
-
-def write_geotiff(file: Path, bands: Mapping[str, Floats], cells: Cells) -> None:
-    """Write bands (rows, columns) by name as a GeoTIFF of float32. Their rows run from south to north, nan is no data."""
-    pixels = zlib.compress(np.stack([band[::-1] for band in bands.values()], axis=-1).astype("<f4").tobytes())
-    west, north = cells.x[0] - cells.edge / 2, cells.y[-1] + cells.edge / 2
+def write_geotiff(file: Path, data: RssiMap) -> None:
+    """Write a map as a GeoTIFF of float32 with a band for each receiver; nan is no data."""
+    pixels = zlib.compress(np.moveaxis(data.mean[:, ::-1], 0, -1).astype("<f4").tobytes())
+    west, _, _, north = data.corners
     names = "".join(  # GDAL escapes descriptions twice
         f'<Item name="DESCRIPTION" sample="{number}" role="description">{escape(escape(name))}</Item>'
-        for number, name in enumerate(bands)
+        for number, name in enumerate(data.receiver_names)
     )
-    keys, numbers = _geo_keys(cells.origin)
-    n = len(bands)
+    keys, numbers = _geo_keys(data.origin)
+    n, rows, columns = data.mean.shape
     tags: list[tuple[int, int, Any]] = [
-        (256, LONG, [len(cells.x)]),  # width
-        (257, LONG, [len(cells.y)]),  # length
+        (256, LONG, [columns]),  # width
+        (257, LONG, [rows]),  # length
         (258, SHORT, [32] * n),  # bits of a sample
         (259, SHORT, [8]),  # compression: deflate
         (262, SHORT, [1]),  # photometric interpretation: black is zero
         (273, LONG, [0]),  # offset of the only strip, after the directory
         (277, SHORT, [n]),  # samples of a pixel
-        (278, LONG, [len(cells.y)]),  # rows of a strip
+        (278, LONG, [rows]),  # rows of a strip
         (279, LONG, [len(pixels)]),  # bytes of the strip
         (284, SHORT, [1]),  # planar configuration: the bands of a pixel follow each other
         (338, SHORT, [0] * (n - 1)),  # extra samples
         (339, SHORT, [3] * n),  # sample format: floating point
-        (33550, DOUBLE, [cells.edge, cells.edge, 0.0]),  # scale of a pixel
+        (33550, DOUBLE, [data.cell, data.cell, 0.0]),  # scale of a pixel
         (33922, DOUBLE, [0.0, 0.0, 0.0, west, north, 0.0]),  # pixel 0, 0 and its place
         (34735, SHORT, keys),
         (34736, DOUBLE, numbers),
@@ -107,48 +89,50 @@ def _geo_keys(origin: GeodeticOrigin | None) -> tuple[list[int], list[float]]:
     return [1, 1, 1, len(entries), *(number for entry in entries for number in entry)], numbers
 
 
-def write_geojson(file: Path, bands: Mapping[str, Floats], cells: Cells) -> None:
-    """Write a GeoJSON collection (RFC 7946) with one square for each cell, whose properties are the values by band.
+def write_geojson(file: Path, data: RssiMap) -> None:
+    """Write a GeoJSON collection (RFC 7946) with one square for each cell, whose properties are the RSSI by receiver.
 
-    Rows of the bands run from south to north, nan is no data. Values are written with 2 decimals.
+    Values are written with 2 decimals, nan as null.
 
     Raises:
-        InputError: Cells in local metres.
+        InputError: A map in local metres.
     """
-    if cells.origin is None:
+    if data.origin is None:
         raise InputError(
             f"{file.name} needs latitude and longitude, but the data are in local metres; write .tif, .png or .csv"
         )
-    edges = [np.append(centres - cells.edge / 2, centres[-1] + cells.edge / 2) for centres in (cells.x, cells.y)]
-    corner = np.stack(np.meshgrid(*edges), axis=-1)
-    degrees = cells.origin.to_degrees(corner.reshape(-1, 2))[:, ::-1].round(DEGREE_DECIMALS).reshape(corner.shape)
+    x0, x1, y0, y1 = data.corners
+    _, rows, columns = data.mean.shape
+    corner = np.stack(np.meshgrid(np.linspace(x0, x1, columns + 1), np.linspace(y0, y1, rows + 1)), axis=-1)
+    degrees = data.origin.to_degrees(corner.reshape(-1, 2))[:, ::-1].round(DEGREE_DECIMALS).reshape(corner.shape)
     squares = np.stack(
         [degrees[:-1, :-1], degrees[:-1, 1:], degrees[1:, 1:], degrees[1:, :-1], degrees[:-1, :-1]], axis=2
     )
-    values = {name: band.astype(np.float64).round(2) for name, band in bands.items()}
+    values = data.mean.astype(np.float64).round(2)
     features = [
         {
             "type": "Feature",
             "geometry": {"type": "Polygon", "coordinates": [squares[row, column].tolist()]},
             "properties": {
-                name: None if np.isnan(band[row, column]) else float(band[row, column]) for name, band in values.items()
+                name: None if np.isnan(value) else float(value)
+                for name, value in zip(data.receiver_names, values[:, row, column], strict=True)
             },
         }
-        for row, column in np.ndindex(len(cells.y), len(cells.x))
+        for row, column in np.ndindex(rows, columns)
     ]
     write_text(file, json.dumps({"type": "FeatureCollection", "features": features}, ensure_ascii=False))
 
 
-def write_world_file(file: Path, cells: Cells) -> None:
-    """Write the world file of an image of the cells, the northernmost row on top.
+def write_world_file(file: Path, data: RssiMap) -> None:
+    """Write the world file of an image of a map, the northernmost row on top.
 
     It contains longitude and latitude (WGS84), exact in the middle of the map, or x and y [m] without an origin.
     """
-    middle = np.array([(cells.x[0] + cells.x[-1]) / 2, (cells.y[0] + cells.y[-1]) / 2])
-    place = middle + cells.edge * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, -1.0]])
-    if cells.origin is not None:
-        place = cells.origin.to_degrees(place)[:, ::-1]
+    x0, x1, y0, y1 = data.corners
+    place = np.array([[(x0 + x1) / 2, (y0 + y1) / 2]]) + data.cell * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, -1.0]])
+    if data.origin is not None:
+        place = data.origin.to_degrees(place)[:, ::-1]
     along_row, along_column = place[1:] - place[0]
-    first = place[0] - along_row * (len(cells.x) - 1) / 2 - along_column * (len(cells.y) - 1) / 2
+    first = place[0] - along_row * (len(data.x) - 1) / 2 - along_column * (len(data.y) - 1) / 2
     numbers = (*along_row.tolist(), *along_column.tolist(), *first.tolist())
     write_text(file, "".join(f"{number:.12g}\n" for number in numbers))
