@@ -15,7 +15,7 @@ from swiftwrf.data.columns import is_coordinate, is_rssi
 from swiftwrf.data.files import SUFFIXES, TABLES, digests, has_header, read_table
 from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
 from swiftwrf.data.formats.captures import holds_captures
-from swiftwrf.data.formats.nerf2_rssi import FILES as NERF2_FILES
+from swiftwrf.data.formats.nerf2 import FILES as NERF2_FILES
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
 from swiftwrf.data.survey import TableOptions, has_positions, read_survey
