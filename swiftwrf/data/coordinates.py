@@ -30,17 +30,16 @@ STOREY_M = 4.0  # height of a floor where heights are missing or count from the 
 MIN_STOREY_M = 1.5  # difference of the heights of two floors
 BELOW_GROUND = re.compile(r"(?:b|ug|u\.g\.?|basement|cellar|keller|sub|lower)[ ._-]*(?:level|floor)?[ ._-]*(\d*)")
 VALUE, PX, METRE = r"(\d+(?:[.,]\d+)?)", "(?:px|pixels?)", "m(?:et(?:er|re)s?)?"
-PIXELS_PER_METRE = [
-    re.compile(pattern, re.IGNORECASE)
-    for pattern in (
-        rf"\b1 *{METRE} *[=:] *{VALUE} *{PX}\b",
-        rf"{VALUE} *{PX} *(?:/|per|=) *(?:1 *)?{METRE}\b",
-        rf"{PX}[ _]*(?:/|per)[ _]*{METRE}\W+{VALUE}",
+SCALES = [  # of a plan in lines above a table: pixels in a metre, and metres in a pixel, whose power is -1
+    (re.compile(pattern, re.IGNORECASE), power)
+    for pattern, power in (
+        (rf"\b1 *{METRE} *[=:] *{VALUE} *{PX}\b", 1),
+        (rf"{VALUE} *{PX} *(?:/|per|=) *(?:1 *)?{METRE}\b", 1),
+        (rf"{PX}[ _]*(?:/|per)[ _]*{METRE}\W+{VALUE}", 1),
+        (rf"\b1 *{PX} *[=:] *{VALUE} *{METRE}\b", -1),
+        (rf"{VALUE} *{METRE} *(?:/|per|=) *(?:1 *)?{PX}\b", -1),
     )
 ]
-METRES_PER_PIXEL = re.compile(
-    rf"\b1 *{PX} *[=:] *{VALUE} *{METRE}\b|{VALUE} *{METRE} *(?:/|per|=) *(?:1 *)?{PX}\b", re.IGNORECASE
-)
 FLOOR_NAMES = {  # numbers of floors without a digit in their name
     **dict.fromkeys(("ground", "g", "gf", "eg", "erdgeschoss", "parterre", "rdc", "lobby", "pb"), 0.0),
     **dict.fromkeys(("mezzanine", "zg"), 0.5),
@@ -56,12 +55,10 @@ def stated_scale(text: str) -> float | None:
         >>> stated_scale("Scale: 1 m = 20.7 px"), stated_scale("0.05 m/px"), stated_scale("Project: office")
         (20.7, 20.0, None)
     """
-    for pattern in PIXELS_PER_METRE:
+    for pattern, power in SCALES:
         if (found := pattern.search(text)) and (value := float(found[1].replace(",", "."))) > 0:
-            return value
-    found = METRES_PER_PIXEL.search(text)
-    value = float((found[1] or found[2]).replace(",", ".")) if found else 0.0
-    return 1 / value if value > 0 else None
+            return float(value**power)
+    return None
 
 
 class PlanFrame(NamedTuple):

@@ -15,7 +15,7 @@ from torch import Tensor
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin
 from swiftwrf.data.dataset import Arrays, Numbers, PositionedData, position_coordinates, to_positions
 from swiftwrf.data.powers import check_powers
-from swiftwrf.data.splits import MIN_TRAINING, Validation, random_split, validation_for
+from swiftwrf.data.splits import MIN_TRAINING, Validation, random_split
 from swiftwrf.data.survey import TableOptions, read_survey
 from swiftwrf.errors import InputError, listed
 from swiftwrf.plotting import MARK, Axes, plan
@@ -229,7 +229,8 @@ class Rssi(PositionedData):
     def validation_for(self, split: str, test: Rssi) -> Validation:
         """Return the kind of folds of this training part that resembles the test part of a split.
 
-        Folds are whole sessions if the test rows are of other sessions than the training rows.
+        Folds are single rows for random splits and regions for all others. They are whole sessions if the test rows are of
+        other sessions than the training rows.
 
         Example:
             >>> import swiftwrf
@@ -238,7 +239,9 @@ class Rssi(PositionedData):
             'block'
         """
         own, others = ({*data.session.tolist()} if data.session is not None else {0} for data in (self, test))
-        return "session" if len(own) > 1 and own.isdisjoint(others) else validation_for(split)
+        if len(own) > 1 and own.isdisjoint(others):
+            return "session"
+        return "random" if split == "random" else "block"
 
     @checked
     def receivers(self, asked: Sequence[str]) -> Rssi:

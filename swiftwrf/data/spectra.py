@@ -336,30 +336,20 @@ def coarsening(shape: Sequence[int], max_azimuths: int, least_rows: int = 1) -> 
 
 
 @checked
-def check_training(train: Spectra) -> None:
-    """Refuse spectra that no model can be fitted to.
+def check_training(train: Spectra, least: int = MIN_TRAINING) -> None:
+    """Refuse spectra that no model can be fitted to, or updated by with fewer as the least number.
 
     Raises:
-        InputError: No spectra, fewer than 10 spectra, or a spectrum that is not finite.
+        InputError: Fewer spectra than the least number, or a spectrum that is not finite.
     """
-    if len(train) < MIN_TRAINING:
-        raise InputError(f"a fit needs at least {MIN_TRAINING} spectra, got {len(train)}")
-    check_spectra(train)
-
-
-def check_spectra(train: Spectra) -> None:
-    """Refuse spectra with values that are not finite.
-
-    Raises:
-        InputError: The first such spectrum.
-    """
-    if train.store.values.is_floating_point():
-        for rows in train.store.parts():
-            bad = (~train.store[rows].isfinite()).flatten(1).any(dim=1).nonzero()
-            if len(bad):
-                raise InputError(
-                    f"spectrum of training spectrum {rows.start + int(bad[0])} is not finite; mend or leave it out"
-                )
+    if len(train) < least:
+        raise InputError(f"a fit needs at least {least} spectra, got {len(train)}")
+    for rows in train.store.parts() if train.store.values.is_floating_point() else ():
+        bad = (~train.store[rows].isfinite()).flatten(1).any(dim=1).nonzero()
+        if len(bad):
+            raise InputError(
+                f"spectrum of training spectrum {rows.start + int(bad[0])} is not finite; mend or leave it out"
+            )
 
 
 def fingerprint(train: Spectra, *settings: Any) -> str:

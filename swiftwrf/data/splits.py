@@ -205,11 +205,6 @@ def folds(
     return (order % number)[place]
 
 
-def validation_for(split: str) -> Validation:
-    """Return the kind of folds that resembles a split: single rows for random splits, regions for all others."""
-    return "random" if split == "random" else "block"
-
-
 def matching_validation(train: Tensor, test: Tensor) -> Validation:
     """Return the kind of folds whose held-out distances resemble those of the test positions.
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.choices import FIELD_MODELS, PUBLISHED, Moving
 from swiftwrf.data.dataset import Numbers
-from swiftwrf.data.spectra import Spectra, check_spectra, check_training
+from swiftwrf.data.spectra import Spectra, check_training
 from swiftwrf.data.splits import Validation
 from swiftwrf.errors import InputError, with_article
 from swiftwrf.models.link import Link
@@ -277,7 +277,7 @@ class FieldModel(Configured, Saved, Displayed):
             )
         self._check_described(new)
         self.link.check(new)
-        check_spectra(new)
+        check_training(new, least=0)
 
     def forget(self, rows: Numbers) -> Self:
         """Return the model without some of its training spectra; see `update`.

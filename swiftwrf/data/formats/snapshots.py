@@ -209,12 +209,10 @@ def measured(
         raise InputError(
             f"{source}: csi has values at {int(used.sum())} elements; expected at least 2 to resolve directions"
         )
-    for which, reason in (
-        (silent.nonzero()[:, 0].tolist(), "silent (0 or NaN everywhere)"),
-        (list(drop), "to be ignored"),
-    ):
+    left_out = {"silent (0 or NaN everywhere)": silent.nonzero()[:, 0].tolist(), "to be ignored": sorted(drop)}
+    for reason, which in left_out.items():
         if which:
-            named = f"element {which[0]} is" if len(which) == 1 else f"elements {ranges(sorted(which))} are"
+            named = f"element {which[0]} is" if len(which) == 1 else f"elements {ranges(which)} are"
             notes.append(f"{named} {reason} and left out (counted from 0)")
     channel, missing = channel[..., used], missing[..., used]
     empty = missing.all(dim=2)
@@ -226,13 +224,13 @@ def measured(
         first = channel[:1, :, :1]
         null = ((channel - first).abs() <= 1e-3 * first.abs()).all(dim=2).all(dim=0)
         if bool(null.any()) and not bool(null.all()):
-            which_null = f"({int(null.sum())} of {count}, counted from 0): {ranges(null.nonzero()[:, 0].tolist())}"
-            name = "null subcarriers, the same at every position and element, are"
             kept = ~null if drop_null else kept
+            used_how, remedy = (
+                ("left out", "") if drop_null else ("used like the others", "; --drop-null leaves them out")
+            )
             notes.append(
-                f"{name} left out {which_null}"
-                if drop_null
-                else f"{name} used like the others {which_null}; --drop-null leaves them out"
+                f"null subcarriers, the same at every position and element, are {used_how} ({int(null.sum())} of {count}, "
+                f"counted from 0): {ranges(null.nonzero()[:, 0].tolist())}{remedy}"
             )
     if some := int((missing & ~empty[..., None]).sum()):
         notes.append(f"{some} of {missing.numel()} values of single elements are 0 or NaN and not used")
