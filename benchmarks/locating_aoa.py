@@ -48,7 +48,7 @@ from swiftwrf import (
     simulated_room,
 )
 from swiftwrf.choices import Moving, fraction_key
-from swiftwrf.data.raytraced import Box, FurnishedRoom, Material, Scene, Tracing, trace
+from swiftwrf.data.raytraced import FurnishedRoom, Material, Scene, Tracing, trace
 from swiftwrf.data.spectra import array_spectra
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import GaussianProcess, choose_kernel
@@ -130,13 +130,13 @@ def furnished_room(config: Config, seed: int) -> Spectra:
     generator = np.random.default_rng(seed)
     size = generator.uniform((5, 4, 2.6), (7, 6, 3.2))
     fixed = np.append(generator.uniform(0.2, 0.6, 2), size[2] - 0.3)  # under the ceiling in a corner
-    boxes: list[Box] = []
+    boxes = []
     while len(boxes) < N_BOXES:
         extent = generator.uniform((0.4, 0.4, 0.5), (1.6, 1.6, 1.9))
         low = np.append(generator.uniform(0, size[:2] - extent[:2]), 0.0)
         if (low[:2] > fixed[:2] + 0.3).any():
             material = ("wood", "metal", "chipboard")[len(boxes) % 3]
-            boxes.append(Box(material, tuple(low), tuple(low + extent)))
+            boxes.append((material, tuple(low), tuple(low + extent)))
     room = FurnishedRoom(tuple(size), "wall", "wall", "wall", tuple(boxes), tuple(fixed), ((0, 0, 0), (0, 0, 0)))
     surfaces = [s if s.material.name != WALL.name else replace(s, material=WALL) for s in room.surfaces()]
     position = torch.from_numpy(generator.uniform((0.4, 0.4, 0.8), (*size[:2] - 0.4, 1.7), (4 * N_POSITIONS, 3)))

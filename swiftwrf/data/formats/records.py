@@ -180,11 +180,8 @@ def _read_station(
     antenna = content["antennas"][index]
     right, up = antenna.get("spacingX"), antenna.get("spacingY")
     frequency: Any = content.get("frequency")
-    for name, value in (
-        ("spacingX [m] of an array", right),
-        ("spacingY [m] of an array", up),
-        ("frequency", frequency),
-    ):
+    sizes = {"spacingX [m] of an array": right, "spacingY [m] of an array": up, "frequency": frequency}
+    for name, value in sizes.items():
         check_value(f"{file}: {name}", value, PositiveFloat)
     rows: Assignments = [[row * COLUMNS + column for column in range(COLUMNS)] for row in range(ROWS)]
     first = index * ROWS * COLUMNS  # of the antennas of ESPARGOS, whose arrays follow each other

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 Point = tuple[float, float, float]
+Box = tuple[str, Point, Point]  # material of a piece of furniture, and two opposite corners [m]
 CONTENT = yaml.safe_load(Path(__file__).with_name("rooms.yml").read_text(encoding="utf-8"))
 FACES = [  # of a box, corners counted as x y z bits, counter-clockwise from outside
     (0, 1, 3, 2),
@@ -88,15 +89,6 @@ def _halved(faces: Sequence[tuple[int, int, int, int]]) -> NDArray[np.int64]:
 
 
 @dataclass(frozen=True)
-class Box:
-    """A piece of furniture between two opposite corners [m]."""
-
-    material: str
-    low: Point
-    high: Point
-
-
-@dataclass(frozen=True)
 class FurnishedRoom:
     """A rectangular room with one corner at the origin, and its furniture.
 
@@ -128,8 +120,8 @@ class FurnishedRoom:
         walls = [rectangle(corner, (x, 0, 0), (0, 0, z)) for corner in ((0, 0, 0), (0, y, 0))]
         walls += [rectangle(corner, (0, y, 0), (0, 0, z)) for corner in ((0, 0, 0), (x, 0, 0))]
         meshes = {"floor": (self.floor, floor), "ceiling": (self.ceiling, ceiling), "walls": (self.walls, walls)}
-        for material in dict.fromkeys(piece.material for piece in self.furniture):
-            boxes = [box(piece.low, piece.high) for piece in self.furniture if piece.material == material]
+        for material in dict.fromkeys(material for material, *_ in self.furniture):
+            boxes = [box(*corners) for own, *corners in self.furniture if own == material]
             meshes[f"furniture-{material}"] = (material, boxes)
         return [
             Surface.joined(name, Material(material, CONTENT["thickness_m"].get(material, 0.1)), parts)
@@ -140,8 +132,8 @@ class FurnishedRoom:
         """Return whether positions (n, 3) [m] keep `clearance` [m] from walls and furniture, bool (n,)."""
         size = torch.tensor(self.size, dtype=torch.float64)
         free = ((position >= clearance) & (position <= size - clearance)).all(dim=1)
-        for piece in self.furniture:
-            low, high = (torch.tensor(corner, dtype=torch.float64) for corner in (piece.low, piece.high))
+        for _, *corners in self.furniture:
+            low, high = torch.tensor(corners, dtype=torch.float64)
             free &= ~((position > low - clearance) & (position < high + clearance)).all(dim=1)
         return free
 
@@ -150,9 +142,9 @@ def _rooms() -> dict[str, FurnishedRoom]:
     def boxes(entry: Any) -> list[Box]:
         if isinstance(entry, list):
             material, low, high = entry
-            return [Box(material, tuple(low), tuple(high))]
+            return [(material, tuple(low), tuple(high))]
         return [
-            Box(material, (x + low[0], y + low[1], low[2]), (x + high[0], y + high[1], high[2]))
+            (material, (x + low[0], y + low[1], low[2]), (x + high[0], y + high[1], high[2]))
             for piece, places in entry.items()
             for x, y in places
             for material, low, high in CONTENT["pieces"][piece]

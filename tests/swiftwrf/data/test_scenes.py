@@ -54,9 +54,10 @@ def ends(position, moving):
 @pytest.mark.parametrize("name", list(ROOMS))
 def test_furniture_stands_in_the_room_and_leaves_the_ends_free(name):
     room = ROOMS[name]
-    for piece in room.furniture:
-        assert all(0 <= low < high <= side for low, high, side in zip(piece.low, piece.high, room.size, strict=True))
-        assert not room.free(torch.tensor([[(a + b) / 2 for a, b in zip(piece.low, piece.high, strict=True)]]).double())
+    for _, *corners in room.furniture:
+        low, high = torch.tensor(corners, dtype=torch.float64)
+        assert bool(((low >= 0) & (low < high) & (high <= torch.tensor(room.size, dtype=torch.float64))).all())
+        assert not room.free((low + high)[None] / 2)
     assert room.free(torch.tensor([room.fixed], dtype=torch.float64))
     assert not room.free(torch.tensor([[-1.0, 1, 1]], dtype=torch.float64))
     drawn = draw_positions(room, torch.tensor(room.region, dtype=torch.float64), 200, 0)
