@@ -65,45 +65,38 @@ class Scene:
     """Surfaces at a carrier frequency, ready to be traced.
 
     Args:
-        surfaces: Surfaces of the scene.
+        content: Surfaces of the scene, or a Mitsuba XML file that names their radio materials.
         frequency_hz: Frequency of the carrier [Hz].
         scattering: Scattering coefficient of all materials, the fraction of the reflected amplitude that is scattered.
 
     Raises:
-        InputError: Sionna RT or LLVM is missing, or a material is unknown or has no constants at the carrier.
+        InputError: Sionna RT or LLVM is missing, a material is unknown or has no constants at the carrier, or a file is
+            missing or no scene with objects.
     """
 
-    def __init__(self, surfaces: Sequence[Surface], frequency_hz: float, scattering: float = 0.0) -> None:
-        self.held = _at(sionna().load_scene(), frequency_hz)
-        self.surfaces = list(surfaces)
+    def __init__(self, content: Sequence[Surface] | Path, frequency_hz: float, scattering: float = 0.0) -> None:
+        file = content if isinstance(content, Path) else None
+        if file is not None and not file.is_file():
+            raise InputError(f"{file} does not exist; expected a Mitsuba scene (XML) or the name of a room")
+        rt = sionna()
+        with refusing_broken(file, "a scene that Sionna RT reads"):
+            self.held = rt.load_scene() if file is None else rt.load_scene(str(file))
+        if file is not None and not self.held.objects:
+            raise InputError(f"{file} is a scene without objects; there is nothing to trace")
+        surfaces = [] if isinstance(content, Path) else list(content)
         materials = {surface.material: _material(surface.material) for surface in surfaces}
         try:
+            self.held.frequency = frequency_hz
             self.held.edit(add=[_object(surface, materials[surface.material]) for surface in surfaces])
         except ValueError as error:
-            raise InputError(_reason(surfaces, frequency_hz, error)) from None
-        self._scatter(scattering)
-
-    @classmethod
-    def read(cls, file: Path, frequency_hz: float, scattering: float = 0.0) -> Scene:
-        """Return the scene in a Mitsuba XML file, with the radio materials that it names.
-
-        Raises:
-            InputError: As the constructor, no such file, or a file that is no scene with objects.
-        """
-        if not file.is_file():
-            raise InputError(f"{file} does not exist; expected a Mitsuba scene (XML) or the name of a room")
-        rt, scene = sionna(), cls.__new__(cls)
-        with refusing_broken(file, "a scene that Sionna RT reads"):
-            held = rt.load_scene(str(file))
-        if not held.objects:
-            raise InputError(f"{file} is a scene without objects; there is nothing to trace")
-        try:
-            scene.held = _at(held, frequency_hz)
-        except ValueError as error:
-            raise InputError(f"{file} has a material without constants at {frequency_hz:g} Hz ({error})") from None
-        scene._scatter(scattering)
-        scene.surfaces = [_surface(name, thing) for name, thing in held.objects.items()]
-        return scene
+            reason = f"{file} has a material without constants at {frequency_hz:g} Hz ({error})"
+            raise InputError(_reason(surfaces, frequency_hz, error) if file is None else reason) from None
+        self.held.tx_array = self.held.rx_array = rt.PlanarArray(
+            num_rows=1, num_cols=1, pattern="iso", polarization="V"
+        )
+        for material in self.held.radio_materials.values():
+            material.scattering_coefficient = scattering
+        self.surfaces = surfaces or [_surface(name, thing) for name, thing in self.held.objects.items()]
 
     def plot(self, fixed: Tensor | None = None, position: Tensor | None = None, ax: Axes | None = None) -> Axes:
         """Draw the surfaces seen from above by material, the fixed end (3,) and positions (n, 3) of the moving one."""
@@ -131,10 +124,6 @@ class Scene:
         ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1))
         return ax
 
-    def _scatter(self, coefficient: float) -> None:
-        for material in self.held.radio_materials.values():
-            material.scattering_coefficient = coefficient
-
 
 def open_scene(name: str, frequency_hz: float, scattering: float = 0.0) -> Scene:
     """Return the scene of a built-in room, or of a file, at a carrier frequency [Hz].
@@ -143,15 +132,7 @@ def open_scene(name: str, frequency_hz: float, scattering: float = 0.0) -> Scene
         InputError: As `Scene`, or an unknown room.
     """
     check_scene(name)
-    if name.endswith(SCENE_FILE):
-        return Scene.read(Path(name), frequency_hz, scattering)
-    return Scene(ROOMS[name].surfaces(), frequency_hz, scattering)
-
-
-def _at(held: Any, frequency_hz: float) -> Any:
-    held.frequency = frequency_hz
-    held.tx_array = held.rx_array = sionna().PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
-    return held
+    return Scene(Path(name) if name.endswith(SCENE_FILE) else ROOMS[name].surfaces(), frequency_hz, scattering)
 
 
 def _material(material: Material) -> Any:

@@ -216,7 +216,7 @@ def test_a_scene_is_read_back_as_spectra(ray_tracer, tmp_path, moving):
 
 def test_a_scene_file_is_traced_as_the_room_that_it_describes(ray_tracer, tmp_path):
     file = write_scene(tmp_path, "concrete")
-    read = trace(Scene.read(file, FREQUENCY), FIXED, places(4), "receiver", Tracing())
+    read = trace(Scene(file, FREQUENCY), FIXED, places(4), "receiver", Tracing())
     built = trace(Scene(empty("concrete").surfaces(), FREQUENCY), FIXED, places(4), "receiver", Tracing())
     torch.testing.assert_close(read.length, built.length, rtol=1e-5, atol=0)
     torch.testing.assert_close(read.gain.abs(), built.gain.abs(), rtol=1e-2, atol=1e-7)
