@@ -100,14 +100,12 @@ def find_roles(
     Raises:
         InputError: A column that is missing, no or several columns for x or y, or receivers without RSSI.
     """
-    for role in asked:
+    for role, name in asked.items():
         if role not in ROLES:
             raise InputError(f"columns takes {', '.join(ROLES)}, got {role!r}")
-    roles = {role: name for role, name in asked.items() if name in table.columns}
-    for role, name in asked.items():
-        pattern = role == "rssi" and fnmatch.filter(table.columns, name)
-        if role not in roles and not pattern:
+        if name not in table.columns and not (role == "rssi" and fnmatch.filter(table.columns, name)):
             raise InputError(f"{label} has no column {name!r} for {role}; there are {listed(table.columns)}")
+    roles = {role: name for role, name in asked.items() if name in table.columns}
     for role in ROLES:
         found = [name for name in candidates(table, role) if name not in (*roles.values(), *taken)]
         if role in asked or not found:

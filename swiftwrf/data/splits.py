@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from typing import Literal
 
+import pandas as pd
 import torch
 from scipy.stats import wasserstein_distance
 from torch import Tensor
@@ -90,12 +91,9 @@ def places(position: Tensor, n_parts: int) -> Tensor:
 
     Rows at one position share a place. Each row is a place of its own if there are fewer places than parts.
     """
-    rows = torch.arange(len(position))
-    spots, spot = position.unique(dim=0, return_inverse=True)
-    if len(spots) < n_parts:
-        return rows
-    first = torch.full((len(spots),), len(position)).scatter_reduce(0, spot, rows, "amin")
-    return first.argsort().argsort()[spot]
+    spot = position.unique(dim=0, return_inverse=True)[1]
+    place, spots = pd.factorize(spot.numpy())
+    return torch.from_numpy(place) if len(spots) >= n_parts else torch.arange(len(position))
 
 
 def random_rows(position: Tensor, n: int, seed: int) -> Tensor:

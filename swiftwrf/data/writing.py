@@ -75,14 +75,12 @@ def write_rssi(data: Rssi, folder: Path) -> None:
     of_rows = {"session": data.session, "time": data.time}
     if columns := {name: values.numpy() for name, values in of_rows.items() if values is not None}:
         write_text(folder / META, pd.DataFrame(columns).to_csv(index=False))
-    survey: dict[str, Any] = {}
-    if data.origin is not None:
-        survey["origin"] = list(data.origin)
-    if data.floors is not None:
-        survey["floors"] = dict(zip(data.floors.names, data.floors.height_m, strict=True))
-    if data.receiver_moves:
-        survey["receiver_moves"] = True
-    if survey:
+    survey = {
+        "origin": data.origin and list(data.origin),
+        "floors": data.floors and dict(zip(data.floors.names, data.floors.height_m, strict=True)),
+        "receiver_moves": data.receiver_moves,
+    }
+    if survey := {name: value for name, value in survey.items() if value}:
         write_text(folder / SURVEY, yaml.safe_dump(survey, sort_keys=False, allow_unicode=True))
     write_splits(data.named_splits, folder, first=0)
 
