@@ -8,7 +8,6 @@ The geometry is exact. There is no diffraction, no scattering, and no material t
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import torch
@@ -106,28 +105,20 @@ class ShoeboxRoom:
         )
 
     def _blocked(self, receiver: Tensor, ray: Tensor, rooms: Tensor) -> Tensor:
-        """Return whether a box blocks each path, bool (n, 25)."""
-        size = torch.tensor(self.size, dtype=torch.float64)
-        crossing = [torch.zeros(ray.shape[:2], dtype=torch.float64), torch.ones(ray.shape[:2], dtype=torch.float64)]
-        for axis, k in itertools.product(range(3), range(MAX_ORDER)):  # the k-th wall crossed along an axis
-            count = rooms[:, axis]
-            wall = torch.where(count > 0, k + 1.0, -float(k)) * size[axis]
-            at = (wall - receiver[:, None, axis]) / ray[..., axis]
-            crossing.append(torch.where(count.abs() > k, at, torch.ones_like(at)))
-        parameter = torch.stack(crossing, dim=-1).sort(dim=-1).values  # corners along the line, 0 to 1
-        unfolded = torch.remainder(receiver[:, None, None] + parameter[..., None] * ray[:, :, None], 2 * size)
-        corner = torch.minimum(unfolded, 2 * size - unfolded)  # folded back into the room
-        start, step = corner[:, :, :-1], corner.diff(dim=2)
-        step = torch.where(step == 0, torch.full_like(step, 1e-300), step)
-        segments = [(s.contiguous(), d.contiguous()) for s, d in zip(start.unbind(-1), step.unbind(-1), strict=True)]
-        blocked = torch.zeros(ray.shape[:2], dtype=torch.bool)
-        for low, high in self.boxes:
-            enter, leave = torch.zeros_like(segments[0][0]), torch.ones_like(segments[0][0])  # fractions of a segment
-            for (start, step), near, far in zip(segments, low, high, strict=True):
-                a, b = (near - start) / step, (far - start) / step
+        """Return whether a box, or its mirror image in a room on the way, blocks each path, bool (n, 25)."""
+        on_the_way = (rooms - rooms[:, None]).abs() + rooms.abs() == rooms[:, None].abs()
+        path, number = on_the_way.all(dim=-1).nonzero().T  # 79 pairs of a path and a room
+        room, size = rooms[number], torch.tensor(self.size, dtype=torch.float64)
+        hits = torch.zeros(ray.shape[:2], dtype=torch.int64)
+        axes = [(x[:, None], step[:, path]) for x, step in zip(receiver.unbind(-1), ray.unbind(-1), strict=True)]
+        for corners in torch.tensor(self.boxes, dtype=torch.float64):
+            ends = room * size + torch.where(room % 2 == 0, corners[:, None], size - corners[:, None])  # (2, 79, 3)
+            enter, leave = torch.zeros(len(ray), len(path)), torch.ones(len(ray), len(path))  # fractions of a ray
+            for (x, step), (near, far) in zip(axes, ends.unbind(-1), strict=True):
+                a, b = (near - x) / step, (far - x) / step
                 enter, leave = torch.maximum(enter, torch.minimum(a, b)), torch.minimum(leave, torch.maximum(a, b))
-            blocked |= (enter < leave).any(dim=-1)
-        return blocked
+            hits = hits.index_add(1, path, (enter < leave).long())
+        return hits > 0
 
 
 @checked
