@@ -79,9 +79,10 @@ class Scene:
         if file is not None and not file.is_file():
             raise InputError(f"{file} does not exist; expected a Mitsuba scene (XML) or the name of a room")
         rt = sionna()
-        with refusing_broken(file, "a scene that Sionna RT reads"):
+        with refusing_broken(file, "a scene of meshes that Sionna RT reads"):
             self.held = rt.load_scene() if file is None else rt.load_scene(str(file))
-        if file is not None and not self.held.objects:
+            held = [_surface(name, thing) for name, thing in self.held.objects.items()]
+        if file is not None and not held:
             raise InputError(f"{file} is a scene without objects; there is nothing to trace")
         surfaces = [] if isinstance(content, Path) else list(content)
         materials = {surface.material: _material(surface.material) for surface in surfaces}
@@ -96,7 +97,7 @@ class Scene:
         )
         for material in self.held.radio_materials.values():
             material.scattering_coefficient = scattering
-        self.surfaces = surfaces or [_surface(name, thing) for name, thing in self.held.objects.items()]
+        self.surfaces = surfaces or held
 
     def plot(self, fixed: Tensor | None = None, position: Tensor | None = None, ax: Axes | None = None) -> Axes:
         """Draw the surfaces seen from above by material, the fixed end (3,) and positions (n, 3) of the moving one."""
