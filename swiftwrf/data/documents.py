@@ -122,21 +122,17 @@ def _points(text: str) -> list[dict[str, Any]]:
 
 
 def _tree(element: ElementTree.Element) -> dict[str, Any]:
-    found: dict[str, Any] = {_tag(name): value for name, value in element.attrib.items()}
+    """Return attributes and children of an element by name, lists of those with one name."""
+    found: dict[str, list[Any]] = {_tag(name): [value] for name, value in element.attrib.items()}
     for child in element:
-        tag, value = (
-            _tag(child.tag),
-            "".join(child.itertext() if _tag(child.tag) in NAMED else child.text or "").strip(),
-        )
-        name = child.get("name", tag) if tag in NAMED else tag
-        content: Any = value if value else _tree(child)
+        tag = _tag(child.tag)
+        value = "".join(child.itertext() if tag in NAMED else child.text or "").strip()
+        content: Any = value or _tree(child)
         if tag == "coordinates" and len(value.split()) == 1:  # of a point, and no line
             content = dict(zip(AXES, map(float, value.split(",")), strict=False))
-        if isinstance(several := found.get(name), list):
-            several.append(content)
-        elif tag not in VIEWS:
-            found[name] = [found[name], content] if name in found else content
-    return found
+        if tag not in VIEWS:
+            found.setdefault(child.get("name", tag) if tag in NAMED else tag, []).append(content)
+    return {name: values[0] if len(values) == 1 else values for name, values in found.items()}
 
 
 def _tag(name: str) -> str:

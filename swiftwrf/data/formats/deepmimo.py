@@ -60,7 +60,11 @@ class DeepMimo(Format[Spectra]):
     def read(self, path: Path, options: ReadOptions) -> Spectra:
         pairs = _pairs(path)
         pair = pairs[station(f"{path} holds {len(pairs)} pairs of transmitter and receivers", pairs, options.station)]
-        frequency, tracer = _params(path / "params.json")
+        params = path / "params.json"
+        with refusing_broken(params, "JSON with rt_params, and in it frequency, the carrier in Hz"):
+            given = json.loads(read_text(params))["rt_params"]
+            frequency, tracer = float(given["frequency"]), str(given.get("raytracer_name", ""))
+        check_carrier(params, frequency)
         table = _table(path, pair)
         files = [path / f"{key}_{pair}.npz" for key in table]
         known = np.isfinite(np.stack([table[key] for key in KEYS])).all(axis=0) & (table["power"] > -math.inf)
@@ -79,7 +83,7 @@ class DeepMimo(Format[Spectra]):
             subcarriers=options.subcarriers,
             bandwidth_hz=options.bandwidth,
             index=torch.from_numpy(index),
-            source=digests([path / "params.json", *files]),
+            source=digests([params, *files]),
             notes=(*notes, *found),
         )
 
@@ -87,15 +91,6 @@ class DeepMimo(Format[Spectra]):
 def _pairs(path: Path) -> list[str]:
     found = (FILE.fullmatch(file.name) for file in path.iterdir()) if path.is_dir() else ()
     return sorted(match[1] for match in found if match)
-
-
-def _params(file: Path) -> tuple[float, str]:
-    """Return the carrier [Hz] and the name of the ray tracer."""
-    with refusing_broken(file, "JSON with rt_params, and in it frequency, the carrier in Hz"):
-        given = json.loads(read_text(file))["rt_params"]
-        frequency, tracer = float(given["frequency"]), str(given.get("raytracer_name", ""))
-    check_carrier(file, frequency)
-    return frequency, tracer
 
 
 def _table(folder: Path, pair: str) -> dict[str, Floats]:
@@ -178,9 +173,6 @@ def _from_horizon(
 
     Direct paths come from the transmitter, `away` (n, 3) from the receivers. They reveal the convention of angles (n, paths)
     [deg]. With few of them negative angles do.
-
-    Raises:
-        InputError: Angles that point the other way, or another frame.
     """
     if direct.sum() < MIN_DIRECT_PATHS:
         return bool((zenith[known] < 0).any())
@@ -190,8 +182,7 @@ def _from_horizon(
         """Return the median angle [deg] to the transmitter."""
         return float(angular_distance(torch.from_numpy(claimed), torch.from_numpy(away)).rad2deg().median())
 
-    declared = offset(_direction(azimuth, zenith))
-    horizon = offset(_direction(azimuth, 90 - zenith))
+    declared, horizon = offset(_direction(azimuth, zenith)), offset(_direction(azimuth, 90 - zenith))
     if min(declared, horizon) <= MAX_ANGLE_OFFSET_DEG:
         return horizon < declared
     others: dict[str, Any] = {
