@@ -135,12 +135,10 @@ def calibrate(train: Snapshots) -> Calibration:
     received = of_unit_power(unit(seen.channel))
     strongest = torch.linalg.eigh(received).eigenvectors[..., -1]
     problem = _Problem(seen.array, seen.position, seen.away, received, strongest)
-    found = problem.descend(start := problem.scan())
-    if float(problem.away.norm(dim=1).min()) < seen.array.far_field_m:
-        curved = replace(problem, curved=True)
-        other = curved.descend(start)
-        if float(curved.shares(other).mean()) > float(problem.shares(found).mean()):
-            problem, found = curved, other
+    start, near = problem.scan(), float(problem.away.norm(dim=1).min()) < seen.array.far_field_m
+    waves = [problem, replace(problem, curved=True)] if near else [problem]
+    fits = [(each, each.descend(start)) for each in waves]
+    problem, found = max(fits, key=lambda fit: float(fit[0].shares(fit[1]).mean()))
     if (turn := float(found.turn.norm())) > MAX_TURN:
         raise InputError(
             f"the phases of {train.name} fit best with the array turned by {math.degrees(turn):.0f} degrees; beyond "
