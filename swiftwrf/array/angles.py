@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from annotated_types import Ge, Le
@@ -148,6 +148,11 @@ def folded_to_front(direction: Tensor) -> Tensor:
 def wrap(angle: Tensor) -> Tensor:
     """Return the angle [rad] in [-pi, pi] that differs by a multiple of 2 pi."""
     return angle - math.tau * torch.round(angle / math.tau)
+
+
+def rotation_matrix(turn: Any) -> Tensor:
+    """Return the matrix (3, 3) of a rotation vector (3,) [rad], a tensor or an array."""
+    return torch.from_numpy(Rotation.from_rotvec(turn).as_matrix())
 
 
 def angular_distance(a: Tensor, b: Tensor) -> Tensor:

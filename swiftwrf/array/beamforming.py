@@ -41,6 +41,11 @@ def unit(channel: Tensor) -> Tensor:
     return channel / channel.abs().clamp_min(1e-300)
 
 
+def unit_phasor(phase: Tensor) -> Tensor:
+    """Return exp(j phase) for phases [rad] of any shape."""
+    return torch.polar(torch.ones_like(phase), phase)
+
+
 def phase(channel: Tensor, responses: Responses) -> Tensor:
     """Return squared spectra (n, ...) of the phases of channels (n, S, K)."""
     return responses(of_unit_power(unit(channel)) / channel.shape[2] ** 2)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid, to_angles
+from swiftwrf.array.beamforming import unit_phasor
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray, folded_angles
 from swiftwrf.choices import Moving
 from swiftwrf.data.spectra import GRID, Spectra, array_spectra, check_pixels
@@ -115,7 +116,7 @@ class PropagationPaths:
         channel = []
         for change in offset.tolist():
             at = PlanarArray(array.element, LIGHT_SPEED / (self.frequency_hz + change))
-            gain = self.gain * torch.polar(torch.ones_like(delay), -2 * math.pi * change * delay)
+            gain = self.gain * unit_phasor(-2 * math.pi * change * delay)
             channel.append(at.channel(self.direction, gain, self.owner, len(self.count)))
         return torch.stack(channel, dim=1), self.frequency_hz + offset
 
@@ -125,7 +126,7 @@ class PropagationPaths:
             return self.length
         wavelength = LIGHT_SPEED / self.frequency_hz
         length = wavelength / (4 * math.pi * self.gain.abs())
-        turned = self.gain * torch.polar(torch.ones_like(length), 2 * math.pi / wavelength * length)
+        turned = self.gain * unit_phasor(2 * math.pi / wavelength * length)
         if not bool((turned.angle().abs() < 0.1).double().mean() > 0.99):
             raise InputError(
                 "several subcarriers need the length of each path, and these paths have none; add the array length, or take "

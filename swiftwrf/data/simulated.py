@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid, ArrayPose
+from swiftwrf.array.beamforming import unit_phasor
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.choices import Moving
 from swiftwrf.data.paths import PropagationPaths
@@ -92,7 +93,7 @@ class ShoeboxRoom:
         wavelength = LIGHT_SPEED / self.frequency_hz
         amplitude = wavelength / (4 * math.pi * length) * self.reflection ** rooms.abs().sum(-1)
         amplitude = torch.where(clear, amplitude, self.blockage * amplitude)
-        gain = amplitude * torch.polar(torch.ones_like(length), -2 * math.pi / wavelength * length)
+        gain = amplitude * unit_phasor(-2 * math.pi / wavelength * length)
         return PropagationPaths(
             transmitter=transmitter,
             receiver=receiver,
@@ -166,7 +167,7 @@ def simulated_room(
     channel = torch.cat([paths.channel(array, pose.rotation) for paths in parts])
     noise = phase_noise * torch.randn(channel.shape, dtype=torch.float64, generator=generator)
     return Spectra(
-        store=array_spectra(array, channel * torch.polar(torch.ones_like(noise), noise), grid),
+        store=array_spectra(array, channel * unit_phasor(noise), grid),
         position=position,
         array=array,
         moving=moving,
@@ -236,6 +237,6 @@ def _power(position: Tensor, receiver: Tensor) -> Tensor:
     power = []
     for frequency in CHANNELS_HZ:
         turn = -math.tau / LIGHT_SPEED * (frequency - FLOOR.frequency_hz) * paths.length
-        gain = FLOOR.frequency_hz / frequency * paths.gain * torch.polar(torch.ones_like(turn), turn)
+        gain = FLOOR.frequency_hz / frequency * paths.gain * unit_phasor(turn)
         power.append(20 * gain.reshape(len(position), -1).sum(dim=1).abs().clamp_min(1e-9).log10())
     return torch.stack(power, dim=1)

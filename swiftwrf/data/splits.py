@@ -114,6 +114,11 @@ def random_rows(position: Tensor, n: int, seed: int) -> Tensor:
     return chosen[place].nonzero()[:, 0]
 
 
+def some_rows(n: int, most: int) -> Tensor:
+    """Return the numbers of at most `most` of n rows, equally spaced."""
+    return torch.linspace(0, n - 1, min(most, n)).round().long()
+
+
 def random_split(position: Tensor, seed: int) -> tuple[Tensor, Tensor]:
     """Return training rows and a random fifth as test rows, both ascending. Rows at one position are in one part.
 

@@ -26,19 +26,12 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn import functional
 
-from swiftwrf.array.angles import angular_distance, wrap
-from swiftwrf.array.beamforming import of_unit_power, unit
+from swiftwrf.array.angles import angular_distance, rotation_matrix, wrap
+from swiftwrf.array.beamforming import of_unit_power, unit, unit_phasor
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.snapshots import Snapshots
-from swiftwrf.data.splits import FOLDS, MIN_TRAINING, slabs
-from swiftwrf.diagnostics.elements import (
-    constant_phases,
-    in_noise,
-    noisy_elements,
-    rotation_matrix,
-    some_rows,
-    unit_phasor,
-)
+from swiftwrf.data.splits import FOLDS, MIN_TRAINING, slabs, some_rows
+from swiftwrf.diagnostics import elements
 from swiftwrf.errors import InputError, ranges
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import checked
@@ -127,7 +120,7 @@ def calibrate(train: Snapshots) -> Calibration:
             f"the elements of {train.name} lie on a line, which receives the angle to its axis only, so the array's "
             "orientation cannot be estimated"
         )
-    if bool(constant_phases(seen).any()):
+    if bool(elements.constant_phases(seen).any()):
         raise InputError(
             f"the phases between the elements of {train.name} hardly depend on the position, so they do not contain the "
             "direction of the line of sight"
@@ -163,8 +156,8 @@ def calibrate(train: Snapshots) -> Calibration:
         mean = problem.direction.mean(dim=0).expand_as(problem.direction)
         cone = float(angular_distance(problem.direction, mean).median())
         reason = "phases change from position to position as no direct path explains"
-        if noise := noisy_elements(seen, problem.away @ rotation_matrix(found.turn)):
-            reason = in_noise(noise)
+        if noise := elements.noisy_elements(seen, problem.away @ rotation_matrix(found.turn)):
+            reason = elements.in_noise(noise)
         elif cone < math.radians(20) and clear >= len(seen) / 2:
             reason = "measure positions in more directions from the array"
         raise InputError(f"{train.name} does not determine {' and '.join(open_ones)}; {reason}")

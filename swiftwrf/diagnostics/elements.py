@@ -10,15 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import torch
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn import functional
 
-from swiftwrf.array.beamforming import unit
+from swiftwrf.array.beamforming import unit, unit_phasor
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.errors import listed
@@ -240,18 +238,3 @@ def uncalibrated(data: Snapshots, away: Tensor) -> Tensor:
 def unit_channel(data: Snapshots) -> Tensor:
     """Return the phases of some snapshots of each position, complex128 (n, S, K)."""
     return unit(data.channel[:, :: max(1, data.channel.shape[1] // 8)])
-
-
-def unit_phasor(phase: Tensor) -> Tensor:
-    """Return exp(j phase) for phases [rad] of any shape."""
-    return torch.polar(torch.ones_like(phase), phase)
-
-
-def rotation_matrix(turn: Any) -> Tensor:
-    """Return the matrix (3, 3) of a rotation vector (3,) [rad], a tensor or an array."""
-    return torch.from_numpy(Rotation.from_rotvec(turn).as_matrix())
-
-
-def some_rows(n: int, most: int) -> Tensor:
-    """Return the numbers of at most `most` of n rows, equally spaced."""
-    return torch.linspace(0, n - 1, min(most, n)).round().long()

@@ -29,23 +29,13 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn import functional
 
-from swiftwrf.array.angles import AngularGrid, folded_to_front
+from swiftwrf.array.angles import AngularGrid, folded_to_front, rotation_matrix
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.data.splits import slabs
-from swiftwrf.diagnostics.elements import (
-    constant_phases,
-    evidence,
-    excess,
-    flipping_elements,
-    other_readings,
-    rotation_matrix,
-    sloped,
-    some_rows,
-    uncalibrated,
-)
+from swiftwrf.data.splits import slabs, some_rows
+from swiftwrf.diagnostics import elements
 from swiftwrf.errors import ranges
 
 Frame = Literal["unknown", "fits", "in part", "explained", "turned", "undecided"]
@@ -285,7 +275,7 @@ def _normalised(position: Tensor) -> str:
 def _evidence(away: Tensor, frame: _Frame, peak: Tensor, seen: Snapshots | None) -> Tensor:
     """Return the evidence (n,) for direct paths from points `away` (n, 3): power of snapshots, otherwise peaks."""
     if seen is not None:
-        return evidence(seen, away)
+        return elements.evidence(seen, away)
     return _kernel(_nearest(frame.folded(functional.normalize(away, dim=1)), peak))
 
 
@@ -301,7 +291,7 @@ def _reaches(found: _Hypothesis, declared: Snapshots | None) -> bool:
     least = MIN_REACHED_FITTED if found.free else MIN_REACHED
     if found.free and found.seen.array.wavelength != declared.array.wavelength:
         least = MIN_REACHED_CARRIER
-    return mean >= max(0.45 + chance, least * float(excess(share, chance).mean()))
+    return mean >= max(0.45 + chance, least * float(elements.excess(share, chance).mean()))
 
 
 def _hypotheses(
@@ -338,15 +328,15 @@ def _hypotheses(
         for meaning, peak_there in _grids(spectra, rows, frame):
             yield meaning, at(away, peak=peak_there)
         return
-    for meaning, fitted, reading in other_readings(seen, away):
+    for meaning, fitted, reading in elements.other_readings(seen, away):
         yield meaning, at(away, fitted, reading)
-    flipping, power = flipping_elements(seen, away)
-    elements = f"{'element' if len(flipping) == 1 else 'elements'} {ranges(flipping)}, counted from 0,"
+    flipping, power = elements.flipping_elements(seen, away)
+    named = f"{'element' if len(flipping) == 1 else 'elements'} {ranges(flipping)}, counted from 0,"
     for meaning, excess_power in {
-        f"the phase of {elements} jumps by half a turn from measurement to measurement": power,
-        CONSTANT: constant_phases(seen),
-        SLOPE: sloped(seen, away),
-        UNCALIBRATED: uncalibrated(seen, away),
+        f"the phase of {named} jumps by half a turn from measurement to measurement": power,
+        CONSTANT: elements.constant_phases(seen),
+        SLOPE: elements.sloped(seen, away),
+        UNCALIBRATED: elements.uncalibrated(seen, away),
     }.items():
         # constant phases fit channels whose phases hardly differ, too
         yield meaning, _Hypothesis(excess_power, 0.0, {CONSTANT: 5, UNCALIBRATED: 2}.get(meaning, 0), seen)

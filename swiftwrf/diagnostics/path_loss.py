@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.splits import MIN_TRAINING
-from swiftwrf.diagnostics.elements import some_rows
+from swiftwrf.data.splits import MIN_TRAINING, some_rows
 from swiftwrf.diagnostics.frames import best_delay, best_explanations, best_mirror, linear_errors
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, log_distance
 
