@@ -8,13 +8,11 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from swiftwrf.data.cells import parsed, plain_name, text_of
 from swiftwrf.data.powers import KNOWN_FILLERS, MIN_RSSI_DBM
 from swiftwrf.errors import InputError, listed
 
-Floats = NDArray[np.float64]
 PLACE = (
     "pos|position|coord|coordinate|loc|location|tx|rx|transmitter|receiver|map|plan|floorplan|image|point|pixels?|px|local|robot|ue|"
     "true|truth|gt"

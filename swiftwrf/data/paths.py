@@ -169,7 +169,6 @@ class PropagationPaths:
         moving: Moving = "receiver" if receivers >= transmitters else "transmitter"
         position, fixed = (self.receiver, self.transmitter)[:: 1 if moving == "receiver" else -1]
         channel, frequency = self.subcarriers(array, subcarriers or 1, bandwidth_hz or 0.0)
-        kept: dict[str, Any] = {"channel": channel, "frequency_hz": frequency} if subcarriers else {}
         return Spectra(
             store=array_spectra(array, channel, grid),
             position=position,
@@ -181,6 +180,7 @@ class PropagationPaths:
             name=name,
             fixed_position=fixed[0] if min(transmitters, receivers) == 1 else None,
             rotation=torch.eye(3, dtype=torch.float64),
-            **kept,
+            channel=channel if subcarriers else None,
+            frequency_hz=frequency,
             **details,
         )

@@ -16,7 +16,7 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid, ArrayPose, to_angles
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray, folded_angles
-from swiftwrf.choices import Moving
+from swiftwrf.choices import CARRIERS_HZ, Moving
 from swiftwrf.data.dataset import Arrays, Numbers, PositionedData, to_positions, to_rotation
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.data.store import BATCH_PIXELS, MAX_FILE_PIXELS, MAX_FINE_PIXELS, MAX_MEMORY_PIXELS, Store, stored
@@ -28,7 +28,6 @@ from swiftwrf.runtime.validation import checked
 
 GRID = AngularGrid.hemisphere(90, 360)  # of spectra that are computed
 DIRECTION = ("elevation", "azimuth")  # names of the dimensions of a spectrum
-MIN_FREQUENCY_HZ = 1e6  # lower ones are in another unit
 MAX_LABEL = torch.tensor([math.tau, math.pi / 2], dtype=torch.float64) + 1e-6  # azimuth and elevation [rad], rounded
 
 
@@ -262,7 +261,7 @@ def snapshot_frequencies(frequency_hz: Numbers | None, channel: Tensor) -> Tenso
     if frequency_hz is None:
         return None
     found = to_tensor("frequency_hz", frequency_hz, torch.float64, (channel.shape[1],))
-    if len(found) and not MIN_FREQUENCY_HZ <= float(found.min()) <= float(found.max()) <= 2 * float(found.min()):
+    if len(found) and not CARRIERS_HZ[0] <= float(found.min()) <= float(found.max()) <= 2 * float(found.min()):
         raise InputError(
             f"frequency_hz must be frequencies of one carrier's snapshots in Hz, got {float(found.min()):.6g} to "
             f"{float(found.max()):.6g}; give e.g. 2.412e9"
