@@ -22,10 +22,9 @@ from matplotlib.image import AxesImage
 from scipy.stats import norm
 
 import swiftwrf
-from swiftwrf.plotting import mark_direction, polar_spectrum
+from swiftwrf.plotting import hatch, mark_direction, polar_spectrum
 from swiftwrf.rssi.maps import RssiMap
 from tasks.page.figures import as_svg
-from tasks.page.maps import hatch
 
 FOLDER = Path(__file__).parent.parent / "docs" / "figures"
 INK, TRAIN, TEST, SYNTHETIC = (
