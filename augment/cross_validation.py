@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
-from typing import TypedDict, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -22,7 +21,7 @@ from augment import Fold, Mixed, synthetic_positions
 from augment.estimators import Estimator, make_estimator
 from swiftwrf.gp import subsample
 from swiftwrf.locate import MatchedField, MatchedFieldConfig
-from swiftwrf.metrics import ChangeMetrics, angle_errors, paired_change
+from swiftwrf.metrics import angle_errors, paired_change
 from swiftwrf.runtime.threads import parallel_map
 
 STAND_IN = "kernel_regression"  # estimator in place of the network where many or quick trainings are needed
@@ -34,69 +33,31 @@ Errors = NDArray[np.float64]
 _PREDICTING = threading.Lock()  # folds are computed side by side, but parallel loops of numba take one caller at a time
 
 
-class GainMetrics(ChangeMetrics):
-    """Change by a number of synthetic spectra at synthetic positions."""
-
-    n_synthetic: int
-
-
-class CrossValidationMetrics(TypedDict):
-    """Cross-validation of one field model: change of the error on held-out measured spectra by extra synthetic spectra.
-
-    `gains` has every number that was compared, `rule` the number chosen on the other folds. Further positions
-    are recommended if every number reduces the error; `helps` requires that the interval of `rule` excludes zero, too.
-    """
-
-    stand_in: str
-    n_held_out: int
-    measured_only_deg: float
-    gains: list[GainMetrics]
-    rule: ChangeMetrics | None
-    recommended_n_synthetic: int
-    helps: bool
-
-
-class EstimatorChoiceMetrics(TypedDict):
-    """Method with the smallest median angular error on held-out measured spectra; that error of each candidate.
-
-    `better` has the methods with a significantly smaller error on the test spectra, best first, and why they are not chosen.
-    """
-
-    name: str
-    held_out_deg: dict[str, float]
-    n_held_out: int
-    better: dict[str, str]
-
-
-@dataclass(frozen=True)
-class CrossValidation:
-    """Result of `cross_validate`.
-
-    Args:
-        metrics: Values for metrics.json.
-        measured_only: Angular errors [deg] on the held-out spectra of each fold, trained on measured spectra alone.
-        turbo: The same with synthetic spectra, their number chosen on the other folds. Empty without extra positions.
-    """
-
-    metrics: CrossValidationMetrics
-    measured_only: list[Errors]
-    turbo: list[Errors]
-
-
-def cross_validate(folds: Sequence[Fold], n_synthetic: int, seed: int) -> CrossValidation:
+def cross_validate(
+    folds: Sequence[Fold], n_synthetic: int, seed: int
+) -> tuple[dict[str, Any], list[Errors], list[Errors]]:
     """Return the change of the error on held-out measured spectra by synthetic spectra of one field model.
 
     Args:
         folds: Field model fitted without each fold in turn, at least two folds.
         n_synthetic: Number of synthetic positions that the run adds. Larger numbers are not compared.
         seed: Seed of positions and stand-in.
+
+    Returns:
+        metrics: Values for metrics.json. `gains` has the change by every number that was compared, `rule` that by the number
+            chosen on the other folds. Further positions are recommended if every number reduces the error; `helps` requires
+            that the interval of `rule` excludes zero, too.
+        measured_only: Angular errors [deg] on the held-out spectra of each fold, trained on measured spectra alone.
+        turbo: The same with synthetic spectra, their number chosen on the other folds. Empty without extra positions.
     """
     numbers = sorted({*(n for n in N_SYNTHETIC_CANDIDATES if n < n_synthetic), *([n_synthetic] if n_synthetic else [])})
     every = range(len(folds))
 
     @cache
     def fold_errors(number: int) -> list[Errors]:
-        return parallel_map(lambda fold: _errors(fold, number, seed), folds)
+        return parallel_map(
+            lambda fold: held_out_errors(fold, make_estimator(STAND_IN, seed=seed), number, seed), folds
+        )
 
     def errors(some: Iterable[int], number: int) -> Errors:
         return np.concatenate([fold_errors(number)[fold] for fold in some])
@@ -107,7 +68,7 @@ def cross_validate(folds: Sequence[Fold], n_synthetic: int, seed: int) -> CrossV
 
     alone = fold_errors(0)
     measured_only = np.concatenate(alone)
-    validation: CrossValidationMetrics = {
+    validation: dict[str, Any] = {
         "stand_in": STAND_IN,
         "n_held_out": len(measured_only),
         "measured_only_deg": float(np.median(measured_only)),
@@ -117,24 +78,32 @@ def cross_validate(folds: Sequence[Fold], n_synthetic: int, seed: int) -> CrossV
         "helps": False,
     }
     if not numbers:
-        return CrossValidation(validation, alone, [])
+        return validation, alone, []
     by_rule = [fold_errors(best([other for other in every if other != fold]))[fold] for fold in every]
     rule = validation["rule"] = paired_change(measured_only, np.concatenate(by_rule))
     # a gain at one number of positions alone is likely chance, because few spectra are held out
     if all(gain["change"] < 0 for gain in validation["gains"]):
         validation["recommended_n_synthetic"] = best(every)
         validation["helps"] = rule["high"] < 0
-    return CrossValidation(validation, alone, by_rule)
+    return validation, alone, by_rule
 
 
-def measured_errors(fold: Fold, estimator: Estimator) -> Errors:
-    """Return the angular errors [deg] of an estimator, trained on the measured spectra of a fold, on its test spectra.
+def held_out_errors(fold: Fold, estimator: Estimator, n_synthetic: int = 0, seed: int = 0) -> Errors:
+    """Return the angular errors [deg] of an estimator, trained on the spectra of a fold, on the held-out spectra.
 
     Args:
-        fold: Training and held-out spectra.
+        fold: Training and held-out spectra, and the field model of the synthetic spectra.
         estimator: Estimator, which is trained here.
+        n_synthetic: Number of synthetic spectra that are added to the measured ones.
+        seed: Seed of their positions.
     """
-    return _degrees(estimator.fit(Mixed.measured(fold.train)).estimate(fold.test), fold.test.label)
+    train = Mixed.measured(fold.train)
+    if n_synthetic:
+        positions = synthetic_positions(fold.train, n_synthetic, seed)
+        with _PREDICTING:
+            spectra = fold.model.synthesize(positions.position)
+        train = train.add(positions, spectra.cpu())
+    return _degrees(estimator.fit(train).estimate(fold.test), fold.test.label)
 
 
 def located_errors(fold: Fold, seed: int) -> Errors:
@@ -154,8 +123,8 @@ def located_errors(fold: Fold, seed: int) -> Errors:
 
 def choose_estimator(
     errors: Mapping[str, Sequence[Errors]], located: Mapping[int, Errors | None], locator: str = LOCATOR
-) -> EstimatorChoiceMetrics:
-    """Return the estimator with the smallest median error on held-out measured spectra, `better` left empty.
+) -> dict[str, Any]:
+    """Return name and error of the estimator with the smallest median error on held-out measured spectra, for metrics.json.
 
     Matched-field processing is compared on a fold of each of two searches, because its fits take seconds. It is a candidate
     only if planes were found without the spectra of each of these folds. All estimators are then compared on the spectra
@@ -176,24 +145,12 @@ def choose_estimator(
         compared[locator] = np.concatenate(list(found.values()))
     held_out = {name: float(np.median(values)) for name, values in compared.items()}
     best = min(held_out, key=lambda name: held_out[name])
-    return {"name": best, "held_out_deg": held_out, "n_held_out": len(compared[best]), "better": {}}
+    return {"name": best, "held_out_deg": held_out, "n_held_out": len(compared[best])}
 
 
 def _located_rows(n: int) -> Tensor:
     """Return the numbers of those of n held-out spectra that are located."""
     return subsample(torch.arange(n), rows=MAX_LOCATED)[0]
-
-
-def _errors(fold: Fold, n_synthetic: int, seed: int) -> Errors:
-    """Return the angular errors [deg] of the stand-in on held-out spectra, trained with synthetic spectra."""
-    train = Mixed.measured(fold.train)
-    if n_synthetic:
-        positions = synthetic_positions(fold.train, n_synthetic, seed)
-        with _PREDICTING:
-            spectra = fold.model.synthesize(positions.position)
-        train = train.add(positions, spectra.cpu())
-    stand_in = make_estimator(STAND_IN, seed=seed).fit(train)
-    return _degrees(stand_in.predict(fold.test.spectrum), fold.test.label)
 
 
 def _degrees(estimate: Tensor, label: Tensor) -> Errors:

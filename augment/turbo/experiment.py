@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from augment.choose import blind_folds, candidates
-from augment.cross_validation import LOCATOR, STAND_IN, CrossValidationMetrics
+from augment.cross_validation import LOCATOR, STAND_IN
 from augment.estimators import ESTIMATORS, Estimator, make_estimator
 from augment.mix import withhold
 from augment.positions import SyntheticPositions
-from augment.turbo.condition import NETWORKS, MeasuredSubset, Training
+from augment.turbo.condition import NETWORKS, MeasuredSubset, Row, Training
 from swiftwrf.choices import AUTO
 from swiftwrf.data import Spectra
 from swiftwrf.errors import InputError
@@ -117,7 +117,7 @@ class Experiment:
         """Return the fold of each measured spectrum, and the folds that each search for a room leaves out."""
         return blind_folds(self.withhold(subset)[0], "random", self.seed + subset.repeat)
 
-    def trainings(self, validation: CrossValidationMetrics | None) -> list[tuple[Training, int]]:
+    def trainings(self, validation: Row | None) -> list[tuple[Training, int]]:
         """Return the training sets with spectra of a field model, and their numbers of extra synthetic positions."""
         # by default only where held-out measured spectra gain from extra positions
         wanted = self.extra is not None or bool(validation and validation["recommended_n_synthetic"])

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from pandas import DataFrame, concat
 
-from augment.cross_validation import LOCATOR, STAND_IN, EstimatorChoiceMetrics, choose_estimator
+from augment.cross_validation import LOCATOR, STAND_IN, choose_estimator
 from augment.estimators import Estimator
 from augment.turbo.artifacts import LEVEL
 from augment.turbo.condition import (
@@ -164,8 +164,10 @@ class TurboResult:
             counts: Spectra by origin in each training set.
             choice: Chosen field model, trimmed mean PSNR [dB] and seconds of each candidate, and reasons why others could
                 not be fitted. This and the next two are of the first repeat, None without a comparison.
-            cross_validation: `CrossValidationMetrics` by field model.
-            estimator_choice: `EstimatorChoiceMetrics`.
+            cross_validation: Change of the error by extra synthetic spectra, by field model; see `cross_validate`.
+            estimator_choice: Name of the method with the smallest median angular error on held-out measured spectra, that
+                error of each candidate, and `better`: the methods with a significantly smaller error on the test spectra,
+                best first, and why they are not chosen.
             synthesis: Quality of each field model at the test positions, and its mean seconds to `fit` and `synthesize`.
             methods: Condition, errors, mean seconds and `changes` of each method. These are changes of the angular error by
                 synthetic spectra, by the method that it is compared to: the same estimator on measured spectra, and the
@@ -199,9 +201,9 @@ class TurboResult:
         }
 
     @property
-    def choice(self) -> EstimatorChoiceMetrics | None:
+    def choice(self) -> Row | None:
         """Choice of the estimator by cross-validation; `choice["name"]` is its method. None if nothing was compared."""
-        found: EstimatorChoiceMetrics | None = self.metrics["estimator_choice"]
+        found: Row | None = self.metrics["estimator_choice"]
         return found
 
     @cached_property
@@ -257,7 +259,7 @@ class TurboResult:
         """Angular errors [deg] of each method, (n, repeats)."""
         return {method: by_repeat(part, "great_circle_deg") for method, part in self.errors.groupby("method")}
 
-    def _estimator_choice(self) -> EstimatorChoiceMetrics | None:
+    def _estimator_choice(self) -> Row | None:
         """Return the choice of the estimator by cross-validation. None if field models could not be compared."""
         if self.compared.get("choice") is None:
             return None
@@ -274,7 +276,7 @@ class TurboResult:
         choice = choose_estimator(errors, found, LOCATED)
         return {**choice, "better": self._better(choice)}
 
-    def _better(self, choice: EstimatorChoiceMetrics) -> dict[str, str]:
+    def _better(self, choice: Row) -> dict[str, str]:
         """Return the methods that are significantly better than the chosen one on the test spectra, and why not chosen."""
         error, reasons = self._error, {}
         for condition, _ in self.pooled:

@@ -15,8 +15,8 @@ from augment.cross_validation import (
     LOCATOR,
     STAND_IN,
     cross_validate,
+    held_out_errors,
     located_errors,
-    measured_errors,
 )
 from augment.estimators import SavedEstimator
 from augment.mix import Mixed, mix
@@ -71,19 +71,19 @@ def compare(experiment: Experiment, folder: Path, subset: MeasuredSubset, compar
         return {"choice": None, "cross_validation": {}}
     trained = [name for name in compared if name in choice.folds] or [choice.name]
     validation = {name: cross_validate(choice.folds[name], experiment.n_synthetic, seed) for name in trained}
-    first, folds = validation[trained[0]], choice.folds[trained[0]]
-    errors = {Condition(STAND_IN, "measured").method: first.measured_only}
-    if first.turbo:
-        training, _ = experiment.trainings(first.metrics)[-1]
-        errors[Condition(STAND_IN, training, trained[0]).method] = first.turbo
+    (first, measured_only, turbo), folds = validation[trained[0]], choice.folds[trained[0]]
+    errors = {Condition(STAND_IN, "measured").method: measured_only}
+    if turbo:
+        training, _ = experiment.trainings(first)[-1]
+        errors[Condition(STAND_IN, training, trained[0]).method] = turbo
     for name in experiment.evaluated:
         if name not in (*NETWORKS.values(), STAND_IN, *experiment.lacking):
             errors[Condition(name, "measured").method] = [
-                measured_errors(fold, experiment.make_estimator(name, subset.repeat)) for fold in folds
+                held_out_errors(fold, experiment.make_estimator(name, subset.repeat)) for fold in folds
             ]
     return {
         "choice": {name: value for name, value in vars(choice).items() if name != "folds"},
-        "cross_validation": {name: entry.metrics for name, entry in validation.items()},
+        "cross_validation": {name: metrics for name, (metrics, *_) in validation.items()},
         "errors": errors,
     }
 

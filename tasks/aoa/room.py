@@ -11,9 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pandas import DataFrame, concat
 
-from augment.cross_validation import CrossValidationMetrics, GainMetrics
 from augment.turbo.condition import LOCATED
-from swiftwrf.metrics import ChangeMetrics
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.plotting import corners_of, hatch
 from tasks import labels
@@ -22,7 +20,7 @@ from tasks.aoa.synthesis import quality_table
 from tasks.page import figures
 from tasks.page.page import Plot, Section, Table, number
 from tasks.page.shared import with_interval
-from tasks.records import read_json
+from tasks.records import Row, read_json
 
 MARGIN = 0.5  # [m] around the room in a plan
 FIXED, MEASURED, IMAGE = "#cf4a4a", "#3a7fd5", "#d1620f"
@@ -32,7 +30,7 @@ MIN_WINDOW_M = 0.02  # half the side of the smallest map of a posterior
 MAX_MARK = 120  # area [pt^2] of the candidate with the largest mass
 
 
-def _cross_validations(fraction: FractionRecords) -> dict[str, CrossValidationMetrics]:
+def _cross_validations(fraction: FractionRecords) -> dict[str, Row]:
     """Return the cross-validation of each field model, if it has extra positions."""
     return {name: entry for name, entry in (fraction.mix["cross_validation"] or {}).items() if entry["gains"]}
 
@@ -54,7 +52,7 @@ def cross_validation_sentences(fraction: FractionRecords) -> list[str]:
     return texts
 
 
-def _advice(validation: CrossValidationMetrics) -> str:
+def _advice(validation: Row) -> str:
     """Return in one sentence whether turbo learning helps by a field model."""
     if validation["helps"]:
         return f"Turbo learning helps here: use --extra {validation['recommended_n_synthetic']} with this fraction."
@@ -63,7 +61,7 @@ def _advice(validation: CrossValidationMetrics) -> str:
     return "The change is not significant: more measured positions are the safer way."
 
 
-def _best_and_rule(validation: CrossValidationMetrics) -> tuple[GainMetrics, ChangeMetrics]:
+def _best_and_rule(validation: Row) -> tuple[Row, Row]:
     """Return the number with the lowest error, and the number chosen on other folds."""
     best = min(validation["gains"], key=lambda gain: gain["median_deg"])
     return best, validation["rule"] or best
@@ -81,7 +79,7 @@ def choice_section(fraction: FractionRecords) -> Section:
     return Section("Do synthetic spectra help?", texts, [quality_table(fraction)], plots)
 
 
-def _gain(fraction: FractionRecords, name: str, validation: CrossValidationMetrics) -> Plot:
+def _gain(fraction: FractionRecords, name: str, validation: Row) -> Plot:
     figure, ax = figures.panel(5.8, 3.2)
     colour = labels.colour(fraction.palette, name)
     gains = sorted(validation["gains"], key=lambda gain: gain["n_synthetic"])

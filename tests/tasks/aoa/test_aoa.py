@@ -305,10 +305,10 @@ def test_networks_are_seeded_and_leave_the_global_generator_alone(room, kind):
 
 def pretended(monkeypatch, room, errors):
     """Return the cross-validation for four folds with these errors by fold and number of synthetic positions."""
-    monkeypatch.setattr(cross_validation, "_errors", lambda fold, number, *_: errors(fold.test, number))
+    monkeypatch.setattr(cross_validation, "held_out_errors", lambda fold, _, number, seed: errors(fold.test, number))
     model = make_model("idw").fit(room)
     folds = [SimpleNamespace(model=model, test=fold) for fold in range(4)]
-    return cross_validation.cross_validate(folds, n_synthetic=3000, seed=0).metrics
+    return cross_validation.cross_validate(folds, n_synthetic=3000, seed=0)[0]
 
 
 @pytest.mark.parametrize(
