@@ -10,7 +10,7 @@ from typing import Any
 
 from record import without_folders
 
-from tasks.page.records import Records
+from tasks.records import Records
 
 
 def collect(folder: Path, name: str) -> None:

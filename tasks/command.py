@@ -45,7 +45,7 @@ COMMANDS = {
     ),
     "resume": Command("continue an interrupted run: swiftwrf resume DIR.partial", "ResumeConfig", "tasks.resume"),
     "scenes": Command("trace ray paths in a room (extra: raytrace)", "ScenesConfig", "tasks.scenes"),
-    "view": Command("show a fitted field in the browser (extra: view)", "ViewConfig", "tasks.view.run"),
+    "view": Command("show a fitted field in the browser (extra: view)", "ViewConfig", "tasks.view.sources"),
 }
 
 

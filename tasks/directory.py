@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import errno
-import hashlib
-import json
 import os
 import re
 import secrets
@@ -26,7 +24,7 @@ from swiftwrf.runtime.steps import LOCATOR, MODEL, STEPS, Memo
 from swiftwrf.runtime.threads import set_threads
 from tasks.environment import environment, invocation, now, number_of_processes, stamp
 from tasks.options import plain
-from tasks.records import CONFIG, ENVIRONMENT, METRICS, PARTIAL, Row, read_json
+from tasks.records import CONFIG, ENVIRONMENT, METRICS, PARTIAL, Row, digest, read_json
 from tasks.terminal import terminal
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # errors of file systems without locks
@@ -168,11 +166,6 @@ def unchanged_environment(folder: Path, source: dict[str, str]) -> Row:
             f"the input has changed since {folder} began ({', '.join(changed)}); restore it or start a new run"
         )
     return found
-
-
-def digest(config: Any) -> str:
-    """Return the SHA-256 of a configuration of plain values."""
-    return hashlib.sha256(json.dumps(strict(config), sort_keys=True).encode()).hexdigest()
 
 
 class Run(Memo):

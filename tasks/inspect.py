@@ -19,7 +19,6 @@ from swiftwrf.diagnostics.inspection import Findings, inspect, propose_offsets
 from swiftwrf.positions import nearest
 from swiftwrf.rssi import fit_path_loss, log_distance
 from swiftwrf.runtime.durable import write_json
-from tasks.answer import NextStep
 from tasks.configs import InspectConfig
 from tasks.directory import new_directory
 from tasks.environment import command, stamp
@@ -27,7 +26,7 @@ from tasks.options import given
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table, write_page
 from tasks.source import located, reading
-from tasks.terminal import terminal
+from tasks.terminal import NextStep, terminal
 
 AXES = ("#cf4a4a", "#2a9165", "#3a7fd5")  # colours of x, y and normal
 DOTS, NONE = "#3a7fd5", "#7f8794"  # with line of sight, without

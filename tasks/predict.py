@@ -25,8 +25,7 @@ from tasks.convert import write_file
 from tasks.directory import check_new_file, kept_model
 from tasks.environment import stamp
 from tasks.options import given
-from tasks.page.records import Records
-from tasks.records import CONFIG, Row, rounded, write_table
+from tasks.records import CONFIG, Records, Row, rounded, write_table
 from tasks.source import aligned, located, observed_spectra, reading
 from tasks.terminal import console, terminal
 

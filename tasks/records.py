@@ -1,4 +1,4 @@
-"""Tables and values on disk: written whole or not at all, refused if damaged. NumPy and pandas are imported at first use.
+"""Files of a run: written whole or not at all, refused if damaged. NumPy and pandas are imported at first use.
 
 Spreadsheet programs run a cell that begins with = + - @ as a formula. Receiver names come from files of others, so a text
 of that kind is written behind an apostrophe, which those programs take for a mark of text, and read without it.
@@ -6,15 +6,17 @@ of that kind is written behind an apostrophe, which those programs take for a ma
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from swiftwrf.errors import InputError
-from swiftwrf.runtime.durable import write_text
+from swiftwrf.runtime.durable import strict, write_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -55,6 +57,11 @@ def read_json(file: Path) -> Row:
     if not isinstance(content, dict):
         raise InputError(f"{file} must hold a JSON object, got a {type(content).__name__}; restore it")
     return content
+
+
+def digest(config: Any) -> str:
+    """Return the SHA-256 of a configuration of plain values."""
+    return hashlib.sha256(json.dumps(strict(config), sort_keys=True).encode()).hexdigest()
 
 
 def write_table(file: Path, rows: Iterable[Row]) -> None:
@@ -172,3 +179,77 @@ def read_npz(
         if not array.dtype.str[1:].startswith(kind) or array.ndim != len(names) or not all(known):
             raise InputError(f"{file}: {name} is {array.dtype} of {array.shape}, expected {expected[name]}; restore it")
     return arrays
+
+
+def notes(run: Records) -> list[str]:
+    """Return what the reader of the data found, in sentences; nothing for a run that did not keep it."""
+    return [f"{note[0].upper()}{note[1:]}." for note in run.metrics.get("notes", [])]
+
+
+class Records:
+    """The files of one run.
+
+    Args:
+        folder: Directory of the run.
+        metrics: Content of metrics.json. Defaults to the file in the directory.
+        number: Number of the run in a report over several runs, from 1. 0 for a report over one run.
+
+    Raises:
+        InputError: The directory contains no finished run.
+    """
+
+    def __init__(self, folder: Path, metrics: Row | None = None, number: int = 0) -> None:
+        self.folder, self.number = folder, number
+        if metrics is None:
+            file = folder / METRICS
+            if not file.is_file():
+                raise InputError(f"{folder} is no finished run: it has no {METRICS}")
+            metrics = read_json(file)
+        self.metrics = metrics
+        self._tables: dict[str, pd.DataFrame] = {}
+        self._arrays: dict[str, dict[str, NDArray[Any]]] = {}
+
+    @property
+    def place(self) -> str:
+        """The data and their split in words."""
+        data = self.metrics["data"]
+        return f"{'the ' + data.replace('-', ' ') if data.startswith('simulated-') else data}, {self.metrics['split']} split"
+
+    @property
+    def scene(self) -> str:
+        """The data and their split in words, and which run it is where there are several."""
+        return self.place + (f", run {self.number}" if self.number else "")
+
+    @property
+    def file_name(self) -> str:
+        """Prefix of the names of the run's figures, unique within a report."""
+        names = [re.sub(r"[^\w.=-]+", "_", self.metrics[key], flags=re.ASCII)[:40] for key in ("data", "split")]
+        return "-".join([*names, f"s{self.metrics['seed']}", *([f"run{self.number}"] if self.number else [])])
+
+    @cached_property
+    def config(self) -> Row:
+        """Command and configuration."""
+        return read_json(self.folder / CONFIG)
+
+    @cached_property
+    def environment(self) -> Row:
+        """Environment of the run: machine, versions, commit."""
+        return read_json(self.folder / ENVIRONMENT)
+
+    def table(self, name: str) -> pd.DataFrame:
+        """One of the run's tables, e.g. `errors`; not to be changed."""
+        if name not in self._tables:
+            self._tables[name] = read_table(self.folder / f"{name}.csv")
+        return self._tables[name]
+
+    def arrays(self, name: str) -> dict[str, NDArray[Any]]:
+        """Return the arrays that the run saved in a file, e.g. `maps`, by their names; none without that file."""
+        if name not in self._arrays:
+            file = self.folder / f"{name}.npz"
+            self._arrays[name] = read_npz(file) if file.is_file() else {}
+        return self._arrays[name]
+
+    @property
+    def path(self) -> str:
+        """Directory of the run as commands take it, also while the run is not finished."""
+        return str(self.folder).removesuffix(PARTIAL)

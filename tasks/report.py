@@ -20,8 +20,7 @@ from tasks.environment import choose_device, environment, stamp
 from tasks.locate.experiment import record as locate_record
 from tasks.locate.page import page as locate
 from tasks.page.page import REPORT, Page, write_page
-from tasks.page.records import Records
-from tasks.records import CONFIG, ENVIRONMENT
+from tasks.records import CONFIG, ENVIRONMENT, Records
 from tasks.rssi.experiment import record as rssi_record
 from tasks.rssi.page import page as rssi
 from tasks.terminal import terminal

@@ -9,8 +9,7 @@ from tasks import configs
 from tasks.command import COMMANDS, run_task
 from tasks.command_line import parse
 from tasks.configs import ResumeConfig
-from tasks.directory import digest
-from tasks.records import CONFIG, ENVIRONMENT, read_json
+from tasks.records import CONFIG, ENVIRONMENT, digest, read_json
 
 
 def run(config: ResumeConfig) -> None:

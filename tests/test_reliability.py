@@ -23,8 +23,7 @@ from swiftwrf.runtime import durable
 from tasks import environment
 from tasks.command import main
 from tasks.directory import Claim
-from tasks.page.records import Records
-from tasks.records import read_table, write_table
+from tasks.records import Records, read_table, write_table
 from tasks.report import merge
 from tasks.rssi import experiment as rssi
 

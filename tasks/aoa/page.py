@@ -9,14 +9,14 @@ from augment.estimators import ESTIMATORS
 from augment.turbo.condition import FULL_NETWORK, LOCATED, MEASURED_NETWORK, MEASURED_STAND_IN, NETWORK, NETWORKS
 from swiftwrf.metrics import ChangeMetrics
 from tasks import labels
-from tasks.answer import Answer, Method, NextStep
 from tasks.aoa.records import FractionRecords, palette
 from tasks.aoa.room import choice_section, located_plan, locating_section, room_section
 from tasks.aoa.synthesis import examples, examples_plot, spectra
 from tasks.environment import command
 from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of
-from tasks.page.records import Records, notes
 from tasks.page.shared import again, compared, errors_section, fingerprinting, next_steps, suggestion_section, worth
+from tasks.records import Records, notes
+from tasks.terminal import Answer, Method, NextStep
 
 BASELINES = ("peak", "constant")  # others must beat them
 

@@ -14,7 +14,7 @@ from pandas import DataFrame
 from augment.turbo.condition import Condition, Row, chosen_file, conditions_of, headline
 from swiftwrf.choices import AUTO, fraction_key
 from tasks import labels
-from tasks.page.records import Records
+from tasks.records import Records
 
 # colours of conditions without a field model
 LOWER_REFERENCE, UPPER_REFERENCE, CHOSEN = "#cf4a4a", "#2a9165", "#3a7fd5"

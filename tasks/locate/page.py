@@ -16,10 +16,8 @@ from scipy.stats import binomtest
 from swiftwrf.locate.baselines import LOCALIZERS
 from swiftwrf.plotting import corners_of
 from tasks import labels
-from tasks.answer import Answer, Method, NextStep
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of
-from tasks.page.records import Records, notes
 from tasks.page.shared import (
     again,
     by_method,
@@ -32,6 +30,8 @@ from tasks.page.shared import (
     next_steps,
     suggestion_section,
 )
+from tasks.records import Records, notes
+from tasks.terminal import Answer, Method, NextStep
 
 OWN = "posterior"  # the localizer that all others are compared with
 NEIGHBOURS = ("knn", "knn_difference")

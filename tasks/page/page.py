@@ -13,13 +13,11 @@ from matplotlib.figure import Figure
 from pandas import DataFrame
 
 from swiftwrf.runtime.durable import write_text
-from tasks.answer import Answer, NextStep
 from tasks.directory import Run
 from tasks.page.figures import as_svg, for_page
-from tasks.page.records import Records
 from tasks.preload import served_map
-from tasks.records import write_table
-from tasks.terminal import terminal
+from tasks.records import Records, write_table
+from tasks.terminal import Answer, NextStep, terminal
 
 HALF = 92  # letters of a table that fit into half of the page
 WIDE = 7.5  # [inches] figures that are wider take the whole width of the page, others half

@@ -16,13 +16,12 @@ from torch import Tensor
 
 from swiftwrf.metrics import ErrorSummary, paired_difference
 from swiftwrf.runtime.durable import write_npz
-from tasks.answer import Answer, NextStep
 from tasks.environment import command
 from tasks.page import figures
 from tasks.page.figures import MAX_CURVES, Colours
 from tasks.page.page import Plot, Section, Summary, Table, number
-from tasks.page.records import Records
-from tasks.records import write_table
+from tasks.records import Records, write_table
+from tasks.terminal import Answer, NextStep
 
 MEASURED, SUGGESTED = "#3a7fd5", "#cf4a4a"
 MIN_REDUCTION = 0.1  # of the variance, below which more positions are not worth it

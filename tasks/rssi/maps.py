@@ -17,7 +17,7 @@ from swiftwrf.plotting import corners_of, hatch
 from swiftwrf.rssi import LEVEL
 from tasks.page import figures, maps
 from tasks.page.page import Plot
-from tasks.page.records import Records
+from tasks.records import Records
 
 MAX_MAPS = 24  # receivers with a map in the report; all are in the tables
 MAX_VECTOR_DOTS = 300  # more dots become an image: the page would grow to megabytes

@@ -9,11 +9,9 @@ from matplotlib.figure import Figure
 
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.metrics import paired_difference
-from tasks.answer import Answer, Method, NextStep
 from tasks.labels import PREDICTORS, colour, colours, meanings
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of
-from tasks.page.records import Records, notes
 from tasks.page.shared import (
     again,
     by_method,
@@ -25,7 +23,9 @@ from tasks.page.shared import (
     limits,
     next_steps,
 )
+from tasks.records import Records, notes
 from tasks.rssi.maps import CERTAINTY, COVERED_DBM, MAX_VECTOR_DOTS, MIN_RATIO, WIDTH_PER_STD, Maps
+from tasks.terminal import Answer, Method, NextStep
 
 COLUMNS = ["index", "receiver", "method", "abs_error_db"]  # of the errors of methods
 COLOURS = colours(PREDICTORS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 
 import torch
@@ -11,16 +12,17 @@ from pandas import DataFrame
 from torch import Tensor
 
 from swiftwrf.data.files import read_bytes
+from swiftwrf.errors import InputError
 from swiftwrf.online import Step
 from swiftwrf.positions import nearest
 from swiftwrf.runtime.checkpoint import refusing
 from swiftwrf.runtime.durable import write_json, write_text
 from swiftwrf.runtime.steps import MODEL
-from tasks.answer import NextStep
 from tasks.environment import command
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table
 from tasks.records import Row, as_table, from_text, read_json
+from tasks.terminal import NextStep
 
 TABLE, SUMMARY = "measurements.csv", "update.json"
 COLUMNS = (
@@ -43,6 +45,7 @@ WINDOW = 30  # measurements of the running error
 MAX_SURPRISING = 10
 N_NEIGHBOURS = 5  # measurements whose mean innovation a map shows at each position
 BLUE, RED = "#4477aa", "#ee6677"
+Version = tuple[tuple[int, int], ...]  # time of change [ns] and size of each file
 
 
 @dataclass(eq=False)
@@ -228,3 +231,42 @@ def map_plot(record: Record) -> Plot:
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     table = DataFrame(position.numpy(), columns=["x_m", "y_m", "z_m"]).assign(innovation=surprise.numpy())
     return Plot("changes", [figure], caption, table)
+
+
+@dataclass(frozen=True)
+class FollowedView:
+    """Directory of an update, which may still grow.
+
+    Raises:
+        InputError: It holds no record.
+    """
+
+    folder: Path
+
+    def __post_init__(self) -> None:
+        if not (self.folder / SUMMARY).exists():
+            raise InputError(f"{self.folder} holds no record of an update: it has no {SUMMARY}")
+
+    @property
+    def title(self) -> str:
+        """Title of the page."""
+        return self.folder.name
+
+    @property
+    def version(self) -> Version:
+        """Version of the files, which changes when a measurement is learnt."""
+        found = [file.stat() for name in (TABLE, SUMMARY) if (file := self.folder / name).exists()]
+        return tuple((stat.st_mtime_ns, stat.st_size) for stat in found)
+
+
+@lru_cache(maxsize=1)
+def snapshot(view: FollowedView, version: Version) -> tuple[Record, dict[str, str]]:
+    """Return the record at a version of its files, and its figures as SVG by name; several visitors share them.
+
+    Raises:
+        InputError: The record is damaged.
+    """
+    record = Record.read(view.folder)
+    plots = (error_plot(record), map_plot(record)) if record.rows else ()
+    svg = {plot.name: figures.for_page(figures.as_svg(plot.panels[0], plot.caption), plot.name) for plot in plots}
+    return record, svg

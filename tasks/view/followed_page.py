@@ -7,10 +7,11 @@ from nicegui import run, ui
 from swiftwrf import InputError
 from tasks.environment import command
 from tasks.records import Row, rounded
-from tasks.view.followed import FollowedView, Version, snapshot
+from tasks.update.record import FollowedView, Version, snapshot
 from tasks.view.page import NewestOnly, header
 
 PERIOD_S = 1.0  # between two looks at the files
+LAST_ROWS = 20
 COLUMNS = {
     "index": "measurement",
     "x_m": "x [m]",
@@ -57,11 +58,11 @@ class FollowedPage:
             return
         if found is None:  # the server is being ended
             return
-        self._shown = version
-        self._sentences.set_text("\n".join(found.sentences))
+        (record, svg), self._shown = found, version
+        self._sentences.set_text("\n".join(record.sentences()) if record.rows else "no measurement yet")
         for name, box in self._figures.items():
-            box.set_content(found.figures.get(name, ""))
-        self._table.rows = [_cells(row) for row in found.rows]
+            box.set_content(svg.get(name, ""))
+        self._table.rows = [_cells(row) for row in record.rows[: -LAST_ROWS - 1 : -1]]
         self._table.update()
 
 

@@ -1,4 +1,4 @@
-"""Open a run or a saved model for the page."""
+"""A page to explore a run or a saved model in the browser, served on this machine."""
 
 from __future__ import annotations
 
@@ -24,16 +24,37 @@ from swiftwrf.runtime.checkpoint import Saved, refusing
 from swiftwrf.runtime.steps import LOCATOR, MODEL
 from tasks.aoa.experiment import measurements as spectra_of
 from tasks.command_line import parse
-from tasks.configs import AoaConfig, LocateConfig
+from tasks.configs import AoaConfig, LocateConfig, ViewConfig
 from tasks.locate.experiment import measurements as rssi_of
 from tasks.records import CONFIG, ENVIRONMENT, Row, read_json
-from tasks.view.followed import FollowedView
+from tasks.update.record import FollowedView
 from tasks.view.locating import RssiLocating
 from tasks.view.rssi import RssiView, rows_of_model, rows_of_run
 from tasks.view.spectra import LoadedModel, SpectraView
 
 EXPECTED = "give the directory of a run of aoa, rssi, locate or update, or a saved model of spectra or RSSI"
 Kind = TypeVar("Kind", bound=Saved)
+
+
+def run(config: ViewConfig) -> None:
+    """Serve the page until the process is interrupted.
+
+    Raises:
+        InputError: The source holds no model, the port is in use, or the optional extra is not installed.
+    """
+    try:
+        from tasks.view.followed_page import FollowedPage
+        from tasks.view.page import free_port, serve
+        from tasks.view.rssi_page import RssiPage
+        from tasks.view.spectra_page import SpectraPage
+    except ModuleNotFoundError as error:
+        if error.name != "nicegui":
+            raise
+        raise InputError("swiftwrf view needs the optional extra: pip install 'swiftwrf-tasks[view]'") from None
+    port = free_port(config.host, config.port)
+    view = open_source(Path(config.source))
+    page: Any = {SpectraView: SpectraPage, RssiView: RssiPage, FollowedView: FollowedPage}[type(view)]
+    serve(view.title, lambda: page(view), config.host, port, config.open)
 
 
 def open_source(source: Path) -> SpectraView | RssiView | FollowedView:

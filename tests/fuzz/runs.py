@@ -42,9 +42,8 @@ from tasks.configs import AoaConfig, LocateConfig
 from tasks.options import plain
 from tasks.page.maps import FloorPlan
 from tasks.update import lines
-from tasks.update.record import TABLE, Record
+from tasks.update.record import TABLE, FollowedView, Record, snapshot
 from tasks.view.charts import around, picture, points
-from tasks.view.followed import FollowedView, snapshot
 from tasks.view.rssi import MapSelection, RssiView
 from tasks.view.sources import open_source
 
@@ -88,7 +87,7 @@ def followed_run(folder: Path) -> None:
 
 def show(folder: Path) -> None:
     """Open a run and compute what its page shows, with small maps and without files of the figures."""
-    with mock.patch("swiftwrf.rssi.maps.CELLS", 9), mock.patch("tasks.view.followed.as_svg", return_value="<svg"):
+    with mock.patch("swiftwrf.rssi.maps.CELLS", 9), mock.patch("tasks.page.figures.as_svg", return_value="<svg"):
         view = open_source(folder)
         if isinstance(view, FollowedView):
             snapshot(view, view.version)

@@ -13,7 +13,6 @@ from pandas import DataFrame
 from swiftwrf import AngularGrid, Rssi, Spectra, plotting
 from swiftwrf.diagnostics.inspection import Findings
 from tasks import labels
-from tasks.answer import NextStep
 from tasks.aoa.records import CHOSEN, LOWER_REFERENCE, UPPER_REFERENCE
 from tasks.aoa.synthesis import SCALES, spectra
 from tasks.configs import InspectConfig
@@ -24,6 +23,7 @@ from tasks.page.maps import colour_image, inside
 from tasks.page.page import Number, Page, Plot, Section, Summary, write_page
 from tasks.page.shared import again
 from tasks.records import read_table
+from tasks.terminal import NextStep
 
 
 def plot(name: str = "line", width: float = 6.0) -> Plot:

@@ -20,7 +20,7 @@ from swiftwrf.metrics import angle_errors
 from swiftwrf.runtime.checkpoint import read, write
 from tasks.aoa.page import steps
 from tasks.aoa.records import FractionRecords
-from tasks.page.records import Records
+from tasks.records import Records
 
 GRID = AngularGrid.hemisphere(8, 32)
 

@@ -10,9 +10,8 @@ import quick
 from rich.console import Console
 
 from swiftwrf.runtime.progress import progress
-from tasks.answer import Answer, Method, NextStep
 from tasks.options import Output
-from tasks.terminal import Terminal, terminal
+from tasks.terminal import Answer, Method, NextStep, Terminal, terminal
 
 ERROR = {"median": 2.36, "p90": 7.0, "mean": 3.1, "low": 2.0, "high": 2.9, "n": 40}
 

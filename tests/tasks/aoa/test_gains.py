@@ -18,7 +18,7 @@ from swiftwrf.metrics import summary as error_summary
 from tasks.aoa.page import answer, comparison, first_screen
 from tasks.aoa.records import FractionRecords
 from tasks.configs import AoaConfig
-from tasks.page.records import Records
+from tasks.records import Records
 
 MEASURED = Condition("aann_kernel", "measured", measured_fraction=0.3)
 TURBO = replace(MEASURED, training="measured + synthetic", synthesizer="gp")

@@ -32,9 +32,8 @@ from tasks.configs import LocateConfig
 from tasks.convert import saved_model
 from tasks.options import plain
 from tasks.page.maps import FloorPlan, colour_image
-from tasks.update.record import Record
+from tasks.update.record import Record, snapshot
 from tasks.view import charts, spectra
-from tasks.view.followed import snapshot
 from tasks.view.locating import RssiLocating
 from tasks.view.rssi import MapSelection, RssiView, at_least, probability_above
 from tasks.view.sources import open_source
@@ -483,20 +482,20 @@ def test_a_followed_run_is_read_again_when_it_grows(tmp_path):
         open_source(tmp_path)
     record.write(tmp_path)
     view = open_source(tmp_path)
-    assert snapshot(view, view.version).sentences == ["no measurement yet"]
+    assert "0 measurements" in snapshot(view, view.version)[0].sentences()[0]
     for i in range(60, 63):
         step = follower.step(data.subset(torch.tensor([i])))
         record.append(tmp_path, record.add(i, replace(step, alarms=("hall weaker everywhere",)) if i == 62 else step))
     version = view.version
     shown = snapshot(view, version)
     assert snapshot(view, view.version) is shown
-    assert [row["index"] for row in shown.rows] == [62, 61, 60]
-    assert shown.rows[0]["alarm"] == "hall weaker everywhere"
-    assert "Change at measurement 62: hall weaker everywhere." in shown.sentences
-    assert all(figure.startswith("<svg") for figure in shown.figures.values())
+    assert [row["index"] for row in shown[0].rows] == [60, 61, 62]
+    assert shown[0].rows[-1]["alarm"] == "hall weaker everywhere"
+    assert "Change at measurement 62: hall weaker everywhere." in shown[0].sentences()
+    assert all(figure.startswith("<svg") for figure in shown[1].values())
     record.append(tmp_path, record.add(63, step))
     assert view.version != version
-    assert "4 measurements" in snapshot(view, view.version).sentences[0]
+    assert "4 measurements" in snapshot(view, view.version)[0].sentences()[0]
 
 
 def test_total_coverage_counts_receivers(rssi_run):
