@@ -145,17 +145,13 @@ def room_section(fraction: FractionRecords) -> Section | None:
 def furniture_panels(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) -> list[Figure]:
     """Return a plan of the absorption between each pair of neighbouring heights, with the planes."""
     x, y, height = points["plan_x"], points["plan_y"], points["height"]
-    low, high = extent(planes, np.concatenate([points["measured"], points["fixed"][None]]))
     most = max(float(np.nanmax(points["plan"], initial=0.0)), 1.0)
     panels = []
     for values, ends in zip(points["plan"], pairwise(height), strict=True):
-        figure, ax = figures.panel(3.8, 3.6)
+        figure, ax = _plan(planes, points, 3.8, 3.6)
         drawn = ax.imshow(values, origin="lower", extent=corners_of(x, y), vmin=0, vmax=most, cmap="Greys")
         hatch(ax, x, y, np.isnan(values))
-        for plane in planes:
-            draw_in_plan(ax, plane, low, high)
-        ax.plot(*points["fixed"][:2], "*", color=FIXED, markersize=9)
-        ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title=f"z = {ends[0]:.2f} to {ends[1]:.2f} m")
+        ax.set_title(f"z = {ends[0]:.2f} to {ends[1]:.2f} m")
         figures.colour_bar(ax, drawn, "absorption [dB/m]")
         panels.append(figure)
     return panels
@@ -181,16 +177,25 @@ def _described(plane: dict[str, Any]) -> str:
     return f"({', '.join(f'{x:.3f}' for x in normal)}) . x = {plane['offset_m']:.3f} m"
 
 
-def _room_panel(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) -> Figure:
+def _plan(
+    planes: list[dict[str, Any]], points: dict[str, NDArray[Any]], width: float, height: float
+) -> tuple[Figure, Axes]:
+    """Return a panel with the planes and the fixed end in plan; planes are dashed if they are uncertain."""
     low, high = extent(planes, np.concatenate([points["measured"], points["fixed"][None]]))
-    figure, plan = figures.panel(5.4, 4.2)
+    figure, plan = figures.panel(width, height)
     for plane in planes:
-        draw_in_plan(plan, plane, low, high)
-    own = points["order"] == 1
-    plan.plot(*points["measured"][:, :2].T, "o", color=MEASURED, markersize=2, label="measured")
+        ends = in_plan(plane, low - MARGIN, high + MARGIN)
+        if ends is not None:
+            plan.plot(*ends.T, "-" if plane["certain"] else "--", color="black", linewidth=1.3)
     plan.plot(*points["fixed"][:2], "*", color=FIXED, markersize=11, label="fixed end")
-    plan.plot(*points["image"][own][:, :2].T, "D", color=IMAGE, markersize=4, label="its images")
     plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    return figure, plan
+
+
+def _room_panel(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) -> Figure:
+    figure, plan = _plan(planes, points, 5.4, 4.2)
+    plan.plot(*points["measured"][:, :2].T, "o", color=MEASURED, markersize=2, label="measured")
+    plan.plot(*points["image"][points["order"] == 1][:, :2].T, "D", color=IMAGE, markersize=4, label="its images")
     figures.legend_below(plan)
     return figure
 
@@ -223,36 +228,18 @@ def in_plan(plane: dict[str, Any], low: NDArray[Any], high: NDArray[Any]) -> NDA
     return np.stack([x, (plane["offset_m"] - nx * x - nz * height) / ny], axis=1)
 
 
-def draw_in_plan(ax: Axes, plane: dict[str, Any], low: NDArray[Any], high: NDArray[Any]) -> None:
-    """Draw a plane's line through the box from `low` to `high` (3,) [m], dashed if it is uncertain."""
-    ends = in_plan(plane, low - MARGIN, high + MARGIN)
-    if ends is not None:
-        ax.plot(*ends.T, "-" if plane["certain"] else "--", color="black", linewidth=1.3)
-
-
 def located_plan(fraction: FractionRecords) -> Figure:
     """Return the plan of the room with a line from each test position to its estimate."""
     table, room = fraction.table("positions"), fraction.arrays("located")
     own = table[(table["method"] == LOCATED) & (table["repeat"] == 0)]
     truth, estimate = own[["truth_x_m", "truth_y_m"]].to_numpy(), own[["estimate_x_m", "estimate_y_m"]].to_numpy()
-    figure, plan = figures.panel(4.6, 3.7)
     planes = [
         {"normal": normal, "offset_m": offset, "certain": certain}
         for normal, offset, certain in zip(room["normal"], room["offset"], room["certain"], strict=True)
     ]
-    low, high = extent(planes, np.concatenate([room["measured"], room["fixed"][None]]))
-    for plane in planes:
-        draw_in_plan(plan, plane, low, high)
+    figure, plan = _plan(planes, room, 4.6, 3.7)
     plan.plot(*room["measured"][:, :2].T, ".", color=figures.RULE, markersize=3)
-    plan.plot(*room["fixed"][:2], "*", color=FIXED, markersize=11)
-    highest = max(float(own["error_m"].quantile(0.95)), 1e-3)
-    for at, to in zip(truth, estimate, strict=True):
-        plan.plot(*zip(at, to, strict=True), color=figures.RULE, linewidth=1, zorder=2)
-    drawn = plan.scatter(
-        truth[:, 0], truth[:, 1], c=100 * own["error_m"], s=14, cmap="viridis", vmin=0, vmax=100 * highest, zorder=3
-    )
-    plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    figures.colour_bar(plan, drawn, "position error [cm]", extend="max")
+    figures.errors_in_plan(plan, truth, estimate, 100 * own["error_m"].to_numpy(), "position error [cm]")
     return figure
 
 

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
@@ -37,7 +36,6 @@ OWN = "posterior"  # the localizer that all others are compared with
 NEIGHBOURS = ("knn", "knn_difference")
 LEVEL = 0.8  # probability of the credible regions in the summary
 SUGGESTED = "suggested"  # name of the files with suggested positions
-MAX_VECTOR_LINES = 300  # more lines become an image, so that the page stays small
 TRUTH, ESTIMATE = "#cf4a4a", "#ffffff"
 COLUMNS = ["index", "place", "method", "position_error_m"]  # of the errors of methods
 COLOURS = labels.colours(labels.LOCALIZERS)
@@ -116,17 +114,7 @@ def _overview(run: Records, name: str) -> Plot:
     figure, plan = figures.panel(5.4, 4.2)
     own = errors[errors["method"] == OWN]
     truth, estimate = own[["truth_x_m", "truth_y_m"]].to_numpy(), own[["x_m", "y_m"]].to_numpy()
-    value = own["position_error_m"].to_numpy()
-    many = len(own) >= MAX_VECTOR_LINES
-    style: dict[str, Any] = {"cmap": "viridis", "clim": (0, float(np.quantile(value, 0.95)) or 1.0)}
-    lines = LineCollection(np.stack([truth, estimate], axis=1).tolist(), linewidths=1, rasterized=many, **style)
-    lines.set_array(value)
-    plan.add_collection(lines)
-    dots = plan.scatter(truth[:, 0], truth[:, 1], c=value, s=8, cmap=style["cmap"], rasterized=many, zorder=3)
-    dots.set_clim(*style["clim"])
-    plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    plan.autoscale()
-    figures.colour_bar(plan, lines, "position error [m]", extend="max")
+    figures.errors_in_plan(plan, truth, estimate, own["position_error_m"].to_numpy(), "position error [m]")
     caption = (
         "Errors of the posterior in plan: a line from each true position (dot) to its estimate, coloured by the error."
     )

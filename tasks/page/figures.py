@@ -12,9 +12,10 @@ import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from pandas import DataFrame
 
 from tasks.labels import colour
@@ -26,6 +27,7 @@ Colours = Mapping[str, str]  # by name, those of `tasks.labels.colour` for other
 RULE, LINES, PAPER = "#7f8794", "#e4e8ef", "#fffffe"  # marks of reference, grid, background
 THEMED = {"#000000": "currentColor", LINES: "var(--lines)", PAPER: "var(--paper)"}  # colours that follow the page's
 MARKERS = "osD^"  # of the series of a dot plot
+MAX_VECTOR_MARKS = 300  # of a panel; more become an image, so that the page stays small
 MAX_LINE_LENGTH = 100  # characters of a line of text
 NAME = 24  # characters of a name among others
 LABEL = 7  # size of a point's name [pt]
@@ -135,6 +137,20 @@ def speed(axes: Axes, colours: Colours, points: Mapping[str, tuple[float, float]
     axes.set(xlabel=x, ylabel=y, ylim=(0, None))
     log_scale(axes)
     legend_below(axes)
+
+
+def errors_in_plan(axes: Axes, truth: NDArray[Any], estimate: NDArray[Any], error: NDArray[Any], label: str) -> None:
+    """Draw a line from each true position (n, 2) to its estimate (n, 2) [m], coloured by the error (n,)."""
+    style: dict[str, Any] = {"cmap": "viridis", "rasterized": len(error) >= MAX_VECTOR_MARKS}
+    lines = LineCollection(np.stack([truth, estimate], axis=1).tolist(), linewidths=1, **style)
+    lines.set_array(error)
+    axes.add_collection(lines)
+    dots = axes.scatter(truth[:, 0], truth[:, 1], c=error, s=8, zorder=3, **style)
+    for drawn in (lines, dots):
+        drawn.set_clim(0, float(np.quantile(error, 0.95)) or 1.0)
+    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    axes.autoscale()
+    colour_bar(axes, lines, label, extend="max")
 
 
 def log_scale(axes: Axes) -> None:

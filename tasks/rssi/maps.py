@@ -20,7 +20,6 @@ from tasks.page.page import Plot
 from tasks.records import Records
 
 MAX_MAPS = 24  # receivers with a map in the report; all are in the tables
-MAX_VECTOR_DOTS = 300  # more dots become an image: the page would grow to megabytes
 MAX_WIDTH_DB = 30.0  # end of the scale of interval widths of the page
 MAX_RATIO = 12.0  # of the sides of a map that is to scale; one of a corridor would be a line
 MIN_RATIO = 1.2  # of the widest interval inside to the median one, for which the widths are drawn
@@ -157,7 +156,7 @@ class Maps:
         known = a["measured_position"]
         if receiver is not None and kind == "predicted":
             detected = ~np.isnan(a["measured"][:, receiver])
-            many = len(detected) >= MAX_VECTOR_DOTS
+            many = len(detected) >= figures.MAX_VECTOR_MARKS
             ax.plot(*known[~detected, :2].T, "o", markersize=3, markerfacecolor="none", color="white", rasterized=many)
             style |= {"zorder": 3, "edgecolors": "white", "linewidths": 0.4, "rasterized": many}
             ax.scatter(known[detected, 0], known[detected, 1], s=9, c=a["measured"][detected, receiver], **style)

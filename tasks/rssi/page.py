@@ -24,7 +24,7 @@ from tasks.page.shared import (
     next_steps,
 )
 from tasks.records import Records, notes
-from tasks.rssi.maps import CERTAINTY, COVERED_DBM, MAX_VECTOR_DOTS, MIN_RATIO, WIDTH_PER_STD, Maps
+from tasks.rssi.maps import CERTAINTY, COVERED_DBM, MIN_RATIO, WIDTH_PER_STD, Maps
 from tasks.terminal import Answer, Method, NextStep
 
 COLUMNS = ["index", "receiver", "method", "abs_error_db"]  # of the errors of methods
@@ -246,7 +246,7 @@ def _where(run: Records) -> Plot:
     """Return predicted against measured RSSI, and the error against distances."""
     errors = run.table("errors")
     own = errors[errors["method"] == model_of(run)]
-    own_colour, many = colour(COLOURS, model_of(run)), len(own) >= MAX_VECTOR_DOTS
+    own_colour, many = colour(COLOURS, model_of(run)), len(own) >= figures.MAX_VECTOR_MARKS
     columns = {
         "from_receiver_m": "distance from the receiver [m]",
         "from_training_m": "distance from training positions [m]",
