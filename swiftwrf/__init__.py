@@ -50,24 +50,4 @@ if TYPE_CHECKING:
     from swiftwrf.rssi import fit_rssi as fit_rssi
     from swiftwrf.runtime.checkpoint import load as load
 
-import_lazily(
-    __name__,
-    {
-        "swiftwrf": ("datasets", "locate", "metrics", "rssi"),
-        "swiftwrf.array.angles": ("AngularGrid", "ArrayPose"),
-        "swiftwrf.data": ("Rssi", "Snapshots", "Spectra", "load_rssi", "load_snapshots", "load_spectra"),
-        "swiftwrf.data.simulated": ("rssi_room", "simulated_room"),
-        "swiftwrf.diagnostics.calibration": ("calibrate",),
-        "swiftwrf.diagnostics.inspection": ("inspect",),
-        "swiftwrf.errors": ("FitError", "InputError"),
-        "swiftwrf.locate": ("MatchedField", "RssiLocator"),
-        "swiftwrf.models.base": ("FieldModel", "make_model"),
-        "swiftwrf.models.geometry": ("GeometryModel",),
-        "swiftwrf.models.prediction": ("Prediction",),
-        "swiftwrf.models.swiftwrf": ("SwiftWRF", "fit"),
-        "swiftwrf.predicting": ("predict",),
-        "swiftwrf.rasterize": ("rasterize",),
-        "swiftwrf.rssi": ("PairModel", "RssiModel", "fit_rssi"),
-        "swiftwrf.runtime.checkpoint": ("load",),
-    },
-)
+import_lazily(__name__)

@@ -11,7 +11,7 @@ from swiftwrf.runtime.lazy import import_lazily
 if TYPE_CHECKING:
     from swiftwrf.locate.comparison import LocateComparison, compare
 
-import_lazily(__name__, {"swiftwrf.locate.comparison": ("LocateComparison", "compare")})  # imports scikit-learn
+import_lazily(__name__)  # the comparison imports scikit-learn
 
 __all__ = ["LocateComparison", "MatchedField", "MatchedFieldConfig", "Posterior", "Region", "RssiLocator"]
 __all__ += ["compare", "smoothed"]

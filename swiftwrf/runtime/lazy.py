@@ -1,12 +1,13 @@
 """Packages whose members are imported at first use, so that importing the package loads neither torch nor SciPy.
 
-Type checkers and editors read the usual import statements, in a block `if TYPE_CHECKING`, as `import name as name`.
+The names are those of the import statements in the package's block `if TYPE_CHECKING`, which type checkers and editors read.
 """
 
 from __future__ import annotations
 
+import ast
+import inspect
 import sys
-from collections.abc import Mapping, Sequence
 from importlib import import_module
 from types import ModuleType
 from typing import Any
@@ -34,14 +35,17 @@ class _LazyPackage(ModuleType):
         return sorted({*self.__dict__, *self.lazy})
 
 
-def import_lazily(package: str, members: Mapping[str, Sequence[str]]) -> None:
-    """Postpone the imports of a package until a name is read from it. `__all__` are the names that are no submodules.
+def import_lazily(package: str) -> None:
+    """Postpone the imports in a package's block `if TYPE_CHECKING` until a name is read from it.
+
+    `__all__` are the names that are no submodules.
 
     Args:
         package: `__name__` of the package.
-        members: Names by the module that defines them; submodules by the package.
     """
     module = sys.modules[package]
-    lazy = {name: source for source, names in members.items() for name in names}
+    block = next(part for part in ast.parse(inspect.getsource(module)).body if isinstance(part, ast.If))
+    imports = [part for part in block.body if isinstance(part, ast.ImportFrom)]
+    lazy = {name.name: str(part.module) for part in imports for name in part.names}
     module.__dict__.update(lazy=lazy, __all__=sorted(name for name, source in lazy.items() if source != package))
     module.__class__ = _LazyPackage
