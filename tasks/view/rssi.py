@@ -66,8 +66,9 @@ class MapSelection:
 
 @dataclass(frozen=True)
 class ColouredMap:
-    """Values of a map and their colours."""
+    """Values of a map, their colours, and what it shows."""
 
+    sentence: str  # description in a few sentences
     values: Values  # values (len(y), len(x)), nan where the map is transparent
     colours: str  # name of a matplotlib colour map
     low: float  # value of its first colour
@@ -159,27 +160,44 @@ class RssiView:
         return np.asarray(shown < 0.5)
 
     def coloured(self, selection: MapSelection) -> ColouredMap:
-        """Return values and colours of the selected map."""
-        if (found := self._located(selection)) is not None:
+        """Return values, colours and a description of the selected map."""
+        if self.locating is not None and (found := self._located(selection)) is not None:
             if selection.kind == "posterior":
-                return ColouredMap(found.values, "magma", 0.0, 1.0, "of the maximum", corners=found.corners)
+                text = self.locating.describe(selection.row)
+                return ColouredMap(text, found.values, "magma", 0.0, 1.0, "of the maximum", corners=found.corners)
             most = float(np.nanpercentile(found.values, 98))
-            return ColouredMap(found.values, "viridis", 0.0, most, "m", "max", found.corners)
+            return ColouredMap(self.locating.summary, found.values, "viridis", 0.0, most, "m", "max", found.corners)
         chart, receiver = self.map(selection.height), selection.receiver
-        mean = chart.mean
+        mean, name, number = chart.mean, self.receivers[receiver], selection.at_least
+        hatched = " Hatched: a packet is more likely lost than received." if self.silent(selection).any() else ""
         match selection.kind:
             case "RSSI":
-                measured = self.rows.rssi_dbm[self.rows.detected].numpy()
-                low, high = np.percentile(measured if len(measured) else mean, (1, 99)).tolist()
-                return ColouredMap(mean[receiver], "viridis", low, high, "dBm", "both")
+                detected = self.rows.detected
+                shown = self.rows.rssi_dbm[detected].numpy() if detected.any() else mean
+                low, high = np.percentile(shown, (1, 99)).tolist()
+                dots = "; dots: measured, in the same colours, hollow where nothing was received"
+                text = f"Predicted RSSI of {name}{dots if detected[:, receiver].any() else ''}.{hatched}"
+                return ColouredMap(text, mean[receiver], "viridis", low, high, "dBm", "both")
             case "interval":
                 low, high = chart.prediction.interval(LEVEL)
-                return ColouredMap((high - low)[receiver].numpy(), "magma", 0.0, MAX_WIDTH_DB, "dB", "max")
+                text = f"Width of the {LEVEL:.0%} interval of a measurement at {name}.{hatched}"
+                return ColouredMap(text, (high - low)[receiver].numpy(), "magma", 0.0, MAX_WIDTH_DB, "dB", "max")
             case "coverage":
-                return ColouredMap(np.where(self._covered(selection), 0.7, np.nan), "GnBu", 0.0, 1.0, "")
+                covered, known = self._covered(selection), self.inside(selection.height)
+                who = {0: name, 1: "at least one receiver"}.get(number, f"at least {number} receivers")
+                area = f", {covered[known].mean():.0%} of the measured area" if known.any() else ""
+                text = (
+                    f"{covered.mean():.0%} of the map{area} is coloured: there a measurement at {who} is above "
+                    f"{selection.threshold:g} dBm with {selection.certainty:.0%} certainty, if it is detected at all."
+                )
+                return ColouredMap(text, np.where(covered, 0.7, np.nan), "GnBu", 0.0, 1.0, "")
             case "best receiver":
+                first, part = next(iter(self.best(selection.height).items()))
+                text = (
+                    f"Receiver with the highest prediction: {self.receivers[first]} on {part:.0%} of the map.{hatched}"
+                )
                 values = mean.argmax(axis=0) % N_RECEIVER_COLOURS + 0.5
-                return ColouredMap(values, RECEIVER_COLOURS, 0, N_RECEIVER_COLOURS, "")
+                return ColouredMap(text, values, RECEIVER_COLOURS, 0, N_RECEIVER_COLOURS, "")
         raise AssertionError(selection.kind)
 
     def _located(self, selection: MapSelection) -> PlanMap | None:
@@ -203,36 +221,6 @@ class RssiView:
         counts = np.bincount(self.map(height).mean.argmax(axis=0).ravel())
         order = [int(number) for number in np.argsort(-counts, kind="stable") if counts[number]]
         return {number: float(counts[number] / counts.sum()) for number in order}
-
-    def sentence(self, selection: MapSelection) -> str:
-        """Describe the selected map in a few sentences."""
-        if self.locating is not None and selection.kind in LOCATING:
-            return self.locating.describe(selection.row) if selection.kind == "posterior" else self.locating.summary
-        name = self.receivers[selection.receiver]
-        match selection.kind:
-            case "RSSI":
-                dots = bool(self.rows.detected[:, selection.receiver].any())
-                measured = "; dots: measured, in the same colours, hollow where nothing was received" if dots else ""
-                return f"Predicted RSSI of {name}{measured}.{self._hatching(selection)}"
-            case "interval":
-                return f"Width of the {LEVEL:.0%} interval of a measurement at {name}.{self._hatching(selection)}"
-            case "coverage":
-                number = selection.at_least
-                who = {0: name, 1: "at least one receiver"}.get(number, f"at least {number} receivers")
-                covered, known = self._covered(selection), self.inside(selection.height)
-                area = f", {covered[known].mean():.0%} of the measured area" if known.any() else ""
-                return (
-                    f"{covered.mean():.0%} of the map{area} is coloured: there a measurement at {who} is above "
-                    f"{selection.threshold:g} dBm with {selection.certainty:.0%} certainty, if it is detected at all."
-                )
-            case "best receiver":
-                first, fraction = next(iter(self.best(selection.height).items()))
-                best = f"Receiver with the highest prediction: {self.receivers[first]} on {fraction:.0%} of the map."
-                return best + self._hatching(selection)
-        raise AssertionError(selection.kind)
-
-    def _hatching(self, selection: MapSelection) -> str:
-        return " Hatched: a packet is more likely lost than received." if self.silent(selection).any() else ""
 
     def at(self, selection: MapSelection, x: float, y: float) -> Prediction:
         """Return the predictions of all receivers (R,) at a position [m], at the height of the selected map."""

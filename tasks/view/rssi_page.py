@@ -131,23 +131,23 @@ class RssiPage:
         found = await run.io_bound(self._computed, selection)
         if found is None:  # the server is being ended
             return
-        coloured, data, sentence, best = found
+        coloured, data, best = found
         self._limits.set_visibility(selection.kind == "coverage")
         self._receiver.set_enabled(selection.kind not in ("best receiver", *LOCATING))
         self._height.set_enabled(selection.kind not in LOCATING)
         self._choice.set_visibility(selection.kind == "posterior")
-        self._sentence.set_text(sentence)
+        self._sentence.set_text(coloured.sentence)
         entries = [(_colour(r), "■", f"{self._view.receivers[r]} {part:.0%}") for r, part in best.items()]
         self._best.set_content(legend(entries[:N_RECEIVER_COLOURS]))
         limits = coloured.low, coloured.high
         bar = colour_bar(coloured.colours, limits, coloured.label, "measured", coloured.extend)
         self._plan.show(data, bar if coloured.label else {"id": BAR, "show": False})
 
-    def _computed(self, selection: MapSelection) -> tuple[ColouredMap, dict[str, Data], str, dict[int, float]]:
-        """Return colours, layers and sentence of a map, and the receivers that are best somewhere."""
+    def _computed(self, selection: MapSelection) -> tuple[ColouredMap, dict[str, Data], dict[int, float]]:
+        """Return colours and layers of a map, and the receivers that are best somewhere."""
         view, coloured = self._view, self._view.coloured(selection)
         best = view.best(selection.height) if selection.kind == "best receiver" else {}
-        return coloured, self._data(selection, coloured), view.sentence(selection), best
+        return coloured, self._data(selection, coloured), best
 
     def _data(self, selection: MapSelection, coloured: ColouredMap) -> dict[str, Data]:
         """Return the data of all layers of the plan."""

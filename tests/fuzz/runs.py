@@ -107,7 +107,6 @@ def _show_rssi(view: RssiView) -> None:
     for kind in set(view.kinds) - {"expected error"}:
         selection = MapSelection(kind, 0, view.heights[1])
         view.coloured(selection)
-        view.sentence(selection)
         view.describe(selection, x, y)
     json.dumps([around(view.region), points(view.position)], allow_nan=False)
     if view.plan is not None:

@@ -228,7 +228,7 @@ def test_coverage_is_where_the_probability_is_high_enough(rssi_run):
     selection = MapSelection("coverage", 2, 1.2, threshold, 0.9)
     covered = np.isfinite(view.coloured(selection).values)
     assert covered.mean() == pytest.approx(0.5, abs=0.01)
-    assert view.sentence(selection).startswith("50% of the map")
+    assert view.coloured(selection).sentence.startswith("50% of the map")
     for cells, sign in ((covered, 1), (~covered, -1)):
         i, j = np.argwhere(cells)[0]
         above = float(probability_above(view.at(selection, view.map(1.2).x[j], view.map(1.2).y[i]), selection)[2])
@@ -252,7 +252,7 @@ def test_fractions_of_the_best_receivers(rssi_run):
     assert sum(fraction.values()) == pytest.approx(1)
     first, part = next(iter(fraction.items()))
     assert part == pytest.approx((mean.argmax(axis=0) == first).mean())
-    assert f"{view.receivers[first]} on {part:.0%}" in view.sentence(MapSelection("best receiver", 0, 1.2))
+    assert f"{view.receivers[first]} on {part:.0%}" in view.coloured(MapSelection("best receiver", 0, 1.2)).sentence
 
 
 def test_one_receiver_has_no_best(rssi_run):
@@ -277,7 +277,7 @@ def test_floors_and_what_was_not_received_are_shown_apart():
     assert view.floors.names == ("lower", "upper")
     assert view.on_floor(above.height).tolist() == upper.tolist()
     assert view.silent(above).mean() > 0.9 > 0.1 > view.silent(lower).mean()
-    assert ("Hatched" in view.sentence(above), "Hatched" in view.sentence(lower)) == (True, False)
+    assert ("Hatched" in view.coloured(above).sentence, "Hatched" in view.coloured(lower).sentence) == (True, False)
     assert np.nanmean(charts.stripes(view.silent(above))) == 1
 
 
