@@ -9,7 +9,6 @@ from pathlib import Path
 
 import torch
 from pandas import DataFrame
-from torch import Tensor
 
 from swiftwrf.data.files import read_bytes
 from swiftwrf.errors import InputError
@@ -121,11 +120,10 @@ class Record:
         self.rows.append(row)
         return row
 
-    def column(self, *names: str) -> Tensor:
-        """Return columns of numbers, float64 (n,) or, of several names, (n, len(names))."""
-        cells = [[torch.nan if row[name] is None else float(row[name]) for name in names] for row in self.rows]
-        values = torch.tensor(cells, dtype=torch.float64).reshape(-1, len(names))
-        return values[:, 0] if len(names) == 1 else values
+    @property
+    def table(self) -> DataFrame:
+        """All rows as a table."""
+        return DataFrame(self.rows, columns=list(COLUMNS))
 
     def summary(self) -> Row:
         """Return the results as plain values."""
@@ -195,11 +193,10 @@ def page(record: Record, name: str, folder: Path) -> Page:
         "Continue with the updated model", command("update", str(folder / MODEL), "SOURCE", "--out", "NEXT")
     )
     summary = Summary(numbers, [error_plot(record)], record.sentences(), [step])
-    known = [row for row in record.rows if not math.isnan(row["innovation"])]
-    surprising = sorted(known, key=lambda row: -row["innovation"])[:MAX_SURPRISING]
+    surprising = record.table.dropna(subset="innovation").nlargest(MAX_SURPRISING, "innovation")
     cells = [
         [str(row["index"]), *(f"{row[key]:.3g}" for key in ("x_m", "y_m", "z_m", "error", "innovation"))]
-        for row in surprising
+        for row in surprising.to_dict("records")
     ]
     columns = ["measurement", "x [m]", "y [m]", "z [m]", record.error_label, "innovation"]
     table = Table(columns, cells, "Measurements with the largest innovations.")
@@ -209,28 +206,28 @@ def page(record: Record, name: str, folder: Path) -> Page:
 def error_plot(record: Record) -> Plot:
     """Return the errors over time, and the alarms."""
     figure, axes = figures.panel(7.4, 3.2)
-    index, error, running = (record.column(name) for name in ("index", "error", "running_error"))
-    axes.plot(index, error, ".", markersize=3, color=figures.RULE)
-    axes.plot(index, running, color=BLUE)
+    shown = record.table[["index", "error", "running_error"]]
+    axes.plot(shown["index"], shown["error"], ".", markersize=3, color=figures.RULE)
+    axes.plot(shown["index"], shown["running_error"], color=BLUE)
     for row in record.alarms:
         axes.axvline(row["index"], color=RED, linewidth=1)
     axes.set(xlabel="measurement", ylabel=record.error_label, ylim=(0, None))
     caption = f"Error of each measurement before it was learnt, mean of the last {WINDOW} (blue), and alarms (red)."
-    return Plot("error", [figure], caption, DataFrame({"index": index, "error": error, "running_error": running}))
+    return Plot("error", [figure], caption, shown)
 
 
 def map_plot(record: Record) -> Plot:
     """Return the positions from above with their innovations."""
     figure, axes = figures.panel(6.8, 5)
-    position = record.column("x_m", "y_m", "z_m")
+    shown = record.table[["x_m", "y_m", "z_m", "innovation"]].astype(float)
+    position, innovation = torch.tensor(shown.to_numpy()).split([3, 1], dim=1)
     _, near = nearest(position, position, min(N_NEIGHBOURS, len(position)))
-    surprise = record.column("innovation")[near].nanmean(dim=1)
+    surprise = innovation[near, 0].nanmean(dim=1)
     drawn = axes.scatter(position[:, 0], position[:, 1], s=10, c=surprise, cmap="viridis", vmin=0)
     figures.colour_bar(axes, drawn, f"mean innovation of the {N_NEIGHBOURS} nearest measurements")
     caption = "Positions from above, coloured by their innovations."
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    table = DataFrame(position.numpy(), columns=["x_m", "y_m", "z_m"]).assign(innovation=surprise.numpy())
-    return Plot("changes", [figure], caption, table)
+    return Plot("changes", [figure], caption, shown.assign(innovation=surprise.numpy()))
 
 
 @dataclass(frozen=True)

@@ -77,11 +77,6 @@ def dots(name: str, colour: str, size: float, system: str = "cartesian2d", **sty
     return option | {"id": name, "silent": True, "data": []}
 
 
-def rings(name: str, colour: str, size: float, system: str = "cartesian2d") -> Option:
-    """Return a layer of rings of a size in pixels."""
-    return dots(name, "transparent", size, system, borderColor=colour, borderWidth=3)
-
-
 def crosses(name: str, colour: str, system: str = "cartesian2d") -> Option:
     """Return a layer of crosses with a dark rim."""
     return dots(name, colour, 16, system, borderColor=INK, borderWidth=1) | {"symbol": CROSS}
@@ -201,7 +196,8 @@ def spectrum(polar: bool, colours: str, high: float, extend: str, peak: str, sig
     In polar coordinates directions are (angle to the normal, azimuth), else (azimuth, elevation) [deg].
     """
     system = "polar" if polar else "cartesian2d"
-    layers = [pictures("spectrum", system), rings("peak", peak, 14, system), crosses("sight", sight, system)]
+    ring = dots("peak", "transparent", 14, system, borderColor=peak, borderWidth=3)
+    layers = [pictures("spectrum", system), ring, crosses("sight", sight, system)]
     bar = colour_bar(colours, (0.0, high), "magnitude", "spectrum", extend)
     option = {"animation": False, "series": [layer | {"z": 2 + n} for n, layer in enumerate(layers)], "visualMap": bar}
     if not polar:

@@ -208,7 +208,7 @@ def test_a_record_is_cut_to_what_the_model_has_learnt(tmp_path):
     kept = Record.read(tmp_path, 2)
     kept.write(tmp_path)
     assert [row["index"] for row in kept.rows] == [row["index"] for row in Record.read(tmp_path).rows] == [60, 61]
-    assert kept.column("error").tolist() == pytest.approx(record.column("error")[:2].tolist())
+    assert kept.table["error"].tolist() == pytest.approx(record.table["error"][:2].tolist())
 
 
 def test_a_follower_continues_after_the_model_has_grown():
