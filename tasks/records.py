@@ -10,7 +10,7 @@ import hashlib
 import io
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -152,33 +152,15 @@ def from_text(text: str, names: Sequence[str]) -> pd.DataFrame:
     return table
 
 
-def read_npz(
-    file: Path, expected: Mapping[str, str] | None = None, optional: Iterable[str] = ()
-) -> dict[str, NDArray[Any]]:
-    """Read arrays of `write_npz` by name.
-
-    Args:
-        file: The archive.
-        expected: NumPy type and shape of each array, e.g. `f n 3` for positions. Sizes with one name are equal. Defaults to
-            all arrays of the archive, numbers or texts.
-        optional: Names of expected arrays that may be missing.
+def read_npz(file: Path) -> dict[str, NDArray[Any]]:
+    """Read arrays of `write_npz` by name, numbers or texts.
 
     Raises:
-        InputError: There is no such file, it is damaged, or an array has another type or shape.
+        InputError: There is no such file, or it is damaged.
     """
     from swiftwrf.data.archives import NUMBERS, array_names, read_arrays
 
-    if expected is None:
-        return read_arrays(file, sorted(array_names(file)), kinds=f"{NUMBERS}U")
-    arrays = read_arrays(file, list(expected.keys() - optional), list(optional))
-    sizes: dict[str, int] = {}
-    for name, array in arrays.items():
-        kind, *names = expected[name].split()
-        pairs = zip(names, array.shape, strict=False)
-        known = (sizes.setdefault(key, int(key) if key.isdigit() else size) == size for key, size in pairs)
-        if not array.dtype.str[1:].startswith(kind) or array.ndim != len(names) or not all(known):
-            raise InputError(f"{file}: {name} is {array.dtype} of {array.shape}, expected {expected[name]}; restore it")
-    return arrays
+    return read_arrays(file, sorted(array_names(file)), kinds=f"{NUMBERS}U")
 
 
 def notes(run: Records) -> list[str]:

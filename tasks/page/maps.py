@@ -74,7 +74,8 @@ class FloorPlan:
     def __post_init__(self) -> None:
         x0, x1, y0, y1 = self.corners
         near = all(abs(edge) <= MAX_COORDINATE_M for edge in self.corners)  # false for nan
-        if not (near and x0 < x1 and y0 < y1 and self.pixels.size):
+        is_image = self.pixels.dtype == np.uint8 and self.pixels.shape[2:] == (3,) and self.pixels.size
+        if not (near and x0 < x1 and y0 < y1 and is_image):
             raise InputError(
                 f"a floor plan needs pixels, a positive scale [m a pixel] and an origin [pixels] with edges within "
                 f"{MAX_COORDINATE_M:g} m, got edges at {x0:g}, {x1:g}, {y0:g}, {y1:g} m"
@@ -114,7 +115,7 @@ class FloorPlan:
         if not file.exists():
             return None
         with refusing(f"{file} holds no floor plan"):
-            stored = read_npz(file, {"pixels": "u1 height width 3", "corners": "f 4"})
+            stored = read_npz(file)
             x0, x1, y0, y1 = stored["corners"].tolist()
             return cls(stored["pixels"], (x0, x1, y0, y1))
 

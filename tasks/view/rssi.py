@@ -29,7 +29,6 @@ MIN_STD_DB = 1e-6
 MAX_MAPS = 8  # in memory, e.g. those of as many floors
 MapKind = Literal["RSSI", "interval", "coverage", "best receiver", "posterior", "expected error"]
 LOCATING: tuple[MapKind, ...] = ("posterior", "expected error")
-MAPS = {"measured_position": "f n 3", "measured": "f n receivers", "receiver": "f receivers 3"}  # of maps.npz
 Values = NDArray[np.floating]
 
 
@@ -39,7 +38,7 @@ def rows_of_run(file: Path, receivers: tuple[str, ...]) -> Rssi:
     Raises:
         InputError: The file is damaged, or contains other receivers.
     """
-    stored = read_npz(file, MAPS)
+    stored = read_npz(file)
     measured, position, receiver = stored["measured"], stored["measured_position"], stored["receiver"]
     return Rssi(measured, position, receiver_position=receiver, receiver_names=receivers)
 
