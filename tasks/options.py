@@ -237,11 +237,6 @@ class TableSource:
     window: PositiveFloat | None = None
     """join packets of several receivers in windows of this length [s] to one row each, by their means"""
 
-    @property
-    def column_names(self) -> dict[str, str] | None:
-        """Names of columns by role, None if there are none."""
-        return pairs("columns", self.columns, "x")
-
     def check(self) -> None:
         """Refuse options that are wrong whatever the data.
 
@@ -251,11 +246,6 @@ class TableSource:
         pairs("columns", self.columns, "x")
         if len(self.transmitter) > 3:
             raise InputError(f"--transmitter takes 1 to 3 columns, got {' '.join(self.transmitter)}")
-
-    @property
-    def fillers(self) -> tuple[float, ...] | None:
-        """Values that stand for not detected. None for those that are recognised."""
-        return () if self.filler == "none" else self.filler or None
 
 
 @options

@@ -34,8 +34,8 @@ def reading(spectra: SpectraSource, table: TableSource) -> ReadOptions:
         | {
             "array": _array(spectra),
             "arrays": pairs("arrays", spectra.arrays, "csi"),
-            "columns": table.column_names,
-            "filler": table.fillers,
+            "columns": pairs("columns", table.columns, "x"),
+            "filler": () if table.filler == "none" else table.filler or None,
             "offset_by": (options.get("offset_by") or "").partition("=")[0] or None,
         }
     )

@@ -26,11 +26,13 @@ def page(runs: list[Records]) -> Page:
     fractions = [fraction for run in runs for fraction in FractionRecords.of(run)]
     sections = [
         sections_of("Errors", fractions, _errors, _terms()),
-        sections_of("Where was it?", fractions, _positions),
+        sections_of("Where was it?", fractions, lambda one: _parts(locating_section(one), room_section(one))),
         sections_of("Spectra", fractions, lambda fraction: Section("", plots=[examples_plot(fraction)])),
         _limits(runs[0]),
     ]
-    more = sections_of("Measure or synthesize more?", fractions, _more)
+    more = sections_of(
+        "Measure or synthesize more?", fractions, lambda one: _parts(choice_section(one), _suggestion_section(one))
+    )
     details = [more, sections_of("What is left out", fractions, _left_out), provenance(runs)]
     sections, details = (
         [section for section in part if section.paragraphs or section.plots or section.parts or section.tables]
@@ -106,14 +108,9 @@ def _left_out(fraction: FractionRecords) -> Section:
     return Section("", texts or ["Nothing."])
 
 
-def _positions(fraction: FractionRecords) -> Section | None:
-    parts = [part for make in (locating_section, room_section) if (part := make(fraction))]
-    return Section("", parts=parts) if parts else None
-
-
-def _more(fraction: FractionRecords) -> Section | None:
-    parts = [part for make in (choice_section, _suggestion_section) if (part := make(fraction))]
-    return Section("", parts=parts) if parts else None
+def _parts(*parts: Section | None) -> Section | None:
+    found = [part for part in parts if part is not None]
+    return Section("", parts=found) if found else None
 
 
 def _suggestion_section(fraction: FractionRecords) -> Section | None:

@@ -123,9 +123,13 @@ def room_section(fraction: FractionRecords) -> Section | None:
     )
     table = Table(["plane", "gain", "standard deviation [mm]", "identifiable"], rows, caption)
     points = fraction.arrays("room")
+    figure, plan = _plan(room["planes"], points, 5.4, 4.2)
+    plan.plot(*points["measured"][:, :2].T, "o", color=MEASURED, markersize=2, label="measured")
+    plan.plot(*points["image"][points["order"] == 1][:, :2].T, "D", color=IMAGE, markersize=4, label="its images")
+    figures.legend_below(plan)
     plot = Plot(
         f"room-{fraction.file_name}",
-        [_room_panel(room["planes"], points)],
+        [figure],
         "The planes in plan (dashed: uncertain), measured positions, the fixed end and its images of first "
         "order. The images of a moving transmitter are those of the array that sees it.",
         _places(points),
@@ -190,14 +194,6 @@ def _plan(
     plan.plot(*points["fixed"][:2], "*", color=FIXED, markersize=11, label="fixed end")
     plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     return figure, plan
-
-
-def _room_panel(planes: list[dict[str, Any]], points: dict[str, NDArray[Any]]) -> Figure:
-    figure, plan = _plan(planes, points, 5.4, 4.2)
-    plan.plot(*points["measured"][:, :2].T, "o", color=MEASURED, markersize=2, label="measured")
-    plan.plot(*points["image"][points["order"] == 1][:, :2].T, "D", color=IMAGE, markersize=4, label="its images")
-    figures.legend_below(plan)
-    return figure
 
 
 def extent(planes: list[dict[str, Any]], inside: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
