@@ -165,20 +165,14 @@ def _neighbours(data: Spectra) -> Plot:
 
 def _floor(data: Rssi) -> Plot:
     figure, ax = figures.panel(6.8, 4.8)
-    place = data.transmitter_position
-    strongest = data.rssi_dbm.nan_to_num(-torch.inf).amax(dim=1)
-    drawn = ax.scatter(
-        place[:, 0], place[:, 1], s=8, c=strongest.where(strongest.isfinite(), torch.nan), cmap="viridis"
-    )
-    figures.colour_bar(ax, drawn, "strongest RSSI [dBm]")
-    places = zip(data.receiver_names, data.receiver_position.tolist(), data.receiver_located.tolist(), strict=True)
+    data.plot(ax=ax).set_title("")
+    places = zip(data.receiver_names, data.receiver_position, data.receiver_located, strict=True)
     for name, at, is_located in places:
         if is_located:
-            ax.plot(*at[:2], "x", color="#cf4a4a", markersize=8, markeredgewidth=2)
-            ax.annotate(figures.short(name), at[:2], fontsize=7, xytext=(3, 3), textcoords="offset points")
-    ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    caption = "Positions, coloured by the strongest RSSI; crosses: receivers, where they are known."
-    return Plot("plan", [figure], caption, _places(place, strongest_dbm=strongest))
+            ax.annotate(figures.short(name), at[:2].tolist(), fontsize=7, xytext=(3, 3), textcoords="offset points")
+    caption = "Positions, coloured by the strongest RSSI; triangles: receivers, where they are known."
+    strongest = data.rssi_dbm.nan_to_num(-torch.inf).amax(dim=1)
+    return Plot("plan", [figure], caption, _places(data.transmitter_position, strongest_dbm=strongest))
 
 
 def _against_distance(data: Rssi) -> Plot:

@@ -78,7 +78,6 @@ class AANN(SavedEstimator):
     config_type = AANNConfig
 
     def _build(self, device: torch.device) -> None:
-        """Make the network with its initial weights."""
         with torch.random.fork_rng(devices=[]):  # torchvision uses the global generator
             torch.manual_seed(self.config.seed)
             network = backbone(device.type == "cpu")
@@ -173,7 +172,6 @@ class AANN(SavedEstimator):
         self._offset = tensors["offset"]
 
     def _weights(self) -> dict[str, Tensor]:
-        """Return the network's tensors by their names in a file."""
         return {f"network.{name}": halved(value) for name, value in self._network.state_dict().items()}
 
     def _restore_network(self, tensors: dict[str, Tensor], others: dict[str, tuple[int, ...]]) -> None:

@@ -259,7 +259,6 @@ def locating_section(fraction: FractionRecords) -> Section | None:
 
 
 def _calibration(fraction: FractionRecords) -> Plot:
-    """Return the calibration of the credible regions."""
     table = fraction.table("positions")
     figure, axes = figures.panel(5.4, 3.2)
     axes.plot([0, 1], [0, 1], color=figures.RULE, linewidth=1)

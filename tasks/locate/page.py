@@ -69,7 +69,6 @@ def page(runs: list[Records]) -> Page:
 
 
 def _summary(run: Records) -> Summary:
-    """Return the first screen of one run."""
     error = {name: entry["position_error_m"]["median"] for name, entry in run.metrics["overall"].items()}
     nearest, found = min(NEIGHBOURS, key=lambda name: error[name]), answer(run)
     numbers = [

@@ -67,7 +67,6 @@ def page(runs: list[Records]) -> Page:
 
 
 def _summary(run: Records) -> Summary:
-    """Return the first screen of one run."""
     found, floors, interval = answer(run), Maps.of_floors(run), run.metrics["interval"]
     error = {name: entry["abs_error_db"] for name, entry in run.metrics["overall"].items()}
     best = best_baseline(run)

@@ -141,7 +141,6 @@ def _write_config(config: UpdateConfig, folder: Path) -> None:
 
 
 def _unit(model: FieldModel | RssiModel) -> str:
-    """Return the unit of the errors of a model."""
     return "dB" if isinstance(model, RssiModel) else ""
 
 

@@ -49,7 +49,6 @@ class FollowedPage:
             self._requests.submit()
 
     async def _show(self) -> None:
-        """Show the record, whose files have changed."""
         version = self._view.version
         try:
             found = await run.io_bound(snapshot, self._view, version)
@@ -67,6 +66,5 @@ class FollowedPage:
 
 
 def _cells(row: Row) -> Row:
-    """Return the cells of a row as text."""
     row = rounded([row])[0]
     return {key: row[key] if isinstance(row[key], int | str) else f"{row[key]:.4g}" for key in COLUMNS}
