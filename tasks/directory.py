@@ -176,9 +176,8 @@ class Run(Memo):
 
     Args:
         task: Name of the task, which is the parent directory of runs without `--out`.
-        out: Directory of the finished run. None for a new directory under `runs/`.
-        label: Text after the time in the name of such a new directory.
-        config: Dataclass of plain values.
+        label: Text after the time in the name of a new directory under `runs/`.
+        config: Dataclass of plain values. Its `out` is the directory of the finished run, None for a new one under `runs/`.
         device: Device of the computation.
         source: SHA-256 of everything that the run reads, by name. A resumed run must find the same input.
         resume: Directory of an interrupted run to continue. Each process takes the number of threads of its beginning.
@@ -193,7 +192,6 @@ class Run(Memo):
     def __init__(
         self,
         task: str,
-        out: str | None,
         label: str,
         config: Any,
         device: torch.device,
@@ -202,7 +200,7 @@ class Run(Memo):
         processes: int | None = 1,
         described: Callable[[Row], str] = lambda value: "",
     ) -> None:
-        self.described = described
+        self.described, out = described, config.out
         if resume is not None:
             self.final = resume.with_name(resume.name.removesuffix(PARTIAL))
         else:

@@ -68,8 +68,8 @@ def results(folder, given, processes=1, cluster=None, resume=None, act=lambda: N
         act()
         return ""
 
-    config = AoaConfig(mix=(0.5,))
-    with Run("aoa", str(folder), "", config, torch.device("cpu"), {}, resume, processes, show) as run:
+    config = AoaConfig(mix=(0.5,), out=str(folder))
+    with Run("aoa", "", config, torch.device("cpu"), {}, resume, processes, show) as run:
         with workers_of(run, cluster) as workers:
             steps = Steps(10, run, workers)
             started = [

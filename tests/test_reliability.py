@@ -169,7 +169,7 @@ def test_a_resumed_run_keeps_its_number_of_threads_and_its_report_says_where_it_
     report = (stopped.with_name("run") / "report.html").read_text()
     assert "like the seed" in report
     assert "resumed" in report
-    assert f"; device {content['device']})" in report
+    assert f", {content['device']}, processes: 1)" in report
 
 
 @pytest.mark.parametrize("left", [[], ["environment.json"], ["steps/"]])

@@ -177,14 +177,12 @@ def pooled(results: list[tuple[Condition, Value]], auto: bool) -> list[tuple[Con
             found.append((condition, value))
             continue
         most: Training = "measured + synthetic + extra"
-        own, extra = repeats[condition.repeat], (condition.synthesizer, most)
-        if auto:
-            if condition.training == most or not any(training == most for _, training in own):
-                found.append((replace(condition, training="measured + synthetic", synthesizer=AUTO), value))
-            continue
-        own_way = (condition.synthesizer, condition.training)
-        if own_way == extra or all(own_way in others for others in repeats.values()):
+        extra, own_way = (condition.synthesizer, most), (condition.synthesizer, condition.training)
+        stands_for_repeat = own_way == extra or extra not in repeats[condition.repeat]
+        if auto and stands_for_repeat:
+            found.append((replace(condition, training="measured + synthetic", synthesizer=AUTO), value))
+        if not auto and own_way != extra and all(own_way in others for others in repeats.values()):
             found.append((condition, value))
-        if extra not in own and any(extra in others for others in repeats.values()):
+        if not auto and stands_for_repeat and any(extra in others for others in repeats.values()):
             found.append((replace(condition, training=most), value))
     return found

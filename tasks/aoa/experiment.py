@@ -51,18 +51,8 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
     for note in data.notes:
         console.print(f"{data.name}: {note}")
     train, test = data.split(config.split, config.seed)
-    experiment = Experiment(
-        train,
-        test,
-        config.mix,
-        models,
-        extra=config.extra,
-        preset=config.preset,
-        repeats=config.repeats,
-        seed=config.seed,
-        device=device,
-        split=config.split,
-    )
+    same = {name: getattr(config, name) for name in ("extra", "preset", "repeats", "seed", "split")}
+    experiment = Experiment(train, test, config.mix, models, device=device, **same)
     label = f"mix{'_'.join(map(fraction_key, config.mix))}-s{config.seed}"
 
     def described(value: Row) -> str:
@@ -71,19 +61,10 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
         error = angle_errors(torch.tensor(value["estimate"], dtype=torch.float64), test.label)["great_circle"]
         return f"{float(error.nanquantile(0.5).rad2deg()):.2f} degrees"
 
+    source |= data.source
     with (
         connected(config.scheduler, device) as cluster,
-        Run(
-            "aoa",
-            config.out,
-            label,
-            config,
-            device,
-            data.source | source,
-            resume,
-            1 if cluster else config.processes,
-            described,
-        ) as run,
+        Run("aoa", label, config, device, source, resume, 1 if cluster else config.processes, described) as run,
     ):
         with workers_of(run, cluster) as workers, terminal.progress():
             results = learn(experiment, run, workers)

@@ -40,7 +40,7 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"
     with (
         connected(config.scheduler, device) as cluster,
-        Run("locate", config.out, label, config, device, data.source, resume, described=_described) as directory,
+        Run("locate", label, config, device, data.source, resume, described=_described) as directory,
     ):
         with workers_of(directory, cluster) as workers, terminal.progress():
             result = compare(

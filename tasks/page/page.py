@@ -209,7 +209,8 @@ def provenance(runs: Sequence[Records]) -> Section:
         environment = run.environment
         packages = ", ".join(f"{name} {version}" for name, version in environment["packages"].items())
         resumed = ", ".join(
-            f"{session['start']} ({_changed(session, environment)})" for session in environment.get("resumed", [])
+            f"{session['start']} (commit {session['commit']}, {session['device']}, processes: {session['processes']})"
+            for session in environment.get("resumed", [])
         )
         processes = environment.get("processes", 1)
         rows = [
@@ -230,13 +231,3 @@ def provenance(runs: Sequence[Records]) -> Section:
         ]
         tables.append(Table(["", ""], rows, long=True))
     return Section("Provenance", tables=tables)
-
-
-def _changed(session: dict[str, Any], first: dict[str, Any]) -> str:
-    """The code of a session that went on, and what else was not as at the beginning."""
-    differing = [
-        f"{name} {session[name]}"
-        for name in ("device", "processes")
-        if name in session and session[name] != first.get(name)
-    ]
-    return "; ".join([f"commit {session['commit']}", *differing])

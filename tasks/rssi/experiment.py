@@ -25,7 +25,7 @@ from tasks.records import Row, write_table
 from tasks.rssi.page import answer, page
 from tasks.source import measured_rssi, offset_notes, split_notes
 from tasks.terminal import console, terminal
-from tasks.workers import connected
+from tasks.workers import connected, workers_of
 
 FEWER = (0.125, 0.25, 0.5)  # of the training rows, for the figure of the error against their number
 
@@ -47,28 +47,24 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         console.print(f"left out: {reason}")
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"
     source = data.source | ({"floor plan": sha256(Path(config.floor_plan))} if config.floor_plan else {})
+    options = ("split", "seed", "also", "preset", "not_detected", "validation")
+    same = {name: getattr(config, name) for name in options}
     with (
         connected(config.scheduler, device) as cluster,
-        Run("rssi", config.out, label, config, device, source, resume, described=_described) as directory,
+        Run("rssi", label, config, device, source, resume, described=_described) as directory,
     ):
-        with terminal.progress():
+        with workers_of(directory, cluster) as workers, terminal.progress():
             result = compare(
                 whole,
                 receivers=config.rx,
-                split=config.split,
-                seed=config.seed,
-                also=config.also,
-                preset=config.preset,
-                not_detected=config.not_detected,
-                validation=config.validation,
                 reference=config.table.reference,
                 fewer=FEWER,
                 device=device,
                 keep=directory,
-                executor=cluster,
+                executor=workers,
                 progress=True,
+                **same,
             )
-        directory.computed_on(cluster.machines if cluster else ())
         if result.train.offsets is not None:
             console.print(f"{data.name}: {result.train.offsets.note()}")
         if (detection := result.predictors[result.model].detection) is not None:

@@ -190,7 +190,7 @@ def test_sixty_shares_without_out(tmp_path, monkeypatch):
 
     monkeypatch.chdir(tmp_path)
     label = "mix" + "_".join(f"0.{i}" for i in range(60)) + "/../" + "\u00e4" * 200
-    with Run("rssi", None, label, RssiTaskConfig(("1",)), torch.device("cpu"), {}) as directory:
+    with Run("rssi", label, RssiTaskConfig(("1",)), torch.device("cpu"), {}) as directory:
         name = directory.final.name
     assert len(name) < 100
     assert "/" not in name
