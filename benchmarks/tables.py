@@ -139,7 +139,7 @@ def commands() -> str:
     """Return all options of the commands but those of reading, with the commands that have them."""
     reading = {*_options(SpectraSource), *_options(OffsetSource)}
     found: dict[tuple[str, str], list[str]] = {}
-    for command, (_, config, *_) in COMMANDS.items():
+    for command, (config, _) in COMMANDS.items():
         for name, meaning in _options(getattr(configs, config)).items():
             if name not in reading:
                 found.setdefault((name, meaning), []).append(f"`{command}`")

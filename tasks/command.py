@@ -19,36 +19,23 @@ from typing import Any, NamedTuple
 class Command(NamedTuple):
     """A command of the console script."""
 
-    summary: str  # one line for the help
-    options: str  # dataclass of the options, in `tasks.configs`
+    options: str  # dataclass of the options, in `tasks.configs`; the first line of its docstring stands in the help
     module: str  # module with `run(config)`, or `run(config, resume)` if its runs can be resumed
 
 
 COMMANDS = {
-    "aoa": Command(
-        "estimate angles of arrival with few measured spectra, and report the errors",
-        "AoaConfig",
-        "tasks.aoa.experiment",
-    ),
-    "rssi": Command("predict RSSI maps of receivers, and report the errors", "RssiTaskConfig", "tasks.rssi.experiment"),
-    "locate": Command(
-        "locate transmitters from RSSI, and report the errors", "LocateConfig", "tasks.locate.experiment"
-    ),
-    "predict": Command("apply a saved model to new measurements or positions", "PredictConfig", "tasks.predict"),
-    "report": Command("merge finished runs of one task into one report", "ReportConfig", "tasks.report"),
-    "inspect": Command(
-        "check measurements before a run: counts, frames, calibration", "InspectConfig", "tasks.inspect"
-    ),
-    "convert": Command("write measurements and RSSI maps in other formats", "ConvertConfig", "tasks.convert"),
-    "update": Command(
-        "update a fitted model with new measurements, and detect changes", "UpdateConfig", "tasks.update.run"
-    ),
-    "resume": Command("continue an interrupted run: swiftwrf resume DIR.partial", "ResumeConfig", "tasks.resume"),
-    "scenes": Command("trace ray paths in a room (extra: raytrace)", "ScenesConfig", "tasks.scenes"),
-    "view": Command("show a fitted field in the browser (extra: view)", "ViewConfig", "tasks.view.sources"),
+    "aoa": Command("AoaConfig", "tasks.aoa.experiment"),
+    "rssi": Command("RssiTaskConfig", "tasks.rssi.experiment"),
+    "locate": Command("LocateConfig", "tasks.locate.experiment"),
+    "predict": Command("PredictConfig", "tasks.predict"),
+    "report": Command("ReportConfig", "tasks.report"),
+    "inspect": Command("InspectConfig", "tasks.inspect"),
+    "convert": Command("ConvertConfig", "tasks.convert"),
+    "update": Command("UpdateConfig", "tasks.update.run"),
+    "resume": Command("ResumeConfig", "tasks.resume"),
+    "scenes": Command("ScenesConfig", "tasks.scenes"),
+    "view": Command("ViewConfig", "tasks.view.sources"),
 }
-
-
 # modules that processes of a run load while the run itself begins
 PRELOADED = {"aoa": ("augment.turbo.learning", "torchvision", "torch._dynamo")}
 
@@ -67,14 +54,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     name, *options = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if name in ("-h", "--help"):
+        from tasks import configs
+        from tasks.command_line import without_reader
+
         try:
             print("usage: swiftwrf COMMAND [OPTIONS]\n")
             for name, command in COMMANDS.items():
-                print(f"  {name:<9} {command.summary}")
+                summary, *_ = getattr(configs, command.options).__doc__.splitlines()
+                print(f"  {name:<9} {summary}")
             print("\noptions of a command: swiftwrf COMMAND --help", flush=True)
         except BrokenPipeError:
-            from tasks.command_line import without_reader
-
             return without_reader()
         return 0
     if name not in COMMANDS:

@@ -48,7 +48,7 @@ OF_ROWS = ("columns", "filler", "coordinates", "scale", "y_down", "up")  # optio
 
 @options
 class AoaConfig(Options):
-    """Angle of arrival with few measured spectra: turbo learning against its references and baselines.
+    """Estimate angles of arrival with few measured spectra: turbo learning against its references and baselines.
 
     Without --data the built-in simulated room is used. swiftwrf resume DIR.partial continues an interrupted run.
 
@@ -137,7 +137,7 @@ class AoaConfig(Options):
 
 @options
 class RssiTaskConfig(Options):
-    """RSSI of a moving transmitter at fixed receivers, against baselines.
+    """Predict RSSI maps of receivers, and report the errors beside those of baselines.
 
     Without --data the built-in simulated floor is used. swiftwrf resume DIR.partial continues an interrupted run.
 
@@ -193,9 +193,10 @@ class RssiTaskConfig(Options):
 
 @options
 class LocateConfig(Options):
-    """Compare localizers on a split of measured RSSI, by default of the built-in simulated floor, and report their errors.
+    """Locate transmitters from RSSI, and report the errors beside those of baselines.
 
-    swiftwrf resume DIR.partial continues an interrupted run. Positions of new rows: swiftwrf predict.
+    Without --data the built-in simulated floor is used. swiftwrf resume DIR.partial continues an interrupted run. Positions
+    of new rows: swiftwrf predict.
 
     Example: swiftwrf locate --rx all --data DIR
     """
@@ -256,7 +257,7 @@ class PredictConfig(Options):
 
 @options
 class ReportConfig(Options):
-    """One report over several finished runs of one task.
+    """Merge finished runs of one task into one report.
 
     Example: swiftwrf report runs/rssi/first runs/rssi/second --out runs/report
     """
@@ -419,7 +420,7 @@ class ResumeConfig(Options):
 
 @options
 class ScenesConfig(Options):
-    """Ray paths in a room with furniture or in a scene file of Mitsuba, traced by Sionna RT (extra: raytrace).
+    """Trace ray paths in a furnished room or in a scene file of Mitsuba by Sionna RT (extra: raytrace).
 
     The directory holds paths.npz, which --data of the tasks reads, and scene.svg, a plan of the room and the positions.
 
@@ -472,9 +473,9 @@ class ScenesConfig(Options):
 
 @options
 class ViewConfig(Options):
-    """A page to explore a fitted model: drag the moving end and see its spectrum, or hover over a map of RSSI.
+    """Explore a fitted model in the browser (extra: view).
 
-    Needs the optional extra: pip install 'swiftwrf-tasks[view]'. Ctrl-C ends it.
+    Drag the moving end and see its spectrum, or hover over a map of RSSI. Ctrl-C ends the page.
 
     Example: swiftwrf view runs/aoa/first
     """
