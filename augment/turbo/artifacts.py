@@ -29,20 +29,18 @@ def model_file(folder: Path, name: str, key: str) -> Path:
     return folder / f"{name}-mix{key}.safetensors"
 
 
-def save_model(model: FieldModel, key: str, measured: Spectra, test: Spectra, folder: Path) -> None:
+def save_model(model: FieldModel, key: str, measured: Spectra, folder: Path) -> None:
     """Save a field model fitted to the measured spectra, and its room. Models that store these spectra are not saved."""
     mix = f"mix{key}"
     if not isinstance(model, MemoryModel):
         model.save(model_file(folder, model.name, key))
     if model.room is not None:
         write_json(folder / f"geometry-{mix}.json", model.room.to_json())
-        position, gain, order = model.room.image_sources()
+        position, _, order = model.room.image_sources()
         places = {
             "measured": measured.position,
-            "test": test.position,
             "fixed": model.room.fixed_position,
             "image": position,
-            "gain": gain,
             "order": order,
         }
         arrays = {name: value.numpy() for name, value in places.items()}

@@ -202,7 +202,7 @@ def synthesize(
     if trains:
         write(folder / _file(synthesis), KIND, tensors, {})
         if subset.repeat == 0:
-            save_model(model, subset.key, measured, experiment.test, folder)
+            save_model(model, subset.key, measured, folder)
             if experiment.is_first(name):
                 std = None
                 if model.predict(experiment.test.position[:1]).std is not None:

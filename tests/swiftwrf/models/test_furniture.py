@@ -184,7 +184,7 @@ def test_furniture_is_drawn_by_height_and_hatched_where_it_is_unknown(tmp_path):
     assert math.isnan(shown.in_plan(0.0, 0.24)[2][0, 0])
     assert shown.plot(0.0, 0.24).get_xlabel() == "x [m]"
     walls.furniture = shown
-    save_model(walls, "0.3", data, data, tmp_path)
+    save_model(walls, "0.3", data, tmp_path)
     found = json.loads((tmp_path / "geometry-mix0.3.json").read_text())["furniture"]
     assert (found["shape"], found["voxel_m"], found["surfaces"]) == ([26, 22, 14], 0.25, [])
     assert [11, 5, 3, pytest.approx(2 * 20 / math.log(10), abs=0.01)] in found["voxels"]
