@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
+from os.path import isdir, isfile  # unlike methods of Path, they are False for names that are too long
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ from swiftwrf.locate import RssiLocator
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import Plane
 from swiftwrf.rssi.base import RssiPredictor
-from swiftwrf.runtime.checkpoint import Saved, refusing
+from swiftwrf.runtime.checkpoint import refusing
 from swiftwrf.runtime.steps import LOCATOR, MODEL
 from tasks.aoa.experiment import measurements as spectra_of
 from tasks.command_line import parse
@@ -33,7 +34,6 @@ from tasks.view.rssi import RssiView, rows_of_model, rows_of_run
 from tasks.view.spectra import LoadedModel, SpectraView
 
 EXPECTED = "give the directory of a run of aoa, rssi, locate or update, or a saved model of spectra or RSSI"
-Kind = TypeVar("Kind", bound=Saved)
 
 
 def run(config: ViewConfig) -> None:
@@ -63,16 +63,11 @@ def open_source(source: Path) -> SpectraView | RssiView | FollowedView:
     Raises:
         InputError: The source holds no model that predicts spectra or RSSI.
     """
-    try:
-        is_file, is_folder = source.is_file(), source.is_dir()
-    except OSError as error:
-        raise InputError(f"{source} cannot be read ({error.strerror}); {EXPECTED}") from None
-    if is_file:
+    if isfile(source):
         return _saved_model(source)
-    if not is_folder:
-        raise InputError(f"{source} does not exist; {EXPECTED}")
-    if not (source / CONFIG).is_file():
-        raise InputError(f"{source} is no run: it has no {CONFIG}; {EXPECTED}")
+    if not isfile(source / CONFIG):
+        reason = f"is no run: it has no {CONFIG}" if isdir(source) else "does not exist or cannot be read"
+        raise InputError(f"{source} {reason}; {EXPECTED}")
     content = read_json(source / CONFIG)
     match content.get("task"):
         case "aoa":
@@ -88,28 +83,22 @@ def open_source(source: Path) -> SpectraView | RssiView | FollowedView:
 
 
 def _saved_model(file: Path) -> SpectraView | RssiView:
-    model = load(file)
+    model = _opened(file, RssiModel, RssiLocator, FieldModel)
     if isinstance(model, RssiModel):
         return RssiView(file.name, model, rows_of_model(model))
     if isinstance(model, RssiLocator):
         return _located(file.name, RssiLocating.of_training(model))
-    if not isinstance(model, FieldModel):
-        raise _not_shown(model, file)
     return SpectraView(file.name, [LoadedModel(model.kind, model, _planes(model))])
 
 
-def _not_shown(model: Saved, file: Path) -> InputError:
-    instead = "the report of its run shows its maps" if isinstance(model, RssiPredictor) else EXPECTED
-    return InputError(f"{file} holds {with_article(model.kind)}, which cannot be shown; {instead}")
-
-
-def _kept(kind: type[Kind], file: Path) -> Kind:
-    """Return the model that a run keeps."""
+def _opened(file: Path, *kinds: Any) -> Any:
+    """Return the saved model in a file if it is of one of these kinds."""
     if not file.is_file():
         raise InputError(f"{file.parent} holds no model: it has no {file.name}; the run did not end")
     model = load(file)
-    if not isinstance(model, kind):
-        raise _not_shown(model, file)
+    if not isinstance(model, kinds):
+        instead = "the report of its run shows its maps" if isinstance(model, RssiPredictor) else EXPECTED
+        raise InputError(f"{file} holds {with_article(model.kind)}, which cannot be shown; {instead}")
     return model
 
 
@@ -149,9 +138,7 @@ def _aoa_run(folder: Path, content: Row) -> SpectraView:
             files = {name: file for name in names if (file := model_file(folder, name, key)).is_file()}
             locator_file = files.pop(MATCHED_FIELD, None)
             for name, file in files.items():
-                model = load(file)
-                if not isinstance(model, FieldModel):
-                    raise _not_shown(model, file)
+                model = _opened(file, FieldModel)
                 planes = _planes(model) or _planes_of_run(folder / f"geometry-mix{key}.json")
                 title = f"{name}, {100 * fraction:g}% measured"
                 models.append(LoadedModel(title, model, planes, in_training, locator_file))
@@ -167,7 +154,7 @@ def _planes_of_run(file: Path) -> list[dict[str, Any]]:
 
 
 def _locate_run(folder: Path, content: Row) -> RssiView:
-    locator, notes = _kept(RssiLocator, folder / LOCATOR), []
+    locator, notes = _opened(folder / LOCATOR, RssiLocator), []
     with refusing(f"the records in {folder} are not those of a run"):
         config = parse(LocateConfig, [], "tasks.view", content["config"], folder)
         try:
@@ -185,6 +172,6 @@ def _located(title: str, locating: RssiLocating, notes: Sequence[str] = (), fold
 
 
 def _rssi_run(folder: Path) -> RssiView:
-    model = _kept(RssiModel, folder / MODEL)
+    model = _opened(folder / MODEL, RssiModel)
     with refusing(f"the maps in {folder} are not those of a run"):
         return RssiView(folder.name, model, rows_of_run(folder / "maps.npz", model.receiver_names), folder=folder)
