@@ -15,9 +15,10 @@ import tyro
 from record import ROOT, load, markdown
 
 from augment.turbo.condition import LOCATED, MEASURED_NETWORK
-from swiftwrf.choices import ROOMS
+from swiftwrf.choices import ROOMS, RSSI_PREDICTORS
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.datasets import catalogue
+from swiftwrf.locate.baselines import LOCALIZERS
 from tasks import configs, labels
 from tasks.command import COMMANDS
 from tasks.options import OffsetSource, SpectraSource
@@ -149,12 +150,16 @@ def commands() -> str:
 
 def predictors() -> str:
     """Return the predictors of RSSI."""
-    return markdown(["predictor", "method"], [[f"`{name}`", one.meaning] for name, one in labels.PREDICTORS.items()])
+    return markdown(
+        ["predictor", "method"], [[f"`{name}`", text] for name, text in labels.meanings(RSSI_PREDICTORS).items()]
+    )
 
 
 def localizers() -> str:
     """Return the localizers."""
-    return markdown(["localizer", "estimate"], [[f"`{name}`", one.meaning] for name, one in labels.LOCALIZERS.items()])
+    return markdown(
+        ["localizer", "estimate"], [[f"`{name}`", text] for name, text in labels.meanings(LOCALIZERS).items()]
+    )
 
 
 def rooms() -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from swiftwrf.runtime.registry import Registry
@@ -55,58 +56,40 @@ BEAMFORMERS = {
     "capon": Label("minimum variance; needs as many snapshots as elements"),
 }
 
+# colours of methods whose meaning is the first line of their docstring
 ESTIMATORS = {
-    "aann": Label("the paper's angular neural network: ResNet-50 and a multilayer perceptron"),
-    "aann_kernel": Label("kernel regression on the features of a briefly trained ResNet-50 and on coarse pixels"),
-    "kernel_regression": Label("kernel regression from the spectrum to the direction", "#2a9165"),
-    "matched_field": Label(
-        "the position whose spectrum, predicted by the room, matches, and its direction (matched-field processing)",
-        "#d1620f",
-    ),
-    "nearest_spectrum": Label("the label of the most similar training spectrum", "#8f7d12"),
-    "constant": Label("the mean direction of the training labels", "#7f8794"),
-    "peak": Label("the strongest direction", "#a0623a"),
-    "music": Label("MUSIC on the array snapshots, for one source", "#b5539f"),
-    "esprit": Label("ESPRIT on the array snapshots, for one source", "#3a8fb7"),
-    "joint_music": Label("MUSIC over elements and subcarriers, for the earliest path", "#8f5fb5"),
-    "maximum_likelihood": Label("maximum likelihood on the array snapshots, for one source", "#5f8f3a"),
+    "kernel_regression": "#2a9165",
+    "matched_field": "#d1620f",
+    "nearest_spectrum": "#8f7d12",
+    "constant": "#7f8794",
+    "peak": "#a0623a",
+    "music": "#b5539f",
+    "esprit": "#3a8fb7",
+    "joint_music": "#8f5fb5",
+    "maximum_likelihood": "#5f8f3a",
 }
-
 PREDICTORS = {
-    "swiftwrf": Label(
-        "50 primitives a receiver on a 16 x 16 grid, averaged, on a log-distance path-loss model; mixed with simpler "
-        "predictors by cross-validation",
-        "#3a7fd5",
-    ),
-    "gp": Label(
-        "a Gaussian process on the residual of the path-loss model (or of the mean)",
-        "#2a9165",
-    ),
-    "mri_pooled": Label("one log-distance path-loss model for all receivers of the data", "#cf4a4a"),
-    "mri_receiver": Label("a log-distance path-loss model for each receiver", "#d1620f"),
-    "mri_residual": Label("mri_receiver, its residual interpolated from the nearest measurements", "#8f7d12"),
-    "knn": Label("inverse-distance mean of the nearest measurements", "#1b8fa6"),
-    "mean": Label("the mean of the receiver's training values", "#7f8794"),
-    "pairs": Label(
-        "a log-distance path-loss model and a Gaussian process over the positions of both ends of the link", "#8b6fd0"
-    ),
-    "knn_pairs": Label("inverse-distance mean of the nearest pairs of positions", "#a0623a"),
-    "nerf2": Label("a neural field for all receivers, its rays averaged (NeRF2)", "#4f8f2f"),
+    "swiftwrf": "#3a7fd5",
+    "gp": "#2a9165",
+    "mri_pooled": "#cf4a4a",
+    "mri_receiver": "#d1620f",
+    "mri_residual": "#8f7d12",
+    "knn": "#1b8fa6",
+    "mean": "#7f8794",
+    "pairs": "#8b6fd0",
+    "knn_pairs": "#a0623a",
+    "nerf2": "#4f8f2f",
 }
-
 LOCALIZERS = {
-    "posterior": Label(
-        "the median of the posterior over positions: radio maps with their uncertainty, detections, similar training rows",
-        "#3a7fd5",
-    ),
-    "knn": Label("the inverse-distance mean position of the k places with the most similar RSSI", "#1b8fa6"),
-    "knn_difference": Label("knn on differences to the row's strongest value, without the device's offset", "#d1620f"),
-    "nearest": Label("the single most similar training row by Manhattan distance, the field's benchmark", "#a0559c"),
-    "gp": Label("Gaussian-process regression from RSSI to coordinates", "#2a9165"),
-    "mean": Label("the mean training position", "#7f8794"),
+    "posterior": "#3a7fd5",
+    "knn": "#1b8fa6",
+    "knn_difference": "#d1620f",
+    "nearest": "#a0559c",
+    "gp": "#2a9165",
+    "mean": "#7f8794",
 }
 
 
-def meanings(registry: Registry[Any], known: Mapping[str, Label]) -> dict[str, str]:
-    """Return the meanings of registered methods. That of another package's method is the first line of its docstring."""
+def meanings(registry: Registry[Any], known: Mapping[str, Label] = MappingProxyType({})) -> dict[str, str]:
+    """Return the meanings of registered methods: of their labels, or the first lines of their docstrings."""
     return {name: known[name].meaning if name in known else registry.summary(name) for name in registry}

@@ -71,7 +71,7 @@ class SharedPathLoss(RssiPredictor):
 
 
 class ReceiverPathLoss(SharedPathLoss):
-    """A log-distance path-loss model for each receiver, shrunk to that of all receivers; see `fit_path_losses`."""
+    """A log-distance path-loss model for each receiver, shrunk to that of all receivers."""
 
     name = "mri_receiver"
 

@@ -43,8 +43,9 @@ FIELD_ALONE = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)  # mixing 
 
 
 class RssiModel(SavedRssiPredictor):
-    """RSSI at fixed receivers for any position of the transmitter; predictions are differentiable in the position.
+    """50 primitives a receiver on a log-distance path-loss model, mixed with simpler predictors by cross-validation.
 
+    It predicts RSSI at fixed receivers for any position of the transmitter, differentiable in the position.
     Five held-out folds of the training rows determine the kernel, the presence of a field, the mixing weights and the scale
     of the standard deviation. The field is mixed with simpler predictors: the path-loss model of the receiver, that of all
     receivers, and the mean of the receiver. All receivers share the mixing weights. The path loss of a receiver is shrunk to

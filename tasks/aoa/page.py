@@ -159,8 +159,8 @@ def _terms() -> dict[str, str]:
         "measured + synthetic + extra (NAME)": "the same, and spectra that NAME predicts at extra positions, as many as "
         "--extra",
         NETWORK: f"{' or, with --preset paper, '.join(NETWORKS.values())}",
-        **labels.meanings(ESTIMATORS, labels.ESTIMATORS),
-        LOCATOR: labels.ESTIMATORS[LOCATOR].meaning,
+        **labels.meanings(ESTIMATORS),
+        LOCATOR: "the position whose spectrum, predicted by the room, matches, and its direction (matched-field processing)",
     }
 
 

@@ -112,7 +112,7 @@ def palette(conditions: Iterable[Condition]) -> dict[str, str]:
             case "measured" if condition.is_network:
                 own = LOWER_REFERENCE
             case "measured":
-                own = labels.colour(labels.colours(labels.ESTIMATORS), condition.estimator)
+                own = labels.colour(labels.ESTIMATORS, condition.estimator)
             case "all measured":
                 own = UPPER_REFERENCE
             case _:

@@ -38,7 +38,7 @@ LEVEL = 0.8  # probability of the credible regions in the summary
 SUGGESTED = "suggested"  # name of the files with suggested positions
 TRUTH, ESTIMATE = "#cf4a4a", "#ffffff"
 COLUMNS = ["index", "place", "method", "position_error_m"]  # of the errors of methods
-COLOURS = labels.colours(labels.LOCALIZERS)
+COLOURS = labels.LOCALIZERS
 LIMITS = (
     "Rows that no receiver detected have no position. They are left out of the errors.",
     "Candidate positions lie in and around the training positions. A transmitter elsewhere is located at their edge.",
@@ -53,7 +53,7 @@ def page(runs: list[Records]) -> Page:
     """Return the page of these runs."""
     sections = [
         sections_of("Where was it?", runs, lambda run: _posteriors(run, several=len(runs) > 1)),
-        sections_of("Errors", runs, _errors, labels.meanings(LOCALIZERS, labels.LOCALIZERS)),
+        sections_of("Errors", runs, _errors, labels.meanings(LOCALIZERS)),
         sections_of("How sure is it?", runs, lambda run: Section("", plots=[_calibration(run)])),
         limits(runs[0], *LIMITS),
     ]

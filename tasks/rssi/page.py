@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.metrics import paired_difference
-from tasks.labels import PREDICTORS, colour, colours, meanings
+from tasks.labels import PREDICTORS, colour, meanings
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of
 from tasks.page.shared import (
@@ -28,7 +28,7 @@ from tasks.rssi.maps import CERTAINTY, COVERED_DBM, MIN_RATIO, WIDTH_PER_STD, Ma
 from tasks.terminal import Answer, Method, NextStep
 
 COLUMNS = ["index", "receiver", "method", "abs_error_db"]  # of the errors of methods
-COLOURS = colours(PREDICTORS)
+COLOURS = PREDICTORS
 REFERENCES = ("mean", "mri_pooled")  # which explain no place
 MIN_POSITIONS = 30  # for an interval of one width to show that more positions do not help
 MIN_REPEATS = 10  # of measurements at one place
@@ -48,7 +48,7 @@ LIMITS = (
 def page(runs: list[Records]) -> Page:
     """Return the page of these runs."""
     sections = [
-        sections_of("Errors", runs, _errors, meanings(RSSI_PREDICTORS, PREDICTORS)),
+        sections_of("Errors", runs, _errors, meanings(RSSI_PREDICTORS)),
         sections_of("Where the errors are", runs, lambda run: Section("", plots=[_where(run)])),
         limits(runs[0], *LIMITS),
     ]

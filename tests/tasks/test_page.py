@@ -105,8 +105,8 @@ def test_every_colour_of_a_curve_stands_out_in_light_and_dark():
     template = (Path(figures.__file__).parent / "template.html").read_text()
     papers = ["#ffffff" if paper == "#fff" else paper for paper in re.findall(r"--paper: (#\w+)", template)]
     assert len(set(papers)) == 2
-    tables = (labels.FIELD_MODELS, labels.ESTIMATORS, labels.PREDICTORS, labels.LOCALIZERS)
-    colours = {label.colour for table in tables for label in table.values() if label.colour}
+    tables = (labels.colours(labels.FIELD_MODELS), labels.ESTIMATORS, labels.PREDICTORS, labels.LOCALIZERS)
+    colours = {colour for table in tables for colour in table.values()}
     colours |= {*labels.OTHER_COLOURS, figures.RULE, LOWER_REFERENCE, UPPER_REFERENCE, CHOSEN}
     for colour in colours:
         for paper in papers:
