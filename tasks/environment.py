@@ -36,10 +36,8 @@ def now() -> str:
 
 def invocation(task: str) -> str:
     """Return the command line of this process, which runs a task."""
-    arguments = sys.argv[1:]
-    return command(
-        *([] if arguments[:1] == [task] else [task]), *arguments
-    )  # python -m tasks.aoa has no name of a task
+    first, *others = sys.argv[1:] or [task]
+    return command(task, *([] if first == task else [first]), *others)  # python -m tasks.aoa has no name of a task
 
 
 def command(*arguments: str) -> str:

@@ -283,10 +283,10 @@ def given(group: Any) -> dict[str, list[str]]:
         >>> given(SpectraSource(every=2, drop_null=True))
         {'every': ['--every', '2'], 'drop-null': ['--drop-null']}
     """
-    values = {option.name.replace("_", "-"): (getattr(group, option.name), option.default) for option in fields(group)}
     found = {}
-    for name, (value, default) in values.items():
-        if value != default:
+    for option in fields(group):
+        if (value := getattr(group, option.name)) != option.default:
+            name = option.name.replace("_", "-")
             words = [] if value is True else value if isinstance(value, tuple) else [value]
             found[name] = [f"--{name}", *map(str, words)]
     return found

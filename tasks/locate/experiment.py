@@ -38,9 +38,10 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
     for note in data.notes:
         console.print(f"{data.name}: {note}")
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"
+    described = "{median_m:.2f} m".format_map
     with (
         connected(config.scheduler, device) as cluster,
-        Run("locate", label, config, device, data.source, resume, described=_described) as directory,
+        Run("locate", label, config, device, data.source, resume, described=described) as directory,
     ):
         with workers_of(directory, cluster) as workers, terminal.progress():
             result = compare(
@@ -63,10 +64,6 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
             measured = train.transmitter_position
             write_suggestion(directory.path(SUGGESTED), measured, found.position, found.variance, degrees)
         finish(directory, record(result, directory.folder), page, answer)
-
-
-def _described(value: Row) -> str:
-    return f"{value['median_m']:.2f} m"
 
 
 def measurements(config: LocateConfig) -> Rssi:

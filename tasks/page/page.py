@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -143,12 +144,11 @@ def rich(text: str) -> Markup:
         >>> str(rich("a < b: `python`"))
         'a &lt; b: <code><span>python</span></code>'
     """
-    parts = [escape(part) for part in text.split("`")]
-    for n, part in enumerate(text.split("`")):
-        if n % 2:
-            words = Markup(" ").join(Markup("<span>{}</span>").format(word) for word in part.split(" "))
-            parts[n] = Markup("<code>{}</code>").format(words)
-    return Markup("").join(parts)
+
+    def code(found: re.Match[str]) -> str:
+        return f"<code>{' '.join(f'<span>{word}</span>' for word in found[1].split(' '))}</code>"
+
+    return Markup(re.sub("`([^`]*)`", code, str(escape(text))))  # of escaped text
 
 
 def write_page(folder: Path, page: Page) -> None:

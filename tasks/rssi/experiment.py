@@ -49,9 +49,13 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     source = data.source | ({"floor plan": sha256(Path(config.floor_plan))} if config.floor_plan else {})
     options = ("split", "seed", "also", "preset", "not_detected", "validation")
     same = {name: getattr(config, name) for name in options}
+
+    def described(value: Row) -> str:
+        return f"{value['median_db']:.2f} dB" if "median_db" in value else ""
+
     with (
         connected(config.scheduler, device) as cluster,
-        Run("rssi", label, config, device, source, resume, described=_described) as directory,
+        Run("rssi", label, config, device, source, resume, described=described) as directory,
     ):
         with workers_of(directory, cluster) as workers, terminal.progress():
             result = compare(
@@ -72,10 +76,6 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         if plan is not None:
             plan.save(directory.folder)
         finish(directory, record(result, directory.folder, offset_notes(data, config.table)), page, answer)
-
-
-def _described(value: Row) -> str:
-    return f"{value['median_db']:.2f} dB" if "median_db" in value else ""
 
 
 def _read_floor_plan(config: RssiTaskConfig, data: Rssi) -> FloorPlan | None:

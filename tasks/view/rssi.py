@@ -92,7 +92,9 @@ class RssiView:
     def __post_init__(self) -> None:
         if self.folder is not None:
             self.plan = FloorPlan.load(self.folder)
-        self.map = lru_cache(maxsize=MAX_MAPS)(self._map)
+        self.map = lru_cache(maxsize=MAX_MAPS)(
+            lambda height: RssiMap.predict(self.model, height=height, region=self.region)
+        )
         """Return the map at a height of the transmitter [m]; the last ones are cached for all visitors."""
 
     @property
@@ -143,9 +145,6 @@ class RssiView:
         corners = np.array(self.plan.corners).reshape(2, 2).T if self.plan else np.empty((0, 2))
         receiver = self.rows.receiver_position[self.rows.receiver_located]
         return np.concatenate([self.model.region().numpy()[:, :2], receiver.numpy()[:, :2], corners])
-
-    def _map(self, height: float) -> RssiMap:
-        return RssiMap.predict(self.model, height=height, region=self.region)
 
     def inside(self, height: float) -> NDArray[np.bool_]:
         """Return which cells of a map are inside the measured positions, in plan (rows, columns)."""
