@@ -43,8 +43,7 @@ def run(config: ViewConfig) -> None:
         InputError: The source holds no model, the port is in use, or the optional extra is not installed.
     """
     try:
-        from tasks.view.followed_page import FollowedPage
-        from tasks.view.page import free_port, serve
+        from tasks.view.page import FollowedPage, free_port, serve
         from tasks.view.rssi_page import RssiPage
         from tasks.view.spectra_page import SpectraPage
     except ModuleNotFoundError as error:
