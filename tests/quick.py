@@ -85,7 +85,7 @@ def sketched() -> Iterator[None]:
 def one_example() -> Iterator[None]:
     """Write reports with one example of a spectrum, each of which takes as long as the other figures."""
 
-    def first(fraction: FractionRecords) -> list[synthesis.Example]:
+    def first(fraction: FractionRecords) -> list[tuple[synthesis.Images, str, synthesis.Direction | None]]:
         return every(fraction)[:1]
 
     every = synthesis.examples

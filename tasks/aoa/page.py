@@ -65,9 +65,9 @@ def first_screen(fraction: FractionRecords) -> Summary:
         ),
     ]
     found_examples = examples(fraction)
-    example = found_examples[len(found_examples) // 2]
-    pair = {kind: example.images[kind] for kind in ("measured", "predicted")}
-    panels = [spectra(pair, f"spectrum {example.title}", example.truth)]
+    images, title, truth = found_examples[len(found_examples) // 2]
+    pair = {kind: images[kind] for kind in ("measured", "predicted")}
+    panels = [spectra(pair, f"spectrum {title}", truth)]
     caption = (
         "A spectrum at a position without a measurement, measured and predicted (cross: true direction, ring: peak)."
     )

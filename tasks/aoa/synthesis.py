@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import matplotlib.style
@@ -22,6 +21,7 @@ from tasks.page.shared import with_interval
 MAX_DIFFERENCE = 0.5  # of a magnitude in [0, 1]: end of the scale of standard deviations of one spectrum
 TRUTH, PEAK = "#ffffff", "#cf4a4a"
 Direction = tuple[float, float]  # azimuth, elevation [deg]
+Images = dict[str, NDArray[Any]]  # values (n_elevation, n_azimuth) by kind
 SCALES = {
     "measured": ("viridis", 0.0, 1.0),
     "predicted": ("viridis", 0.0, 1.0),
@@ -30,17 +30,8 @@ SCALES = {
 }
 
 
-@dataclass(frozen=True)
-class Example:
-    """A test spectrum and its prediction: title, values (n_elevation, n_azimuth) by kind, true direction if known."""
-
-    title: str
-    images: dict[str, NDArray[Any]]
-    truth: Direction | None
-
-
-def examples(fraction: FractionRecords) -> list[Example]:
-    """Return test spectra from the best to the worst prediction."""
+def examples(fraction: FractionRecords) -> list[tuple[Images, str, Direction | None]]:
+    """Return images, title and true direction, if known, of test spectra, from the best to the worst prediction."""
     stored = fraction.arrays("examples")
     labels = fraction.table("errors").drop_duplicates("index").set_index("index")
     found = []
@@ -53,7 +44,7 @@ def examples(fraction: FractionRecords) -> list[Example]:
         if index in labels.index:
             label = labels.loc[index]
             truth = (float(label["truth_azimuth_deg"]), float(label["truth_elevation_deg"]))
-        found.append(Example(f"row {index}, PSNR {stored['psnr_db'][row]:.1f} dB", images, truth))
+        found.append((images, f"row {index}, PSNR {stored['psnr_db'][row]:.1f} dB", truth))
     return found
 
 
@@ -79,7 +70,7 @@ def quality_table(fraction: FractionRecords) -> Table:
 def examples_plot(fraction: FractionRecords) -> Plot:
     """Return measured spectra and their predictions."""
     stored, found = fraction.arrays("examples"), examples(fraction)
-    small = [image.ravel() for one in found for kind, image in one.images.items() if SCALES[kind][0] != "viridis"]
+    small = [image.ravel() for images, *_ in found for kind, image in images.items() if SCALES[kind][0] != "viridis"]
     most = max(float(np.quantile(np.abs(np.concatenate(small)), 0.99)), 1e-3)  # end of a scale that shows them
     text = (
         f"Spectra at positions without a measurement, by {stored['synthesizer']}, from the best to the "
@@ -88,7 +79,7 @@ def examples_plot(fraction: FractionRecords) -> Plot:
     )
     if "deviation" in stored:
         text += f" Intervals of 80 % cover {float(stored['coverage']):.0%} of the pixels of all test spectra."
-    panels = [spectra(one.images, one.title, one.truth, most) for one in found]
+    panels = [spectra(*example, most) for example in found]
     return Plot(f"spectra-{fraction.file_name}", panels, text, _pixels(stored))
 
 
@@ -106,9 +97,7 @@ def _pixels(example: dict[str, NDArray[Any]]) -> DataFrame:
     return concat([DataFrame(names), table], axis=1)
 
 
-def spectra(
-    images: dict[str, NDArray[Any]], title: str, truth: Direction | None = None, most: float = MAX_DIFFERENCE
-) -> Figure:
+def spectra(images: Images, title: str, truth: Direction | None = None, most: float = MAX_DIFFERENCE) -> Figure:
     """Return a panel with one hemisphere for each image, two in a row.
 
     Azimuth runs counter-clockwise from the right. Images (n_elevation, n_azimuth), whose last row is the zenith, are by
