@@ -51,8 +51,18 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
     for note in data.notes:
         console.print(f"{data.name}: {note}")
     train, test = data.split(config.split, config.seed)
-    same = {name: getattr(config, name) for name in ("extra", "preset", "repeats", "seed", "split")}
-    experiment = Experiment(train, test, config.mix, models, device=device, **same)
+    experiment = Experiment(
+        train,
+        test,
+        config.mix,
+        models,
+        extra=config.extra,
+        preset=config.preset,
+        repeats=config.repeats,
+        seed=config.seed,
+        device=device,
+        split=config.split,
+    )
     label = f"mix{'_'.join(map(fraction_key, config.mix))}-s{config.seed}"
 
     def described(value: Row) -> str:

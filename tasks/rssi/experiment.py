@@ -47,8 +47,6 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         console.print(f"left out: {reason}")
     label = f"rx{'_'.join(config.rx)}-s{config.seed}"
     source = data.source | ({"floor plan": sha256(Path(config.floor_plan))} if config.floor_plan else {})
-    options = ("split", "seed", "also", "preset", "not_detected", "validation")
-    same = {name: getattr(config, name) for name in options}
 
     def described(value: Row) -> str:
         return f"{value['median_db']:.2f} dB" if "median_db" in value else ""
@@ -61,13 +59,18 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
             result = compare(
                 whole,
                 receivers=config.rx,
+                split=config.split,
+                seed=config.seed,
+                also=config.also,
+                preset=config.preset,
+                not_detected=config.not_detected,
+                validation=config.validation,
                 reference=config.table.reference,
                 fewer=FEWER,
                 device=device,
                 keep=directory,
                 executor=workers,
                 progress=True,
-                **same,
             )
         if result.train.offsets is not None:
             console.print(f"{data.name}: {result.train.offsets.note()}")
