@@ -105,6 +105,14 @@ def locating_spectra() -> str:
     return markdown(["scene", "measured", "random choices", "position [m]", "80 % regions hold"], rows)
 
 
+def best_other(row: dict[str, Any]) -> tuple[str, float]:
+    """Return the estimator of smallest median error beside matched-field processing, and this error [deg]."""
+    ending = "_angle_deg"
+    errors = {key.removesuffix(ending): float(row[key]["median"]) for key in row if key.endswith(ending)}
+    best = min(errors, key=errors.__getitem__)
+    return best.replace("_", " "), errors[best]
+
+
 def channels() -> str:
     """Return errors of matched fields on channels, and coherence and errors of channels predicted at unseen positions."""
     rows = []
@@ -119,11 +127,10 @@ def channels() -> str:
                 if (own := row["channel"].get(name))
             ]
             what = [scene, f"{float(fraction):.0%}", name.split("_")[1], str(len(found["draws"]))]
-            others = {key: own for key, own in row.items() if key.endswith("_angle_deg")}
-            best = min(others, key=lambda key: float(others[key]["median"]), default="")
-            other = (
-                f"{others[best]['median']:.2g} ({best.removesuffix('_angle_deg').replace('_', ' ')})" if best else ""
-            )
+            other = ""
+            if "peak_angle_deg" in row:
+                best, least = best_other(row)
+                other = f"{least:.2g} ({best})"
             rows.append([*what, *error, other, f"{row['coverage_80']:.0%}", *predicted])
     columns = ["scene", "measured", "subcarriers", "draws", "angle [deg]", "position [m]", "best other angle [deg]"]
     predictors = ["nearest", "Gaussian process", "planes", "planes and furniture"]

@@ -75,6 +75,7 @@ def headline() -> str:
     channels = (
         f"{coherence['furniture']} ({100 * csi['position_m']['median']:.1f} cm, {csi['angle_deg']['median']:.2f}° off)"
     )
+    by_channels = [_by_channels(name) for name in ("channels_8_rooms", "channels_8_adarf")]
     degree = {}
     for share, mix, result in aoa_tables.aoa_shares():
         errors = {name: f"{m['great_circle_deg']['median']:.2f}°" for name, m in mix["methods"].items()}
@@ -87,6 +88,8 @@ def headline() -> str:
         ["position from RSSI", "tetam-tracks, spatial"],
         ["position from Wi-Fi RSSI, public benchmark, mean 3D error", "ts-tut5, published"],
         ["wideband CSI where nobody measured, coherence", "newrf-conference, 8 subcarriers in 80 MHz"],
+        ["direction by wideband CSI (position)", "ten furnished rooms, 20 MHz, 20 dB"],
+        ["direction by CSI of RFID tags (position)", "adarf-d1, published"],
         ["direction, ray-traced furnished room", "newrf-office, random"],
         ["direction, measured spectra of an RFID tag", "s23-200, block"],
     ]
@@ -95,11 +98,21 @@ def headline() -> str:
         [f"mean {metre['mean']:.2f} m", f"`{other}` {metre[other]:.2f} m", f"{metre['posterior']:.2f} m"],
         [f"1-NN {mean['nearest']:.2f} m", f"`knn` {mean['knn']:.2f} m", f"{mean['posterior']:.2f} m"],
         [f"nearest {coherence['nearest']}", f"Gaussian process {coherence['gaussian_process']}", channels],
+        *by_channels,
         [f"strongest peak {office['peak']}", f"network {office[MEASURED_NETWORK]}", room],
         [f"mean {tag['constant']}", f"network {tag[MEASURED_NETWORK]}", tag["synthetic"]],
     ]
     columns = ["question", "data, split", "simplest method", "best other method", "SwiftWRF"]
     return markdown(columns, [[*row, *three] for row, three in zip(rows, cells, strict=True)])
+
+
+def _by_channels(name: str) -> list[str]:
+    """Return the direction by the strongest peak, by the best other estimator, and by matched-field processing."""
+    (scene,) = load(name)["scenes"].values()
+    (found,) = (fraction["median"] for fraction in scene.values())
+    other, error = aoa_tables.best_other(found)
+    own = f"{found['angle_deg']['median']:.2f}° ({100 * found['position_m']['median']:.1f} cm)"
+    return [f"strongest peak {found['peak_angle_deg']['median']:.2f}°", f"{other} {error:.2f}°", own]
 
 
 def datasets() -> str:
