@@ -109,7 +109,7 @@ def room_section(fraction: FractionRecords) -> Section | None:
     rows = [
         [
             _described(plane),
-            f"{plane['gain']:+.2f}",
+            f"{plane['gain']:+.2f}" + " (dielectric)" * plane["dielectric"],
             number(plane["std_mm"], 1),
             "yes" if plane["certain"] else "no",
         ]
@@ -119,7 +119,8 @@ def room_section(fraction: FractionRecords) -> Section | None:
         f"Mirror planes, also in `geometry-mix{fraction.key}.json`; images up to order {room['order']}. The room explains "
         f"{1 - room['unexplained']:.0%} of the power of the spectra. Its spectra have a correlation of "
         f"{1 - room['score_held_out']:.3f} with measured ones that the first stage of the search did not use. Not "
-        "identifiable: another place explains the spectra nearly as well, or held-out spectra hardly need the plane."
+        "identifiable: another place explains the spectra nearly as well, or held-out spectra hardly need the plane. The "
+        "gain of a dielectric is that at normal incidence."
     )
     table = Table(["plane", "gain", "standard deviation [mm]", "identifiable"], rows, caption)
     points = fraction.arrays("room")
