@@ -138,6 +138,11 @@ def comparison() -> str:
     return scores(_by_scene(load("comparison")["rows"], label) | {"paper, other spectra of s23": paper}, {})
 
 
+def with_channels() -> str:
+    """Return the scores of models of paths that were fitted to spectra, and to channels."""
+    return scores(_by_scene(load("with_channels")["rows"], lambda row: str(row["scene"])), {})
+
+
 def _at_paper_scale(split: str) -> dict[str, dict[str, Row]]:
     rows = [row for row in load("paper_scale")["rows"] if row["split"] == split]
     return _by_scene(rows, lambda row: str(row["scene"]))

@@ -3,6 +3,7 @@
 python benchmarks/fields.py STUDY --data DATA
 
 coverage: intervals of `swiftwrf` on measured scenes and in the built-in room, all training spectra measured.
+with_channels: `geometry` and `hybrid` by spectra, and by channels at the carrier, 30 % of the training positions measured.
 raytracing: `raytrace` beside other field models in the furnished rooms (extra: raytrace).
 comparison: the paper's methods on measured and built-in scenes, with few training spectra, and turbo learning.
 paper_scale: every method on six scenes of 6,000 positions at one height (extra: raytrace), and angle of arrival.
@@ -29,6 +30,7 @@ import tyro
 from record import CPU, ROOT, kept, load, options, provenance, write_result
 from torch import Tensor
 
+from augment import withhold
 from swiftwrf import AngularGrid, FieldModel, FitError, InputError, Spectra, SwiftWRF, make_model, simulated_room
 from swiftwrf import load_spectra as read
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
@@ -49,7 +51,7 @@ from tasks.page import figures
 from tasks.scenes import run as trace
 from tasks.workers import connected
 
-Study = Literal["coverage", "raytracing", "comparison", "paper_scale"]
+Study = Literal["coverage", "with_channels", "raytracing", "comparison", "paper_scale"]
 S23_ARRAY = PlanarArray.square(4, 915e6, spacing=0.16)  # the files of s23-200 do not describe it
 MEASURED = (("s23-200", "random"), ("s23-200", "block"), ("newrf-bedroom", "random"), ("newrf-office", "random"))
 MEAN = "mean"  # the mean training spectrum
@@ -330,6 +332,15 @@ def coverage(config: Config) -> Iterator[Scene]:
         yield Scene(name, split, data.split(split, config.seed), fits(config, ("swiftwrf",), data, split))
 
 
+def with_channels(config: Config) -> Iterator[Scene]:
+    """The ray-traced rooms: models of paths by spectra alone, and by the channels behind them."""
+    for name in ("newrf-conference", "newrf-bedroom", "newrf-office"):
+        for known, subcarriers in (("spectra", None), ("channels", 1)):
+            train, test = read((config.data or Path()) / name, subcarriers=subcarriers).split("random", config.seed)
+            part = withhold(train, 0.3, config.seed)[0], test
+            yield Scene(f"{name}, {known}", "random", part, [Fit(method) for method in ("geometry", "hybrid")])
+
+
 def raytracing(config: Config) -> Iterator[Scene]:
     """The furnished rooms, either end moving. No model receives the geometry of the room, which is traced again."""
     methods = (MEAN, "swiftwrf", "geometry", "hybrid", "raytrace")
@@ -459,6 +470,7 @@ def draw(rows: Sequence[Row]) -> None:
 
 STUDIES: dict[str, Callable[[Config], Iterator[Scene]]] = {
     "coverage": coverage,
+    "with_channels": with_channels,
     "raytracing": raytracing,
     "comparison": comparison,
     "paper_scale": paper_scale,
