@@ -48,9 +48,10 @@ OF_ROWS = ("columns", "filler", "coordinates", "scale", "y_down", "up")  # optio
 
 @options
 class AoaConfig(Options):
-    """Estimate angles of arrival with few measured spectra: turbo learning against its references and baselines.
+    """Estimate angles of arrival with few measured spectra, and report the errors.
 
-    Without --data the built-in simulated room is used. swiftwrf resume DIR.partial continues an interrupted run.
+    Turbo learning is compared with its references and baselines. Without --data the built-in simulated room is used.
+    swiftwrf resume DIR.partial continues an interrupted run.
 
     Example: swiftwrf aoa --mix 0.3 --data DIR --split block
     """
@@ -137,7 +138,7 @@ class AoaConfig(Options):
 
 @options
 class RssiTaskConfig(Options):
-    """Predict RSSI maps of receivers, and report the errors beside those of baselines.
+    """Predict RSSI maps of receivers, and report the errors.
 
     Without --data the built-in simulated floor is used. swiftwrf resume DIR.partial continues an interrupted run.
 
@@ -193,7 +194,7 @@ class RssiTaskConfig(Options):
 
 @options
 class LocateConfig(Options):
-    """Locate transmitters from RSSI, and report the errors beside those of baselines.
+    """Locate transmitters from RSSI, and report the errors.
 
     Without --data the built-in simulated floor is used. swiftwrf resume DIR.partial continues an interrupted run. Positions
     of new rows: swiftwrf predict.
@@ -271,7 +272,7 @@ class ReportConfig(Options):
 
 @options
 class InspectConfig(Options):
-    """Inspect measurements of any known format: counts, extents, neighbours, frames, calibration, suspicious columns.
+    """Inspect measurements: counts, extents, frames, calibration, suspicious columns.
 
     Example: swiftwrf inspect DIR
     """
@@ -287,7 +288,7 @@ class InspectConfig(Options):
 
 @options
 class ConvertConfig(Options):
-    """Convert measurements and RSSI maps: OUT is a directory in the toolkit's own layout, or a file.
+    """Convert measurements and RSSI maps to the toolkit's layout or to files.
 
     SOURCE is measurements of any known format (see docs/formats.md), the directory of a run of rssi or locate,
     or a saved RSSI model.
@@ -340,7 +341,9 @@ class ConvertConfig(Options):
 
 @options
 class UpdateConfig(Options):
-    """Update a fitted model with new measurements. Each is predicted before the model learns it, and tested for a change.
+    """Update a fitted model with new measurements, and detect changes.
+
+    Each measurement is predicted before the model learns it, and tested for a change.
 
     With --follow the measurements come one by one, a JSON object a line: {"position": [x, y, z], "rssi_dbm": {"NAME": -60}}
     or {"position": [x, y, z], "spectrum": [[...], ...]}; or rows of RSSI in a CSV table, which has a column a receiver. The
@@ -420,7 +423,7 @@ class ResumeConfig(Options):
 
 @options
 class ScenesConfig(Options):
-    """Trace ray paths in a furnished room or in a scene file of Mitsuba by Sionna RT (extra: raytrace).
+    """Trace ray paths in a room or a scene file by Sionna RT (extra: raytrace).
 
     The directory holds paths.npz, which --data of the tasks reads, and scene.svg, a plan of the room and the positions.
 
