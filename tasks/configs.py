@@ -291,7 +291,7 @@ class ConvertConfig(Options):
     """Convert measurements and RSSI maps to the toolkit's layout or to files.
 
     SOURCE is measurements of any known format (see docs/formats.md), the directory of a run of rssi or locate,
-    or a saved RSSI model.
+    or a saved RSSI model. OUT is a directory in that layout, or a file.
 
     Example: swiftwrf convert DIR converted --calibrate
 
