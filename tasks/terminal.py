@@ -28,7 +28,7 @@ if TYPE_CHECKING:  # which imports torch
 
 LOGGERS = ("swiftwrf", "augment", "tasks")  # whose messages --verbose shows
 PLAIN_WIDTH = 140  # characters of a table that is not shown on a terminal
-MAX_USABLE, MAX_REFERENCES = 4, 2  # rows of the short table
+MAX_USABLE, MAX_REFERENCES = 5, 2  # rows of the short table
 SPEED_PERIOD_S = 120  # over which the speed is averaged for the time left
 logger = logging.getLogger(__name__)
 
