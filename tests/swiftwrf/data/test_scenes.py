@@ -6,6 +6,7 @@ What needs Sionna RT is skipped where it, or LLVM, is missing.
 import cmath
 import json
 import math
+import re
 import sys
 from contextlib import nullcontext
 from dataclasses import replace
@@ -253,6 +254,10 @@ def write_scene(folder, material):
             ("--room", "{folder}/empty.xml", *OPTIONS[2:], "--fixed", 0, 0, 1, "--region", 0, 0, 0, 1, 1, 1),
             "not a scene",
         ),
+        (
+            ("--room", "{folder}/rectangle.xml", *OPTIONS[2:], "--fixed", 0, 0, 1, "--region", 0, 0, 0, 1, 1, 1),
+            "a scene of meshes",
+        ),
         (("--room", "{folder}/room.xml", *OPTIONS[2:], "--fixed", 0, 0, 9, "--region", 1, 1, 1, 2, 2, 2), "no path"),
     ],
 )
@@ -260,6 +265,8 @@ def test_what_only_sionna_knows_is_refused(ray_tracer, tmp_path, capsys, argumen
     write_scene(tmp_path, "concrete")
     (tmp_path / "junk.xml").write_text("junk")
     (tmp_path / "empty.xml").write_text("<scene/>")
+    room = (tmp_path / "room.xml").read_text()
+    (tmp_path / "rectangle.xml").write_text(re.sub("<shape.*</shape>", '<shape type="rectangle" id="floor"/>', room))
     before = sorted(tmp_path.iterdir())
     arguments = [str(a).replace("{folder}", str(tmp_path)) for a in arguments]
     assert run("scenes", *arguments, "--out", tmp_path / "out") == 2

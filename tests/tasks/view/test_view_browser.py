@@ -239,7 +239,7 @@ def test_page_of_a_locator(browser, chromium, serve, locate_run):
     plan = opened(browser, serve(locate_run), "map", "sentence")
 
     def point(x, y):
-        """Move the pointer, again until a page that is busy has noticed it, and return what it says of the place."""
+        """Move the pointer and return the text about its position. A busy page may need more than one move."""
         pointer(browser).move_to_element_with_offset(plan, x, y).perform()
         return said(browser, "here")
 
