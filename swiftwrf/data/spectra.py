@@ -336,10 +336,14 @@ def coarsening(shape: Sequence[int], max_azimuths: int, least_rows: int = 1) -> 
 
 @checked
 def check_training(train: Spectra, least: int = MIN_TRAINING) -> None:
-    """Refuse spectra that no model can be fitted to, or updated by with fewer as the least number.
+    """Refuse too few spectra, and values that are not finite.
+
+    Args:
+        train: Spectra that a model is fitted to or updated by.
+        least: Smallest number of spectra. Defaults to that of a fit, 10.
 
     Raises:
-        InputError: Fewer spectra than the least number, or a spectrum that is not finite.
+        InputError: Fewer spectra, or a spectrum that is not finite.
     """
     if len(train) < least:
         raise InputError(f"a fit needs at least {least} spectra, got {len(train)}")

@@ -222,19 +222,20 @@ class MatchedField(Configured, Saved):
 
         everything = torch.ones_like(fold, dtype=torch.bool)
         *parts, self._fit = parallel_map(fitted, [*(fold != number for number in range(FOLDS)), everything])
-        if self.n_snapshots:
-            *parts, self._fit = self._with_nearby(train.position, features, fold, [*parts, self._fit])
-        # of every spectrum, by the fit without its fold
-        self.residual = torch.empty(len(self._fit.features), *features.coarray.shape)
-        missing, held = torch.ones(len(train)), []
+        held = []  # rooms, waves and features of every spectrum, by the fit without its fold
         for number, part in enumerate(parts):
             waves = PathWaves.at(part.room, train.position[fold == number], self._frequency(part.room))
             held.append((part.room, waves, features.subset(fold == number)))
+        if self.n_snapshots:
+            *parts, self._fit = self._with_nearby(train.position, features, fold, held, [*parts, self._fit])
+        self.residual = torch.empty(len(self._fit.features), *features.coarray.shape)
+        missing = torch.ones(len(train))
+        for number, (part, (_, waves, observed)) in enumerate(zip(parts, held, strict=True)):
             for kind, predict in enumerate(part.features):
                 predicted, std = predict(waves)
-                self.residual[kind, fold == number] = (predicted - features.coarray[fold == number]) / std[:, None]
-            if features.channel is not None:
-                missing[fold == number] = 1 - coherence(features.channel[fold == number], waves.channel)
+                self.residual[kind, fold == number] = (predicted - observed.coarray) / std[:, None]
+            if observed.channel is not None:
+                missing[fold == number] = 1 - coherence(observed.channel, waves.channel)
         if self.n_snapshots:  # furniture is fitted more closely to the channels that determine it than to others
             variance = PathLikelihood.fit(held).log_variance
             *parts, self._fit = (replace(f, paths=PathLikelihood(f.room, variance)) for f in (*parts, self._fit))
@@ -252,7 +253,12 @@ class MatchedField(Configured, Saved):
         return self
 
     def _with_nearby(
-        self, position: Tensor, features: SpectrumFeatures, fold: Tensor, fits: list[_Fit]
+        self,
+        position: Tensor,
+        features: SpectrumFeatures,
+        fold: Tensor,
+        held: list[tuple[GeometryModel, PathWaves, SpectrumFeatures]],
+        fits: list[_Fit],
     ) -> Iterator[_Fit]:
         """Yield fits with the process of the difference of measured channels from their rooms.
 
@@ -260,6 +266,7 @@ class MatchedField(Configured, Saved):
             position: Positions of the channels (n, 3) [m].
             features: Their features.
             fold: Their folds (n,).
+            held: Room without each fold, its waves at the positions of the fold, and the features there.
             fits: Fits without each fold, and to all channels.
         """
 
@@ -269,8 +276,8 @@ class MatchedField(Configured, Saved):
             return features.coarray[rows] - torch.cat([channel_numbers(own, fit.room.array) for own in channels])
 
         held_out = torch.empty_like(features.coarray)
-        for number in range(FOLDS):
-            held_out[fold == number] = difference(fits[number], fold == number)
+        for number, (room, waves, observed) in enumerate(held):
+            held_out[fold == number] = observed.coarray - channel_numbers(waves.channel, room.array)
         kernel = choose_kernel(position, held_out[:, None], fold)
         for number, fit in enumerate(fits):
             kept = fold != number  # all channels for the last
@@ -477,6 +484,7 @@ class MatchedField(Configured, Saved):
         locator.grid = room.grid
         if is_channel:
             nearby = GaussianProcess.from_state(tensors, header, torch.float32, prefix=NEARBY)
+            expect(tensors, {f"{NEARBY}coefficient": (len(nearby.known), features)})
             locator._fit = _Fit(room, PathLikelihood(room, tensors["statistics"]), nearby=nearby)
         else:
             gains = PathGains.from_state(tensors, header, room)

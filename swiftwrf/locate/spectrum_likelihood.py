@@ -125,11 +125,8 @@ class CoarrayLikelihood:
 
     def screen(self, whitened: Tensor, std: Tensor) -> Screen:
         """Return the function from n observations to log-likelihoods (n, m), by whitened predictions (m, F) at m cells."""
-        squared, precision, volume = (
-            whitened.square().sum(dim=1),
-            std.square().reciprocal(),
-            whitened.shape[1] * std.log(),
-        )
+        squared, precision = whitened.square().sum(dim=1), std.square().reciprocal()
+        volume = whitened.shape[1] * std.log()
 
         def log_likelihood(observed: SpectrumFeatures) -> Tensor:
             target = observed.coarray @ self.distribution.whitening

@@ -243,8 +243,8 @@ def test_page_of_a_locator(browser, chromium, serve, locate_run):
         pointer(browser).move_to_element_with_offset(plan, x, y).perform()
         return said(browser, "here")
 
-    told = until(lambda: "dBm" in point(30, 20) and said(browser, "here"))
-    until(lambda: point(-120, 80) != told)
+    first = until(lambda: "dBm" in point(30, 20) and said(browser, "here"))
+    until(lambda: point(-120, 80) != first)
     for kind, sentence in (
         ("coverage", "% of the map"),
         ("best receiver", "highest prediction"),
