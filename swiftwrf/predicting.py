@@ -107,8 +107,8 @@ def _positions_of_spectra(locator: MatchedField, store: Store, known: Spectra | 
     found: list[Tensor] = []
     index = torch.arange(len(store)) if known is None else known.index
     batches: Iterable[Tensor] = (part for batch in store.batches() for part in batch.split(BATCH_ROWS))
-    if known is not None and known.channel is not None:
-        batches = known.channel.split(BATCH_ROWS) if locator.n_snapshots else batches
+    if locator.by_channels and known is not None and known.channel is not None:
+        batches = known.channel.split(BATCH_ROWS)
     posteriors: Iterable[Posterior] = map(locator.locate, batches)
     if track is not None:
         posteriors = _tracked(posteriors, index.double(), track)

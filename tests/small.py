@@ -104,7 +104,7 @@ def short_path_gains() -> Iterator[None]:
     priors = {"tight": replace(PRIORS["tight"], steps=15)}
     with (
         mock.patch("swiftwrf.models.geometry.path_gains.PRIORS", priors),
-        mock.patch("swiftwrf.locate.matched_field.PRIORS", priors),
+        mock.patch("swiftwrf.locate.likelihoods.PRIORS", priors),
     ):
         yield
 

@@ -18,7 +18,7 @@ from swiftwrf.data.coordinates import Floors
 from swiftwrf.errors import InputError
 from swiftwrf.plotting import MARK, Axes, Displayed, corners_of, plan
 from swiftwrf.positions import nearest
-from swiftwrf.runtime.checkpoint import Header
+from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.validation import checked
 
 PLAN_PIXELS = 80  # of a posterior in plan, along its longer side
@@ -26,6 +26,7 @@ JUMP = 1e-3  # prior probability of a displacement that does not depend on the d
 CHUNK = 2**22  # pairs of candidates whose distances are computed together
 MAX_KEPT_PAIRS = 4096**2  # pairs of shared candidates whose distances are kept from step to step
 MAX_PAIRS = 20_000**2  # pairs of candidates of two consecutive observations
+MAX_WEIGHT = 1e3  # of a likelihood in a file
 RIDGE = 1e-3  # of the weights: keeps those that the data do not determine near their start
 
 
@@ -280,8 +281,15 @@ def _geometric_median(point: Tensor, weight: Tensor, start: Tensor, smallest: fl
 
 
 def normalised(log_mass: Tensor) -> Tensor:
-    """Return logarithms of masses (n, m) shifted so that each row sums to mass 1."""
-    return log_mass - log_mass.logsumexp(dim=1, keepdim=True)
+    """Return logarithms of masses (n, m) shifted so that each row sums to mass 1.
+
+    Raises:
+        InputError: A row without a finite mass: likelihoods overflow.
+    """
+    total = log_mass.logsumexp(dim=1, keepdim=True)
+    if not bool(total.isfinite().all()):
+        raise InputError("no candidate position has a finite likelihood; the locator overflows, so fit it again")
+    return log_mass - total
 
 
 def pooled_weights(at_truth: Tensor, at_candidates: Tensor, log_volume: Tensor) -> Tensor:
@@ -335,12 +343,19 @@ def inflation(posterior: Posterior, truth: Tensor, level: float = 0.8, margin: f
     return float(ratio.quantile(min(level + margin, 1.0)))
 
 
-def read_inflation(header: Header) -> float:
-    """Return the inflation of the header of a saved locator; refuse a value that is not a number at least 0."""
-    value = header["inflation"]
-    if not (isinstance(value, int | float) and 0 <= value < math.inf):
-        raise InputError(f"inflation must be a number at least 0, got {value!r}")
-    return float(value)
+def read_pool(tensors: dict[str, Tensor], header: Header) -> tuple[Tensor, float]:
+    """Return the three weights and the inflation of a saved locator.
+
+    Raises:
+        InputError: Weights outside [0, 1000], or an inflation that is not a number at least 0.
+    """
+    expect(tensors, {"weight": (3,)})
+    weight, factor = tensors["weight"], header["inflation"]
+    if not 0 <= float(weight.min()) <= float(weight.max()) <= MAX_WEIGHT:
+        raise InputError(f"weight must be 0 to {MAX_WEIGHT:g}, got {weight.tolist()}")
+    if not (isinstance(factor, int | float) and 0 <= factor < math.inf):
+        raise InputError(f"inflation must be a number at least 0, got {factor!r}")
+    return weight, float(factor)
 
 
 def smoothed(posterior: Posterior, time: Tensor | None, speed_m_s: float) -> Posterior:

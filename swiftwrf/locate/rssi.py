@@ -16,7 +16,7 @@ from swiftwrf.data.powers import MAX_RSSI_DBM, MIN_RSSI_DBM, check_powers
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import FOLDS, Validation, folds
 from swiftwrf.errors import InputError, listed
-from swiftwrf.locate.posterior import Posterior, inflation, normalised, pooled_weights, read_inflation
+from swiftwrf.locate.posterior import Posterior, inflation, normalised, pooled_weights, read_pool
 from swiftwrf.locate.region import Region, outside_mass
 from swiftwrf.locate.rssi_likelihood import (
     METRICS,
@@ -264,7 +264,7 @@ class RssiLocator(Configured, Saved):
         locator.model = RssiModel.from_state(tensors, header)
         locator.receiver_names = locator.model.receiver_names
         n, r = len(tensors["known"]), len(locator.receiver_names)
-        expect(tensors, {"known": (n, 3), "fingerprint": (n, r), "scale_m": (3,), "weight": (3,)})
+        expect(tensors, {"known": (n, 3), "fingerprint": (n, r), "scale_m": (3,)})
         (common_db, scale, degrees), k, metric = header["values"], int(header["k"]), str(header["metric"])
         values = ValueLikelihood(float(common_db), float(scale), math.inf if degrees is None else float(degrees))
         if not 1 <= k <= n or metric not in METRICS:
@@ -281,6 +281,6 @@ class RssiLocator(Configured, Saved):
             FingerprintLikelihood(known, tensors["scale_m"], float(header["miss"])),
         )
         locator.cells = locator.region.cells(locator.config.n_cells)
-        locator.weight, locator.inflation = tensors["weight"], read_inflation(header)
+        locator.weight, locator.inflation = read_pool(tensors, header)
         locator._maps = maps_at(locator.model, locator.cells.position)
         return locator

@@ -31,7 +31,10 @@ N_ALIGNED = 3  # iterations of the phases of snapshots and the expected field
 SCALES = (0.1, 1.0, 10.0)  # of the variances of path gains and scattering at a position
 BOUNDS = (-10.0, 6.0)  # of the logarithms of variances: products of four of them stay within float32
 
+Likelihood = Callable[[PathWaves, SpectrumFeatures], Tensor]
+"""from waves at m candidates and m observations to log-likelihoods (m,), up to a constant of each observation"""
 Screen = Callable[[SpectrumFeatures], Tensor]
+"""from n observations to log-likelihoods (n, m) at m cells"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,22 +106,21 @@ def covariance(residual: Tensor, shrinkage: Tensor, degrees: float, floor: float
     return scale
 
 
+@dataclass(frozen=True, eq=False)
 class CoarrayLikelihood:
     """Student likelihood of the co-array numbers, with the covariance of held-out residuals.
 
     Args:
-        features: Predicted co-array numbers.
-        residual: Held-out residuals (n, F), predicted minus observed, over their relative standard deviations.
-        power: Mean square of the observed numbers.
+        predict: Predicted co-array numbers.
+        distribution: Distribution of predicted minus observed numbers over their relative standard deviations.
     """
 
-    def __init__(self, features: Features, residual: Tensor, power: float) -> None:
-        self.features = features
-        self.distribution = Student.fit(residual, floor=1e-6 * power)
+    predict: Features
+    distribution: Student
 
     def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
         """Return log-likelihoods (m,) of m observations at m candidates, up to a constant of each observation."""
-        predicted, std = self.features(waves)
+        predicted, std = self.predict(waves)
         away = (predicted - observed.coarray) @ self.distribution.whitening / std[:, None]
         density: Tensor = self.distribution.log_density(away.square().sum(dim=1)) - away.shape[1] * std.log()
         return density

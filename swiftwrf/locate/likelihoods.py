@@ -1,0 +1,382 @@
+"""The likelihoods that matched-field processing pools: those of spectra, and those of channels.
+
+Both kinds are fitted without each fold and to all data, screen the cells of a region, and evaluate candidates.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from swiftwrf.array.planar import LIGHT_SPEED, differences
+from swiftwrf.data.dataset import Numbers
+from swiftwrf.data.spectra import Spectra
+from swiftwrf.errors import InputError
+from swiftwrf.gp import GaussianProcess, choose_kernel
+from swiftwrf.locate.features import (
+    CARRIER,
+    Features,
+    PathWaves,
+    SpectrumFeatures,
+    channel_numbers,
+    channels_beside,
+    gain_features,
+    nearby_features,
+    nearby_numbers,
+    room_features,
+)
+from swiftwrf.locate.region import Cells, Region
+from swiftwrf.locate.spectrum_likelihood import (
+    ChannelLikelihood,
+    CoarrayLikelihood,
+    Likelihood,
+    PathLikelihood,
+    PhaseLikelihood,
+    Screen,
+    Student,
+)
+from swiftwrf.models.geometry import GeometryModel
+from swiftwrf.models.geometry.channels import coherence, ends
+from swiftwrf.models.geometry.fit import GeometryConfig, observe
+from swiftwrf.models.geometry.model import kept_snapshots
+from swiftwrf.models.geometry.path_gains import PRIORS, PathGains, choose_prior, fit_path_gains, kernel_of
+from swiftwrf.positions import to_tensor
+from swiftwrf.runtime.checkpoint import Header, expect
+from swiftwrf.runtime.threads import parallel_map
+
+CHANNEL_CELLS = 8  # times as many first cells for channels, which are not computed at each of them
+CHANNEL_PARTS = 4  # along each edge of a cell with paths of its own
+MIN_FLOOR = 1e-4  # of missing coherence, by rounding
+MIN_VARIANCE = 1e-6  # of the errors of co-array numbers, relative to their mean square
+BATCH_CANDIDATES = 2048  # whose waves are computed together: as many as a processor's cache holds
+BATCH_CELLS = 256  # the same with parts
+MAX_KEPT_NUMBERS = 2**25  # co-array numbers of channels at all cells: 134 MB
+MAX_LOG_VARIANCE = 30.0
+NEARBY, DEGREES = "nearby.", "degrees"  # prefix and name in a file
+
+
+@dataclass(frozen=True, eq=False)
+class Likelihoods(ABC):
+    """Likelihoods by one room, which a pool weighs.
+
+    Args:
+        room: Room whose paths they share.
+        frequency: Frequencies of the snapshots relative to the carrier, float64 (F,), one if all are at the carrier.
+    """
+
+    room: GeometryModel
+    frequency: Tensor
+
+    start: ClassVar[tuple[float, ...]]
+    """weights by which the calibration searches"""
+
+    @property
+    @abstractmethod
+    def parts(self) -> tuple[Likelihood, ...]:
+        """Likelihoods in the order of their weights."""
+
+    @classmethod
+    @abstractmethod
+    def fit(cls, train: Spectra, room: GeometryModel, fold: Tensor, seed: int) -> tuple[SpectrumFeatures, list[Self]]:
+        """Return the features of the data, and the likelihoods without each fold (n,) and, last, of all data."""
+
+    @abstractmethod
+    def features(self, data: Numbers | Spectra, seed: int) -> SpectrumFeatures:
+        """Return the features of what is located.
+
+        Raises:
+            InputError: Other measurements than those that the likelihoods were fitted to.
+        """
+
+    @abstractmethod
+    def screens(self, region: Region, count: int, most: int) -> tuple[Cells, list[Screen]]:
+        """Return about `count` cells of a region, or `most` of them, and likelihoods at all of them that choose some."""
+
+    @abstractmethod
+    def state(self) -> tuple[dict[str, Tensor], Header]:
+        """Return the fitted tensors by name, and plain values, without those of the room."""
+
+    @classmethod
+    @abstractmethod
+    def from_state(cls, room: GeometryModel, tensors: dict[str, Tensor], header: Header) -> Self:
+        """Return the likelihoods of a room that `state` describes."""
+
+    def __call__(self, position: Tensor, observed: SpectrumFeatures, weight: Tensor) -> Tensor:
+        """Return log-likelihoods (k, n, m) of n observations at candidates (n, m, 3) [m], 0 for those of weight 0."""
+        n, m, _ = position.shape
+        at, owner = position.reshape(-1, 3), torch.arange(n).repeat_interleave(m)
+        counted = list(zip(self.parts, weight.tolist(), strict=True))
+
+        def of_batch(rows: Tensor) -> Tensor:
+            waves, target = PathWaves.at(self.room, at[rows], self.frequency), observed.subset(owner[rows])
+            none = torch.zeros(len(rows))
+            return torch.stack([part(waves, target) if weight > 0 else none for part, weight in counted])
+
+        batches = torch.arange(n * m).split(BATCH_CANDIDATES // len(self.frequency))
+        return torch.cat(parallel_map(of_batch, batches), dim=1).reshape(len(counted), n, m)
+
+
+@dataclass(frozen=True, eq=False)
+class SpectrumLikelihoods(Likelihoods):
+    """Likelihoods of spectra.
+
+    They are those of co-array numbers by constant and by position-dependent path gains, and of element phases under
+    uncertain path gains.
+
+    Args:
+        gains: Position-dependent path gains.
+        coarray: Distributions of the errors of both predictions of co-array numbers.
+        phases: Likelihood of the element phases.
+    """
+
+    gains: PathGains
+    coarray: tuple[Student, Student]
+    phases: PhaseLikelihood
+
+    start = (0.05, 0.05, 0.3)
+
+    @property
+    def parts(self) -> tuple[Likelihood, ...]:
+        predictions = _by_gains(self.room, self.gains)
+        return *map(CoarrayLikelihood, predictions, self.coarray), self.phases
+
+    @classmethod
+    def fit(cls, train: Spectra, room: GeometryModel, fold: Tensor, seed: int) -> tuple[SpectrumFeatures, list[Self]]:
+        features = SpectrumFeatures.of(train.store.batches(), room.array, train.grid, seed)
+        scene, rows = observe(train, GeometryConfig(seed=seed))
+        prior = next(iter(PRIORS))
+        if room.planes:
+            room, prior, _ = choose_prior(room, scene, fold[rows])
+        kernel = kernel_of(scene.moving)
+
+        def fitted(kept: Tensor) -> tuple[GeometryModel, PathGains, PhaseLikelihood]:
+            phases = scene.subset(kept[rows].nonzero()[:, 0])
+            own = room.refined_on(phases)
+            likelihood = PhaseLikelihood.fit([(own, PathWaves.at(own, train.position[kept]), features.subset(kept))])
+            return own, fit_path_gains(own, phases, kernel, prior), likelihood
+
+        kept = _without_folds(fold)
+        fits = parallel_map(fitted, kept)
+        residual = torch.empty(2, *features.coarray.shape)
+        for number, (own, gains, _) in enumerate(fits[:-1]):
+            out = fold == number
+            waves, observed = PathWaves.at(own, train.position[out]), features.coarray[out]
+            residual[:, out] = torch.stack([predict(waves)[0] - observed for predict in _by_gains(own, gains)])
+        floor = MIN_VARIANCE * float(features.coarray.square().mean())
+        found = []
+        for rows, (own, gains, phases) in zip(kept, fits, strict=True):
+            constant, varying = (Student.fit(part[rows], floor) for part in residual)
+            found.append(cls(own, CARRIER, gains, (constant, varying), phases))
+        return features, found
+
+    def features(self, data: Numbers | Spectra, seed: int) -> SpectrumFeatures:
+        values, grid = data.spectrum if isinstance(data, Spectra) else data, self.room.grid
+        magnitude = to_tensor("spectra", values, torch.float32, (None, *grid.shape))
+        return SpectrumFeatures.of([magnitude], self.room.array, grid, seed)
+
+    def screens(self, region: Region, count: int, most: int) -> tuple[Cells, list[Screen]]:
+        cells = region.cells(min(max(count, 1), most))
+        # the mean of the path gains takes an eighth of the time of all their fields, and ranks cells nearly alike
+        predictions = _by_gains(self.room, self.gains.averaged())
+        likelihoods = [*map(CoarrayLikelihood, predictions, self.coarray)]
+
+        def whitened(position: Tensor) -> list[Tensor]:
+            waves = PathWaves.at(self.room, position)
+            return [own.predict(waves)[0] @ own.distribution.whitening for own in likelihoods]
+
+        parts = zip(*parallel_map(whitened, cells.position.split(BATCH_CANDIDATES)), strict=True)
+        ones = torch.ones(len(cells.position))
+        return cells, [own.screen(torch.cat(part), ones) for own, part in zip(likelihoods, parts, strict=True)]
+
+    def state(self) -> tuple[dict[str, Tensor], Header]:
+        tensors, header = self.gains.state()
+        distributions, degrees = _state_of(self.coarray)
+        return tensors | {"statistics": self.phases.log_variance} | distributions, header | degrees
+
+    @classmethod
+    def from_state(cls, room: GeometryModel, tensors: dict[str, Tensor], header: Header) -> Self:
+        constant, varying = _distributions(room, tensors, header, 2)
+        phases = PhaseLikelihood(room, _log_variance(room, tensors))
+        return cls(room, CARRIER, PathGains.from_state(tensors, header, room), (constant, varying), phases)
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelLikelihoods(Likelihoods):
+    """Likelihoods of channels.
+
+    They are those of channels under uncertain path gains, of co-array numbers by constant path gains and measured channels
+    nearby, and of channels by constant path gains.
+
+    Args:
+        n_snapshots: Number of snapshots of each measurement.
+        paths: Likelihood under uncertain path gains.
+        process: Process of the differences of measured co-array numbers from those of the room.
+        nearby: Distribution of the errors of the co-array numbers by room and process.
+        fields: Likelihood by constant path gains.
+    """
+
+    n_snapshots: int
+    paths: PathLikelihood
+    process: GaussianProcess
+    nearby: Student
+    fields: ChannelLikelihood
+
+    start = (0.5, 0.05, 0.05)
+
+    @property
+    def parts(self) -> tuple[Likelihood, ...]:
+        return self.paths, self._coarray, self.fields
+
+    @property
+    def _coarray(self) -> CoarrayLikelihood:
+        return CoarrayLikelihood(nearby_features(self.room.array, self.process), self.nearby)
+
+    @classmethod
+    def fit(cls, train: Spectra, room: GeometryModel, fold: Tensor, seed: int) -> tuple[SpectrumFeatures, list[Self]]:
+        assert train.channel is not None
+        array, position, n_snapshots = room.array, train.position, train.channel.shape[1]
+        features = SpectrumFeatures.of_channels(train.channel, array)
+        scene, rows = observe(train, GeometryConfig(seed=seed))
+        frequency = CARRIER
+        if train.frequency_hz is not None:
+            frequency = train.frequency_hz[kept_snapshots(n_snapshots)] * array.wavelength / LIGHT_SPEED
+
+        def fitted(kept: Tensor) -> GeometryModel:
+            return room.refined_on(scene.subset(kept[rows].nonzero()[:, 0])).furnished_on(train.subset(kept))
+
+        kept = _without_folds(fold)
+        rooms = parallel_map(fitted, kept)
+        outs = [fold == number for number in range(len(rooms) - 1)]
+        # every channel, by the room without its fold
+        held = [
+            (own, PathWaves.at(own, position[out], frequency), features.subset(out))
+            for own, out in zip(rooms, outs, strict=False)
+        ]
+        missing, error = torch.empty(len(train)), torch.empty_like(features.coarray)
+        for out, (_, waves, observed) in zip(outs, held, strict=True):
+            assert observed.channel is not None
+            missing[out] = 1 - coherence(observed.channel, waves.channel)
+            error[out] = observed.coarray - channel_numbers(waves.channel, array)
+        fields = ChannelLikelihood(max(float(missing.median()), MIN_FLOOR))
+        # furniture is fitted more closely to the channels that determine it than to others
+        variance = PathLikelihood.fit(held).log_variance
+        kernel = choose_kernel(position, error[:, None], fold)
+
+        def process(own: GeometryModel, rows: Tensor) -> GaussianProcess:
+            channels = (PathWaves.at(own, at, frequency).channel for at in position[rows].split(BATCH_CANDIDATES))
+            predicted = torch.cat([channel_numbers(channel, array) for channel in channels])
+            difference = features.coarray[rows] - predicted
+            return GaussianProcess.regress(kernel, position[rows], difference, dtype=torch.float32)
+
+        processes = [*map(process, rooms, kept)]
+        residual = torch.empty_like(features.coarray)
+        for nearby, out, (_, waves, observed) in zip(processes, outs, held, strict=False):
+            numbers, std = nearby_numbers(waves.channel, waves.position, array, nearby)
+            residual[out] = (numbers - observed.coarray) / std[:, None]
+        floor = MIN_VARIANCE * float(features.coarray.square().mean())
+        return features, [
+            cls(
+                own,
+                frequency,
+                n_snapshots,
+                PathLikelihood(own, variance),
+                nearby,
+                Student.fit(residual[rows], floor),
+                fields,
+            )
+            for own, nearby, rows in zip(rooms, processes, kept, strict=True)
+        ]
+
+    def features(self, data: Numbers | Spectra, seed: int) -> SpectrumFeatures:
+        channel = data.channel if isinstance(data, Spectra) else data
+        if channel is None or not torch.as_tensor(channel).is_complex():
+            raise InputError(
+                "this locator was fitted to channels; give channels, complex (n, S, K), in place of spectra"
+            )
+        shape = None, self.n_snapshots, len(self.room.array.element)
+        return SpectrumFeatures.of_channels(to_tensor("channel", channel, torch.complex64, shape), self.room.array)
+
+    def screens(self, region: Region, count: int, most: int) -> tuple[Cells, list[Screen]]:
+        parts = CHANNEL_PARTS ** len(region.extent)
+        whole = region.cells(int(max(min(count, CHANNEL_CELLS * most) / parts, 1)))
+        cells, away = whole.cut(CHANNEL_PARTS), whole.centres(CHANNEL_PARTS)
+        frequency = self.frequency[ends(len(self.frequency))]
+
+        def predicted(position: Tensor) -> Tensor:
+            return channels_beside(self.room, position, away, frequency).movedim(1, 0).contiguous()
+
+        channels = parallel_map(predicted, whole.position.split(BATCH_CELLS))
+        screens = [self.fields.screen(channels)]
+        if len(cells.position) * len(self.nearby.scale) <= MAX_KEPT_NUMBERS:
+
+            def corrected(at: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+                channel, position = at
+                numbers, std = nearby_numbers(channel.movedim(0, 1), position, self.room.array, self.process)
+                return numbers @ self.nearby.whitening, std
+
+            some = [part for channel in channels for part in channel.split(BATCH_CANDIDATES, dim=1)]
+            positions = cells.position.split([part.shape[1] for part in some])
+            numbers, std = zip(*parallel_map(corrected, zip(some, positions, strict=True)), strict=True)
+            screens.append(self._coarray.screen(torch.cat(numbers), torch.cat(std)))
+        return cells, screens
+
+    def state(self) -> tuple[dict[str, Tensor], Header]:
+        tensors, header = self.process.state(NEARBY)
+        distributions, degrees = _state_of([self.nearby])
+        own = {"statistics": self.paths.log_variance, "frequency": self.frequency}
+        plain = {"n_snapshots": self.n_snapshots, "floor": self.fields.floor}
+        return tensors | own | distributions, header | degrees | plain
+
+    @classmethod
+    def from_state(cls, room: GeometryModel, tensors: dict[str, Tensor], header: Header) -> Self:
+        (nearby,) = _distributions(room, tensors, header, 1)
+        process = GaussianProcess.from_state(tensors, header, torch.float32, prefix=NEARBY)
+        expect(tensors, {f"{NEARBY}coefficient": (len(process.known), len(nearby.scale))})
+        n_snapshots, floor, frequency = (
+            int(header["n_snapshots"]),
+            float(header["floor"]),
+            tensors["frequency"].double(),
+        )
+        counts = {1, len(kept_snapshots(n_snapshots))}
+        if not floor > 0 or frequency.dim() != 1 or len(frequency) not in counts or bool((frequency <= 0).any()):
+            raise InputError("frequencies and missing coherence are not those of a fitted locator")
+        paths = PathLikelihood(room, _log_variance(room, tensors))
+        return cls(room, frequency, n_snapshots, paths, process, nearby, ChannelLikelihood(floor))
+
+
+def _without_folds(fold: Tensor) -> list[Tensor]:
+    """Return the rows of all but each fold, bool (n,), and last all rows."""
+    return [*(fold != number for number in range(int(fold.max()) + 1)), torch.ones_like(fold, dtype=torch.bool)]
+
+
+def _by_gains(room: GeometryModel, gains: PathGains) -> tuple[Features, Features]:
+    """Return the co-array numbers by constant and by position-dependent path gains."""
+    return room_features(room.array), gain_features(room.array, gains)
+
+
+def _state_of(distributions: Sequence[Student]) -> tuple[dict[str, Tensor], Header]:
+    degrees = [None if math.isinf(own.degrees) else own.degrees for own in distributions]
+    return {"scale": torch.stack([own.scale for own in distributions])}, {DEGREES: degrees}
+
+
+def _distributions(room: GeometryModel, tensors: dict[str, Tensor], header: Header, count: int) -> list[Student]:
+    size = 2 * len(differences(room.array))
+    expect(tensors, {"scale": (count, size, size)})
+    degrees = [math.inf if value is None else float(value) for value in header[DEGREES]]
+    scales = tensors["scale"].double()
+    if len(degrees) != count or not min(degrees) > 0 or bool(torch.linalg.cholesky_ex(scales).info.any()):
+        raise InputError("scales or degrees of freedom are those of no distribution")
+    return [Student(scale, own) for scale, own in zip(scales, degrees, strict=True)]
+
+
+def _log_variance(room: GeometryModel, tensors: dict[str, Tensor]) -> Tensor:
+    expect(tensors, {"statistics": (4 + room.reflectors.gain.shape[1],)})
+    if bool((tensors["statistics"].abs() > MAX_LOG_VARIANCE).any()):
+        raise InputError("variances are not those of a fitted locator")
+    return tensors["statistics"]
