@@ -107,7 +107,7 @@ class MatchedField(Configured, Saved):
 
     @property
     def by_channels(self) -> bool:
-        """Whether the locator was fitted to channels, and locates by these."""
+        """True if the locator was fitted to channels, and locates by these."""
         self.check_fitted()
         return isinstance(self.likelihoods, ChannelLikelihoods)
 
