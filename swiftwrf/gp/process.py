@@ -222,13 +222,13 @@ class GaussianProcess:
         """Return the posterior mean at positions (m, 3) as a linear function of the values.
 
         Returns:
-            Row numbers (r,) of the values that count, and their weights, float64 (m, r).
+            Row numbers (m, k) of the values that count at each position, and their weights, float64 (m, k).
         """
         if self.is_exact:
             weight = torch.cholesky_solve(self._cross(position).T, self._factor).T
-            return torch.arange(len(self.known)), weight
+            return torch.arange(len(self.known)).expand_as(weight), weight
         number, weight, _ = self._local(position)
-        return dense_weights(number, weight)
+        return number, weight
 
     def variance(self, position: Tensor) -> Tensor:
         """Return the posterior variance, without noise, at positions (m, 3), relative to k(0) = 1, float64 (m,)."""

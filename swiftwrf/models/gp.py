@@ -68,9 +68,14 @@ class GPModel(ProcessModel, MemoryModel):
         self._set_process(self.process)
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
-        rows, weight = self.process.weights(position)
-        change = (self.store[rows] - self._mean).flatten(1) if self._change is None else self._change
-        mean = self._mean + (weight.float() @ change).reshape(-1, *grid.shape)
+        number, weight = self.process.weights(position)
+        weight = weight.float()
+        if self._change is None:  # each position has few spectra of its own
+            mean = torch.empty(len(position), *grid.shape)
+            for row, (near, own) in enumerate(zip(number, weight, strict=True)):
+                mean[row] = torch.tensordot(own, self.store[near], dims=1) + (1 - own.sum()) * self._mean
+        else:
+            mean = self._mean + (weight @ self._change).reshape(-1, *grid.shape)
         return mean, self._std(position, grid) if with_std else None
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
