@@ -62,6 +62,17 @@ class InputError(ValueError):
         super().__init__(one_line(str(message)))
 
 
+class NotFitted(InputError, AttributeError):
+    """An attribute that `fit` sets is asked of a model that is not fitted.
+
+    Example:
+        >>> import swiftwrf
+        >>> swiftwrf.make_model("geometry").planes
+        Traceback (most recent call last):
+        swiftwrf.errors.NotFitted: this GeometryModel is not fitted; call fit first
+    """
+
+
 class FitError(RuntimeError):
     """A fit that cannot go on. The last good state remains on disk if a checkpoint path was given.
 

@@ -97,7 +97,6 @@ class MatchedField(Configured, Saved):
     @property
     def room(self) -> GeometryModel:
         """Room whose paths the likelihoods use."""
-        self.check_fitted()
         return self.likelihoods.room
 
     @property
@@ -108,7 +107,6 @@ class MatchedField(Configured, Saved):
     @property
     def by_channels(self) -> bool:
         """True if the locator was fitted to channels, and locates by these."""
-        self.check_fitted()
         return isinstance(self.likelihoods, ChannelLikelihoods)
 
     @all_or_nothing

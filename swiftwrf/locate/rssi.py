@@ -90,6 +90,11 @@ class RssiLocator(Configured, Saved):
     fitted_attribute = "_maps"
     config: RssiLocatorConfig
 
+    model: RssiModel
+    """radio maps of the receivers, set by `fit`"""
+    receiver_names: tuple[str, ...]
+    """names of the receivers, set by `fit`"""
+
     @all_or_nothing
     @checked
     def fit(
@@ -194,7 +199,6 @@ class RssiLocator(Configured, Saved):
             InputError: Another number of receivers, infinite values, a row that no receiver detected, or a locator that is
                 not fitted.
         """
-        self.check_fitted()
         rssi = to_tensor("rssi", rssi, torch.float64, (None, len(self.receiver_names)), missing=True)
         check_powers("rssi", rssi.numpy(), self.receiver_names, np.arange(len(rssi))[:, None])
         silent = rssi.isnan().all(dim=1).nonzero()[:, 0]
@@ -218,7 +222,6 @@ class RssiLocator(Configured, Saved):
         Returns:
             RSSI (n, m, R) [dBm], NaN if not detected. A row whose packets are all lost keeps its strongest value.
         """
-        self.check_fitted()
         mean, std = (values.double() for values in maps_at(self.model, position))
         error = self.likelihoods.values.sample(std.expand(n, -1, -1), generator)
         rssi = (mean + error).clamp(MIN_RSSI_DBM, MAX_RSSI_DBM)
@@ -235,7 +238,6 @@ class RssiLocator(Configured, Saved):
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         """Return the fitted tensors by name, and plain values."""
-        self.check_fitted()
         tensors, header = self.model.state()
         values, likelihood = self.likelihoods.values, self.likelihoods.fingerprints
         known = likelihood.fingerprints
@@ -269,15 +271,19 @@ class RssiLocator(Configured, Saved):
         values = ValueLikelihood(float(common_db), float(scale), math.inf if degrees is None else float(degrees))
         if not 1 <= k <= n or metric not in METRICS:
             raise InputError(f"k must be 1 to the number of rows, the metric {listed(METRICS)}; got {k} and {metric!r}")
-        positive = values.common_db >= 0 and min(values.scale, values.degrees) > 0
-        if not (positive and bool((tensors["scale_m"] > 0).all()) and 0 < float(header["miss"]) < 1):
+        detections = DetectionLikelihood(
+            *(float(header["detections"][name]) for name in ("threshold", "width", "loss"))
+        )
+        positive = values.common_db >= 0 and min(values.scale, values.degrees, detections.width) > 0
+        fractions = 0 < float(header["miss"]) < 1 and 0 <= detections.loss < 1
+        if not (positive and fractions and bool((tensors["scale_m"] > 0).all())):
             raise InputError("scales, degrees of freedom or a probability are those of no distribution")
         locator.region = Region.from_state(tensors, header)
         rssi = tensors["fingerprint"].where(tensors["fingerprint"] > UNDETECTED_DBM, torch.nan)
         known = Fingerprints(tensors["known"], rssi, locator.region.floors, metric, k)
         locator.likelihoods = RssiLikelihoods(
             values,
-            DetectionLikelihood(**header["detections"]),
+            detections,
             FingerprintLikelihood(known, tensors["scale_m"], float(header["miss"])),
         )
         locator.cells = locator.region.cells(locator.config.n_cells)

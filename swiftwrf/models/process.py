@@ -47,7 +47,6 @@ class ProcessModel(FieldModel):
 
     def expected_error(self, position: Tensor) -> Tensor:
         """Return the expected error at positions (n, 3) [m] relative to that far from all training positions, (n,)."""
-        self.check_fitted()
         return (self.process.variance(self._process_position(position)) + self.process.kernel.noise).sqrt()
 
     def region(self) -> Tensor:
@@ -56,7 +55,6 @@ class ProcessModel(FieldModel):
     @property
     def kernel(self) -> Kernel:
         """Kernel of the process, lengths in [m]."""
-        self.check_fitted()
         return self.process.kernel
 
     def with_chosen_kernel(self, without: Tensor | None = None) -> Self:

@@ -163,7 +163,6 @@ class SwiftWRF(ProcessModel):
 
     def primitives(self, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return mean, cholesky and weight at positions (n, 3) [m], the arguments of `swiftwrf.rasterize`."""
-        self.check_fitted()
         real = self.weight[0] + self.process.mean(self._process_position(position)).float() @ self.weight[1:]
         return self.mean.expand(len(real), -1, -1), self.cholesky, torch.stack([real, torch.zeros_like(real)], dim=-1)
 

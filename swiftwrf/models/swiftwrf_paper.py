@@ -121,7 +121,6 @@ class SwiftWRFPaper(FieldModel):
 
     def primitives(self, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return mean, cholesky and weight at positions (n, 3) [m], the arguments of `swiftwrf.rasterize`."""
-        self.check_fitted()
         found: tuple[Tensor, Tensor, Tensor] = self.field(self.field.normalise(position.to(self.device)))
         return found
 

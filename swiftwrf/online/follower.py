@@ -242,8 +242,8 @@ class Follower:
         false_alarm_rate: False alarms a measurement, over all regions and receivers together.
 
     Raises:
-        InputError: A model without `update`, training spectra of another link than that of the model, or a rate outside
-            (0, 1).
+        InputError: A model that is not fitted or without `update`, training spectra of another link than that of the model,
+            or a rate outside (0, 1).
 
     Example:
         >>> import swiftwrf
@@ -262,6 +262,7 @@ class Follower:
         train: Spectra | Rssi | None = None,
         false_alarm_rate: FalseAlarmRate = 1e-4,
     ) -> None:
+        model.check_fitted()
         self.model, self.count = model, 0
         self.monitor = Monitor.of(model, train, false_alarm_rate)
         self._unjudged: list[tuple[Spectra | Rssi, Scores]] = []  # measurements since the last choice of the kernel

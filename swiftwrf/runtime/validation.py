@@ -17,6 +17,7 @@ from copy import copy
 from dataclasses import dataclass, fields, is_dataclass, replace
 from numbers import Integral, Real
 from typing import (
+    TYPE_CHECKING,
     Annotated,
     Any,
     ClassVar,
@@ -31,7 +32,7 @@ from typing import (
 
 from annotated_types import Ge, Gt, Le, Lt
 
-from swiftwrf.errors import InputError
+from swiftwrf.errors import InputError, NotFitted
 
 NonNegativeInt = Annotated[int, Ge(0)]
 PositiveInt = Annotated[int, Ge(1)]
@@ -232,12 +233,25 @@ class Configured:
     @property
     def is_fitted(self) -> bool:
         """True after `fit`, and for a model that was loaded."""
-        return hasattr(self, self.fitted_attribute)
+        return self.fitted_attribute in vars(self)
 
     def check_fitted(self) -> None:
-        """Raise InputError if the model is not fitted."""
+        """Refuse a model that is not fitted.
+
+        Raises:
+            NotFitted: It is not.
+        """
         if not self.is_fitted:
-            raise InputError(f"this {type(self).__name__} is not fitted; call fit first")
+            raise NotFitted(f"this {type(self).__name__} is not fitted; call fit first")
+
+    if not TYPE_CHECKING:  # for which any name would be an attribute
+
+        def __getattr__(self, name: str) -> Any:
+            """Refuse an attribute that the class declares and `fit` sets."""
+            declared = (vars(kind) | getattr(kind, "__annotations__", {}) for kind in type(self).__mro__)
+            if any(name in own for own in declared):
+                self.check_fitted()
+            return self.__getattribute__(name)  # raises the usual error
 
     @classmethod
     def supported(cls, options: Mapping[str, Any]) -> dict[str, Any]:

@@ -115,6 +115,7 @@ def damages(file: Path, kind: str) -> Iterator[tuple[str, Callable[[], object]]]
         for name, tensor in tensors.items():
             others = {"deeper": tensor[None], "flat": tensor.ravel()[None, :3]}
             others |= {"shorter": tensor[:-1], "narrower": tensor[..., :-1]} if tensor.ndim else {}
+            others = {how: other for how, other in others.items() if other.shape != tensor.shape}  # (1, 1) is flat
             others |= {"nan": tensor * torch.nan} if tensor.is_floating_point() else {}
             for how, other in others.items():
                 yield f"tensor {name} {how}", partial(write, file, kind, tensors | {name: other}, header)

@@ -5,7 +5,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
@@ -20,7 +20,9 @@ from samples import install
 import swiftwrf
 from augment import Mixed
 from augment.estimators.kernel_regression import KernelRegression
-from swiftwrf import AngularGrid, FieldModel, InputError, Spectra, load, make_model
+from swiftwrf import AngularGrid, FieldModel, InputError, RssiModel, Spectra, load, make_model
+from swiftwrf.errors import NotFitted
+from swiftwrf.locate import MatchedField, RssiLocator
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.base import ARRAY, FIXED_END
 from swiftwrf.models.base import model_type as model_type_of
@@ -311,3 +313,15 @@ def test_numbers_of_numpy_are_numbers():
 def test_intervals_of_any_level_below_1_are_finite():
     low, high = swiftwrf.Prediction(torch.zeros(1), torch.ones(1)).interval(0.9999999999999999)
     assert 8 < float(high) == -float(low) < 9
+
+
+@pytest.mark.parametrize("model", [*FIELD_MODELS.values(), RssiModel, RssiLocator, MatchedField])
+def test_what_a_fit_determines_is_refused_before_it(model):
+    unfitted = model()
+    properties = {name for kind in model.__mro__ for name, own in vars(kind).items() if isinstance(own, property)}
+    for name in properties - {"is_fitted"}:
+        with suppress(NotFitted):  # a property that no fit determines has a value
+            getattr(unfitted, name)
+    assert not hasattr(unfitted, model.fitted_attribute)
+    with pytest.raises(AttributeError, match="no attribute 'predcit'"):
+        unfitted.predcit  # noqa: B018
