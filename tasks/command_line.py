@@ -48,7 +48,12 @@ def command_line(
     except FitError as error:
         return _report(str(error), 1)
     except OSError as error:
-        return _report(_no_access(error), 2)
+        file = error.filename2 or error.filename or "the run's files"
+        if error.errno in DISK_FULL:
+            go_on = "free space and run the same command again, or resume what was stopped"
+            return _report(f"no space left to write {file}; {go_on}", 2)
+        reason = "no permission" if isinstance(error, PermissionError) else error.strerror or str(error)
+        return _report(f"cannot read or write {file} ({reason}); choose another path", 2)
     except MemoryError as error:
         return _report(f"not enough memory ({error}); use less data or a smaller model", 2)
     except KeyboardInterrupt:
@@ -72,14 +77,6 @@ def without_reader() -> int:
 def _report(sentence: str, code: int) -> int:
     print(f"error: {one_line(sentence)}", file=sys.stderr)
     return code
-
-
-def _no_access(error: OSError) -> str:
-    file = error.filename2 or error.filename or "the run's files"
-    if error.errno in DISK_FULL:
-        return f"no space left to write {file}; free space and run the same command again, or resume what was stopped"
-    reason = "no permission" if isinstance(error, PermissionError) else error.strerror or str(error)
-    return f"cannot read or write {file} ({reason}); choose another path"
 
 
 def execute(program: str, config_type: type[Config], task: Callable[[Config], None], arguments: Sequence[str]) -> None:

@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from swiftwrf import InputError
+from swiftwrf.runtime.checkpoint import refusing
 from swiftwrf.runtime.durable import strict, write_json
 from tasks.aoa.experiment import record as aoa_record
 from tasks.aoa.page import page as aoa
@@ -78,15 +79,6 @@ def merge(folders: list[Path], out: Path) -> None:
         raise InputError(
             f"a report takes finished runs of one task ({' or '.join(PAGES)}), got {', '.join(tasks) or 'no runs'}"
         )
-    try:
-        with new_directory(out, "a report") as unfinished:
-            write_page(unfinished, PAGES[tasks[0]](runs))
-    except InputError:
-        raise
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        # the records are files that anybody may have changed, and the page uses all of them
-        names = ", ".join(os.fspath(run.folder) for run in runs)
-        raise InputError(
-            f"the records in {names} do not hold what a report shows ({type(error).__name__}: {error}); they were changed "
-            "or written by another version"
-        ) from error
+    names = ", ".join(os.fspath(run.folder) for run in runs)
+    with new_directory(out, "a report") as unfinished, refusing(f"{names} does not hold what a report shows"):
+        write_page(unfinished, PAGES[tasks[0]](runs))

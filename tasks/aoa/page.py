@@ -14,11 +14,24 @@ from tasks.aoa.room import choice_section, located_plan, locating_section, room_
 from tasks.aoa.synthesis import examples, examples_plot, spectra
 from tasks.environment import command
 from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of
-from tasks.page.shared import again, compared, errors_section, fingerprinting, next_steps, suggestion_section, worth
+from tasks.page.shared import again, compared, errors_section, limits, next_steps, suggestion_section, worth
 from tasks.records import Records, notes
 from tasks.terminal import Answer, Method, NextStep
 
 BASELINES = ("peak", "constant")  # others must beat them
+LIMITS = (
+    "The test positions lie in the region and time of one measurement campaign. They do not predict errors in another room, "
+    "after furniture moved, or with another array.",
+    "The label is the geometric direction of the transmitter, computed from positions. If the direct path is blocked, the "
+    "spectrum may not contain it.",
+    "Intervals treat test spectra as independent draws. Along a measured path they are not, so on such data the intervals "
+    "are too narrow.",
+)
+MAX_SPREAD = 0.5  # of the labels about their mean, relative to the error of the peaks, where paths are fingerprints
+LOOK_UP = (
+    "A random split of positions along a path tests look-up more than prediction: each test position has a training "
+    "position beside it. Use --split block for positions in a region without measurements."
+)
 
 
 def page(runs: list[Records]) -> Page:
@@ -28,7 +41,7 @@ def page(runs: list[Records]) -> Page:
         sections_of("Errors", fractions, _errors, _terms()),
         sections_of("Where was it?", fractions, lambda one: _parts(locating_section(one), room_section(one))),
         sections_of("Spectra", fractions, lambda fraction: Section("", plots=[examples_plot(fraction)])),
-        _limits(runs[0]),
+        limits(runs[0], *LIMITS, *([LOOK_UP] if runs[0].metrics["split"] == "random" else [])),
     ]
     more = sections_of(
         "Measure or synthesize more?", fractions, lambda one: _parts(choice_section(one), _suggestion_section(one))
@@ -128,27 +141,6 @@ def _suggestion_section(fraction: FractionRecords) -> Section | None:
     )
 
 
-def _limits(run: Records) -> Section:
-    texts = [
-        "The test positions lie in the region and time of one measurement campaign. They do not predict errors in "
-        "another room, after furniture moved, or with another array.",
-        "The label is the geometric direction of the transmitter, computed from positions. If the direct path is blocked, "
-        "the spectrum may not contain it.",
-        "Intervals treat test spectra as independent draws. Along a measured path they are not, so on such data the "
-        "intervals are too narrow.",
-    ]
-    if run.metrics["split"] == "random":
-        texts.append(
-            "A random split of positions along a path tests look-up more than prediction: each test position has a training "
-            "position beside it. Use --split block for positions in a region without measurements."
-        )
-    if run.metrics["data"] == "simulated-room":
-        texts.append(
-            "These spectra are simulated: image sources in an idealised room. They show that the software works, no more."
-        )
-    return Section("What this does not show", texts)
-
-
 def _terms() -> dict[str, str]:
     """Return what the parts of the names of methods mean."""
     return {
@@ -220,8 +212,11 @@ def conclusion(fraction: FractionRecords) -> list[str]:
     compared = comparison(fraction)
     if "peak" in medians and chosen != "peak":
         compared += f" The strongest peak, which needs no training, is within {medians['peak']:.2f} degrees."
-    if "peak" in medians and "constant" in medians:
-        compared += f" {fingerprinting(medians['constant'], medians['peak'])}"
+    if "constant" in medians and medians["constant"] < MAX_SPREAD * medians.get("peak", 0.0):
+        compared += (
+            " This is fingerprinting along a path rather than estimation of angles: directions lie within "
+            f"{medians['constant']:.1f} degrees of their mean (median), and peaks are {medians['peak']:.0f} degrees off."
+        )
     return [
         f"Directions are found within {error['median']:.2f} degrees{at} (median errors; 90 % of the directions within "
         f"{error['p90']:.1f} degrees), by `{chosen}`.",

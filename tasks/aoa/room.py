@@ -124,25 +124,29 @@ def room_section(fraction: FractionRecords) -> Section | None:
     )
     table = Table(["plane", "gain", "standard deviation [mm]", "identifiable"], rows, caption)
     points = fraction.arrays("room")
+    first = points["image"][points["order"] == 1]
+    places = {"measured": points["measured"], "fixed end": points["fixed"][None], "image of first order": first}
     figure, plan = _plan(room["planes"], points, 5.4, 4.2)
     plan.plot(*points["measured"][:, :2].T, "o", color=MEASURED, markersize=2, label="measured")
-    plan.plot(*points["image"][points["order"] == 1][:, :2].T, "D", color=IMAGE, markersize=4, label="its images")
+    plan.plot(*first[:, :2].T, "D", color=IMAGE, markersize=4, label="its images")
     figures.legend_below(plan)
     plot = Plot(
         f"room-{fraction.file_name}",
         [figure],
         "The planes in plan (dashed: uncertain), measured positions, the fixed end and its images of first "
         "order. The images of a moving transmitter are those of the array that sees it.",
-        _places(points),
+        concat([DataFrame(at, columns=["x_m", "y_m", "z_m"]).assign(what=what) for what, at in places.items()]),
     )
     if "plan" not in points:
         return Section(title, [], [table], [plot])
+    z, y, x = np.meshgrid(points["height"][:-1], points["plan_y"], points["plan_x"], indexing="ij")
+    columns = {"x_m": x, "y_m": y, "z_from_m": z, "absorption_db_per_m": points["plan"]}
     furniture = Plot(
         f"furniture-{fraction.file_name}",
         furniture_panels(room["planes"], points),
         "What stands in the room between three pairs of heights: the largest absorption of the amplitude. Hatched: unknown, "
         "because no measured path crosses it. Held-out channels need this furniture.",
-        _cells(points),
+        DataFrame({name: values.ravel().round(3) for name, values in columns.items()}),
     )
     return Section(title, [], [table], [plot, furniture])
 
@@ -160,18 +164,6 @@ def furniture_panels(planes: list[dict[str, Any]], points: dict[str, NDArray[Any
         figures.colour_bar(ax, drawn, "absorption [dB/m]")
         panels.append(figure)
     return panels
-
-
-def _cells(points: dict[str, NDArray[Any]]) -> DataFrame:
-    z, y, x = np.meshgrid(points["height"][:-1], points["plan_y"], points["plan_x"], indexing="ij")
-    columns = {"x_m": x, "y_m": y, "z_from_m": z, "absorption_db_per_m": points["plan"]}
-    return DataFrame({name: values.ravel().round(3) for name, values in columns.items()})
-
-
-def _places(points: dict[str, NDArray[Any]]) -> DataFrame:
-    first = points["image"][points["order"] == 1]
-    parts = {"measured": points["measured"], "fixed end": points["fixed"][None], "image of first order": first}
-    return concat([DataFrame(at, columns=["x_m", "y_m", "z_m"]).assign(what=what) for what, at in parts.items()])
 
 
 def _described(plane: dict[str, Any]) -> str:

@@ -28,7 +28,6 @@ MIN_REDUCTION = 0.1  # of the variance, below which more positions are not worth
 MAX_NUMBERED = 30  # suggestions with their rank beside them; more would hide each other
 MAX_COVERAGE_ERROR = 0.05  # difference from the nominal coverage below which intervals count as calibrated
 MIN_RELEVANT = 0.02  # difference of mean errors, relative to them, below which methods are equal in practice
-MAX_SPREAD = 0.5  # of labels about their mean direction, relative to the error of the peaks, for a warning
 NONE = (np.nan, np.nan, np.nan)
 
 
@@ -97,9 +96,9 @@ def by_method(errors: DataFrame) -> DataFrame:
 
 def limits(run: Records, *texts: str) -> Section:
     """Return the section on what a report does not show, with a sentence about simulated data."""
-    if run.metrics["data"] == "simulated-floor":
+    if run.metrics["data"].startswith("simulated-"):
         texts += (
-            "This floor is simulated. It shows that the software works, and not how accurate it is on measurements.",
+            "These data are simulated. They show that the software works, and not how accurate it is on measurements.",
         )
     return Section("What this does not show", list(texts))
 
@@ -277,21 +276,4 @@ def coverage_warning(name: str, coverage: float, nominal: float, n_test: int) ->
     size = "narrow" if coverage < nominal else "wide"
     return (
         f"The {100 * nominal:.0f} % {name} contain {100 * coverage:.0f} % of the test values: they are too {size} here."
-    )
-
-
-def fingerprinting(constant_deg: float, peak_deg: float) -> str:
-    """Return a warning if spectra are labels of positions rather than of directions, else nothing.
-
-    Median errors [deg] of the mean direction of the labels, which is their spread, and of the strongest direction decide.
-
-    Example:
-        >>> fingerprinting(26.0, 2.4)
-        ''
-    """
-    if not constant_deg < MAX_SPREAD * peak_deg:
-        return ""
-    return (
-        f"This is fingerprinting along a path rather than estimation of angles: directions lie within {constant_deg:.1f} "
-        f"degrees of their mean (median), and peaks are {peak_deg:.0f} degrees off."
     )

@@ -20,7 +20,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from swiftwrf import InputError
 from tasks.environment import command
 from tasks.page.maps import Corners
-from tasks.records import Row, rounded
+from tasks.records import rounded
 from tasks.update.record import FollowedView, Version, snapshot
 from tasks.view.charts import Data, Option, axis, circle, crosses, lines, paths, points
 from tasks.view.locating import Located
@@ -235,13 +235,11 @@ class FollowedPage:
         self._sentences.set_text("\n".join(record.sentences()) if record.rows else "no measurement yet")
         for name, box in self._figures.items():
             box.set_content(svg.get(name, ""))
-        self._table.rows = [_cells(row) for row in record.rows[: -LAST_ROWS - 1 : -1]]
+        self._table.rows = [
+            {key: row[key] if isinstance(row[key], int | str) else f"{row[key]:.4g}" for key in FOLLOWED_COLUMNS}
+            for row in rounded(record.rows[: -LAST_ROWS - 1 : -1])
+        ]
         self._table.update()
-
-
-def _cells(row: Row) -> Row:
-    row = rounded([row])[0]
-    return {key: row[key] if isinstance(row[key], int | str) else f"{row[key]:.4g}" for key in FOLLOWED_COLUMNS}
 
 
 def limited(app: ASGIApp) -> ASGIApp:

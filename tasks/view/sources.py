@@ -72,7 +72,11 @@ def open_source(source: Path) -> SpectraView | RssiView | FollowedView:
         case "aoa":
             return _aoa_run(source, content)
         case "rssi":
-            return _rssi_run(source)
+            model = _opened(source / MODEL, RssiModel)
+            with refusing(f"the maps in {source} are not those of a run"):
+                return RssiView(
+                    source.name, model, rows_of_run(source / "maps.npz", model.receiver_names), folder=source
+                )
         case "locate":
             return _locate_run(source, content)
         case "update":
@@ -168,9 +172,3 @@ def _locate_run(folder: Path, content: Row) -> RssiView:
 
 def _located(title: str, locating: RssiLocating, notes: Sequence[str] = (), folder: Path | None = None) -> RssiView:
     return RssiView(title, locating.locator.model, locating.rows, locating, list(notes), folder)
-
-
-def _rssi_run(folder: Path) -> RssiView:
-    model = _opened(folder / MODEL, RssiModel)
-    with refusing(f"the maps in {folder} are not those of a run"):
-        return RssiView(folder.name, model, rows_of_run(folder / "maps.npz", model.receiver_names), folder=folder)
