@@ -139,23 +139,17 @@ Features = Callable[[PathWaves], tuple[Tensor, Tensor]]
 """from waves of m positions to co-array numbers, float32 (m, F), and relative standard deviations of their errors, (m,)"""
 
 
-def room_features(array: PlanarArray) -> Features:
-    """Return co-array numbers by constant path gains, as a function of waves."""
+def gain_features(array: PlanarArray, gains: PathGains) -> tuple[Features, Features]:
+    """Return co-array numbers by constant and by position-dependent path gains, as functions of waves."""
 
-    def features(waves: PathWaves) -> tuple[Tensor, Tensor]:
+    def constant(waves: PathWaves) -> tuple[Tensor, Tensor]:
         return real_parts(autocorrelation(waves.channel[:, 0].sgn(), array)), torch.ones(len(waves.position))
 
-    return features
-
-
-def gain_features(array: PlanarArray, gains: PathGains) -> Features:
-    """Return co-array numbers by position-dependent path gains, as a function of waves."""
-
-    def features(waves: PathWaves) -> tuple[Tensor, Tensor]:
+    def varying(waves: PathWaves) -> tuple[Tensor, Tensor]:
         channel = (waves.gain[:, None] + gains.change(waves.position)) @ waves.wave[:, :, 0]
         return real_parts(autocorrelation(channel.sgn(), array).mean(dim=1)), torch.ones(len(waves.position))
 
-    return features
+    return constant, varying
 
 
 def nearby_features(array: PlanarArray, process: GaussianProcess) -> Features:

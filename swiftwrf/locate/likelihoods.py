@@ -21,7 +21,6 @@ from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, choose_kernel
 from swiftwrf.locate.features import (
     CARRIER,
-    Features,
     PathWaves,
     SpectrumFeatures,
     channel_numbers,
@@ -29,7 +28,6 @@ from swiftwrf.locate.features import (
     gain_features,
     nearby_features,
     nearby_numbers,
-    room_features,
 )
 from swiftwrf.locate.region import Cells, Region
 from swiftwrf.locate.spectrum_likelihood import (
@@ -143,7 +141,7 @@ class SpectrumLikelihoods(Likelihoods):
 
     @property
     def parts(self) -> tuple[Likelihood, ...]:
-        predictions = _by_gains(self.room, self.gains)
+        predictions = gain_features(self.room.array, self.gains)
         return *map(CoarrayLikelihood, predictions, self.coarray), self.phases
 
     @classmethod
@@ -167,7 +165,9 @@ class SpectrumLikelihoods(Likelihoods):
         for number, (own, gains, _) in enumerate(fits[:-1]):
             out = fold == number
             waves, observed = PathWaves.at(own, train.position[out]), features.coarray[out]
-            residual[:, out] = torch.stack([predict(waves)[0] - observed for predict in _by_gains(own, gains)])
+            residual[:, out] = torch.stack(
+                [predict(waves)[0] - observed for predict in gain_features(own.array, gains)]
+            )
         floor = MIN_VARIANCE * float(features.coarray.square().mean())
         found = []
         for rows, (own, gains, phases) in zip(kept, fits, strict=True):
@@ -183,7 +183,7 @@ class SpectrumLikelihoods(Likelihoods):
     def screens(self, region: Region, count: int, most: int) -> tuple[Cells, list[Screen]]:
         cells = region.cells(min(max(count, 1), most))
         # the mean of the path gains takes an eighth of the time of all their fields, and ranks cells nearly alike
-        predictions = _by_gains(self.room, self.gains.averaged())
+        predictions = gain_features(self.room.array, self.gains.averaged())
         likelihoods = [*map(CoarrayLikelihood, predictions, self.coarray)]
 
         def whitened(position: Tensor) -> list[Tensor]:
@@ -353,11 +353,6 @@ class ChannelLikelihoods(Likelihoods):
 def _without_folds(fold: Tensor) -> list[Tensor]:
     """Return the rows of all but each fold, bool (n,), and last all rows."""
     return [*(fold != number for number in range(int(fold.max()) + 1)), torch.ones_like(fold, dtype=torch.bool)]
-
-
-def _by_gains(room: GeometryModel, gains: PathGains) -> tuple[Features, Features]:
-    """Return the co-array numbers by constant and by position-dependent path gains."""
-    return room_features(room.array), gain_features(room.array, gains)
 
 
 def _state_of(distributions: Sequence[Student]) -> tuple[dict[str, Tensor], Header]:
