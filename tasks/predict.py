@@ -76,7 +76,7 @@ def run(config: PredictConfig) -> None:
     write_table(out, rounded(table.to_dict("records")))
     values: Row = {"n": len(table), "table": str(out)}
     values |= {f"median_{name}": float(table[name].median()) for name in MEDIANS if name in table}
-    errors = " and ".join(f"{values[f'median_{name}']:.2f} {MEDIANS[name]}" for name in MEDIANS if name in table)
+    errors = " and ".join(f"{values[f'median_{name}']:.3g} {MEDIANS[name]}" for name in MEDIANS if name in table)
     what = "positions" if "x_m" in table else "directions"
     said = f", median error {errors}, too low if these rows trained the model" if errors else ""
     terminal.page(values, f"{values['n']} {what}{said}: {out}")
