@@ -1,35 +1,32 @@
 """Runs as the page opens them, and sources that a model follows."""
 
 import csv
-import functools
 import io
 import json
 import math
 import random
 import sys
+from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 from unittest import mock
 
 import numpy as np
 import torch
 from PIL import Image
-from small import FLOOR
 
-from fuzz.misuse import MAX_RSSI_DB, check_plausible
+from fuzz.misuse import MAX_RSSI_DB, check_plausible, fitted, planes, rssi, rssi_model
 from fuzz.mutate import mutated
 from swiftwrf import (
     AngularGrid,
     FieldModel,
-    GeometryModel,
     InputError,
-    Rssi,
     RssiLocator,
     RssiModel,
     fit,
     load,
-    make_model,
     rssi_room,
     simulated_room,
 )
@@ -58,8 +55,8 @@ def run_of_locate(folder: Path) -> None:
 
 
 def run_of_rssi(folder: Path) -> None:
-    data = _rssi()
-    _rssi_model().save(folder / "model.safetensors")
+    data = rssi()
+    rssi_model().save(folder / "model.safetensors")
     write_json(folder / "config.json", {"task": "rssi", "config": {}})
     measured = {"measured_position": data.transmitter_position, "measured": data.rssi_dbm}
     arrays = {name: values.numpy() for name, values in (measured | {"receiver": data.receiver_position}).items()}
@@ -116,26 +113,10 @@ def _show_rssi(view: RssiView) -> None:
 # followed sources
 
 
-@functools.cache
-def _rssi() -> Rssi:
-    return rssi_room(n=36).receivers(["1", "2", "3"])
-
-
-@functools.cache
-def _rssi_model() -> RssiModel:
-    return RssiModel().fit(_rssi().subset(torch.arange(30)))
-
-
-@functools.cache
-def _field_model(name: str) -> FieldModel:
-    room = simulated_room(n=14, grid=AngularGrid.hemisphere(4, 8))
-    return GeometryModel.of_planes(room, [FLOOR]) if name == "geometry" else make_model(name).fit(room)
-
-
 def json_lines(model: FieldModel | RssiModel) -> bytes:
     """Return measurements for a model as JSON lines."""
     if isinstance(model, RssiModel):
-        new = _rssi().subset(torch.arange(30, 33))
+        new = rssi().subset(torch.arange(30, 33))
         values = [dict(zip(new.receiver_names, row, strict=True)) for row in new.rssi_dbm.nan_to_num(-90).tolist()]
         rows = list(zip(new.transmitter_position.tolist(), values, strict=True))
     else:
@@ -147,8 +128,34 @@ def json_lines(model: FieldModel | RssiModel) -> bytes:
 
 def table() -> bytes:
     """Return rows of RSSI as a table."""
-    header = ",".join(["x", "y", "z", *_rssi().receiver_names])
+    header = ",".join(["x", "y", "z", *rssi().receiver_names])
     return "\n".join([header, *(f"{x},2,1,-60,-{61 + x},-70" for x in range(3)), ""]).encode()
+
+
+def interrupt(seconds: float) -> None:
+    """Stop a command in the place where it waits for more lines."""
+    raise KeyboardInterrupt
+
+
+def follow(
+    model: Path,
+    source: Path | str = "-",
+    content: bytes = b"",
+    out: Path | None = None,
+    options: tuple[str, ...] = (),
+    stop: Callable[[float], None] = interrupt,
+) -> tuple[int, list[dict[str, Any]], str]:
+    """Follow standard input, or a file to its present end. Return the exit code, the answers and the messages."""
+    answers, messages = io.StringIO(), io.StringIO()
+    arguments = [str(model), str(source), "--follow", "--out", str(out or model.with_name("out")), *options]
+    with (
+        mock.patch.object(sys, "stdin", io.TextIOWrapper(io.BytesIO(content))),
+        mock.patch.object(lines, "time", SimpleNamespace(sleep=stop)),
+        redirect_stdout(answers),
+        redirect_stderr(messages),
+    ):
+        code = run_command("update", arguments, "swiftwrf update")
+    return code, [json.loads(line) for line in answers.getvalue().splitlines()], messages.getvalue()
 
 
 def followed(model: FieldModel | RssiModel, content: bytes, folder: Path, source: str = "-") -> None:
@@ -158,7 +165,7 @@ def followed(model: FieldModel | RssiModel, content: bytes, folder: Path, source
         InputError: The first sentence, if a line was reported.
         AssertionError: A line that was lost, doubled or learnt although it is implausible.
     """
-    file, out, answers, said = folder / "model", folder / "out", io.StringIO(), io.StringIO()
+    file, out = folder / "model", folder / "out"
     model.save(file)
     n_lines = sum(bool(line.strip()) for line in content.split(b"\n"))
     if source != "-":
@@ -166,16 +173,11 @@ def followed(model: FieldModel | RssiModel, content: bytes, folder: Path, source
         n_lines = sum(bool(line.strip()) for line in content.split(b"\n")[:-1])  # the last line may grow
         n_lines -= source.endswith(".csv") and n_lines > 0
     with (
-        mock.patch.object(sys, "stdin", io.TextIOWrapper(io.BytesIO(content))),
-        mock.patch.object(lines, "time", SimpleNamespace(sleep=mock.Mock(side_effect=KeyboardInterrupt))),
         mock.patch("tasks.update.run.environment", return_value={}),  # asks git
         mock.patch("tasks.page.page.as_svg", return_value="<svg></svg>"),
-        redirect_stdout(answers),
-        redirect_stderr(said),
     ):
-        source = source if source == "-" else str(folder / source)
-        code = run_command("update", [str(file), source, "--follow", "--out", str(out)], "swiftwrf update")
-    errors, learnt = said.getvalue().splitlines(), [json.loads(line) for line in answers.getvalue().splitlines()]
+        code, learnt, messages = follow(file, source if source == "-" else folder / source, content)
+    errors = messages.splitlines()
     assert all(line.startswith(ERROR) and len(line) <= MAX_LENGTH + len(ERROR) for line in errors), errors
     if code == 2 and len(errors) == 1 and not learnt:
         raise InputError(errors[0])
@@ -198,12 +200,12 @@ def followed(model: FieldModel | RssiModel, content: bytes, folder: Path, source
 
 def followed_lines(name: str, draw: random.Random, folder: Path) -> None:
     """Follow mutated JSON lines over standard input."""
-    model = _rssi_model() if name == "rssi" else _field_model(name)
+    model = {"rssi": rssi_model, "geometry": planes}.get(name, lambda: fitted(name))()
     followed(model, mutated(json_lines(model), draw, words_only=draw.random() < 0.5), folder)
 
 
 def followed_file(source: str, draw: random.Random, folder: Path) -> None:
     """Follow a mutated file of JSON lines or rows to its end."""
     followed(
-        _rssi_model(), mutated(table() if source.endswith(".csv") else json_lines(_rssi_model()), draw), folder, source
+        rssi_model(), mutated(table() if source.endswith(".csv") else json_lines(rssi_model()), draw), folder, source
     )

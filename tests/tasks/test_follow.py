@@ -1,24 +1,21 @@
-"""The command `update --follow`: directories that it continues, places in a source, and lines that are no measurements."""
+"""The command `update`: its outputs, and with `--follow` directories that it continues, places in a source, bad lines."""
 
 import csv
-import io
 import json
-import sys
 import time
 from dataclasses import replace
 from functools import cache
-from types import SimpleNamespace
 
 import pytest
 import small
 import torch
+from fuzz.runs import follow
 
 from swiftwrf import AngularGrid, Rssi, RssiModel, load, make_model, rssi_room, simulated_room
 from swiftwrf.data.writing import write_rssi
 from swiftwrf.models.geometry import GeometryModel, Plane
 from swiftwrf.online import Follower
 from tasks.command import run_command
-from tasks.update import lines as followed_lines
 from tasks.update.record import Record
 
 
@@ -48,25 +45,6 @@ def model(tmp_path):
     file = tmp_path / "model.safetensors"
     rssi_model().save(file)
     return file
-
-
-@pytest.fixture
-def follow(monkeypatch, capsys, tmp_path):
-    """Run the command on standard input, or on a file to its present end, where it is stopped."""
-
-    def stopped(seconds):
-        raise KeyboardInterrupt
-
-    def run(model, source="-", content=b"", out=tmp_path / "out", options=(), stop=stopped):
-        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(content)))
-        monkeypatch.setattr(followed_lines, "time", SimpleNamespace(sleep=stop))
-        code = run_command(
-            "update", [str(model), str(source), "--follow", "--out", str(out), *options], "swiftwrf update"
-        )
-        said = capsys.readouterr()
-        return code, [json.loads(text) for text in said.out.splitlines()], said.err
-
-    return run
 
 
 def indices(folder):
@@ -104,7 +82,7 @@ def foreign(folder, name, files):
     ],
     ids=lambda files: " ".join(files),
 )
-def test_a_directory_of_something_else_is_refused_and_unchanged(follow, model, tmp_path, files):
+def test_a_directory_of_something_else_is_refused_and_unchanged(model, tmp_path, files):
     folder = foreign(tmp_path, "taken", files)
     code, answers, said = follow(model, content=line(40), out=folder)
     assert (code, answers) == (2, [])
@@ -115,7 +93,7 @@ def test_a_directory_of_something_else_is_refused_and_unchanged(follow, model, t
 
 
 @pytest.mark.parametrize("change", ["other", "missing", "rewritten", "data"])
-def test_a_run_goes_on_with_the_model_and_data_that_it_began_with(follow, model, tmp_path, change):
+def test_a_run_goes_on_with_the_model_and_data_that_it_began_with(model, tmp_path, change):
     assert follow(model, content=line(40))[0] == 0
     before, options = contents(tmp_path / "out"), ()
     if change == "other":
@@ -154,7 +132,7 @@ def observed(answers):
 )
 @pytest.mark.parametrize("by", ["in place", "by name"])
 @pytest.mark.parametrize("when", ["between two starts", "while it is followed"])
-def test_a_source_goes_on_after_the_lines_learnt_or_begins_again(follow, model, tmp_path, after, expected, by, when):
+def test_a_source_goes_on_after_the_lines_learnt_or_begins_again(model, tmp_path, after, expected, by, when):
     source, changed = tmp_path / "rows.csv", []
     source.write_bytes(HEADER + b"".join(ROWS[:3]))
 
@@ -183,7 +161,7 @@ def killed(*arguments):
     raise KeyboardInterrupt
 
 
-def test_a_row_without_its_model_is_dropped(follow, model, tmp_path, monkeypatch):
+def test_a_row_without_its_model_is_dropped(model, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr("tasks.update.run._save", killed)
         assert follow(model, content=line(40))[0] == 130
@@ -213,7 +191,7 @@ def spectrum_lines(first, last):
     )
 
 
-def test_spectra_that_wait_are_learnt_by_the_next_start(follow, tmp_path):
+def test_spectra_that_wait_are_learnt_by_the_next_start(tmp_path):
     file, learnt = tmp_path / "room.safetensors", tmp_path / "out" / "model.safetensors"
     geometry().save(file)
     assert len(follow(file, content=spectrum_lines(40, 45))[1]) == 5
@@ -260,14 +238,14 @@ def test_an_update_of_a_room_states_the_spectra_that_it_has_not_learnt(tmp_path,
     ],
     ids=lambda bad: str(bad[:40]),
 )
-def test_a_bad_line_is_reported_and_left_out(follow, model, bad):
+def test_a_bad_line_is_reported_and_left_out(model, bad):
     code, answers, said = follow(model, content=line(40) + bad + line(42))
     assert (code, len(answers), said.count("error: ")) == (0, 2, 1)
     assert said.startswith("error: line 2")
     assert said.count("\n") == 1
 
 
-def test_booleans_are_no_spectrum(follow, tmp_path):
+def test_booleans_are_no_spectrum(tmp_path):
     make_model("gp").fit(room().subset(torch.arange(40))).save(tmp_path / "gp.safetensors")
     bad = json.dumps({"position": [1, 1, 1], "spectrum": [[True] * 72] * 18}).encode() + b"\n"
     code, answers, said = follow(tmp_path / "gp.safetensors", content=bad + spectrum_lines(41, 42))
@@ -275,7 +253,7 @@ def test_booleans_are_no_spectrum(follow, tmp_path):
     assert said.startswith("error: line 1")
 
 
-def test_bad_rows_of_a_table_are_left_out(follow, model, tmp_path):
+def test_bad_rows_of_a_table_are_left_out(model, tmp_path):
     source = tmp_path / "rows.csv"
     rows = [ROWS[0], b"caf\xe9,2,1,-60,-61\n", b"1" * 401 + b",2,1,-60,-61\n", b"1,2,-60\n", ROWS[1]]
     source.write_bytes(b"\xef\xbb\xbf" + HEADER + b"".join(rows))
@@ -284,7 +262,7 @@ def test_bad_rows_of_a_table_are_left_out(follow, model, tmp_path):
     assert [text.replace(":", "").split()[:3] for text in said.splitlines()] == [["error", "line", n] for n in "345"]
 
 
-def test_a_character_in_two_parts_is_one(follow, model, tmp_path):
+def test_a_character_in_two_parts_is_one(model, tmp_path):
     source, parts = tmp_path / "rows.ndjson", [b"\xa9", b'"}\n']
     whole = line(40, note="?").replace(b"?", b"\xc3")
     source.write_bytes(whole.partition(b"\xc3")[0] + b"\xc3")
@@ -299,7 +277,7 @@ def test_a_character_in_two_parts_is_one(follow, model, tmp_path):
     assert (code, len(answers), said) == (130, 1, "")
 
 
-def test_names_of_receivers_are_any_text(follow, tmp_path, monkeypatch):
+def test_names_of_receivers_are_any_text(tmp_path, monkeypatch):
     """No encoding of the terminal breaks an answer."""
     data = floor()
     names = ("caf\u00e9 hall", *data.receiver_names[1:])
@@ -315,26 +293,11 @@ def test_names_of_receivers_are_any_text(follow, tmp_path, monkeypatch):
     assert any("caf\u00e9 hall stronger" in row["alarm"] for row in rows)
 
 
-def test_a_record_comes_back_as_it_was(tmp_path):
-    """Texts that spreadsheets would run, rows in which nothing was detected, and a row that a kill cut in a letter."""
-    follower, record = Follower(rssi_model()), Record("source", "dB")
-    nothing = replace(floor().subset(torch.tensor([41])), rssi_dbm=torch.full((1, 12), torch.nan, dtype=torch.float64))
-    step = replace(follower.step(nothing), alarms=("=hall weaker everywhere",))
-    record.append(tmp_path, record.add(41, step))
-    assert "Mean error before each was learnt: unknown, over the last 30: unknown." in record.sentences()
-    for _ in range(2):
-        with (tmp_path / "measurements.csv").open("ab") as file:
-            file.write("42,1.0,é".encode()[:-1])
-        record = Record.read(tmp_path)
-        assert "Change at measurement 41: =hall weaker everywhere." in record.sentences()
-        record.write(tmp_path)
-
-
 # sources and ends
 
 
 @pytest.mark.parametrize("name", ["nothing.csv", "folder.csv", "nothing.ndjson"])
-def test_a_source_that_is_no_file_is_refused_before_the_directory_is_made(follow, model, tmp_path, name):
+def test_a_source_that_is_no_file_is_refused_before_the_directory_is_made(model, tmp_path, name):
     (tmp_path / "folder.csv").mkdir()
     code, _, said = follow(model, tmp_path / name)
     assert code == 2
@@ -343,7 +306,7 @@ def test_a_source_that_is_no_file_is_refused_before_the_directory_is_made(follow
     assert not (tmp_path / "out").exists()
 
 
-def test_a_table_for_spectra_is_refused_before_the_directory_is_made(follow, tmp_path):
+def test_a_table_for_spectra_is_refused_before_the_directory_is_made(tmp_path):
     make_model("gp").fit(room().subset(torch.arange(40))).save(tmp_path / "gp.safetensors")
     (tmp_path / "rows.csv").write_bytes(HEADER)
     code, _, said = follow(tmp_path / "gp.safetensors", tmp_path / "rows.csv")
@@ -352,7 +315,7 @@ def test_a_table_for_spectra_is_refused_before_the_directory_is_made(follow, tmp
     assert not (tmp_path / "out").exists()
 
 
-def test_a_full_disk_is_answered_with_the_right_advice(follow, model, monkeypatch):
+def test_a_full_disk_is_answered_with_the_right_advice(model, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
@@ -365,7 +328,7 @@ def test_a_full_disk_is_answered_with_the_right_advice(follow, model, monkeypatc
     assert follow(model, content=line(40))[0] == 0
 
 
-def test_a_last_line_without_its_end(follow, model, tmp_path):
+def test_a_last_line_without_its_end(model, tmp_path):
     """It counts at the end of standard input, but waits in a file, which may grow."""
     assert len(follow(model, content=line(40) + line(41).strip())[1]) == 2
     source = tmp_path / "rows.csv"
@@ -374,18 +337,6 @@ def test_a_last_line_without_its_end(follow, model, tmp_path):
     with source.open("ab") as file:
         file.write(b"\n")
     assert observed(follow(model, source, out=tmp_path / "table")[1]) == [-61]
-
-
-@pytest.mark.parametrize("kind", ["source", "data"])
-def test_names_of_public_data_sets_are_sources(model, tmp_path, monkeypatch, capsys, kind):
-    folder = tmp_path / "public" / "tetam-tracks"
-    folder.mkdir(parents=True)
-    write_rssi(floor().subset(torch.arange(40, 50)), folder)
-    monkeypatch.setenv("SWIFTWRF_DATA", str(folder.parent))
-    source, data = ("tetam-tracks", folder) if kind == "source" else (folder, "tetam-tracks")
-    options = [str(model), str(source), "--data", str(data), "--out", str(tmp_path / "out")]
-    assert run_command("update", options, "swiftwrf update") == 0
-    assert "10 measurements learnt" in capsys.readouterr().out
 
 
 def test_a_line_costs_the_same_in_a_long_record():
@@ -400,3 +351,57 @@ def test_a_line_costs_the_same_in_a_long_record():
     assert time.process_time() - begin < 0.2
     assert found["measurements"] == 100_010
     assert found["mean_error"] == pytest.approx(first.rows[0]["error"])
+
+
+@pytest.mark.parametrize("named", [None, "source", "data"])
+def test_an_update_from_files_or_a_public_data_set_writes_model_table_and_page(
+    model, tmp_path, monkeypatch, capsys, named
+):
+    folder, out = tmp_path / "public" / "tetam-tracks", tmp_path / "out"
+    folder.mkdir(parents=True)
+    write_rssi(floor().subset(torch.arange(40, 50)), folder)
+    monkeypatch.setenv("SWIFTWRF_DATA", str(folder.parent))
+    source, data = (folder.name if named == kind else folder for kind in ("source", "data"))
+    options = [str(model), str(source), *(("--data", str(data)) if named else ()), "--out", str(out)]
+    assert run_command("update", options, "swiftwrf update") == 0
+    assert "10 measurements learnt" in capsys.readouterr().out
+    assert {"model.safetensors", "report.html", "measurements.csv", "update.json"} <= {f.name for f in out.iterdir()}
+    assert len(load(out / "model.safetensors").anchor) == 50
+    assert run_command("update", options, "swiftwrf update") == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--follow", "--json"), "--follow prints JSON lines"),
+        (("--false-alarm-rate", "2"), "--false-alarm-rate must be"),
+        (("--follow", "--open"), "--follow prints JSON lines"),
+        (("--follow", "--window", "1"), "--window is no option of a followed source"),
+        (("--follow", "--y-down", "--every", "2"), "--every is no option of a followed source"),
+    ],
+)
+def test_wrong_options_are_refused(arguments, says, capsys):
+    assert run_command("update", ["m", "table.csv", "--out", "x", *arguments], "swiftwrf update") == 2
+    assert capsys.readouterr().err.startswith(f"error: {says}")
+
+
+def test_a_record_comes_back_as_it_was_and_is_cut_to_what_the_model_has_learnt(tmp_path):
+    """Texts that spreadsheets would run, rows in which nothing was detected, and a row that a kill cut in a letter."""
+    follower, record = Follower(rssi_model()), Record("source", "dB")
+    nothing = replace(floor().subset(torch.tensor([41])), rssi_dbm=torch.full((1, 12), torch.nan, dtype=torch.float64))
+    step = replace(follower.step(nothing), alarms=("=hall weaker everywhere",), notice="kernel chosen again")
+    record.append(tmp_path, record.add(41, step))
+    assert "Mean error before each was learnt: unknown, over the last 30: unknown." in record.sentences()
+    for _ in range(2):
+        with (tmp_path / "measurements.csv").open("ab") as file:
+            file.write("42,1.0,é".encode()[:-1])
+        record = Record.read(tmp_path)
+        assert {"Change at measurement 41: =hall weaker everywhere.", "Kernel chosen again."} <= {*record.sentences()}
+        record.write(tmp_path)
+    record.append(tmp_path, record.add(42, follower.step(floor().subset(torch.tensor([42])))))
+    assert [(row["index"], row["notice"]) for row in Record.read(tmp_path).notices] == [(41, "kernel chosen again")]
+    for number in (2, 1):
+        kept = Record.read(tmp_path, number)
+        kept.write(tmp_path)
+        assert [row["index"] for row in Record.read(tmp_path).rows] == [41, 42][:number]
+        assert kept.table["error"].tolist() == pytest.approx(record.table["error"][:number].tolist(), nan_ok=True)

@@ -9,16 +9,13 @@ import pytest
 import torch
 from rooms import built_in_walls, room_with_box
 
-from swiftwrf import AngularGrid, GeometryModel, InputError, RssiModel, load, make_model
+from swiftwrf import AngularGrid, GeometryModel, InputError, RssiModel, make_model
 from swiftwrf.data.simulated import ShoeboxRoom, rssi_room, simulated_room
-from swiftwrf.data.writing import write_rssi
 from swiftwrf.metrics import psnr
 from swiftwrf.models.geometry import HybridModel
 from swiftwrf.models.geometry.planes import Plane
 from swiftwrf.online import Follower, Monitor, adapted, alarm_threshold, prequential, score
 from swiftwrf.online.follower import joined, unexplained
-from tasks.command import main
-from tasks.update.record import Record
 
 GRID = AngularGrid.hemisphere(15, 60)
 PLACE = (1.6, 2.4)
@@ -37,11 +34,6 @@ def coarray():
 @cache
 def floor():
     return rssi_room(n=100)
-
-
-@cache
-def radio_maps():
-    return RssiModel().fit(floor().subset(torch.arange(60)))
 
 
 @cache
@@ -165,52 +157,6 @@ def test_a_follower_adapts_and_goes_on():
     assert len(follower.model.process.known) == 102
 
 
-@pytest.fixture
-def model_file(tmp_path):
-    file = tmp_path / "model.safetensors"
-    radio_maps().save(file)
-    return file
-
-
-def test_an_update_from_files_writes_model_table_and_page(tmp_path, model_file, capsys):
-    (tmp_path / "data").mkdir()
-    write_rssi(floor().subset(torch.arange(60, 75)), tmp_path / "data")
-    out = tmp_path / "updated"
-    assert main(["update", str(model_file), str(tmp_path / "data"), "--out", str(out)]) == 0
-    assert "15 measurements learnt" in capsys.readouterr().out
-    assert {"model.safetensors", "report.html", "measurements.csv", "update.json"} <= {f.name for f in out.iterdir()}
-    assert len(load(out / "model.safetensors").anchor) == 75
-    assert main(["update", str(model_file), str(tmp_path / "data"), "--out", str(out)]) == 2
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (("--follow", "--json"), "--follow prints JSON lines"),
-        (("--false-alarm-rate", "2"), "--false-alarm-rate must be"),
-        (("--follow", "--open"), "--follow prints JSON lines"),
-        (("--follow", "--window", "1"), "--window is no option of a followed source"),
-        (("--follow", "--y-down", "--every", "2"), "--every is no option of a followed source"),
-    ],
-)
-def test_wrong_options_are_refused(arguments, says, capsys):
-    assert main(["update", "m", "table.csv", "--out", "x", *arguments]) == 2
-    assert capsys.readouterr().err.startswith(f"error: {says}")
-
-
-def test_a_record_is_cut_to_what_the_model_has_learnt(tmp_path):
-    record, follower = Record("source", " [dB]"), Follower(radio_maps())
-    for i in range(60, 63):
-        record.append(tmp_path, record.add(i, follower.step(floor().subset(torch.tensor([i])))))
-    with (tmp_path / "measurements.csv").open("a") as file:
-        file.write("63,1.0")  # a kill while a row was written
-    assert [row["index"] for row in Record.read(tmp_path).rows] == [60, 61, 62]
-    kept = Record.read(tmp_path, 2)
-    kept.write(tmp_path)
-    assert [row["index"] for row in kept.rows] == [row["index"] for row in Record.read(tmp_path).rows] == [60, 61]
-    assert kept.table["error"].tolist() == pytest.approx(record.table["error"][:2].tolist())
-
-
 def test_a_follower_continues_after_the_model_has_grown():
     """New positions lie outside of those that the tests began with."""
     data = simulated_room(n=80, grid=AngularGrid.hemisphere(8, 32))
@@ -297,13 +243,3 @@ def test_a_followed_geometry_is_refined_with_every_ten_spectra():
     assert models[11] is models[9]
     offset = walls().tensors().offset  # of planes without uncertainty
     torch.testing.assert_close(models[9].tensors().offset, offset)
-
-
-def test_a_notice_is_recorded(tmp_path):
-    record, follower = Record("source", " [dB]"), Follower(radio_maps())
-    for i in range(60, 62):
-        step = follower.step(floor().subset(torch.tensor([i])))
-        record.append(tmp_path, record.add(i, replace(step, notice="kernel chosen again" if i == 61 else "")))
-    again = Record.read(tmp_path)
-    assert [(row["index"], row["notice"]) for row in again.notices] == [(61, "kernel chosen again")]
-    assert "Kernel chosen again." in again.sentences()
