@@ -81,12 +81,14 @@ def test_a_damaged_step_does_not_cost_the_others(stopped, capsys, damage):
     }
 
 
-def test_a_run_stopped_while_it_finishes_can_be_finished(finished, tmp_path, monkeypatch):
+def test_a_run_stopped_while_it_finishes_states_how_to_finish_it(finished, tmp_path, monkeypatch, capsys):
     with monkeypatch.context() as patch:
         patch.setattr("tasks.directory.rename", _interrupt)
-        assert run("rssi", "--rx", "1", "--out", tmp_path / "cut") == 130
+        assert run("rssi", "--rx", "1", "--quiet", "--out", tmp_path / "cut") == 130
+    assert capsys.readouterr().err == f"stopped; continue with: swiftwrf resume {tmp_path / 'cut.partial'}\n"
     assert (tmp_path / "cut.partial" / "metrics.json").exists()
-    assert run("resume", tmp_path / "cut.partial") == 0
+    assert run("resume", tmp_path / "cut.partial", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["rows"]
     assert sorted(p.name for p in (tmp_path / "cut").iterdir()) == sorted(p.name for p in finished.iterdir())
     for name in TABLES:
         assert (tmp_path / "cut" / name).read_bytes() == (finished / name).read_bytes()
@@ -209,26 +211,6 @@ def test_report_leaves_the_interrupted_work_of_others(finished, tmp_path):
     merge([tmp_path / "one"], tmp_path / "long")
     assert (tmp_path / "long.partial" / "config.json").exists()
     assert {file.name for file in tmp_path.iterdir()} == {"one", "long", "long.partial"}
-
-
-@pytest.mark.parametrize("task", ["rssi", "aoa"])
-def test_merged_reports_show_every_run(request, tmp_path, task):
-    if task == "rssi":
-        other = request.getfixturevalue("finished")
-    else:
-        other = Path(shutil.copytree(request.getfixturevalue("aoa_run"), tmp_path / "other"))
-        table = pd.read_csv(other / "errors.csv")
-        table.assign(great_circle_deg=2 * table.great_circle_deg).to_csv(other / "errors.csv", index=False)
-    with quick.sketched():
-        merge([request.getfixturevalue(f"{task}_run"), other], tmp_path / "both")
-    drawn = _files(tmp_path / "both" / "figures")
-    first, second = (
-        {text for name, text in drawn.items() if run in name and name.startswith("errors") and name.endswith(".csv")}
-        for run in ("run1", "run2")
-    )
-    assert first
-    assert second
-    assert not first & second
 
 
 @pytest.mark.parametrize(
@@ -354,3 +336,23 @@ def test_a_full_disk_ends_in_a_sentence_and_can_be_resumed(tmp_path, capsys, mon
     assert "no space left" in said(capsys)
     assert run("resume", tmp_path / "run.partial") == 0
     assert not list((tmp_path / "run").rglob(".*"))
+
+
+@pytest.mark.parametrize(
+    ("task", "error"), [("rssi", "abs_error_db"), ("aoa", "great_circle_deg"), ("locate", "position_error_m")]
+)
+def test_merged_reports_show_every_run(request, tmp_path, task, error):
+    run = request.getfixturevalue(f"{task}_run")
+    other = Path(shutil.copytree(run, tmp_path / "other"))
+    table = pd.read_csv(other / "errors.csv")
+    table.assign(**{error: 2 * table[error]}).to_csv(other / "errors.csv", index=False)
+    with quick.sketched():
+        merge([run, other], tmp_path / "both")
+    drawn = _files(tmp_path / "both" / "figures")
+    first, second = (
+        {text for name, text in drawn.items() if run in name and name.startswith("errors") and name.endswith(".csv")}
+        for run in ("run1", "run2")
+    )
+    assert first
+    assert second
+    assert not first & second

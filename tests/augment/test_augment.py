@@ -150,13 +150,6 @@ def test_positions_are_drawn_between_spots_that_were_measured_again_and_again(ji
     assert torch.cdist(drawn, known).amin(dim=1).max() > 10 * jitter
 
 
-def test_counts_say_where_spectra_come_from():
-    measured, withheld = withhold(TRAIN, 0.5, 0)
-    further = synthetic_positions(measured, 7, seed=0)
-    mixed = mix(measured, withheld, torch.zeros(len(withheld), 15, 60)).add(further, torch.zeros(7, 15, 60))
-    assert mixed.counts == {"measured": len(measured), "withheld": len(withheld), "extra": 7}
-
-
 def test_choice_takes_the_best_on_held_out_spectra():
     chosen = choose_model(TRAIN, ("nearest", "idw", "gp"))
     assert set(chosen.psnr_db) == {"nearest", "idw", "gp"}

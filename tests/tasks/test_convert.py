@@ -116,18 +116,6 @@ def test_an_array_that_the_files_contradict_is_refused(tmp_path):
     assert load_spectra(tmp_path, array=PlanarArray.square(4, 915e6)).array == PlanarArray.square(4, 915e6)
 
 
-@pytest.mark.parametrize("name", ["spectrum.npy", "spectrum.npz"])
-def test_arrays_beside_images(name, tmp_path):
-    room = simulated_room(n=20, grid=AngularGrid.hemisphere(9, 30))
-    write_spectra(room, tmp_path)
-    (tmp_path / "spectrum.npz").unlink()
-    if name == "spectrum.npy":
-        np.save(tmp_path / name, room.spectrum.numpy())
-    else:
-        np.savez(tmp_path / name, spectrum=(room.spectrum * 255).round().byte().numpy())
-    torch.testing.assert_close(load_spectra(tmp_path).spectrum, room.spectrum, rtol=0, atol=0.5 / 255)
-
-
 @pytest.mark.parametrize(
     ("change", "says"),
     [

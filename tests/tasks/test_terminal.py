@@ -131,15 +131,3 @@ def test_quiet_runs_show_the_answer_alone(tmp_path, capsys):
     assert out.startswith("what you can use")
     assert err == ""
     assert not terminal.console.quiet
-
-
-def test_an_interrupted_run_says_how_to_resume(tmp_path, capsys, monkeypatch):
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("tasks.rssi.experiment.record", interrupt)
-    assert quick.run("rssi", "--rx", "1", "--quiet", "--out", tmp_path / "run") == 130
-    assert capsys.readouterr().err == f"stopped; continue with: swiftwrf resume {tmp_path / 'run.partial'}\n"
-    monkeypatch.undo()
-    assert quick.run("resume", tmp_path / "run.partial", "--json") == 0
-    assert json.loads(capsys.readouterr().out)["rows"]

@@ -36,7 +36,7 @@ def test_field_models_do_not_depend_on_the_origin(room, small_published, short_f
     torch.testing.assert_close(*predicted, atol={"dcgan": 2e-2, "hybrid": 1e-2}.get(name, 2e-3), rtol=0)
 
 
-@pytest.mark.parametrize("name", [name for name in RSSI_PREDICTORS if name != "swiftwrf"])
+@pytest.mark.parametrize("name", RSSI_PREDICTORS)
 def test_predictors_do_not_depend_on_the_origin(small_published, short_fits, name):
     data, predicted = rssi_room(n=40).receivers(["1", "2"]), []
     for shift in (0.0, 1e7):

@@ -260,18 +260,6 @@ def test_far_away_the_prediction_is_the_path_loss_model():
     torch.testing.assert_close(model.predict(far).mean, path_loss, atol=1e-3, rtol=0)
 
 
-def test_shift_of_the_coordinates_changes_nothing():
-    """UTM coordinates: all positions moved by 10,000 km."""
-    data = with_field()
-    shift = torch.tensor([1e7, -1e7, 1e7], dtype=torch.float64)
-    moved = replace(
-        data, receiver_position=data.receiver_position + shift, transmitter_position=data.transmitter_position + shift
-    )
-    here, there = fit_rssi(data), fit_rssi(moved)
-    a, b = here.predict(data.transmitter_position).mean, there.predict(moved.transmitter_position).mean
-    torch.testing.assert_close(a, b, atol=1e-3, rtol=0)
-
-
 @pytest.mark.parametrize("make", [RssiModel, PairModel])
 def test_rows_about_another_origin_are_predicted_where_they_were_measured(make):
     data = replace(path_loss_only(), origin=GeodeticOrigin(48.0, 11.0))

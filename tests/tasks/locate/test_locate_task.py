@@ -16,7 +16,7 @@ from swiftwrf import AngularGrid, InputError, load, rssi_room, simulated_room
 from swiftwrf.data import ReadOptions
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.locate import MatchedField
-from swiftwrf.locate.baselines import LEVELS, LOCALIZERS, RegressedCoordinates
+from swiftwrf.locate.baselines import LEVELS, LOCALIZERS
 from swiftwrf.locate.comparison import LocateSplit, compare
 from swiftwrf.runtime.steps import LOCATOR as MODEL
 from tasks.predict import read_rssi
@@ -134,11 +134,6 @@ def test_the_report_shows_errors_calibration_and_posteriors(locate_run):
         assert np.nanmax(maps["density"], axis=(1, 2)) == pytest.approx(1)
 
 
-def test_runs_are_merged(locate_run, tmp_path):
-    assert quick.run("report", locate_run, locate_run, "--out", tmp_path / "merged") == 0
-    assert "run 2" in (tmp_path / "merged" / "report.html").read_text()
-
-
 def test_rows_that_no_receiver_detected_are_left_out(tmp_path, capsys):
     data = rssi_room(n=80)
     data.rssi_dbm[::4] = torch.nan
@@ -154,19 +149,6 @@ def test_rows_that_no_receiver_detected_are_left_out(tmp_path, capsys):
         LocateSplit.of(data, "random", 100, 0)
     with pytest.raises(InputError, match="split 'place' tests other receivers than it trains; choose random or block"):
         LocateSplit.of(data, "place", 100, 0)
-
-
-def test_an_interrupted_run_goes_on_to_the_same_numbers(locate_run, tmp_path):
-    out = tmp_path / "run"
-    with mock.patch.object(RegressedCoordinates, "fit", side_effect=KeyboardInterrupt):
-        assert run("--cells", 300, "--out", out) == 130
-    partial = tmp_path / "run.partial"
-    kept = {file.stem for file in (partial / "steps").iterdir()}
-    assert {"posterior", "knn", "knn_difference"} <= kept
-    assert quick.run("resume", partial) == 0
-    same, other = (pd.read_csv(folder / "errors.csv") for folder in (locate_run, out))
-    pd.testing.assert_frame_equal(same, other)
-    assert strict_json(out / "metrics.json")["calibration"] == strict_json(locate_run / "metrics.json")["calibration"]
 
 
 def test_positions_of_new_rows(locate_run, tmp_path, capsys):
@@ -257,8 +239,3 @@ def test_positions_and_directions_of_spectra(matched, tmp_path, capsys):
     unknown = pd.read_csv(tmp_path / "unknown.csv")
     assert list(unknown)[-2:] == ["azimuth_deg", "elevation_deg"]
     assert len(unknown) == 5
-    np.save(tmp_path / "other.npy", np.zeros((3, 8, 16), np.float32))
-    assert quick.command("predict", file, tmp_path / "other.npy", "--out", tmp_path / "out.csv") == 2
-    assert "--grid 8 32" in said(capsys)
-    assert quick.command("predict", file, tmp_path / "unknown.npy", "--every", 2, "--out", tmp_path / "out.csv") == 2
-    assert "--every does not apply" in said(capsys)
