@@ -97,7 +97,7 @@ def test_repeated_rows_do_not_narrow_an_interval():
     assert by_place[2] - by_place[1] > 2 * (by_row[2] - by_row[1])
 
 
-@pytest.mark.parametrize(("n_pairs", "mean", "has_interval"), [(0, np.nan, False), (9, 1.0, False), (12, 1.0, True)])
+@pytest.mark.parametrize(("n_pairs", "mean", "has_interval"), [(0, np.nan, False), (9, 1.0, False), (10, 1.0, True)])
 def test_a_method_without_error_at_most_rows_has_few_pairs(n_pairs, mean, has_interval):
     error = np.concatenate([np.ones(12), np.where(np.arange(12) < n_pairs, 2.0, np.nan)])
     table = pd.DataFrame({"method": ["a"] * 12 + ["b"] * 12, "index": [*range(12)] * 2, "error": error})

@@ -126,36 +126,30 @@ def test_refuses_descriptions(tmp_path, changes, says):
         load_snapshots(write_dichasus(tmp_path / "hall", **changes))
 
 
-def test_refuses_records(tmp_path):
-    folder = write_espargos(tmp_path / "lab")
-    file = folder / "walk.tfrecords"
-    content = file.read_bytes()
-    file.write_bytes(content[:-10])
-    with pytest.raises(InputError, match="ends within record 24"):
-        load_snapshots(folder)
-    file.write_bytes(b"\xff" * 100)
-    with pytest.raises(InputError, match="no TFRecord file"):
-        load_snapshots(folder)
-    write_records(file, [{"csi": np.ones((2, 4, 3), np.float32), "pos": np.zeros(3)}])
-    with pytest.raises(InputError, match="not what the data set has"):
-        load_snapshots(folder)
-    write_records(file, [{"csi": np.ones((1, 2, 4, 3), np.complex64)}])
-    with pytest.raises(InputError, match="'pos'"):
-        load_snapshots(folder)
+def _records(**arrays):
+    return lambda folder: write_records(folder / "walk.tfrecords", [arrays])
 
 
-def test_refuses_records_without_a_description(tmp_path):
-    folder = write_espargos(tmp_path / "lab")
-    (folder / "metadata.json").unlink()
-    with pytest.raises(InputError, match="no JSON with antennas"):
-        load_snapshots(folder)
+def _offsets(**content):
+    return lambda folder: (folder / "reftx-offsets-walk.json").write_text(json.dumps(content))
 
 
-def test_refuses_offsets_of_other_antennas(tmp_path):
-    folder = write_dichasus(tmp_path / "hall", offsets=True)
-    (folder / "reftx-offsets-walk.json").write_text(json.dumps({"cpo": [0.0], "sto": [0.0]}))
-    with pytest.raises(InputError, match="offsets of 1"):
-        load_snapshots(folder, station=1)
-    (folder / "reftx-offsets-walk.json").write_text(json.dumps({"cpo": ["a"], "sto": [0.0]}))
-    with pytest.raises(InputError, match="cpo and sto"):
-        load_snapshots(folder, station=1)
+CSI = np.ones((1, 2, 4, 3), np.complex64)
+SPOILT = {  # with the message of the refusal
+    "cut off": (lambda f: (f / "walk.tfrecords").write_bytes((f / "walk.tfrecords").read_bytes()[:-10]), "record 24"),
+    "other bytes": (lambda f: (f / "walk.tfrecords").write_bytes(b"\xff" * 100), "no TFRecord file"),
+    "another shape": (_records(csi=np.ones((2, 4, 3), np.float32), pos=np.zeros(3)), "not what the data set has"),
+    "no positions": (_records(csi=CSI), "'pos'"),
+    "no description": (lambda f: (f / "metadata.json").unlink(), "no JSON with antennas"),
+    "offsets of other antennas": (_offsets(cpo=[0.0], sto=[0.0]), "offsets of 1"),
+    "offsets of text": (_offsets(cpo=["a"], sto=[0.0]), "cpo and sto"),
+}
+
+
+@pytest.mark.parametrize("name", SPOILT)
+def test_refuses_files(tmp_path, name):
+    of_offsets, (spoil, says) = name.startswith("offsets"), SPOILT[name]
+    folder = write_dichasus(tmp_path / "hall", offsets=True) if of_offsets else write_espargos(tmp_path / "lab")
+    spoil(folder)
+    with pytest.raises(InputError, match=says):
+        load_snapshots(folder, station=1 if of_offsets else None)

@@ -163,25 +163,6 @@ def test_hdf5_without_its_library(tmp_path, monkeypatch):
         load_snapshots(folder)
 
 
-def test_hdf5_that_points_elsewhere_is_refused(tmp_path):
-    import h5py
-
-    write_snapshots(tmp_path / "secret", "snapshots.h5")
-    with h5py.File(tmp_path / "links.h5", "w") as file:
-        file["csi"] = h5py.ExternalLink(str(tmp_path / "secret" / "snapshots.h5"), "csi")
-    with pytest.raises(InputError, match="no array of numbers in this file"):
-        read_arrays(tmp_path / "links.h5", ["csi"])
-
-
-def test_hdf5_that_claims_much_is_refused_before_memory_is_taken(tmp_path):
-    import h5py
-
-    with h5py.File(tmp_path / "big.h5", "w") as file:
-        file.create_dataset("csi", shape=(2**20, 2**10), dtype="c16", chunks=(1, 1))
-    with pytest.raises(InputError, match="unpacks to"):
-        read_arrays(tmp_path / "big.h5", ["csi"])
-
-
 def test_a_grid_is_given_as_a_pair(tmp_path):
     folder = write_snapshots(tmp_path / "a", data=snapshots(n=20))
     assert load_spectra(folder, grid=(12, 48)).grid == AngularGrid.hemisphere(12, 48)
@@ -190,43 +171,37 @@ def test_a_grid_is_given_as_a_pair(tmp_path):
         load_spectra(folder, grid=(0, 48))
 
 
-def _matlab(name):
-    """The arrays as MATLAB stores them: matrices only."""
-    arrays = snapshot_arrays(snapshots())
-    return {key: np.atleast_2d(value) for key, value in arrays.items()}
+def _compound(values, names=("real", "imag")):
+    """Return complex numbers as pairs of fields, as HDF5 stores them."""
+    if values.dtype.kind != "c":
+        return values
+    return np.ascontiguousarray(values).view([(name, values.real.dtype) for name in names])
 
 
 def write_matlab(file):
-    from scipy.io import savemat
+    """Matrices only."""
+    savemat(file, {key: np.atleast_2d(value) for key, value in snapshot_arrays(snapshots()).items()})
 
-    savemat(file, _matlab(file))
+
+def write_hdf5(file, stored, **options):
+    import h5py
+
+    with h5py.File(file, "w", **options) as content:
+        for key, value in snapshot_arrays(snapshots()).items():
+            for name, values in stored(key, np.asarray(value)).items():
+                content[name] = values
 
 
 def write_matlab_hdf5(file):
     """MATLAB 7.3: HDF5 with axes in reverse order and complex numbers as compounds."""
-    import h5py
-
-    with h5py.File(file, "w", userblock_size=512) as content:
-        for key, value in _matlab(file).items():
-            content[key] = _compound(value.T)
+    write_hdf5(file, lambda key, value: {key: _compound(np.atleast_2d(value).T)}, userblock_size=512)
     with open(file, "r+b") as stream:
         stream.write(b"MATLAB 7.3 MAT-file")
 
 
 def write_octave(file):
     """Octave's HDF5: a group a variable, axes in reverse order, scalars as such."""
-    import h5py
-
-    with h5py.File(file, "w") as content:
-        for key, value in snapshot_arrays(snapshots()).items():
-            content[f"{key}/type"] = np.bytes_("matrix")
-            content[f"{key}/value"] = _compound(np.asarray(value).T)
-
-
-def _compound(values, names=("real", "imag")):
-    if values.dtype.kind != "c":
-        return values
-    return np.ascontiguousarray(values).view([(name, values.real.dtype) for name in names])
+    write_hdf5(file, lambda key, value: {f"{key}/type": np.bytes_("matrix"), f"{key}/value": _compound(value.T)})
 
 
 WRITERS = {
@@ -234,38 +209,55 @@ WRITERS = {
     "monday.mat": write_matlab_hdf5,
     "snapshots.h5": write_octave,
     "octave.mat": write_octave,
+    **{
+        f"{names[0]}.h5": lambda file, names=names: write_hdf5(file, lambda k, v: {k: _compound(v, names)})
+        for names in (("real", "imag"), ("r", "i"))
+    },
 }
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_reads_what_matlab_and_octave_write(tmp_path, name):
+def test_reads_what_matlab_octave_and_h5py_write(tmp_path, name):
     usual = load_snapshots(write_snapshots(tmp_path / "a"))
     WRITERS[name](tmp_path / name)
     data = load_snapshots(tmp_path / name if "snapshots" not in name else tmp_path)
     torch.testing.assert_close(data.channel, usual.channel)
     torch.testing.assert_close(data.position, usual.position)
     assert data.array == usual.array
-    assert any("reverse order" in note for note in data.notes) == (name != "snapshots.mat")
+    assert any("reverse order" in note for note in data.notes) == (name in ("monday.mat", "snapshots.h5", "octave.mat"))
 
 
-@pytest.mark.parametrize("names", [("real", "imag"), ("r", "i")])
-def test_reads_complex_numbers_as_compounds(tmp_path, names):
+def _elsewhere(file):
     import h5py
 
-    usual = load_snapshots(write_snapshots(tmp_path / "a"))
-    with h5py.File(tmp_path / "b.h5", "w") as content:
-        for key, value in snapshot_arrays(snapshots()).items():
-            content[key] = _compound(np.asarray(value), names)
-    torch.testing.assert_close(load_snapshots(tmp_path / "b.h5").channel, usual.channel)
+    write_snapshots(file.with_name("secret"), "snapshots.h5")
+    with h5py.File(file, "w") as content:
+        content["csi"] = h5py.ExternalLink(str(file.with_name("secret") / "snapshots.h5"), "csi")
 
 
-def test_other_compounds_are_refused(tmp_path):
-    import h5py
+def _data_set(**options):
+    def write(file):
+        import h5py
 
-    with h5py.File(tmp_path / "b.h5", "w") as content:
-        content["csi"] = np.zeros(3, dtype=[("real", "f8"), ("weight", "f8")])
-    with pytest.raises(InputError, match="no array of numbers"):
-        read_arrays(tmp_path / "b.h5", ["csi"])
+        with h5py.File(file, "w") as content:
+            content.create_dataset("csi", **options)
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("write", "says"),
+    [
+        (_elsewhere, "no array of numbers in this file"),
+        (_data_set(data=np.zeros(3, dtype=[("real", "f8"), ("weight", "f8")])), "no array of numbers"),
+        (_data_set(shape=(2**20, 2**10), dtype="c16", chunks=(1, 1)), "unpacks to"),  # before memory is taken
+    ],
+    ids=["a link to another file", "other compounds", "a large claim"],
+)
+def test_hdf5_without_the_numbers_is_refused(tmp_path, write, says):
+    write(tmp_path / "a.h5")
+    with pytest.raises(InputError, match=says):
+        read_arrays(tmp_path / "a.h5", ["csi"])
 
 
 def test_null_subcarriers_are_named_and_left_out_on_request(tmp_path):

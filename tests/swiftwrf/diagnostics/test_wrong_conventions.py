@@ -1,4 +1,4 @@
-"""Wrong frames, units and conventions that test_diagnosis does not have: refused by the reader or named by the inspection."""
+"""Wrong frames, units and conventions that test_diagnosis lacks: refused by the reader or named by the inspection."""
 
 import math
 from dataclasses import replace

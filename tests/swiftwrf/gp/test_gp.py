@@ -39,13 +39,6 @@ def test_regression_is_that_of_scikit_learn(generator):
     np.testing.assert_allclose(process.variance(asked).sqrt(), deviation, rtol=1e-6)
 
 
-def test_kernel_is_positive_definite_and_one_at_home(generator):
-    position = torch.rand(40, 3, generator=generator, dtype=torch.float64)
-    gram = KERNEL(position, position)
-    torch.testing.assert_close(gram.diagonal(), torch.ones(40, dtype=torch.float64))
-    assert torch.linalg.eigvalsh(gram).min() > 0
-
-
 def test_kernel_choice_finds_smooth_and_rough_fields(generator):
     position = torch.rand(80, 3, generator=generator, dtype=torch.float64)
     fold = torch.arange(80) % 5

@@ -106,6 +106,8 @@ def test_rows_at_other_receivers_are_refused(short_fits, tmp_path, predictor):
 def test_unknown_positions_of_receivers_are_not_compared(tmp_path):
     unlocated = Rssi(FLOOR.rssi_dbm, FLOOR.transmitter_position, receiver_names=FLOOR.receiver_names)
     model = RssiModel().fit(unlocated)
+    assert not model.slope.any()
+    assert not model.directivity.any()
     model.save(tmp_path / "model")
     again = load(tmp_path / "model")
     assert again.receiver_position.isnan().all()

@@ -17,16 +17,6 @@ def point(*x):
     return torch.tensor([x], dtype=torch.float64)
 
 
-def test_one_path_peaks_at_its_direction():
-    array = PlanarArray.square(4, 915e6)
-    direction = to_direction(torch.tensor([math.radians(200)]), torch.tensor([math.radians(60)]))
-    channel = array.channel(direction, torch.ones(1), torch.zeros(1, dtype=torch.int64), 1)
-    spectrum = array.spectrum(channel, FINE)
-    row, column = divmod(int(spectrum.argmax()), 360)
-    assert (column, row + 1) == (200, 60)
-    assert spectrum.max().item() == pytest.approx(1, abs=1e-5)
-
-
 def test_two_paths_make_the_known_fringe():
     """Two equal waves from the zenith and from azimuth 0, elevation e: the phase along x is half that of the second wave,
     so the spectrum peaks halfway between them in direction cosine; the amplitude follows |1 + exp(j phase)|."""

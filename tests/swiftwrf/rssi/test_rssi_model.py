@@ -342,21 +342,14 @@ def test_saved_model_predicts_the_same(tmp_path):
     assert torch.equal(*(both(m.predict(data.transmitter_position)) for m in (again, model)))
 
 
-@pytest.mark.parametrize("n_detected", [12, 0])
-def test_a_receiver_that_few_of_many_rows_detect(n_detected):
-    data = with_field(n=700)
-    data.rssi_dbm[torch.randperm(700, generator=torch.Generator().manual_seed(0))[n_detected:], 0] = torch.nan
-    assert fit_rssi(data).predict(data.transmitter_position[:5]).mean.isfinite().all()
-
-
 # --- awkward data ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("n_detected", [0, 2, 10])
+@pytest.mark.parametrize(("n", "n_detected"), [(150, 0), (150, 2), (150, 10), (700, 0), (700, 12)])
 @pytest.mark.parametrize("validation", ["random", "block"])
-def test_a_rarely_detected_receiver_does_not_stop_the_others(n_detected, validation):
-    data = with_field()
-    data.rssi_dbm[n_detected:, 1] = torch.nan
+def test_a_rarely_detected_receiver_does_not_stop_the_others(n, n_detected, validation):
+    data = with_field(n)
+    data.rssi_dbm[torch.randperm(n, generator=torch.Generator().manual_seed(0))[n_detected:], 1] = torch.nan
     model = fit_rssi(data, RssiConfig(validation=validation))
     prediction = model.predict(data.transmitter_position)
     assert prediction.mean.isfinite().all()
@@ -407,12 +400,8 @@ def test_refuses():
     assert model.predict(torch.empty(0, 3)).mean.shape == (0, 3)
     with pytest.raises(InputError, match="receivers a, b, c have 0 training measurements in all; measure at least 10"):
         fit_rssi(replace(data, rssi_dbm=data.rssi_dbm * torch.nan))
-    with pytest.raises(InputError, match="rssi_dbm must be finite"):
-        fit_rssi(replace(data, rssi_dbm=data.rssi_dbm * torch.inf))
     with pytest.raises(InputError, match="same rows"):
         fit_rssi(data, pool=path_loss_only(seed=1))
-    with pytest.raises(InputError, match="is not fitted"):
-        RssiModel().predict(data.transmitter_position)
     with pytest.raises(InputError, match="is not fitted"):
         RssiModel().state()
     with pytest.raises(InputError, match="a predictor mean has no map; choose swiftwrf or pairs"):

@@ -20,12 +20,11 @@ from sklearn.neighbors import KNeighborsRegressor
 from small import with_defaults
 from test_rssi_model import path_loss_only
 
-from swiftwrf import InputError, fit_rssi, load, rssi_room
+from swiftwrf import InputError, rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.comparison import NeRF2Rssi
 from swiftwrf.comparison.nerf2 import NeRF2RssiConfig
 from swiftwrf.data.splits import folds
-from swiftwrf.metrics import paired_difference
 from swiftwrf.rssi import RssiPredictor, compare
 from swiftwrf.rssi.baselines import NEIGHBOUR_COUNTS
 from swiftwrf.rssi.comparison import compared, make_predictor, pool_of
@@ -212,16 +211,6 @@ def test_predictors_without_positions_of_the_receivers(name):
         assert predictor.fit(data).predict(data.transmitter_position).mean.isfinite().all()
 
 
-def test_model_without_positions_of_the_receivers_is_saved(tmp_path):
-    data = unlocated()
-    model = fit_rssi(data)
-    assert not model.slope.any()
-    assert not model.directivity.any()
-    model.save(tmp_path / "model")
-    position = data.transmitter_position[:5]
-    torch.testing.assert_close(load(tmp_path / "model").predict(position).mean, model.predict(position).mean)
-
-
 def test_a_survey_table_is_one_command_to_a_map(tmp_path, capsys):
     file = write_survey(tmp_path / "walk")
     assert quick.run("rssi", "--data", file, "--rx", "all", "--out", tmp_path / "run") == 0
@@ -252,15 +241,6 @@ def test_neighbours_are_those_that_a_grid_search_chooses():
         search = GridSearchCV(KNeighborsRegressor(), grid, scoring="neg_mean_absolute_error", cv=PredefinedSplit(own))
         found = predictor._regressor(x, y, own)
         assert {"n_neighbors": found.n_neighbors, "weights": found.weights} == search.fit(x, y).best_params_
-
-
-@pytest.mark.parametrize(("rows", "known"), [(1, False), (9, False), (10, True)])
-def test_few_test_rows_tell_no_difference(rows, known):
-    index = pd.MultiIndex.from_product([range(rows), ["a", "b"]], names=["index", "receiver"])
-    errors = pd.DataFrame({"one": np.arange(2.0 * rows), "other": 1.0}, index=index)
-    mean, low, high = paired_difference(errors, "one", "other")
-    assert mean == pytest.approx(rows - 1.5)
-    assert (low < mean < high) == known
 
 
 def test_an_interval_of_one_width_sends_nobody_to_measure():
