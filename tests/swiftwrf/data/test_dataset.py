@@ -211,17 +211,6 @@ def test_corrected_rssi_may_leave_the_range_of_received_powers():
     assert offsets.removed(data).subset([1]).rssi_dbm.tolist() == [[40.0]]
 
 
-@pytest.mark.parametrize(
-    ("unit", "factor"), [("seconds", 1), ("milliseconds", 10**3), ("microseconds", 10**6), ("nanoseconds", 10**9)]
-)
-def test_times_since_1970_are_seconds_whatever_they_count(unit, factor):
-    steps = range(0, 8, 2)
-    table = pd.DataFrame({"timestamp": [(1_700_000_000 + step) * factor for step in steps], "x": steps, "y": 0, "z": 1})
-    data = Rssi.from_frame(table.assign(hall=[-50, -51, -52, -53]))
-    assert data.time.tolist() == pytest.approx([*steps], abs=1e-5)
-    assert any(unit in note for note in data.notes) == (factor > 1)
-
-
 def test_rssi_from_a_table_and_back():
     data = rssi_room(n=30)
     places = dict(zip(data.receiver_names, data.receiver_position.tolist(), strict=True))

@@ -76,15 +76,56 @@ def test_a_receiver_that_is_named_unlike_the_others_is_pointed_out(table):
     assert noted(data, "named unlike the others: hx")
 
 
+def written(power, metres="{} m"):
+    """Return a change of a table that writes its numbers as text."""
+    return lambda t: t[["x", "y"]].map(metres.format).join(t[["a", "b", "c", "d"]].map(power))
+
+
+def scaled(unit, factor):
+    """Return a change of a table to lengths in another unit."""
+    return lambda t: t.assign(x=factor * t.x, y=factor * t.y).rename(columns={"x": f"x_{unit}", "y": f"y [{unit}]"})
+
+
+def with_letters(table):
+    degrees = GeodeticOrigin(-33.9, -70.2).to_degrees(table[["x", "y"]].to_numpy())
+    text = {"Lat": [f"{-value:.8f} S" for value in degrees[:, 0]], "Lon": [f"{-v:.8f}\u00b0W" for v in degrees[:, 1]]}
+    return table.assign(**text).drop(columns=["x", "y"])
+
+
+def called_latitude(table):
+    return table.assign(longitude=table.x - 7541.26, latitude=table.y + 4864921.5).drop(columns=["x", "y"])
+
+
 RECEIVERS = [
     *("gateway_id", "gateway", "gw", "ap", "ap_name", "AP Name", "ap_mac", "mac_address", "MAC", "beacon_id", "anchor"),
     *("sensor", "node", "station", "access_point", "rx_id", "ssid", "BSSID", "cell_id", "pci", "eui", "beacon"),
 ]
+FORMS = {  # the change of the table, and words of a note
+    "units": (written(lambda v: f"{v:.0f} dBm"), ""),
+    "units without space": (written(lambda v: f"{v:.1f}dBm"), ""),
+    "typographic minus": (written(lambda v: f"\u2212{-v:.0f}"), ""),
+    "dash for minus": (written(lambda v: f"\u2013{-v:.0f}"), ""),
+    "centimetres": (scaled("cm", 100.0), "cm in a metre"),
+    "millimetres": (scaled("mm", 1000.0), "mm in a metre"),
+    "feet": (scaled("ft", 1 / 0.3048), "ft in a metre"),
+    "degrees with letters": (with_letters, ""),
+    "metres that are called latitude": (called_latitude, ""),
+    **{
+        f"receivers in a column {name}": (
+            lambda t, name=name: long_of(t, name, "rssi").assign(snr=-3.5, device="phone"),
+            "",
+        )
+        for name in RECEIVERS
+    },
+}
 
 
-@pytest.mark.parametrize("name", RECEIVERS)
-def test_columns_of_receivers_by_name(table, name):
-    is_read_as(Rssi.from_frame(long_of(table, name, "rssi").assign(snr=-3.5, device="phone")), table)
+@pytest.mark.parametrize("form", FORMS)
+def test_a_walk_in_any_form_is_read_the_same(table, form):
+    change, words = FORMS[form]
+    data = Rssi.from_frame(change(table))
+    is_read_as(data, table, atol=0.01 if "degrees" in form else 1e-6)
+    assert not words or noted(data, words)
 
 
 @pytest.mark.parametrize("name", ["hotspot", "Netzwerk", "peer"])
@@ -104,20 +145,6 @@ def test_columns_that_are_no_receivers_are_not_asked_about(table):
     halves = np.where(one.x < 9, "west", "east")
     data = Rssi.from_frame(one.assign(wing=halves, phone=["p", "q"] * (N // 2), sf=["SF7", "SF9", "SF12"] * (N // 3)))
     assert data.receiver_names == ("rssi",)
-
-
-CELLS = {
-    "units": lambda v: f"{v:.0f} dBm",
-    "units without space": lambda v: f"{v:.1f}dBm",
-    "typographic minus": lambda v: f"\u2212{-v:.0f}",
-    "dash for minus": lambda v: f"\u2013{-v:.0f}",
-}
-
-
-@pytest.mark.parametrize("kind", CELLS)
-def test_numbers_as_people_write_them(table, kind):
-    powers = table[["a", "b", "c", "d"]].map(CELLS[kind])
-    is_read_as(Rssi.from_frame(table[["x", "y"]].map("{} m".format).join(powers)), table)
 
 
 @pytest.mark.parametrize(
@@ -209,14 +236,6 @@ def test_pixels_of_a_floor_plan(table, tmp_path, scale, above):
     is_read_as(Rssi.from_frame(plain, scale=scale, y_down=True), table)
 
 
-@pytest.mark.parametrize(("unit", "factor"), [("cm", 100.0), ("mm", 1000.0), ("ft", 1 / 0.3048)])
-def test_lengths_in_other_units(table, unit, factor):
-    scaled = table.assign(x=factor * table.x, y=factor * table.y)
-    data = Rssi.from_frame(scaled.rename(columns={"x": f"x_{unit}", "y": f"y [{unit}]"}))
-    is_read_as(data, table)
-    assert noted(data, f"{unit} in a metre")
-
-
 def test_y_that_points_up(table, tmp_path):
     """Receivers beside the table have its axes."""
     phone = table.assign(z=-table.y, y=0.1 * np.sin(table.x))[["x", "y", "z", "a", "b", "c", "d"]]
@@ -243,22 +262,9 @@ def test_degrees_in_other_units(table, unit, at):
     assert noted(data, "longitude longitude and latitude latitude are projected")
 
 
-def test_degrees_with_letters(table):
-    degrees = GeodeticOrigin(-33.9, -70.2).to_degrees(table[["x", "y"]].to_numpy())
-    text = {"Lat": [f"{-value:.8f} S" for value in degrees[:, 0]], "Lon": [f"{-v:.8f}\u00b0W" for v in degrees[:, 1]]}
-    is_read_as(Rssi.from_frame(table.assign(**text).drop(columns=["x", "y"])), table, atol=0.01)
-
-
 def test_one_row_of_a_stream_keeps_its_receivers(table):
     row = table.iloc[:1].assign(a=-11.5, noise=-95)
     assert Rssi.from_frame(row).receiver_names == ("a", "b", "c", "d")
-
-
-def test_metres_that_are_called_latitude_stay_metres(table):
-    data = Rssi.from_frame(
-        table.assign(longitude=table.x - 7541.26, latitude=table.y + 4864921.5).drop(columns=["x", "y"])
-    )
-    is_read_as(data, table)
 
 
 START = pd.Timestamp("2024-03-09 16:00:00", tz="UTC")
@@ -282,8 +288,11 @@ def test_times_in_other_units(table, kind):
         3.0 * np.arange(N) if "start" not in kind else np.cumsum(np.random.default_rng(0).uniform(4, 6, N)).round(3)
     )
     name = "time_ms" if "start" in kind else "timestamp"
-    time = Rssi.from_frame(table.assign(**{name: TIMES[kind](seconds)})).time
-    np.testing.assert_allclose(time, seconds - (seconds[0] if "start" in kind or kind == "epoch" else 0), atol=1e-3)
+    data = Rssi.from_frame(table.assign(**{name: TIMES[kind](seconds)}))
+    assert noted(data, kind) == (kind in ("milliseconds", "microseconds", "nanoseconds"))
+    np.testing.assert_allclose(
+        data.time, seconds - (seconds[0] if "start" in kind or kind == "epoch" else 0), atol=1e-3
+    )
 
 
 def test_date_and_time_in_two_columns(table):

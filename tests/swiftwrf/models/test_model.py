@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from swiftwrf import AngularGrid, InputError, SwiftWRF, fit, load, load_spectra
 from swiftwrf.array.planar import PlanarArray
@@ -93,6 +94,10 @@ def test_load_refuses_other_files(tmp_path):
     (tmp_path / "text").write_text("hello")
     with pytest.raises(InputError, match="not a readable"):
         load(tmp_path / "text")
+    for header in ("", "[]", "{", "[" * 100_000, "3"):
+        save_file({}, tmp_path / "m", {"kind": "swiftwrf model", "format": "1", "header": header})
+        with pytest.raises(InputError):
+            load(tmp_path / "m")
     checkpoint.write(tmp_path / "other", "fit state", {"a": torch.zeros(1)}, {})
     with pytest.raises(InputError, match="holds 'fit state' in format 1; expected '"):
         load(tmp_path / "other")
@@ -184,6 +189,13 @@ def test_a_spectrum_without_any_signal_spoils_nothing(room):
     spectrum[3] = 0
     model = CoarrayModel().fit(replace(room, store=Store(spectrum)))
     assert psnr(model.synthesize(room.position[4:]), spectrum[4:]).median() > 15
+
+
+def test_models_whose_parameters_overflow_are_refused(room):
+    tensors, header = CoarrayModel().fit(room).state()
+    model = CoarrayModel.from_state(tensors | {"form": 3e38 * tensors["form"].sign()}, header)
+    with pytest.raises(InputError, match="not finite"):
+        model.synthesize(room.position[:1])
 
 
 @pytest.mark.data

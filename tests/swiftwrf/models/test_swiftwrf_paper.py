@@ -12,9 +12,11 @@ from swiftwrf.models.primitives import MIN_WIDTH_PIXELS, Primitives
 from swiftwrf.models.swiftwrf_paper import DeformableGaussians, Optimisation, SwiftWRFPaper, SwiftWRFPaperConfig
 from swiftwrf.positions import frame
 from swiftwrf.rasterize import rasterize_magnitude
+from swiftwrf.runtime.checkpoint import read, write
 
 GRID = AngularGrid.hemisphere(15, 60)
 QUICK = SwiftWRFPaperConfig(n_primitives=24, steps=80, check_every=20)
+TINY = SwiftWRFPaperConfig(n_primitives=4, steps=10, check_every=5)
 
 
 def field(n=6, shift=0.0):
@@ -191,3 +193,16 @@ def test_recovers_a_scene_that_it_can_represent_exactly(room, generator):
     while optimisation.step < 300:
         optimisation.advance()
     assert before < 35 < 45 < quality(optimisation.result)
+
+
+def test_a_damaged_state_of_a_fit_is_refused(room, tmp_path):
+    state = tmp_path / "state"
+    SwiftWRFPaper(TINY).fit(room, checkpoint=state)
+    kind, tensors, header = read(state, "fit state")
+    for change in ({"seconds": None}, {"records": 3}, {"step": "x"}, {"fingerprint": 1}):
+        write(state, kind, tensors, header | change)
+        with pytest.raises(InputError):
+            SwiftWRFPaper(TINY).fit(room, checkpoint=state)
+    write(state, kind, {name: t for name, t in tensors.items() if "mean" not in name}, header)
+    with pytest.raises(InputError):
+        SwiftWRFPaper(TINY).fit(room, checkpoint=state)

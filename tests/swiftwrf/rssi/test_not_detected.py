@@ -5,6 +5,7 @@ from dataclasses import replace
 import pandas as pd
 import pytest
 import torch
+from test_floors import FLOOR_DB, RECEIVERS, building, rssi
 
 from swiftwrf import InputError, Rssi, RssiModel, load, rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
@@ -165,27 +166,15 @@ def test_the_limit_is_one_of_received_power_whatever_offset_is_removed(fitted):
     torch.testing.assert_close(found.predict_detection(at, -20.0), model.predict_detection(at), **close)
 
 
-def building(located):
-    """14 dB a floor; two floors away hardly anything is received."""
-    generator = torch.Generator().manual_seed(0)
-    floor = torch.arange(240) % 3
-    position = torch.rand(240, 3, generator=generator).double() * torch.tensor([30.0, 20.0, 0.0])
-    position[:, 2] = 4.0 * floor
-    receiver = RECEIVER + torch.tensor([0.0, 4.0, 8.0, 4.0])[:, None] * torch.tensor([0.0, 0, 1])
-    crossed = (floor[:, None] - torch.tensor([0, 1, 2, 1])).abs()
-    flat = torch.tensor([1.0, 1.0, 0.0])
-    rssi = -40.0 - 30.0 * log_distance(position * flat, receiver * flat) - 14.0 * crossed
-    rssi = rssi + 3.0 * torch.randn(240, 4, generator=generator)
-    table = Rssi(rssi, position, receiver_position=receiver, receiver_names=list("abcd"), name="s").to_frame()
-    table = table.rename(columns={"x_m": "x", "y_m": "y", "z_m": "z"}).assign(floor=floor.numpy())
-    places = dict(zip("abcd", receiver.tolist(), strict=True)) if located else None
-    table[list("abcd")] = table[list("abcd")].where(table[list("abcd")] > LIMIT)
-    return Rssi.from_frame(table.reset_index(drop=True), receiver_position=places)
+def hidden_building(located):
+    """Return the building of test_floors, in which hardly anything is received two floors away."""
+    table, names = building(), list(RECEIVERS)
+    return rssi(table.assign(**table[names].where(table[names] > -80)), located)
 
 
 @pytest.mark.parametrize("located", [True, False])
 def test_the_attenuation_of_floors_counts_what_they_hide(located):
-    assert estimate_floor_attenuation(building(located)).db == pytest.approx(14, abs=3)
+    assert estimate_floor_attenuation(hidden_building(located)).db == pytest.approx(FLOOR_DB, abs=3)
 
 
 def test_floors_and_offsets_need_a_column():
@@ -196,7 +185,7 @@ def test_floors_and_offsets_need_a_column():
 
 
 def test_another_kernel_keeps_the_limit_of_detection_of_a_building():
-    data = building(located=True)
+    data = hidden_building(located=True)
     model = RssiModel().fit(data)
     found = model.with_chosen_kernel()
     assert found.detection.limit == pytest.approx(model.detection.limit, abs=1)
