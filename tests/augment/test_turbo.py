@@ -9,7 +9,7 @@ from quick import cheap
 
 from augment import turbo_learning
 from augment.estimators import Estimator
-from swiftwrf import AngularGrid, InputError, load_spectra, make_model, simulated_room
+from swiftwrf import AngularGrid, load_spectra, simulated_room
 from swiftwrf.metrics import angle_errors
 from swiftwrf.models.neighbours import NearestModel
 from swiftwrf.runtime.steps import Memo
@@ -79,20 +79,3 @@ def test_a_call_continues_after_the_steps_that_it_kept_and_computes_the_others_i
     pd.testing.assert_frame_equal(again.errors, first.errors)
     changed = [file.stem for file, time in steps.items() if file.stat().st_mtime_ns != time]
     assert changed == ["kernel_regression_measured-mix0.5-r0"]
-
-
-@pytest.mark.parametrize(
-    ("options", "reason"),
-    [
-        ({"measured": 0.0}, "in \\(0, 1\\]"),
-        ({"split": "nowhere"}, "choose one of block, random"),
-        ({"models": ["oracle"]}, "unknown field model"),
-        ({"estimators": ["oracle"]}, "unknown estimator"),
-        ({"measured": 0.1}, "leaves 2 of 24"),
-        ({"models": [make_model("idw"), "idw"]}, "two field models have the name 'idw'"),
-        ({"estimators": [Zenith(), Zenith()]}, "two estimators have the name 'Zenith'"),
-    ],
-)
-def test_what_does_not_exist_is_refused(data, options, reason):
-    with pytest.raises(InputError, match=reason):
-        turbo_learning(data, **options)

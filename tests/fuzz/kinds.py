@@ -8,6 +8,7 @@ import functools
 import json
 import random
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +112,7 @@ def _room() -> Spectra:
 
 @functools.cache
 def _floor() -> Rssi:
-    return rssi_room(n=40).receivers(["1", "2"])
+    return replace(rssi_room(n=40).receivers(["1", "2"]), receiver_names=("NA", "12:34:56"))
 
 
 def _of_the_floor() -> GeometryModel:
@@ -153,16 +154,6 @@ MODELS: dict[str, Callable[[], Any]] = {
 }
 
 
-@functools.cache
-def _fitted(name: str) -> Any:
-    return MODELS[name]()
-
-
-def save(name: str, folder: Path) -> None:
-    """Save a model of this kind."""
-    _fitted(name).save(folder / "model")
-
-
 def rssi_survey(folder: Path) -> None:
     write_survey(folder)
     (folder / "receivers.csv").write_text("receiver,x,y,z\n" + "".join(f"{r},1,1,2\n" for r in survey_rows()[0][3:]))
@@ -195,36 +186,47 @@ def read_rssi(folder: Path) -> Rssi:
     return data
 
 
-def read_model(folder: Path) -> object:
-    model, position = load(folder / "model"), torch.tensor([[3.0, 2.5, 1.2]])
-    predicted = model.predict(position)
-    for values in (predicted.mean, predicted.std):
-        assert values is None or values.isfinite().all()
-    return predicted
+def predicted(model: Any) -> torch.Tensor:
+    found = model.predict(torch.tensor([[3.0, 2.5, 1.2]]))
+    return torch.cat([values.ravel() for values in (found.mean, found.std) if values is not None])
 
 
-def read_estimator(folder: Path) -> torch.Tensor:
-    estimator = load(folder / "model")
+def estimated(estimator: Any) -> torch.Tensor:
     assert isinstance(estimator, KernelRegression)
-    estimate = estimator.predict(torch.rand(2, *estimator.grid.shape))
-    assert estimate.isfinite().all()
-    return estimate
+    return estimator.predict(_room().spectrum[:2].flip(2))
+
+
+def located(locator: Any) -> torch.Tensor:
+    if isinstance(locator, RssiLocator):
+        return locator.locate(torch.full((1, len(locator.receiver_names)), -70.0)).median
+    assert isinstance(locator, MatchedField)
+    return locator.locate(_room().spectrum[:1]).median
+
+
+ANSWERS = {"kernel regression": estimated, "RSSI locator": located, "matched-field locator": located}  # others predict
+
+
+@functools.cache
+def fitted(name: str) -> Any:
+    """Return a model of this kind."""
+    return MODELS[name]()
+
+
+def save(name: str, folder: Path) -> None:
+    """Save a model of this kind."""
+    fitted(name).save(folder / "model")
+
+
+def answer(name: str, model: Any) -> torch.Tensor:
+    """Return what a model of this kind predicts, estimates or locates."""
+    found = ANSWERS.get(name, predicted)(model)
+    assert found.isfinite().all()
+    return found
 
 
 def go_on(folder: Path) -> SwiftWRFPaper:
     """A fit from its state."""
     return SwiftWRFPaper(TINY).fit(_room(), checkpoint=folder / "state")
-
-
-def read_locator(folder: Path) -> torch.Tensor:
-    locator = load(folder / "model")
-    if isinstance(locator, RssiLocator):
-        posterior = locator.locate(torch.full((1, len(locator.receiver_names)), -70.0))
-    else:
-        assert isinstance(locator, MatchedField)
-        posterior = locator.locate(torch.rand(1, *locator.grid.shape))
-    assert posterior.median.isfinite().all()
-    return posterior.median
 
 
 KINDS: dict[str, tuple[Callable[[Path], object], Reader]] = {
@@ -243,10 +245,10 @@ KINDS: dict[str, tuple[Callable[[Path], object], Reader]] = {
     "format of RSSI survey": (rssi_survey, read_rssi),
     "survey in JSON": (survey_json, lambda folder: read_rssi(folder / "walk.json")),
     "track in GPX": (track_gpx, lambda folder: read_rssi(folder / "walk.gpx")),
-    **{name: (functools.partial(save, name), read_model) for name in MODELS},
-    "kernel regression": (functools.partial(save, "kernel regression"), read_estimator),
-    "RSSI locator": (functools.partial(save, "RSSI locator"), read_locator),
-    "matched-field locator": (functools.partial(save, "matched-field locator"), read_locator),
+    **{
+        name: (functools.partial(save, name), lambda folder, name=name: answer(name, load(folder / "model")))
+        for name in MODELS
+    },
     "fit state": (go_on, go_on),
     "run of aoa on the page": (runs.run_of_aoa, runs.show),
     "run of rssi on the page": (runs.run_of_rssi, runs.show),

@@ -12,14 +12,15 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from quick import run
 
 from fuzz.commands import command_lines
-from fuzz.kinds import ATTEMPTS, KINDS, MODELS, Attempt
+from fuzz.kinds import ATTEMPTS, KINDS, MODELS, Attempt, answer, fitted, save
 from fuzz.mutate import damages, spoil
-from swiftwrf import FitError, InputError
+from swiftwrf import FitError, InputError, load
 from swiftwrf.data.files import read_table, read_yaml
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.errors import MAX_LENGTH
@@ -75,6 +76,15 @@ def test_every_format_and_model_is_fuzzed():
     own = {kind for kind, model in saved.items() if model.__module__.startswith("swiftwrf.")}
     own -= {"ray-tracing model"}  # Sionna RT opens it; its file is that of a geometry model
     assert own <= set(KINDS), "add a sample of the model to fuzz/kinds.py"
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_model_from_a_file_answers_as_the_one_in_memory(name, tmp_path):
+    save(name, tmp_path)
+    model, again = fitted(name), load(tmp_path / "model")
+    torch.testing.assert_close(answer(name, again), answer(name, model), atol=1e-6, rtol=0)
+    assert again.config == model.config
+    assert getattr(again, "receiver_names", None) == getattr(model, "receiver_names", None)
 
 
 def few_or_many(few: int, many: int):

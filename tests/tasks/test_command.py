@@ -7,15 +7,12 @@ import resource
 import runpy
 import subprocess
 import sys
-from importlib import import_module
 from pathlib import Path
-from typing import get_type_hints
 
 import pytest
 import torch
 from quick import run, said
 
-from tasks import configs
 from tasks.command import COMMANDS, main
 from tasks.command_line import BROKEN_PIPE
 
@@ -72,13 +69,6 @@ def test_the_two_tasks_of_the_paper_are_packages_that_python_runs(name, monkeypa
     with pytest.raises(SystemExit, match="0"):
         runpy.run_module(f"tasks.{name}", run_name="__main__")
     assert capsys.readouterr().out.startswith(f"usage: python -m tasks.{name} ")
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_has_options(name):
-    config_type = get_type_hints(import_module(COMMANDS[name].module).run)["config"]
-    assert config_type is getattr(configs, COMMANDS[name].options)
-    assert config_type.__doc__
 
 
 def test_a_file_called_tasks_in_the_working_directory(tmp_path):

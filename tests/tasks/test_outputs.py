@@ -2,7 +2,6 @@
 
 import io
 import json
-import sys
 import zlib
 from dataclasses import replace
 from xml.etree import ElementTree
@@ -115,12 +114,6 @@ def test_data_sets_have_coordinates_and_units(field, model, geodetic, room, floo
     back = ORIGIN.to_metres(np.stack([chart.latitude, chart.longitude], axis=-1).reshape(-1, 2))
     np.testing.assert_allclose(back[:, 0], np.broadcast_to(chart.x, chart.latitude.shape).ravel(), atol=1e-6)
     assert snapshots(n=12).to_xarray().channel.dims == ("position", "snapshot", "element")
-
-
-def test_without_xarray_a_sentence_says_what_to_install(room, monkeypatch):
-    monkeypatch.setitem(sys.modules, "xarray", None)
-    with pytest.raises(InputError, match=r"pip install 'swiftwrf-tasks\[xarray\]'"):
-        room.to_xarray()
 
 
 def test_matlab_files_hold_spectra_and_predictions(field, room, tmp_path):

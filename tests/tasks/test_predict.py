@@ -13,7 +13,6 @@ from scipy.io import loadmat
 from augment import Mixed
 from augment.estimators.aann import AANN
 from augment.estimators.aann_kernel import AANNKernel
-from augment.estimators.kernel_regression import KernelRegression
 from swiftwrf import AngularGrid, InputError, Rssi, RssiModel, Spectra, load, make_model, rssi_room, simulated_room
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
@@ -45,15 +44,6 @@ def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run") / "aoa"
     assert run("aoa", "--mix", 0.5, "--synthesizer", "nearest", "idw", "--extra", 5, "--out", folder) == 0
     return folder
-
-
-def test_kernel_regression_comes_back(small, tmp_path):
-    estimator = KernelRegression(seed=3).fit(Mixed.measured(small))
-    estimator.save(tmp_path / "model")
-    again = load(tmp_path / "model")
-    assert again.config == estimator.config
-    apart = angle_errors(again.predict(small.spectrum), estimator.predict(small.spectrum))["great_circle"]
-    assert float(apart.max()) < 1e-5
 
 
 def test_the_network_comes_back_as_it_was(small, network):

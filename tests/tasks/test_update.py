@@ -14,8 +14,7 @@ from swiftwrf import AngularGrid, InputError, RssiModel, load, make_model
 from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.simulated import rssi_room, simulated_room
 from swiftwrf.gp import GaussianProcess, Kernel
-from swiftwrf.models import FIELD_MODELS
-from swiftwrf.rssi import FloorAttenuation, RssiPaperModel
+from swiftwrf.rssi import FloorAttenuation
 
 SIGNAL = 1e-5  # of the signal: magnitudes up to 1, RSSI over 60 dB
 OPTIONS = {"swiftwrf": {"n_primitives": 24}}
@@ -147,21 +146,6 @@ def test_a_room_is_refined_by_its_covariance():
     assert len(updated.planes) == len(room.planes) > 0
     before, after = (model.estimate.covariance.diagonal() for model in (room, updated))
     assert (after <= before).all()
-    with pytest.raises(InputError, match="fewer than 10"):
-        room.update(new.subset(torch.arange(3)))
-
-
-@pytest.mark.parametrize("name", [name for name in ("nearest", "idw") if not FIELD_MODELS[name].updates])
-def test_other_models_must_be_fitted_again(name):
-    with pytest.raises(InputError, match="fit it again"):
-        fitted(name).update(data())
-
-
-def test_wrong_spectra_are_refused():
-    with pytest.raises(InputError, match="another grid"):
-        fitted("coarray").update(simulated_room(n=2, grid=AngularGrid.hemisphere(7, 30)))
-    with pytest.raises(InputError, match="correlation"):
-        fitted("coarray").aged(0.0)
 
 
 @settings(max_examples=4, deadline=None)
@@ -197,13 +181,6 @@ def test_rssi_is_updated_after_loading_and_beyond_its_rows_in_memory(tmp_path, m
     torch.testing.assert_close(loaded.predict(at).mean, expected, atol=0.2, rtol=0)
     monkeypatch.setattr("swiftwrf.rssi.posterior.MAX_NEW_ROWS", 12)
     torch.testing.assert_close(model.update(rest).predict(at).mean, expected, atol=0.2, rtol=0)
-
-
-def test_rssi_refuses_the_papers_head():
-    few = floor().columns([0])
-    paper = RssiPaperModel(steps=2).fit(few)
-    with pytest.raises(InputError, match="fit it again"):
-        paper.update(few)
 
 
 @pytest.mark.parametrize("name", PROCESSES)

@@ -86,12 +86,6 @@ def test_the_two_ends_of_an_axis_are_distinguished(method):
         assert angular_distance(method(array, channel), direction).max() < math.radians(5)
 
 
-def test_esprit_refuses_an_array_of_wide_spacing():
-    wide = PlanarArray.grid(2, 2, spacing=0.1, frequency_hz=2.4e9)
-    with pytest.raises(InputError, match="at most half a wavelength, along two directions; use MUSIC"):
-        esprit(wide, torch.ones(1, 3, 4, dtype=torch.complex128))
-
-
 @pytest.mark.parametrize("array", [SQUARE, ROW])
 def test_the_earliest_path_is_found_below_a_stronger_reflection(array):
     """With a delay and a phase of each packet, noise, and subcarriers in any order."""

@@ -157,13 +157,6 @@ def test_a_table_of_positions_is_no_survey(tmp_path):
         load_rssi(tmp_path)
 
 
-def test_the_extra_is_named(tmp_path, monkeypatch):
-    write_captures(tmp_path)
-    monkeypatch.setitem(__import__("sys").modules, "csiread", None)
-    with pytest.raises(InputError, match=r"pip install 'swiftwrf-tasks\[csi\]'"):
-        load_snapshots(tmp_path)
-
-
 def subcarriers(tones, first, last, step=1):
     """Indices of the subcarriers first to last on both sides of DC, in the order of the FFT."""
     return [*range(first, last + 1), *range(tones - last, tones - first + 1)][::step]

@@ -4,13 +4,13 @@ import errno
 import importlib
 import math
 import os
-from dataclasses import replace
+import sys
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
-from samples import install
+from samples import install, write_captures
 
 from swiftwrf import (
     AngularGrid,
@@ -19,6 +19,8 @@ from swiftwrf import (
     Rssi,
     Snapshots,
     Spectra,
+    datasets,
+    load_rssi,
     load_spectra,
     rssi_room,
     simulated_room,
@@ -27,10 +29,7 @@ from swiftwrf.array import planar
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data import load_snapshots
 from swiftwrf.data.formats import SPECTRA_FORMATS
-from swiftwrf.data.raytraced import Tracing
 from swiftwrf.data.rssi import Offsets
-from swiftwrf.data.simulated import ShoeboxRoom
-from swiftwrf.data.splits import folds
 from swiftwrf.runtime import durable
 
 ROOM = simulated_room(n=24, grid=AngularGrid.hemisphere(9, 36))
@@ -78,105 +77,6 @@ def test_snapshots_from_arrays():
     assert repr(data).startswith(
         "<Snapshots 'snapshots': 20 channels of 1 snapshots, 4 elements at 2.4 GHz,\n positions over"
     )
-
-
-NAN_POSITION = ROOM.position.where(torch.arange(24)[:, None] != 3, torch.nan)
-FOUR = PlanarArray.square(2, 1e9)
-
-
-def of_spectra(values=ROOM.spectrum, position=ROOM.position, **options):
-    return lambda: Spectra(values, position, **options)
-
-
-def of_room(**changes):
-    return lambda: replace(ROOM, **changes)
-
-
-def of_snapshots(channel, **options):
-    return lambda: Snapshots(channel, torch.rand(5, 3), array=FOUR, **options)
-
-
-def of_rssi(values, position=((0, 0, 0),), **options):
-    return lambda: Rssi(values, position, **options)
-
-
-WRONG = {
-    "other number of positions": (of_spectra(position=ROOM.position[:5]), "5 positions, but store has 24"),
-    "flat spectra": (of_spectra(ROOM.spectrum[0]), r"spectra must have shape \(n, n, n\)"),
-    "decibels": (of_spectra(-20 * ROOM.spectrum), r"magnitudes in \[0, 1\]"),
-    "a spectrum is nan": (of_spectra(ROOM.spectrum * torch.nan), "spectra must be finite; row 0"),
-    "a position is nan": (of_spectra(position=NAN_POSITION), "position must be finite; row 3"),
-    "positions in a plane": (of_spectra(position=ROOM.position[:, :2]), r"position must have shape \(n, 3\)"),
-    "text": (of_spectra(position=[["a", "b", "c"]] * 24), "position must be numbers"),
-    "labels of others": (of_room(label=ROOM.label[:7]), "label has 7 rows"),
-    "labels of one angle": (of_spectra(label=ROOM.label[:, 0]), "label must have shape"),
-    "visibility of others": (of_room(line_of_sight=torch.ones(3)), "line_of_sight has 3 rows"),
-    "another end": (of_spectra(moving="reciever"), "moving must be 'transmitter' or"),
-    "another grid": (of_spectra(grid=AngularGrid.hemisphere(9, 30)), "do not fit a grid"),
-    "pose twice": (of_spectra(pose=FACING_X, fixed_position=(0, 0, 0)), "leave them out"),
-    "at the array": (
-        of_spectra(pose=ArrayPose((*ROOM.position[2].tolist(),))),
-        "position 2 of spectra is that of the fixed end",
-    ),
-    "a field of others": (of_spectra(colour="red"), "Spectra has no colour"),
-    "no positions": (lambda: Spectra(ROOM.spectrum), "spectra and their positions"),
-    "a split of others": (
-        of_room(named_splits={"day": (torch.arange(20), torch.tensor([24]))}),
-        "'day' .* outside 0 to 23",
-    ),
-    "no pose": (of_snapshots(torch.ones(5, 4).cfloat()), "needs the pose"),
-    "other elements": (of_snapshots(torch.ones(5, 3).cfloat(), pose=FACING_X), r"channel must have shape \(5, 4\)"),
-    "real channels": (of_snapshots(torch.ones(5, 4), pose=FACING_X), "channel must be complex64 numbers"),
-    "channels beyond their type": (of_snapshots(np.full((5, 4), 1e300j), pose=FACING_X), "channel must be finite"),
-    "complex spectra": (of_spectra(ROOM.spectrum + 0j), "spectra must be real"),
-    "masked spectra": (of_spectra(np.ma.masked_less(ROOM.spectrum, 0.1)), "has masked values"),
-    "spectra of truth values": (of_spectra(ROOM.spectrum > 0.5), "must be float32 numbers"),
-    "complex positions": (of_spectra(position=ROOM.position + 0j), "position must be real"),
-    "a position far away": (of_spectra(position=1e9 * ROOM.position), "position must be .* at most 1e.09; row 0"),
-    "a far end": (of_spectra(fixed_position=(0, 0, 1e300)), "fixed_position must be .* at most 1e.09"),
-    "partly visible": (of_room(line_of_sight=[0.3] * 24), "line_of_sight must be True or False, got 0.3"),
-    "labels in degrees": (of_room(label=torch.full((24, 2), 200.0)), "convert degrees by deg2rad"),
-    "infinite labels": (of_room(label=torch.full((24, 2), math.inf)), "label must be finite, or nan"),
-    "half an index": (of_room(index=torch.arange(24) + 0.5), "index must be whole numbers, got 0.5"),
-    "a stretched rotation": (of_room(rotation=2 * torch.eye(3)), "must be a rotation matrix"),
-    "a mirrored rotation": (of_room(rotation=-torch.eye(3)), "must be a rotation matrix"),
-    "infinite RSSI": (of_rssi([[-math.inf]]), "rssi_dbm must be finite, or nan"),
-    "RSSI of others": (of_rssi([[-50.0]] * 3, torch.rand(4, 3)), "4 positions, but rssi_dbm has 3 rows"),
-    "one name for two": (of_rssi([[-50.0, -60]], receiver_names=["a", "a"]), "2 receivers, but the names"),
-    "path loss for RSSI": (of_rssi([[-50.0], [60.0]], torch.rand(2, 3)), "row 2, receiver receiver1: 60 dBm"),
-    "RSSI of a filler": (of_rssi([[-99999.0]]), "-99999 dBm is no received power"),
-    "RSSI of truth values": (of_rssi([[True]]), "rssi_dbm must be float64 numbers"),
-    "complex RSSI": (of_rssi([[-50j]]), "rssi_dbm must be real"),
-    "masked RSSI": (of_rssi(np.ma.masked_values([[-50.0, 100.0]], 100.0)), "has masked values"),
-    "far RSSI": (of_rssi([[-50.0]], [[0, 0, 2e9]]), "transmitter_position must be .* at most 1e.09"),
-    "a far receiver": (
-        of_rssi([[-50.0]], receiver_position=[[2e9, 0, 0]]),
-        "receiver_position must be .* at most 1e.09",
-    ),
-    "complex receivers": (of_rssi([[-50.0]], receiver_position=[[1j, 0, 0]]), "receiver_position must be real"),
-    "an infinite time": (of_rssi([[-50.0]], time=[math.inf]), "time must be finite, or nan"),
-    "names in one text": (of_rssi([[-50.0, -60]], receiver_names="ab"), "must be a list, of which each is a text"),
-    "an empty name": (of_rssi([[-50.0]], receiver_names=[" "]), "must be a list of texts"),
-    "a number as name": (of_rssi([[-50.0]], receiver_names=[1]), "must be a list, of which each is a text"),
-    "two lines as name": (of_rssi([[-50.0]], receiver_names=["a\r\nb"]), "must be a list of texts"),
-    "half a place": (
-        of_rssi([[-50.0, -60]], receiver_position=[[0, 0, 0], [0, 0, math.nan]]),
-        "nan where it is unknown; row 1",
-    ),
-    "half a seed": (lambda: ROOM.split("block", 0.5), "seed must be a whole number at least 0, got 0.5"),
-    "a seed of text": (lambda: rssi_room(n=20).split(seed="a"), "seed must be a whole number"),
-    "a row beyond the last": (lambda: ROOM.subset([24]), "rows of simulated-room must be a list of numbers below 24"),
-    "a mask of others": (lambda: ROOM.subset(torch.ones(10, dtype=torch.bool)), "a mask of that length"),
-    "half a row": (lambda: ROOM[[0.5]], "a list of numbers below 24"),
-    "one row": (lambda: ROOM[3], "must be a list of numbers"),
-}
-
-
-@pytest.mark.parametrize("name", WRONG)
-def test_refuses_arrays(name):
-    make, says = WRONG[name]
-    with pytest.raises(InputError, match=says):
-        make()
 
 
 @pytest.mark.parametrize(
@@ -239,35 +139,6 @@ def test_tables_and_one_line_of_a_data_set():
     assert "30 rows at 12 receivers" in repr(rssi_room(n=30))
 
 
-@pytest.mark.parametrize(
-    ("call", "says"),
-    [
-        (lambda: simulated_room(moving="reciever"), "moving must be"),
-        (lambda: simulated_room(n=0), "n must be a whole number at least 1"),
-        (lambda: simulated_room(phase_noise=-1.0), "phase_noise must be"),
-        (lambda: rssi_room(n=-1), "n must be"),
-        (lambda: folds(ROOM.position, "blok", 0), "validation must be 'random' or 'block'"),
-        (lambda: load_spectra("x", every=0), "every must be"),
-        (lambda: load_snapshots("x", station=-1), "station must be"),
-        (lambda: Tracing(order=-1), "order must be"),
-        (lambda: PlanarArray.square(0, 1e9), "side must be a whole number at least 1"),
-        (lambda: PlanarArray.square(4, 0), "frequency_hz must be a number above 0"),
-        (lambda: PlanarArray.square(4, 1e9, spacing=-1.0), "spacing must be a number above 0"),
-        (lambda: PlanarArray.grid(2.5, 2, 0.1, 1e9), "rows must be a whole number"),
-        (lambda: PlanarArray.grid(2, 2, 0.0, 1e9), "spacing must be a number above 0"),
-        (lambda: PlanarArray([[0.0, 1j]], 1.0), "element must be real"),
-        (lambda: PlanarArray([[0.0, 0.0]], "1 m"), "wavelength must be a number above 0"),
-        (lambda: AngularGrid.hemisphere(10, 40.0), "n_azimuth must be a whole number"),
-        (lambda: AngularGrid.hemisphere(0, 40), "n_elevation must be a whole number at least 2"),
-        (lambda: ArrayPose((0.0, 1.0)), r"position must have shape \(3\), got \(2,\)"),
-        (lambda: ShoeboxRoom(size=(0.0, 1.0, 1.0)), "size must be"),
-    ],
-)
-def test_declared_ranges_are_checked(call, says):
-    with pytest.raises(InputError, match=says):
-        call()
-
-
 READER = """
 import torch
 from swiftwrf import Spectra
@@ -294,6 +165,29 @@ def test_a_reader_comes_from_another_package(tmp_path, monkeypatch):
     assert "saved" in SPECTRA_FORMATS
     with pytest.raises(InputError, match="read as saved, which takes no grid"):
         load_spectra(tmp_path / "room.pt", grid=ROOM.grid)
+
+
+@pytest.mark.parametrize(
+    ("module", "extra", "use"),
+    [
+        ("h5py", "formats", lambda folder: load_snapshots(write_empty(folder / "snapshots.h5"))),
+        ("pyarrow.parquet", "formats", lambda folder: load_rssi(write_empty(folder / "walk.parquet"))),
+        ("csiread", "csi", lambda folder: (write_captures(folder), load_snapshots(folder))),
+        ("xarray", "xarray", lambda folder: ROOM.to_xarray()),
+        ("pooch", "data", lambda folder: datasets.fetch("kolak")),
+    ],
+)
+def test_a_missing_library_is_named_with_its_extra(tmp_path, monkeypatch, module, extra, use):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv("SWIFTWRF_DATA", raising=False)
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(InputError, match=rf"pip install 'swiftwrf-tasks\[{extra}\]'"):
+        use(tmp_path)
+
+
+def write_empty(file):
+    file.touch()
+    return file.parent
 
 
 def test_what_is_cached_is_bounded_in_bytes(monkeypatch):

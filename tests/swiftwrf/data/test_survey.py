@@ -1,7 +1,5 @@
 """Survey tables: long, wide, their sentinels and names, and what is refused."""
 
-import sys
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -203,11 +201,4 @@ def test_refuses(tmp_path, name):
     make, says = REFUSED[name]
     make(tmp_path)
     with pytest.raises(InputError, match=says):
-        load_rssi(tmp_path)
-
-
-def test_parquet_without_its_library(tmp_path, monkeypatch):
-    (tmp_path / "walk.parquet").write_bytes(b"")
-    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
-    with pytest.raises(InputError, match=r"pip install 'swiftwrf-tasks\[formats\]'"):
         load_rssi(tmp_path)

@@ -4,7 +4,6 @@ import hashlib
 import io
 import json
 import pickle
-import sys
 import threading
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -123,12 +122,6 @@ def test_a_conversion_that_fails_leaves_nothing(served, tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"^no$"):
         datasets.fetch("toy")
     assert [path.name for path in (tmp_path / "cache" / "swiftwrf" / "datasets").iterdir()] == ["raw"]
-
-
-def test_without_pooch_a_sentence_says_what_to_install(served, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pooch", None)
-    with pytest.raises(InputError, match=r"pip install 'swiftwrf-tasks\[data\]'"):
-        datasets.fetch("toy")
 
 
 def test_commands_take_names_where_there_is_no_such_folder(served, tmp_path, capsys, monkeypatch):

@@ -197,13 +197,6 @@ def test_few_cells_are_enough_where_path_gains_change_with_position():
     assert locator.inflation < 3
 
 
-def test_saved_locators_locate_alike(closed_form, floor, tmp_path):
-    for data, locator in ((closed_form[1].spectrum, closed_form[2]), (floor[1].rssi_dbm, floor[2])):
-        locator.save(tmp_path / "locator.safetensors")
-        again = load(tmp_path / "locator.safetensors")
-        assert torch.equal(again.locate(data).log_weight, locator.locate(data).log_weight)
-
-
 def test_coordinates_from_another_origin_change_nothing(floor):
     train, test, locator = floor
     shift = torch.tensor([512.0, -256.0, 0.0], dtype=torch.float64)
@@ -252,12 +245,6 @@ def test_a_region_takes_finite_positions_of_any_kind():
     for given, message in ((known * math.nan, "must be finite"), (known[:1], "at least 2"), (known[:, :2], "shape")):
         with pytest.raises(InputError, match=message):
             Region(given)
-
-
-@pytest.mark.parametrize("locator", [MatchedField, RssiLocator])
-def test_unknown_options_are_refused(locator):
-    with pytest.raises(InputError, match="has no option 'cells'"):
-        locator(cells=4)
 
 
 def test_rows_at_one_position_are_located_there(tmp_path):
@@ -406,31 +393,6 @@ def test_detections_are_learnt():
     found = DetectionLikelihood.fit(mean, detected)
     assert found.threshold == pytest.approx(-85, abs=2)
     assert found.loss == pytest.approx(0.1, abs=0.05)
-
-
-@pytest.mark.parametrize(
-    ("rssi", "message"),
-    [
-        (torch.full((2, 6), math.nan), "no receiver detected the transmitter in row 0"),
-        (torch.zeros(2, 5), r"rssi must have shape \(n, 6\), got \(2, 5\)"),
-        (torch.full((1, 6), math.inf), "finite"),
-    ],
-)
-def test_observations_that_make_no_sense_are_refused(floor, rssi, message):
-    with pytest.raises(InputError, match=message):
-        floor[2].locate(rssi)
-
-
-def test_spectra_on_another_grid_are_refused(closed_form):
-    with pytest.raises(InputError, match="spectra must have shape"):
-        closed_form[2].locate(torch.zeros(1, 30, 120))
-    with pytest.raises(InputError, match="finite"):
-        closed_form[2].locate(torch.full((1, 15, 60), math.nan))
-
-
-def test_data_without_an_array_have_no_matched_field(room):
-    with pytest.raises(InputError, match="array"):
-        MatchedField().fit(replace(room, array=None))
 
 
 def test_variances_of_phases_that_no_room_explains_stay_finite():

@@ -214,11 +214,6 @@ def test_structure_is_reused_from_a_model_of_the_same_scene(fitted, room, name):
         type(first)(first.config).fit(room, like=outside_mean.Mean().fit(room))
 
 
-def test_unknown_names_are_refused():
-    with pytest.raises(InputError, match="unknown field model 'swiftwarf'; choose from"):
-        make_model("swiftwarf")
-
-
 USE = """
 import sys
 sys.path.append(sys.argv[1])
@@ -257,46 +252,6 @@ def test_predictions_of_each_device_are_drawn_tabulated_and_stored(fitted, posit
     assert peak.device == found.mean.device
     stored = Spectra(found.mean, position, grid=model.grid)
     assert torch.equal(model.grid.peak_direction(stored.spectrum), peak.cpu())
-
-
-def gp(spectra):
-    return make_model("gp").fit(spectra)
-
-
-@pytest.mark.parametrize(
-    ("call", "says"),
-    [
-        (lambda spectra, rssi: swiftwrf.fit(rssi), "train must be an instance of Spectra, got <Rssi"),
-        (lambda spectra, rssi: gp(None), "train must be an instance of Spectra, got None"),
-        (lambda spectra, rssi: gp(spectra).update(rssi), "new must be an instance of Spectra"),
-        (lambda spectra, rssi: swiftwrf.fit_rssi(spectra), "train must be an instance of Rssi, got <Spectra"),
-        (lambda spectra, rssi: swiftwrf.RssiModel().fit(rssi).update(spectra), "new must be an instance of Rssi"),
-        (lambda spectra, rssi: gp(spectra).predict(spectra), "positions must be numbers"),
-        (lambda spectra, rssi: gp(spectra).predict(torch.zeros(1, 3) + 0j), "positions must be real"),
-        (lambda spectra, rssi: gp(spectra).predict([[2e9, 0, 0]]), "positions must be .* at most 1e.09"),
-        (lambda spectra, rssi: swiftwrf.load(None), "None is not a readable safetensors file"),
-        (lambda spectra, rssi: make_model("gp").fit(spectra, device="gpu"), "device must be .* got 'gpu'"),
-        (lambda spectra, rssi: make_model("gp").fit(spectra, device="meta"), "device must be .* got 'meta'"),
-        (
-            lambda spectra, rssi: gp(spectra).save("none/model"),
-            "folder of the pixel Gaussian process none/model does not",
-        ),
-        (lambda spectra, rssi: make_model("wrfgs", n_gaussians=3), "n_gaussians must be a whole number at least 4"),
-        (lambda spectra, rssi: make_model("gp").fit(spectra, device="cuda:99"), "cuda:99 needs an NVIDIA GPU"),
-        (lambda spectra, rssi: swiftwrf.RssiModel().fit(rssi, device="cuda:99"), "cuda:99 needs an NVIDIA GPU"),
-        (lambda spectra, rssi: gp(spectra).predict(spectra.position).interval("0.8"), "level must be"),
-        (lambda spectra, rssi: gp(spectra).predict(spectra.position).interval(1.0), "level must be"),
-    ],
-)
-def test_mistakes_of_newcomers_end_in_a_sentence(call, says):
-    with pytest.raises(InputError, match=says):
-        call(swiftwrf.simulated_room(n=12, grid=AngularGrid.hemisphere(9, 36)), swiftwrf.rssi_room(n=20))
-
-
-def test_a_table_without_receivers_is_refused():
-    prediction = swiftwrf.Prediction(torch.zeros(2, 3), position=torch.zeros(2, 3))
-    with pytest.raises(InputError, match="lacks positions, or directions or receivers"):
-        prediction.to_frame()
 
 
 def test_numbers_of_numpy_are_numbers():

@@ -1,6 +1,5 @@
 """Rooms in closed form found again, conclusions on what is not identifiable, samples, state."""
 
-import math
 from copy import copy
 from dataclasses import replace
 
@@ -533,23 +532,3 @@ def test_spectra_and_their_gradient_are_finite_where_both_ends_meet():
     spectrum.sum().backward()
     assert spectrum.isfinite().all()
     assert at.grad.isfinite().all()
-
-
-@pytest.mark.parametrize(
-    ("normal", "offset", "gain", "order", "says"),
-    [
-        ((0.0, 0.0, -2.0), 0.0, -0.6, 2, "unit vector, got .* of length 2; divide"),
-        ((math.inf, 0.0, 0.0), 0.0, -0.6, 2, "unit vector"),
-        ((0.0, 0.0, -1.0), math.inf, -0.6, 2, "offset and gain of a plane must be finite"),
-        ((0.0, 0.0, -1.0), 0.0, -math.inf, 2, "offset and gain of a plane must be finite"),
-        ((0.0, 0.0, -1.0), 0.0, -0.6, 5, "order must be a whole number at least 0 and at most 4, got 5"),
-        ((0.0, 0.0, -1.0), 0.0, -0.6, -1, "order must be a whole number"),
-        ((0.0, 0.0, -1.0), 0.0, -0.6, 1.0, "order must be a whole number"),
-    ],
-)
-def test_rooms_that_cannot_be_are_refused(normal, offset, gain, order, says):
-    link = simulated_room(n=10, grid=AngularGrid.hemisphere(9, 36))
-    with pytest.raises(InputError, match=says):
-        GeometryModel.of_planes(link, [Plane(normal, offset, gain)], order)
-    with pytest.raises(InputError, match="number of planes must be a whole number at most 64"):
-        GeometryModel.of_planes(link, [Plane((0.0, 0.0, -1.0), 0.0, -0.6)] * 65)

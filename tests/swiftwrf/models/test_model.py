@@ -14,7 +14,6 @@ from swiftwrf.metrics import psnr, ssim
 from swiftwrf.models import coarray
 from swiftwrf.models import swiftwrf as module
 from swiftwrf.models.coarray import CoarrayModel, basis, differences
-from swiftwrf.models.swiftwrf_paper import SwiftWRFPaperConfig
 from swiftwrf.rasterize import rasterize_magnitude
 from swiftwrf.runtime import checkpoint
 
@@ -101,23 +100,6 @@ def test_load_refuses_other_files(tmp_path):
     checkpoint.write(tmp_path / "other", "fit state", {"a": torch.zeros(1)}, {})
     with pytest.raises(InputError, match="holds 'fit state' in format 1; expected '"):
         load(tmp_path / "other")
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"n_primitives": 0}, "n_primitives must be"),
-        ({"n_primitives": 2.5}, "n_primitives must be"),
-        ({"n_primitives": "many"}, "n_primitives must be"),
-        ({"max_azimuths": -1}, "max_azimuths must be a whole number at least 0"),
-        ({"steps": 5}, "no option 'steps'"),
-        ({"presets": "paper"}, "no option 'presets'"),
-        ({"config": SwiftWRFPaperConfig()}, "takes a SwiftWRFConfig"),
-    ],
-)
-def test_options_outside_their_ranges_are_refused(options, message):
-    with pytest.raises(InputError, match=message):
-        SwiftWRF(**options)
 
 
 @pytest.mark.parametrize(("n_primitives", "batch"), [(16, 4096), (10_000, 1677), (500_000, 64)])

@@ -134,12 +134,6 @@ def test_interrupted_fit_goes_on_to_the_same_bits(room, tmp_path):
     assert torch.equal(again.synthesize(room.position), whole)
 
 
-def test_refuses_the_state_of_another_fit(room, tmp_path):
-    SwiftWRFPaper(QUICK, steps=20).fit(room, checkpoint=tmp_path / "state")
-    with pytest.raises(InputError, match="another fit"):
-        SwiftWRFPaper(QUICK).fit(room, checkpoint=tmp_path / "state")
-
-
 def test_loss_that_is_not_finite_stops_and_keeps_the_last_good_state(room, tmp_path, monkeypatch):
     state = tmp_path / "state"
     honest = Optimisation.objective

@@ -9,7 +9,7 @@ import pytest
 import torch
 from rooms import built_in_walls, room_with_box
 
-from swiftwrf import AngularGrid, GeometryModel, InputError, RssiModel, make_model
+from swiftwrf import AngularGrid, GeometryModel, RssiModel, make_model
 from swiftwrf.data.simulated import ShoeboxRoom, rssi_room, simulated_room
 from swiftwrf.metrics import psnr
 from swiftwrf.models.geometry import HybridModel
@@ -87,21 +87,6 @@ def test_each_region_has_a_place_of_its_own(n_places):
     position = torch.eye(3)[:n_places].repeat(40, 1)
     monitor = Monitor(position)
     assert len(monitor.centre.unique(dim=0)) == len(monitor.centre) == n_places
-
-
-@pytest.mark.parametrize(
-    ("call", "says"),
-    [
-        (lambda: Follower(coarray()).step(spectra(72, 0).subset(torch.arange(2))), "one measurement, got 2"),
-        (lambda: Follower(coarray()).step(spectra(72, 0).subset(torch.arange(0))), "one measurement, got 0"),
-        (lambda: Follower(coarray(), spectra(72, 0).subset(torch.arange(60))), "positions of the 72 spectra"),
-        (lambda: Follower(coarray(), spectra(72, 0).subset(torch.arange(72).flip(0))), "in their order"),
-        (lambda: prequential(coarray(), spectra(72, 0), batch=0), "batch must be a whole number at least 1"),
-    ],
-)
-def test_measurements_that_cannot_be_followed_are_refused(call, says):
-    with pytest.raises(InputError, match=says):
-        call()
 
 
 def test_spectra_that_wait_keep_their_snapshots():

@@ -7,13 +7,13 @@ import pytest
 import torch
 from test_floors import FLOOR_DB, RECEIVERS, building, rssi
 
-from swiftwrf import InputError, Rssi, RssiModel, load, rssi_room
+from swiftwrf import Rssi, RssiModel, load, rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.data.rssi import Offsets
 from swiftwrf.gp import Kernel
 from swiftwrf.rssi import compare
 from swiftwrf.rssi.detection import Detection, DetectionField
-from swiftwrf.rssi.offsets import estimate_floor_attenuation, estimate_offsets
+from swiftwrf.rssi.offsets import estimate_floor_attenuation
 from swiftwrf.rssi.path_loss import fit_path_losses, log_distance
 
 LIMIT = -88.0
@@ -175,13 +175,6 @@ def hidden_building(located):
 @pytest.mark.parametrize("located", [True, False])
 def test_the_attenuation_of_floors_counts_what_they_hide(located):
     assert estimate_floor_attenuation(hidden_building(located)).db == pytest.approx(FLOOR_DB, abs=3)
-
-
-def test_floors_and_offsets_need_a_column():
-    with pytest.raises(InputError, match="simulated-floor has no floors; give the table a column"):
-        estimate_floor_attenuation(rssi_room(n=20))
-    with pytest.raises(InputError, match="simulated-floor has no phone in row 1; name the group of each row"):
-        estimate_offsets(replace(rssi_room(n=20), groups=pd.Series(["a", None] * 10, name="phone")))
 
 
 def test_another_kernel_keeps_the_limit_of_detection_of_a_building():

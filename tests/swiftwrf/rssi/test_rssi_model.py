@@ -8,13 +8,12 @@ import pytest
 import torch
 from scipy.optimize import minimize
 
-from swiftwrf import InputError, PairModel, Rssi, RssiModel, fit_rssi, load, rssi_room
+from swiftwrf import InputError, PairModel, Rssi, RssiModel, fit_rssi, rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.gp import Kernel
 from swiftwrf.rssi import RssiConfig, RssiPaperModel, compare
 from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
-from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.mixing import mixing_weights
 from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, harmonics, log_distance
 from swiftwrf.rssi.regression import DIRECTIVITY_STD_DB, fit_receiver
@@ -330,18 +329,6 @@ def test_gradients_are_those_of_finite_differences_in_metres():
 # --- files -----------------------------------------------------------------------------------------------------------
 
 
-def test_saved_model_predicts_the_same(tmp_path):
-    data = with_field(n=60)
-    data = replace(data, receiver_names=("NA", "1", "12:34:56"))
-    model = fit_rssi(data)
-    model.save(tmp_path / "model.safetensors")
-    again = load(tmp_path / "model.safetensors")
-    assert again.receiver_names == ("NA", "1", "12:34:56")
-    assert again.n_primitives == model.n_primitives
-    assert again.config == model.config
-    assert torch.equal(*(both(m.predict(data.transmitter_position)) for m in (again, model)))
-
-
 # --- awkward data ----------------------------------------------------------------------------------
 
 
@@ -389,27 +376,10 @@ def test_measurements_on_a_receiver_give_finite_predictions():
     assert both(fit_rssi(data).predict(with_field(n=10).transmitter_position)).isfinite().all()
 
 
-def test_refuses():
-    data = path_loss_only()
-    model = fit_rssi(data)
-    with pytest.raises(InputError, match="positions must be finite"):
-        model.predict(torch.tensor([[0.0, 0.0, float("nan")]]))
-    with pytest.raises(InputError, match="at most 1e\\+09"):
-        model.predict(torch.tensor([[1e20, 0.0, 0.0]]))
+def test_predictions_far_away_are_finite_and_those_of_no_position_empty():
+    model = fit_rssi(path_loss_only())
     assert both(model.predict(torch.tensor([[1e8, 0.0, 0.0]]))).isfinite().all()
     assert model.predict(torch.empty(0, 3)).mean.shape == (0, 3)
-    with pytest.raises(InputError, match="receivers a, b, c have 0 training measurements in all; measure at least 10"):
-        fit_rssi(replace(data, rssi_dbm=data.rssi_dbm * torch.nan))
-    with pytest.raises(InputError, match="same rows"):
-        fit_rssi(data, pool=path_loss_only(seed=1))
-    with pytest.raises(InputError, match="is not fitted"):
-        RssiModel().state()
-    with pytest.raises(InputError, match="a predictor mean has no map; choose swiftwrf or pairs"):
-        RssiMap.predict(RSSI_PREDICTORS["mean"]().fit(data))
-    with pytest.raises(InputError, match="region must be finite"):
-        RssiMap.predict(model, region=[[float("nan"), 0.0]])
-    with pytest.raises(InputError, match="a region needs at least one position"):
-        RssiMap.predict(model, region=torch.empty(0, 2))
 
 
 def test_another_kernel_keeps_the_intervals_of_rows_in_bins():
@@ -434,22 +404,6 @@ def test_a_receiver_that_is_nowhere_and_detects_nothing_has_the_mean_level():
     found = fit_rssi(train).predict(train.transmitter_position).mean[:, 0]
     assert found.std() < 0.1
     assert float(found.mean()) == pytest.approx(float(rssi.nanmean()), abs=1)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"n_primitives": -1}, "n_primitives must be a whole number at least 0"),
-        ({"huber": 0.0}, "huber must be a number above 0"),
-        ({"validation": "blok"}, "validation must be 'random' or 'block'"),
-        ({"max_locations": 3}, "max_locations must be"),
-        ({"plain": True}, "RssiModel has no option 'plain'"),
-        ({"preset": "Paper"}, "preset must be 'quick' or 'paper'"),
-    ],
-)
-def test_refuses_options(options, message):
-    with pytest.raises(InputError, match=message):
-        RssiModel(**options)
 
 
 def test_a_lone_receiver_detected_in_one_slab_only_is_refused():

@@ -27,7 +27,7 @@ from swiftwrf.comparison.nerf2 import NeRF2RssiConfig
 from swiftwrf.data.splits import folds
 from swiftwrf.rssi import RssiPredictor, compare
 from swiftwrf.rssi.baselines import NEIGHBOUR_COUNTS
-from swiftwrf.rssi.comparison import compared, make_predictor, pool_of
+from swiftwrf.rssi.comparison import make_predictor, pool_of
 from swiftwrf.runtime import registry
 from tasks.report import merge
 from tasks.rssi import experiment
@@ -90,20 +90,6 @@ def test_predictors_fall_back_at_a_rarely_detected_receiver(name):
     data.rssi_dbm[:, 2][data.transmitter_position[:, 0] > 6] = torch.nan
     predictor = make_predictor(name, validation="block").fit(data)
     assert predictor.predict(data.transmitter_position).mean.isfinite().all()
-
-
-def test_unknown_predictor():
-    with pytest.raises(InputError, match="choose from swiftwrf"):
-        make_predictor("forest")
-    with pytest.raises(InputError, match="validation must be 'random' or 'block'"):
-        make_predictor("knn", validation="blok")
-    with pytest.raises(InputError, match="KNNPredictor has no option 'k'"):
-        RSSI_PREDICTORS["knn"](k=3)
-    room = rssi_room(n=20)
-    with pytest.raises(InputError, match="unknown predictor 'forest'"):
-        compared(room, also=["forest"])
-    with pytest.raises(InputError, match="fewer must be a list, of which each is a number at least 0 and at most 1"):
-        compare(room, fewer=(-0.5,))
 
 
 def test_a_predictor_of_another_package(monkeypatch):
@@ -223,11 +209,6 @@ def test_a_survey_table_is_one_command_to_a_map(tmp_path, capsys):
         assert np.isfinite(maps["predicted"]).all()
     with quick.sketched():
         merge([tmp_path / "run"], tmp_path / "merged")
-
-
-def test_columns_are_for_tables(small, tmp_path, capsys):
-    assert run("--rx", "1", "--columns", "x=a", "--out", tmp_path / "run") == 2
-    assert "give it with --data" in capsys.readouterr().err
 
 
 def test_neighbours_are_those_that_a_grid_search_chooses():

@@ -214,14 +214,6 @@ def test_visitors_at_other_heights_have_maps_of_their_own(monkeypatch):
         assert [chart.height for chart in visitors.map(view.map, (1.0, 2.0))] == [1.0, 2.0]
 
 
-def test_certainty_is_that_of_the_interval(rssi_run):
-    """90 % of a normal variable lie above the lower end of its 80 % interval, half above its mean."""
-    rssi = open_source(rssi_run).map(1.2).prediction
-    for threshold, certainty in ((rssi.interval(0.8)[0], 0.9), (rssi.mean, 0.5)):
-        selection = MapSelection("coverage", 0, 1.2, threshold)
-        np.testing.assert_allclose(probability_above(rssi, selection), certainty, atol=1e-4)
-
-
 def test_coverage_is_where_the_probability_is_high_enough(rssi_run):
     view = open_source(rssi_run)
     threshold = float(view.map(1.2).prediction.interval(0.8)[0][2].median())
