@@ -365,7 +365,7 @@ AUGMENTATION = [
     ("unknown estimator", turbo(estimators=["oracle"])),
     ("leaves 2 of 19", turbo(measured=0.1)),
     ("two field models have the name 'idw'", turbo(models=[make_model("idw"), "idw"])),
-    ("two estimators have the name 'peak'", turbo(measured=1.0, estimators=[make_estimator("peak")] * 2)),
+    ("two estimators have the name 'Peak'", turbo(measured=1.0, estimators=[make_estimator("peak")] * 2)),
     ("7 x 7", turbo(simulated_room(n=20, grid=AngularGrid.hemisphere(4, 16)))),
 ]
 

@@ -7,12 +7,18 @@ import resource
 import runpy
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from fuzz.kinds import fitted
 from quick import run, said
+from samples import write_snapshots, write_survey
 
+from swiftwrf import AngularGrid, simulated_room
+from swiftwrf.data.writing import write_spectra
 from tasks.command import COMMANDS, main
 from tasks.command_line import BROKEN_PIPE
 
@@ -106,72 +112,139 @@ def test_unknown_commands_and_directories(tmp_path, capsys):
     assert "unknown command 'rsi'; choose from aoa, rssi" in said(capsys)
     assert main(["resume", str(tmp_path)]) == 2
     assert "no interrupted run" in said(capsys)
-    (tmp_path / "old.partial").mkdir()
-    (tmp_path / "old.partial" / "config.json").write_text('{"task": "other"}')
-    assert main(["resume", str(tmp_path / "old.partial")]) == 2
-    assert "unknown task 'other'" in said(capsys)
 
 
 # command lines that cannot be: each ends in one sentence and exit code 2, and leaves nothing
 
 
-@pytest.mark.parametrize(
-    ("task", "arguments", "says"),
-    [
-        ("aoa", ("--mix", 0.5, "--data", ""), "--data is empty"),
-        ("rssi", ("--rx", "1", "--data", ""), "--data is empty"),
-        ("rssi", ("--rx", ""), "--rx is empty"),
-        ("aoa", ("--mix", 0.5, "--seed", -1), "--seed must be"),
-        ("aoa", ("--mix", 0.5, "--seed", 2**32), "--seed must be"),
-        ("rssi", ("--rx", "1", "--seed", -1), "--seed must be"),
-        ("aoa", ("--mix", 0.5, "--seed", 2**32 - 1, "--repeats", 2), "--seed"),
-        ("aoa", ("--mix", 0.5, "--synthesizer"), "--synthesizer"),
-        ("aoa", ("--mix", 0.5, "--array", 4, 0.16, "nan"), "finite"),
-        ("aoa", ("--mix", 0.5, "--array", 100000, 0.16, 1e9), "--array"),
-        ("aoa", ("--mix", "nan"), "finite"),
-        ("aoa", ("--seed", 1), "got none"),
-        ("aoa", ("--mix", 0), "in (0, 1]"),
-        ("aoa", ("--mix", 0.3, 0.3), "twice"),
-        ("aoa", ("--mix", 0.5, "--repeats", 0), "--repeats"),
-        ("aoa", ("--mix", 0.5, "--suggest", -1), "--suggest"),
-        ("aoa", ("--mix", 0.5, "--data", "/nowhere"), "is not a folder"),
-        ("rssi", ("--rx", "99"), "no receiver '99'"),
-        ("rssi", ("--rx", "1", "--floor-plan", "x.png"), "needs --floor-extent"),
-        ("rssi", ("--rx", "1", "--floor-plan", "x.png", "--floor-extent", 0, 1, 0, 1), "not a readable image"),
-        ("rssi", ("--rx", "1", "--floor-plan", "x.png", "--floor-extent", 1, 0, 0, 1), "x0 < x1"),
-        ("aoa", ("--mix", 1e-9), "leaves 0"),
-        ("rssi", ("--rx", "1", "--floor-extent", 0, "inf", 0, "inf"), "finite"),
-        ("rssi", ("--rx", "1", "--out", "{file}/run"), "cannot read or write"),
-        ("rssi", ("--rx", "1", "--out", "/proc/run"), "cannot read or write"),
-        ("rssi", ("--rx", "1", "--out", "/"), "no name of its own"),
-        ("rssi", ("--rx", "1", "--out", "."), "no name of its own"),
-        ("rssi", ("--rx", "1", "--out", "{file}-" + "x" * 300), "cannot read or write"),
-        ("resume", ("{file}",), "no interrupted run"),
-        ("locate", ("--data", ""), "--data is empty"),
-        ("locate", ("--rx", "99"), "no receiver '99'"),
-        ("locate", ("--split", "nowhere"), "choose one of block, random"),
-        ("rssi", ("--rx", "1", "--split", "nowhere"), "choose one of block, random"),
-        ("locate", ("--cells", 9), "--cells must be a whole number at least 10"),
-        ("aoa", ("--mix", 0.5, "--processes", 0), "--processes must be a whole number at least 1, got 0"),
-        ("rssi", ("--rx", "1", "--out", "link"), "link exists already"),
-        ("report", ("{file}", "--out", "link"), "no finished run"),
-        ("predict", ("{file}", "{file}", "--out", "link"), "link exists already"),
-        ("locate", ("--columns", "x=a"), "give it with --data"),
-        ("locate", ("--data", "x", "--offset-by", "=phone"), "takes COLUMN or COLUMN=VALUE"),
-        ("locate", ("--scheduler", "tcp://127.0.0.1:1"), "no Dask scheduler"),
-        ("predict", ("{file}", "{file}", "--out", "{file}-new.csv"), "not a readable safetensors file"),
-        ("report", ("{file}",), "no finished run"),
-        ("report", ("--out", "{file}/x"), "no runs"),
-        ("inspect", ("/nowhere", "--out", "page"), "is not a folder or file"),
-    ],
-)
-def test_command_lines_end_in_a_sentence(tmp_path, capsys, monkeypatch, task, arguments, says):
+COARRAY = ("--mix", 0.5, "--synthesizer", "coarray")
+FOLLOWED = ("m", "table.csv", "--out", "x", "--follow")
+without_gpu = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+LINES = [
+    ("aoa", ("--mix", 0.5, "--data", ""), "--data is empty"),
+    ("rssi", ("--rx", "1", "--data", ""), "--data is empty"),
+    ("rssi", ("--rx", ""), "--rx is empty"),
+    ("aoa", ("--mix", 0.5, "--seed", -1), "--seed must be"),
+    ("aoa", ("--mix", 0.5, "--seed", 2**32), "--seed must be"),
+    ("rssi", ("--rx", "1", "--seed", -1), "--seed must be"),
+    ("aoa", ("--mix", 0.5, "--seed", 2**32 - 1, "--repeats", 2), "--seed"),
+    ("aoa", ("--mix", 0.5, "--synthesizer"), "--synthesizer"),
+    ("aoa", ("--mix", 0.5, "--array", 4, 0.16, "nan"), "finite"),
+    ("aoa", ("--mix", 0.5, "--array", 100000, 0.16, 1e9), "--array"),
+    ("aoa", ("--mix", "nan"), "finite"),
+    ("aoa", ("--seed", 1), "got none"),
+    ("aoa", ("--mix", 0), "in (0, 1]"),
+    ("aoa", ("--mix", 0.3, 0.3), "twice"),
+    ("aoa", ("--mix", 0.5, "--repeats", 0), "--repeats"),
+    ("aoa", ("--mix", 0.5, "--suggest", -1), "--suggest"),
+    ("aoa", ("--mix", 0.5, "--data", "/nowhere"), "is not a folder"),
+    ("rssi", ("--rx", "99"), "no receiver '99'"),
+    ("rssi", ("--rx", "1", "--floor-plan", "x.png"), "needs --floor-extent"),
+    ("rssi", ("--rx", "1", "--floor-plan", "x.png", "--floor-extent", 0, 1, 0, 1), "not a readable image"),
+    ("rssi", ("--rx", "1", "--floor-plan", "x.png", "--floor-extent", 1, 0, 0, 1), "x0 < x1"),
+    ("aoa", ("--mix", 1e-9), "leaves 0"),
+    ("rssi", ("--rx", "1", "--floor-extent", 0, "inf", 0, "inf"), "finite"),
+    ("rssi", ("--rx", "1", "--out", "{file}/run"), "cannot read or write"),
+    ("rssi", ("--rx", "1", "--out", "/proc/run"), "cannot read or write"),
+    ("rssi", ("--rx", "1", "--out", "/"), "no name of its own"),
+    ("rssi", ("--rx", "1", "--out", "."), "no name of its own"),
+    ("rssi", ("--rx", "1", "--out", "{file}-" + "x" * 300), "cannot read or write"),
+    ("resume", ("{file}",), "no interrupted run"),
+    ("locate", ("--data", ""), "--data is empty"),
+    ("locate", ("--rx", "99"), "no receiver '99'"),
+    ("locate", ("--split", "nowhere"), "choose one of block, random"),
+    ("rssi", ("--rx", "1", "--split", "nowhere"), "choose one of block, random"),
+    ("locate", ("--cells", 9), "--cells must be a whole number at least 10"),
+    ("aoa", ("--mix", 0.5, "--processes", 0), "--processes must be a whole number at least 1, got 0"),
+    ("rssi", ("--rx", "1", "--out", "link"), "link exists already"),
+    ("report", ("{file}", "--out", "link"), "no finished run"),
+    ("predict", ("{file}", "{file}", "--out", "link"), "link exists already"),
+    ("locate", ("--columns", "x=a"), "give it with --data"),
+    ("locate", ("--data", "x", "--offset-by", "=phone"), "takes COLUMN or COLUMN=VALUE"),
+    ("locate", ("--scheduler", "tcp://127.0.0.1:1"), "no Dask scheduler"),
+    ("predict", ("{file}", "{file}", "--out", "{file}-new.csv"), "not a readable safetensors file"),
+    ("report", ("{file}",), "no finished run"),
+    ("report", ("--out", "{file}/x"), "no runs"),
+    ("inspect", ("/nowhere", "--out", "page"), "is not a folder or file"),
+    ("aoa", ("--mix", 0.5, "--synthesizer", "nearest", "--scene", "office"), "--scene is for synthesizer raytrace"),
+    ("aoa", ("--mix", 0.5, "--synthesizer", "raytrace", "--scene", "kitchen"), "unknown room 'kitchen'"),
+    ("aoa", ("--mix", 0.5, "--synthesizer", "raytrace", "--scene", "none.xml"), "--scene none.xml does not exist"),
+    ("aoa", ("--mix", 0.5, "--array", 4, 0.164, 915e6), "give it with --data"),
+    ("aoa", (*COARRAY, "--data", "{bare}"), "give it with --array"),
+    ("aoa", (*COARRAY, "--data", "{bare}", "--array", 1, 0.16, 915e6), "2 to 32 elements a side"),
+    pytest.param("aoa", ("--mix", 0.5, "--device", "cuda"), "NVIDIA GPU", marks=without_gpu),
+    ("locate", ("--suggest", 501), "--suggest must be a whole number at least 0 and at most 500"),
+    ("resume", ("{other}",), "unknown task 'other'"),
+    ("convert", ("{snapshots}", "{other}"), "never overwritten; choose another directory"),
+    ("convert", ("/nowhere", "new"), "is not a folder or file"),
+    ("convert", ("{snapshots}", "new", "--columns", "x"), "x=NAME"),
+    ("convert", ("{snapshots}", "new", "--columns", "x=a"), "takes no columns"),
+    ("convert", ("{snapshots}", "new", "--grid", 1, 1), "--grid"),
+    ("convert", ("{snapshots}", "new", "--every", 0), "--every must be a whole number at least 1"),
+    ("convert", ("{snapshots}", "new", "--array", 1, 0.06, 2.4e9), "2 to 32 elements a side"),
+    ("convert", ("{snapshots}", "new", "--array", 2, 64, 0.06, 2.4e9), "2 to 32 elements a side"),
+    ("convert", ("{snapshots}", "new", "--array", 2, 0, 0.06, 2.4e9), "2 to 32 elements a side"),
+    ("convert", ("{snapshots}", "new", "--array", 2, 8, -0.06, 2.4e9), "above 0"),
+    ("convert", ("{survey}", "new", "--calibrate"), "takes array snapshots"),
+    ("convert", ("{snapshots}", "new", "--split", "block"), "are of the calibration; give --calibrate, too"),
+    ("convert", ("{survey}", "new", "--beamformer", "capon"), "takes no beamformer"),
+    ("convert", ("{snapshots}", "new", "--beamformer", "music"), "unknown beamformer"),
+    ("convert", ("{snapshots}", "new", "--calibrate", "--split", "days"), "no split 'days'"),
+    ("convert", ("{room}", "out.tif"), "holds a map of RSSI"),
+    ("convert", ("{room}", "out.csv", "--cell", 1), "are for maps of RSSI models"),
+    ("convert", ("{room}", "out.mat", "--deepmimo"), "give a directory"),
+    ("convert", ("{room}", "out.mat", "--calibrate"), "writes a directory"),
+    ("convert", ("{room}", "out.png", "--cell", 0), "a number above 0"),
+    ("convert", ("{room}", "nowhere/out.csv"), "no directory"),
+    ("convert", ("{rssi_model}", "out"), "is a model"),
+    ("convert", ("{field_model}", "out.csv"), "use swiftwrf predict"),
+    ("convert", ("{rssi_model}", "a.tif", "--rx", "nobody"), "no receiver 'nobody'"),
+    ("convert", ("{rssi_model}", "map.geojson"), "needs latitude and longitude"),
+    ("predict", ("none", "{spectra}", "--out", "out.csv"), "not a readable"),
+    ("predict", ("{estimator}", "none.npy", "--out", "out.csv"), "is missing"),
+    ("predict", ("{estimator}", "{spectra}", "--out", "{file}"), "exists already"),
+    ("predict", ("{estimator}", "{spectra}", "--out", "no/out.csv"), "no directory"),
+    ("predict", ("{estimator}", "{spectra}", "--every", 7, "--out", "out.csv"), "--every does not apply"),
+    ("predict", ("{field_model}", "{survey}", "--grid", 4, 8, "--out", "b.csv"), "--grid is for reading spectra"),
+    ("predict", ("{field_model}", "{survey}", "--track", 1, "--out", "b.csv"), "locates nothing"),
+    ("update", ("m", "table.csv", "--out", "x", "--follow", "--json"), "--follow prints JSON lines"),
+    ("update", ("m", "table.csv", "--out", "x", "--false-alarm-rate", 2), "--false-alarm-rate must be"),
+    ("update", ("m", "table.csv", "--out", "x", "--follow", "--open"), "--follow prints JSON lines"),
+    ("update", (*FOLLOWED, "--window", 1), "--window is no option of a followed source"),
+    ("update", (*FOLLOWED, "--y-down", "--every", 2), "--every is no option of a followed source"),
+]
+
+
+@pytest.fixture(scope="module")
+def sources(tmp_path_factory):
+    """Paths by name: an empty file, measurements, models and an interrupted run of something else."""
+    folder = tmp_path_factory.mktemp("sources")
+    place = {name: folder / name for name in ("file", "snapshots", "room", "bare")}
+    place |= {"spectra": folder / "spectra.npy", "other": folder / "other.partial"}
+    place["file"].touch()
+    write_snapshots(place["snapshots"])
+    place["survey"] = write_survey(folder / "survey")
+    room = simulated_room(n=20, grid=AngularGrid.hemisphere(8, 32))
+    for name, data in (("room", room), ("bare", replace(room, array=None))):
+        place[name].mkdir()
+        write_spectra(data, place[name])
+    models = {"rssi_model": "rssi model", "field_model": "inverse-distance model", "estimator": "kernel regression"}
+    for name, kind in models.items():
+        place[name] = folder / f"{name}.safetensors"
+        fitted(kind).save(place[name])
+    np.save(place["spectra"], room.spectrum.numpy())
+    place["other"].mkdir()
+    (place["other"] / "config.json").write_text('{"task": "other"}')
+    return place
+
+
+@pytest.mark.parametrize(("task", "arguments", "says"), LINES)
+def test_command_lines_end_in_a_sentence(sources, tmp_path, capsys, monkeypatch, task, arguments, says):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "file").write_text("")
     (tmp_path / "link").symlink_to("nowhere")
-    assert run(task, *(str(a).replace("{file}", str(tmp_path / "file")) for a in arguments)) == 2
+    assert run(task, *(str(a).format(**sources) for a in arguments)) == 2
     assert says in said(capsys)
-    assert {file.name for file in tmp_path.iterdir()} == {"file", "link"}
+    assert [file.name for file in tmp_path.iterdir()] == ["link"]
 
 
 def test_sixty_shares_without_out(tmp_path, monkeypatch):

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import quick
 import torch
-from quick import said
 from samples import snapshots, write_deepmimo, write_dichasus, write_espargos, write_snapshots, write_survey
 from test_calibration import spoilt
 
@@ -161,39 +160,6 @@ def test_calibration_sees_the_training_part_alone(tmp_path, capsys):
     assert float((mended.spectrum - usual.spectrum).abs().mean()) < 0.01
     assert {name: (len(a), len(b)) for name, (a, b) in mended.named_splits.items()} == {"block": (120, 30)}
     assert torch.equal(mended.split("block")[1].index, data.split("block", 1)[1].index)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (("{source}", "{taken}"), "never overwritten; choose another directory"),
-        (("/nowhere", "{new}"), "is not a folder or file"),
-        (("{source}", "{new}", "--columns", "x"), "x=NAME"),
-        (("{source}", "{new}", "--columns", "x=a"), "takes no columns"),
-        (("{source}", "{new}", "--grid", 1, 1), "--grid"),
-        (("{source}", "{new}", "--every", 0), "--every must be a whole number at least 1"),
-        (("{source}", "{new}", "--array", 1, 0.06, 2.4e9), "2 to 32 elements a side"),
-        (("{source}", "{new}", "--array", 2, 64, 0.06, 2.4e9), "2 to 32 elements a side"),
-        (("{source}", "{new}", "--array", 2, 0, 0.06, 2.4e9), "2 to 32 elements a side"),
-        (("{source}", "{new}", "--array", 2, 8, -0.06, 2.4e9), "above 0"),
-        (("{survey}", "{new}", "--calibrate"), "takes array snapshots"),
-        (("{source}", "{new}", "--split", "block"), "--split and --seed are of the calibration; give --calibrate, too"),
-        (("{survey}", "{new}", "--beamformer", "capon"), "takes no beamformer"),
-        (("{source}", "{new}", "--beamformer", "music"), "unknown beamformer"),
-        (("{source}", "{new}", "--calibrate", "--split", "days"), "no split 'days'"),
-    ],
-)
-def test_refusals_leave_nothing(tmp_path, capsys, arguments, says):
-    places = {
-        "source": write_snapshots(tmp_path / "source"),
-        "survey": write_survey(tmp_path / "walk"),
-        "new": tmp_path / "new",
-    }
-    (tmp_path / "taken").mkdir()
-    places["taken"] = tmp_path / "taken"
-    assert run(*(str(a).format(**places) for a in arguments)) == 2
-    assert says in said(capsys)
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["source", "taken", "walk"]
 
 
 def test_every_format_is_described():

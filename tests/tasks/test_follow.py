@@ -370,21 +370,6 @@ def test_an_update_from_files_or_a_public_data_set_writes_model_table_and_page(
     assert run_command("update", options, "swiftwrf update") == 2
 
 
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (("--follow", "--json"), "--follow prints JSON lines"),
-        (("--false-alarm-rate", "2"), "--false-alarm-rate must be"),
-        (("--follow", "--open"), "--follow prints JSON lines"),
-        (("--follow", "--window", "1"), "--window is no option of a followed source"),
-        (("--follow", "--y-down", "--every", "2"), "--every is no option of a followed source"),
-    ],
-)
-def test_wrong_options_are_refused(arguments, says, capsys):
-    assert run_command("update", ["m", "table.csv", "--out", "x", *arguments], "swiftwrf update") == 2
-    assert capsys.readouterr().err.startswith(f"error: {says}")
-
-
 def test_a_record_comes_back_as_it_was_and_is_cut_to_what_the_model_has_learnt(tmp_path):
     """Texts that spreadsheets would run, rows in which nothing was detected, and a row that a kill cut in a letter."""
     follower, record = Follower(rssi_model()), Record("source", "dB")

@@ -188,13 +188,6 @@ def test_geojson_has_a_square_a_cell_in_degrees(geodetic, tmp_path):
     assert cell["properties"][chart.receiver_names[1]] == pytest.approx(chart.mean[1, 1, 3], abs=0.00501)
 
 
-def test_geojson_of_local_metres_is_refused(model, tmp_path, capsys):
-    model.save(tmp_path / "model.safetensors")
-    assert run(tmp_path / "model.safetensors", tmp_path / "map.geojson") == 2
-    assert "needs latitude and longitude" in said(capsys)
-    assert not (tmp_path / "map.geojson").exists()
-
-
 @pytest.mark.parametrize("with_origin", [True, False])
 def test_an_image_has_a_world_file(geodetic, model, with_origin, tmp_path):
     chosen = geodetic if with_origin else model
@@ -275,35 +268,3 @@ def test_deepmimo_folders_are_made_of_ray_paths(paths, tmp_path, capsys):
     assert run(tmp_path / "unknown", tmp_path / "other", "--deepmimo") == 2
     assert "lengths of these paths are unknown" in said(capsys)
     assert not (tmp_path / "other").exists()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "reason"),
-    [
-        (("out.tif",), "holds a map of RSSI"),
-        (("out.csv", "--cell", "1"), "are for maps of RSSI models"),
-        (("out.mat", "--deepmimo"), "give a directory"),
-        (("out.mat", "--calibrate"), "writes a directory"),
-        (("out.png", "--cell", "0"), "a number above 0"),
-        (("nowhere/out.csv",), "no directory"),
-    ],
-)
-def test_what_does_not_go_together_is_refused(room, arguments, reason, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "room").mkdir()
-    write_spectra(room, tmp_path / "room")
-    assert run("room", *arguments) == 2
-    assert reason in said(capsys)
-
-
-@pytest.mark.parametrize(("out", "reason"), [("out", "is a model"), ("out.csv", "use swiftwrf predict")])
-def test_a_file_of_a_model_is_a_map_of_rssi(field, model, out, reason, tmp_path, capsys):
-    (model if out == "out" else field).save(tmp_path / "model.safetensors")
-    assert run(tmp_path / "model.safetensors", tmp_path / out) == 2
-    assert reason in said(capsys)
-
-
-def test_an_unknown_receiver_of_a_map_is_refused(model, tmp_path, capsys):
-    model.save(tmp_path / "model.safetensors")
-    assert run(tmp_path, tmp_path / "a.tif", "--rx", "nobody") == 2
-    assert "no receiver 'nobody'" in said(capsys)

@@ -123,8 +123,6 @@ def test_directions_of_measured_and_unknown_positions(finished, small, tmp_path,
     unknown = pd.read_csv(tmp_path / "unknown.csv")
     assert default.read_bytes() == (tmp_path / "unknown.csv").read_bytes()
     assert unknown.columns.tolist() == ["index", "azimuth_deg", "elevation_deg"]
-    assert run("predict", estimator, tmp_path / "unknown.npy", "--every", 7, "--out", tmp_path / "some.csv") == 2
-    assert "--every does not apply" in said(capsys)
     np.testing.assert_allclose(unknown["elevation_deg"], known["elevation_deg"], atol=0.05)  # 8 or 16 bits on disk
 
 
@@ -166,21 +164,7 @@ def test_other_spectra_are_refused(finished, tmp_path, capsys, content, sentence
     assert not (tmp_path / "out.csv").exists()
 
 
-def test_other_files_are_refused(finished, small, tmp_path, capsys):
-    estimator, spectra = finished / "kernel_regression-mix0.5.safetensors", tmp_path / "spectra.npy"
-    np.save(spectra, small.spectrum.numpy())
-    spectra.with_suffix(".txt").write_text("")
-    assert run("predict", tmp_path / "none", spectra, "--out", tmp_path / "out.csv") == 2
-    assert "not a readable" in said(capsys)
-    assert run("predict", estimator, tmp_path / "none.npy", "--out", tmp_path / "out.csv") == 2
-    assert "is missing" in said(capsys)
-    assert run("predict", estimator, spectra, "--out", spectra) == 2
-    assert "exists already" in said(capsys)
-    assert run("predict", estimator, spectra, "--out", tmp_path / "no" / "out.csv") == 2
-    assert "no directory" in said(capsys)
-
-
-def test_spectra_and_rssi_at_the_positions_of_a_table(small, tmp_path, capsys):
+def test_spectra_and_rssi_at_the_positions_of_a_table(small, tmp_path):
     field, rssi = make_model("idw").fit(small), RssiModel(n_primitives=0).fit(rssi_room(n=60).columns([0, 4]))
     field.save(tmp_path / "field.safetensors")
     rssi.save(tmp_path / "rssi.safetensors")
@@ -192,12 +176,6 @@ def test_spectra_and_rssi_at_the_positions_of_a_table(small, tmp_path, capsys):
     table = pd.read_csv(tmp_path / "a.csv")
     np.testing.assert_allclose(table["predicted_dbm"], rssi.predict(position).mean.numpy().ravel(), atol=0.00501)
     assert all(len(text.rpartition(".")[2]) <= 2 for text in table["predicted_dbm"].astype(str))
-    for options, reason in (
-        (("--grid", "4", "8"), "--grid is for reading spectra"),
-        (("--track", "1"), "locates nothing"),
-    ):
-        assert run("predict", tmp_path / "field.safetensors", at, *options, "--out", tmp_path / "b.csv") == 2
-        assert reason in said(capsys)
 
 
 def test_positions_on_floors_have_the_heights_of_the_measurements(tmp_path, capsys):

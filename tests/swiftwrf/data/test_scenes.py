@@ -354,20 +354,6 @@ def test_the_synthesizer_is_refused_before_anything_is_computed(tmp_path, capsys
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("scene", "synthesizer", "says"),
-    [
-        ("office", "nearest", "--scene is for synthesizer raytrace"),
-        ("kitchen", "raytrace", "unknown room 'kitchen'"),
-        ("none.xml", "raytrace", "--scene none.xml does not exist"),
-    ],
-)
-def test_a_scene_that_cannot_be(tmp_path, capsys, scene, synthesizer, says):
-    out = ("--out", tmp_path / "out")
-    assert run("aoa", "--mix", 0.5, "--synthesizer", synthesizer, "--scene", scene, *out) == 2
-    assert says in said(capsys)
-
-
 # the synthesizer
 
 
