@@ -49,7 +49,11 @@ FLOOR = {"x": [0.0, 1.0], "y": [0.0, 1.0], "z": [1.0, 1.0], "hall": [-50.0, -60.
 SPECTRA_OPTIONS = (
     "array", "pose", "moving", "grid", "label", "line_of_sight", "name", "fixed_position", "rotation", "index", "notes",
 )  # fmt: skip
-QUATERNION = (0.0, 0.0, 0.0, 1.0)
+RSSI_OPTIONS = ("receiver_position", "receiver_names", "origin", "session", "time", "name", "index")
+FRAME_OPTIONS = (
+    "columns", "filler", "coordinates", "offset_by", "transmitter", "pool_by", "scale", "y_down", "up", "window",
+    "receiver_position", "name",
+)  # fmt: skip
 Call = Callable[[Any], object]
 
 
@@ -113,112 +117,69 @@ def strange() -> tuple[Any, ...]:
     return (*plain, *arrays, *tensors, *others)
 
 
+def each(function: Callable[..., object], *options: str, **valid: Any) -> dict[str, Call]:
+    """Return calls of a function, in each of which a strange value takes the place of one argument."""
+    return {
+        f"{function.__qualname__}({name}=x)": lambda x, name=name: function(**valid | {name: x})
+        for name in (*valid, *options)
+    }
+
+
+def named(*functions: Callable[..., object]) -> dict[str, Call]:
+    """Return functions by name."""
+    return {function.__qualname__: function for function in functions}
+
+
 DATA: dict[str, Call] = {
-    "Spectra(x, position)": lambda x: Spectra(x, spectra().position),
-    "Spectra(spectra, x)": lambda x: Spectra(spectra().store[:], x),
-    **{
-        f"Spectra({name}=x)": lambda x, name=name: Spectra(spectra().store[:], spectra().position, **{name: x})
-        for name in SPECTRA_OPTIONS
-    },
-    "Rssi(x, position)": lambda x: Rssi(x, rssi().transmitter_position),
-    "Rssi(rssi, x)": lambda x: Rssi(rssi().rssi_dbm, x),
-    **{
-        f"Rssi({name}=x)": lambda x, name=name: Rssi(rssi().rssi_dbm, rssi().transmitter_position, **{name: x})
-        for name in ("receiver_position", "receiver_names", "origin", "session", "time", "name", "index")
-    },
-    "from_frame(x)": Rssi.from_frame,
+    **each(Spectra, *SPECTRA_OPTIONS, spectra=spectra().store[:], position=spectra().position),
+    **each(Rssi, *RSSI_OPTIONS, rssi_dbm=rssi().rssi_dbm, transmitter_position=rssi().transmitter_position),
+    **each(Rssi.from_frame, *FRAME_OPTIONS, frame=pd.DataFrame(FLOOR)),
     "from_frame, a column": lambda x: Rssi.from_frame(pd.DataFrame(FLOOR | {"hall": [-50.0, x]}, dtype=object)),
     "from_frame, a coordinate": lambda x: Rssi.from_frame(pd.DataFrame(FLOOR | {"x": [0.0, x]}, dtype=object)),
-    **{
-        f"from_frame({name}=x)": lambda x, name=name: Rssi.from_frame(pd.DataFrame(FLOOR), **{name: x})
-        for name in (
-            "columns",
-            "filler",
-            "coordinates",
-            "offset_by",
-            "transmitter",
-            "pool_by",
-            "scale",
-            "y_down",
-            "up",
-            "window",
-            "receiver_position",
-            "name",
-        )
-    },
-    "split(x)": lambda x: rssi().split(x),
+    **named(rssi().split, spectra().subset, rssi().__getitem__, rssi().receivers),
     "split(seed=x)": lambda x: spectra().split("block", x),
-    "subset(x)": lambda x: spectra().subset(x),
-    "rssi[x]": lambda x: rssi()[x],
-    "receivers(x)": lambda x: rssi().receivers(x),
-    "Snapshots(x, position)": lambda x: Snapshots(x, spectra().position, array=spectra().array),
-    "Snapshots(array=x)": lambda x: Snapshots(torch.ones(14, 1, 16) + 0j, spectra().position, array=x),
-    "calibrate(x)": calibrate,
-    "load(x)": load,
-    "load_spectra(x)": load_spectra,
-    "load_rssi(x)": load_rssi,
-    "simulated_room(n=x)": lambda x: simulated_room(n=x, grid=AngularGrid.hemisphere(2, 4)),
-    "simulated_room(seed=x)": lambda x: simulated_room(n=2, seed=x, grid=AngularGrid.hemisphere(2, 4)),
-    "simulated_room(grid=x)": lambda x: simulated_room(n=2, grid=x),
-    "rssi_room(n=x)": lambda x: rssi_room(n=x),
-    "rssi_room(seed=x)": lambda x: rssi_room(n=2, seed=x),
+    **each(Snapshots, channel=torch.ones(14, 1, 16) + 0j, position=spectra().position, array=spectra().array),
+    **named(calibrate, load, load_spectra, load_rssi),
+    **each(simulated_room, n=2, seed=0, grid=AngularGrid.hemisphere(2, 4)),
+    **each(rssi_room, n=2, seed=0),
 }
 ARRAYS: dict[str, Call] = {
-    "PlanarArray(x, 0.1)": lambda x: PlanarArray(x, 0.1),
-    "PlanarArray(element, x)": lambda x: PlanarArray(torch.rand(4, 2), x),
-    "square(x)": lambda x: PlanarArray.square(x, 1e9),
-    "square(frequency_hz=x)": lambda x: PlanarArray.square(2, x),
-    "square(spacing=x)": lambda x: PlanarArray.square(2, 1e9, x),
-    "grid(x, 2)": lambda x: PlanarArray.grid(x, 2, 0.1, 1e9),
-    "grid(spacing=x)": lambda x: PlanarArray.grid(2, 2, x, 1e9),
-    "AngularGrid.hemisphere(x, 4)": lambda x: AngularGrid.hemisphere(x, 4),
-    "AngularGrid(x, ...)": lambda x: AngularGrid(x, 0.1, 4, 0.0, 8),
-    "AngularGrid(n_azimuth=x)": lambda x: AngularGrid(0.0, 0.1, 4, 0.0, x),
-    "ArrayPose(x)": lambda x: ArrayPose(x, QUATERNION),
-    "ArrayPose(orientation=x)": lambda x: ArrayPose((0.0, 0.0, 1.0), x),
-    "Plane(x)": lambda x: Plane(x, 0.0, -0.5),
-    "Plane(offset_m=x)": lambda x: Plane((1.0, 0.0, 0.0), x, -0.5),
-    "Plane(gain=x)": lambda x: Plane((1.0, 0.0, 0.0), 0.0, x),
-    "Plane(std_mm=x)": lambda x: Plane((1.0, 0.0, 0.0), 0.0, -0.5, x),
-    "of_planes(x)": lambda x: GeometryModel.of_planes(x, []),
-    "of_planes(spectra, x)": lambda x: GeometryModel.of_planes(spectra(), x),
-    "of_planes(order=x)": lambda x: GeometryModel.of_planes(spectra(), [], x),
+    **each(PlanarArray, element=torch.rand(4, 2), wavelength=0.1),
+    **each(PlanarArray.square, side=2, frequency_hz=1e9, spacing=0.1),
+    **each(PlanarArray.grid, rows=2, columns=2, spacing=0.1, frequency_hz=1e9),
+    **each(AngularGrid.hemisphere, n_elevation=2, n_azimuth=4),
+    **each(AngularGrid, elevation_start=0.0, elevation_step=0.1, n_elevation=4, azimuth_start=0.0, n_azimuth=8),
+    **each(ArrayPose, position=(0.0, 0.0, 1.0), orientation=(0.0, 0.0, 0.0, 1.0)),
+    **each(Plane, normal=(1.0, 0.0, 0.0), offset_m=0.0, gain=-0.5, std_mm=0.0),
+    **each(GeometryModel.of_planes, link=spectra(), planes=[], order=2),
 }
 MODELS: dict[str, Call] = {
-    "make_model(x)": make_model,
-    "make_model(preset=x)": lambda x: make_model("gp", preset=x),
-    "make_model(seed=x)": lambda x: make_model("gp", seed=x),
+    **each(make_model, "preset", "seed", name="gp"),
     "make_model(validation=x)": lambda x: make_model("coarray", validation=x),
     "SwiftWRF(n_primitives=x)": lambda x: make_model("swiftwrf", n_primitives=x),
-    "GeometryModel(x)": GeometryModel,
-    "fit(x)": fit,
-    "fit_rssi(x)": fit_rssi,
-    "fit_rssi(rssi, x)": lambda x: fit_rssi(rssi(), x),
-    "RssiModel(x)": RssiModel,
-    "RssiModel(seed=x)": lambda x: RssiModel(seed=x),
-    "PairModel().fit(x)": lambda x: PairModel().fit(x),
-    **{
-        f"gp.fit({name}=x)": lambda x, name=name: make_model("gp").fit(spectra(), **{name: x})
-        for name in ("like", "device", "checkpoint")
-    },
-    **{
-        f"rssi.fit({name}=x)": lambda x, name=name: RssiModel(n_primitives=0).fit(rssi(), **{name: x})
-        for name in ("pool", "device")
-    },
+    **named(GeometryModel, fit, PairModel().fit),
+    **each(fit_rssi, "config", train=rssi()),
+    **each(RssiModel, "config", "seed"),
+    **each(make_model("gp").fit, "like", "device", "checkpoint", train=spectra()),
+    **each(RssiModel(n_primitives=0).fit, "pool", "device", train=rssi()),
     **{
         f"{name}.{method}(x)": lambda x, name=name, method=method: getattr(fitted(name), method)(x)
         for name in ("gp", "idw", "swiftwrf", "coarray", "nearest")
         for method in ("fit", "predict", "synthesize", "update", "forget", "aged", "plot")
         if method != "fit" or name != "swiftwrf"
     },
-    "gp.predict(grid=x)": lambda x: fitted("gp").predict(spectra().position, x),
-    "coarray.predict(grid=x)": lambda x: fitted("coarray").predict(spectra().position, x),
-    "geometry.predict(x)": lambda x: planes().predict(x),
-    "geometry.update(x)": lambda x: planes().update(x),
-    "rssi.predict(x)": lambda x: rssi_model().predict(x),
-    "rssi.update(x)": lambda x: rssi_model().update(x),
-    "rssi.predict_detected(x)": lambda x: rssi_model().predict_detected(x),
-    "rssi.plot(x)": lambda x: rssi_model().plot(x),
+    **{
+        f"{name}.predict(grid=x)": lambda x, name=name: fitted(name).predict(spectra().position, x)
+        for name in ("gp", "coarray")
+    },
+    **{
+        f"geometry.{method}(x)": lambda x, method=method: getattr(planes(), method)(x)
+        for method in ("predict", "update")
+    },
+    **{
+        f"rssi.{method}(x)": lambda x, method=method: getattr(rssi_model(), method)(x)
+        for method in ("predict", "update", "predict_detected", "plot")
+    },
     "interval(x)": lambda x: rssi_model().predict(rssi().transmitter_position).interval(x),
     "save(x)": lambda x: fitted("nearest").save(x) if not isinstance(x, str | Path) else None,
     "Follower(x)": Follower,
@@ -227,20 +188,15 @@ MODELS: dict[str, Call] = {
     "Follower(false_alarm_rate=x)": lambda x: Follower(rssi_model(), None, x),
 }
 LOCATORS: dict[str, Call] = {
-    "RssiLocator(x)": RssiLocator,
-    "RssiLocator(n_cells=x)": lambda x: RssiLocator(n_cells=x),
-    "RssiLocator().fit(x)": lambda x: RssiLocator(n_cells=50).fit(x),
-    "RssiLocator().fit(model=x)": lambda x: RssiLocator(n_cells=50).fit(rssi(), model=x),
-    "RssiLocator().fit(region=x)": lambda x: RssiLocator(n_cells=50).fit(rssi(), region=x),
+    **each(RssiLocator, "config", "n_cells"),
+    **each(RssiLocator(n_cells=50).fit, "model", "region", train=rssi()),
     "locate(x)": lambda x: locator().locate(x),
     "credible_radius(x)": lambda x: locator().locate(rssi().rssi_dbm).credible_radius(x),
     "sample(x)": lambda x: locator().sample(x, 2, torch.Generator()),
     "sample(n=x)": lambda x: locator().sample(rssi().transmitter_position[:2], x, torch.Generator()),
-    "MatchedField(x)": MatchedField,
-    "MatchedField(spacing=x)": lambda x: MatchedField(spacing=x),
-    "MatchedField().fit(x)": lambda x: MatchedField().fit(x),
+    **each(MatchedField, "config", "spacing"),
+    **named(MatchedField().fit, MatchedField().locate),
     "MatchedField().fit(room=x)": lambda x: MatchedField().fit(simulated_room(n=16), room=x) if x is not None else None,
-    "MatchedField().locate(x)": lambda x: MatchedField().locate(x),
 }
 CALLS = {"data": DATA, "arrays and rooms": ARRAYS, "models": MODELS, "locators": LOCATORS}
 
