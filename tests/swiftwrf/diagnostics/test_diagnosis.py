@@ -58,60 +58,6 @@ def received(data: Snapshots, seed: int, echo: float = 0.1, noise: float = 0.1, 
     return replace(data, channel=channel.to(torch.complex64))
 
 
-def without_delay(seed):
-    data = scene(seed)
-    return replace(data, channel=data.channel[..., :1] * (1 + 0.05 * torch.randn(data.channel.shape)))
-
-
-def axes_swapped(seed):
-    rows, columns = SHAPES[seed % len(SHAPES)]
-    data = scene(seed, count=rows * columns)
-    return replace(data, channel=data.channel.mT)
-
-
-def by_column(seed):
-    data = scene(seed)
-    rows, columns = SHAPES[seed % len(SHAPES)]
-    order = torch.arange(rows * columns).reshape(rows, columns).T.flatten()
-    return replace(data, channel=data.channel[..., order])
-
-
-def normalised(seed):
-    data = scene(seed)
-    low, high = data.position.amin(dim=0), data.position.amax(dim=0)
-    return replace(data, position=2 * (data.position - low) / (high - low) - 1)
-
-
-def there_and_back(seed):
-    return received(scene(seed), seed, echo=0.1, ways=2)
-
-
-def flipped(seed):
-    data = scene(seed, count=1)
-    draw = torch.Generator().manual_seed(seed)
-    half = torch.arange(data.channel.shape[2]) >= data.channel.shape[2] // 2
-    flip = torch.rand(len(data), 1, 1, generator=draw) < 0.5
-    return replace(data, channel=torch.where(flip & half, -data.channel, data.channel))
-
-
-def uncalibrated(seed):
-    data = scene(seed, n=100)
-    phase = 2 * math.pi * torch.rand(data.channel.shape[2], generator=torch.Generator().manual_seed(seed))
-    return replace(data, channel=data.channel * torch.polar(torch.ones_like(phase), phase))
-
-
-def tilted(seed):
-    data = scene(seed)
-    wrong = Rotation.from_rotvec([0, 0, math.radians(25 + seed)])
-    return replace(data, rotation=data.rotation @ torch.from_numpy(wrong.as_matrix()))
-
-
-def image_axes(seed):
-    data = scene(seed)
-    top = float(data.position[:, 1].max()) + 0.7
-    return replace(data, position=data.position * torch.tensor([1.0, -1.0, 1.0]) + torch.tensor([0.0, top, 0.0]))
-
-
 def walk(seed: int, n: int = 120) -> Snapshots:
     """A scene whose positions lie along a walk, 0.2 s apart."""
     data = scene(seed, n=n)
@@ -123,14 +69,68 @@ def walk(seed: int, n: int = 120) -> Snapshots:
     return received(replace(data, position=position, time=0.2 * time), seed)
 
 
-def delayed(seed):
-    data, late = walk(seed), (-9, -4, 3, 6, 11)[seed % 5]
-    return replace(data, position=data.position[(torch.arange(len(data)) + late).clamp(0, len(data) - 1)])
+# changes of a scene, as functions of its seed
 
 
-def by_text(seed):
-    data = scene(seed)
-    return replace(data, position=data.position[sorted(range(len(data)), key=str)])
+def drawn(seed):
+    return torch.Generator().manual_seed(seed)
+
+
+def with_channel(change, **options):
+    """Change the channel of a scene by a function of channel and seed."""
+    return lambda seed: replace(data := scene(seed, **options), channel=change(data.channel, seed))
+
+
+def with_position(change, make=scene):
+    """Change the positions of a scene by a function of positions and seed."""
+    return lambda seed: replace(data := make(seed), position=change(data.position, seed))
+
+
+def with_phases(angle, **options):
+    """Add an angle, which is a function of channel and seed."""
+    return with_channel(lambda c, seed: c * torch.polar(torch.ones(1), angle(c, seed).float()), **options)
+
+
+def with_order(order, **options):
+    """Put the elements in an order, which is a function of their number and the seed."""
+    return with_channel(lambda c, seed: c[..., order(c.shape[2], seed)], **options)
+
+
+def cycle(moved):
+    """Return the order after the cables of some elements were exchanged, in a cycle."""
+
+    def order(n, seed):
+        elements, order = torch.randperm(n, generator=drawn(seed))[:moved], torch.arange(n)
+        order[elements] = elements.roll(1)
+        return order
+
+    return order
+
+
+def second_half(c):
+    return torch.arange(c.shape[2]) >= c.shape[2] // 2
+
+
+def of_elements(c, seed):
+    return 2 * math.pi * torch.rand(c.shape[2], generator=drawn(seed))
+
+
+def random_order(n, seed):
+    return torch.randperm(n, generator=drawn(seed))
+
+
+def there_and_back(seed, echo=0.1):
+    return received(scene(seed), seed, echo=echo, ways=2)
+
+
+def tilted(seed):
+    wrong = Rotation.from_rotvec([0, 0, math.radians(25 + seed)])
+    return replace(data := scene(seed), rotation=data.rotation @ torch.from_numpy(wrong.as_matrix()))
+
+
+def late(p, seed):
+    rows = torch.arange(len(p)) + (-9, -4, 3, 6, 11)[seed % 5]
+    return p[rows.clamp(0, len(p) - 1)]
 
 
 def carrier_of_another_band(seed):
@@ -138,28 +138,10 @@ def carrier_of_another_band(seed):
     return replace(data, array=PlanarArray(data.array.element, data.array.wavelength * factor))
 
 
-def sampled_in_turn(seed):
+def sampled_in_turn(c, seed):
     """Carrier offsets turn the phases from element to element, by another angle in each packet."""
-    data = scene(seed, count=4)
-    draw = torch.Generator().manual_seed(3000 + seed)
-    slope = (0.4 + 0.1 * (seed % 5)) * torch.randn(len(data), 4, 1, generator=draw)
-    phase = slope * torch.arange(data.channel.shape[2])
-    return replace(data, channel=data.channel * torch.polar(torch.ones_like(phase), phase))
-
-
-def exchanged(seed, moved=2, shape=None):
-    """Cables of some elements exchanged, in a cycle."""
-    data = scene(seed, shape=shape)
-    elements = torch.randperm(data.channel.shape[2], generator=torch.Generator().manual_seed(seed))[:moved]
-    order = torch.arange(data.channel.shape[2])
-    order[elements] = elements.roll(1)
-    return replace(data, channel=data.channel[..., order])
-
-
-def random_order(seed, shape=(4, 4)):
-    data = scene(seed, shape=shape)
-    order = torch.randperm(data.channel.shape[2], generator=torch.Generator().manual_seed(seed))
-    return replace(data, channel=data.channel[..., order])
+    slope = (0.4 + 0.1 * (seed % 5)) * torch.randn(len(c), 4, 1, generator=drawn(3000 + seed))
+    return slope * torch.arange(c.shape[2])
 
 
 def narrow(seed):
@@ -170,52 +152,66 @@ def narrow(seed):
 
 def behind(seed):
     data = scene(seed)
-    position = data.position.clone()
-    normal = data.rotation[:, 2]
-    away = position - data.fixed_position
+    normal, away = data.rotation[:, 2], data.position - data.fixed_position
+    mirrored = data.position - 2 * (away @ normal)[:, None] * normal
     back = torch.arange(len(data))[:, None] % 3 == 0
-    return received(
-        replace(data, position=torch.where(back, position - 2 * (away @ normal)[:, None] * normal, position)), seed
-    )
-
-
-def hidden(seed):
-    data = scene(seed)
-    draw = torch.Generator().manual_seed(seed)
-    return replace(data, channel=torch.randn(data.channel.shape, dtype=torch.complex64, generator=draw))
+    return received(replace(data, position=torch.where(back, mirrored, data.position)), seed)
 
 
 CAUSES = {  # measurements, and the statement of the cause of an error
     "nothing": (scene, "in one frame"),
     "a line": (lambda seed: scene(seed, shape=(1, 3 + seed % 4)), "angle to the array's axis) and follow it"),
     "behind": (behind, "behind the array"),
-    "no line of sight": (hidden, "do not follow it in any frame"),
-    "phases without delay": (without_delay, "hardly depend on the position"),
-    "axes swapped": (axes_swapped, "csi.transpose(0, 2, 1)"),
-    "elements by column": (by_column, "the elements are given column by column"),
-    "normalised positions": (normalised, "look normalised"),
-    "there and back": (there_and_back, "there and back"),
-    "half-turn flips": (flipped, "jumps by half a turn"),
-    "there and back with strong echoes": (lambda s: received(scene(s), s, echo=0.35, ways=2), "there and back"),
-    "uncalibrated": (uncalibrated, "The array is not calibrated"),
-    "tilted": (tilted, "constant rotation of"),
-    "x and y swapped": (
-        lambda s: replace(d := scene(s), position=d.position[:, [1, 0, 2]]),
-        "x and y of the positions",
+    "no line of sight": (
+        with_channel(lambda c, seed: torch.randn(c.shape, dtype=torch.complex64, generator=drawn(seed))),
+        "do not follow it in any frame",
     ),
-    "millimetres": (lambda s: replace(d := scene(s), position=1000 * d.position), "the positions are in millimetres"),
-    "image axes": (image_axes, "y of the positions counts from the other side"),
+    "phases without delay": (
+        with_channel(lambda c, seed: c[..., :1] * (1 + 0.05 * torch.randn(c.shape))),
+        "hardly depend on the position",
+    ),
+    "axes swapped": (
+        lambda seed: replace(d := scene(seed, count=math.prod(SHAPES[seed % len(SHAPES)])), channel=d.channel.mT),
+        "csi.transpose(0, 2, 1)",
+    ),
+    "elements by column": (
+        with_order(lambda n, seed: torch.arange(n).reshape(SHAPES[seed % len(SHAPES)]).T.flatten()),
+        "the elements are given column by column",
+    ),
+    "normalised positions": (
+        with_position(lambda p, seed: 2 * (p - p.amin(dim=0)) / (p.amax(dim=0) - p.amin(dim=0)) - 1),
+        "look normalised",
+    ),
+    "there and back": (there_and_back, "there and back"),
+    "half-turn flips": (
+        with_phases(
+            lambda c, seed: math.pi * (torch.rand(len(c), 1, 1, generator=drawn(seed)) < 0.5) * second_half(c), count=1
+        ),
+        "jumps by half a turn",
+    ),
+    "there and back with strong echoes": (lambda seed: there_and_back(seed, echo=0.35), "there and back"),
+    "uncalibrated": (with_phases(of_elements, n=100), "The array is not calibrated"),
+    "tilted": (tilted, "constant rotation of"),
+    "x and y swapped": (with_position(lambda p, seed: p[:, [1, 0, 2]]), "x and y of the positions"),
+    "millimetres": (with_position(lambda p, seed: 1000 * p), "the positions are in millimetres"),
+    "image axes": (
+        with_position(lambda p, seed: torch.stack([p[:, 0], p[:, 1].max() + 0.7 - p[:, 1], p[:, 2]], dim=1)),
+        "y of the positions counts from the other side",
+    ),
     "one direction": (narrow, "nearly one direction"),
-    "positions late or early": (delayed, "differ in time"),
-    "rows in reverse order": (lambda s: replace(d := scene(s), position=d.position.flip(0)), "in reverse order"),
-    "rows in the order of text": (by_text, "in the order of text"),
+    "positions late or early": (with_position(late, walk), "differ in time"),
+    "rows in reverse order": (with_position(lambda p, seed: p.flip(0)), "in reverse order"),
+    "rows in the order of text": (
+        with_position(lambda p, seed: p[sorted(range(len(p)), key=str)]),
+        "in the order of text",
+    ),
     "carrier of another band": (carrier_of_another_band, "the carrier is about"),
-    "elements in turn": (sampled_in_turn, "another slope in each snapshot"),
-    "two cables": (exchanged, "are exchanged"),
-    "three cables": (lambda seed: exchanged(seed, 3, (3, 4)), "are exchanged"),
-    "random order": (random_order, "are exchanged"),
-    "random order on a line": (lambda seed: random_order(seed, (1, 8)), "are exchanged"),
-    "four cables of a line": (lambda seed: exchanged(seed, 4, (1, 8)), "are exchanged"),
+    "elements in turn": (with_phases(sampled_in_turn, count=4), "another slope in each snapshot"),
+    "two cables": (with_order(cycle(2)), "are exchanged"),
+    "three cables": (with_order(cycle(3), shape=(3, 4)), "are exchanged"),
+    "random order": (with_order(random_order, shape=(4, 4)), "are exchanged"),
+    "random order on a line": (with_order(random_order, shape=(1, 8)), "are exchanged"),
+    "four cables of a line": (with_order(cycle(4), shape=(1, 8)), "are exchanged"),
 }
 OF_INSPECTION = (  # statements that are not those of an error of frames, elements or labels
     "nothing",
@@ -249,54 +245,33 @@ def test_true_cause_is_stated_and_no_other(name, further):
         check(name, seed)
 
 
-def jumping(seed, turns):
+def jumping(turns):
     """Phases of half of the elements that change from measurement to measurement, by multiples of a turn / `turns`."""
-    data = scene(seed, shape=(4, 4), count=1)
-    steps = torch.randint(0, turns, (len(data), 1, 1), generator=torch.Generator().manual_seed(seed))
-    half = torch.arange(16) >= 8
-    phase = 2 * math.pi / turns * steps * half
-    return replace(data, channel=data.channel * torch.polar(torch.ones(phase.shape), phase.float()))
+
+    def angle(c, seed):
+        steps = torch.randint(0, turns, (len(c), 1, 1), generator=drawn(seed))
+        return 2 * math.pi / turns * steps * second_half(c)
+
+    return with_phases(angle, shape=(4, 4), count=1)
 
 
-def uncalibrated_line(seed):
-    data = scene(seed, shape=(1, 4))
-    phase = 2 * math.pi * torch.rand(4, generator=torch.Generator().manual_seed(seed))
-    return replace(data, channel=data.channel * torch.polar(torch.ones_like(phase), phase))
-
-
-def standardised(seed):
-    data = scene(seed)
-    return replace(data, position=(data.position - data.position.mean(dim=0)) / data.position.std(dim=0))
-
-
-def labels_mixed_in_part(seed):
-    data = scene(seed)
-    order = torch.arange(len(data))
+def mixed_in_part(p, seed):
+    order = torch.arange(len(p))
     order[:40] = order[:40].roll(1 + seed % 20)
-    return replace(data, position=data.position[order])
+    return p[order]
 
 
-def moved_and_turned(seed):
-    data = tilted(seed)
-    return replace(data, position=data.position @ torch.tensor([[0.8, 0.6, 0], [-0.6, 0.8, 0], [0, 0, 1.0]]).double())
-
-
-def stretched(seed):
-    return replace(d := scene(seed), position=d.position * torch.tensor([0.6, 1.5, 1.0]))
-
-
+ABOUT_THE_ORIGIN = torch.tensor([[0.8, 0.6, 0], [-0.6, 0.8, 0], [0, 0, 1.0]]).double()
 UNKNOWN = {  # errors that no statement names
-    "quarter turns": lambda seed: jumping(seed, 4),
-    "boards without common phase": lambda seed: jumping(seed, 360),
-    "uncalibrated line": uncalibrated_line,
-    "standardised positions": standardised,
-    "positions of other rows": lambda s: replace(
-        d := scene(s), position=d.position[torch.randperm(len(d), generator=torch.Generator().manual_seed(s))]
-    ),
-    "labels mixed in part": labels_mixed_in_part,
-    "stretched": stretched,
-    "turned about the origin and tilted": moved_and_turned,
-    "shifted": lambda s: replace(d := scene(s), position=d.position + torch.tensor([2.0, -3.0, 0.5])),
+    "quarter turns": jumping(4),
+    "boards without common phase": jumping(360),
+    "uncalibrated line": with_phases(of_elements, shape=(1, 4)),
+    "standardised positions": with_position(lambda p, seed: (p - p.mean(dim=0)) / p.std(dim=0)),
+    "positions of other rows": with_position(lambda p, seed: p[random_order(len(p), seed)]),
+    "labels mixed in part": with_position(mixed_in_part),
+    "stretched": with_position(lambda p, seed: p * torch.tensor([0.6, 1.5, 1.0])),
+    "turned about the origin and tilted": with_position(lambda p, seed: p @ ABOUT_THE_ORIGIN, tilted),
+    "shifted": with_position(lambda p, seed: p + torch.tensor([2.0, -3.0, 0.5])),
 }
 
 
