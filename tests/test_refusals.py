@@ -33,6 +33,7 @@ from swiftwrf import (
     load_snapshots,
     load_spectra,
     make_model,
+    predict,
     rasterize,
     rssi_room,
     simulated_room,
@@ -45,6 +46,7 @@ from swiftwrf.data.simulated import ShoeboxRoom
 from swiftwrf.data.splits import folds
 from swiftwrf.data.store import Store
 from swiftwrf.gp import Kernel
+from swiftwrf.locate import Posterior, smoothed
 from swiftwrf.metrics import ssim
 from swiftwrf.models.geometry import Plane
 from swiftwrf.models.swiftwrf_paper import SwiftWRFPaperConfig
@@ -78,6 +80,13 @@ def of_rssi(values, position=((0, 0, 0),), **options):
     return lambda: Rssi(values, position, **options)
 
 
+def of_table(table, **options):
+    return lambda: Rssi.from_frame(table, **options)
+
+
+NUMBERS = np.arange(24.0)
+LINKS = pd.DataFrame({"rx_x": NUMBERS, "rx_y": 0.0, "tx_x": NUMBERS % 4, "tx_y": 1.0, "rssi": -50.0 - NUMBERS})
+RADIOS = pd.DataFrame({"x": NUMBERS, "y": 0.0, "a4:56:cc:00:10:b0": -50.0, "a4:56:cc:00:10:b1": -60.0})
 DATA = [
     ("5 positions, but store has 24", of_spectra(position=ROOM.position[:5])),
     (r"spectra must have shape \(n, n, n\)", of_spectra(ROOM.spectrum[0])),
@@ -144,6 +153,21 @@ DATA = [
     ("station must be", lambda: load_snapshots("x", station=-1)),
     ("order must be", lambda: Tracing(order=-1)),
     ("size must be", lambda: ShoeboxRoom(size=(0.0, 1.0, 1.0))),
+    ("takes the columns of x, y", of_table(LINKS, transmitter=["tx_x", "nowhere"])),
+    ("takes the columns of x, y", of_table(LINKS, transmitter=["tx_x", "tx_x"])),
+    ("RSSI of 2 receivers; name one", of_table(LINKS.assign(rssi2=-50.0), transmitter=())),
+    ("no column 'tag'", of_table(LINKS, transmitter=["tag"])),
+    ("pool by their names", of_table(RADIOS, pool_by="x")),
+    ("no column and no regular expression", of_table(RADIOS, pool_by="(")),
+    ("a regular expression with one group", of_table(RADIOS, pool_by="a4.*")),
+    ("matches no receiver", of_table(RADIOS, pool_by="(hall).*")),
+    ("needs measurements with sessions", lambda: folds(ROOM.position, "session", 0)),
+    ("session has 2 rows", of_rssi([[-60.0]] * 20, torch.rand(20, 3), session=["monday", "tuesday"])),
+    *(
+        ("frequency_hz", of_snapshots(torch.ones(5, 2, 4).cfloat(), pose=FACING_X, frequency_hz=frequency))
+        for frequency in ([2.4e9], [2.4e3, 2.41e3], [2.4e9, 5.2e9])  # one, in MHz, two bands
+    ),
+    ("no receiver 'c'", lambda: rssi().plot("c")),
     ("outside the room", lambda: ShoeboxRoom().paths(torch.tensor([[-1.0, 1, 1]]), torch.ones(1, 3))),
     ("one place", lambda: ShoeboxRoom().paths(torch.ones(1, 3), torch.ones(1, 3))),
 ]
@@ -243,6 +267,11 @@ MODELS = [
         "lacks positions, or directions or receivers",
         lambda: Prediction(torch.zeros(2, 3), position=torch.zeros(2, 3)).to_frame(),
     ),
+    ("neither directions nor positions", lambda: Prediction(torch.zeros(3, 2)).plot()),
+    ("locates nothing", lambda: predict(rssi_model(), rssi().transmitter_position, track=1.0)),
+    ("needs measurements with sessions", lambda: make_model("gp", validation="session").fit(spectra())),
+    ("seed must be a whole number at least 0, got np", lambda: make_model("gp", seed=np.int64(-1))),
+    ("seed must be", lambda: make_model("gp", seed=np.float64(1.5))),
     ("n_primitives must be", lambda: SwiftWRF(n_primitives=0)),
     ("n_primitives must be", lambda: SwiftWRF(n_primitives=2.5)),
     ("n_primitives must be", lambda: SwiftWRF(n_primitives="many")),
@@ -297,6 +326,7 @@ PREDICTORS = [
         "a predictor mean has no map; choose swiftwrf or pairs",
         lambda: RssiMap.predict(RSSI_PREDICTORS["mean"]().fit(rssi())),
     ),
+    ("no receiver 'x'", lambda: rssi_model().plot("x")),
     ("region must be finite", lambda: RssiMap.predict(rssi_model(), region=[[NAN, 0.0]])),
     ("a region needs at least one position", lambda: RssiMap.predict(rssi_model(), region=torch.empty(0, 2))),
     ("fit it again", paper_updated),
@@ -317,7 +347,21 @@ PREDICTORS = [
         lambda: estimate_offsets(replace(rssi_room(n=20), groups=pd.Series(["a", None] * 10, name="phone"))),
     ),
 ]
+
+
+def of_walk(time, speed):
+    """Smooth the posteriors of three observations."""
+    posterior = Posterior(torch.eye(3).double()[None], torch.zeros(3, 3).double(), 0.1)
+    return lambda: smoothed(posterior, None if time is None else torch.tensor(time), speed)
+
+
 LOCATORS = [
+    ("speed is a number above 0", of_walk(None, 0.0)),
+    ("speed is a number above 0", of_walk(None, NAN)),
+    ("3 finite times", of_walk([0.0, 1.0], 1.0)),
+    ("3 finite times", of_walk([0.0, 1.0, NAN], 1.0)),
+    ("number 3 is earlier", of_walk([0.0, 2.0, 1.0], 1.0)),
+    ("takes Rssi", lambda: predict(locator(), rssi().transmitter_position)),
     ("has no option 'cells'", lambda: MatchedField(cells=4)),
     ("has no option 'cells'", lambda: RssiLocator(cells=4)),
     ("no receiver detected the transmitter in row 0", lambda: locator().locate(torch.full((2, 3), NAN))),

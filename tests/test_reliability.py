@@ -75,10 +75,7 @@ def test_a_damaged_step_does_not_cost_the_others(stopped, capsys, damage):
     before = _files(stopped)
     assert run("resume", stopped) == 2
     assert "mean.json" in said(capsys)
-    after = _files(stopped)
-    assert {name: after[name] for name in before if name != "environment.json"} == {
-        name: before[name] for name in before if name != "environment.json"
-    }
+    assert {name for name, content in _files(stopped).items() if before.get(name) != content} <= {"environment.json"}
 
 
 def test_a_run_stopped_while_it_finishes_states_how_to_finish_it(finished, tmp_path, monkeypatch, capsys):
@@ -123,12 +120,7 @@ def test_a_failed_start_leaves_nothing(tmp_path, monkeypatch):
     [
         ("config.json", ("config", "seed"), 1, "not what the run began with"),
         ("environment.json", ("packages", "torch"), "0.1", "began with torch 0.1; go on with these"),
-        (
-            "environment.json",
-            ("packages", "swiftwrf-tasks"),
-            "0.0.1",
-            "began with swiftwrf-tasks 0.0.1; go on with these",
-        ),
+        ("environment.json", ("packages", "swiftwrf-tasks"), "0.0.1", "began with swiftwrf-tasks 0.0.1; go on"),
         ("environment.json", ("commit",), "0123456789ab", "began with commit 0123456789ab; go on with these"),
         ("environment.json", ("packages",), 3, "began with other libraries"),
     ],

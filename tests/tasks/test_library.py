@@ -64,10 +64,6 @@ def test_predictions_are_those_of_the_models():
     assert "position_error_m" not in swiftwrf.predict(locator, test, truth=False)
     at = test.transmitter_position
     assert swiftwrf.predict(locator.model, at).mean.equal(locator.model.predict(at).mean)
-    with pytest.raises(InputError, match="locates nothing"):
-        swiftwrf.predict(locator.model, at, track=1.0)
-    with pytest.raises(InputError, match="takes Rssi"):
-        swiftwrf.predict(locator, at)
     spectra = swiftwrf.simulated_room(n=12, grid=AngularGrid.hemisphere(10, 40))
     estimator = augment.estimators.make_estimator("peak").fit(augment.Mixed.measured(spectra))
     assert len(swiftwrf.predict(estimator, spectra.store)) == 12

@@ -67,17 +67,3 @@ def test_column_of_a_long_table(tmp_path):
     long.loc[0, "ssid"] = "lab"
     with pytest.raises(InputError, match="has several values in column 'ssid'"):
         Rssi.from_frame(long, pool_by="ssid")
-
-
-@pytest.mark.parametrize(
-    ("by", "says"),
-    [
-        ("x", "pool by their names"),
-        ("(", "no column and no regular expression"),
-        ("a4.*", "a regular expression with one group"),
-        ("(hall).*", "matches no receiver"),
-    ],
-)
-def test_what_is_refused(by, says):
-    with pytest.raises(InputError, match=says):
-        Rssi.from_frame(scans()[0], pool_by=by)

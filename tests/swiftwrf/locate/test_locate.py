@@ -514,22 +514,6 @@ def test_joined_groups_are_one_walk():
     assert own.position.shape == (9, 301, 3)
 
 
-@pytest.mark.parametrize(
-    ("time", "speed", "message"),
-    [
-        (None, 0.0, "speed is a number above 0"),
-        (None, float("nan"), "speed is a number above 0"),
-        ([0.0, 1.0], 1.0, "3 finite times"),
-        ([0.0, 1.0, float("nan")], 1.0, "3 finite times"),
-        ([0.0, 2.0, 1.0], 1.0, "number 3 is earlier"),
-    ],
-)
-def test_other_speeds_and_times_are_refused(time, speed, message):
-    posterior = gaussian(line(), walk(n=3)[1])
-    with pytest.raises(InputError, match=message):
-        smoothed(posterior, None if time is None else torch.tensor(time), speed)
-
-
 def times(table, **options):
     time = Rssi.from_frame(table, **options).time
     return None if time is None else time.tolist()

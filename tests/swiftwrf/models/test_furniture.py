@@ -12,7 +12,7 @@ from rooms import built_in_walls, mirror_room
 from augment.turbo.artifacts import save_model
 from swiftwrf import AngularGrid, InputError, MatchedField, Spectra, load, simulated_room
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
-from swiftwrf.data import PropagationPaths, Snapshots
+from swiftwrf.data import PropagationPaths
 from swiftwrf.data.store import Store
 from swiftwrf.locate.features import PathWaves, SpectrumFeatures, channels_beside
 from swiftwrf.locate.spectrum_likelihood import SCALES, PathLikelihood
@@ -335,21 +335,6 @@ def test_subcarriers_of_paths_without_lengths_are_refused():
     for number, bandwidth in ((8, 0.0), (1, 20e6), (8, 80.0), (8, 3e9)):
         with pytest.raises(InputError, match="goes with several subcarriers"):
             paths(None).subcarriers(PlanarArray.square(2, 2.4e9), number, bandwidth)
-
-
-@pytest.mark.parametrize("frequency", [[2.4e9], [2.4e3, 2.41e3], [2.4e9, 5.2e9]], ids=["one", "in MHz", "two bands"])
-def test_frequencies_of_snapshots_are_checked(frequency):
-    array = PlanarArray.square(2, 2.4e9)
-    channel = torch.ones(12, 2, 4, dtype=torch.complex64)
-    with pytest.raises(InputError, match="frequency_hz"):
-        Snapshots(
-            channel,
-            torch.rand(12, 3),
-            array=array,
-            fixed_position=(9, 9, 9),
-            rotation=torch.eye(3),
-            frequency_hz=frequency,
-        )
 
 
 def test_coherence_is_one_for_any_phase_of_each_snapshot():

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from swiftwrf import AngularGrid, FitError, InputError, SwiftWRF, make_model
+from swiftwrf import AngularGrid, FitError, InputError, make_model
 from swiftwrf.metrics import psnr
 from swiftwrf.models.mlp import encode
 from swiftwrf.models.primitives import MIN_WIDTH_PIXELS, Primitives
@@ -92,8 +92,6 @@ def test_the_preset_paper_is_the_paper():
     paper = model.config
     assert (paper.n_primitives, paper.steps, paper.batch, paper.max_azimuths) == (10_000, 110_000, 1, 0)
     assert (paper.rate, paper.deformation_rate, paper.ssim_weight, paper.smoothing) == (1e-2, 8e-3, 0.3, 1.0)
-    with pytest.raises(InputError, match="no published settings"):
-        SwiftWRF(preset="paper")
 
 
 def test_fit_beats_the_mean_spectrum(room):

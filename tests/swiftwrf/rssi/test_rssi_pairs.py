@@ -116,20 +116,6 @@ def test_both_ends_in_degrees():
     torch.testing.assert_close(between[0][row, column], between[1][row, own], rtol=0.02, atol=0.02)
 
 
-@pytest.mark.parametrize(
-    ("change", "transmitter", "says"),
-    [
-        ({}, ["tx_x", "nowhere"], "transmitter takes the columns of x, y"),
-        ({}, ["tx_x", "tx_x"], "transmitter takes the columns of x, y"),
-        ({"rssi2": -50.0}, (), "RSSI of 2 receivers; name one"),
-        ({}, ["tag"], "no column 'tag'"),
-    ],
-)
-def test_what_is_refused(change, transmitter, says):
-    with pytest.raises(InputError, match=says):
-        Rssi.from_frame(links(n_places=12).assign(**change), transmitter=transmitter)
-
-
 def test_many_positions_of_both_ends_are_averaged():
     table = links(n_places=700, rows=1)
     data = Rssi.from_frame(table)

@@ -355,42 +355,29 @@ def test_whole_run(small, registered, tmp_path):
     more = ("--extra", 20, "--suggest", 4)
     assert run("--mix", 0.5, "--synthesizer", "coarray", "idw", *more, "--out", out) == 0
     metrics = json.loads((out / "metrics.json").read_text(), parse_constant=lambda name: pytest.fail(name))
-    assert (metrics["task"], metrics["data"], metrics["split"], metrics["seed"]) == (
-        "aoa",
-        "simulated-room",
-        "random",
-        0,
-    )
-    methods = metrics["mixes"]["0.5"]["methods"]
+    assert [metrics[name] for name in ("task", "data", "split", "seed")] == ["aoa", "simulated-room", "random", 0]
+    mix, turbo = metrics["mixes"]["0.5"], "network, measured + synthetic + extra (coarray)"
+    methods = mix["methods"]
     synthetic = {f"measured + synthetic{more} ({name})" for name in ("coarray", "idw") for more in ("", " + extra")}
     every = {"measured", "all measured", *synthetic}
     expected = {"constant", "peak", "northern"}
     expected |= {f"network, {training}" for training in every if "synthetic (" not in training}
     expected |= {f"{name}, {training}" for name in ("nearest_spectrum", "kernel_regression") for training in every}
     assert set(methods) == expected
-    drawn = {"idw", "gp", "coarray"}
-    assert set(metrics["mixes"]["0.5"]["synthesis"]) == drawn
-    assert metrics["mixes"]["0.5"]["counts"]["measured + synthetic + extra (idw)"] == {
-        "measured": 20,
-        "withheld": 20,
-        "extra": 20,
-    }
-    assert metrics["mixes"]["0.5"]["cross_validation"]["coarray"]["n_held_out"] == 16  # of 20: one fold is never scored
-    assert set(metrics["mixes"]["0.5"]["seconds"]) == {"fit", "synthesize", "train"}
+    assert set(mix["synthesis"]) == {"idw", "gp", "coarray"}
+    assert mix["counts"]["measured + synthetic + extra (idw)"] == {"measured": 20, "withheld": 20, "extra": 20}
+    assert mix["cross_validation"]["coarray"]["n_held_out"] == 16  # of 20: one fold is never scored
+    assert set(mix["seconds"]) == {"fit", "synthesize", "train"}
 
     errors = pd.read_csv(out / "errors.csv")
     assert len(errors) == 19 * 10  # methods, test spectra
-    own = errors[
-        (errors.measured_fraction == 0.5) & (errors.method == "network, measured + synthetic + extra (coarray)")
-    ]
+    own = errors[(errors.measured_fraction == 0.5) & (errors.method == turbo)]
     assert set(own.estimator) == {"aann_kernel"}
     assert set(own.training) == {"measured + synthetic + extra"}
     assert set(own.synthesizer) == {"coarray"}
     median = own.great_circle_deg.median()
-    assert methods["network, measured + synthetic + extra (coarray)"]["great_circle_deg"]["median"] == pytest.approx(
-        median
-    )
-    assert methods["network, measured + synthetic + extra (coarray)"]["great_circle_deg"]["low"] <= median
+    assert methods[turbo]["great_circle_deg"]["median"] == pytest.approx(median)
+    assert methods[turbo]["great_circle_deg"]["low"] <= median
     truth = np.degrees(small.label[own["index"].tolist()].numpy())
     np.testing.assert_allclose(own[["truth_azimuth_deg", "truth_elevation_deg"]], truth, rtol=1e-9)
 

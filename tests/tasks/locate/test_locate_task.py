@@ -99,12 +99,7 @@ def test_test_rows_reach_no_fit():
 
 def test_whole_run(locate_run):
     metrics = strict_json(locate_run / "metrics.json")
-    assert (metrics["task"], metrics["data"], metrics["split"], metrics["seed"]) == (
-        "locate",
-        "simulated-floor",
-        "random",
-        0,
-    )
+    assert [metrics[name] for name in ("task", "data", "split", "seed")] == ["locate", "simulated-floor", "random", 0]
     assert (metrics["n_train"], metrics["n_test"], metrics["n_receivers"], metrics["n_undetected"]) == (64, 16, 12, 0)
     assert list(metrics["overall"]) == list(LOCALIZERS)
     assert set(metrics["weights"]) == {"values", "detections", "fingerprints"}
