@@ -69,33 +69,21 @@ def test_a_yaml_file_holds_options_and_positional_arguments(tmp_path):
     [
         (None, "cannot be read"),
         ("mix: [0.3", "cannot be read"),
+        ("[" * 5000, "cannot be read"),
+        ("#" * 2**20 + "\n", "at most 1048576 bytes"),
         ("- 0.3", "must hold options by name, got list"),
         ("mixx: 0.3", "names 'mixx', which is no option of this command; --help lists them"),
-    ],
-)
-def test_files_that_hold_no_options_are_refused(tmp_path, content, sentence):
-    file = tmp_path / "options.yaml"
-    if content is not None:
-        file.write_text(content)
-    with pytest.raises(InputError, match=sentence):
-        parse(AoaConfig, [], "aoa", file_options(file))
-
-
-@pytest.mark.parametrize(
-    ("content", "sentence"),
-    [
         ("mix: [0.3]\nseed: many\n", "o.yaml: seed takes INT, got 'many'"),
         ("seed: [1, 2]\n", "seed takes INT"),
         ("array: [4, 0.1]\n", "array takes"),
         ("preset: large\n", "preset takes"),
         ("a: &a [x, x]\nsynthesizer: [*a, *a]\n", "synthesizer takes"),
         ("synthesizer: [[x]]\n", "synthesizer takes"),
-        ("[" * 5000, "cannot be read"),
-        ("#" * 2**20 + "\n", "at most 1048576 bytes"),
     ],
 )
-def test_values_of_a_file_are_checked_as_those_of_a_command_line(tmp_path, content, sentence):
-    (tmp_path / "o.yaml").write_text(content)
+def test_a_file_of_options_is_checked_as_a_command_line(tmp_path, content, sentence):
+    if content is not None:
+        (tmp_path / "o.yaml").write_text(content)
     with pytest.raises(InputError, match=sentence):
         parse(AoaConfig, [], "aoa", file_options(tmp_path / "o.yaml"), "o.yaml")
 

@@ -7,7 +7,7 @@ from unittest import mock
 
 import pytest
 import torch
-from small import PUBLISHED, PUBLISHED_RSSI
+from small import PAPER, PUBLISHED, PUBLISHED_RSSI
 from torch.nn import functional
 
 from swiftwrf import AngularGrid, FitError, InputError, Spectra, load, make_model, rssi_room, simulated_room
@@ -20,6 +20,7 @@ from swiftwrf.data.store import Store
 from swiftwrf.metrics import psnr
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.mlp import encode
+from swiftwrf.models.swiftwrf_paper import SwiftWRFPaperConfig
 from swiftwrf.rasterize import rasterize_magnitude
 
 GRID = AngularGrid.hemisphere(90, 360)
@@ -28,6 +29,7 @@ LEARNS = {
     "wrfgs": WrfGsConfig(n_gaussians=100, width=32, depth=4, bands=4, steps=250, rate=5e-3),
     "vae": VaeConfig(latent=4, bands=2, hidden=64, steps=200),
     "dcgan": DcganConfig(noise=2, bands=2, hidden=64, steps=300),
+    "swiftwrf_paper": SwiftWRFPaperConfig(n_primitives=24, steps=400, batch=16, coarse_fraction=0.3, check_every=200),
 }
 
 
@@ -278,7 +280,7 @@ def interrupt(record):
 every = pytest.mark.parametrize("name", PUBLISHED)
 
 
-@every
+@pytest.mark.parametrize("name", LEARNS)
 def test_learns_a_source_that_moves(name):
     data = blob()
     rows = torch.arange(len(data))
@@ -288,15 +290,16 @@ def test_learns_a_source_that_moves(name):
     assert psnr(predicted, test.spectrum).median() > mean + 4
 
 
-@every
-def test_same_seed_same_model_and_interruptions_do_not_show(room, tmp_path, name):
-    config = PUBLISHED[name]
-    whole = fit(room, name).synthesize(room.position)
-    records = []
+@pytest.mark.parametrize(("name", "config"), {**PUBLISHED, "swiftwrf_paper": PAPER}.items())
+def test_same_seed_same_model_and_interruptions_do_not_show(room, tmp_path, name, config):
+    first, records = [], []
+    whole = fit(room, name, config, on_record=first.append).synthesize(room.position)
     with pytest.raises(KeyboardInterrupt):
-        fit(room, name, checkpoint=tmp_path / "state", on_record=interrupt)
-    again = fit(room, name, checkpoint=tmp_path / "state", on_record=records.append)
-    assert [record["step"] for record in records] == [config.check_every, config.steps]
+        fit(room, name, config, checkpoint=tmp_path / "state", on_record=interrupt)
+    again = fit(room, name, config, checkpoint=tmp_path / "state", on_record=records.append)
+    assert [record["step"] for record in records] == [*range(config.check_every, config.steps + 1, config.check_every)]
+    for one, other in zip(first, records, strict=True):  # the history is whole
+        assert {key: value for key, value in one.items() if key not in ("elapsed", "seconds")}.items() <= other.items()
     assert torch.equal(again.synthesize(room.position), whole)
     with pytest.raises(InputError, match="another fit"):
         fit(room, name, replace(config, seed=1), checkpoint=tmp_path / "state")
