@@ -1,5 +1,6 @@
 """Results of the library, which need no directory, process or terminal."""
 
+import json
 from functools import partial
 from unittest import mock
 
@@ -48,13 +49,6 @@ def test_a_result_writes_the_report_of_its_command_into_one_file(name, tmp_path,
         result.report(file)
 
 
-def test_the_best_estimator_of_a_result_predicts_and_is_saved(tmp_path):
-    result = turbo()
-    result.best.save(tmp_path / "best.safetensors")
-    spectra = result.experiment.test.spectrum
-    assert swiftwrf.load(tmp_path / "best.safetensors").predict(spectra).equal(result.best.predict(spectra))
-
-
 def test_predictions_are_those_of_the_models():
     train, test = swiftwrf.rssi_room(n=60).split()
     locator = swiftwrf.RssiLocator(n_cells=300).fit(train)
@@ -78,3 +72,21 @@ def test_a_comparison_continues_after_its_kept_results(tmp_path, compare):
         again = compare(data, receivers=["1", "6", "12"], keep=Memo(tmp_path))
     pd.testing.assert_frame_equal(again.errors, first.errors)
     again.report(tmp_path / "report.html")
+
+
+COMPARISONS = {
+    "rssi": (lambda: swiftwrf.rssi.compare(swiftwrf.rssi_room(n=40), receivers=["1", "6", "12"]), "abs_error_db"),
+    "locate": (lambda: swiftwrf.locate.compare(swiftwrf.rssi_room(n=80), n_cells=300), "position_error_m"),
+}
+
+
+@pytest.mark.parametrize("task", COMPARISONS)
+def test_a_comparison_without_a_folder_has_the_errors_of_the_command(task, request):
+    (compare, error), run = COMPARISONS[task], request.getfixturevalue(f"{task}_run")
+    result, metrics = compare(), json.loads((run / "metrics.json").read_text())
+    pd.testing.assert_frame_equal(result.errors, pd.read_csv(run / "errors.csv"), check_dtype=False)
+    medians = {name: entry[error]["median"] for name, entry in metrics["overall"].items()}
+    assert result.summary()["median"].to_dict() == pytest.approx(medians)
+    inside = {float(level): inside for level, inside in metrics.get("calibration", {}).items()}
+    assert result.coverage == pytest.approx(inside or metrics["interval"]["coverage"])
+    assert task == "locate" or {*result.predictors} == {*medians}

@@ -84,20 +84,6 @@ def test_regression_recovers_fields_of_primitives(generator):
     assert psnr(model.synthesize(position[120:]), spectrum[120:]).median() > 35
 
 
-def test_regression_is_the_same_at_any_number_of_threads(room):
-    def drawn(threads):
-        before = torch.get_num_threads()
-        torch.set_num_threads(threads)
-        try:
-            return fit(room, n_primitives=32).state()[0]
-        finally:
-            torch.set_num_threads(before)
-
-    one, two = drawn(1), drawn(2)
-    for name, value in one.items():
-        torch.testing.assert_close(two[name], value, atol=1e-5, rtol=1e-5, equal_nan=True, msg=name)
-
-
 @pytest.mark.parametrize("name", ["swiftwrf", "gp", "coarray", "hybrid"])
 def test_standard_deviations_are_calibrated(built_in_room, floor_alone, name):
     """75 to 85 % of the pixels of unseen spectra lie within 1.28 standard deviations; these grow with the distance."""

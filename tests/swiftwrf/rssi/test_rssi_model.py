@@ -19,7 +19,6 @@ from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, harmoni
 from swiftwrf.rssi.regression import DIRECTIVITY_STD_DB, fit_receiver
 from swiftwrf.rssi.training import RssiTraining, bin_locations
 from swiftwrf.runtime.steps import Memo
-from swiftwrf.runtime.threads import threads_kept
 
 KERNEL = Kernel(4.0, 1.0, matern12_weight=0.6, noise=1.0)
 FIELD_DB, NOISE_DB, PATH_LOSS_STD_DB = 3.0, 2.0, 30.0
@@ -273,17 +272,6 @@ def test_same_data_same_model_and_any_batch(monkeypatch):
     assert torch.equal(a, b)
     monkeypatch.setattr(RssiModel, "batch_size", 7)
     torch.testing.assert_close(fit_rssi(data).predict(data.transmitter_position).mean, a)
-
-
-def test_any_number_of_threads_gives_the_same_model():
-    data, here = with_field(), with_field(seed=1).transmitter_position
-    predicted = []
-    for threads in (1, 2):
-        with threads_kept():
-            torch.set_num_threads(threads)
-            predicted.append(both(fit_rssi(data).predict(here)))
-            assert torch.get_num_threads() == threads
-    assert torch.equal(*predicted)
 
 
 def test_many_rows_are_averaged_by_location():

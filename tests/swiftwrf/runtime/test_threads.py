@@ -6,8 +6,10 @@ from collections.abc import Iterator
 import pytest
 import scipy.linalg  # noqa: F401  # loads its library
 import torch
+from test_rssi_model import with_field
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
+from swiftwrf import fit, fit_rssi
 from swiftwrf.runtime.threads import parallel_map, single_thread, threads_kept
 
 
@@ -79,3 +81,19 @@ def test_each_of_several_threads_uses_one():
 
     assert parallel_map(uses_threads, range(8)) == [1] * 8
     assert torch.get_num_threads() == in_a_new_thread() == 4
+
+
+@pytest.mark.parametrize(("kind", "tolerance"), [("spectra", 1e-5), ("RSSI", 0.0)])
+def test_any_number_of_threads_gives_the_same_model(room, kind, tolerance):
+    def fitted(threads: int) -> dict[str, torch.Tensor]:
+        with threads_kept():
+            torch.set_num_threads(threads)
+            if kind == "spectra":
+                return fit(room, n_primitives=32).state()[0]
+            found = fit_rssi(with_field()).predict(with_field(seed=1).transmitter_position)
+            assert torch.get_num_threads() == threads
+        return {"mean": found.mean, "std": found.std}
+
+    one, two = fitted(1), fitted(2)
+    for name, value in one.items():
+        torch.testing.assert_close(two[name], value, atol=tolerance, rtol=tolerance, equal_nan=True, msg=name)

@@ -17,7 +17,7 @@ from swiftwrf.data import ReadOptions
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.locate import MatchedField
 from swiftwrf.locate.baselines import LEVELS, LOCALIZERS
-from swiftwrf.locate.comparison import LocateSplit, compare
+from swiftwrf.locate.comparison import LocateSplit
 from swiftwrf.runtime.steps import LOCATOR as MODEL
 from tasks.predict import read_rssi
 from tasks.source import aligned
@@ -50,18 +50,6 @@ def matched(tmp_path_factory):
     with known_planes(FLOOR):
         MatchedField(max_cells=200, n_best=20, n_background=10, n_rounds=1).fit(data).save(file)
     return data, file
-
-
-def test_a_comparison_without_a_folder_has_the_errors_of_the_command(locate_run):
-    with quick.quick():
-        result = compare(rssi_room(n=80), n_cells=300)
-    pd.testing.assert_frame_equal(result.errors, pd.read_csv(locate_run / "errors.csv"), check_dtype=False)
-    metrics = strict_json(locate_run / "metrics.json")
-    medians = {name: entry["position_error_m"]["median"] for name, entry in metrics["overall"].items()}
-    assert result.summary()["median"].to_dict() == pytest.approx(medians)
-    assert {str(level): fraction for level, fraction in result.coverage.items()} == pytest.approx(
-        metrics["calibration"]
-    )
 
 
 @pytest.mark.parametrize("name", [name for name in LOCALIZERS if name != "posterior"])

@@ -154,18 +154,6 @@ def test_whole_run(small, tmp_path):
     assert list((out / "figures").glob("map-*.svg"))
 
 
-def test_a_comparison_without_a_folder_has_the_errors_of_the_command(rssi_run):
-    floor, receivers = rssi_room(n=40), ["1", "6", "12"]
-    with quick.quick():
-        result = compare(floor, receivers=receivers)
-    pd.testing.assert_frame_equal(result.errors, pd.read_csv(rssi_run / "errors.csv"), check_dtype=False)
-    metrics = json.loads((rssi_run / "metrics.json").read_text())
-    medians = {name: entry["abs_error_db"]["median"] for name, entry in metrics["overall"].items()}
-    assert result.summary()["median"].to_dict() == pytest.approx(medians)
-    assert result.coverage == pytest.approx(metrics["interval"]["coverage"])
-    assert set(result.predictors) == set(medians)
-
-
 def test_a_lone_receiver_has_one_map_and_no_average(tmp_path, capsys):
     out = tmp_path / "her 'own' run"
     assert quick.run("rssi", "--rx", "1", "--out", out) == 0
