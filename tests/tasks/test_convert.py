@@ -67,34 +67,25 @@ def test_rssi_comes_back_as_it_was(tmp_path):
     assert torch.equal(after.named_splits["random"][1], before.named_splits["random"][1])
 
 
-def test_names_and_values_that_the_layout_has_signs_for(tmp_path):
-    data = replace(
-        load_rssi(write_survey(tmp_path / "a")),
-        receiver_names=('a,"b"', "NA", "1"),
-        receiver_position=torch.eye(3, dtype=torch.float64),
-    )
+def test_what_is_known_of_the_measurements_comes_back(tmp_path):
+    """Also names and values for which the layout has signs."""
+    known = {
+        "receiver_names": ('a,"b"', "NA", "1"),
+        "receiver_position": torch.eye(3, dtype=torch.float64),
+        "origin": GeodeticOrigin(48.1234567, -11.5),
+        "floors": Floors(("0", "1, 2"), (1.0, 5.25)),
+        "receiver_moves": True,
+        "session": torch.arange(40) // 20,
+        "time": torch.arange(40).double() / 3,
+    }
+    data = replace(load_rssi(write_survey(tmp_path / "a")), **known)
     data.rssi_dbm[0, 0] = -100.0
     write_rssi(data, tmp_path)
     back = load_rssi(tmp_path)
-    assert back.receiver_names == data.receiver_names
-    assert torch.equal(back.receiver_position, data.receiver_position)
+    for name, value in known.items():
+        found = getattr(back, name)
+        assert torch.equal(found, value) if isinstance(value, torch.Tensor) else found == value, name
     assert back.rssi_dbm[0, 0] == -99.99
-
-
-def test_what_is_known_of_the_measurements_comes_back(tmp_path):
-    data = replace(
-        load_rssi(write_survey(tmp_path / "a")),
-        origin=GeodeticOrigin(48.1234567, -11.5),
-        floors=Floors(("0", "1, 2"), (1.0, 5.25)),
-        receiver_moves=True,
-        session=torch.arange(40) // 20,
-        time=torch.arange(40).double() / 3,
-    )
-    write_rssi(data, tmp_path)
-    back = load_rssi(tmp_path)
-    assert torch.equal(back.session, data.session)
-    assert torch.equal(back.time, data.time)
-    assert (back.origin, back.floors, back.receiver_moves) == (data.origin, data.floors, True)
     assert SURVEY in back.source
 
 

@@ -109,6 +109,10 @@ def _params(text):
     return lambda folder: (folder / "params.json").write_text(text)
 
 
+def _array(name, values):
+    return lambda folder: np.savez(folder / f"{name}_t000_tx000_r001.npz", **{name: values})
+
+
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
@@ -116,13 +120,10 @@ def _params(text):
         (_params("{}"), "rt_params"),
         (_params(json.dumps({"rt_params": {"frequency": 2.4}})), "carrier in Hz"),
         (lambda f: (f / "phase_t000_tx000_r001.npz").unlink(), "phase_t000_tx000_r001.npz is missing"),
-        (lambda f: np.savez(f / "phase_t000_tx000_r001.npz", phase=np.zeros((3, 25))), "all have shape"),
-        (lambda f: np.savez(f / "rx_pos_t000_tx000_r001.npz", rx_pos=np.zeros((3, 3))), "rx_pos of pair"),
-        (lambda f: np.savez(f / "rx_pos_t000_tx000_r001.npz", rx_pos=np.full((30, 3), np.nan)), "must be finite"),
-        (
-            lambda f: np.savez(f / "power_t000_tx000_r001.npz", power=np.full((30, 25), np.nan)),
-            "no receiver with a path",
-        ),
+        (_array("phase", np.zeros((3, 25))), "all have shape"),
+        (_array("rx_pos", np.zeros((3, 3))), "rx_pos of pair"),
+        (_array("rx_pos", np.full((30, 3), np.nan)), "must be finite"),
+        (_array("power", np.full((30, 25), np.nan)), "no receiver with a path"),
     ],
 )
 def test_refuses(tmp_path, spoil, says):
