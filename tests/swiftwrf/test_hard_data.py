@@ -89,6 +89,8 @@ def rssi(case):
     if case in RSSI:
         return replace(floor, rssi_dbm=RSSI[case](floor.rssi_dbm))
     receiver = floor.receiver_position
+    if case == "on a receiver":
+        return replace(floor, transmitter_position=receiver[:1].expand(len(floor), -1))
     if case.startswith("scale"):
         receiver = PLACES[case](receiver)
     return replace(floor, transmitter_position=PLACES[case](floor.transmitter_position), receiver_position=receiver)
@@ -119,7 +121,7 @@ def test_field_models_of_hard_data(name, case):
 
 
 @pytest.mark.usefixtures("short_fits")
-@pytest.mark.parametrize("case", [*PLACES, *RSSI])
+@pytest.mark.parametrize("case", [*PLACES, *RSSI, "on a receiver"])
 @pytest.mark.parametrize("model", [RssiModel, PairModel])
 def test_rssi_models_of_hard_data(model, case):
     data = rssi(case)
@@ -127,7 +129,7 @@ def test_rssi_models_of_hard_data(model, case):
 
 
 @pytest.mark.usefixtures("short_fits")
-@pytest.mark.parametrize("case", [*PLACES, *RSSI])
+@pytest.mark.parametrize("case", [*PLACES, *RSSI, "on a receiver"])
 def test_rssi_locators_of_hard_data(case):
     data = rssi(case)
     try:

@@ -8,6 +8,7 @@ from dataclasses import fields, is_dataclass
 from unittest import mock
 
 import pytest
+import yaml
 
 from swiftwrf import InputError
 from tasks import configs
@@ -95,12 +96,27 @@ def executed(config_type, *arguments):
     return found[0]
 
 
+@pytest.mark.parametrize(
+    ("content", "options", "expected"),
+    [
+        (
+            {"seed": 5, "split": "block", "rx": [1, "a b"]},
+            ("--seed", 6),
+            {"seed": 6, "split": "block", "rx": ("1", "a b")},
+        ),
+        ({"rx": [1], "json": True}, (), {"output": Output(json=True)}),
+        ({"rx": [1], "json": True}, ("--no-json",), {"output": Output(json=False)}),
+        *(
+            ({"rx": texts}, (), {"rx": tuple(texts), "out": None})  # values of a file are no flags
+            for texts in (["--out", "X"], ["--help"], ["--config=x"], ["-1"])
+        ),
+    ],
+)
 @pytest.mark.parametrize("form", [lambda file: ("--config", file), lambda file: (f"--config={file}",)])
-def test_a_file_of_options_is_given_in_both_forms(tmp_path, form):
-    file = tmp_path / "opts.yaml"
-    file.write_text("seed: 5\nsplit: block\nrx: [1, a b]\n")
-    found = executed(RssiTaskConfig, *form(file), "--seed", 6)
-    assert (found.seed, found.split, found.rx) == (6, "block", ("1", "a b"))
+def test_a_file_of_options_is_given_in_both_forms_and_the_command_line_wins(tmp_path, content, options, expected, form):
+    (tmp_path / "opts.yaml").write_text(yaml.safe_dump(content))
+    found = vars(executed(RssiTaskConfig, *form(tmp_path / "opts.yaml"), *options))
+    assert {name: found[name] for name in expected} == expected
 
 
 def test_the_configuration_of_a_run_with_out_starts_another_run(tmp_path):
@@ -112,19 +128,6 @@ def test_the_configuration_of_a_run_with_out_starts_another_run(tmp_path):
     assert plain(found) == values | {"out": None}
     again = executed(RssiTaskConfig, "--config", tmp_path / "config.json", "--filler", -100, 100, "--out", "other")
     assert (again.table.filler, again.out) == ((-100.0, 100.0), "other")
-
-
-def test_a_flag_that_a_file_sets_is_negated_on_the_command_line(tmp_path):
-    (tmp_path / "o.yaml").write_text("rx: [1]\njson: true\n")
-    assert executed(RssiTaskConfig, "--config", tmp_path / "o.yaml").output.json
-    assert not executed(RssiTaskConfig, "--config", tmp_path / "o.yaml", "--no-json").output.json
-
-
-@pytest.mark.parametrize("texts", [["--out", "X"], ["--help"], ["--config=x"], ["-1"]])
-def test_values_of_a_file_are_no_flags(tmp_path, texts):
-    (tmp_path / "options.json").write_text(json.dumps({"rx": texts}))
-    found = executed(RssiTaskConfig, "--config", tmp_path / "options.json")
-    assert (found.rx, found.out) == (tuple(texts), None)
 
 
 @pytest.mark.parametrize(

@@ -197,21 +197,6 @@ def test_few_cells_are_enough_where_path_gains_change_with_position():
     assert locator.inflation < 3
 
 
-def test_coordinates_from_another_origin_change_nothing(floor):
-    train, test, locator = floor
-    shift = torch.tensor([512.0, -256.0, 0.0], dtype=torch.float64)
-
-    def moved(data):
-        return replace(
-            data,
-            transmitter_position=data.transmitter_position + shift,
-            receiver_position=data.receiver_position + shift,
-        )
-
-    again = RssiLocator(n_cells=600).fit(moved(train)).locate(test.rssi_dbm)
-    assert torch.allclose(again.median - shift, locator.locate(test.rssi_dbm).median, atol=0.05)
-
-
 def test_the_order_of_receivers_changes_nothing(floor):
     train, test, locator = floor
     order = list(reversed(range(len(train.receiver_names))))

@@ -9,7 +9,7 @@ import pytest
 import small
 import torch
 
-from swiftwrf import rssi_room
+from swiftwrf import RssiLocator, rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.models import FIELD_MODELS
 
@@ -34,17 +34,24 @@ def test_field_models_do_not_depend_on_the_origin(room, small_published, short_f
     torch.testing.assert_close(*predicted, atol={"dcgan": 2e-2, "hybrid": 1e-2}.get(name, 2e-3), rtol=0)
 
 
+def floors(data):
+    """Return RSSI in coordinates from two origins, and how far these are apart [m]."""
+    for shift in (0.0, 1e7):
+        at, receiver = data.transmitter_position + shift, data.receiver_position + shift
+        yield shift, replace(data, transmitter_position=at, receiver_position=receiver)
+
+
 @pytest.mark.parametrize("name", RSSI_PREDICTORS)
 def test_predictors_do_not_depend_on_the_origin(small_published, short_fits, name):
-    data, predicted = rssi_room(n=40).receivers(["1", "2"]), []
-    for shift in (0.0, 1e7):
-        moved = replace(
-            data,
-            transmitter_position=data.transmitter_position + shift,
-            receiver_position=data.receiver_position + shift,
-        )
-        predicted.append(RSSI_PREDICTORS[name]().fit(moved).predict(moved.transmitter_position[:10]).mean)
+    models = [(RSSI_PREDICTORS[name]().fit(some), some) for _, some in floors(rssi_room(n=40).receivers(["1", "2"]))]
+    predicted = [model.predict(some.transmitter_position[:10]).mean for model, some in models]
     torch.testing.assert_close(*predicted, atol=0.05, rtol=0)  # dB
+
+
+def test_locators_do_not_depend_on_the_origin():
+    train, test = rssi_room(n=150, seed=1).columns(range(0, 12, 2)).split()
+    located = [RssiLocator(n_cells=600).fit(some).locate(test.rssi_dbm).median - at for at, some in floors(train)]
+    torch.testing.assert_close(*located, atol=0.05, rtol=0)  # m
 
 
 def test_an_installation_without_a_place_for_caches(tmp_path):
