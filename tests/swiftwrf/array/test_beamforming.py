@@ -38,19 +38,16 @@ def slow(name, channel):
     return power / power.max() if name == "capon" else power
 
 
-@pytest.mark.parametrize("name", list(BEAMFORMERS))
-@pytest.mark.parametrize("count", [6, 9])
+COUNTS = [(name, count) for name in BEAMFORMERS for count in (1, 6, 9) if name != "capon" or count > 1]
+
+
+@pytest.mark.parametrize(("name", "count"), COUNTS)
 def test_beamformers_are_their_definitions(name, count):
+    """Phases of one snapshot give the equation of the paper."""
     channel = channels(count=count)
     spectrum = ARRAY.spectrum(channel, GRID, name)
     expected = torch.stack([slow(name, one) for one in channel]).sqrt().reshape(-1, *GRID.shape)
     torch.testing.assert_close(spectrum, expected.float(), rtol=1e-4, atol=1e-5)
-
-
-def test_one_snapshot_by_phases_is_the_equation_of_the_paper():
-    channel = channels(count=1)[:, 0]
-    beam = (channel / channel.abs()) @ steering().conj().T
-    torch.testing.assert_close(ARRAY.spectrum(channel, GRID).flatten(1), beam.abs().float() / 6, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["phase", "bartlett"])

@@ -44,12 +44,6 @@ def test_spectra_peak_at_the_line_of_sight(tmp_path, beamformer):
     assert (data.moving, data.array, data.fixed_position.tolist()) == ("transmitter", data.array, [0.2, 2.4, 1.2])
 
 
-def test_one_snapshot_needs_no_axis_of_its_own(tmp_path):
-    made = snapshots()
-    folder = write_snapshots(tmp_path / "a", csi=made.channel[:, 0].numpy())
-    assert load_snapshots(folder).channel.shape == (120, 1, 16)
-
-
 @pytest.mark.parametrize("suffix", [".npz", ".mat"])
 def test_arrays_with_other_names(tmp_path, suffix):
     names = {"csi": "H", "position": "pos", "frequency_hz": "f"}

@@ -10,7 +10,7 @@ from samples import snapshots
 from scipy.spatial.transform import Rotation
 
 from swiftwrf import InputError, calibrate
-from swiftwrf.array.angles import AngularGrid, wrap
+from swiftwrf.array.angles import wrap
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data import Snapshots
 from swiftwrf.diagnostics.inspection import inspect
@@ -64,14 +64,6 @@ def test_a_calibrated_array_is_left_as_it_is():
     assert float(found.turn.norm().rad2deg()) < 0.2
     assert float(found.phase.abs().max().rad2deg()) < 1
     assert found.after == pytest.approx(found.before, abs=0.01)
-
-
-def test_what_it_found_mends_the_spectra():
-    data, *_ = spoilt(snapshots(n=150))
-    mended = calibrate(data).apply(data).spectra(AngularGrid.hemisphere(24, 96))
-    usual = snapshots(n=150).spectra(AngularGrid.hemisphere(24, 96))
-    torch.testing.assert_close(mended.spectrum, usual.spectrum, atol=0.02, rtol=0)
-    torch.testing.assert_close(mended.label[:, 1], usual.label[:, 1], atol=0.01, rtol=0)
 
 
 def test_positions_without_line_of_sight_do_not_count():

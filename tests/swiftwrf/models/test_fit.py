@@ -5,13 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from swiftwrf import AngularGrid, Spectra, SwiftWRF, fit, make_model
+from swiftwrf import AngularGrid, SwiftWRF, fit, make_model
 from swiftwrf.data.splits import folds
 from swiftwrf.data.store import Store
 from swiftwrf.gp import GaussianProcess, choose_kernel
 from swiftwrf.metrics import covered, psnr
 from swiftwrf.models.swiftwrf import smallest
-from swiftwrf.rasterize import reference
 
 
 def test_finds_a_size(room):
@@ -68,20 +67,6 @@ def test_regression_draws_what_the_process_on_the_pixels_predicts(room):
     weights = GaussianProcess(kernel, known.position).weights(unseen.position)[1].float()
     predicted = (mean + (weights @ change).reshape(unseen.spectrum.shape)).clamp(0, 1)
     assert psnr(model.synthesize(unseen.position), predicted).min() > 38
-
-
-def test_regression_recovers_fields_of_primitives(generator):
-    """Spectra of primitives whose responses are smooth in position are predicted where none was measured."""
-    position = 2 * torch.rand(150, 3, generator=generator, dtype=torch.float64)
-    grid = AngularGrid.hemisphere(15, 60)
-    mean = torch.tensor([[1.0, 0.5], [3.0, 0.9], [5.0, 0.4]])
-    cholesky = torch.tensor([[0.5, 0.0, 0.3]] * 3)
-    kernel = reference.kernels(mean, cholesky, grid, cutoff=1e-4)
-    response = 0.4 + 0.3 * torch.sin(position @ torch.randn(3, 3, generator=generator, dtype=torch.float64)).float()
-    spectrum = torch.einsum("bn,nhw->bhw", response, kernel).clamp(0, 1)
-    scene = Spectra(spectrum, position, grid=grid)
-    model = fit(scene.subset(torch.arange(120)))
-    assert psnr(model.synthesize(position[120:]), spectrum[120:]).median() > 35
 
 
 @pytest.mark.parametrize("name", ["swiftwrf", "gp", "coarray", "hybrid"])
