@@ -98,15 +98,6 @@ def test_fillers_are_no_power(tmp_path, floor, filler, share):
     assert np.isnan(load_rssi(tmp_path / "long.csv").rssi_dbm.numpy()).sum() == filled.sum()
 
 
-def test_fillers_of_the_nerf2_layout(tmp_path, floor):
-    filled = floor.some(0.3)
-    (tmp_path / "tx_pos.csv").write_text(floor.table()[["x", "y", "z"]].to_csv(index=False))
-    pd.DataFrame(np.where(filled, 127, floor.rssi), columns=NAMES).to_csv(tmp_path / "gateway_rssi.csv", index=False)
-    data = load_rssi(tmp_path)
-    np.testing.assert_array_equal(cells(data), np.where(filled, 0, floor.rssi))
-    assert not data.located
-
-
 def test_the_user_decides_on_fillers(tmp_path, floor):
     filled = floor.some(0.3)
     floor.table(np.where(filled, -104, floor.rssi)).to_csv(tmp_path / "walk.csv", index=False)

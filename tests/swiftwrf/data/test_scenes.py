@@ -33,6 +33,7 @@ SIZE = (6.0, 5.0, 3.0)
 FIXED = torch.tensor([3.1, 2.4, 2.6], dtype=torch.float64)
 EDGE_M = 0.01  # Sionna loses paths that pass an edge this closely
 OPTIONS = ("--room", "bedroom", "--moving", "receiver", "--positions", 5)
+ENDS = (*OPTIONS[2:], "--fixed", 0, 0, 1, "--region", 0, 0, 0, 1, 1, 1)
 
 
 def empty(material: str) -> FurnishedRoom:
@@ -246,18 +247,9 @@ def write_scene(folder, material):
     ("arguments", "says"),
     [
         ((*OPTIONS, "--frequency", 9e8), "ITU-R P.2040 knows plasterboard at"),
-        (
-            ("--room", "{folder}/junk.xml", *OPTIONS[2:], "--fixed", 0, 0, 1, "--region", 0, 0, 0, 1, 1, 1),
-            "not a scene",
-        ),
-        (
-            ("--room", "{folder}/empty.xml", *OPTIONS[2:], "--fixed", 0, 0, 1, "--region", 0, 0, 0, 1, 1, 1),
-            "not a scene",
-        ),
-        (
-            ("--room", "{folder}/rectangle.xml", *OPTIONS[2:], "--fixed", 0, 0, 1, "--region", 0, 0, 0, 1, 1, 1),
-            "a scene of meshes",
-        ),
+        (("--room", "{folder}/junk.xml", *ENDS), "not a scene"),
+        (("--room", "{folder}/empty.xml", *ENDS), "not a scene"),
+        (("--room", "{folder}/rectangle.xml", *ENDS), "a scene of meshes"),
         (("--room", "{folder}/room.xml", *OPTIONS[2:], "--fixed", 0, 0, 9, "--region", 1, 1, 1, 2, 2, 2), "no path"),
     ],
 )
