@@ -39,13 +39,7 @@ def test_a_wheel_runs_beside_a_module_called_tasks(tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
     (empty / "tasks.py").write_text("raise RuntimeError('the module of the user')\n")
-    run = [
-        str(tmp_path / "clean" / "bin" / "swiftwrf"),
-        "inspect",
-        str(write_survey(tmp_path / "walk")),
-        "--out",
-        "page",
-    ]
+    run = [str(tmp_path / "clean" / "bin" / "swiftwrf"), "inspect", str(write_survey(tmp_path / "walk"))]
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    subprocess.run(run, cwd=empty, env=environment, check=True)
+    subprocess.run([*run, "--out", "page"], cwd=empty, env=environment, check=True)
     assert (empty / "page" / "report.html").is_file()

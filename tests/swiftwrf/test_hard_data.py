@@ -5,6 +5,7 @@ from functools import cache
 
 import pytest
 import torch
+from small import GLANCE
 
 from swiftwrf import (
     AngularGrid,
@@ -25,13 +26,7 @@ from swiftwrf.models.geometry.fit import observe
 from swiftwrf.rssi.mixing import rounding_std
 from swiftwrf.rssi.pairs import PairPathLoss
 
-SHORT = {
-    "search_distance_m": 0.5,
-    "n_search_positions": 10,
-    "beam_width": 1,
-    "max_order": 1,
-    "max_extra_planes": 1,
-}  # search for a room
+SHORT = {"config": replace(GLANCE, max_extra_planes=1)}  # search for a room
 OPTIONS = {"swiftwrf": {"n_primitives": 4}, "geometry": SHORT, "hybrid": SHORT}
 MODELS = [name for name, model in FIELD_MODELS.items() if not model.slow]
 SCALES = (1e-3, 1e3, 1e6)

@@ -31,14 +31,8 @@ def started(folder: Path, *arguments: str, **variables: str) -> subprocess.Compl
     script.parent.mkdir(exist_ok=True)
     script.write_text("import sys\nfrom tasks.command import main\nsys.exit(main())\n")
     environment = os.environ | {"PYTHONPATH": str(ROOT)} | variables
-    return subprocess.run(
-        [sys.executable, str(script), *arguments],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = [sys.executable, str(script), *arguments]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
 
 def test_help_lists_every_command_at_once(tmp_path):

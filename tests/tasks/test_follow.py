@@ -183,12 +183,9 @@ def geometry():
 
 
 def spectrum_lines(first, last):
-    rows = range(first, last)
-    return b"".join(
-        json.dumps({"position": room().position[i].tolist(), "spectrum": room().store[i : i + 1][0].tolist()}).encode()
-        + b"\n"
-        for i in rows
-    )
+    rows = room().subset(range(first, last))
+    pairs = zip(rows.position.tolist(), rows.store[:].tolist(), strict=True)
+    return b"".join(json.dumps({"position": at, "spectrum": values}).encode() + b"\n" for at, values in pairs)
 
 
 def test_spectra_that_wait_are_learnt_by_the_next_start(tmp_path):
@@ -210,12 +207,8 @@ def test_spectra_that_wait_are_learnt_by_the_next_start(tmp_path):
 def test_an_update_of_a_room_states_the_spectra_that_it_has_not_learnt(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("tasks.update.run._read", lambda *_: room().subset(torch.arange(40, 43)))
     geometry().save(tmp_path / "room.safetensors")
-    assert (
-        run_command(
-            "update", [str(tmp_path / "room.safetensors"), "x", "--out", str(tmp_path / "out")], "swiftwrf update"
-        )
-        == 0
-    )
+    options = [str(tmp_path / "room.safetensors"), "x", "--out", str(tmp_path / "out")]
+    assert run_command("update", options, "swiftwrf update") == 0
     assert "3 spectra are not learnt" in capsys.readouterr().out
 
 

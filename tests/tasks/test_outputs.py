@@ -251,12 +251,8 @@ def test_deepmimo_folders_are_made_of_ray_paths(paths, tmp_path, capsys):
         (tmp_path / name).mkdir()
         write_paths(some, tmp_path / name)
     assert run(tmp_path / "known", tmp_path / "town", "--deepmimo") == 0
-    torch.testing.assert_close(
-        load_spectra(tmp_path / "town", grid=GRID).spectrum,
-        load_spectra(tmp_path / "known", grid=GRID).spectrum,
-        atol=1e-6,
-        rtol=0,
-    )
+    found, expected = (load_spectra(tmp_path / name, grid=GRID).spectrum for name in ("town", "known"))
+    torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
     capsys.readouterr()
     assert run(tmp_path / "unknown", tmp_path / "other", "--deepmimo") == 2
     assert "lengths of these paths are unknown" in said(capsys)

@@ -81,18 +81,8 @@ def test_semicolons_and_decimal_commas(tmp_path):
 
 
 def test_uji_indoor_loc(tmp_path):
-    header = [
-        "WAP001",
-        "WAP002",
-        "WAP003",
-        "LONGITUDE",
-        "LATITUDE",
-        "FLOOR",
-        "BUILDINGID",
-        "SPACEID",
-        "USERID",
-        "TIMESTAMP",
-    ]
+    columns = ["LONGITUDE", "LATITUDE", "FLOOR", "BUILDINGID", "SPACEID", "USERID", "TIMESTAMP"]
+    header = ["WAP001", "WAP002", "WAP003", *columns]
     place = [[-7541.2 + i, 4864921.0 + i, i % 3] for i in range(12)]
     rows = [[-80 + i, 100, 100 if i % 2 else -90, *at, 1, 106, 2, 1371713733] for i, at in enumerate(place)]
     data = load_rssi(write_survey(tmp_path, "trainingData.csv", header, rows))

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from rooms import built_in_walls, mirror_room
+from small import GLANCE
 
 from swiftwrf import Spectra, load
 from swiftwrf.data.splits import folds
@@ -96,14 +97,8 @@ def test_a_search_finds_a_dielectric_from_channels_alone_and_a_file_keeps_it(tmp
     for name, value in {"SETTINGS": ((4.0, 1e-3),), "N_STEPS": 10, "MAX_CHOICE": 20}.items():
         monkeypatch.setattr(furniture, name, value)
     data = channels([WALLS[5]])
-    options = {
-        "search_distance_m": 0.8,
-        "beam_width": 1,
-        "max_order": 1,
-        "max_extra_planes": 0,
-        "n_search_positions": 20,
-    }
-    room, other = (GeometryModel(**options).fit(some) for some in (data, replace(data, channel=None)))
+    config = replace(GLANCE, search_distance_m=0.8, n_search_positions=20)
+    room, other = (GeometryModel(config).fit(some) for some in (data, replace(data, channel=None)))
     assert room.planes[0].dielectric
     assert room.planes[0].offset_m == pytest.approx(WALLS[5].offset_m, abs=1e-3)
     assert not other.planes[0].dielectric

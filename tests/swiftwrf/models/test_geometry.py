@@ -161,12 +161,8 @@ def test_rooms_are_refined_together_as_one_by_one():
     scene, _ = observe(mirror_room(SIX, n=20))
     normal, offset = torch.tensor([list(SIX)]).double(), torch.tensor([list(SIX.values())]).double()
     room = PlaneSet(normal, offset + 0.01, torch.full((1, 6), -0.5), 2)
-    rooms = [
-        room,
-        room.without(0),
-        replace(room, offset=offset - 0.01),
-        PlaneSet(normal[:, :0], offset[:, :0], offset[:, :0], 2),
-    ]
+    none = PlaneSet(normal[:, :0], offset[:, :0], offset[:, :0], 2)
+    rooms = [room, room.without(0), replace(room, offset=offset - 0.01), none]
     for together, given in zip(refine_all(scene, rooms, 3), rooms, strict=True):
         alone = refine(scene, given, 3)
         torch.testing.assert_close(together.offset, alone.offset, atol=1e-6, rtol=0)
@@ -296,12 +292,8 @@ def test_noise_stays_within_the_deviations():
 
 @pytest.mark.usefixtures("short_searches")
 def test_positions_in_a_plane_leave_no_plane_certain():
-    model = fit(
-        mirror_room(SIX, noise=0.1, n=16, low=(1.5, 1.2, 1.2), high=(3.5, 3.2, 1.2)),
-        max_extra_planes=0,
-        beam_width=1,
-        max_order=2,
-    )
+    data = mirror_room(SIX, noise=0.1, n=16, low=(1.5, 1.2, 1.2), high=(3.5, 3.2, 1.2))
+    model = fit(data, max_extra_planes=0, beam_width=1, max_order=2)
     assert not any(p.certain for p in model.planes)
     assert "the positions lie on a plane" in model.conclusion
     assert all(error < 3 * std for error, std in errors(model, SIX) if model.planes)

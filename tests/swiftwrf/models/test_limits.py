@@ -62,11 +62,6 @@ def test_an_installation_without_a_place_for_caches(tmp_path):
         "for l in c.CacheImpl._locator_classes: l.from_function = classmethod(lambda *a: None)\n"
         "import swiftwrf.rasterize.cpu\nprint('imported')"
     )
-    child = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        env=os.environ | {"PYTHONPATH": os.getcwd()},
-        check=False,
-    )
+    environment = os.environ | {"PYTHONPATH": os.getcwd()}
+    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
     assert "imported" in child.stdout, child.stderr[-500:]

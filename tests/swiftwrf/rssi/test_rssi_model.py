@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import partial
 from unittest import mock
 
+import numpy as np
 import pytest
 import torch
 from scipy.optimize import minimize
@@ -132,13 +133,8 @@ def test_solution_is_the_maximum_of_the_posterior():
         value.backward()
         return value.item(), parameters.grad.numpy()
 
-    best = minimize(
-        objective,
-        torch.zeros(50).double().numpy(),
-        jac=True,
-        method="L-BFGS-B",
-        options={"maxiter": 5000, "maxfun": 9000, "ftol": 1e-14},
-    )
+    options = {"maxiter": 5000, "maxfun": 9000, "ftol": 1e-14}
+    best = minimize(objective, np.zeros(50), jac=True, method="L-BFGS-B", options=options)
     latent = (gram @ found["coefficient"])[:, None]
     table = HeadTable(training.rendered)
     mine = found["level"] + found["slope"] * distance + bearing @ found["directivity"]

@@ -99,15 +99,8 @@ def test_names_of_places_with_their_positions_beside(tmp_path):
 
 def test_both_ends_in_degrees():
     table = links(n_places=12)
-    degrees = pd.DataFrame(
-        {
-            "longitude": 11 + table.rx_x / 74000,
-            "latitude": 48 + table.rx_y / 111200,
-            "lon of tag": 11 + table.tx_x / 74000,
-            "lat of tag": 48 + table.tx_y / 111200,
-            "rssi": table.rssi,
-        }
-    )
+    degrees = table[["rx_x", "rx_y", "tx_x", "tx_y"]] / [74000, 111200, 74000, 111200] + [11, 48, 11, 48]
+    degrees = degrees.set_axis(["longitude", "latitude", "lon of tag", "lat of tag"], axis=1).assign(rssi=table.rssi)
     data = Rssi.from_frame(degrees, transmitter=["lon of tag", "lat of tag"])
     expected = Rssi.from_frame(table)
     between = [torch.cdist(d.transmitter_position[:5], d.receiver_position) for d in (data, expected)]

@@ -171,19 +171,14 @@ def test_without_array_or_planes_it_is_left_out_with_one_sentence(closed_form, t
 
 def test_the_estimator_is_chosen_by_held_out_errors_alone(closed_form):
     """Without a model that has a room, or with planes in one of two searches, it is not matched-field processing."""
-    errors = {
-        "kernel_regression": [np.full(4, 2.0)] * 4,
-        "kernel_regression, measured + synthetic (idw)": [np.full(4, 1.0)] * 4,
-    }
+    turbo = "kernel_regression, measured + synthetic (idw)"
+    errors = {"kernel_regression": [np.full(4, 2.0)] * 4, turbo: [np.full(4, 1.0)] * 4}
     for located in ({}, dict.fromkeys((0, 2)), {0: np.full(4, 0.1), 2: None}):
         choice = cross_validation.choose_estimator(errors, located)
-        assert choice["name"] == "kernel_regression, measured + synthetic (idw)"
-        assert choice["held_out_deg"] == {
-            "kernel_regression": 2.0,
-            "kernel_regression, measured + synthetic (idw)": 1.0,
-        }
+        assert choice["name"] == turbo
+        assert choice["held_out_deg"] == {"kernel_regression": 2.0, turbo: 1.0}
         assert choice["n_held_out"] == 16
-    for error, chosen in ((0.1, LOCATOR), (1.5, "kernel_regression, measured + synthetic (idw)")):
+    for error, chosen in ((0.1, LOCATOR), (1.5, turbo)):
         choice = cross_validation.choose_estimator(errors, dict.fromkeys((0, 2), np.full(4, error)))
         assert (choice["name"], choice["n_held_out"]) == (chosen, 8)
 

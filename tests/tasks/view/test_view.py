@@ -492,14 +492,12 @@ def test_a_followed_run_is_read_again_when_it_grows(tmp_path):
 
 def test_total_coverage_counts_receivers(rssi_run):
     view = open_source(rssi_run)
-    fraction = [
-        view._covered(MapSelection("coverage", 0, 1.2, threshold=-60, certainty=0.7, at_least=number)).mean()
-        for number in (1, 2, 3)
-    ]
-    single = [
-        view._covered(MapSelection("coverage", receiver, 1.2, threshold=-60, certainty=0.7)).mean()
-        for receiver in range(3)
-    ]
+
+    def covered(**selected):
+        return view._covered(MapSelection("coverage", height=1.2, threshold=-60, certainty=0.7, **selected)).mean()
+
+    fraction = [covered(receiver=0, at_least=number) for number in (1, 2, 3)]
+    single = [covered(receiver=receiver) for receiver in range(3)]
     assert 0 < max(single) <= fraction[0]
     assert fraction[0] > fraction[1] >= fraction[2]
     generator = torch.Generator().manual_seed(0)
