@@ -61,7 +61,8 @@ FACING_X = ArrayPose((0.1, 2.4, 1.2), (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5))
 FOUR = PlanarArray.square(2, 1e9)
 NAN, INF = math.nan, math.inf
 WAVE = torch.ones(2, 5, 4, dtype=torch.complex128)  # (positions, snapshots, elements)
-FLOOR = Plane((0.0, 0.0, -1.0), 0.0, -0.6)
+WIDE = PlanarArray.grid(2, 2, spacing=0.1, frequency_hz=2.4e9)
+ROWS = rssi_room(n=20)
 
 
 def of_spectra(values=ROOM.spectrum, position=ROOM.position, **options):
@@ -139,7 +140,7 @@ DATA = [
     ("must be a list of texts", of_rssi([[-50.0]], receiver_names=["a\r\nb"])),
     ("where it is unknown; row 1", of_rssi([[-50.0, -60]], receiver_position=[[0, 0, 0], [0, 0, NAN]])),
     ("seed must be a whole number at least 0, got 0.5", lambda: ROOM.split("block", 0.5)),
-    ("seed must be a whole number", lambda: rssi_room(n=20).split(seed="a")),
+    ("seed must be a whole number", lambda: ROWS.split(seed="a")),
     ("rows of simulated-room must be a list of numbers below 24", lambda: ROOM.subset([24])),
     ("a mask of that length", lambda: ROOM.subset(torch.ones(10, dtype=torch.bool))),
     ("a list of numbers below 24", lambda: ROOM[[0.5]]),
@@ -192,10 +193,7 @@ ARRAYS = [
     ("finite", lambda: ArrayPose((0, NAN, 0))),
     ("at least as many snapshots", lambda: FOUR.spectrum(WAVE[:, :3], GRID, "capon")),
     ("unknown beamformer 'music'", lambda: FOUR.spectrum(WAVE, GRID, "music")),
-    (
-        "at most half a wavelength, along two directions; use MUSIC",
-        lambda: esprit(PlanarArray.grid(2, 2, spacing=0.1, frequency_hz=2.4e9), WAVE),
-    ),
+    ("at most half a wavelength, along two directions; use MUSIC", lambda: esprit(WIDE, WAVE)),
     ("at least 7 x 7", lambda: ssim(torch.zeros(6, 20), torch.zeros(6, 20))),
     ("matern12_length must be", lambda: Kernel(matern12_length=NAN)),
     ("matern32_length must be", lambda: Kernel(matern32_length=0.0)),
@@ -240,8 +238,8 @@ PRIMITIVES = [
 ]
 
 
-def of_plane(normal=FLOOR.normal, offset=0.0, gain=-0.6, order=2):
-    return lambda: GeometryModel.of_planes(spectra(), [Plane(normal, offset, gain)], order)
+def of_plane(normal=(0.0, 0.0, -1.0), offset=0.0, gain=-0.6, order=2, count=1):
+    return lambda: GeometryModel.of_planes(spectra(), [Plane(normal, offset, gain)] * count, order)
 
 
 MODELS = [
@@ -263,10 +261,7 @@ MODELS = [
     ("n_gaussians must be a whole number at least 4", lambda: make_model("wrfgs", n_gaussians=3)),
     ("level must be", lambda: fitted("gp").predict(spectra().position).interval("0.8")),
     ("level must be", lambda: fitted("gp").predict(spectra().position).interval(1.0)),
-    (
-        "lacks positions, or directions or receivers",
-        lambda: Prediction(torch.zeros(2, 3), position=torch.zeros(2, 3)).to_frame(),
-    ),
+    ("lacks positions, or directions or receivers", Prediction(torch.zeros(2, 3), position=torch.zeros(2, 3)).to_frame),
     ("neither directions nor positions", lambda: Prediction(torch.zeros(3, 2)).plot()),
     ("locates nothing", lambda: predict(rssi_model(), rssi().transmitter_position, track=1.0)),
     ("needs measurements with sessions", lambda: make_model("gp", validation="session").fit(spectra())),
@@ -286,10 +281,7 @@ MODELS = [
     ("order must be a whole number at least 0 and at most 4, got 5", of_plane(order=5)),
     ("order must be a whole number", of_plane(order=-1)),
     ("order must be a whole number", of_plane(order=1.0)),
-    (
-        "number of planes must be a whole number at most 64",
-        lambda: GeometryModel.of_planes(spectra(), [FLOOR] * 65),
-    ),
+    ("number of planes must be a whole number at most 64", of_plane(count=65)),
     ("another grid", lambda: fitted("coarray").update(ROOM)),
     ("correlation", lambda: fitted("coarray").aged(0.0)),
     ("fit it again", lambda: fitted("nearest").update(spectra())),
@@ -333,18 +325,12 @@ PREDICTORS = [
     ("choose from swiftwrf", lambda: make_predictor("forest")),
     ("validation must be 'random' or 'block'", lambda: make_predictor("knn", validation="blok")),
     ("KNNPredictor has no option 'k'", lambda: RSSI_PREDICTORS["knn"](k=3)),
-    ("unknown predictor 'forest'", lambda: compared(rssi_room(n=20), also=["forest"])),
-    (
-        "fewer must be a list, of which each is a number at least 0 and at most 1",
-        lambda: compare(rssi_room(n=20), fewer=(-0.5,)),
-    ),
-    (
-        "simulated-floor has no floors; give the table a column",
-        lambda: estimate_floor_attenuation(rssi_room(n=20)),
-    ),
+    ("unknown predictor 'forest'", lambda: compared(ROWS, also=["forest"])),
+    ("fewer must be a list, of which each is a number at least 0 and at most 1", lambda: compare(ROWS, fewer=(-0.5,))),
+    ("simulated-floor has no floors; give the table a column", lambda: estimate_floor_attenuation(ROWS)),
     (
         "simulated-floor has no phone in row 1; name the group of each row",
-        lambda: estimate_offsets(replace(rssi_room(n=20), groups=pd.Series(["a", None] * 10, name="phone"))),
+        lambda: estimate_offsets(replace(ROWS, groups=pd.Series(["a", None] * 10, name="phone"))),
     ),
 ]
 

@@ -63,6 +63,10 @@ def _positions(row):
     return _write("tx_pos.csv", "x,y,z\n" + "".join(f"{i},1,1\n" for i in range(1, N)) + row + "\n")
 
 
+def _gateway(content):
+    return _write("gateway_info.yml", f"g: {{{content}}}\n")
+
+
 WRONG = {
     "no pose": (lambda f: (f / "gateway_info.yml").unlink(), "gateway_info.yml is missing"),
     "pose is no yaml": (_write("gateway_info.yml", "a: [1"), "not valid YAML"),
@@ -70,13 +74,10 @@ WRONG = {
         _write("gateway_info.yml", "a: !!python/object/apply:os.getcwd []"),
         "must describe one gateway",
     ),
-    "quaternion": (
-        _write("gateway_info.yml", "g:\n  position: [0, 0, 0]\n  orientation: [0, 0, 1, 1]\n"),
-        "unit quaternion",
-    ),
+    "quaternion": (_gateway("position: [0, 0, 0], orientation: [0, 0, 1, 1]"), "unit quaternion"),
     "no gateway": (_write("gateway_info.yml", "name: x\n"), "one gateway"),
     "short position": (
-        _write("gateway_info.yml", "g:\n  position: [0, 0]\n  orientation: [0, 0, 0, 1]\n"),
+        _gateway("position: [0, 0], orientation: [0, 0, 0, 1]"),
         r"position must have shape \(3\)",
     ),
     "no positions": (lambda f: (f / "tx_pos.csv").unlink(), "one of tx_pos.csv"),

@@ -75,6 +75,10 @@ def _csi(change):
     return {"csi": change(snapshots().channel.numpy())}
 
 
+def _elements(change):
+    return {"element_position": change(snapshot_arrays(snapshots())["element_position"])}
+
+
 REFUSED = {
     "real numbers": (_csi(np.abs), "must hold complex numbers"),
     "parts apart": (_csi(lambda c: np.stack([c.real, c.imag], -1)), "join real and imaginary parts"),
@@ -86,10 +90,7 @@ REFUSED = {
     "not finite": (_csi(lambda c: c + np.inf), "no power, or more than numbers hold"),
     "one element alone": (_csi(lambda c: c * (np.arange(16) == 3)), "values at 1 elements"),
     "an array that moves": ({"array_position": np.zeros((120, 3))}, "the array must rest"),
-    "unequal polarisations": (
-        {"element_position": snapshot_arrays(snapshots())["element_position"][[0, *range(15)]]},
-        "1 to 2 elements at one place",
-    ),
+    "unequal polarisations": (_elements(lambda e: e[[0, *range(15)]]), "1 to 2 elements at one place"),
     "no csi": ({"csi": None}, "lacks csi"),
     "no pose": ({"array_orientation": None}, "lacks array_orientation"),
     "Euler angles": ({"array_orientation": np.zeros(3)}, "Euler angles"),
@@ -99,14 +100,8 @@ REFUSED = {
     "at the array": ({"position": np.tile([0.2, 2.4, 1.2], (120, 1))}, "equal to array_position"),
     "no array": ({"element_position": None}, "lacks the array"),
     "half rows": ({"element_position": None, "rows": 4.5, "columns": 4, "spacing_m": 0.06}, "whole numbers"),
-    "elements in millimetres": (
-        {"element_position": 1000 * snapshot_arrays(snapshots())["element_position"]},
-        "wavelengths",
-    ),
-    "elements upright": (
-        {"element_position": snapshot_arrays(snapshots())["element_position"][:, [2, 0, 1]]},
-        "along z",
-    ),
+    "elements in millimetres": (_elements(lambda e: 1000 * e), "wavelengths"),
+    "elements upright": (_elements(lambda e: e[:, [2, 0, 1]]), "along z"),
     "carrier in GHz": ({"frequency_hz": 2.4}, "carrier in Hz"),
     "frequencies of others": ({"frequency_hz": np.full(7, FREQUENCY)}, "frequency_hz"),
     "times of others": ({"time": np.zeros(3)}, "time has 3 rows"),

@@ -81,24 +81,22 @@ def narrow(data):
     return data.subset((data.direction[:, 2] > 0.97).nonzero()[:, 0])
 
 
+def changed(**changes):
+    """Return a function that makes snapshots, some parts of which are computed from the usual ones."""
+    return lambda: replace(data := snapshots(), **{name: change(data) for name, change in changes.items()})
+
+
 REFUSED = {
     "few": (lambda: snapshots(n=12), "needs at least 20"),
-    "no line of sight": (
-        lambda: replace(snapshots(), line_of_sight=torch.zeros(120, dtype=torch.bool)),
-        "has 0 training positions",
-    ),
+    "no line of sight": (changed(line_of_sight=lambda data: torch.zeros(120).bool()), "has 0 training positions"),
     "noise": (lambda: snapshots(n=200, noise=30.0), "positions where a direct path stands out"),
     "a cone": (lambda: narrow(snapshots(n=900, noise=0.5)), "measure positions in more directions"),
     "a line": (
-        lambda: replace(
-            (data := snapshots()),
-            channel=data.channel[..., :4],
-            array=PlanarArray(data.array.element[:4], data.array.wavelength),
-        ),
+        changed(channel=lambda data: data.channel[..., :4], array=lambda data: data.array.subset(torch.arange(4))),
         "the elements of made lie on a line",
     ),
     "constant phases": (
-        lambda: replace((data := snapshots()), channel=data.channel[..., :1].expand_as(data.channel)),
+        changed(channel=lambda data: data.channel[..., :1].expand_as(data.channel)),
         "hardly depend on the position",
     ),
     "a quarter turn": (
@@ -106,7 +104,7 @@ REFUSED = {
         "an error of frames, not of mounting|a direct path stands out|does not determine",
     ),
     "positions of others": (
-        lambda: replace(snapshots(), position=snapshots().position.flip(0)),
+        changed(position=lambda data: data.position.flip(0)),
         "a direct path stands out|does not determine|does harm",
     ),
 }
