@@ -107,9 +107,8 @@ def test_documented_extensions_work(tmp_path, monkeypatch):
     room = simulated_room(n=30, grid=AngularGrid.hemisphere(15, 60))
     mean = names["MeanModel"]().fit(room)
     mean.save("mean.safetensors")
-    torch.testing.assert_close(
-        load("mean.safetensors").predict(room.position[:2]).mean, mean.predict(room.position[:2]).mean
-    )
+    found, expected = (model.predict(room.position[:2]).mean for model in (load("mean.safetensors"), mean))
+    torch.testing.assert_close(found, expected)
     np.save("spectra.npy", room.spectrum)
     np.save("positions.npy", room.position)
     reader = names["TwoArrays"]()

@@ -277,9 +277,8 @@ def test_the_commit_is_that_of_this_project_and_names_every_change(tmp_path, mon
 def test_a_receiver_may_have_any_name(tmp_path, monkeypatch):
     floor, names = rssi_room(n=40), ("NA", "$x^{$", "=cmd()", "12:34:56", "7", "<b>", "x" * 300)
     with quick.quick(drawn=True):
-        monkeypatch.setattr(
-            rssi, "rssi_room", lambda seed: replace(floor, receiver_names=(*names, *floor.receiver_names[len(names) :]))
-        )
+        renamed = replace(floor, receiver_names=(*names, *floor.receiver_names[len(names) :]))
+        monkeypatch.setattr(rssi, "rssi_room", lambda seed: renamed)
         config = rssi.RssiTaskConfig(rx=names, out=str(tmp_path / "run"))
         rssi.run(config)
     written = pd.read_csv(tmp_path / "run" / "errors.csv", dtype=str, keep_default_na=False)["receiver"]

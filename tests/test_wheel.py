@@ -23,10 +23,8 @@ def test_a_wheel_runs_beside_a_module_called_tasks(tmp_path):
     )
     (wheel,) = (tmp_path / "dist").glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
-        packages = {
-            name.partition("/")[0] for name in archive.namelist() if not name.partition("/")[0].endswith(".dist-info")
-        }
-    assert packages == {"swiftwrf", "augment", "tasks"}
+        tops = {name.partition("/")[0] for name in archive.namelist()}
+    assert {name for name in tops if not name.endswith(".dist-info")} == {"swiftwrf", "augment", "tasks"}
 
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "clean")], check=True)
     python = tmp_path / "clean" / "bin" / "python"

@@ -22,9 +22,8 @@ def test_suggestions_lie_in_the_region_and_lower_the_variance(room):
     assert (found.variance.diff() < 0).all()
     assert torch.equal(found.position, suggest(room, 12).position)
     nearest = torch.cdist(found.position, room.position).min(dim=1).values
-    assert (
-        nearest.median() > torch.cdist(*2 * (room.position,)).kthvalue(2).values.median() / 2
-    )  # not where it is known
+    apart = torch.cdist(room.position, room.position).kthvalue(2).values
+    assert nearest.median() > apart.median() / 2  # not where it is known
 
 
 def test_suggested_positions_keep_the_digits_of_maps(room, tmp_path):

@@ -65,9 +65,8 @@ def run_of_rssi(folder: Path) -> None:
 
 
 def run_of_aoa(folder: Path) -> None:
-    fit(simulated_room(n=20, grid=AngularGrid.hemisphere(4, 8)), n_primitives=3).save(
-        folder / "swiftwrf-mix1.safetensors"
-    )
+    model = fit(simulated_room(n=20, grid=AngularGrid.hemisphere(4, 8)), n_primitives=3)
+    model.save(folder / "swiftwrf-mix1.safetensors")
     plane = {"normal": [1.0, 0, 0], "offset_m": 6.0, "gain": -0.5, "std_mm": 1.0, "certain": True}
     write_json(folder / "geometry-mix1.json", {"planes": [plane]})
     write_json(folder / "config.json", {"task": "aoa", "config": plain(AoaConfig(mix=(1.0,), data="gone"))})
@@ -206,6 +205,5 @@ def followed_lines(name: str, draw: random.Random, folder: Path) -> None:
 
 def followed_file(source: str, draw: random.Random, folder: Path) -> None:
     """Follow a mutated file of JSON lines or rows to its end."""
-    followed(
-        rssi_model(), mutated(table() if source.endswith(".csv") else json_lines(rssi_model()), draw), folder, source
-    )
+    content = table() if source.endswith(".csv") else json_lines(rssi_model())
+    followed(rssi_model(), mutated(content, draw), folder, source)

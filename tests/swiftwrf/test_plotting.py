@@ -53,9 +53,8 @@ def test_spectra_name_quantity_position_and_line_of_sight():
     (mark,) = ax.lines
     azimuth, elevation = ROOM.label[3]
     assert mark.get_label() == "line of sight"
-    assert (float(mark.get_xdata()[0]), float(mark.get_ydata()[0])) == pytest.approx(
-        (float(azimuth), 90 - float(elevation.rad2deg()))
-    )
+    found = float(mark.get_xdata()[0]), float(mark.get_ydata()[0])
+    assert found == pytest.approx((float(azimuth), 90 - float(elevation.rad2deg())))
     into = pyplot.figure().add_subplot(projection="polar")
     assert ROOM.plot(0, ax=into) is into
     assert ROOM.plot(-1).get_title().startswith("simulated-room 19 ")

@@ -56,9 +56,8 @@ def test_garbage_is_collected_while_and_after_a_command_runs(monkeypatch):
 @pytest.mark.parametrize("arguments", [("--help",), ("inspect", "--help")])
 def test_a_closed_output_ends_a_command_without_a_message(arguments):
     """A case is `swiftwrf --help | head -1`, where `head` ends first."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tasks", *arguments], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
+    command, pipe = [sys.executable, "-m", "tasks", *arguments], subprocess.PIPE
+    process = subprocess.Popen(command, cwd=ROOT, stdout=pipe, stderr=pipe)
     process.stdout.close()
     assert (process.stderr.read(), process.wait()) == (b"", BROKEN_PIPE)
 

@@ -54,9 +54,8 @@ def test_every_figure_lies_in_the_page_and_as_a_file_with_its_numbers(tmp_path):
 
 
 def test_text_is_escaped_and_identifiers_are_unique(tmp_path):
-    write_page(
-        tmp_path, page(Section("<One>", ["a < b"], terms={"<name>": "<meaning>"}), Section("Two", plots=[plot()]))
-    )
+    one = Section("<One>", ["a < b"], terms={"<name>": "<meaning>"})
+    write_page(tmp_path, page(one, Section("Two", plots=[plot()])))
     html = (tmp_path / "report.html").read_text()
     assert "A &amp; B" in html
     assert "of &lt;something&gt;" in html

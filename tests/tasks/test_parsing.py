@@ -49,9 +49,8 @@ def test_a_run_is_repeated_from_its_configuration_and_the_command_line_wins(tmp_
     for given in (("--mix", "0.5"), ("--mix=0.5",)):
         again = parse(AoaConfig, given, "aoa", file_options(tmp_path / "config.json"))
         assert plain(again) == plain(first) | {"mix": (0.5,)}
-    rssi = parse(
-        RssiTaskConfig, ["--rx", "1", "a b", "--floor-plan", "p", "--floor-extent", "-1", "2", "0", "1"], "rssi"
-    )
+    options = ["--rx", "1", "a b", "--floor-plan", "p", "--floor-extent", "-1", "2", "0", "1"]
+    rssi = parse(RssiTaskConfig, options, "rssi")
     (tmp_path / "rssi.json").write_text(json.dumps(plain(rssi)))
     assert parse(RssiTaskConfig, [], "rssi", file_options(tmp_path / "rssi.json")) == rssi
 
@@ -120,9 +119,8 @@ def test_a_file_of_options_is_given_in_both_forms_and_the_command_line_wins(tmp_
 
 
 def test_the_configuration_of_a_run_with_out_starts_another_run(tmp_path):
-    values = plain(
-        RssiTaskConfig(("1",), out=str(tmp_path), data="x", table=OffsetSource(filler="none"), output=Output(json=True))
-    )
+    options = {"table": OffsetSource(filler="none"), "output": Output(json=True)}
+    values = plain(RssiTaskConfig(("1",), out=str(tmp_path), data="x", **options))
     (tmp_path / "config.json").write_text(json.dumps({"task": "rssi", "config": values}))
     found = executed(RssiTaskConfig, "--config", tmp_path / "config.json")
     assert plain(found) == values | {"out": None}

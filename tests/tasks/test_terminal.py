@@ -28,9 +28,8 @@ def found():
 
 def test_the_answer_is_a_sorted_table_next_steps_the_conclusion_and_the_report(tmp_path, capsys, found):
     Terminal().answer(found, tmp_path / "report.html")
-    head, *rows, none, step, empty, first, second, last = (
-        line.rstrip() for line in capsys.readouterr().out.splitlines()
-    )
+    lines = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
+    head, *rows, none, step, empty, first, second, last = lines
     assert " ".join(head.split()) == "what you can use median [deg] 95 % interval 90 % below [deg]"
     assert rows[0].split() == ["network,", "measured", "2.36", "2.00", "to", "2.90", "7.00"]
     assert [row.split()[0] for row in rows] == ["network,", "*", "references", "peak"]

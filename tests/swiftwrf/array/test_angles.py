@@ -37,9 +37,8 @@ def test_what_comes_from_behind_is_folded_up():
 
 @given(ANGLE, st.floats(0.01, math.pi / 2 - 0.01))
 def test_angles_and_direction_are_inverse(azimuth, elevation):
-    a, e = to_angles(
-        to_direction(torch.tensor(azimuth, dtype=torch.float64), torch.tensor(elevation, dtype=torch.float64))
-    )
+    given = torch.tensor([azimuth, elevation], dtype=torch.float64)
+    a, e = to_angles(to_direction(*given))
     assert 0 <= a < 2 * math.pi
     assert abs(wrap(a - azimuth)) < 1e-9
     assert abs(e - elevation) < 1e-9

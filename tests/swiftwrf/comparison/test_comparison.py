@@ -108,9 +108,8 @@ def test_one_sample_that_emits_arrives_with_its_phase_and_path_loss(at):
     real, imaginary = integrate(tuple(medium), distance)
     size = 2.0 * PATH_GAIN / float(distance[at + 1])
     angle = 0.7 + FIRST_PHASE + 0.3 * float(distance[at])
-    torch.testing.assert_close(
-        torch.stack([real, imaginary]), size * torch.tensor([math.cos(angle), math.sin(angle)]).double()
-    )
+    expected = torch.polar(torch.tensor(size).double(), torch.tensor(angle).double())
+    torch.testing.assert_close(torch.complex(real, imaginary), expected)
 
 
 def test_a_slab_absorbs_what_lies_behind_it_and_nothing_before_it():

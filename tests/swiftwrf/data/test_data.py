@@ -202,9 +202,8 @@ def test_paths_that_say_nothing_are_refused(tmp_path, changes, says):
 def test_paths_in_other_precisions(tmp_path, dtype):
     usual = load_spectra(write_paths(tmp_path / "a"))
     single = np.tile([0.0, 0.0, 2.0], (N, 1)).astype(np.float32)
-    other = load_spectra(
-        write_paths(tmp_path / "b", path_count=np.ones(N, dtype=dtype), transmitter_position=single, last_point=single)
-    )
+    same = {"path_count": np.ones(N, dtype=dtype), "transmitter_position": single, "last_point": single}
+    other = load_spectra(write_paths(tmp_path / "b", **same))
     torch.testing.assert_close(other.spectrum, usual.spectrum)
     torch.testing.assert_close(other.label, usual.label)
 

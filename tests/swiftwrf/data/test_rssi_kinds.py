@@ -436,9 +436,8 @@ def test_a_run_with_offsets(tmp_path, capsys):
     found = []
     for other in ("galaxy", "pixel"):  # the same transmitters, each measured by another device
         rssi = floor.rssi + truth[other]
-        floor.table(rssi).drop(columns=["x", "y", "z"]).assign(Device=other).to_csv(
-            tmp_path / f"{other}.csv", index=False
-        )
+        measured = floor.table(rssi)[NAMES].assign(Device=other)
+        measured.to_csv(tmp_path / f"{other}.csv", index=False)
         out = tmp_path / f"{other}-positions.csv"
         assert quick.command("predict", tmp_path / "locator.safetensors", tmp_path / f"{other}.csv", "--out", out) == 0
         found.append(pd.read_csv(out)[["x_m", "y_m"]].to_numpy())

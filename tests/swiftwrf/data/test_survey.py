@@ -103,9 +103,8 @@ def test_columns_named_by_the_user(tmp_path):
         load_rssi(file)
     data = load_rssi(file, columns={"x": "easting_of_robot", "rssi": "ap *"})
     assert data.receiver_names == ("ap one", "ap two")
-    named = write_survey(
-        tmp_path, "named.csv", header=["x", "y", "a[1]", "a1"], rows=[[i, i, -50, -60] for i in range(12)]
-    )
+    rows = [[i, i, -50, -60] for i in range(12)]
+    named = write_survey(tmp_path, "named.csv", header=["x", "y", "a[1]", "a1"], rows=rows)
     assert load_rssi(named, columns={"rssi": "a[1]"}).receiver_names == ("a[1]",)  # before it is taken for a pattern
     with pytest.raises(InputError, match="no column 'nowhere' for y"):
         load_rssi(file, columns={"x": "easting_of_robot", "y": "nowhere"})

@@ -290,9 +290,8 @@ def test_times_in_other_units(table, kind):
     name = "time_ms" if "start" in kind else "timestamp"
     data = Rssi.from_frame(table.assign(**{name: TIMES[kind](seconds)}))
     assert noted(data, kind) == (kind in ("milliseconds", "microseconds", "nanoseconds"))
-    np.testing.assert_allclose(
-        data.time, seconds - (seconds[0] if "start" in kind or kind == "epoch" else 0), atol=1e-3
-    )
+    first = seconds[0] if "start" in kind or kind == "epoch" else 0
+    np.testing.assert_allclose(data.time, seconds - first, atol=1e-3)
 
 
 def test_date_and_time_in_two_columns(table):

@@ -191,9 +191,7 @@ def test_axes_along_which_all_positions_are_equal_are_not_swapped():
 def test_a_delay_between_positions_and_rssi_of_a_walk_is_named(late, words):
     time = torch.arange(300, dtype=torch.float64)
     place = torch.stack([5 + 4 * torch.sin(0.11 * time), 6 + 5 * torch.cos(0.07 * time), 1.2 + 0 * time], dim=1)
-    receivers = torch.tensor(
-        [[1.0, 1.0, 2.0], [9.0, 2.0, 2.0], [8.0, 11.0, 2.0], [1.0, 10.0, 2.0]], dtype=torch.float64
-    )
+    receivers = torch.tensor([[1, 1, 2], [9, 2, 2], [8, 11, 2], [1, 10, 2]], dtype=torch.float64)
     noise = 3 * torch.randn(300, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     rssi = -40 - 25 * torch.cdist(place, receivers).log10() + noise
     walk = Rssi(rssi, place.roll(-late, 0), receiver_position=receivers, time=0.5 * time)

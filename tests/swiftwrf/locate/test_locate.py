@@ -67,9 +67,8 @@ def test_the_mass_of_a_one_dimensional_posterior_is_right():
 
 def test_two_modes_are_ambiguous():
     one, two = gaussian_on_a_line(-3, 0.2), gaussian_on_a_line(3, 0.2)
-    both = Posterior(
-        one.position, torch.logaddexp(one.log_weight + math.log(0.6), two.log_weight + math.log(0.4)), 0.025
-    )
+    weight = torch.logaddexp(one.log_weight + math.log(0.6), two.log_weight + math.log(0.4))
+    both = Posterior(one.position, weight, 0.025)
     assert both.ambiguous[0]
     assert not replace(both, mode_width_m=6.5).ambiguous[0]
     assert both.most_likely[0, 0] == pytest.approx(-3, abs=0.05)

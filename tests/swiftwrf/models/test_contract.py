@@ -134,9 +134,8 @@ def test_gradients_are_those_of_finite_differences_in_metres(fitted, room, posit
     (gradient,) = torch.autograd.grad(total(position).sum(), position)
     steps = STEP_M * torch.eye(3, dtype=torch.float64)
     with torch.no_grad(), torch.backends.cudnn.flags(allow_tf32=False):  # whose 10 bits drown differences on a GPU
-        expected = torch.stack([total(position + step) - total(position - step) for step in steps], dim=1) / (
-            2 * STEP_M
-        )
+        differences = [total(position + step) - total(position - step) for step in steps]
+        expected = torch.stack(differences, dim=1) / (2 * STEP_M)
     assert gradient.norm() > 0
     torch.testing.assert_close(gradient, expected, rtol=0, atol=0.03 * float(expected.abs().max()))
 

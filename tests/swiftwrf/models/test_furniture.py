@@ -53,9 +53,8 @@ def measured(
     channel = channel * torch.polar(torch.ones_like(turn), turn)
     error = torch.randn(channel.shape, dtype=channel.dtype, generator=generator)
     channel = channel + noise * channel.abs().square().mean(dim=(1, 2), keepdim=True).sqrt() * error
-    return replace(
-        data, store=Store(data.array.spectrum(channel, data.grid)), channel=channel, frequency_hz=frequency
-    ), walls
+    store = Store(data.array.spectrum(channel, data.grid))
+    return replace(data, store=store, channel=channel, frequency_hz=frequency), walls
 
 
 def fitted(walls: GeometryModel, train: Spectra) -> GeometryModel:

@@ -148,9 +148,8 @@ def test_fields_and_scores_of_many_rooms_are_those_of_the_definition(moving):
                 phase = (ray / length) @ scene.element.double().T - scene.wavenumber * length
                 expected[room] += torch.polar(torch.ones_like(phase), phase) * strength / length
         found = rooms.field(scene)
-        torch.testing.assert_close(
-            found, torch.cat([expected.real, expected.imag], dim=-1).permute(1, 2, 0).float(), atol=1e-4, rtol=0
-        )
+        parts = torch.cat([expected.real, expected.imag], dim=-1).permute(1, 2, 0).float()
+        torch.testing.assert_close(found, parts, atol=1e-4, rtol=0)
         match = torch.einsum("bnk,nfk->bnf", expected.sgn(), scene.channel.conj().to(torch.complex128))
         coherence = (match.abs().square().amax(-1) / 16**2).float()
         torch.testing.assert_close(scene.coherence(found), coherence.T, atol=1e-4, rtol=0)
@@ -258,9 +257,7 @@ def test_a_tilted_plane_is_found_to_a_millimetre(monkeypatch):
     model = fit(mirror_room({(0.8, 0.5, 0.1): 5.0}, -0.7, n=25), search_distance_m=0.5, beam_width=1, max_order=1)
     assert len(model.planes) == 1
     assert errors(model, {(0.8, 0.5, 0.1): 5.0})[0][0] < 1
-    torch.testing.assert_close(
-        torch.tensor(model.planes[0].normal), torch.tensor([0.8433, 0.5270, 0.1054]), atol=1e-3, rtol=0
-    )
+    assert model.planes[0].normal == pytest.approx([0.8433, 0.5270, 0.1054], abs=1e-3)
 
 
 @pytest.mark.parametrize("moving", ["receiver", "transmitter"])

@@ -313,9 +313,8 @@ def test_takes_strided_and_misaligned_tensors():
     expected = operators.field(mean.repeat(3, 1, 1), cholesky, weight.repeat(3, 1, 1), grid, 1e-4)
     misaligned = torch.cat([torch.zeros(1), weight.flatten()])[1:].view_as(weight)
     assert misaligned.data_ptr() % 8
-    assert torch.equal(
-        operators.field(mean.expand(3, -1, -1), cholesky, weight.expand(3, -1, -1), grid, 1e-4), expected
-    )
+    strided = operators.field(mean.expand(3, -1, -1), cholesky, weight.expand(3, -1, -1), grid, 1e-4)
+    assert torch.equal(strided, expected)
     assert torch.equal(operators.field(mean, cholesky, misaligned, grid, 1e-4), expected[:1])
 
 

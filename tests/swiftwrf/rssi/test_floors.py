@@ -99,8 +99,7 @@ def test_the_attenuation_is_saved(model, tmp_path):
     fitted.save(tmp_path / "model.safetensors")
     loaded = swiftwrf.load(tmp_path / "model.safetensors")
     assert loaded.attenuation == fitted.attenuation
-    torch.testing.assert_close(
-        loaded.predict(data.transmitter_position).mean, fitted.predict(data.transmitter_position).mean
-    )
+    found, expected = (some.predict(data.transmitter_position).mean for some in (loaded, fitted))
+    torch.testing.assert_close(found, expected)
     again = model().fit(replace(data, floors=None))
     assert again.attenuation is None

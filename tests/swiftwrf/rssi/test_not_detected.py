@@ -23,9 +23,7 @@ RECEIVER = torch.tensor([[3.0, 3, 2], [27, 4, 2], [15, 18, 2], [5, 15, 2]], dtyp
 def survey(n=150, limit=LIMIT, missed=0.0, seed=0):
     """Path loss, a smooth field and noise at four receivers, and what is below the limit missing; with the true power."""
     generator = torch.Generator().manual_seed(seed)
-    position = torch.rand(n, 3, generator=generator).double() * torch.tensor([30.0, 20.0, 0.0]) + torch.tensor(
-        [0.0, 0, 1]
-    )
+    position = torch.tensor([0.0, 0, 1]) + torch.rand(n, 3, generator=generator).double() * torch.tensor([30.0, 20, 0])
     truth = -42.0 - 38.0 * log_distance(position, RECEIVER) + 3 * torch.sin(position[:, :1] / 4 + torch.arange(4))
     rssi = truth + 2.0 * torch.randn(n, 4, generator=generator)
     lost = (rssi < limit) | (torch.rand(n, 4, generator=generator) < missed)

@@ -125,9 +125,8 @@ def test_every_spectrum_counts_alike_in_the_batch_norms():
     network = AANN(steps=2, batch=4).fit(labelled(spectrum, label, AngularGrid.hemisphere(8, 32)))
     first = network._network.conv1(network._prepare(spectrum))
     spread = first.std(dim=(0, 2, 3))
-    torch.testing.assert_close(
-        network._network.bn1.running_mean / spread, first.mean(dim=(0, 2, 3)) / spread, atol=0.02, rtol=0
-    )
+    found, expected = network._network.bn1.running_mean / spread, first.mean(dim=(0, 2, 3)) / spread
+    torch.testing.assert_close(found, expected, atol=0.02, rtol=0)
 
 
 def test_the_headline_is_of_the_network_that_is_kept():
