@@ -151,6 +151,7 @@ LINES = [
     ("report", ("{file}", "--out", "link"), "no finished run"),
     ("predict", ("{file}", "{file}", "--out", "link"), "link exists already"),
     ("locate", ("--columns", "x=a"), "give it with --data"),
+    ("rssi", ("--rx", 1, "--columns", "x=a"), "give it with --data"),
     ("locate", ("--data", "x", "--offset-by", "=phone"), "takes COLUMN or COLUMN=VALUE"),
     ("locate", ("--scheduler", "tcp://127.0.0.1:1"), "no Dask scheduler"),
     ("predict", ("{file}", "{file}", "--out", "{file}-new.csv"), "not a readable safetensors file"),

@@ -81,8 +81,8 @@ COMPARISONS = {
 
 
 @pytest.mark.parametrize("task", COMPARISONS)
-def test_a_comparison_without_a_folder_has_the_errors_of_the_command(task, request):
-    (compare, error), run = COMPARISONS[task], request.getfixturevalue(f"{task}_run")
+def test_a_comparison_without_a_folder_has_the_errors_of_the_command(task, rssi_run, locate_run):
+    (compare, error), run = COMPARISONS[task], {"rssi": rssi_run, "locate": locate_run}[task]
     result, metrics = compare(), json.loads((run / "metrics.json").read_text())
     pd.testing.assert_frame_equal(result.errors, pd.read_csv(run / "errors.csv"), check_dtype=False)
     medians = {name: entry[error]["median"] for name, entry in metrics["overall"].items()}
