@@ -298,7 +298,7 @@ def test_files_reach_the_disk_before_they_get_their_name(tmp_path, monkeypatch):
     assert done[2][1] == str(tmp_path)
 
 
-def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+def test_a_failed_write_leaves_the_old_file(tmp_path):
     with durable.replacing(tmp_path / "a") as one, durable.replacing(tmp_path / "a") as other:  # threads of a process
         one.write_text("one")
         other.write_text("other")

@@ -140,7 +140,7 @@ def test_an_array_of_any_rows_and_columns(tmp_path, asked, array):
     assert torch.equal(load_spectra(tmp_path / "own").spectrum, expected.spectrum)
 
 
-def test_calibration_sees_the_training_part_alone(tmp_path, capsys):
+def test_calibration_sees_the_training_part_alone(tmp_path):
     data, *_ = spoilt(snapshots(n=150))
     folder = write_snapshots(tmp_path / "source", data=data)
     assert run(folder, tmp_path / "own", *GRID, "--calibrate", "--split", "block", "--seed", 1) == 0

@@ -34,7 +34,7 @@ RESULTS = {
 
 
 @pytest.mark.parametrize("name", RESULTS)
-def test_a_result_writes_the_report_of_its_command_into_one_file(name, tmp_path, capsys):
+def test_a_result_writes_the_report_of_its_command_into_one_file(name, tmp_path):
     result, file = RESULTS[name](), tmp_path / "report.html"
     result.report(file)
     html = file.read_text(encoding="utf-8")

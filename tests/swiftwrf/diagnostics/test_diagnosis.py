@@ -213,15 +213,6 @@ CAUSES = {  # measurements, and the statement of the cause of an error
     "random order on a line": (with_order(random_order, shape=(1, 8)), "are exchanged"),
     "four cables of a line": (with_order(cycle(4), shape=(1, 8)), "are exchanged"),
 }
-OF_INSPECTION = (  # statements that are not those of an error of frames, elements or labels
-    "nothing",
-    "a line",
-    "behind",
-    "no line of sight",
-    "normalised positions",
-    "uncalibrated",
-    "one direction",
-)
 ERRORS = [says for name, (_, says) in CAUSES.items() if name not in ("nothing", "a line", "behind", "no line of sight")]
 ALSO = {"tilted": "The array is not calibrated"}  # its calibration includes the rotation
 

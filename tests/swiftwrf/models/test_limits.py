@@ -54,7 +54,7 @@ def test_locators_do_not_depend_on_the_origin():
     torch.testing.assert_close(*located, atol=0.05, rtol=0)  # m
 
 
-def test_an_installation_without_a_place_for_caches(tmp_path):
+def test_an_installation_without_a_place_for_caches():
     """Numba keeps what it compiled beside the source or in the home; where it can do neither, it must do without."""
     code = (
         "import numba.core.caching as c\n"

@@ -169,7 +169,7 @@ def test_without_array_or_planes_it_is_left_out_with_one_sentence(closed_form, t
     assert reason in html
 
 
-def test_the_estimator_is_chosen_by_held_out_errors_alone(closed_form):
+def test_the_estimator_is_chosen_by_held_out_errors_alone():
     """Without a model that has a room, or with planes in one of two searches, it is not matched-field processing."""
     turbo = "kernel_regression, measured + synthetic (idw)"
     errors = {"kernel_regression": [np.full(4, 2.0)] * 4, turbo: [np.full(4, 1.0)] * 4}

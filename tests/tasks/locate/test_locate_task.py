@@ -152,7 +152,7 @@ def test_positions_of_new_rows(locate_run, tmp_path, capsys):
     np.testing.assert_allclose(found.position_error_m, errors.position_error_m, atol=5.001e-4)
 
 
-def test_receivers_of_the_model_are_found_by_name(locate_run, tmp_path, capsys):
+def test_receivers_of_the_model_are_found_by_name(locate_run, capsys):
     data = rssi_room(n=80)
     some = replace(data.columns([1, 0]), receiver_names=("receiver02", "kitchen"))
     locator = load(locate_run / MODEL)
@@ -177,7 +177,7 @@ def test_a_table_without_positions(tmp_path):
     assert read_rssi(str(write_rssi(tmp_path / "c.csv", rssi_room(n=20))), ReadOptions())[1]
 
 
-def test_other_rows_are_refused(locate_run, matched, tmp_path, capsys):
+def test_other_rows_are_refused(locate_run, tmp_path, capsys):
     data, out = rssi_room(n=20), tmp_path / "out.csv"
     others = write_rssi(tmp_path / "a.csv", replace(data, receiver_names=tuple("abcdefghijkl")))
     assert quick.command("predict", locate_run / MODEL, others, "--out", out) == 2

@@ -185,7 +185,7 @@ def test_predictors_without_positions_of_the_receivers(name):
         assert predictor.fit(data).predict(data.transmitter_position).mean.isfinite().all()
 
 
-def test_a_survey_table_is_one_command_to_a_map(tmp_path, capsys):
+def test_a_survey_table_is_one_command_to_a_map(tmp_path):
     file = write_survey(tmp_path / "walk")
     assert quick.run("rssi", "--data", file, "--rx", "all", "--out", tmp_path / "run") == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text(), parse_constant=lambda name: pytest.fail(name))
