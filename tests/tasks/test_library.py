@@ -49,6 +49,13 @@ def test_a_result_writes_the_report_of_its_command_into_one_file(name, tmp_path)
         result.report(file)
 
 
+def test_the_best_estimator_of_a_result_predicts_and_is_saved(tmp_path):
+    result = turbo()
+    result.best.save(tmp_path / "best.safetensors")
+    spectra = result.experiment.test.spectrum
+    assert swiftwrf.load(tmp_path / "best.safetensors").predict(spectra).equal(result.best.predict(spectra))
+
+
 def test_predictions_are_those_of_the_models():
     train, test = swiftwrf.rssi_room(n=60).split()
     locator = swiftwrf.RssiLocator(n_cells=300).fit(train)
