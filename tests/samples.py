@@ -274,11 +274,8 @@ def plane_waves(n: int, packets: int, subcarriers: int) -> tuple[np.ndarray, np.
     return position, np.round(channel.real) + 1j * np.round(channel.imag)
 
 
-NEXMON_FLOATS = {
-    3: (9, 5),
-    0xDEAD: (9, 5),
-    106: (12, 6),
-}  # by number of the chip: bits of each mantissa with its sign, and of the exponent
+# by number of the chip: bits of each mantissa with its sign, and of the exponent
+NEXMON_FLOATS = {3: (9, 5), 0xDEAD: (9, 5), 106: (12, 6)}
 
 
 def nexmon_payload(csi: np.ndarray, core: int, number: int = 1, chip: int = 106, stream: int = 0) -> bytes:

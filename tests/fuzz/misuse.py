@@ -42,9 +42,8 @@ from swiftwrf.online import Follower
 from swiftwrf.positions import MAX_COORDINATE_M
 from swiftwrf.rssi.base import RssiPredictor
 
-MAX_RSSI_DB = (
-    300.0  # of any plausible prediction, and of its standard deviation: path loss of 50 dB a decade, 100 km away
-)
+# of any plausible prediction, and of its standard deviation: path loss of 50 dB a decade, 100 km away
+MAX_RSSI_DB = 300.0
 FLOOR = {"x": [0.0, 1.0], "y": [0.0, 1.0], "z": [1.0, 1.0], "hall": [-50.0, -60.0]}
 SPECTRA_OPTIONS = (
     "array", "pose", "moving", "grid", "label", "line_of_sight", "name", "fixed_position", "rotation", "index", "notes",

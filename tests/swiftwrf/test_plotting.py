@@ -64,11 +64,8 @@ def test_rssi_is_drawn_where_it_was_detected():
     data = Rssi(
         [[-50.0, float("nan")], [-60.0, -40.0], [float("nan")] * 2], torch.rand(3, 3), receiver_names=["a", "b"]
     )
-    for receiver, values, title in (
-        (None, [-50, -40], "strongest receiver"),
-        ("b", [-40], "b"),
-        ("1", [-50, -60], "a"),
-    ):
+    drawn = ((None, [-50, -40], "strongest receiver"), ("b", [-40], "b"), ("1", [-50, -60], "a"))
+    for receiver, values, title in drawn:
         ax = data.plot(receiver)
         assert ax.collections[0].get_array().tolist() == values
         assert ax.get_title() == f"rssi, {title}"

@@ -165,13 +165,8 @@ def test_another_server_is_no_scheduler(local, monkeypatch):
     monkeypatch.setattr(workers, "CONNECT_S", 1)
     with socket.create_server(("127.0.0.1", 0)) as mute:
         silent = f"tcp://127.0.0.1:{mute.getsockname()[1]}"
-        for address in (
-            silent,
-            "tcp://127.0.0.1:1",
-            "127.0.0.1",
-            "http://127.0.0.1:1",
-            next(iter(local.scheduler.workers)),
-        ):
+        worker = next(iter(local.scheduler.workers))
+        for address in (silent, "tcp://127.0.0.1:1", "127.0.0.1", "http://127.0.0.1:1", worker):
             with pytest.raises(InputError, match="no Dask scheduler answers"), connected(address, CPU):
                 pass
 

@@ -28,12 +28,7 @@ from tasks.aoa import experiment
 
 PLANES = {(0.0, 0.0, -1.0): 0.0, (1.0, 0.0, 0.0): 5.0, (0.0, 1.0, 0.0): 4.0}  # outward normal to offset [m]
 FIT = MatchedField.fit
-ON_SNAPSHOTS = {
-    "music",
-    "esprit",
-    "maximum_likelihood",
-    "joint_music",
-}  # left out too, because the data contain spectra alone
+ON_SNAPSHOTS = {"music", "esprit", "maximum_likelihood", "joint_music"}  # left out, as the data contain spectra alone
 
 
 @pytest.fixture(scope="module")

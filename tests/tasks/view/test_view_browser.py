@@ -245,11 +245,8 @@ def test_page_of_a_locator(browser, chromium, serve, locate_run):
 
     first = until(lambda: "dBm" in point(30, 20) and said(browser, "here"))
     until(lambda: point(-120, 80) != first)
-    for kind, sentence in (
-        ("coverage", "% of the map"),
-        ("best receiver", "highest prediction"),
-        ("uncertainty", "interval"),
-    ):
+    sentences = {"coverage": "% of the map", "best receiver": "highest prediction", "uncertainty": "interval"}
+    for kind, sentence in sentences.items():
         press(browser, kind)
         until(lambda sentence=sentence: sentence in said(browser, "sentence"))
         until(lambda kind=kind: ("receiver01" in said(browser, "best")) == (kind == "best receiver"))  # its legend
