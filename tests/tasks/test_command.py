@@ -235,9 +235,11 @@ def sources(tmp_path_factory):
 def test_command_lines_end_in_a_sentence(sources, tmp_path, capsys, monkeypatch, task, arguments, says):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "link").symlink_to("nowhere")
+    before = sorted(sources["file"].parent.rglob("*"))
     assert run(task, *(str(a).format(**sources) for a in arguments)) == 2
     assert says in said(capsys)
     assert [file.name for file in tmp_path.iterdir()] == ["link"]
+    assert sorted(sources["file"].parent.rglob("*")) == before
 
 
 def test_sixty_shares_without_out(tmp_path, monkeypatch):
