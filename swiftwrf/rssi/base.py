@@ -85,6 +85,8 @@ class RssiPredictor(Configured, Displayed, ABC):
     """whether the positions of the receivers must be known"""
     slow: ClassVar[bool] = False
     """whether a fit takes minutes, so that it is compared only on request"""
+    updates: ClassVar[bool] = False
+    """whether `update` is available; other predictors must be fitted again"""
     max_map_predictions: ClassVar[int] = 2**22
     """predictions of a map at all receivers if its cells are not given"""
     batch_size: ClassVar[int] = 512
@@ -196,8 +198,14 @@ class RssiPredictor(Configured, Displayed, ABC):
         if self.attenuation is not None:
             new = self.attenuation.removed(new)
         if len(new):
+            self.check_updates()
             predictor._update(new)
         return predictor
+
+    def check_updates(self) -> None:
+        """Raise InputError if the predictor must be fitted again to more rows."""
+        if not self.updates:
+            raise InputError(f"a predictor {self.name} cannot be updated; fit it again to all rows")
 
     def check_measurements(self, data: Rssi) -> None:
         """Refuse rows at other receivers than those of the training rows. Unknown positions are not compared.
@@ -222,7 +230,6 @@ class RssiPredictor(Configured, Displayed, ABC):
 
     def _update(self, new: Rssi) -> None:
         """Add checked rows to this copy."""
-        raise InputError(f"a predictor {self.name} cannot be updated; fit it again to all rows")
 
     def region(self) -> Tensor:
         """Return the training positions (n, 3) [m], whose box a map covers."""

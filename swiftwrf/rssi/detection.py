@@ -190,15 +190,18 @@ class DetectionField:
         return replace(self, process=self.process.updated(position, detected.double() - self.mean))
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
-        """Return the tensors and plain values of the field by their names in files."""
-        tensors, header = self.process.state("share.")
+        """Return the tensors, without the positions, and plain values of the field by their names in files."""
+        header = self.process.state("share.")[1]
         plain = {"limit": self.limit, "weight": self.weight.tolist()}
-        return tensors | {"share.mean": self.mean}, header | {"share": plain}
+        tensors = {"share.coefficient": self.process.coefficient, "share.mean": self.mean}
+        return tensors, header | {"share": plain}
 
     @classmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
-        """Return the field of a state."""
-        process = GaussianProcess.from_state(tensors, header, torch.float64, prefix="share.")
+    def from_state(cls, tensors: dict[str, Tensor], header: Header, position: Tensor) -> Self:
+        """Return the field of a state, given its positions (n, 3)."""
+        process = GaussianProcess.from_state(
+            tensors | {"share.position": position}, header, torch.float64, prefix="share."
+        )
         weight = to_tensor("share.weight", header["share"]["weight"], torch.float64, (3,))
         return cls(process, tensors["share.mean"].double(), float(header["share"]["limit"]), weight)
 

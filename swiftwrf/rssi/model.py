@@ -18,7 +18,6 @@ from torch import Tensor
 
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.errors import InputError
 from swiftwrf.gp import Kernel, subsample
 from swiftwrf.models.base import CPU
 from swiftwrf.models.prediction import Prediction
@@ -29,8 +28,8 @@ from swiftwrf.rssi.detection import Detection, DetectionField
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.mixing import check_comparable, comparable, interval_scale, mixing_weights, rounding_std
-from swiftwrf.rssi.path_loss import N_HARMONICS, harmonics, log_distance
-from swiftwrf.rssi.posterior import FitState, RssiPosterior
+from swiftwrf.rssi.path_loss import harmonics, log_distance
+from swiftwrf.rssi.posterior import RssiPosterior
 from swiftwrf.rssi.regression import Uncertainty, fit_receiver, held_out_std
 from swiftwrf.rssi.training import MAX_KERNEL_RECEIVERS, RssiTraining, prepare
 from swiftwrf.runtime import checkpoint as files
@@ -39,6 +38,7 @@ from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import parallel_map, single_thread
 from swiftwrf.runtime.validation import checked
 
+RECEIVERS_AT_ONCE = 64  # between two steps of the progress bar; starting threads costs milliseconds
 FIELD_ALONE = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)  # mixing weights
 
 
@@ -67,6 +67,7 @@ class RssiModel(SavedRssiPredictor):
     kind: ClassVar[str] = "rssi model"
     name = "swiftwrf"
     config_type = RssiConfig
+    updates = True
 
     kernel: Kernel
     """kernel of the latent field, lengths in [m]"""
@@ -98,9 +99,12 @@ class RssiModel(SavedRssiPredictor):
     """calibrated standard deviation of the field far from all measurements, (R,) [dB]"""
     noise_db: Tensor
     """calibrated standard deviation of a measurement about the field, (R,) [dB]"""
-    _posterior: RssiPosterior | None
-    """least squares of the fit, which `update` continues; None for `RssiPaperModel`"""
+    baseline: Tensor
+    """RSSI at 1 m [dBm] and slope [dB a decade] of the simpler predictors by their mixing weights, float64 (2, R)"""
+    _posterior: RssiPosterior
+    """least squares of the fit, which `update` continues"""
 
+    @single_thread()
     def _fit(
         self,
         train: Rssi,
@@ -131,56 +135,56 @@ class RssiModel(SavedRssiPredictor):
         predicted, measured = predictors[..., columns], pool.rssi_dbm[:, often]
         is_comparable = bool(comparable(predicted, measured).any())
         weight = mixing_weights(predicted, measured) if is_comparable else FIELD_ALONE
-        found = {name: value[mine] for name, value in found.items()}
-        self._assemble(train, training.columns(mine), found, (predictors[..., mine], std[:, mine]), weight)
-
-    @single_thread()
-    def _assemble(
-        self,
-        train: Rssi,
-        training: RssiTraining,
-        found: dict[str, Tensor],
-        held_out: tuple[Tensor, Tensor],
-        weight: Tensor,
-    ) -> None:
-        """Mix the fits of all receivers with the simpler predictors by weights (4,), and calibrate the deviation."""
-        predictors, std = held_out
+        found, training = {name: value[mine] for name, value in found.items()}, training.columns(mine)
+        predictors = predictors[..., mine]
         check_comparable(predictors, train.rssi_dbm)
         predicted = torch.einsum("k,knr->nr", weight[weight > 0], predictors[weight > 0])
-        scale = interval_scale(predicted, std, train.rssi_dbm)
-
-        def mixed(own: Tensor, baselines: Tensor) -> Tensor:
-            return weight @ torch.cat([own[None], baselines])
-
-        self.n_primitives, self.kernel, self.mixing_weight = training.n_primitives, training.kernel, weight
-        self.centre, loss = training.centre, training.path_loss
-        self.middle, self.detection = loss.middle, loss.detection
-        self.level = mixed(found["level"], training.baselines.level)
-        self.slope = mixed(found["slope"], training.baselines.slope)
-        self.directivity = (weight[0] * found["directivity"]).float()
-        self.anchor, self.coefficient = training.position.float(), found["coefficient"].T.float().contiguous()
-        self.rendered = found["rendered"]
-        self.detection_field = None
-        if self.detection is not None:
-            level = found["held_out"].T.where(~found["held_out"].T.isnan(), training.baseline_held_out[0])
-            seen = ~training.rssi.isnan()
-            bins = training.position, seen, training.fold, level + training.shift
-            self.detection_field = DetectionField.fit(training.kernel, *bins, self.detection.limit)
-        rows = {name: found[name].T for name in ("dual", "tangent", "variance")}
-        prior = {name: found[name] for name in ("prior_level", "prior_slope", "prior_std")}
-        state = FitState(
-            **rows,
-            **prior,
-            measured=(~training.rssi.isnan()).to(training.rssi),
-            middle=self.middle.clone(),
-            field_variance=training.field_db.square(),
-            noise_variance=training.noise_db.square(),
-        )
-        noise_db = (scale * training.noise_db).clamp_min(rounding_std(train.rssi_dbm))
-        self.field_db, self.noise_db = (scale * training.field_db).float(), noise_db.float()
+        scale = self._calibrate(train.rssi_dbm, predicted, std[:, mine], (training.field_db, training.noise_db))
         # only two predictors have the receiver's path loss
-        self.covariance = (weight[:2].sum() * scale).square()[:, None, None] * found["covariance"]
-        self._precompute(state)
+        self.covariance = (weight[:2].sum() * scale).square()[:, None, None] * found.pop("covariance")
+        self.mixing_weight, self.kernel = weight, training.kernel
+        self.n_primitives, self.rendered = training.n_primitives, training.rendered
+        self.centre, self.detection, self.detection_field = training.centre, training.path_loss.detection, None
+        self.baseline = torch.stack([weight[1:] @ values for values in training.baselines])
+        held_out, measured = found.pop("held_out").T, ~training.rssi.isnan()
+        if self.detection is not None:
+            level = held_out.where(~held_out.isnan(), training.baseline_held_out[0]) + training.shift
+            bins = training.position, measured, training.fold, level
+            self.detection_field = DetectionField.fit(training.kernel, *bins, self.detection.limit)
+        state = found | {
+            "anchor": training.position,
+            "measured": measured.T.double(),
+            "middle": training.path_loss.middle,
+            "field_variance": training.field_db.square(),
+            "noise_variance": training.noise_db.square(),
+        }
+        self._take(state)
+
+    def _calibrate(self, rssi: Tensor, predicted: Tensor, std: Tensor, prior_db: tuple[Tensor, Tensor]) -> Tensor:
+        """Calibrate the standard deviations by held-out predictions of the training rows, and return their factors (R,).
+
+        `rssi`, `predicted` [dBm] and `std` [dB] are (n, R), the prior deviations of latent field and noise are (R,) [dB].
+        """
+        scale = interval_scale(predicted, std, rssi)
+        self.field_db = (scale * prior_db[0]).float()
+        self.noise_db = (scale * prior_db[1]).clamp_min(rounding_std(rssi)).float()
+        return scale
+
+    def _take(self, state: dict[str, Any]) -> None:
+        """Take the state of a posterior over; see `RssiPosterior`."""
+        self._table, receiver = HeadTable(self.rendered), self.receiver_position - self.centre
+        self._set_posterior(RssiPosterior(receiver, self.kernel, self._table, self.config.huber, **state))
+
+    def _set_posterior(self, posterior: RssiPosterior) -> None:
+        """Mix a posterior with the simpler predictors, and compute what all predictions share."""
+        self._posterior, self.middle, weight = posterior, posterior.middle, self.mixing_weight[0]
+        linear = posterior.linear.T  # (10, R)
+        self.level = self.baseline[0] + weight * (posterior.prior_level + linear[0])
+        self.slope = self.baseline[1] + weight * (posterior.prior_slope + linear[1])
+        self.directivity = (weight * linear[2:].T).float()
+        self.anchor, self.coefficient = posterior.anchor.float(), posterior.coefficient.float().contiguous()
+        known, receiver = posterior.anchor, posterior.receiver
+        self._uncertainty = Uncertainty(self.kernel, known, receiver, self.middle, self.covariance)
 
     @property
     def receiver(self) -> Tensor:
@@ -191,34 +195,15 @@ class RssiModel(SavedRssiPredictor):
         """Return the positions (n, 3) [m] of the location bins."""
         return self.anchor.double() + self.centre
 
-    def _precompute(self, state: FitState | None) -> None:
-        """Compute what all predictions share, and the posterior that `update` continues, if there is one."""
-        self._table, receiver = HeadTable(self.rendered), self.receiver_position - self.centre
-        self._offset = self._table(torch.zeros(1, len(self.level)))[0]
-        self._uncertainty, self._posterior = self._uncertainty_of_rows(), None
-        if state is not None:
-            self._posterior = RssiPosterior(state, self.anchor, receiver, self.kernel, self._table, self.config.huber)
-
-    def _uncertainty_of_rows(self) -> Uncertainty:
-        receiver = self.receiver_position - self.centre
-        return Uncertainty(self.kernel, self.anchor.double(), receiver, self.middle, self.covariance)
-
     @single_thread()
     def _update(self, new: Rssi) -> None:
-        posterior = self._checked_posterior()
         if self.offsets is not None:
             new = self.offsets.removed(new)
-        new, before = new.about(self.origin), posterior.linear
-        self._posterior = posterior.updated(new.transmitter_position - self.centre, new.rssi_dbm)
+        new = new.about(self.origin)
+        at = new.transmitter_position - self.centre
         if self.detection_field is not None:
-            at = new.transmitter_position - self.centre
             self.detection_field = self.detection_field.updated(at, new.detected)
-        change = self.mixing_weight[0] * (self._posterior.linear - before).T  # (10, R)
-        self.level, self.slope = self.level + change[0], self.slope + change[1]
-        self.directivity = self.directivity + change[2:].T.float()
-        folded = self._posterior.folded()
-        self.anchor, self.coefficient = folded.anchor.float(), folded.coefficient.float()
-        self._uncertainty = self._uncertainty_of_rows()
+        self._set_posterior(self._posterior.updated(at, new.rssi_dbm))
 
     def with_chosen_kernel(self, without: Tensor | None = None) -> Self:
         """Return the model fitted again to all rows that it has learnt, with kernel, noise and mixing weights chosen again.
@@ -241,7 +226,8 @@ class RssiModel(SavedRssiPredictor):
             50
         """
         self.check_fitted()
-        posterior = self._checked_posterior().folded()
+        self.check_updates()
+        posterior = self._posterior
         kept = torch.ones(len(posterior.anchor), dtype=torch.bool)
         if without is not None:
             kept[without] = False
@@ -258,16 +244,10 @@ class RssiModel(SavedRssiPredictor):
         validation = "block" if self.config.validation == "session" else self.config.validation
         model = type(self)(replace(self.config, validation=validation)).fit(rows)
         model.offsets = self.offsets
-        state = posterior.state
         # a mean of several measurements has a smaller variance than one measurement
-        if bool(((state.variance > 0) & (state.variance < 0.99 * state.noise_variance)).any()):
+        if bool(((posterior.variance > 0) & (posterior.variance < 0.99 * posterior.noise_variance[:, None])).any()):
             model.field_db, model.noise_db = self.field_db, self.noise_db
         return model
-
-    def _checked_posterior(self) -> RssiPosterior:
-        if self._posterior is None:
-            raise InputError(f"a predictor {self.name} cannot be updated; fit it again to all rows")
-        return self._posterior
 
     @single_thread()
     def _predict(self, position: Tensor) -> tuple[Tensor, Tensor]:
@@ -276,7 +256,7 @@ class RssiModel(SavedRssiPredictor):
         distance = log_distance(position, self.receiver)
         path_loss = self.level + self.slope * distance
         bearing = harmonics(local, (self.receiver - self.centre).float())
-        head = self._table(self.kernel(local, self.anchor) @ self.coefficient)[0] - self._offset
+        head = self._table(self.kernel(local, self.anchor) @ self.coefficient)[0]
         mean = path_loss.float() + torch.einsum("brh,rh->br", bearing, self.directivity)
         mean = mean + self.mixing_weight[0].float() * head
         variance, trend = self._uncertainty(offset)
@@ -329,32 +309,29 @@ class RssiModel(SavedRssiPredictor):
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         self.check_fitted()
-        tensors = {name: getattr(self, name) for name in _shapes(0, 0)}
+        n_receivers, n_anchors = len(self.receiver_names), len(self.anchor)
+        tensors = {name: getattr(self, name) for name in _shapes(n_receivers)}
+        of_fit = RssiPosterior.shapes(n_receivers, n_anchors)
+        tensors |= {f"fit.{name}": getattr(self._posterior, name) for name in of_fit}
         header = self._header() | {"kernel": asdict(self.kernel), "n_primitives": self.n_primitives}
         if self.detection_field is not None:
             of_field = self.detection_field.state()
             tensors, header = tensors | of_field[0], header | of_field[1]
-        if self._posterior is not None:
-            tensors |= {f"fit.{name}": value for name, value in vars(self._posterior.folded().state).items()}
         return tensors, header
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
         model = cls._of_header(header)
         model.kernel, model.n_primitives = Kernel(**header["kernel"]), int(header["n_primitives"])
-        shapes = _shapes(len(model.receiver_names), len(tensors["anchor"]))
-        files.expect(tensors, shapes)
-        for name in shapes:
+        n_receivers, n_anchors, model.detection_field = len(model.receiver_names), len(tensors["fit.anchor"]), None
+        own, of_fit = _shapes(n_receivers), RssiPosterior.shapes(n_receivers, n_anchors)
+        files.expect(tensors, own | {f"fit.{name}": shape for name, shape in of_fit.items()})
+        for name in own:
             setattr(model, name, tensors[name])
-        model.detection_field, n_receivers = None, len(model.receiver_names)
         if "share" in header:
-            files.expect(
-                tensors,
-                {"share.mean": (n_receivers,), "share.coefficient": (len(tensors["share.position"]), n_receivers)},
-            )
-            model.detection_field = DetectionField.from_state(tensors, header)
-        fitted = "fit.dual" in tensors
-        model._precompute(FitState.of(tensors, n_receivers, len(tensors["anchor"])) if fitted else None)
+            files.expect(tensors, {"share.mean": (n_receivers,), "share.coefficient": (n_anchors, n_receivers)})
+            model.detection_field = DetectionField.from_state(tensors, header, tensors["fit.anchor"])
+        model._take({name: tensors[f"fit.{name}"].double() for name in of_fit})
         return model
 
 
@@ -371,22 +348,21 @@ def fit_rssi(train: Rssi, config: RssiConfig | None = None, **options: Any) -> R
 
 def _in_threads(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
     """Apply a function to items as `map` does, in as many threads as torch has."""
-    waiting, n_items = list(items), 4 * torch.get_num_threads()  # starting threads costs milliseconds
-    for start in range(0, len(waiting), n_items):
-        yield from parallel_map(function, waiting[start : start + n_items])
+    waiting = list(items)
+    for start in range(0, len(waiting), RECEIVERS_AT_ONCE):
+        yield from parallel_map(function, waiting[start : start + RECEIVERS_AT_ONCE])
 
 
-def _shapes(n_receivers: int, n_anchors: int) -> dict[str, tuple[int, ...]]:
-    """Return the shape of every saved tensor."""
-    per_receiver = dict.fromkeys(("level", "slope", "middle", "field_db", "noise_db"), (n_receivers,))
-    return per_receiver | {
-        "covariance": (n_receivers, 2, 2),
+def _shapes(n_receivers: int) -> dict[str, tuple[int, ...]]:
+    """Return the shape of every saved tensor beside those of the posterior."""
+    return {
         "mixing_weight": (4,),
+        "baseline": (2, n_receivers),
+        "covariance": (n_receivers, 2, 2),
         "centre": (3,),
-        "directivity": (n_receivers, N_HARMONICS),
-        "anchor": (n_anchors, 3),
-        "coefficient": (n_anchors, n_receivers),
         "rendered": (n_receivers, 2, 2, N_DIRECTIONS),
+        "field_db": (n_receivers,),
+        "noise_db": (n_receivers,),
     }
 
 

@@ -20,10 +20,9 @@ from swiftwrf.data.rssi import Rssi
 from swiftwrf.errors import FitError
 from swiftwrf.models.base import CPU
 from swiftwrf.rssi.base import Map, RssiConfig, often_detected
-from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
-from swiftwrf.rssi.mixing import check_comparable, interval_scale, rounding_std
+from swiftwrf.rssi.head import Head, mean_magnitude, render
+from swiftwrf.rssi.mixing import check_comparable
 from swiftwrf.rssi.model import FIELD_ALONE, RssiModel
-from swiftwrf.rssi.path_loss import N_HARMONICS
 from swiftwrf.rssi.regression import held_out_std
 from swiftwrf.rssi.training import Bins, bin_locations, binned, choose_residual_kernel, prior_std
 from swiftwrf.runtime.progress import progress_bar
@@ -63,7 +62,7 @@ class RssiPaperModel(RssiModel):
     kind = "rssi paper model"
     name = "swiftwrf_paper"
     config_type = RssiPaperConfig
-    slow = True
+    slow, updates = True, False
 
     def _fit(
         self,
@@ -94,24 +93,30 @@ class RssiPaperModel(RssiModel):
             fits = (parallel or map)(task, parts)
             results = list(bar.track(fits, total=len(parts), description="receivers"))
         held_out, white, rendered = (torch.cat(values) for values in zip(*results, strict=True))
-        per_receiver, covariance = torch.zeros(n_receivers).double(), torch.zeros(n_receivers, 2, 2).double()
+        zero, covariance = torch.zeros(n_receivers).double(), torch.zeros(n_receivers, 2, 2).double()
         out = ~bins.rssi.isnan() & (bins.fold == HELD_OUT_FOLD)[:, None]
         predicted = held_out.T.double().where(out, torch.nan)[bins.bin_of_row]
         check_comparable(predicted[None], train.rssi_dbm)
-        std = held_out_std(bins, self.kernel, prior_db, per_receiver, covariance)[bins.bin_of_row]
-        scale = interval_scale(predicted, std, train.rssi_dbm)
-        self.field_db = (scale * prior_db[0]).float()
-        self.noise_db = (scale * prior_db[1]).clamp_min(rounding_std(train.rssi_dbm)).float()
-        self.n_primitives, self.mixing_weight = config.n_primitives, FIELD_ALONE.clone()
-        self.centre, self.anchor, self.rendered = bins.centre, bins.position.float(), rendered
-        self.level = LEVEL_DBM + HeadTable(rendered)(per_receiver[None])[0][0]
-        self.slope, self.middle = per_receiver, per_receiver.clone()
-        self.detection_field = None
-        self.covariance = covariance
-        self.directivity = torch.zeros(n_receivers, N_HARMONICS)
-        dual = torch.linalg.solve_triangular(root.T, white.T.double() * prior_db[0], upper=True)
-        self.coefficient = dual.float()
-        self._precompute(None)
+        std = held_out_std(bins, self.kernel, prior_db, zero, covariance)[bins.bin_of_row]
+        self._calibrate(train.rssi_dbm, predicted, std, prior_db)
+        self.n_primitives, self.mixing_weight, self.baseline = (
+            config.n_primitives,
+            FIELD_ALONE,
+            torch.stack([zero, zero]),
+        )
+        self.centre, self.rendered, self.covariance, self.detection_field = bins.centre, rendered, covariance, None
+        dual = torch.linalg.solve_triangular(root.T, white.T.double() * prior_db[0], upper=True).T
+        state = {"anchor": bins.position, "dual": dual, "prior_std": covariance[..., 0].clone()}
+        # the dual coefficients are those of the kernel alone, without a path loss or noise
+        state |= {
+            "tangent": torch.ones_like(dual),
+            "measured": torch.ones_like(dual),
+            "variance": torch.zeros_like(dual),
+        }
+        state |= {name: zero.clone() for name in ("prior_slope", "middle", "noise_variance")}
+        level = LEVEL_DBM + mean_magnitude(rendered, zero[None])[0].double()
+        state |= {"prior_level": level, "field_variance": torch.ones_like(zero)}
+        self._take(state)
 
 
 @single_thread()

@@ -1,18 +1,17 @@
-"""Update of an RSSI fit with more rows: the weighted least squares that the fit ended in, bordered by the new rows.
+"""The posterior of an RSSI fit, and its update with more rows.
 
-At the end of `swiftwrf.rssi.regression.solve` the rows of one receiver have the covariance
+At the end of `swiftwrf.rssi.regression.solve` the rows of one receiver are a Gaussian process with the kernel and the noise
 
-    (slope slope^T) * covariance of the latent field + F F^T + diag(noise / weight)
+    tangent_i field(x_i, x_j) tangent_j + f_i . f_j,        noise / weight_i
 
-with the scaled regressors F of the path loss. Its inverse is computed once. A new row then costs one product with it.
-Slopes and weights of the rows of the fit stay. Those of new rows are found with all new rows together, so their order has no
-effect.
+for the latent field and the scaled regressors f of the path loss. Given the rows of the fit, more rows have a Gaussian
+prior, which costs one product with the inverse covariance, computed once. Their robust weights are found with all of them
+together, so their order has no effect. Tangents and weights of the rows of the fit stay.
 """
 
 from __future__ import annotations
 
-from copy import copy
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -24,31 +23,44 @@ from torch.nn import functional
 
 from swiftwrf.gp import Kernel
 from swiftwrf.rssi.head import HeadTable
-from swiftwrf.rssi.path_loss import harmonics, log_distance
-from swiftwrf.rssi.regression import WEIGHT_TOLERANCE, coefficient_scale, regressors
-from swiftwrf.runtime.checkpoint import expect
+from swiftwrf.rssi.path_loss import PathLoss, log_distance
+from swiftwrf.rssi.regression import WEIGHT_TOLERANCE, coefficient_scale, covariance_of, huber_weight, regressors
 
 MAX_NEW_ROWS = 256  # beyond, the weights of new rows are fixed and the inverses are computed again
 TOLERANCE = WEIGHT_TOLERANCE / 100  # of these weights, so that the order of the rows does not matter
 
 
 @dataclass(frozen=True, eq=False)
-class FitState:
-    """Weighted least squares of R receivers in n location bins at the end of a fit.
+class RssiPosterior:
+    """Gaussian processes of R receivers, given n rows.
 
     Args:
-        dual: Dual coefficients (n, R); 0 in bins that have no part in the fit.
-        tangent: Slope of each head at the latent field, (n, R); 0 there.
-        variance: Variance of the noise over the weight, (n, R) [dB^2]; 0 in bins that have no part in the fit.
-        measured: 1 where RSSI was measured and not only limited, (n, R).
+        receiver: Positions of the receivers less the centre, (R, 3) [m], nan where unknown.
+        kernel: Kernel of the latent field.
+        table: Heads of the receivers.
+        huber: See `RssiConfig`.
+        anchor: Positions of the rows less the centre, float64 (n, 3) [m].
+        dual: Dual coefficients (R, n); 0 in rows that have no part in the fit.
+        tangent: Slope of each head at the latent field, (R, n); 0 there.
+        variance: Variance of the noise over the weight, (R, n) [dB^2]; 0 in rows that have no part in the fit.
+        measured: 1 where RSSI was measured and not only limited, (R, n).
         prior_level: Prior path-loss model, RSSI at 1 m, (R,) [dBm].
         prior_slope: Its slope, (R,) [dB a decade].
         prior_std: Prior standard deviation of level [dB] and slope [dB a decade], (R, 2).
         middle: log10 of the distance at which levels are compared, (R,).
         field_variance: Prior variance of the latent field, (R,) [dB^2].
         noise_variance: Variance of one measurement, (R,) [dB^2].
+        feature: Scaled regressors (R, n, 10); 0 in rows that have no part in the fit. Defaults to those of the anchors.
+        fit: Posterior of the first n - m rows, whose weights are fixed. Defaults to all rows.
+        later: Of the m rows after those: the effect of their dual coefficients on those of the fit, float32 (R, m, n - m),
+            the errors of the fit, (R, m) [dB], and the covariance of these errors without noise, (R, m, m).
     """
 
+    receiver: Tensor
+    kernel: Kernel
+    table: HeadTable
+    huber: float
+    anchor: Tensor
     dual: Tensor
     tangent: Tensor
     variance: Tensor
@@ -59,178 +71,116 @@ class FitState:
     middle: Tensor
     field_variance: Tensor
     noise_variance: Tensor
+    feature: Tensor = None  # type: ignore[assignment]
+    fit: RssiPosterior | None = None
+    later: tuple[Tensor, Tensor, Tensor] | None = None
 
-    @classmethod
-    def of(cls, tensors: dict[str, Tensor], n_receivers: int, n_bins: int) -> FitState:
-        """Return the state in the tensors of a file, whose names begin with `fit.`."""
-        rows = ("dual", "tangent", "variance", "measured")
-        sizes = {field.name: (n_bins, n_receivers) if field.name in rows else (n_receivers,) for field in fields(cls)}
-        sizes["prior_std"] = (n_receivers, 2)
-        expect(tensors, {f"fit.{name}": size for name, size in sizes.items()})
-        return cls(**{name: tensors[f"fit.{name}"].double() for name in sizes})
+    def __post_init__(self) -> None:
+        if self.feature is None:
+            feature = regressors(self.anchor, self.receiver, self.middle, self.prior_std)
+            object.__setattr__(self, "feature", feature * (self.variance > 0)[..., None])
 
-
-@dataclass(frozen=True, eq=False)
-class NewRows:
-    """m rows beside those of a fit, for R receivers, float64.
-
-    Args:
-        position: Positions less the centre, (m, 3) [m].
-        error: Errors of the fit, (R, m) [dB]; 0 where not detected.
-        tangent: Slopes of the heads (R, m); 0 where not detected.
-        variance: Variance of the noise (R, m) [dB^2]; 0 where not detected.
-        influence: Effect of each new dual coefficient on those of the fit, float32 (R, m, n).
-        covariance: Covariance of the errors without noise, (R, m, m).
-        weight: Robust weights (R, m).
-        dual: Dual coefficients (R, m).
-    """
-
-    position: Tensor
-    error: Tensor
-    tangent: Tensor
-    variance: Tensor
-    influence: Tensor
-    covariance: Tensor
-    weight: Tensor
-    dual: Tensor
-
-    @classmethod
-    def none(cls, n_receivers: int, n_bins: int) -> NewRows:
-        """Return no rows."""
-        row = torch.zeros(n_receivers, 0, dtype=torch.float64)
-        square, influence = row[..., None].expand(-1, 0, 0), torch.zeros(n_receivers, 0, n_bins)
-        return cls(row.new_zeros(0, 3), row, row, row, influence, square, row, row)
-
-    def solved(self, huber: float) -> NewRows:
-        """Return the rows with weights and dual coefficients by iteratively reweighted least squares."""
-        weight, noise = self.weight, self.variance.where(self.variance > 0, 1.0)
-        for _ in range(100):
-            dual = torch.linalg.solve(self.covariance + torch.diag_embed(noise / weight), self.error)
-            used, missed = weight, (noise / weight * dual).abs()
-            weight = (huber * noise.sqrt() / missed.clamp_min(1e-12)).clamp_max(1)
-            if bool(((weight - used).abs() < TOLERANCE).all()):
-                break
-        return replace(self, weight=used, dual=dual)
-
-
-class RssiPosterior:
-    """A fit of R receivers, with more rows.
-
-    Args:
-        state: State of the fit.
-        anchor: Positions of its bins less the centre, (n, 3) [m].
-        receiver: Positions of the receivers less the centre, (R, 3) [m], nan where unknown.
-        kernel: Kernel of the latent field.
-        table: Heads of the receivers.
-        huber: See `RssiConfig`.
-    """
-
-    def __init__(
-        self, state: FitState, anchor: Tensor, receiver: Tensor, kernel: Kernel, table: HeadTable, huber: float
-    ) -> None:
-        self.state, self.anchor, self.receiver, self.kernel = state, anchor.double(), receiver, kernel
-        self.table, self.huber = table, huber
-        self.new = NewRows.none(len(receiver), len(anchor))
-
-    @cached_property
-    def _feature(self) -> Tensor:
-        """Scaled regressors of the bins (R, n, k); 0 in bins that have no part in the fit."""
-        return self._regressors(self.anchor) * (self.state.variance > 0).T[..., None]
+    @staticmethod
+    def shapes(n_receivers: int, n_rows: int) -> dict[str, tuple[int, ...]]:
+        """Return the shape of every tensor that a file contains."""
+        found: dict[str, tuple[int, ...]] = {"anchor": (n_rows, 3), "prior_std": (n_receivers, 2)}
+        found |= dict.fromkeys(("dual", "tangent", "variance", "measured"), (n_receivers, n_rows))
+        per_receiver = ("prior_level", "prior_slope", "middle", "field_variance", "noise_variance")
+        return found | dict.fromkeys(per_receiver, (n_receivers,))
 
     @cached_property
     def _inverses(self) -> list[Any]:
         """Inverse covariance of the rows of each receiver, float32 (n, n)."""
-        covariance, found = self.kernel(self.anchor, self.anchor), []
-        for r, feature in enumerate(self._feature):
-            variance, slope = self.state.variance[:, r], self.state.tangent[:, r]
-            whole = self.state.field_variance[r] * slope[:, None] * covariance * slope + feature @ feature.T
-            whole.diagonal().add_(variance.where(variance > 0, 1.0))
+        field, found = self.kernel(self.anchor, self.anchor), []
+        for r, feature in enumerate(self.feature):
+            rows = self.tangent[r], feature
+            whole = covariance_of(self.field_variance[r] * field, rows, rows)
+            whole.diagonal().add_(self.variance[r].where(self.variance[r] > 0, 1.0))
             inverse = torch.cholesky_inverse(torch.linalg.cholesky(whole)).float()
             found.append(np.asfortranarray(inverse.numpy()))  # as BLAS reads it
         return found
 
-    @cached_property
-    def _fitted(self) -> Tensor:
-        """Coefficients of the scaled regressors from the rows of the fit, (R, k, 1)."""
-        return self._feature.mT @ self.state.dual.T[..., None]
-
-    def _regressors(self, position: Tensor) -> Tensor:
-        """Return the scaled regressors of level, slope and directivity at positions (m, 3), float64 (R, m, k)."""
-        apart, bearing = log_distance(position, self.receiver), harmonics(position, self.receiver)
-        return regressors(apart, bearing, self.state.middle, self.state.prior_std)
-
     @property
     def linear(self) -> Tensor:
-        """Change of level at 1 m, slope and directivity from the prior path-loss model, float64 (R, k) [dB]."""
-        new, dual = self._regressors(self.new.position), self.new.dual[..., None]
-        coefficient = self._fitted + (new - self.new.influence.double() @ self._feature).mT @ dual
-        change = coefficient[..., 0] * coefficient_scale(self.state.prior_std)
-        return torch.cat([change[:, :1] - change[:, 1:2] * self.state.middle[:, None], change[:, 1:]], dim=1)
+        """Change of level at 1 m, slope and directivity from the prior path-loss model, float64 (R, 10) [dB]."""
+        change = self._linear * coefficient_scale(self.prior_std)
+        return torch.cat([change[:, :1] - change[:, 1:2] * self.middle[:, None], change[:, 1:]], dim=1)
 
-    def folded(self) -> RssiPosterior:
-        """Return the fit with the new rows as rows of the fit, their weights fixed."""
-        old, new = self.state, self.new
-        dual = old.dual - torch.einsum("rmn,rm->nr", new.influence, new.dual.float()).double()
-        state = replace(
-            old,
-            dual=torch.cat([dual, new.dual.T]),
-            tangent=torch.cat([old.tangent, new.tangent.T]),
-            variance=torch.cat([old.variance, (new.variance / new.weight).T]),
-            measured=torch.cat([old.measured, (new.variance > 0).T.to(old.measured)]),
-        )
-        anchor = torch.cat([self.anchor, new.position])
-        return RssiPosterior(state, anchor, self.receiver, self.kernel, self.table, self.huber)
+    @cached_property
+    def _linear(self) -> Tensor:
+        """Coefficients of the scaled regressors, (R, 10)."""
+        return (self.feature.mT @ self.dual[..., None])[..., 0]
 
     @property
     def coefficient(self) -> Tensor:
-        """Coefficients of the kernel to the bins whose sum is the latent field, float64 (n, R) [dB]."""
-        return self.state.field_variance * self.state.tangent * self.state.dual
+        """Coefficients of the kernel to the rows whose sum is the latent field, float64 (n, R) [dB]."""
+        return (self.field_variance[:, None] * self.tangent * self.dual).T
 
     @property
     def rssi(self) -> Tensor:
-        """RSSI of the bins of the fit, from fitted values and residuals, float64 (n, R) [dBm]; nan where not detected."""
-        state = self.state
-        latent = self.kernel(self.anchor, self.anchor) @ self.coefficient
-        fitted = state.prior_level + state.prior_slope * log_distance(self.anchor, self.receiver)
-        fitted = fitted + (self._feature @ self._fitted)[..., 0].T
-        fitted = fitted + self.table(latent)[0] - self.table(torch.zeros_like(latent))[0]
-        return (fitted + state.variance * state.dual).where(state.measured > 0, torch.nan)
+        """RSSI of the rows, from fitted values and residuals, float64 (n, R) [dBm]; nan where not detected."""
+        fitted = self._at(self.anchor, self.kernel(self.anchor, self.anchor))[0]
+        return (fitted + self.variance * self.dual).where(self.measured > 0, torch.nan).T
+
+    def _at(self, position: Tensor, cross: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return RSSI (R, m) [dBm], slope of the head (R, m) and regressors (R, m, 10) at positions (m, 3) [m].
+
+        `cross` are the values of the kernel between them and the rows, (m, n).
+        """
+        head, tangent = self.table(cross @ self.coefficient)
+        feature = regressors(position, self.receiver, self.middle, self.prior_std)
+        prior = PathLoss(self.prior_level, self.prior_slope)(log_distance(position, self.receiver))
+        return (prior + head).T + (feature @ self._linear[..., None])[..., 0], tangent.T, feature
 
     def updated(self, position: Tensor, rssi: Tensor) -> RssiPosterior:
         """Return the posterior with more rows, RSSI (m, R) [dBm], nan where not detected, at positions (m, 3) [m]."""
-        if len(self.new.position) and len(self.new.position) + len(position) > MAX_NEW_ROWS:
-            return self.folded().updated(position, rssi)
-        state, detected = self.state, ~rssi.isnan().T  # (R, m)
-        cross = self.kernel(position, self.anchor)  # (m, n)
-        latent = cross @ self.coefficient  # (m, R)
-        head, tangent = self.table(latent)
-        feature = self._regressors(position)
-        predicted = state.prior_level + state.prior_slope * log_distance(position, self.receiver)
-        predicted = predicted + (feature @ self._fitted)[..., 0].T + head - self.table(torch.zeros_like(latent))[0]
-        tangent = tangent.T * detected
-        feature = feature * detected[..., None]
-        scaled = (state.field_variance[:, None] * tangent)[..., None]  # (R, m, 1)
-        # covariances with the bins, (R, m, n)
-        own = scaled * cross * state.tangent.T[:, None] + feature @ self._feature.mT
+        n_receivers, n_new = len(self.receiver), len(position)
+        fit, later = self.fit, self.later
+        if fit is None or later is None or later[1].shape[1] + n_new > MAX_NEW_ROWS:
+            fit = self if fit is None else replace(self, fit=None, later=None)
+            none = self.dual.new_zeros(n_receivers, 0)
+            later = torch.zeros(n_receivers, 0, len(fit.anchor)), none, none[..., None].expand(-1, 0, 0)
+        detected, cross = ~rssi.isnan().T, self.kernel(position, fit.anchor)
+        mean, tangent, feature = fit._at(position, cross)
+        new = tangent * detected, feature * detected[..., None]
+        # condition on the rows of the fit
+        field = fit.field_variance[:, None, None]
+        own = covariance_of(field * cross, new, (fit.tangent, fit.feature))
         # half of each inverse is read, because its time in memory is most of the time of a row
-        pairs = zip(self._inverses, own.float().numpy(), strict=True)
+        pairs = zip(fit._inverses, own.float().numpy(), strict=True)
         influence = torch.from_numpy(np.stack([np.stack([ssymv(1.0, p, x, lower=1) for x in c]) for p, c in pairs]))
-        new = NewRows(
-            position=torch.cat([self.new.position, position]),
-            error=torch.cat([self.new.error, (rssi - predicted).T.where(detected, 0.0)], dim=1),
-            tangent=torch.cat([self.new.tangent, tangent], dim=1),
-            variance=torch.cat([self.new.variance, state.noise_variance[:, None] * detected], dim=1),
-            influence=torch.cat([self.new.influence, influence], dim=1),
-            covariance=self.new.covariance,
-            weight=functional.pad(self.new.weight, (0, len(position)), value=1.0),
-            dual=self.new.dual,
-        )
-        prior = scaled * self.kernel(position, new.position) * new.tangent[:, None]
-        prior = prior + feature @ (self._regressors(new.position) * (new.variance > 0)[..., None]).mT
-        border = prior - (own.float() @ new.influence.mT).double()  # (R, m, all new)
-        covariance = functional.pad(self.new.covariance, (0, len(position), 0, len(position)))
-        covariance[:, -len(position) :] = border
-        covariance[..., -len(position) :] = border.mT
-        result = copy(self)
-        result.new = replace(new, covariance=covariance).solved(self.huber)
-        return result
+        influence = torch.cat([later[0], influence], dim=1)
+        error = torch.cat([later[1], (rssi.T - mean).where(detected, 0.0)], dim=1)
+        noise = fit.noise_variance[:, None] * detected
+        rows: dict[str, Any] = {
+            "anchor": torch.cat([self.anchor, position]),
+            "tangent": torch.cat([self.tangent, new[0]], dim=1),
+            "feature": torch.cat([self.feature, new[1]], dim=1),
+            "variance": torch.cat([self.variance, noise], dim=1),
+            "measured": torch.cat([self.measured, detected.to(self.measured)], dim=1),
+        }
+        n = len(fit.anchor)
+        prior = self.kernel(position, rows["anchor"][n:])
+        border = covariance_of(field * prior, new, (rows["tangent"][:, n:], rows["feature"][:, n:]))
+        border = border - (own.float() @ influence.mT).double()
+        covariance = functional.pad(later[2], (0, n_new, 0, n_new))
+        covariance[:, -n_new:], covariance[..., -n_new:] = border, border.mT
+        dual, rows["variance"][:, n:] = self._robust(covariance, error, rows["variance"][:, n:])
+        of_fit = fit.dual - torch.einsum("rmn,rm->rn", influence, dual.float()).double()
+        rows["dual"] = torch.cat([of_fit, dual], dim=1)
+        return replace(self, **rows, fit=fit, later=(influence, error, covariance))
+
+    def _robust(self, covariance: Tensor, error: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
+        """Return dual coefficients and noise over weight by iteratively reweighted least squares, from one to start with.
+
+        Errors, variances and results are (R, m), the covariance of the errors without noise is (R, m, m).
+        """
+        noise = self.noise_variance[:, None].where(variance > 0, 1.0)
+        weight = (noise / variance).where(variance > 0, 1.0)
+        for _ in range(100):
+            used = noise / weight
+            dual = torch.linalg.solve(covariance + torch.diag_embed(used), error)
+            previous, weight = weight, huber_weight(used * dual, noise.sqrt(), self.huber)
+            if bool(((weight - previous).abs() < TOLERANCE).all()):
+                break
+        return dual, used.where(variance > 0, 0.0)

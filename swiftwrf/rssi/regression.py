@@ -36,13 +36,9 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
     Returns:
         Tensors by name, with R = 1.
 
-        - level (R,) [dBm], slope (R,) [dB a decade] and directivity (R, 8) [dB].
+        - dual, tangent, variance, prior_level, prior_slope and prior_std; see `posterior.RssiPosterior`. If RSSI would rise
+          with the distance, slope and its standard deviation are 0.
         - covariance (R, 2, 2) of level and slope, given the rows.
-        - prior_level, prior_slope and prior_std (R,), (R,), (R, 2): the prior path loss. If RSSI would rise with the
-          distance, slope and its standard deviation are 0.
-        - coefficient (R, n) of the kernel to the bins, whose sum is the latent field [dB].
-        - dual, tangent and variance (R, n). See `posterior.FitState`.
-        - rendered fields of the heads (R, 2, 2, directions).
         - held_out (R, n), predictions of the bins of the fit by all other folds [dBm].
 
     Raises:
@@ -54,10 +50,10 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
     distance = log_distance(data.position, data.receiver)
     used = (~rssi.isnan() | ~limit.isnan()).nonzero()[:, 0]
     error, dual, tangent, variance = (torch.zeros_like(rssi) for _ in range(4))
-    feature = regressors(distance, harmonics(data.position, data.receiver), loss.middle, std[None])[0]
-    linear, covariance = torch.zeros(feature.shape[1]).double(), std.square().diag()
+    covariance = std.square().diag()
     if len(used):
         at, weak = data.position[used].to(device), limit[used].isnan().logical_not()
+        feature = regressors(data.position[used], data.receiver, loss.middle, std[None])[0]
         prior_covariance = float(data.field_db) ** 2 * data.kernel(at, at)
         noise_db = (data.noise_db / data.count[used, 0].clamp_min(1).sqrt()).to(device)
         detection = loss.detection
@@ -66,15 +62,14 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
 
         def solved() -> tuple[Tensor, ...]:
             value = (rssi.where(limit.isnan(), limit) - prior(distance)[:, 0])[used].to(device)
-            return solve(value, weak.to(device), feature[used].to(device), *rest)
+            return solve(value, weak.to(device), feature.to(device), *rest)
 
         try:
             *found, factor = solved()
-            trend = feature[used, :2].to(device)
+            trend = feature[:, :2].to(device)
             open_ = torch.eye(2).double() - (trend.T @ torch.cholesky_solve(trend, factor)).cpu()
             covariance = std[:, None] * open_ * std  # a slope that is held at 0 is as uncertain as a free one
-            slope = float(prior.slope + std[1] * (found[0].cpu() @ feature[used, 1]))
-            if slope > 0:
+            if float(prior.slope + std[1] * (found[0].cpu() @ feature[:, 1])) > 0:
                 level = prior.level + prior.slope * loss.middle
                 prior, std[1], feature[:, 1] = PathLoss(level, torch.zeros(1).double()), 0.0, 0.0
                 *found, factor = solved()
@@ -87,21 +82,15 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
                 f"the RSSI fit of receiver {data.receiver_names[0]!r} broke ({reason}); are its values sane?"
             ) from None
         dual[used], tangent[used], variance[used], target = (x.cpu() for x in found)
-        linear = dual @ feature * coefficient_scale(std[None])[0]
         error[used] -= target  # prediction less prior
     return {
-        "level": prior.level + linear[0] - linear[1] * loss.middle,
-        "slope": prior.slope + linear[1],
-        "covariance": covariance[None],
         "prior_level": prior.level,
         "prior_slope": prior.slope,
         "prior_std": std[None],
-        "directivity": linear[None, 2:],
-        "coefficient": float(data.field_db) ** 2 * (tangent * dual)[None],
+        "covariance": covariance[None],
         "dual": dual[None],
         "tangent": tangent[None],
         "variance": variance[None],
-        "rendered": data.rendered,
         "held_out": (prior(distance)[:, 0] - error).where(variance > 0, torch.nan)[None],
     }
 
@@ -111,14 +100,27 @@ def coefficient_scale(std: Tensor) -> Tensor:
     return torch.cat([std, std.new_full((len(std), N_HARMONICS), DIRECTIVITY_STD_DB)], dim=1)
 
 
-def regressors(distance: Tensor, bearing: Tensor, middle: Tensor, std: Tensor) -> Tensor:
+def regressors(position: Tensor, receiver: Tensor, middle: Tensor, std: Tensor) -> Tensor:
     """Return the regressors of level, slope and directivity, scaled by the standard deviations of their coefficients.
 
-    They are float64 (R, n, 10), at log10 distances (n, R) and harmonics (n, R, 8). For the rest see `PathLosses`.
+    They are float64 (R, n, 10), at positions (n, 3) for receivers at (R, 3), both [m]. For the rest see `PathLosses`.
     """
-    apart = (distance - middle)[..., None]
-    feature = torch.cat([torch.ones_like(apart), apart, bearing], dim=-1) * coefficient_scale(std)
-    return feature.transpose(0, 1)
+    apart = (log_distance(position, receiver) - middle)[..., None]
+    feature = torch.cat([torch.ones_like(apart), apart, harmonics(position, receiver)], dim=-1)
+    return (feature * coefficient_scale(std)).transpose(0, 1)
+
+
+def covariance_of(field: Tensor, a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> Tensor:
+    """Return the covariances (..., n, m) of rows a and b, given those of the latent field, without noise.
+
+    Each row has a slope of the head (..., n) and scaled regressors (..., n, k).
+    """
+    return (a[0][..., None] * field).mul_(b[0][..., None, :]).add_(a[1] @ b[1].mT)
+
+
+def huber_weight(error: Tensor, noise_db: Tensor, huber: float) -> Tensor:
+    """Return the weights of errors [dB] in least squares whose solution minimises Huber's loss; see `RssiConfig`."""
+    return (huber * noise_db / error.abs().clamp_min(1e-12)).clamp_max(1)
 
 
 def solve(
@@ -151,7 +153,6 @@ def solve(
         variance of the noise over the weights (n,) [dB^2]; the values, with those in place of limits, (n,) [dB]; the
         Cholesky factor of the covariance of the data (n, n).
     """
-    zero = table(torch.zeros(1, 1, dtype=torch.float64, device=value.device))[0][0, 0]
     weight, latent = torch.ones_like(value), torch.zeros_like(value)
     target, noise = value.where(~weak, 0.0), noise_db.square()
     precision, pull = torch.zeros_like(value), torch.zeros_like(value)  # of the sites of empty cells
@@ -159,9 +160,9 @@ def solve(
     step, last = 1.0, math.inf
     for _ in range(30):
         head, slope = (x[:, 0] for x in table(latent[:, None]))
-        tangent = slope * latent - (head - zero)
+        tangent = slope * latent - head
         variance = (noise / weight).where(~weak, 1 / precision.clamp_min(1 / NO_SITE))
-        whole = (slope[:, None] * covariance).mul_(slope).addmm_(feature, feature.T)
+        whole = covariance_of(covariance, (slope, feature), (slope, feature))
         whole.diagonal().add_(variance)
         factor = torch.linalg.cholesky(whole)
         used, dual = target, torch.cholesky_solve((target + tangent)[:, None], factor)[:, 0]
@@ -170,8 +171,8 @@ def solve(
         if mean_change > 0.9 * last:  # oscillates where the head bends
             step /= 2
         latent, last = latent + step * change, mean_change
-        previous, error = weight, (variance * dual).abs()  # of the data about the tangent
-        weight = (huber * noise_db / error.clamp_min(1e-12)).clamp_max(1).where(~weak, 1.0)
+        previous = weight  # and below the errors of the data about the tangent
+        weight = huber_weight(variance * dual, noise_db, huber).where(~weak, 1.0)
         settled = float((weight - previous).abs().max()) < WEIGHT_TOLERANCE
         if censored is not None:
             own[weak] = torch.linalg.solve_triangular(factor, limits, upper=False).square().sum(dim=0)
@@ -180,10 +181,8 @@ def solve(
             moved = DAMPING * (site - torch.stack([precision, pull])).where(weak, 0.0)
             precision, pull = precision + moved[0], pull + moved[1]
             informative = precision > 1 / NO_SITE
-            previous, target = (
-                target,
-                (pull / precision.clamp_min(1e-9)).where(informative & weak, value.where(~weak, 0.0)),
-            )
+            previous = target
+            target = (pull / precision.clamp_min(1e-9)).where(informative & weak, value.where(~weak, 0.0))
             settled &= float(((target - previous) * precision.sqrt())[weak].abs().mean()) < 0.02
         if settled and (step == 1 or mean_change < 0.1):
             break

@@ -17,6 +17,7 @@ from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.mixing import mixing_weights
 from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, harmonics, log_distance
+from swiftwrf.rssi.posterior import RssiPosterior
 from swiftwrf.rssi.regression import DIRECTIVITY_STD_DB, fit_receiver
 from swiftwrf.rssi.training import RssiTraining, bin_locations
 from swiftwrf.runtime.steps import Memo
@@ -106,6 +107,15 @@ def training_of(data, n_primitives=50):
     )
 
 
+def posterior(training, found):
+    """The posterior of one receiver's fit."""
+    tensors = {name: found[name] for name in ("dual", "tangent", "variance", "prior_level", "prior_slope", "prior_std")}
+    variances = {"field_variance": training.field_db.square(), "noise_variance": training.noise_db.square()}
+    measured, table = (~training.rssi.isnan()).T.double(), HeadTable(training.rendered)
+    rest = {"anchor": training.position, "middle": training.path_loss.middle, "measured": measured, **variances}
+    return RssiPosterior(training.receiver, training.kernel, table, huber=1.345, **tensors, **rest)
+
+
 # --- the regression -------------------------------------------------------------------------------------------------
 
 
@@ -116,7 +126,7 @@ def test_solution_is_the_maximum_of_the_posterior():
     data.rssi_dbm[3] -= 25.0  # outliers, so that the weights matter
     data.rssi_dbm[20] += 15.0
     training, config = training_of(data), RssiConfig()
-    found = {name: value[0] for name, value in fit_receiver(FIRST, training, config, CPU).items()}
+    found = posterior(training, fit_receiver(FIRST, training, config, CPU))
 
     rendered = training.rendered.double()
     gram = KERNEL(training.position, training.position)
@@ -146,10 +156,9 @@ def test_solution_is_the_maximum_of_the_posterior():
         method="L-BFGS-B",
         options={"maxiter": 5000, "maxfun": 9000, "ftol": 1e-14},
     )
-    latent = (gram @ found["coefficient"])[:, None]
-    table = HeadTable(training.rendered)
-    mine = found["level"] + found["slope"] * distance + bearing @ found["directivity"]
-    mine = mine + (table(latent)[0] - table(torch.zeros_like(latent))[0])[:, 0]
+    level, slope, directivity = found.linear[0].split([1, 1, 8])
+    mine = found.prior_level + level + (found.prior_slope + slope) * distance + bearing @ directivity
+    mine = mine + found.table(gram @ found.coefficient)[0][:, 0]
     torch.testing.assert_close(mine, predicted(torch.tensor(best.x)), atol=0.06, rtol=0)
 
 
@@ -161,10 +170,11 @@ def test_held_out_is_a_fit_without_the_fold():
     for number in range(5):
         out = training.fold == number
         rest = replace(training, rssi=torch.where(out[:, None], torch.nan, training.rssi))
-        alone = fit_receiver(FIRST, rest, gentle, CPU)
-        distance = log_distance(training.position, training.receiver)
-        expected = alone["level"] + alone["slope"] * distance[:, 0]
-        expected = expected + harmonics(training.position, training.receiver)[:, 0] @ alone["directivity"][0]
+        alone = posterior(training, fit_receiver(FIRST, rest, gentle, CPU))
+        level, slope, directivity = alone.linear[0].split([1, 1, 8])
+        distance = log_distance(training.position, training.receiver)[:, 0]
+        expected = alone.prior_level + level + (alone.prior_slope + slope) * distance
+        expected = expected + harmonics(training.position, training.receiver)[:, 0] @ directivity
         torch.testing.assert_close(whole[out], expected[out], atol=1e-5, rtol=0)
 
 
@@ -172,7 +182,8 @@ def test_table_is_the_head():
     rendered = render([Head(name, 50, 0).requires_grad_(False) for name in "ab"])
     latent = torch.linspace(-30, 30, 200)[:, None].expand(-1, 2).contiguous()
     value, slope = HeadTable(rendered)(latent)
-    torch.testing.assert_close(value, mean_magnitude(rendered, latent), atol=2e-3, rtol=0)
+    change = mean_magnitude(rendered, latent) - mean_magnitude(rendered, torch.zeros(1, 2))
+    torch.testing.assert_close(value, change, atol=2e-3, rtol=0)
     assert HeadTable(rendered)(torch.zeros(1, 2))[1].sub(1).abs().max() < 0.01  # 1 dB of the field is 1 dB of RSSI
     assert (slope.diff(dim=0) > -1e-3).all()  # convex
 
