@@ -8,7 +8,7 @@ directivity_r a few harmonics of the direction from the receiver, and w_r the mi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from typing import Any, ClassVar, Self
@@ -29,9 +29,8 @@ from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.mixing import check_comparable, comparable, interval_scale, mixing_weights, rounding_std
 from swiftwrf.rssi.path_loss import harmonics, log_distance
-from swiftwrf.rssi.posterior import RssiPosterior
-from swiftwrf.rssi.regression import Uncertainty, fit_receiver, held_out_std
-from swiftwrf.rssi.training import MAX_KERNEL_RECEIVERS, RssiTraining, prepare
+from swiftwrf.rssi.regression import RssiPosterior, fit_receiver, held_out_std, uncertainty
+from swiftwrf.rssi.training import MAX_KERNEL_RECEIVERS, prepare
 from swiftwrf.runtime import checkpoint as files
 from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.progress import progress_bar
@@ -123,44 +122,46 @@ class RssiModel(SavedRssiPredictor):
         every = torch.cat([own, often[~torch.isin(often, own)]])
         training = prepare(pool.columns(every.tolist()), pool, self.config, shift, curve)
         task = partial(fit_receiver, data=training, config=self.config, device=device)
-        parts = [slice(r, r + 1) for r in range(len(every))]
         with progress_bar(progress) as bar:
-            fits = (parallel or _in_threads)(task, parts)
-            results = list(bar.track(fits, total=len(parts), description="receivers"))
-        found = {name: torch.cat([result[name] for result in results]) for name in results[0]}
-        predictors, std = _held_out_predictors(training, found)
-        predictors, std, mine = predictors[:, training.bin_of_row], std[training.bin_of_row], slice(len(own))
+            fits = (parallel or _in_threads)(task, range(len(every)))
+            results = list(bar.track(fits, total=len(every), description="receivers"))
+        found = {name: torch.stack([result[name] for result in results]) for name in results[0]}
+        loss, shift, measured = training.path_loss, training.shift, ~training.rssi.isnan()
+        field = found.pop("held_out").T
+        # held-out predictions of the field and of the simpler predictors, given that the packets were detected
+        predictors = torch.cat([field.where(measured, torch.nan)[None], training.baseline_held_out])
+        prior_db = training.field_db, training.noise_db
+        std = held_out_std(training, training.kernel, prior_db, loss.middle, found["covariance"])
+        if loss.detection is not None:
+            given = [loss.detection.given_detection(mean + shift, std) for mean in predictors]
+            std = given[0][1].where(~predictors[0].isnan(), std)
+            predictors = torch.stack([mean for mean, _ in given]) - shift
+        predictors, std = predictors[:, training.bin_of_row], std[training.bin_of_row]
         # one set of weights for all receivers: the few folds determine none for each of them
         columns = list(map(every.tolist().index, often.tolist()))
-        predicted, measured = predictors[..., columns], pool.rssi_dbm[:, often]
-        is_comparable = bool(comparable(predicted, measured).any())
-        weight = mixing_weights(predicted, measured) if is_comparable else FIELD_ALONE
-        found, training = {name: value[mine] for name, value in found.items()}, training.columns(mine)
+        some, rssi = predictors[..., columns], pool.rssi_dbm[:, often]
+        weight = mixing_weights(some, rssi) if bool(comparable(some, rssi).any()) else FIELD_ALONE
+        mine = slice(len(own))
+        found |= {"middle": loss.middle, "measured": measured.T.double()}
+        found |= {"field_variance": prior_db[0].square(), "noise_variance": prior_db[1].square()}
+        found = {name: value[mine] for name, value in found.items()}
         predictors = predictors[..., mine]
         check_comparable(predictors, train.rssi_dbm)
         predicted = torch.einsum("k,knr->nr", weight[weight > 0], predictors[weight > 0])
-        scale = self._calibrate(train.rssi_dbm, predicted, std[:, mine], (training.field_db, training.noise_db))
+        scale = self._calibrate(train.rssi_dbm, predicted, std[:, mine], [x[mine] for x in prior_db])
         # only two predictors have the receiver's path loss
         self.covariance = (weight[:2].sum() * scale).square()[:, None, None] * found.pop("covariance")
-        self.mixing_weight, self.kernel = weight, training.kernel
-        self.n_primitives, self.rendered = training.n_primitives, training.rendered
-        self.centre, self.detection, self.detection_field = training.centre, training.path_loss.detection, None
-        self.baseline = torch.stack([weight[1:] @ values for values in training.baselines])
-        held_out, measured = found.pop("held_out").T, ~training.rssi.isnan()
+        self.mixing_weight, self.kernel, self.centre = weight, training.kernel, training.centre
+        self.n_primitives, self.rendered = training.n_primitives, training.rendered[mine]
+        self.baseline = torch.stack([weight[1:] @ values[:, mine] for values in training.baselines])
+        self.detection, self.detection_field = loss.detection and loss.detection.columns(mine), None
         if self.detection is not None:
-            level = held_out.where(~held_out.isnan(), training.baseline_held_out[0]) + training.shift
-            bins = training.position, measured, training.fold, level
+            level = field.where(~field.isnan(), training.baseline_held_out[0]) + shift
+            bins = training.position, measured[:, mine], training.fold, level[:, mine]
             self.detection_field = DetectionField.fit(training.kernel, *bins, self.detection.limit)
-        state = found | {
-            "anchor": training.position,
-            "measured": measured.T.double(),
-            "middle": training.path_loss.middle,
-            "field_variance": training.field_db.square(),
-            "noise_variance": training.noise_db.square(),
-        }
-        self._take(state)
+        self._take(found | {"anchor": training.position})
 
-    def _calibrate(self, rssi: Tensor, predicted: Tensor, std: Tensor, prior_db: tuple[Tensor, Tensor]) -> Tensor:
+    def _calibrate(self, rssi: Tensor, predicted: Tensor, std: Tensor, prior_db: Sequence[Tensor]) -> Tensor:
         """Calibrate the standard deviations by held-out predictions of the training rows, and return their factors (R,).
 
         `rssi`, `predicted` [dBm] and `std` [dB] are (n, R), the prior deviations of latent field and noise are (R,) [dB].
@@ -184,7 +185,7 @@ class RssiModel(SavedRssiPredictor):
         self.directivity = (weight * linear[2:].T).float()
         self.anchor, self.coefficient = posterior.anchor.float(), posterior.coefficient.float().contiguous()
         known, receiver = posterior.anchor, posterior.receiver
-        self._uncertainty = Uncertainty(self.kernel, known, receiver, self.middle, self.covariance)
+        self._uncertainty = uncertainty(self.kernel, known, receiver, self.middle, self.covariance)
 
     @property
     def receiver(self) -> Tensor:
@@ -364,21 +365,3 @@ def _shapes(n_receivers: int) -> dict[str, tuple[int, ...]]:
         "field_db": (n_receivers,),
         "noise_db": (n_receivers,),
     }
-
-
-def _held_out_predictors(training: RssiTraining, found: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-    """Return predictions of held-out measured bins, and their standard deviation before it is calibrated.
-
-    Returns:
-        Those of the fits `found` and of the simpler predictors after them, (4, n, R) [dBm], given that the packets were
-        detected; and their standard deviation (n, R) [dB].
-    """
-    field = found["held_out"].T.where(~training.rssi.isnan(), torch.nan)
-    predictors = torch.cat([field[None], training.baseline_held_out])
-    prior_db, middle = (training.field_db, training.noise_db), training.path_loss.middle
-    std = held_out_std(training, training.kernel, prior_db, middle, found["covariance"])
-    if (detection := training.path_loss.detection) is not None:
-        given = [detection.given_detection(mean + training.shift, std) for mean in predictors]
-        predictors = torch.stack([mean for mean, _ in given]) - training.shift
-        std = given[0][1].where(~field.isnan(), std)
-    return predictors, std

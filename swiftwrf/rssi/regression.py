@@ -1,17 +1,32 @@
-"""The regression of one receiver, and the uncertainty that its rows leave.
+"""The regression of one receiver, its posterior, which more rows update, and the uncertainty that the rows leave.
 
 A receiver is a MAP estimate by iteratively reweighted least squares. The latent field c of its head is a Gaussian process;
 level, slope and directivity have Gaussian priors; the error is Gaussian in the middle and linear in the tails (P. J. Huber,
 1964). With the head replaced by its tangent this is weighted least squares, solved again until weights and tangent converge
 (Gauss-Newton). An empty cell is an upper limit, by expectation propagation.
+
+At its end the rows of a receiver are a Gaussian process with the kernel and the noise
+
+    tangent_i field(x_i, x_j) tangent_j + f_i . f_j,        noise / weight_i
+
+for the latent field and the scaled regressors f of the path loss. Given the rows of the fit, more rows have a Gaussian
+prior, which costs one product with the inverse covariance, computed once. Their robust weights are found with all of them
+together, so their order has no effect. Tangents and weights of the rows of the fit stay.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
+import numpy as np
 import torch
+from scipy.linalg.blas import ssymv
 from torch import Tensor
+from torch.nn import functional
 
 from swiftwrf.errors import FitError
 from swiftwrf.gp import GaussianProcess, Kernel, held_out_errors, subsample
@@ -26,42 +41,43 @@ DIRECTIVITY_STD_DB = 2.0  # prior of each harmonic of a receiver's antenna and s
 NO_SITE = 1e6  # variance of an empty cell without effect [dB^2]
 DAMPING = 0.7  # of expectation propagation
 WEIGHT_TOLERANCE = 3e-3  # each weight is in (0, 1]
+NEW_WEIGHT_TOLERANCE = WEIGHT_TOLERANCE / 100  # of rows after the fit, so that their order does not matter
+MAX_NEW_ROWS = 256  # beyond, the weights of new rows are fixed and the inverses are computed again
 MAX_VARIANCE_POSITIONS = 200  # measured positions that determine where the field is known
 
 
 @single_thread()  # several threads add up sums in another order
-def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: torch.device) -> dict[str, Tensor]:
-    """Fit one receiver, which a slice of length 1 selects.
+def fit_receiver(number: int, data: RssiTraining, config: RssiConfig, device: torch.device) -> dict[str, Tensor]:
+    """Fit one receiver by its number.
 
     Returns:
-        Tensors by name, with R = 1.
+        Tensors by name.
 
-        - dual, tangent, variance, prior_level, prior_slope and prior_std; see `posterior.RssiPosterior`. If RSSI would rise
-          with the distance, slope and its standard deviation are 0.
-        - covariance (R, 2, 2) of level and slope, given the rows.
-        - held_out (R, n), predictions of the bins of the fit by all other folds [dBm].
+        - dual (n,), tangent (n,), variance (n,), prior_level (), prior_slope () and prior_std (2,); see `RssiPosterior`. If
+          RSSI would rise with the distance, slope and its standard deviation are 0.
+        - covariance (2, 2) of level and slope, given the rows.
+        - held_out (n,), predictions of the bins of the fit by all other folds [dBm].
 
     Raises:
         FitError: A system that cannot be solved, for positions or values beyond any measurement.
     """
-    data = data.columns(some)
-    rssi, limit, loss = data.rssi[:, 0], data.limit[:, 0], data.path_loss
-    prior, std = loss.shared, loss.std[0].clone()
-    distance = log_distance(data.position, data.receiver)
+    rssi, limit, loss, one = data.rssi[:, number], data.limit[:, number], data.path_loss, slice(number, number + 1)
+    level, slope, std = loss.shared.level[number], loss.shared.slope[number], loss.std[number].clone()
+    distance, middle = log_distance(data.position, data.receiver[one])[:, 0], loss.middle[number]
     used = (~rssi.isnan() | ~limit.isnan()).nonzero()[:, 0]
     error, dual, tangent, variance = (torch.zeros_like(rssi) for _ in range(4))
     covariance = std.square().diag()
     if len(used):
         at, weak = data.position[used].to(device), limit[used].isnan().logical_not()
-        feature = regressors(data.position[used], data.receiver, loss.middle, std[None])[0]
-        prior_covariance = float(data.field_db) ** 2 * data.kernel(at, at)
-        noise_db = (data.noise_db / data.count[used, 0].clamp_min(1).sqrt()).to(device)
+        feature = regressors(data.position[used], data.receiver[one], loss.middle[one], std[None])[0]
+        prior_covariance = float(data.field_db[number]) ** 2 * data.kernel(at, at)
+        noise_db = (data.noise_db[number] / data.count[used, number].clamp_min(1).sqrt()).to(device)
         detection = loss.detection
-        censored = None if detection is None or not weak.any() else (detection.width, float(detection.missed))
-        rest = prior_covariance, noise_db, HeadTable(data.rendered.to(device)), config.huber, censored
+        censored = None if detection is None or not weak.any() else (detection.width, float(detection.missed[number]))
+        rest = prior_covariance, noise_db, HeadTable(data.rendered[one].to(device)), config.huber, censored
 
         def solved() -> tuple[Tensor, ...]:
-            value = (rssi.where(limit.isnan(), limit) - prior(distance)[:, 0])[used].to(device)
+            value = (rssi.where(limit.isnan(), limit) - level - slope * distance)[used].to(device)
             return solve(value, weak.to(device), feature.to(device), *rest)
 
         try:
@@ -69,30 +85,22 @@ def fit_receiver(some: slice, data: RssiTraining, config: RssiConfig, device: to
             trend = feature[:, :2].to(device)
             open_ = torch.eye(2).double() - (trend.T @ torch.cholesky_solve(trend, factor)).cpu()
             covariance = std[:, None] * open_ * std  # a slope that is held at 0 is as uncertain as a free one
-            if float(prior.slope + std[1] * (found[0].cpu() @ feature[:, 1])) > 0:
-                level = prior.level + prior.slope * loss.middle
-                prior, std[1], feature[:, 1] = PathLoss(level, torch.zeros(1).double()), 0.0, 0.0
+            if float(slope + std[1] * (found[0].cpu() @ feature[:, 1])) > 0:
+                level, slope = level + slope * middle, torch.zeros_like(slope)
+                std[1], feature[:, 1] = 0.0, 0.0
                 *found, factor = solved()
             precision, fold = torch.cholesky_inverse(factor), data.fold[used]
-            for number in fold.unique():
-                part = (fold == number).nonzero()[:, 0]
+            for part in ((fold == out).nonzero()[:, 0] for out in fold.unique()):
                 error[used[part]] = held_out_errors(precision, found[0][:, None], part.to(device))[:, 0].cpu()
         except torch.linalg.LinAlgError as reason:  # type: ignore[attr-defined]
             raise FitError(
-                f"the RSSI fit of receiver {data.receiver_names[0]!r} broke ({reason}); are its values sane?"
+                f"the RSSI fit of receiver {data.receiver_names[number]!r} broke ({reason}); are its values sane?"
             ) from None
         dual[used], tangent[used], variance[used], target = (x.cpu() for x in found)
         error[used] -= target  # prediction less prior
-    return {
-        "prior_level": prior.level,
-        "prior_slope": prior.slope,
-        "prior_std": std[None],
-        "covariance": covariance[None],
-        "dual": dual[None],
-        "tangent": tangent[None],
-        "variance": variance[None],
-        "held_out": (prior(distance)[:, 0] - error).where(variance > 0, torch.nan)[None],
-    }
+    prior = {"prior_level": level, "prior_slope": slope, "prior_std": std, "covariance": covariance}
+    held_out = (level + slope * distance - error).where(variance > 0, torch.nan)
+    return prior | {"dual": dual, "tangent": tangent, "variance": variance, "held_out": held_out}
 
 
 def coefficient_scale(std: Tensor) -> Tensor:
@@ -204,11 +212,171 @@ def _site(mean: Tensor, variance: Tensor, limit: Tensor, noise: Tensor, censored
     return found.where(concave, 0.0)
 
 
-class Uncertainty:
-    """Variance of what n measured positions leave open: of the latent field, and of the path loss as a trend beside it.
+@dataclass(frozen=True, eq=False)
+class RssiPosterior:
+    """Gaussian processes of R receivers, given n rows.
 
-    The trend is that of universal kriging (N. Cressie, "Statistics for Spatial Data", revised ed., 1993, section 3.4): a
-    level or slope that the rows determine badly counts where the field does not follow from rows nearby.
+    Args:
+        receiver: Positions of the receivers less the centre, (R, 3) [m], nan where unknown.
+        kernel: Kernel of the latent field.
+        table: Heads of the receivers.
+        huber: See `RssiConfig`.
+        anchor: Positions of the rows less the centre, float64 (n, 3) [m].
+        dual: Dual coefficients (R, n); 0 in rows that have no part in the fit.
+        tangent: Slope of each head at the latent field, (R, n); 0 there.
+        variance: Variance of the noise over the weight, (R, n) [dB^2]; 0 in rows that have no part in the fit.
+        measured: 1 where RSSI was measured and not only limited, (R, n).
+        prior_level: Prior path-loss model, RSSI at 1 m, (R,) [dBm].
+        prior_slope: Its slope, (R,) [dB a decade].
+        prior_std: Prior standard deviation of level [dB] and slope [dB a decade], (R, 2).
+        middle: log10 of the distance at which levels are compared, (R,).
+        field_variance: Prior variance of the latent field, (R,) [dB^2].
+        noise_variance: Variance of one measurement, (R,) [dB^2].
+        feature: Scaled regressors (R, n, 10); 0 in rows that have no part in the fit. Defaults to those of the anchors.
+        fit: Posterior of the first n - m rows, whose weights are fixed. Defaults to all rows.
+        later: Of the m rows after those: the effect of their dual coefficients on those of the fit, float32 (R, m, n - m),
+            the errors of the fit, (R, m) [dB], and the covariance of these errors without noise, (R, m, m).
+    """
+
+    receiver: Tensor
+    kernel: Kernel
+    table: HeadTable
+    huber: float
+    anchor: Tensor
+    dual: Tensor
+    tangent: Tensor
+    variance: Tensor
+    measured: Tensor
+    prior_level: Tensor
+    prior_slope: Tensor
+    prior_std: Tensor
+    middle: Tensor
+    field_variance: Tensor
+    noise_variance: Tensor
+    feature: Tensor = None  # type: ignore[assignment]
+    fit: RssiPosterior | None = None
+    later: tuple[Tensor, Tensor, Tensor] | None = None
+
+    def __post_init__(self) -> None:
+        if self.feature is None:
+            feature = regressors(self.anchor, self.receiver, self.middle, self.prior_std)
+            object.__setattr__(self, "feature", feature * (self.variance > 0)[..., None])
+
+    @staticmethod
+    def shapes(n_receivers: int, n_rows: int) -> dict[str, tuple[int, ...]]:
+        """Return the shape of every tensor that a file contains."""
+        found: dict[str, tuple[int, ...]] = {"anchor": (n_rows, 3), "prior_std": (n_receivers, 2)}
+        found |= dict.fromkeys(("dual", "tangent", "variance", "measured"), (n_receivers, n_rows))
+        per_receiver = ("prior_level", "prior_slope", "middle", "field_variance", "noise_variance")
+        return found | dict.fromkeys(per_receiver, (n_receivers,))
+
+    @cached_property
+    def _inverses(self) -> list[Any]:
+        """Inverse covariance of the rows of each receiver, float32 (n, n)."""
+        field, found = self.kernel(self.anchor, self.anchor), []
+        for r, feature in enumerate(self.feature):
+            rows = self.tangent[r], feature
+            whole = covariance_of(self.field_variance[r] * field, rows, rows)
+            whole.diagonal().add_(self.variance[r].where(self.variance[r] > 0, 1.0))
+            inverse = torch.cholesky_inverse(torch.linalg.cholesky(whole)).float()
+            found.append(np.asfortranarray(inverse.numpy()))  # as BLAS reads it
+        return found
+
+    @property
+    def linear(self) -> Tensor:
+        """Change of level at 1 m, slope and directivity from the prior path-loss model, float64 (R, 10) [dB]."""
+        change = self._linear * coefficient_scale(self.prior_std)
+        return torch.cat([change[:, :1] - change[:, 1:2] * self.middle[:, None], change[:, 1:]], dim=1)
+
+    @cached_property
+    def _linear(self) -> Tensor:
+        """Coefficients of the scaled regressors, (R, 10)."""
+        return (self.feature.mT @ self.dual[..., None])[..., 0]
+
+    @property
+    def coefficient(self) -> Tensor:
+        """Coefficients of the kernel to the rows whose sum is the latent field, float64 (n, R) [dB]."""
+        return (self.field_variance[:, None] * self.tangent * self.dual).T
+
+    @property
+    def rssi(self) -> Tensor:
+        """RSSI of the rows, from fitted values and residuals, float64 (n, R) [dBm]; nan where not detected."""
+        fitted = self._at(self.anchor, self.kernel(self.anchor, self.anchor))[0]
+        return (fitted + self.variance * self.dual).where(self.measured > 0, torch.nan).T
+
+    def _at(self, position: Tensor, cross: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return RSSI (R, m) [dBm], slope of the head (R, m) and regressors (R, m, 10) at positions (m, 3) [m].
+
+        `cross` are the values of the kernel between them and the rows, (m, n).
+        """
+        head, tangent = self.table(cross @ self.coefficient)
+        feature = regressors(position, self.receiver, self.middle, self.prior_std)
+        prior = PathLoss(self.prior_level, self.prior_slope)(log_distance(position, self.receiver))
+        return (prior + head).T + (feature @ self._linear[..., None])[..., 0], tangent.T, feature
+
+    def updated(self, position: Tensor, rssi: Tensor) -> RssiPosterior:
+        """Return the posterior with more rows, RSSI (m, R) [dBm], nan where not detected, at positions (m, 3) [m]."""
+        n_receivers, n_new = len(self.receiver), len(position)
+        fit, later = self.fit, self.later
+        if fit is None or later is None or later[1].shape[1] + n_new > MAX_NEW_ROWS:
+            fit = self if fit is None else replace(self, fit=None, later=None)
+            none = self.dual.new_zeros(n_receivers, 0)
+            later = torch.zeros(n_receivers, 0, len(fit.anchor)), none, none[..., None].expand(-1, 0, 0)
+        detected, cross = ~rssi.isnan().T, self.kernel(position, fit.anchor)
+        mean, tangent, feature = fit._at(position, cross)
+        new = tangent * detected, feature * detected[..., None]
+        # condition on the rows of the fit
+        field = fit.field_variance[:, None, None]
+        own = covariance_of(field * cross, new, (fit.tangent, fit.feature))
+        # half of each inverse is read, because its time in memory is most of the time of a row
+        pairs = zip(fit._inverses, own.float().numpy(), strict=True)
+        influence = torch.from_numpy(np.stack([np.stack([ssymv(1.0, p, x, lower=1) for x in c]) for p, c in pairs]))
+        influence = torch.cat([later[0], influence], dim=1)
+        error = torch.cat([later[1], (rssi.T - mean).where(detected, 0.0)], dim=1)
+        noise = fit.noise_variance[:, None] * detected
+        rows: dict[str, Any] = {
+            "anchor": torch.cat([self.anchor, position]),
+            "tangent": torch.cat([self.tangent, new[0]], dim=1),
+            "feature": torch.cat([self.feature, new[1]], dim=1),
+            "variance": torch.cat([self.variance, noise], dim=1),
+            "measured": torch.cat([self.measured, detected.to(self.measured)], dim=1),
+        }
+        n = len(fit.anchor)
+        prior = self.kernel(position, rows["anchor"][n:])
+        border = covariance_of(field * prior, new, (rows["tangent"][:, n:], rows["feature"][:, n:]))
+        border = border - (own.float() @ influence.mT).double()
+        covariance = functional.pad(later[2], (0, n_new, 0, n_new))
+        covariance[:, -n_new:], covariance[..., -n_new:] = border, border.mT
+        dual, rows["variance"][:, n:] = self._robust(covariance, error, rows["variance"][:, n:])
+        of_fit = fit.dual - torch.einsum("rmn,rm->rn", influence, dual.float()).double()
+        rows["dual"] = torch.cat([of_fit, dual], dim=1)
+        return replace(self, **rows, fit=fit, later=(influence, error, covariance))
+
+    def _robust(self, covariance: Tensor, error: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
+        """Return dual coefficients and noise over weight by iteratively reweighted least squares, from one to start with.
+
+        Errors, variances and results are (R, m), the covariance of the errors without noise is (R, m, m).
+        """
+        noise = self.noise_variance[:, None].where(variance > 0, 1.0)
+        weight = (noise / variance).where(variance > 0, 1.0)
+        for _ in range(100):
+            used = noise / weight
+            dual = torch.linalg.solve(covariance + torch.diag_embed(used), error)
+            previous, weight = weight, huber_weight(used * dual, noise.sqrt(), self.huber)
+            if bool(((weight - previous).abs() < NEW_WEIGHT_TOLERANCE).all()):
+                break
+        return dual, used.where(variance > 0, 0.0)
+
+
+def uncertainty(
+    kernel: Kernel, known: Tensor, receiver: Tensor, middle: Tensor, covariance: Tensor
+) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
+    """Return the function from positions to the variance that n measured positions leave open.
+
+    The variance is that of the latent field, (m,), relative to that far from all rows, and of the path loss as a trend
+    beside it, (m, R) [dB^2]. The trend is that of universal kriging (N. Cressie, "Statistics for Spatial Data", revised ed.,
+    1993, section 3.4): a level or slope that the rows determine badly counts where the field does not follow from rows
+    nearby.
 
     Args:
         kernel: Kernel of the latent field.
@@ -218,22 +386,20 @@ class Uncertainty:
         covariance: Covariance of level and slope of each receiver, (R, 2, 2).
     """
 
-    def __init__(self, kernel: Kernel, known: Tensor, receiver: Tensor, middle: Tensor, covariance: Tensor) -> None:
-        (known,) = subsample(known, rows=MAX_VARIANCE_POSITIONS)
-        self._receiver, self._middle, self._covariance = receiver, middle, covariance
-        self._process = GaussianProcess.regress(kernel, known, self._trend(known))
-
-    def _trend(self, position: Tensor) -> Tensor:
-        """Return the regressors of level, and of the slope of each receiver, (n, 1 + R)."""
-        apart = log_distance(position, self._receiver) - self._middle
+    def trend(position: Tensor) -> Tensor:  # regressors of level, and of the slope of each receiver, (n, 1 + R)
+        apart = log_distance(position, receiver) - middle
         return torch.cat([torch.ones_like(apart[:, :1]), apart], dim=1)
 
-    def __call__(self, position: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the variance of the field (m,), relative to that far from all rows, and of the trend, (m, R) [dB^2]."""
-        level, slope = (self._trend(position) - self._process.mean(position)).split([1, len(self._middle)], dim=1)
-        of_level, both, of_slope = self._covariance[:, 0, 0], self._covariance[:, 0, 1], self._covariance[:, 1, 1]
-        trend = of_level * level.square() + 2 * both * level * slope + of_slope * slope.square()
-        return self._process.variance(position), trend.clamp_min(0)
+    (known,) = subsample(known, rows=MAX_VARIANCE_POSITIONS)
+    process = GaussianProcess.regress(kernel, known, trend(known))
+    of_level, both, of_slope = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+
+    def variance(position: Tensor) -> tuple[Tensor, Tensor]:
+        level, slope = (trend(position) - process.mean(position)).split([1, len(middle)], dim=1)
+        of_trend = of_level * level.square() + 2 * both * level * slope + of_slope * slope.square()
+        return process.variance(position), of_trend.clamp_min(0)
+
+    return variance
 
 
 def held_out_std(
@@ -241,13 +407,12 @@ def held_out_std(
 ) -> Tensor:
     """Return the standard deviations (n, R) [dB] that models without a bin's fold predict, before they are calibrated.
 
-    `prior_db` are the standard deviations of latent field and noise, each (R,) [dB]; the rest is as in `Uncertainty`.
+    `prior_db` are the standard deviations of latent field and noise, each (R,) [dB]; the rest is as in `uncertainty`.
     """
     (field_db, noise_db), std = prior_db, torch.empty_like(bins.rssi)
     for number in bins.fold.unique():
         out = bins.fold == number
-        variance, trend = Uncertainty(kernel, bins.position[~out], bins.receiver, middle, covariance)(
-            bins.position[out]
-        )
+        left = uncertainty(kernel, bins.position[~out], bins.receiver, middle, covariance)
+        variance, trend = left(bins.position[out])
         std[out] = (noise_db.square() + field_db.square() * variance[:, None] + trend).sqrt()
     return std

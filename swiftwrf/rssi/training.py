@@ -78,19 +78,6 @@ class RssiTraining(Bins):
     baselines: PathLoss
     baseline_held_out: Tensor
 
-    def columns(self, number: slice) -> RssiTraining:
-        """Return the training data of some receivers."""
-        names = ("rssi", "count", "shift", "limit", "field_db", "noise_db", "baseline_held_out")
-        return replace(
-            self,
-            receiver_names=self.receiver_names[number],
-            receiver=self.receiver[number],
-            rendered=self.rendered[number],
-            path_loss=self.path_loss.columns(number),
-            baselines=PathLoss(*(value[:, number] for value in self.baselines)),
-            **{name: getattr(self, name)[..., number] for name in names},
-        )
-
 
 @single_thread()
 def prepare(train: Rssi, pool: Rssi, config: RssiConfig, shift: Tensor, curve: Detection | None) -> RssiTraining:

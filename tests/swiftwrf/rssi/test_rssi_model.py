@@ -17,15 +17,14 @@ from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.mixing import mixing_weights
 from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, harmonics, log_distance
-from swiftwrf.rssi.posterior import RssiPosterior
-from swiftwrf.rssi.regression import DIRECTIVITY_STD_DB, fit_receiver
+from swiftwrf.rssi.regression import DIRECTIVITY_STD_DB, RssiPosterior, fit_receiver
 from swiftwrf.rssi.training import RssiTraining, bin_locations
 from swiftwrf.runtime.steps import Memo
 from swiftwrf.runtime.threads import threads_kept
 
 KERNEL = Kernel(4.0, 1.0, matern12_weight=0.6, noise=1.0)
 FIELD_DB, NOISE_DB, PATH_LOSS_STD_DB = 3.0, 2.0, 30.0
-CPU, FIRST = torch.device("cpu"), slice(0, 1)
+CPU, FIRST = torch.device("cpu"), 0
 
 
 def test_errors_by_the_number_of_training_rows(monkeypatch, tmp_path):
@@ -109,7 +108,9 @@ def training_of(data, n_primitives=50):
 
 def posterior(training, found):
     """The posterior of one receiver's fit."""
-    tensors = {name: found[name] for name in ("dual", "tangent", "variance", "prior_level", "prior_slope", "prior_std")}
+    tensors = {
+        name: found[name][None] for name in ("dual", "tangent", "variance", "prior_level", "prior_slope", "prior_std")
+    }
     variances = {"field_variance": training.field_db.square(), "noise_variance": training.noise_db.square()}
     measured, table = (~training.rssi.isnan()).T.double(), HeadTable(training.rendered)
     rest = {"anchor": training.position, "middle": training.path_loss.middle, "measured": measured, **variances}
@@ -166,7 +167,7 @@ def test_held_out_is_a_fit_without_the_fold():
     """The formula for held-out rows against fits that never see them; without outliers, so that no weight depends on them,
     and without a head, which the formula takes along its tangent."""
     training, gentle = training_of(with_field(n=60).columns([1]), n_primitives=0), RssiConfig(huber=1e6)
-    whole = fit_receiver(FIRST, training, gentle, CPU)["held_out"][0]
+    whole = fit_receiver(FIRST, training, gentle, CPU)["held_out"]
     for number in range(5):
         out = training.fold == number
         rest = replace(training, rssi=torch.where(out[:, None], torch.nan, training.rssi))
