@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.data.store import Store
-from swiftwrf.gp.process import N_NEIGHBOURS, Kernel, candidates, held_out_errors, leave_folds_out, local_weights
+from swiftwrf.gp.process import N_NEIGHBOURS, Kernel, candidates, held_out_errors, local_weights
 from swiftwrf.positions import Neighbours, distance
 from swiftwrf.runtime.threads import single_thread
 
@@ -104,15 +104,10 @@ def choose_rank(position: Tensor, spectrum: Tensor | Store, fold: Tensor, kernel
         True
     """
     position, spectrum, fold = subsample(position, spectrum, fold)
-    variance, vector = torch.linalg.eigh(inner_products(spectrum))
-    variance = variance.flip(0).clamp_min(0)
-    component = vector.flip(1) * variance.sqrt()  # (n, n), one column a component
-    error = torch.zeros((), dtype=torch.float64)
-    for out, kept, weight, _ in leave_folds_out(kernel, position, fold):
-        error += (component[out] - weight @ component[kept]).square().sum()
-    left_out = variance.flip(0).cumsum(0).flip(0)  # by 0, 1, ... components
-    enough = left_out <= 5e-4 * error  # negligible beside it
-    return int((~enough).sum())
+    error = _held_out_errors(position, spectrum, fold)(kernel).sum()
+    variance = torch.linalg.eigvalsh(inner_products(spectrum)).clamp_min(0)  # ascending
+    left_out = variance.cumsum(0).flip(0)  # by 0, 1, ... components
+    return int((left_out > 5e-4 * error).sum())  # the rest is negligible beside it
 
 
 @single_thread()

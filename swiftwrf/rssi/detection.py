@@ -189,22 +189,6 @@ class DetectionField:
         """Return the field with more rows, detections bool (m, R) at positions (m, 3) [m]."""
         return replace(self, process=self.process.updated(position, detected.double() - self.mean))
 
-    def state(self) -> tuple[dict[str, Tensor], Header]:
-        """Return the tensors, without the positions, and plain values of the field by their names in files."""
-        header = self.process.state("share.")[1]
-        plain = {"limit": self.limit, "weight": self.weight.tolist()}
-        tensors = {"share.coefficient": self.process.coefficient, "share.mean": self.mean}
-        return tensors, header | {"share": plain}
-
-    @classmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header, position: Tensor) -> Self:
-        """Return the field of a state, given its positions (n, 3)."""
-        process = GaussianProcess.from_state(
-            tensors | {"share.position": position}, header, torch.float64, prefix="share."
-        )
-        weight = to_tensor("share.weight", header["share"]["weight"], torch.float64, (3,))
-        return cls(process, tensors["share.mean"].double(), float(header["share"]["limit"]), weight)
-
 
 def empty_given(z: Tensor, missed: Tensor) -> tuple[Tensor, Tensor]:
     """Return how an empty cell changes a power that is z standard deviations below the limit.

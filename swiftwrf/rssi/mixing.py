@@ -50,7 +50,7 @@ def mixing_weights(held_out: Tensor, measured: Tensor, shrinkage: float = 0.05) 
             cross-validation.
 
     Returns:
-        Non-negative weights of sum 1, float64 (predictors,).
+        Non-negative weights of sum 1, float64 (predictors,); those of the first predictor alone without a comparable row.
 
     Example:
         >>> held_out = torch.tensor([[[1.0], [2.0], [3.0]], [[9.0], [9.0], [9.0]]])
@@ -58,6 +58,8 @@ def mixing_weights(held_out: Tensor, measured: Tensor, shrinkage: float = 0.05) 
         tensor([1., 0.], dtype=torch.float64)
     """
     usable = comparable(held_out, measured)
+    if not bool(usable.any()):
+        return torch.eye(len(held_out), dtype=torch.float64)[0]
     predicted, target = subsample(held_out[:, usable].T.double(), measured[usable].double(), rows=MAX_PAIRS)
     error = (predicted - target[:, None]).numpy()  # the error of a mean with weights of sum 1 is the mean of the errors
     n = error.shape[1]

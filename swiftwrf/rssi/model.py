@@ -18,7 +18,7 @@ from torch import Tensor
 
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.gp import Kernel, subsample
+from swiftwrf.gp import GaussianProcess, Kernel, subsample
 from swiftwrf.models.base import CPU
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Axes
@@ -27,18 +27,16 @@ from swiftwrf.rssi.base import Map, RssiConfig, SavedRssiPredictor, columns_of, 
 from swiftwrf.rssi.detection import Detection, DetectionField
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
 from swiftwrf.rssi.maps import RssiMap
-from swiftwrf.rssi.mixing import check_comparable, comparable, interval_scale, mixing_weights, rounding_std
+from swiftwrf.rssi.mixing import check_comparable, interval_scale, mixing_weights, rounding_std
 from swiftwrf.rssi.path_loss import harmonics, log_distance
 from swiftwrf.rssi.regression import RssiPosterior, fit_receiver, held_out_std, uncertainty
 from swiftwrf.rssi.training import MAX_KERNEL_RECEIVERS, prepare
-from swiftwrf.runtime import checkpoint as files
-from swiftwrf.runtime.checkpoint import Header
+from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import parallel_map, single_thread
 from swiftwrf.runtime.validation import checked
 
 RECEIVERS_AT_ONCE = 64  # between two steps of the progress bar; starting threads costs milliseconds
-FIELD_ALONE = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)  # mixing weights
 
 
 class RssiModel(SavedRssiPredictor):
@@ -120,7 +118,7 @@ class RssiModel(SavedRssiPredictor):
         (often,) = subsample(often, rows=MAX_KERNEL_RECEIVERS)
         # receivers that determine the mixing weights are fitted, too: predictions do not depend on the receivers of `train`
         every = torch.cat([own, often[~torch.isin(often, own)]])
-        training = prepare(pool.columns(every.tolist()), pool, self.config, shift, curve)
+        training = prepare(pool, every, self.config, shift, curve)
         task = partial(fit_receiver, data=training, config=self.config, device=device)
         with progress_bar(progress) as bar:
             fits = (parallel or _in_threads)(task, range(len(every)))
@@ -139,8 +137,7 @@ class RssiModel(SavedRssiPredictor):
         predictors, std = predictors[:, training.bin_of_row], std[training.bin_of_row]
         # one set of weights for all receivers: the few folds determine none for each of them
         columns = list(map(every.tolist().index, often.tolist()))
-        some, rssi = predictors[..., columns], pool.rssi_dbm[:, often]
-        weight = mixing_weights(some, rssi) if bool(comparable(some, rssi).any()) else FIELD_ALONE
+        weight = mixing_weights(predictors[..., columns], pool.rssi_dbm[:, often])
         mine = slice(len(own))
         found |= {"middle": loss.middle, "measured": measured.T.double()}
         found |= {"field_variance": prior_db[0].square(), "noise_variance": prior_db[1].square()}
@@ -310,15 +307,11 @@ class RssiModel(SavedRssiPredictor):
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         self.check_fitted()
-        n_receivers, n_anchors = len(self.receiver_names), len(self.anchor)
-        tensors = {name: getattr(self, name) for name in _shapes(n_receivers)}
-        of_fit = RssiPosterior.shapes(n_receivers, n_anchors)
-        tensors |= {f"fit.{name}": getattr(self._posterior, name) for name in of_fit}
-        header = self._header() | {"kernel": asdict(self.kernel), "n_primitives": self.n_primitives}
-        if self.detection_field is not None:
-            of_field = self.detection_field.state()
-            tensors, header = tensors | of_field[0], header | of_field[1]
-        return tensors, header
+        tensors = {name: getattr(self, name) for name in _shapes(0)}
+        tensors |= {f"fit.{name}": getattr(self._posterior, name) for name in RssiPosterior.shapes(0, 0)}
+        if (field := self.detection_field) is not None:  # with kernel and positions of the fit
+            tensors |= {"share": field.process.coefficient, "share_mean": field.mean, "share_weight": field.weight}
+        return tensors, self._header() | {"kernel": asdict(self.kernel), "n_primitives": self.n_primitives}
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
@@ -326,12 +319,15 @@ class RssiModel(SavedRssiPredictor):
         model.kernel, model.n_primitives = Kernel(**header["kernel"]), int(header["n_primitives"])
         n_receivers, n_anchors, model.detection_field = len(model.receiver_names), len(tensors["fit.anchor"]), None
         own, of_fit = _shapes(n_receivers), RssiPosterior.shapes(n_receivers, n_anchors)
-        files.expect(tensors, own | {f"fit.{name}": shape for name, shape in of_fit.items()})
+        expect(tensors, own | {f"fit.{name}": shape for name, shape in of_fit.items()})
         for name in own:
             setattr(model, name, tensors[name])
-        if "share" in header:
-            files.expect(tensors, {"share.mean": (n_receivers,), "share.coefficient": (n_anchors, n_receivers)})
-            model.detection_field = DetectionField.from_state(tensors, header, tensors["fit.anchor"])
+        if "share" in tensors and model.detection is not None:
+            shapes = {"share": (n_anchors, n_receivers), "share_mean": (n_receivers,), "share_weight": (3,)}
+            expect(tensors, shapes)
+            coefficient, mean, weight = (tensors[name].double() for name in shapes)
+            process = GaussianProcess(model.kernel, tensors["fit.anchor"], coefficient)
+            model.detection_field = DetectionField(process, mean, model.detection.limit, weight)
         model._take({name: tensors[f"fit.{name}"].double() for name in of_fit})
         return model
 

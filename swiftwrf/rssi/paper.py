@@ -22,7 +22,7 @@ from swiftwrf.models.base import CPU
 from swiftwrf.rssi.base import Map, RssiConfig, often_detected
 from swiftwrf.rssi.head import Head, mean_magnitude, render
 from swiftwrf.rssi.mixing import check_comparable
-from swiftwrf.rssi.model import FIELD_ALONE, RssiModel
+from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.regression import held_out_std
 from swiftwrf.rssi.training import Bins, bin_locations, binned, choose_residual_kernel, prior_std
 from swiftwrf.runtime.progress import progress_bar
@@ -99,11 +99,8 @@ class RssiPaperModel(RssiModel):
         check_comparable(predicted[None], train.rssi_dbm)
         std = held_out_std(bins, self.kernel, prior_db, zero, covariance)[bins.bin_of_row]
         self._calibrate(train.rssi_dbm, predicted, std, prior_db)
-        self.n_primitives, self.mixing_weight, self.baseline = (
-            config.n_primitives,
-            FIELD_ALONE,
-            torch.stack([zero, zero]),
-        )
+        self.n_primitives, self.mixing_weight = config.n_primitives, torch.eye(4, dtype=torch.float64)[0]
+        self.baseline = torch.zeros(2, n_receivers).double()
         self.centre, self.rendered, self.covariance, self.detection_field = bins.centre, rendered, covariance, None
         dual = torch.linalg.solve_triangular(root.T, white.T.double() * prior_db[0], upper=True).T
         state = {"anchor": bins.position, "dual": dual, "prior_std": covariance[..., 0].clone()}

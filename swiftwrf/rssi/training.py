@@ -11,7 +11,7 @@ from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
 from swiftwrf.gp import Kernel, candidates, held_out_errors, subsample
 from swiftwrf.positions import cells
-from swiftwrf.rssi.base import RssiConfig, columns_of, often_detected
+from swiftwrf.rssi.base import RssiConfig, often_detected
 from swiftwrf.rssi.detection import Detection, empty_given
 from swiftwrf.rssi.head import Head, render
 from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_losses, log_distance
@@ -80,11 +80,14 @@ class RssiTraining(Bins):
 
 
 @single_thread()
-def prepare(train: Rssi, pool: Rssi, config: RssiConfig, shift: Tensor, curve: Detection | None) -> RssiTraining:
-    """Average the rows by location bin, fit the path-loss models and choose the kernel; see `RssiPredictor._fit`."""
-    bins = binned(train, config)
+def prepare(pool: Rssi, own: Tensor, config: RssiConfig, shift: Tensor, curve: Detection | None) -> RssiTraining:
+    """Average the rows by location bin, fit the path-loss models and choose the kernel; see `RssiPredictor._fit`.
+
+    `own` are the columns of the receivers that are fitted.
+    """
+    bins = binned(pool.columns(own.tolist()), config)
     rssi, fold, every = bins.rssi, bins.fold, bin_locations(pool, config.max_locations)[1]
-    receiver, own = pool.receiver_position.double() - bins.centre, columns_of(train.receiver_names, pool)
+    receiver = pool.receiver_position.double() - bins.centre
     shift = _bin_means(shift, bins.bin_of_row, len(fold))
 
     def fit(rows: Tensor, detection: Detection | None) -> PathLosses:
@@ -105,7 +108,7 @@ def prepare(train: Rssi, pool: Rssi, config: RssiConfig, shift: Tensor, curve: D
     for baseline, rows in zip(partial, kept[1:], strict=True):
         held_out[:, ~rows] = baseline(distance[~rows])
     residual = (every - everything.own(log_distance(bins.position, receiver)))[:, often_detected(pool)]
-    kernel, helps = choose_residual_kernel(bins.position, residual, fold, train.floors is not None)
+    kernel, helps = choose_residual_kernel(bins.position, residual, fold, pool.floors is not None)
     n_primitives = config.n_primitives if helps else 0
     loss = everything.columns(own)
     field_db, noise_db = prior_std(loss.variance, kernel if n_primitives else None)
