@@ -216,7 +216,7 @@ class GaussianProcess:
         if self.is_exact:
             mean: Tensor = self._cross(position).to(self.coefficient) @ self.coefficient
             return mean
-        return self.local(position)[0]
+        return self.condition(position)[0]
 
     def weights(self, position: Tensor) -> tuple[Tensor, Tensor]:
         """Return the posterior mean at positions (m, 3) as a linear function of the values.
@@ -281,8 +281,10 @@ class GaussianProcess:
     def _neighbours(self) -> Neighbours:
         return Neighbours(self.known)
 
-    def local(self, position: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean (m, K) and variance (m,) at positions from the nearest known ones, whatever their number."""
+    def condition(self, position: Tensor) -> tuple[Tensor, Tensor]:
+        """Return posterior mean (m, K) and variance (m,) at positions (m, 3), as `mean` and `variance`, by one search."""
+        if self.is_exact:
+            return self.mean(position), self.variance(position)
         number, weight, variance = self._local(position)
         return torch.einsum("mk,mkc->mc", weight, self.coefficient[number].double()), variance
 

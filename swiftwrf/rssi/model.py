@@ -68,8 +68,6 @@ class RssiModel(SavedRssiPredictor):
 
     kernel: Kernel
     """kernel of the latent field, lengths in [m]"""
-    n_primitives: int
-    """primitives a receiver; 0 if there is no field"""
     mixing_weight: Tensor
     """weights (4,) of the field and the three simpler predictors at all receivers, contained in the tensors below"""
     centre: Tensor
@@ -78,10 +76,8 @@ class RssiModel(SavedRssiPredictor):
     """RSSI at 1 m, float64 (R,) [dBm]"""
     slope: Tensor
     """float64 (R,) [dB a decade]"""
-    middle: Tensor
-    """log10 of the distance at which levels are compared, float64 (R,)"""
     covariance: Tensor
-    """calibrated covariance of level at that distance and slope, float64 (R, 2, 2)"""
+    """calibrated covariance of the posterior's level at its middle distance and slope, float64 (R, 2, 2)"""
     detection_field: DetectionField | None
     """probability of a detection; None if every cell has a value, or if empty cells are ignored"""
     directivity: Tensor
@@ -149,7 +145,7 @@ class RssiModel(SavedRssiPredictor):
         # only two predictors have the receiver's path loss
         self.covariance = (weight[:2].sum() * scale).square()[:, None, None] * found.pop("covariance")
         self.mixing_weight, self.kernel, self.centre = weight, training.kernel, training.centre
-        self.n_primitives, self.rendered = training.n_primitives, training.rendered[mine]
+        self.rendered = training.rendered[mine]
         self.baseline = torch.stack([weight[1:] @ values[:, mine] for values in training.baselines])
         self.detection, self.detection_field = loss.detection and loss.detection.columns(mine), None
         if self.detection is not None:
@@ -175,14 +171,19 @@ class RssiModel(SavedRssiPredictor):
 
     def _set_posterior(self, posterior: RssiPosterior) -> None:
         """Mix a posterior with the simpler predictors, and compute what all predictions share."""
-        self._posterior, self.middle, weight = posterior, posterior.middle, self.mixing_weight[0]
+        self._posterior, weight = posterior, self.mixing_weight[0]
         linear = posterior.linear.T  # (10, R)
         self.level = self.baseline[0] + weight * (posterior.prior_level + linear[0])
         self.slope = self.baseline[1] + weight * (posterior.prior_slope + linear[1])
         self.directivity = (weight * linear[2:].T).float()
         self.anchor, self.coefficient = posterior.anchor.float(), posterior.coefficient.float().contiguous()
-        known, receiver = posterior.anchor, posterior.receiver
-        self._uncertainty = uncertainty(self.kernel, known, receiver, self.middle, self.covariance)
+        known = posterior.anchor, posterior.receiver, posterior.middle
+        self._uncertainty = uncertainty(self.kernel, *known, self.covariance)
+
+    @property
+    def n_primitives(self) -> int:
+        """Number of primitives a receiver; 0 if there is no field."""
+        return self.config.n_primitives if bool(self.rendered.any()) else 0
 
     @property
     def receiver(self) -> Tensor:
@@ -311,13 +312,13 @@ class RssiModel(SavedRssiPredictor):
         tensors |= {f"fit.{name}": getattr(self._posterior, name) for name in RssiPosterior.shapes(0, 0)}
         if (field := self.detection_field) is not None:  # with kernel and positions of the fit
             tensors |= {"share": field.process.coefficient, "share_mean": field.mean, "share_weight": field.weight}
-        return tensors, self._header() | {"kernel": asdict(self.kernel), "n_primitives": self.n_primitives}
+        return tensors, self._header() | {"kernel": asdict(self.kernel)}
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
         model = cls._of_header(header)
-        model.kernel, model.n_primitives = Kernel(**header["kernel"]), int(header["n_primitives"])
-        n_receivers, n_anchors, model.detection_field = len(model.receiver_names), len(tensors["fit.anchor"]), None
+        model.kernel, model.detection_field = Kernel(**header["kernel"]), None
+        n_receivers, n_anchors = len(model.receiver_names), len(tensors["fit.anchor"])
         own, of_fit = _shapes(n_receivers), RssiPosterior.shapes(n_receivers, n_anchors)
         expect(tensors, own | {f"fit.{name}": shape for name, shape in of_fit.items()})
         for name in own:

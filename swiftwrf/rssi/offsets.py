@@ -20,6 +20,7 @@ from swiftwrf.gp import Kernel
 from swiftwrf.rssi.path_loss import fit_path_losses, log_distance
 from swiftwrf.runtime.threads import single_thread
 
+VAGUE = 1e6  # prior variance of a coefficient relative to the field
 MAX_ROWS = 300  # of a receiver, from which offsets are estimated; the cost grows with their cube
 
 
@@ -144,10 +145,9 @@ def estimate_offsets(train: Rssi, reference: str | None = None) -> Offsets:
         rows = rows[torch.randperm(len(rows), generator=generator)[:MAX_ROWS]]  # evenly spaced rows may be of one group
         if not len(rows):
             continue
-        precision = torch.linalg.inv(kernel.covariance(position[rows]))
         free = torch.stack([torch.ones_like(apart[rows, r]), apart[rows, r]], dim=1)
-        weighted = precision @ free  # level and slope over log10 distance are fitted with the offsets
-        weight = precision - weighted @ torch.linalg.pinv(free.T @ weighted, hermitian=True) @ weighted.T
+        # level and slope over log10 distance are fitted with the offsets, by a linear kernel
+        weight = torch.linalg.inv(kernel.covariance(position[rows]) + VAGUE * free @ free.T)
         normal += member[rows].T @ weight @ member[rows]
         right += member[rows].T @ weight @ rssi[rows]
         total += float(rssi[rows] @ weight @ rssi[rows])

@@ -286,7 +286,7 @@ class PairModel(PairPredictor, SavedRssiPredictor):
 
     @single_thread()
     def _at_pairs(self, pair: Tensor) -> tuple[Tensor, Tensor]:
-        field, variance = self._process.local(scaled(pair, self.ratio))
+        field, variance = self._process.condition(scaled(pair, self.ratio))
         return self.path_loss(pair) + field[:, 0], self.scale_db * (variance + self.kernel.noise).sqrt()
 
     def state(self) -> tuple[dict[str, Tensor], Header]:

@@ -99,8 +99,7 @@ class RssiPaperModel(RssiModel):
         check_comparable(predicted[None], train.rssi_dbm)
         std = held_out_std(bins, self.kernel, prior_db, zero, covariance)[bins.bin_of_row]
         self._calibrate(train.rssi_dbm, predicted, std, prior_db)
-        self.n_primitives, self.mixing_weight = config.n_primitives, torch.eye(4, dtype=torch.float64)[0]
-        self.baseline = torch.zeros(2, n_receivers).double()
+        self.mixing_weight, self.baseline = torch.eye(4).double()[0], torch.zeros(2, n_receivers).double()
         self.centre, self.rendered, self.covariance, self.detection_field = bins.centre, rendered, covariance, None
         dual = torch.linalg.solve_triangular(root.T, white.T.double() * prior_db[0], upper=True).T
         state = {"anchor": bins.position, "dual": dual, "prior_std": covariance[..., 0].clone()}

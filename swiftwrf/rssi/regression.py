@@ -395,9 +395,10 @@ def uncertainty(
     of_level, both, of_slope = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
 
     def variance(position: Tensor) -> tuple[Tensor, Tensor]:
-        level, slope = (trend(position) - process.mean(position)).split([1, len(middle)], dim=1)
+        mean, of_field = process.condition(position)
+        level, slope = (trend(position) - mean).split([1, len(middle)], dim=1)
         of_trend = of_level * level.square() + 2 * both * level * slope + of_slope * slope.square()
-        return process.variance(position), of_trend.clamp_min(0)
+        return of_field, of_trend.clamp_min(0)
 
     return variance
 

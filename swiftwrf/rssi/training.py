@@ -54,7 +54,6 @@ class RssiTraining(Bins):
 
     Args:
         kernel: Kernel of the latent field, lengths in [m].
-        n_primitives: Number of primitives a receiver.
         rendered: Fields of each receiver's head, (R, 2, 2, directions).
         path_loss: Path loss of the receivers, the prior of the fit.
         shift: Received power less RSSI, by floors and offsets that were removed, (n, R) [dB].
@@ -68,7 +67,6 @@ class RssiTraining(Bins):
     """
 
     kernel: Kernel
-    n_primitives: int
     rendered: Tensor
     path_loss: PathLosses
     shift: Tensor
@@ -116,7 +114,6 @@ def prepare(pool: Rssi, own: Tensor, config: RssiConfig, shift: Tensor, curve: D
     return RssiTraining(
         **vars(bins),
         kernel=kernel,
-        n_primitives=n_primitives,
         rendered=render(heads),
         path_loss=loss,
         shift=shift[:, own],

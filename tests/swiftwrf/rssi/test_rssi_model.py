@@ -86,7 +86,6 @@ def training_of(data, n_primitives=50):
         rssi=data.rssi_dbm,
         count=torch.ones(n, r, dtype=torch.float64),
         kernel=KERNEL,
-        n_primitives=n_primitives,
         rendered=render([Head(name, n_primitives, 0).requires_grad_(False) for name in data.receiver_names]),
         path_loss=PathLosses(
             own=path_loss,
