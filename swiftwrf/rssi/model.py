@@ -8,7 +8,7 @@ directivity_r a few harmonics of the direction from the receiver, and w_r the mi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from functools import partial
 from typing import Any, ClassVar, Self
@@ -77,7 +77,7 @@ class RssiModel(SavedRssiPredictor):
     slope: Tensor
     """float64 (R,) [dB a decade]"""
     covariance: Tensor
-    """calibrated covariance of the posterior's level at its middle distance and slope, float64 (R, 2, 2)"""
+    """calibrated covariance of level and slope, float64 (R, 2, 2)"""
     detection_field: DetectionField | None
     """probability of a detection; None if every cell has a value, or if empty cells are ignored"""
     directivity: Tensor
@@ -93,7 +93,7 @@ class RssiModel(SavedRssiPredictor):
     noise_db: Tensor
     """calibrated standard deviation of a measurement about the field, (R,) [dB]"""
     baseline: Tensor
-    """RSSI at 1 m [dBm] and slope [dB a decade] of the simpler predictors by their mixing weights, float64 (2, R)"""
+    """RSSI at 1 m [dBm] and slope [dB a decade] of the simpler predictors by their mixing weights, float64 (R, 2)"""
     _posterior: RssiPosterior
     """least squares of the fit, which `update` continues"""
 
@@ -125,7 +125,7 @@ class RssiModel(SavedRssiPredictor):
         # held-out predictions of the field and of the simpler predictors, given that the packets were detected
         predictors = torch.cat([field.where(measured, torch.nan)[None], training.baseline_held_out])
         prior_db = training.field_db, training.noise_db
-        std = held_out_std(training, training.kernel, prior_db, loss.middle, found["covariance"])
+        std = held_out_std(training, training.kernel, prior_db, found["covariance"])
         if loss.detection is not None:
             given = [loss.detection.given_detection(mean + shift, std) for mean in predictors]
             std = given[0][1].where(~predictors[0].isnan(), std)
@@ -135,18 +135,17 @@ class RssiModel(SavedRssiPredictor):
         columns = list(map(every.tolist().index, often.tolist()))
         weight = mixing_weights(predictors[..., columns], pool.rssi_dbm[:, often])
         mine = slice(len(own))
-        found |= {"middle": loss.middle, "measured": measured.T.double()}
-        found |= {"field_variance": prior_db[0].square(), "noise_variance": prior_db[1].square()}
+        found |= {"measured": measured.T.double(), "field_db": prior_db[0], "noise_db": prior_db[1]}
         found = {name: value[mine] for name, value in found.items()}
         predictors = predictors[..., mine]
         check_comparable(predictors, train.rssi_dbm)
         predicted = torch.einsum("k,knr->nr", weight[weight > 0], predictors[weight > 0])
-        scale = self._calibrate(train.rssi_dbm, predicted, std[:, mine], [x[mine] for x in prior_db])
+        scale = self._calibrate(train.rssi_dbm, predicted, std[:, mine], found["field_db"], found["noise_db"])
         # only two predictors have the receiver's path loss
         self.covariance = (weight[:2].sum() * scale).square()[:, None, None] * found.pop("covariance")
         self.mixing_weight, self.kernel, self.centre = weight, training.kernel, training.centre
         self.rendered = training.rendered[mine]
-        self.baseline = torch.stack([weight[1:] @ values[:, mine] for values in training.baselines])
+        self.baseline = torch.stack([weight[1:] @ values[:, mine] for values in training.baselines], dim=1)
         self.detection, self.detection_field = loss.detection and loss.detection.columns(mine), None
         if self.detection is not None:
             level = field.where(~field.isnan(), training.baseline_held_out[0]) + shift
@@ -154,14 +153,14 @@ class RssiModel(SavedRssiPredictor):
             self.detection_field = DetectionField.fit(training.kernel, *bins, self.detection.limit)
         self._take(found | {"anchor": training.position})
 
-    def _calibrate(self, rssi: Tensor, predicted: Tensor, std: Tensor, prior_db: Sequence[Tensor]) -> Tensor:
+    def _calibrate(self, rssi: Tensor, predicted: Tensor, std: Tensor, field_db: Tensor, noise_db: Tensor) -> Tensor:
         """Calibrate the standard deviations by held-out predictions of the training rows, and return their factors (R,).
 
         `rssi`, `predicted` [dBm] and `std` [dB] are (n, R), the prior deviations of latent field and noise are (R,) [dB].
         """
         scale = interval_scale(predicted, std, rssi)
-        self.field_db = (scale * prior_db[0]).float()
-        self.noise_db = (scale * prior_db[1]).clamp_min(rounding_std(rssi)).float()
+        self.field_db = (scale * field_db).float()
+        self.noise_db = (scale * noise_db).clamp_min(rounding_std(rssi)).float()
         return scale
 
     def _take(self, state: dict[str, Any]) -> None:
@@ -172,13 +171,10 @@ class RssiModel(SavedRssiPredictor):
     def _set_posterior(self, posterior: RssiPosterior) -> None:
         """Mix a posterior with the simpler predictors, and compute what all predictions share."""
         self._posterior, weight = posterior, self.mixing_weight[0]
-        linear = posterior.linear.T  # (10, R)
-        self.level = self.baseline[0] + weight * (posterior.prior_level + linear[0])
-        self.slope = self.baseline[1] + weight * (posterior.prior_slope + linear[1])
-        self.directivity = (weight * linear[2:].T).float()
+        self.level, self.slope = (self.baseline + weight * posterior.path_loss).T
+        self.directivity = (weight * posterior.directivity).float()
         self.anchor, self.coefficient = posterior.anchor.float(), posterior.coefficient.float().contiguous()
-        known = posterior.anchor, posterior.receiver, posterior.middle
-        self._uncertainty = uncertainty(self.kernel, *known, self.covariance)
+        self._uncertainty = uncertainty(self.kernel, posterior.anchor, posterior.receiver, self.covariance)
 
     @property
     def n_primitives(self) -> int:
@@ -244,7 +240,7 @@ class RssiModel(SavedRssiPredictor):
         model = type(self)(replace(self.config, validation=validation)).fit(rows)
         model.offsets = self.offsets
         # a mean of several measurements has a smaller variance than one measurement
-        if bool(((posterior.variance > 0) & (posterior.variance < 0.99 * posterior.noise_variance[:, None])).any()):
+        if bool(((posterior.variance > 0) & (posterior.variance < 0.99 * posterior.noise_db.square()[:, None])).any()):
             model.field_db, model.noise_db = self.field_db, self.noise_db
         return model
 
@@ -355,7 +351,7 @@ def _shapes(n_receivers: int) -> dict[str, tuple[int, ...]]:
     """Return the shape of every saved tensor beside those of the posterior."""
     return {
         "mixing_weight": (4,),
-        "baseline": (2, n_receivers),
+        "baseline": (n_receivers, 2),
         "covariance": (n_receivers, 2, 2),
         "centre": (3,),
         "rendered": (n_receivers, 2, 2, N_DIRECTIONS),

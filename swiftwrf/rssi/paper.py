@@ -93,25 +93,28 @@ class RssiPaperModel(RssiModel):
             fits = (parallel or map)(task, parts)
             results = list(bar.track(fits, total=len(parts), description="receivers"))
         held_out, white, rendered = (torch.cat(values) for values in zip(*results, strict=True))
-        zero, covariance = torch.zeros(n_receivers).double(), torch.zeros(n_receivers, 2, 2).double()
+        covariance = torch.zeros(n_receivers, 2, 2).double()
         out = ~bins.rssi.isnan() & (bins.fold == HELD_OUT_FOLD)[:, None]
         predicted = held_out.T.double().where(out, torch.nan)[bins.bin_of_row]
         check_comparable(predicted[None], train.rssi_dbm)
-        std = held_out_std(bins, self.kernel, prior_db, zero, covariance)[bins.bin_of_row]
-        self._calibrate(train.rssi_dbm, predicted, std, prior_db)
-        self.mixing_weight, self.baseline = torch.eye(4).double()[0], torch.zeros(2, n_receivers).double()
+        std = held_out_std(bins, self.kernel, prior_db, covariance)[bins.bin_of_row]
+        self._calibrate(train.rssi_dbm, predicted, std, *prior_db)
+        self.mixing_weight, self.baseline = torch.eye(4).double()[0], torch.zeros(n_receivers, 2).double()
         self.centre, self.rendered, self.covariance, self.detection_field = bins.centre, rendered, covariance, None
         dual = torch.linalg.solve_triangular(root.T, white.T.double() * prior_db[0], upper=True).T
-        state = {"anchor": bins.position, "dual": dual, "prior_std": covariance[..., 0].clone()}
+        level = LEVEL_DBM + mean_magnitude(rendered, torch.zeros(1, n_receivers))[0].double()
         # the dual coefficients are those of the kernel alone, without a path loss or noise
-        state |= {
+        state = {
+            "anchor": bins.position,
+            "dual": dual,
             "tangent": torch.ones_like(dual),
-            "measured": torch.ones_like(dual),
             "variance": torch.zeros_like(dual),
+            "measured": torch.ones_like(dual),
+            "prior": torch.stack([level, torch.zeros_like(level)], dim=1),
+            "root": torch.zeros_like(covariance),
+            "field_db": torch.ones_like(level),
+            "noise_db": torch.zeros_like(level),
         }
-        state |= {name: zero.clone() for name in ("prior_slope", "middle", "noise_variance")}
-        level = LEVEL_DBM + mean_magnitude(rendered, zero[None])[0].double()
-        state |= {"prior_level": level, "field_variance": torch.ones_like(zero)}
         self._take(state)
 
 

@@ -9,7 +9,7 @@ At its end the rows of a receiver are a Gaussian process with the kernel and the
 
     tangent_i field(x_i, x_j) tangent_j + f_i . f_j,        noise / weight_i
 
-for the latent field and the scaled regressors f of the path loss. Given the rows of the fit, more rows have a Gaussian
+for the latent field and the regressors f of the path loss. Given the rows of the fit, more rows have a Gaussian
 prior, which costs one product with the inverse covariance, computed once. Their robust weights are found with all of them
 together, so their order has no effect. Tangents and weights of the rows of the fit stay.
 """
@@ -33,7 +33,7 @@ from swiftwrf.gp import GaussianProcess, Kernel, held_out_errors, subsample
 from swiftwrf.rssi.base import RssiConfig
 from swiftwrf.rssi.detection import empty_given
 from swiftwrf.rssi.head import HeadTable
-from swiftwrf.rssi.path_loss import N_HARMONICS, PathLoss, harmonics, log_distance
+from swiftwrf.rssi.path_loss import PathLoss, harmonics, log_distance
 from swiftwrf.rssi.training import Bins, RssiTraining
 from swiftwrf.runtime.threads import single_thread
 
@@ -53,8 +53,8 @@ def fit_receiver(number: int, data: RssiTraining, config: RssiConfig, device: to
     Returns:
         Tensors by name.
 
-        - dual (n,), tangent (n,), variance (n,), prior_level (), prior_slope () and prior_std (2,); see `RssiPosterior`. If
-          RSSI would rise with the distance, slope and its standard deviation are 0.
+        - dual (n,), tangent (n,), variance (n,), prior (2,) and root (2, 2); see `RssiPosterior`. If RSSI would rise with
+          the distance, slope and its standard deviation are 0.
         - covariance (2, 2) of level and slope, given the rows.
         - held_out (n,), predictions of the bins of the fit by all other folds [dBm].
 
@@ -62,32 +62,33 @@ def fit_receiver(number: int, data: RssiTraining, config: RssiConfig, device: to
         FitError: A system that cannot be solved, for positions or values beyond any measurement.
     """
     rssi, limit, loss, one = data.rssi[:, number], data.limit[:, number], data.path_loss, slice(number, number + 1)
-    level, slope, std = loss.shared.level[number], loss.shared.slope[number], loss.std[number].clone()
-    distance, middle = log_distance(data.position, data.receiver[one])[:, 0], loss.middle[number]
+    (level_std, slope_std), middle = loss.std[number].tolist(), float(loss.middle[number])
+    prior = torch.stack([loss.shared.level[number], loss.shared.slope[number]])
+    root = torch.tensor([[level_std, -middle * slope_std], [0.0, slope_std]], dtype=torch.float64)
+    distance, field_db = log_distance(data.position, data.receiver[one])[:, 0], float(data.field_db[number])
     used = (~rssi.isnan() | ~limit.isnan()).nonzero()[:, 0]
     error, dual, tangent, variance = (torch.zeros_like(rssi) for _ in range(4))
-    covariance = std.square().diag()
+    covariance = root @ root.T
     if len(used):
         at, weak = data.position[used].to(device), limit[used].isnan().logical_not()
-        feature = regressors(data.position[used], data.receiver[one], loss.middle[one], std[None])[0]
-        prior_covariance = float(data.field_db[number]) ** 2 * data.kernel(at, at)
+        feature = regressors(data.position[used], data.receiver[one], root[None])[0]
         noise_db = (data.noise_db[number] / data.count[used, number].clamp_min(1).sqrt()).to(device)
         detection = loss.detection
         censored = None if detection is None or not weak.any() else (detection.width, float(detection.missed[number]))
-        rest = prior_covariance, noise_db, HeadTable(data.rendered[one].to(device)), config.huber, censored
+        field, table = field_db**2 * data.kernel(at, at), HeadTable(data.rendered[one].to(device))
 
         def solved() -> tuple[Tensor, ...]:
-            value = (rssi.where(limit.isnan(), limit) - level - slope * distance)[used].to(device)
-            return solve(value, weak.to(device), feature.to(device), *rest)
+            value = (rssi.where(limit.isnan(), limit) - prior[0] - prior[1] * distance)[used].to(device)
+            return solve(value, weak.to(device), feature.to(device), field, noise_db, table, config.huber, censored)
 
         try:
             *found, factor = solved()
             trend = feature[:, :2].to(device)
             open_ = torch.eye(2).double() - (trend.T @ torch.cholesky_solve(trend, factor)).cpu()
-            covariance = std[:, None] * open_ * std  # a slope that is held at 0 is as uncertain as a free one
-            if float(slope + std[1] * (found[0].cpu() @ feature[:, 1])) > 0:
-                level, slope = level + slope * middle, torch.zeros_like(slope)
-                std[1], feature[:, 1] = 0.0, 0.0
+            covariance = root @ open_ @ root.T  # a slope that is held at 0 is as uncertain as a free one
+            if float(prior[1] + root[1, 1] * (found[0].cpu() @ feature[:, 1])) > 0:
+                prior = torch.stack([prior[0] + prior[1] * middle, torch.zeros(()).double()])
+                root[:, 1], feature[:, 1] = 0.0, 0.0
                 *found, factor = solved()
             precision, fold = torch.cholesky_inverse(factor), data.fold[used]
             for part in ((fold == out).nonzero()[:, 0] for out in fold.unique()):
@@ -98,30 +99,28 @@ def fit_receiver(number: int, data: RssiTraining, config: RssiConfig, device: to
             ) from None
         dual[used], tangent[used], variance[used], target = (x.cpu() for x in found)
         error[used] -= target  # prediction less prior
-    prior = {"prior_level": level, "prior_slope": slope, "prior_std": std, "covariance": covariance}
-    held_out = (level + slope * distance - error).where(variance > 0, torch.nan)
-    return prior | {"dual": dual, "tangent": tangent, "variance": variance, "held_out": held_out}
+    held_out = (prior[0] + prior[1] * distance - error).where(variance > 0, torch.nan)
+    rows = {"dual": dual, "tangent": field_db * tangent, "variance": variance, "held_out": held_out}
+    return rows | {"prior": prior, "root": root, "covariance": covariance}
 
 
-def coefficient_scale(std: Tensor) -> Tensor:
-    """Return the prior standard deviations (R, 10) of level, slope and directivity; see `PathLosses.std`."""
-    return torch.cat([std, std.new_full((len(std), N_HARMONICS), DIRECTIVITY_STD_DB)], dim=1)
+def regressors(position: Tensor, receiver: Tensor, root: Tensor) -> Tensor:
+    """Return the regressors of level, slope and directivity with standard normal coefficients, float64 (R, n, 10).
 
-
-def regressors(position: Tensor, receiver: Tensor, middle: Tensor, std: Tensor) -> Tensor:
-    """Return the regressors of level, slope and directivity, scaled by the standard deviations of their coefficients.
-
-    They are float64 (R, n, 10), at positions (n, 3) for receivers at (R, 3), both [m]. For the rest see `PathLosses`.
+    Args:
+        position: Positions (n, 3) [m].
+        receiver: Positions of the receivers (R, 3) [m].
+        root: See `RssiPosterior`.
     """
-    apart = (log_distance(position, receiver) - middle)[..., None]
-    feature = torch.cat([torch.ones_like(apart), apart, harmonics(position, receiver)], dim=-1)
-    return (feature * coefficient_scale(std)).transpose(0, 1)
+    apart = log_distance(position, receiver).T
+    trend = torch.stack([torch.ones_like(apart), apart], dim=-1) @ root
+    return torch.cat([trend, DIRECTIVITY_STD_DB * harmonics(position, receiver).transpose(0, 1)], dim=-1)
 
 
 def covariance_of(field: Tensor, a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> Tensor:
     """Return the covariances (..., n, m) of rows a and b, given those of the latent field, without noise.
 
-    Each row has a slope of the head (..., n) and scaled regressors (..., n, k).
+    Each row has a slope of the head (..., n) and regressors (..., n, k).
     """
     return (a[0][..., None] * field).mul_(b[0][..., None, :]).add_(a[1] @ b[1].mT)
 
@@ -149,7 +148,7 @@ def solve(
     Args:
         value: RSSI, or its upper limit, less the prior mean, (n,) [dB].
         weak: Whether a value is an upper limit, bool (n,).
-        feature: Scaled regressors, (n, k).
+        feature: Regressors (n, k).
         covariance: Covariance of the latent field c, (n, n) [dB^2].
         noise_db: Standard deviation of the noise, (n,) [dB].
         table: Head of the receiver.
@@ -223,16 +222,14 @@ class RssiPosterior:
         huber: See `RssiConfig`.
         anchor: Positions of the rows less the centre, float64 (n, 3) [m].
         dual: Dual coefficients (R, n); 0 in rows that have no part in the fit.
-        tangent: Slope of each head at the latent field, (R, n); 0 there.
+        tangent: Slope of each head at the latent field, times the prior standard deviation of the field, (R, n) [dB].
         variance: Variance of the noise over the weight, (R, n) [dB^2]; 0 in rows that have no part in the fit.
         measured: 1 where RSSI was measured and not only limited, (R, n).
-        prior_level: Prior path-loss model, RSSI at 1 m, (R,) [dBm].
-        prior_slope: Its slope, (R,) [dB a decade].
-        prior_std: Prior standard deviation of level [dB] and slope [dB a decade], (R, 2).
-        middle: log10 of the distance at which levels are compared, (R,).
-        field_variance: Prior variance of the latent field, (R,) [dB^2].
-        noise_variance: Variance of one measurement, (R,) [dB^2].
-        feature: Scaled regressors (R, n, 10); 0 in rows that have no part in the fit. Defaults to those of the anchors.
+        prior: Prior path-loss model, RSSI at 1 m [dBm] and slope [dB a decade], (R, 2).
+        root: A factor of their prior covariance, root @ root^T, (R, 2, 2).
+        field_db: Prior standard deviation of the latent field, (R,) [dB].
+        noise_db: Standard deviation of one measurement, (R,) [dB].
+        feature: Regressors (R, n, 10); 0 in rows that have no part in the fit. Defaults to those of the anchors.
         fit: Posterior of the first n - m rows, whose weights are fixed. Defaults to all rows.
         later: Of the m rows after those: the effect of their dual coefficients on those of the fit, float32 (R, m, n - m),
             the errors of the fit, (R, m) [dB], and the covariance of these errors without noise, (R, m, m).
@@ -247,28 +244,29 @@ class RssiPosterior:
     tangent: Tensor
     variance: Tensor
     measured: Tensor
-    prior_level: Tensor
-    prior_slope: Tensor
-    prior_std: Tensor
-    middle: Tensor
-    field_variance: Tensor
-    noise_variance: Tensor
+    prior: Tensor
+    root: Tensor
+    field_db: Tensor
+    noise_db: Tensor
     feature: Tensor = None  # type: ignore[assignment]
     fit: RssiPosterior | None = None
     later: tuple[Tensor, Tensor, Tensor] | None = None
 
     def __post_init__(self) -> None:
         if self.feature is None:
-            feature = regressors(self.anchor, self.receiver, self.middle, self.prior_std)
+            feature = regressors(self.anchor, self.receiver, self.root)
             object.__setattr__(self, "feature", feature * (self.variance > 0)[..., None])
 
     @staticmethod
     def shapes(n_receivers: int, n_rows: int) -> dict[str, tuple[int, ...]]:
         """Return the shape of every tensor that a file contains."""
-        found: dict[str, tuple[int, ...]] = {"anchor": (n_rows, 3), "prior_std": (n_receivers, 2)}
+        found: dict[str, tuple[int, ...]] = {
+            "anchor": (n_rows, 3),
+            "prior": (n_receivers, 2),
+            "root": (n_receivers, 2, 2),
+        }
         found |= dict.fromkeys(("dual", "tangent", "variance", "measured"), (n_receivers, n_rows))
-        per_receiver = ("prior_level", "prior_slope", "middle", "field_variance", "noise_variance")
-        return found | dict.fromkeys(per_receiver, (n_receivers,))
+        return found | dict.fromkeys(("field_db", "noise_db"), (n_receivers,))
 
     @cached_property
     def _inverses(self) -> list[Any]:
@@ -276,27 +274,31 @@ class RssiPosterior:
         field, found = self.kernel(self.anchor, self.anchor), []
         for r, feature in enumerate(self.feature):
             rows = self.tangent[r], feature
-            whole = covariance_of(self.field_variance[r] * field, rows, rows)
+            whole = covariance_of(field, rows, rows)
             whole.diagonal().add_(self.variance[r].where(self.variance[r] > 0, 1.0))
             inverse = torch.cholesky_inverse(torch.linalg.cholesky(whole)).float()
             found.append(np.asfortranarray(inverse.numpy()))  # as BLAS reads it
         return found
 
-    @property
-    def linear(self) -> Tensor:
-        """Change of level at 1 m, slope and directivity from the prior path-loss model, float64 (R, 10) [dB]."""
-        change = self._linear * coefficient_scale(self.prior_std)
-        return torch.cat([change[:, :1] - change[:, 1:2] * self.middle[:, None], change[:, 1:]], dim=1)
-
     @cached_property
     def _linear(self) -> Tensor:
-        """Coefficients of the scaled regressors, (R, 10)."""
-        return (self.feature.mT @ self.dual[..., None])[..., 0]
+        """Coefficients of the regressors, (R, 10, 1)."""
+        return self.feature.mT @ self.dual[..., None]
+
+    @property
+    def path_loss(self) -> Tensor:
+        """RSSI at 1 m [dBm] and slope [dB a decade], float64 (R, 2)."""
+        return self.prior + (self.root @ self._linear[:, :2])[..., 0]
+
+    @property
+    def directivity(self) -> Tensor:
+        """Coefficients of the harmonics, float64 (R, 8) [dB]."""
+        return DIRECTIVITY_STD_DB * self._linear[:, 2:, 0]
 
     @property
     def coefficient(self) -> Tensor:
         """Coefficients of the kernel to the rows whose sum is the latent field, float64 (n, R) [dB]."""
-        return (self.field_variance[:, None] * self.tangent * self.dual).T
+        return (self.field_db[:, None] * self.tangent * self.dual).T
 
     @property
     def rssi(self) -> Tensor:
@@ -305,14 +307,14 @@ class RssiPosterior:
         return (fitted + self.variance * self.dual).where(self.measured > 0, torch.nan).T
 
     def _at(self, position: Tensor, cross: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return RSSI (R, m) [dBm], slope of the head (R, m) and regressors (R, m, 10) at positions (m, 3) [m].
+        """Return RSSI (R, m) [dBm], tangent (R, m) [dB] and regressors (R, m, 10) at positions (m, 3) [m].
 
         `cross` are the values of the kernel between them and the rows, (m, n).
         """
         head, tangent = self.table(cross @ self.coefficient)
-        feature = regressors(position, self.receiver, self.middle, self.prior_std)
-        prior = PathLoss(self.prior_level, self.prior_slope)(log_distance(position, self.receiver))
-        return (prior + head).T + (feature @ self._linear[..., None])[..., 0], tangent.T, feature
+        feature = regressors(position, self.receiver, self.root)
+        mean = PathLoss(*self.prior.T)(log_distance(position, self.receiver)) + head
+        return mean.T + (feature @ self._linear)[..., 0], self.field_db[:, None] * tangent.T, feature
 
     def updated(self, position: Tensor, rssi: Tensor) -> RssiPosterior:
         """Return the posterior with more rows, RSSI (m, R) [dBm], nan where not detected, at positions (m, 3) [m]."""
@@ -326,14 +328,13 @@ class RssiPosterior:
         mean, tangent, feature = fit._at(position, cross)
         new = tangent * detected, feature * detected[..., None]
         # condition on the rows of the fit
-        field = fit.field_variance[:, None, None]
-        own = covariance_of(field * cross, new, (fit.tangent, fit.feature))
+        own = covariance_of(cross, new, (fit.tangent, fit.feature))
         # half of each inverse is read, because its time in memory is most of the time of a row
         pairs = zip(fit._inverses, own.float().numpy(), strict=True)
         influence = torch.from_numpy(np.stack([np.stack([ssymv(1.0, p, x, lower=1) for x in c]) for p, c in pairs]))
         influence = torch.cat([later[0], influence], dim=1)
         error = torch.cat([later[1], (rssi.T - mean).where(detected, 0.0)], dim=1)
-        noise = fit.noise_variance[:, None] * detected
+        noise = fit.noise_db.square()[:, None] * detected
         rows: dict[str, Any] = {
             "anchor": torch.cat([self.anchor, position]),
             "tangent": torch.cat([self.tangent, new[0]], dim=1),
@@ -343,7 +344,7 @@ class RssiPosterior:
         }
         n = len(fit.anchor)
         prior = self.kernel(position, rows["anchor"][n:])
-        border = covariance_of(field * prior, new, (rows["tangent"][:, n:], rows["feature"][:, n:]))
+        border = covariance_of(prior, new, (rows["tangent"][:, n:], rows["feature"][:, n:]))
         border = border - (own.float() @ influence.mT).double()
         covariance = functional.pad(later[2], (0, n_new, 0, n_new))
         covariance[:, -n_new:], covariance[..., -n_new:] = border, border.mT
@@ -357,7 +358,7 @@ class RssiPosterior:
 
         Errors, variances and results are (R, m), the covariance of the errors without noise is (R, m, m).
         """
-        noise = self.noise_variance[:, None].where(variance > 0, 1.0)
+        noise = self.noise_db.square()[:, None].where(variance > 0, 1.0)
         weight = (noise / variance).where(variance > 0, 1.0)
         for _ in range(100):
             used = noise / weight
@@ -369,7 +370,7 @@ class RssiPosterior:
 
 
 def uncertainty(
-    kernel: Kernel, known: Tensor, receiver: Tensor, middle: Tensor, covariance: Tensor
+    kernel: Kernel, known: Tensor, receiver: Tensor, covariance: Tensor
 ) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
     """Return the function from positions to the variance that n measured positions leave open.
 
@@ -382,12 +383,11 @@ def uncertainty(
         kernel: Kernel of the latent field.
         known: Measured positions less the centre, (n, 3) [m]; 200 of them count.
         receiver: Positions of the receivers less the centre, (R, 3) [m].
-        middle: log10 of the distance at which levels are compared, (R,).
         covariance: Covariance of level and slope of each receiver, (R, 2, 2).
     """
 
     def trend(position: Tensor) -> Tensor:  # regressors of level, and of the slope of each receiver, (n, 1 + R)
-        apart = log_distance(position, receiver) - middle
+        apart = log_distance(position, receiver)
         return torch.cat([torch.ones_like(apart[:, :1]), apart], dim=1)
 
     (known,) = subsample(known, rows=MAX_VARIANCE_POSITIONS)
@@ -396,16 +396,14 @@ def uncertainty(
 
     def variance(position: Tensor) -> tuple[Tensor, Tensor]:
         mean, of_field = process.condition(position)
-        level, slope = (trend(position) - mean).split([1, len(middle)], dim=1)
+        level, slope = (trend(position) - mean).split([1, len(receiver)], dim=1)
         of_trend = of_level * level.square() + 2 * both * level * slope + of_slope * slope.square()
         return of_field, of_trend.clamp_min(0)
 
     return variance
 
 
-def held_out_std(
-    bins: Bins, kernel: Kernel, prior_db: tuple[Tensor, Tensor], middle: Tensor, covariance: Tensor
-) -> Tensor:
+def held_out_std(bins: Bins, kernel: Kernel, prior_db: tuple[Tensor, Tensor], covariance: Tensor) -> Tensor:
     """Return the standard deviations (n, R) [dB] that models without a bin's fold predict, before they are calibrated.
 
     `prior_db` are the standard deviations of latent field and noise, each (R,) [dB]; the rest is as in `uncertainty`.
@@ -413,7 +411,7 @@ def held_out_std(
     (field_db, noise_db), std = prior_db, torch.empty_like(bins.rssi)
     for number in bins.fold.unique():
         out = bins.fold == number
-        left = uncertainty(kernel, bins.position[~out], bins.receiver, middle, covariance)
+        left = uncertainty(kernel, bins.position[~out], bins.receiver, covariance)
         variance, trend = left(bins.position[out])
         std[out] = (noise_db.square() + field_db.square() * variance[:, None] + trend).sqrt()
     return std

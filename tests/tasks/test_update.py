@@ -179,7 +179,7 @@ def test_rssi_in_any_order_solves_the_least_squares_of_all_rows(order, sizes):
     for r in range(12):  # dense covariance of all rows times the dual coefficients is the data
         seen = state.variance[r] > 0
         anchor, slope, feature = state.anchor[seen], state.tangent[r, seen], state.feature[r, seen]
-        field = state.field_variance[r] * slope[:, None] * state.kernel(anchor, anchor) * slope
+        field = slope[:, None] * state.kernel(anchor, anchor) * slope
         whole = field + feature @ feature.T + torch.diag(state.variance[r, seen])
         old = before.dual[r, before.variance[r] > 0]
         target = whole[: len(old), : len(old)] @ old

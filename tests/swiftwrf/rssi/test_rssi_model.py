@@ -107,12 +107,10 @@ def training_of(data, n_primitives=50):
 
 def posterior(training, found):
     """The posterior of one receiver's fit."""
-    tensors = {
-        name: found[name][None] for name in ("dual", "tangent", "variance", "prior_level", "prior_slope", "prior_std")
-    }
-    variances = {"field_variance": training.field_db.square(), "noise_variance": training.noise_db.square()}
+    tensors = {name: value[None] for name, value in found.items() if name not in ("covariance", "held_out")}
+    variances = {"field_db": training.field_db, "noise_db": training.noise_db}
     measured, table = (~training.rssi.isnan()).T.double(), HeadTable(training.rendered)
-    rest = {"anchor": training.position, "middle": training.path_loss.middle, "measured": measured, **variances}
+    rest = {"anchor": training.position, "measured": measured, **variances}
     return RssiPosterior(training.receiver, training.kernel, table, huber=1.345, **tensors, **rest)
 
 
@@ -156,8 +154,8 @@ def test_solution_is_the_maximum_of_the_posterior():
         method="L-BFGS-B",
         options={"maxiter": 5000, "maxfun": 9000, "ftol": 1e-14},
     )
-    level, slope, directivity = found.linear[0].split([1, 1, 8])
-    mine = found.prior_level + level + (found.prior_slope + slope) * distance + bearing @ directivity
+    level, slope = found.path_loss[0]
+    mine = level + slope * distance + bearing @ found.directivity[0]
     mine = mine + found.table(gram @ found.coefficient)[0][:, 0]
     torch.testing.assert_close(mine, predicted(torch.tensor(best.x)), atol=0.06, rtol=0)
 
@@ -171,10 +169,10 @@ def test_held_out_is_a_fit_without_the_fold():
         out = training.fold == number
         rest = replace(training, rssi=torch.where(out[:, None], torch.nan, training.rssi))
         alone = posterior(training, fit_receiver(FIRST, rest, gentle, CPU))
-        level, slope, directivity = alone.linear[0].split([1, 1, 8])
+        level, slope = alone.path_loss[0]
         distance = log_distance(training.position, training.receiver)[:, 0]
-        expected = alone.prior_level + level + (alone.prior_slope + slope) * distance
-        expected = expected + harmonics(training.position, training.receiver)[:, 0] @ directivity
+        expected = level + slope * distance
+        expected = expected + harmonics(training.position, training.receiver)[:, 0] @ alone.directivity[0]
         torch.testing.assert_close(whole[out], expected[out], atol=1e-5, rtol=0)
 
 
