@@ -484,7 +484,7 @@ class MatchedField(Configured, Saved):
         locator.grid = room.grid
         if is_channel:
             nearby = GaussianProcess.from_state(tensors, header, torch.float32, prefix=NEARBY)
-            expect(tensors, {f"{NEARBY}coefficient": (len(nearby.known), features)})
+            expect(tensors, {f"{NEARBY}value": (len(nearby.known), features)})
             locator._fit = _Fit(room, PathLikelihood(room, tensors["statistics"]), nearby=nearby)
         else:
             gains = PathGains.from_state(tensors, header, room)

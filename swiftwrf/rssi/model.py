@@ -307,7 +307,7 @@ class RssiModel(SavedRssiPredictor):
         tensors = {name: getattr(self, name) for name in _shapes(0)}
         tensors |= {f"fit.{name}": getattr(self._posterior, name) for name in RssiPosterior.shapes(0, 0)}
         if (field := self.detection_field) is not None:  # with kernel and positions of the fit
-            tensors |= {"share": field.process.coefficient, "share_mean": field.mean, "share_weight": field.weight}
+            tensors |= {"share": field.process.value, "share_mean": field.mean, "share_weight": field.weight}
         return tensors, self._header() | {"kernel": asdict(self.kernel)}
 
     @classmethod
@@ -322,8 +322,8 @@ class RssiModel(SavedRssiPredictor):
         if "share" in tensors and model.detection is not None:
             shapes = {"share": (n_anchors, n_receivers), "share_mean": (n_receivers,), "share_weight": (3,)}
             expect(tensors, shapes)
-            coefficient, mean, weight = (tensors[name].double() for name in shapes)
-            process = GaussianProcess(model.kernel, tensors["fit.anchor"], coefficient)
+            value, mean, weight = (tensors[name].double() for name in shapes)
+            process = GaussianProcess(model.kernel, tensors["fit.anchor"], value)
             model.detection_field = DetectionField(process, mean, model.detection.limit, weight)
         model._take({name: tensors[f"fit.{name}"].double() for name in of_fit})
         return model
