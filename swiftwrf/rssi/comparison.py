@@ -25,11 +25,11 @@ from swiftwrf.metrics import method_summary
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import distance, nearest
 from swiftwrf.rssi.base import RssiPredictor
-from swiftwrf.rssi.mixing import LEVEL
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.offsets import estimate_offsets
 from swiftwrf.rssi.pairs import PairModel
 from swiftwrf.rssi.paper import RssiPaperModel
+from swiftwrf.rssi.training import LEVEL
 from swiftwrf.runtime.checkpoint import Saved, load
 from swiftwrf.runtime.registry import write_report
 from swiftwrf.runtime.steps import MODEL, Memo, Steps

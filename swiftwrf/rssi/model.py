@@ -27,10 +27,16 @@ from swiftwrf.rssi.base import Map, RssiConfig, SavedRssiPredictor, columns_of, 
 from swiftwrf.rssi.detection import Detection, DetectionField
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
 from swiftwrf.rssi.maps import RssiMap
-from swiftwrf.rssi.mixing import check_comparable, interval_scale, mixing_weights, rounding_std
 from swiftwrf.rssi.path_loss import harmonics, log_distance
 from swiftwrf.rssi.regression import RssiPosterior, fit_receiver, held_out_std, uncertainty
-from swiftwrf.rssi.training import MAX_KERNEL_RECEIVERS, prepare
+from swiftwrf.rssi.training import (
+    MAX_KERNEL_RECEIVERS,
+    check_comparable,
+    interval_scale,
+    mixing_weights,
+    prepare,
+    rounding_std,
+)
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import parallel_map, single_thread

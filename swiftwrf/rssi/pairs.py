@@ -27,8 +27,8 @@ from swiftwrf.models.base import FieldConfig
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import Neighbours, check_positions, distance, nearest
 from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiPredictor, SavedRssiPredictor
-from swiftwrf.rssi.mixing import LEVEL, rounding_std
 from swiftwrf.rssi.path_loss import MIN_DISTANCE_M, fit_path_loss
+from swiftwrf.rssi.training import LEVEL, rounding_std
 from swiftwrf.runtime import checkpoint as files
 from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.threads import single_thread

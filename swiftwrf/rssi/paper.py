@@ -21,10 +21,9 @@ from swiftwrf.errors import FitError
 from swiftwrf.models.base import CPU
 from swiftwrf.rssi.base import Map, RssiConfig, often_detected
 from swiftwrf.rssi.head import Head, mean_magnitude, render
-from swiftwrf.rssi.mixing import check_comparable
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.regression import held_out_std
-from swiftwrf.rssi.training import Bins, bin_locations, binned, choose_residual_kernel, prior_std
+from swiftwrf.rssi.training import Bins, bin_locations, binned, check_comparable, choose_residual_kernel, prior_std
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, configuration

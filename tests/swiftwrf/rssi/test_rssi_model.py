@@ -15,10 +15,9 @@ from swiftwrf.gp import Kernel
 from swiftwrf.rssi import RssiConfig, RssiPaperModel, compare
 from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
 from swiftwrf.rssi.maps import RssiMap
-from swiftwrf.rssi.mixing import mixing_weights
 from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, harmonics, log_distance
 from swiftwrf.rssi.regression import DIRECTIVITY_STD_DB, RssiPosterior, fit_receiver
-from swiftwrf.rssi.training import RssiTraining, bin_locations
+from swiftwrf.rssi.training import RssiTraining, bin_locations, mixing_weights
 from swiftwrf.runtime.steps import Memo
 from swiftwrf.runtime.threads import threads_kept
 
