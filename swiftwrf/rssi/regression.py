@@ -62,9 +62,7 @@ def fit_receiver(number: int, data: RssiTraining, config: RssiConfig, device: to
         FitError: A system that cannot be solved, for positions or values beyond any measurement.
     """
     rssi, limit, loss, one = data.rssi[:, number], data.limit[:, number], data.path_loss, slice(number, number + 1)
-    (level_std, slope_std), middle = loss.std[number].tolist(), float(loss.middle[number])
-    prior = torch.stack([loss.shared.level[number], loss.shared.slope[number]])
-    root = torch.tensor([[level_std, -middle * slope_std], [0.0, slope_std]], dtype=torch.float64)
+    prior, root = torch.stack([loss.shared.level[number], loss.shared.slope[number]]), loss.root[number].clone()
     distance, field_db = log_distance(data.position, data.receiver[one])[:, 0], float(data.field_db[number])
     used = (~rssi.isnan() | ~limit.isnan()).nonzero()[:, 0]
     error, dual, tangent, variance = (torch.zeros_like(rssi) for _ in range(4))
@@ -87,7 +85,8 @@ def fit_receiver(number: int, data: RssiTraining, config: RssiConfig, device: to
             open_ = torch.eye(2).double() - (trend.T @ torch.cholesky_solve(trend, factor)).cpu()
             covariance = root @ open_ @ root.T  # a slope that is held at 0 is as uncertain as a free one
             if float(prior[1] + root[1, 1] * (found[0].cpu() @ feature[:, 1])) > 0:
-                prior = torch.stack([prior[0] + prior[1] * middle, torch.zeros(()).double()])
+                # at the distance where level and slope are independent
+                prior = torch.stack([prior[0] - prior[1] * root[0, 1] / root[1, 1], torch.zeros(()).double()])
                 root[:, 1], feature[:, 1] = 0.0, 0.0
                 *found, factor = solved()
             precision, fold = torch.cholesky_inverse(factor), data.fold[used]
