@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from functools import partial
+from operator import attrgetter
 from typing import Any, ClassVar, Self
 
 import torch
@@ -100,7 +101,7 @@ class RssiModel(SavedRssiPredictor):
     """calibrated standard deviation of a measurement about the field, (R,) [dB]"""
     baseline: Tensor
     """RSSI at 1 m [dBm] and slope [dB a decade] of the simpler predictors by their mixing weights, float64 (R, 2)"""
-    _posterior: RssiPosterior
+    posterior: RssiPosterior
     """least squares of the fit, which `update` continues"""
 
     @single_thread()
@@ -176,7 +177,7 @@ class RssiModel(SavedRssiPredictor):
 
     def _set_posterior(self, posterior: RssiPosterior) -> None:
         """Mix a posterior with the simpler predictors, and compute what all predictions share."""
-        self._posterior, weight = posterior, self.mixing_weight[0]
+        self.posterior, weight = posterior, self.mixing_weight[0]
         self.level, self.slope = (self.baseline + weight * posterior.path_loss).T
         self.directivity = (weight * posterior.directivity).float()
         self.anchor, self.coefficient = posterior.anchor.float(), posterior.coefficient.float().contiguous()
@@ -204,7 +205,7 @@ class RssiModel(SavedRssiPredictor):
         at = new.transmitter_position - self.centre
         if self.detection_field is not None:
             self.detection_field = self.detection_field.updated(at, new.detected)
-        self._set_posterior(self._posterior.updated(at, new.rssi_dbm))
+        self._set_posterior(self.posterior.updated(at, new.rssi_dbm))
 
     def with_chosen_kernel(self, without: Tensor | None = None) -> Self:
         """Return the model fitted again to all rows that it has learnt, with kernel, noise and mixing weights chosen again.
@@ -228,7 +229,7 @@ class RssiModel(SavedRssiPredictor):
         """
         self.check_fitted()
         self.check_updates()
-        posterior = self._posterior
+        posterior = self.posterior
         kept = torch.ones(len(posterior.anchor), dtype=torch.bool)
         if without is not None:
             kept[without] = False
@@ -310,28 +311,24 @@ class RssiModel(SavedRssiPredictor):
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         self.check_fitted()
-        tensors = {name: getattr(self, name) for name in _shapes(0)}
-        tensors |= {f"fit.{name}": getattr(self._posterior, name) for name in RssiPosterior.shapes(0, 0)}
-        if (field := self.detection_field) is not None:  # with kernel and positions of the fit
-            tensors |= {"share": field.process.value, "share_mean": field.mean, "share_weight": field.weight}
-        return tensors, self._header() | {"kernel": asdict(self.kernel)}
+        names = _shapes(0, 0, self.detection_field is not None)
+        return {name: attrgetter(name)(self) for name in names}, self._header() | {"kernel": asdict(self.kernel)}
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
         model = cls._of_header(header)
         model.kernel, model.detection_field = Kernel(**header["kernel"]), None
-        n_receivers, n_anchors = len(model.receiver_names), len(tensors["fit.anchor"])
-        own, of_fit = _shapes(n_receivers), RssiPosterior.shapes(n_receivers, n_anchors)
-        expect(tensors, own | {f"fit.{name}": shape for name, shape in of_fit.items()})
-        for name in own:
-            setattr(model, name, tensors[name])
-        if "share" in tensors and model.detection is not None:
-            shapes = {"share": (n_anchors, n_receivers), "share_mean": (n_receivers,), "share_weight": (3,)}
-            expect(tensors, shapes)
-            value, mean, weight = (tensors[name].double() for name in shapes)
-            process = GaussianProcess(model.kernel, tensors["fit.anchor"], value)
+        detections, anchor = any("detection_field." in name for name in tensors), tensors["posterior.anchor"]
+        shapes = _shapes(len(model.receiver_names), len(anchor), detections)
+        expect(tensors, shapes)
+        vars(model).update({name: tensors[name] for name in shapes if "." not in name})
+        if model.detection is not None and detections:
+            of_field = ("process.value", "mean", "weight")
+            value, mean, weight = (tensors[f"detection_field.{name}"].double() for name in of_field)
+            process = GaussianProcess(model.kernel, anchor, value)
             model.detection_field = DetectionField(process, mean, model.detection.limit, weight)
-        model._take({name: tensors[f"fit.{name}"].double() for name in of_fit})
+        of_fit = (name for name in shapes if name.startswith("posterior."))
+        model._take({name.removeprefix("posterior."): tensors[name].double() for name in of_fit})
         return model
 
 
@@ -353,8 +350,10 @@ def _in_threads(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterabl
         yield from parallel_map(function, waiting[start : start + RECEIVERS_AT_ONCE])
 
 
-def _shapes(n_receivers: int) -> dict[str, tuple[int, ...]]:
-    """Return the shape of every saved tensor beside those of the posterior."""
+def _shapes(n_receivers: int, n_rows: int, detections: bool) -> dict[str, tuple[int, ...]]:
+    """Return the shape of every saved tensor by the name of its attribute."""
+    in_rows = ("posterior.dual", "posterior.tangent", "posterior.variance", "posterior.measured")
+    field = {"mean": (n_receivers,), "weight": (3,), "process.value": (n_rows, n_receivers)} if detections else {}
     return {
         "mixing_weight": (4,),
         "baseline": (n_receivers, 2),
@@ -363,4 +362,11 @@ def _shapes(n_receivers: int) -> dict[str, tuple[int, ...]]:
         "rendered": (n_receivers, 2, 2, N_DIRECTIONS),
         "field_db": (n_receivers,),
         "noise_db": (n_receivers,),
+        "posterior.anchor": (n_rows, 3),
+        **dict.fromkeys(in_rows, (n_receivers, n_rows)),
+        "posterior.prior": (n_receivers, 2),
+        "posterior.root": (n_receivers, 2, 2),
+        "posterior.field_db": (n_receivers,),
+        "posterior.noise_db": (n_receivers,),
+        **{f"detection_field.{name}": shape for name, shape in field.items()},
     }

@@ -228,7 +228,6 @@ class RssiPosterior:
         root: A factor of their prior covariance, root @ root^T, (R, 2, 2).
         field_db: Prior standard deviation of the latent field, (R,) [dB].
         noise_db: Standard deviation of one measurement, (R,) [dB].
-        feature: Regressors (R, n, 10); 0 in rows that have no part in the fit. Defaults to those of the anchors.
         fit: Posterior of the first n - m rows, whose weights are fixed. Defaults to all rows.
         later: Of the m rows after those: the effect of their dual coefficients on those of the fit, float32 (R, m, n - m),
             the errors of the fit, (R, m) [dB], and the covariance of these errors without noise, (R, m, m).
@@ -247,25 +246,13 @@ class RssiPosterior:
     root: Tensor
     field_db: Tensor
     noise_db: Tensor
-    feature: Tensor = None  # type: ignore[assignment]
     fit: RssiPosterior | None = None
     later: tuple[Tensor, Tensor, Tensor] | None = None
 
-    def __post_init__(self) -> None:
-        if self.feature is None:
-            feature = regressors(self.anchor, self.receiver, self.root)
-            object.__setattr__(self, "feature", feature * (self.variance > 0)[..., None])
-
-    @staticmethod
-    def shapes(n_receivers: int, n_rows: int) -> dict[str, tuple[int, ...]]:
-        """Return the shape of every tensor that a file contains."""
-        found: dict[str, tuple[int, ...]] = {
-            "anchor": (n_rows, 3),
-            "prior": (n_receivers, 2),
-            "root": (n_receivers, 2, 2),
-        }
-        found |= dict.fromkeys(("dual", "tangent", "variance", "measured"), (n_receivers, n_rows))
-        return found | dict.fromkeys(("field_db", "noise_db"), (n_receivers,))
+    @cached_property
+    def feature(self) -> Tensor:
+        """Regressors (R, n, 10); 0 in rows that have no part in the fit."""
+        return regressors(self.anchor, self.receiver, self.root) * (self.variance > 0)[..., None]
 
     @cached_property
     def _inverses(self) -> list[Any]:
@@ -334,23 +321,26 @@ class RssiPosterior:
         influence = torch.cat([later[0], influence], dim=1)
         error = torch.cat([later[1], (rssi.T - mean).where(detected, 0.0)], dim=1)
         noise = fit.noise_db.square()[:, None] * detected
-        rows: dict[str, Any] = {
-            "anchor": torch.cat([self.anchor, position]),
-            "tangent": torch.cat([self.tangent, new[0]], dim=1),
-            "feature": torch.cat([self.feature, new[1]], dim=1),
-            "variance": torch.cat([self.variance, noise], dim=1),
-            "measured": torch.cat([self.measured, detected.to(self.measured)], dim=1),
-        }
-        n = len(fit.anchor)
-        prior = self.kernel(position, rows["anchor"][n:])
-        border = covariance_of(prior, new, (rows["tangent"][:, n:], rows["feature"][:, n:]))
+        n, anchor = len(fit.anchor), torch.cat([self.anchor, position])
+        slopes, features = torch.cat([self.tangent, new[0]], dim=1), torch.cat([self.feature, new[1]], dim=1)
+        border = covariance_of(self.kernel(position, anchor[n:]), new, (slopes[:, n:], features[:, n:]))
         border = border - (own.float() @ influence.mT).double()
         covariance = functional.pad(later[2], (0, n_new, 0, n_new))
         covariance[:, -n_new:], covariance[..., -n_new:] = border, border.mT
-        dual, rows["variance"][:, n:] = self._robust(covariance, error, rows["variance"][:, n:])
+        dual, variance = self._robust(covariance, error, torch.cat([self.variance[:, n:], noise], dim=1))
         of_fit = fit.dual - torch.einsum("rmn,rm->rn", influence, dual.float()).double()
-        rows["dual"] = torch.cat([of_fit, dual], dim=1)
-        return replace(self, **rows, fit=fit, later=(influence, error, covariance))
+        posterior = replace(
+            self,
+            anchor=anchor,
+            dual=torch.cat([of_fit, dual], dim=1),
+            tangent=slopes,
+            variance=torch.cat([fit.variance, variance], dim=1),
+            measured=torch.cat([self.measured, detected.to(self.measured)], dim=1),
+            fit=fit,
+            later=(influence, error, covariance),
+        )
+        vars(posterior)["feature"] = features
+        return posterior
 
     def _robust(self, covariance: Tensor, error: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
         """Return dual coefficients and noise over weight by iteratively reweighted least squares, from one to start with.

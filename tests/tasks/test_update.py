@@ -175,7 +175,7 @@ def test_rssi_in_any_order_solves_the_least_squares_of_all_rows(order, sizes):
     at = floor().transmitter_position[:10] + 0.5
     tolerance = SIGNAL * 60
     torch.testing.assert_close(updated.predict(at).mean, once.predict(at).mean, rtol=0, atol=tolerance)
-    state, before = updated._posterior, model._posterior
+    state, before = updated.posterior, model.posterior
     for r in range(12):  # dense covariance of all rows times the dual coefficients is the data
         seen = state.variance[r] > 0
         anchor, slope, feature = state.anchor[seen], state.tangent[r, seen], state.feature[r, seen]
@@ -221,7 +221,7 @@ def test_a_chosen_kernel_is_that_of_a_fit(name):
 
 def test_rssi_follows_from_its_residuals():
     model = fitted_rssi().update(floor().subset(torch.arange(60, 90)))
-    found = model._posterior.rssi
+    found = model.posterior.rssi
     missed = (found - floor().rssi_dbm).abs()
     assert torch.equal(found.isnan(), floor().rssi_dbm.isnan())
     assert missed[:60].nanmean() < 0.1
