@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import torch
 from annotated_types import Ge, Gt, Lt
@@ -315,18 +315,9 @@ def dense_weights(number: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     return rows, weight.new_zeros(len(weight), len(rows)).scatter(1, column, weight)
 
 
-class HeldOut(NamedTuple):
-    """Weights with which the rows of other folds predict those of one fold; see `leave_folds_out`."""
-
-    out: Tensor  # numbers of the rows that are held out, (o,)
-    kept: Tensor  # numbers of the rows that predict them, (k,)
-    weight: Tensor  # their weights, float64 (o, k)
-    variance: Tensor  # variances of the errors of noisy values, float64 (o,)
-
-
 def leave_folds_out(
     kernel: Kernel, position: Tensor, fold: Tensor, nearest_for: Tensor | None = None
-) -> Iterator[HeldOut]:
+) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
     """Yield how a process with mean 0 predicts the rows of each fold from all other folds, without another fit.
 
     Args:
@@ -335,10 +326,14 @@ def leave_folds_out(
         fold: Number of the fold of each row, (n,).
         nearest_for: Numbers of rows that are predicted from their nearest rows only. Defaults to all rows from all others.
 
+    Yields:
+        Numbers of the rows that are held out, (o,), and of those that predict them, (k,); the weights of the latter, float64
+        (o, k), and the variances of the errors of noisy values, float64 (o,).
+
     Example:
         >>> position = torch.linspace(0, 1, 20, dtype=torch.float64)[:, None] * torch.ones(3)
         >>> kernel, fold = Kernel(noise=0.01), torch.arange(20) % 2
-        >>> [(part.out.tolist(), part.weight.shape) for part in leave_folds_out(kernel, position, fold, torch.arange(4))]
+        >>> [(out.tolist(), weight.shape) for out, _, weight, _ in leave_folds_out(kernel, position, fold, torch.arange(4))]
         [([0, 2], torch.Size([2, 10])), ([1, 3], torch.Size([2, 10]))]
     """
     if nearest_for is not None:
@@ -346,14 +341,14 @@ def leave_folds_out(
             out, others = nearest_for[fold[nearest_for] == number], (fold != number).nonzero()[:, 0]
             near, weight, variance = GaussianProcess(kernel, position[others], exact=False)._local(position[out])
             used, dense = dense_weights(near, weight)
-            yield HeldOut(out, others[used], dense, variance + kernel.noise)
+            yield out, others[used], dense, variance + kernel.noise
         return
     precision = torch.linalg.inv(kernel.covariance(position))
     for number in fold.unique():
         out, kept = ((fold == number) == held for held in (True, False))
         covariance = torch.linalg.inv(precision[out][:, out])
         weight = -covariance @ precision[out][:, kept]
-        yield HeldOut(out.nonzero()[:, 0], kept.nonzero()[:, 0], weight, covariance.diagonal())
+        yield out.nonzero()[:, 0], kept.nonzero()[:, 0], weight, covariance.diagonal()
 
 
 def held_out_errors(precision: Tensor, dual: Tensor, out: Tensor) -> Tensor:

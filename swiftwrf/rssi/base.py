@@ -329,7 +329,8 @@ class SavedRssiPredictor(RssiPredictor, Saved):
             "origin": self.origin,
             "offsets": self.offsets and asdict(self.offsets),
             "attenuation": self.attenuation and asdict(self.attenuation),
-            "detection": self.detection and self.detection.plain(),
+            "detection": self.detection
+            and {name: torch.as_tensor(x).tolist() for name, x in vars(self.detection).items()},
             "receiver_names": self.receiver_names,
             "receiver_position": [None if math.isnan(at[0]) else at for at in self.receiver_position.tolist()],
         }
@@ -347,8 +348,11 @@ class SavedRssiPredictor(RssiPredictor, Saved):
         attenuation = header.get("attenuation")
         predictor.attenuation = from_plain(FloorAttenuation, attenuation) if attenuation else None
         predictor.offsets = Offsets(**header["offsets"]) if header.get("offsets") else None
-        curve = header.get("detection")
-        predictor.detection = Detection.from_plain(curve, len(known)) if curve else None
+        predictor.detection = None
+        if curve := header.get("detection"):
+            types = {"missed": torch.float64, "is_limit": torch.bool}
+            of_receivers = (to_tensor(name, curve[name], dtype, (len(known),)) for name, dtype in types.items())
+            predictor.detection = Detection(float(curve["limit"]), float(curve["width"]), *of_receivers)
         return predictor
 
 

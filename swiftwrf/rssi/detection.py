@@ -20,8 +20,7 @@ from torch import Tensor
 
 from swiftwrf.errors import listed
 from swiftwrf.gp import GaussianProcess, Kernel, leave_folds_out, subsample
-from swiftwrf.positions import Neighbours, to_tensor
-from swiftwrf.runtime.checkpoint import Header
+from swiftwrf.positions import Neighbours
 
 NEIGHBOURS, FEWEST = 6, 3  # rows beside a cell, and values among them, that determine its level
 MISSED = 1e-3  # share of random misses at least: no value is impossible
@@ -117,17 +116,6 @@ class Detection:
         """Return the curve of some receivers."""
         return replace(self, missed=self.missed[number], is_limit=self.is_limit[number])
 
-    def plain(self) -> Header:
-        """Return the curve as plain values."""
-        return vars(self) | {"missed": self.missed.tolist(), "is_limit": self.is_limit.tolist()}
-
-    @classmethod
-    def from_plain(cls, values: Header, n_receivers: int) -> Self:
-        """Return the curve of plain values."""
-        types = {"missed": torch.float64, "is_limit": torch.bool}
-        missed, is_limit = (to_tensor(name, values[name], dtype, (n_receivers,)) for name, dtype in types.items())
-        return cls(float(values["limit"]), float(values["width"]), missed, is_limit)
-
     def given_detection(self, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean [dBm] and standard deviation [dB] of the power of detected packets, by those of all, each (n, R)."""
         spread = (std.square() + self.width**2).sqrt()
@@ -169,9 +157,9 @@ class DetectionField:
         value, mean = detected.double(), detected.double().mean(dim=0)
         process = GaussianProcess.regress(kernel, position, value - mean)
         share = torch.empty_like(value)
-        for part in leave_folds_out(kernel, position, fold):
-            own = value[part.kept].mean(dim=0)
-            share[part.out] = own + part.weight @ (value[part.kept] - own)
+        for out, kept, weight, _ in leave_folds_out(kernel, position, fold):
+            own = value[kept].mean(dim=0)
+            share[out] = own + weight @ (value[kept] - own)
         known = level.isfinite()
         features = torch.stack([(level - limit) / 10, share], dim=-1)[known]
         detected, order = detected[known].sort(stable=True)  # the first and the last cell, one of each kind, are kept

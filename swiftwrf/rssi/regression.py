@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -374,22 +374,25 @@ def uncertainty(
         receiver: Positions of the receivers less the centre, (R, 3) [m].
         covariance: Covariance of level and slope of each receiver, (R, 2, 2).
     """
-
-    def trend(position: Tensor) -> Tensor:  # regressors of level, and of the slope of each receiver, (n, 1 + R)
-        apart = log_distance(position, receiver)
-        return torch.cat([torch.ones_like(apart[:, :1]), apart], dim=1)
-
     (known,) = subsample(known, rows=MAX_VARIANCE_POSITIONS)
-    process = GaussianProcess.regress(kernel, known, trend(known))
+    process = GaussianProcess.regress(kernel, known, _trend(known, receiver))
+    return partial(_variances, process, receiver, covariance)  # a function that can be pickled
+
+
+def _trend(position: Tensor, receiver: Tensor) -> Tensor:
+    """Return the regressors of level, and of the slope of each receiver, (n, 1 + R)."""
+    apart = log_distance(position, receiver)
+    return torch.cat([torch.ones_like(apart[:, :1]), apart], dim=1)
+
+
+def _variances(
+    process: GaussianProcess, receiver: Tensor, covariance: Tensor, position: Tensor
+) -> tuple[Tensor, Tensor]:
+    mean, of_field = process.condition(position)
+    level, slope = (_trend(position, receiver) - mean).split([1, len(receiver)], dim=1)
     of_level, both, of_slope = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-
-    def variance(position: Tensor) -> tuple[Tensor, Tensor]:
-        mean, of_field = process.condition(position)
-        level, slope = (trend(position) - mean).split([1, len(receiver)], dim=1)
-        of_trend = of_level * level.square() + 2 * both * level * slope + of_slope * slope.square()
-        return of_field, of_trend.clamp_min(0)
-
-    return variance
+    trend = of_level * level.square() + 2 * both * level * slope + of_slope * slope.square()
+    return of_field, trend.clamp_min(0)
 
 
 def held_out_std(bins: Bins, kernel: Kernel, prior_db: tuple[Tensor, Tensor], covariance: Tensor) -> Tensor:
