@@ -268,12 +268,9 @@ class RssiPredictor(Configured, Displayed, ABC):
         self.check_fitted()
         position = check_positions(position)
         with torch.set_grad_enabled(torch.is_grad_enabled() and position.requires_grad):
-            parts = [self._predict(some) for some in position.split(self.batch_size)]
-        stds = [std for _, std in parts if std is not None]
-        mean = torch.cat([mean for mean, _ in parts])
+            mean, std = in_batches(self._predict, position, self.batch_size)
         if self.attenuation is not None:
             mean = mean + self.attenuation.of(position).to(mean)
-        std = torch.cat(stds) if stds else None
         return Prediction(mean, std, position, receiver_names=self.receiver_names)
 
     @checked
@@ -354,6 +351,14 @@ class SavedRssiPredictor(RssiPredictor, Saved):
             of_receivers = (to_tensor(name, curve[name], dtype, (len(known),)) for name, dtype in types.items())
             predictor.detection = Detection(float(curve["limit"]), float(curve["width"]), *of_receivers)
         return predictor
+
+
+def in_batches(
+    predict: Callable[[Tensor], tuple[Tensor, Tensor | None]], rows: Tensor, size: int
+) -> tuple[Tensor, Tensor | None]:
+    """Return mean and standard deviation, or None, of all rows, predicted some rows at a time."""
+    means, stds = zip(*map(predict, rows.split(size)), strict=True)
+    return torch.cat(means), None if stds[0] is None else torch.cat(stds)
 
 
 def often_detected(pool: Rssi) -> Tensor:

@@ -157,6 +157,6 @@ def estimate_offsets(train: Rssi, reference: str | None = None) -> Offsets:
     offset = torch.zeros(len(names), dtype=torch.float64)
     offset[others] = torch.linalg.solve(precision, right[others])
     explained = float(right @ offset) / total if total > 0 else 0.0
-    estimates = dict(zip(names, offset.tolist(), strict=True))
-    known = {name: db for name, db in estimates.items() if frequency[names.index(name)] > 0 or name == chosen}
+    estimates = zip(names, offset.tolist(), frequency.tolist(), strict=True)
+    known = {name: db for name, db, count in estimates if count or name == chosen}
     return Offsets(str(groups.name), chosen, known, explained)
