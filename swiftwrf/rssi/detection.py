@@ -90,11 +90,11 @@ class Detection:
         kept = (torch.special.log_ndtr((value - limit) / width) + (-misses).log1p()).mean(dim=-1)
         below = torch.special.ndtr((limit - lost_level) / (spread**2 + width.square()).sqrt())
         lost = (misses + (1 - misses) * below).log().mean(dim=-1)
-        best = divmod(int((share * kept + (1 - share) * lost).argmax()), width.numel() * misses.numel())
-        at_width, at_misses = divmod(best[1], misses.numel())
-        found = float(limit.flatten()[best[0]]), float(width.flatten()[at_width])
+        score = share * kept + (1 - share) * lost
+        limits, widths, shares = torch.unravel_index(score.argmax(), score.shape)
+        found = float(limit.flatten()[limits]), float(width.flatten()[widths])
         strong = usable & (level > found[0] + 2 * math.hypot(spread, found[1]))
-        lost_count = (strong & ~seen).sum(dim=0).double() + MISSES_WORTH * float(misses.flatten()[at_misses])
+        lost_count = (strong & ~seen).sum(dim=0).double() + MISSES_WORTH * float(misses.flatten()[shares])
         return cls(*found, lost_count / (strong.sum(dim=0) + MISSES_WORTH), is_limit)
 
     def note(self, receiver_names: Sequence[str]) -> str:

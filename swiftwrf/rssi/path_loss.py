@@ -230,21 +230,15 @@ def _maximise(
     (expected, known), of_floor = SLOPE_PRIOR, FLOOR_STD_DB
     certain = torch.tensor([1e-6, known**-2, of_floor**-2], dtype=torch.float64)
 
-    def sums(weight: Tensor) -> tuple[Tensor, Tensor]:
-        """Return weighted sums over the rows of products of regressors, and of them and the values."""
-        weighted = weight[..., None] * feature
-        return torch.einsum("nrk,nrl->rkl", weighted, feature), (weighted * value[..., None]).sum(dim=0)
-
     # unmeasured values, their weights and variances are expectations
     value, weight, spare = rssi.nan_to_num(), seen.double(), torch.zeros_like(rssi)
-    gram, cross = sums(weight)
     variance = rssi[seen].var(correction=0).clamp_min(1e-6).expand(n_receivers)
     missed = torch.zeros(n_receivers).double() if detection is None else detection.missed
     unexplained, last = missed, None
     limited = torch.zeros_like(seen) if detection is None else ~seen & detection.is_limit
     for _ in range(MAX_ROUNDS):
-        scale = variance * repeats
-        normal, right = gram / scale[:, None, None], cross / scale[:, None]
+        weighted = (weight / (variance * repeats))[..., None] * feature
+        normal, right = torch.einsum("nrk,nrl->rkl", weighted, feature), (weighted * value[..., None]).sum(dim=0)
         shrink = torch.linalg.inv(eye + normal @ spread.diag())
         total = (shrink @ normal).sum(dim=0) + certain.diag()
         pull = (shrink @ right[..., None]).sum(dim=0)[:, 0] + torch.tensor([0.0, expected / known**2, 0.0]).double()
@@ -271,7 +265,6 @@ def _maximise(
         ratio, weak = empty_given(z, unexplained)
         hazard = (ratio / weak.clamp_min(1e-12)).clamp_max(40)
         value, weight = rssi.where(seen, mean - variance / std * hazard), weak.where(limited, seen.double())
-        gram, cross = sums(weight)
         spare = (variance * (1 - variance / std.square() * hazard * (z + hazard)).clamp(0, 1)).where(limited, 0.0)
         detected, other = seen.sum(dim=0), (1 - weak).where(limited, 0.0).sum(dim=0)
         share = (other + ROWS_WORTH * other.sum() / (detected + other).sum()) / (detected + other + ROWS_WORTH)
