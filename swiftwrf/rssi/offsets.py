@@ -137,8 +137,7 @@ def estimate_offsets(train: Rssi, reference: str | None = None) -> Offsets:
     kernel = Kernel(0.25 * extent, matern12_weight=1.0, noise=1.0)  # fading is as large as shadowing
     apart = log_distance(position, train.receiver_position)
     member = torch.nn.functional.one_hot(code, len(names)).double()
-    normal = torch.zeros(len(names), len(names), dtype=torch.float64)
-    right, total = torch.zeros(len(names), dtype=torch.float64), 0.0
+    gram = torch.zeros(len(names) + 1, len(names) + 1, dtype=torch.float64)  # of members and RSSI
     generator = torch.Generator().manual_seed(0)
     for r, rssi in enumerate(train.rssi_dbm.T):
         rows = (~rssi.isnan()).nonzero()[:, 0]
@@ -148,9 +147,9 @@ def estimate_offsets(train: Rssi, reference: str | None = None) -> Offsets:
         free = torch.stack([torch.ones_like(apart[rows, r]), apart[rows, r]], dim=1)
         # level and slope over log10 distance are fitted with the offsets, by a linear kernel
         weight = torch.linalg.inv(kernel.covariance(position[rows]) + VAGUE * free @ free.T)
-        normal += member[rows].T @ weight @ member[rows]
-        right += member[rows].T @ weight @ rssi[rows]
-        total += float(rssi[rows] @ weight @ rssi[rows])
+        values = torch.cat([member[rows], rssi[rows, None]], dim=1)
+        gram += values.T @ weight @ values
+    normal, right, total = gram[:-1, :-1], gram[:-1, -1], float(gram[-1, -1])
     others = torch.tensor([name != chosen for name in names])
     prior = 0.05 * torch.eye(int(others.sum()), dtype=torch.float64)  # a standard deviation of 10 dB
     precision = normal[others][:, others] + prior
