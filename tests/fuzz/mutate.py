@@ -113,7 +113,8 @@ def damages(file: Path, kind: str) -> Iterator[tuple[str, Callable[[], object]]]
     elif not file.suffix:
         _, tensors, header = read(file, kind)
         for name, tensor in tensors.items():
-            others = {"deeper": tensor[None], "flat": tensor.ravel()[None, :3]}
+            others = {"deeper": tensor[None]}
+            others |= {"flat": tensor.ravel()[None, :3]} if tensor.shape != (1, 1) else {}
             others |= {"shorter": tensor[:-1], "narrower": tensor[..., :-1]} if tensor.ndim else {}
             others |= {"nan": tensor * torch.nan} if tensor.is_floating_point() else {}
             for how, other in others.items():
