@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
+import numpy as np
 import torch
 from sklearn.linear_model import LogisticRegression
 from torch import Tensor
@@ -91,7 +92,7 @@ class Detection:
         below = torch.special.ndtr((limit - lost_level) / (spread**2 + width.square()).sqrt())
         lost = (misses + (1 - misses) * below).log().mean(dim=-1)
         score = share * kept + (1 - share) * lost
-        limits, widths, shares = torch.unravel_index(score.argmax(), score.shape)
+        limits, widths, shares = np.unravel_index(int(score.argmax()), score.shape)
         found = float(limit.flatten()[limits]), float(width.flatten()[widths])
         strong = usable & (level > found[0] + 2 * math.hypot(spread, found[1]))
         lost_count = (strong & ~seen).sum(dim=0).double() + MISSES_WORTH * float(misses.flatten()[shares])
