@@ -19,4 +19,5 @@ __all__ = [
     "dense_weights",
     "held_out_errors",
 ]
-__all__ += ["inner_products", "leave_folds_out", "most_informative", "principal_components", "subsample"]
+__all__ += ["held_out_errors", "inner_products", "leave_folds_out", "most_informative", "principal_components"]
+__all__ += ["subsample"]
