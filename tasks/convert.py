@@ -19,8 +19,7 @@ from swiftwrf.diagnostics.calibration import Calibration, calibrate
 from swiftwrf.errors import with_article
 from swiftwrf.locate import RssiLocator
 from swiftwrf.rssi.base import RssiPredictor
-from swiftwrf.rssi.maps import RssiMap
-from swiftwrf.rssi.rasters import write_geojson, write_geotiff, write_world_file
+from swiftwrf.rssi.maps import RssiMap, write_geojson, write_geotiff, write_world_file
 from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.durable import replacing, write_json
 from tasks.configs import FILES, MAP_FILES, ConvertConfig

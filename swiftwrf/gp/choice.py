@@ -9,13 +9,12 @@ Learning", 2006, chapters 2 and 5).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from swiftwrf.data.store import Store
-from swiftwrf.gp.process import N_NEIGHBOURS, Kernel, candidates, held_out_errors, leave_folds_out, local_weights
+from swiftwrf.gp.process import N_NEIGHBOURS, Kernel, candidates, held_out_errors, local_weights
 from swiftwrf.positions import Neighbours, distance
 from swiftwrf.runtime.threads import single_thread
 
@@ -104,15 +103,10 @@ def choose_rank(position: Tensor, spectrum: Tensor | Store, fold: Tensor, kernel
         True
     """
     position, spectrum, fold = subsample(position, spectrum, fold)
-    variance, vector = torch.linalg.eigh(inner_products(spectrum))
-    variance = variance.flip(0).clamp_min(0)
-    component = vector.flip(1) * variance.sqrt()  # (n, n), one column a component
-    error = torch.zeros((), dtype=torch.float64)
-    for out, kept, weight, _ in leave_folds_out(kernel, position, fold):
-        error += (component[out] - weight @ component[kept]).square().sum()
-    left_out = variance.flip(0).cumsum(0).flip(0)  # by 0, 1, ... components
-    enough = left_out <= 5e-4 * error  # negligible beside it
-    return int((~enough).sum())
+    error = _held_out_errors(position, spectrum, fold)(kernel).sum()
+    variance = torch.linalg.eigvalsh(inner_products(spectrum)).clamp_min(0)  # ascending
+    left_out = variance.cumsum(0).flip(0)  # by 0, 1, ... components
+    return int((left_out > 5e-4 * error).sum())  # the rest is negligible beside it
 
 
 @single_thread()
@@ -182,41 +176,9 @@ def inner_products(spectrum: Tensor) -> Tensor:
     return flat @ flat.T / flat.shape[1]
 
 
-def squared_errors(gram: Tensor, out: Tensor, kept: Tensor, weight: Tensor) -> Tensor:
-    """Return the squared errors per pixel, (o,), of weighted sums of spectra from the inner products of all spectra.
-
-    Args:
-        gram: Inner products (n, n).
-        out: Rows that are predicted, as numbers (o,) or a mask (n,).
-        kept: Rows that are summed, as numbers (k,) or a mask (n,).
-        weight: Weights (o, k). The mean spectrum has the weight that a row lacks of 1.
-
-    Example:
-        >>> gram = inner_products(torch.tensor([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]))
-        >>> squared_errors(gram, torch.tensor([1]), torch.tensor([0, 2]), torch.tensor([[0.5, 0.5]]).double())
-        tensor([0.], dtype=torch.float64)
-    """
-    own = gram.diagonal()[out]
-    return own - 2 * (weight * gram[out][:, kept]).sum(1) + ((weight @ gram[kept][:, kept]) * weight).sum(1)
-
-
-class Components(NamedTuple):
-    """Rows that are nearly mean + score @ component.
-
-    Example:
-        >>> found = principal_components(torch.outer(torch.arange(5.0), torch.ones(8)), rank=1)
-        >>> (found.mean + found.score.float() @ found.component)[:, 0].round().tolist()
-        [0.0, 1.0, 2.0, 3.0, 4.0]
-    """
-
-    mean: Tensor  # float32 (P,)
-    score: Tensor  # float64 (n, K), each column of length 1, the least component first
-    component: Tensor  # float32 (K, P)
-
-
 def principal_components(
     rows: Tensor | Callable[[], Iterable[Tensor]], rank: int, min_variance: float = MIN_VARIANCE
-) -> Components:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return the largest principal components of rows.
 
     The components of a tensor follow from the inner products of its rows. Those of batches follow from a random sketch of
@@ -228,10 +190,15 @@ def principal_components(
         rank: Maximum number of components.
         min_variance: Fraction of the variance below which a component is left out.
 
+    Returns:
+        Mean (P,), scores (n, K), float64 and each column of length 1, and components (K, P), the least component first. Rows
+        are nearly mean + score @ component.
+
     Example:
         >>> rows = torch.outer(torch.arange(5.0), torch.ones(8))
-        >>> principal_components(rows, rank=3).component.shape
-        torch.Size([1, 8])
+        >>> mean, score, component = principal_components(rows, rank=3)
+        >>> component.shape, (mean + score.float() @ component)[:, 0].round().tolist()
+        (torch.Size([1, 8]), [0.0, 1.0, 2.0, 3.0, 4.0])
     """
     if not isinstance(rows, Tensor):
         return _sketched(rows, rank, min_variance)
@@ -240,10 +207,10 @@ def principal_components(
     value, vector = torch.linalg.eigh((change @ change.T).double())
     kept = (value > min_variance * value.sum()).nonzero()[:, 0]
     vector = vector[:, kept[max(len(kept) - rank, 0) :]]
-    return Components(mean, vector, vector.T.float() @ change)
+    return mean, vector, vector.T.float() @ change
 
 
-def _sketched(batches: Callable[[], Iterable[Tensor]], rank: int, min_variance: float) -> Components:
+def _sketched(batches: Callable[[], Iterable[Tensor]], rank: int, min_variance: float) -> tuple[Tensor, Tensor, Tensor]:
     total, n = torch.zeros((), dtype=torch.float64), 0
     for batch in batches():
         total, n = total + batch.sum(dim=0, dtype=torch.float64), n + len(batch)
@@ -263,4 +230,4 @@ def _sketched(batches: Callable[[], Iterable[Tensor]], rank: int, min_variance: 
     kept = kept[max(len(kept) - rank, 0) :]
     scale = value[kept].sqrt()
     component = (vector[:, kept] * scale).T.float() @ span.T
-    return Components(mean, score @ vector[:, kept] / scale, component)
+    return mean, score @ vector[:, kept] / scale, component

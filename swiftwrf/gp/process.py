@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import torch
 from annotated_types import Ge, Gt, Lt
@@ -110,8 +110,7 @@ class GaussianProcess:
     Args:
         kernel: Kernel with its noise.
         known: Positions of the values (n, 3).
-        coefficient: Dual coefficients of an exact process, values of a local one, (n, K); see `regress`. Defaults to none,
-            for weights and variances alone.
+        value: Values (n, K), in the precision of the posterior mean. Defaults to none, for weights and variances alone.
         exact: Whether every prediction conditions on all positions. Defaults to n <= 2000.
         correlation: Correlation of the field at the time of each value with the present field, (n,), from above 0 to 1,
             ascending. Defaults to 1. Between two values of correlations a <= b it is a / b (autoregressive in time).
@@ -125,15 +124,15 @@ class GaussianProcess:
 
     kernel: Kernel
     known: Tensor
-    coefficient: Tensor = None  # type: ignore[assignment]
+    value: Tensor = None  # type: ignore[assignment]
     exact: bool | None = None
     correlation: Tensor = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         known = self.known.double()
         correlation = known.new_ones(len(known)) if self.correlation is None else self.correlation.double()
-        coefficient = known.new_zeros(len(known), 0) if self.coefficient is None else self.coefficient
-        vars(self).update(known=known, coefficient=coefficient, correlation=correlation)
+        value = known.new_zeros(len(known), 0) if self.value is None else self.value
+        vars(self).update(known=known, value=value, correlation=correlation)
 
     @property
     def is_exact(self) -> bool:
@@ -144,21 +143,14 @@ class GaussianProcess:
     def regress(
         cls, kernel: Kernel, known: Tensor, value: Tensor, exact: bool | None = None, dtype: torch.dtype = torch.float64
     ) -> GaussianProcess:
-        """Return the process of values (n, K) at known positions (n, 3), with coefficients of the given type."""
-        return cls(kernel, known, value.to(dtype), exact).regressed(value)
-
-    def regressed(self, value: Tensor) -> GaussianProcess:
-        """Return the process of other values (n, K) at the same positions."""
-        kept = value.to(self.coefficient)
-        coefficient = torch.cholesky_solve(value.double(), self._factor).to(kept) if self.is_exact else kept
-        return self._with(coefficient=coefficient, value=kept)
+        """Return the process of values (n, K) at known positions (n, 3), with a posterior mean of the given type."""
+        return cls(kernel, known, value.to(dtype), exact)
 
     @cached_property
-    def value(self) -> Tensor:
-        """Values (n, K) that the process was regressed on, in the precision of the coefficients."""
-        if not self.is_exact:
-            return self.coefficient
-        return (self._factor @ (self._factor.T @ self.coefficient.double())).to(self.coefficient)
+    @torch.inference_mode(False)
+    def coefficient(self) -> Tensor:
+        """Dual coefficients (n, K), in the precision of the values."""
+        return torch.cholesky_solve(self.value.double(), self._factor).to(self.value)
 
     def updated(self, position: Tensor, value: Tensor) -> GaussianProcess:
         """Return the process with more values (k, K) at positions (k, 3), equal to `regress` on all values.
@@ -166,12 +158,12 @@ class GaussianProcess:
         The Cholesky factor grows by k rows, in a time proportional to n^2 k (G. H. Golub and C. F. Van Loan, "Matrix
         Computations", 4th ed., 2013, section 6.5.4).
         """
-        values = torch.cat([self.value, value.to(self.coefficient)])
         known = torch.cat([self.known, position.double()])
         correlation = torch.cat([self.correlation, self.correlation.new_ones(len(position))])
-        process = replace(self, known=known, coefficient=values, correlation=correlation)
+        values = torch.cat([self.value, value.to(self.value)])
+        process = replace(self, known=known, value=values, correlation=correlation)
         if not (self.is_exact and process.is_exact):
-            return process.regressed(values)
+            return process
         n, coefficient, cross = len(self.known), self.coefficient.double(), self._cross(position)
         root = torch.linalg.solve_triangular(self._factor, cross.T, upper=False)  # (n, k)
         corner = torch.linalg.cholesky(self.kernel.covariance(position) - root.T @ root)
@@ -179,24 +171,23 @@ class GaussianProcess:
         weight = torch.linalg.solve_triangular(self._factor.T, root, upper=True)
         factor = corner.new_zeros(len(known), len(known))
         factor[:n, :n], factor[n:, :n], factor[n:, n:] = self._factor, root.T, corner
-        coefficient = torch.cat([coefficient - weight @ new, new]).to(values)
-        return process._with(coefficient=coefficient, value=values, _factor=factor)
+        return process._with(coefficient=torch.cat([coefficient - weight @ new, new]).to(values), _factor=factor)
 
     def without(self, rows: Tensor) -> GaussianProcess:
         """Return the process without the values of some rows, by regression on the remaining ones."""
         kept = torch.ones(len(self.known), dtype=torch.bool)
         kept[rows] = False
-        process = replace(self, known=self.known[kept], correlation=self.correlation[kept])
-        return process.regressed(self.value[kept])
+        return replace(self, known=self.known[kept], value=self.value[kept], correlation=self.correlation[kept])
 
     def with_kernel(self, kernel: Kernel) -> GaussianProcess:
         """Return the process of the values with another kernel."""
-        return replace(self, kernel=kernel).regressed(self.value)
+        return replace(self, kernel=kernel)
 
     def widened(self, count: int) -> GaussianProcess:
         """Return the process with some more columns of values, all 0."""
-        coefficient, value = (functional.pad(x, (0, count)) for x in (self.coefficient, self.value))
-        return self._with(coefficient=coefficient, value=value)
+        return self._with(
+            **{name: functional.pad(getattr(self, name), (0, count)) for name in ("value", "coefficient")}
+        )
 
     def aged(self, correlation: float) -> GaussianProcess:
         """Return the process after a change of the field, whose values before and after have the given correlation.
@@ -212,11 +203,11 @@ class GaussianProcess:
         return process
 
     def mean(self, position: Tensor) -> Tensor:
-        """Return the posterior mean at positions (m, 3), (m, K), in the precision of the coefficients."""
+        """Return the posterior mean at positions (m, 3), (m, K), in the precision of the values."""
         if self.is_exact:
             mean: Tensor = self._cross(position).to(self.coefficient) @ self.coefficient
             return mean
-        return self.local(position)[0]
+        return self.condition(position)[0]
 
     def weights(self, position: Tensor) -> tuple[Tensor, Tensor]:
         """Return the posterior mean at positions (m, 3) as a linear function of the values.
@@ -239,8 +230,8 @@ class GaussianProcess:
         return variance.clamp(0, 1)
 
     def state(self, prefix: str = "") -> tuple[dict[str, Tensor], Header]:
-        """Return positions and coefficients, and the kernel as plain values, with names that begin with `prefix`."""
-        tensors = {f"{prefix}position": self.known, f"{prefix}coefficient": self.coefficient}
+        """Return positions and values, and the kernel as plain numbers, with names that begin with `prefix`."""
+        tensors = {f"{prefix}position": self.known, f"{prefix}value": self.value}
         if bool((self.correlation < 1).any()):
             tensors[f"{prefix}correlation"] = self.correlation
         return tensors, {f"{prefix}kernel": asdict(self.kernel)}
@@ -249,19 +240,19 @@ class GaussianProcess:
     def from_state(
         cls, tensors: dict[str, Tensor], header: Header, dtype: torch.dtype, exact: bool | None = None, prefix: str = ""
     ) -> GaussianProcess:
-        """Return the process of a state, with coefficients of the given type.
+        """Return the process of a state, with values of the given type.
 
         Raises:
             InputError: Tensors of other sizes, or a kernel outside its range.
         """
-        known, coefficient = tensors[f"{prefix}position"], tensors[f"{prefix}coefficient"]
+        known, value = tensors[f"{prefix}position"], tensors[f"{prefix}value"]
         n = len(known)
-        expect(tensors, {f"{prefix}position": (n, 3), f"{prefix}coefficient": (n, *coefficient.shape[1:2])})
+        expect(tensors, {f"{prefix}position": (n, 3), f"{prefix}value": (n, *value.shape[1:2])})
         correlation = tensors.get(f"{prefix}correlation", known.new_ones(n))
         expect({"correlation": correlation}, {"correlation": (n,)})
         if not bool(((correlation > 0) & (correlation <= 1)).all()):
             raise InputError("correlation in time must be above 0 and at most 1")
-        return cls(Kernel(**header[f"{prefix}kernel"]), known, coefficient.to(dtype), exact, correlation)
+        return cls(Kernel(**header[f"{prefix}kernel"]), known, value.to(dtype), exact, correlation)
 
     def _cross(self, position: Tensor) -> Tensor:
         """Return the covariances of the present field at positions (m, 3) with the values, float64 (m, n)."""
@@ -281,10 +272,12 @@ class GaussianProcess:
     def _neighbours(self) -> Neighbours:
         return Neighbours(self.known)
 
-    def local(self, position: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean (m, K) and variance (m,) at positions from the nearest known ones, whatever their number."""
+    def condition(self, position: Tensor) -> tuple[Tensor, Tensor]:
+        """Return posterior mean (m, K) and variance (m,) at positions (m, 3), as `mean` and `variance`, by one search."""
+        if self.is_exact:
+            return self.mean(position), self.variance(position)
         number, weight, variance = self._local(position)
-        return torch.einsum("mk,mkc->mc", weight, self.coefficient[number].double()), variance
+        return torch.einsum("mk,mkc->mc", weight, self.value[number].double()), variance
 
     def _local(self, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return row numbers (m, k), weights (m, k) and posterior variance (m,) from the nearest positions."""
@@ -322,18 +315,9 @@ def dense_weights(number: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     return rows, weight.new_zeros(len(weight), len(rows)).scatter(1, column, weight)
 
 
-class HeldOut(NamedTuple):
-    """Weights with which the rows of other folds predict those of one fold; see `leave_folds_out`."""
-
-    out: Tensor  # numbers of the rows that are held out, (o,)
-    kept: Tensor  # numbers of the rows that predict them, (k,)
-    weight: Tensor  # their weights, float64 (o, k)
-    variance: Tensor  # variances of the errors of noisy values, float64 (o,)
-
-
 def leave_folds_out(
     kernel: Kernel, position: Tensor, fold: Tensor, nearest_for: Tensor | None = None
-) -> Iterator[HeldOut]:
+) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
     """Yield how a process with mean 0 predicts the rows of each fold from all other folds, without another fit.
 
     Args:
@@ -342,10 +326,14 @@ def leave_folds_out(
         fold: Number of the fold of each row, (n,).
         nearest_for: Numbers of rows that are predicted from their nearest rows only. Defaults to all rows from all others.
 
+    Yields:
+        Numbers of the rows that are held out, (o,), and of those that predict them, (k,); the weights of the latter, float64
+        (o, k), and the variances of the errors of noisy values, float64 (o,).
+
     Example:
         >>> position = torch.linspace(0, 1, 20, dtype=torch.float64)[:, None] * torch.ones(3)
         >>> kernel, fold = Kernel(noise=0.01), torch.arange(20) % 2
-        >>> [(part.out.tolist(), part.weight.shape) for part in leave_folds_out(kernel, position, fold, torch.arange(4))]
+        >>> [(out.tolist(), weight.shape) for out, _, weight, _ in leave_folds_out(kernel, position, fold, torch.arange(4))]
         [([0, 2], torch.Size([2, 10])), ([1, 3], torch.Size([2, 10]))]
     """
     if nearest_for is not None:
@@ -353,14 +341,14 @@ def leave_folds_out(
             out, others = nearest_for[fold[nearest_for] == number], (fold != number).nonzero()[:, 0]
             near, weight, variance = GaussianProcess(kernel, position[others], exact=False)._local(position[out])
             used, dense = dense_weights(near, weight)
-            yield HeldOut(out, others[used], dense, variance + kernel.noise)
+            yield out, others[used], dense, variance + kernel.noise
         return
     precision = torch.linalg.inv(kernel.covariance(position))
     for number in fold.unique():
         out, kept = ((fold == number) == held for held in (True, False))
         covariance = torch.linalg.inv(precision[out][:, out])
         weight = -covariance @ precision[out][:, kept]
-        yield HeldOut(out.nonzero()[:, 0], kept.nonzero()[:, 0], weight, covariance.diagonal())
+        yield out.nonzero()[:, 0], kept.nonzero()[:, 0], weight, covariance.diagonal()
 
 
 def held_out_errors(precision: Tensor, dual: Tensor, out: Tensor) -> Tensor:

@@ -171,6 +171,5 @@ def nearby_numbers(
     Returns:
         Numbers, float32 (m, 2 P), and the relative standard deviations of their errors, (m,).
     """
-    exact = process.is_exact  # else both follow from the same neighbours
-    mean, variance = (process.mean(position), process.variance(position)) if exact else process.local(position)
+    mean, variance = process.condition(position)
     return channel_numbers(channel, array) + mean.float(), (variance + process.kernel.noise).sqrt().float()

@@ -337,7 +337,7 @@ class ChannelLikelihoods(Likelihoods):
     def from_state(cls, room: GeometryModel, tensors: dict[str, Tensor], header: Header) -> Self:
         (nearby,) = _distributions(room, tensors, header, 1)
         process = GaussianProcess.from_state(tensors, header, torch.float32, prefix=NEARBY)
-        expect(tensors, {f"{NEARBY}coefficient": (len(process.known), len(nearby.scale))})
+        expect(tensors, {f"{NEARBY}value": (len(process.known), len(nearby.scale))})
         n_snapshots, floor, frequency = (
             int(header["n_snapshots"]),
             float(header["floor"]),

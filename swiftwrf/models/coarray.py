@@ -135,7 +135,7 @@ class CoarrayModel(Linked, ProcessModel):
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         self.process = GaussianProcess.from_state(tensors, header, torch.float64)
-        n_scores = tensors["coefficient"].shape[-1]
+        n_scores = tensors["value"].shape[-1]
         form = (1 + 2 * len(differences(self.array)), n_scores, n_scores)
         coarse = _coarse(Store(torch.zeros(1, *self.grid.shape))).shape[1:]
         expect(tensors, {"offset": (1,), "form": form, "component": (n_scores, *coarse)})

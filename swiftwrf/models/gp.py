@@ -85,6 +85,6 @@ class GPModel(ProcessModel, MemoryModel):
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         super()._restore(tensors, header)
-        none = {"coefficient": torch.zeros(len(self.position), 0)}
+        none = {"value": torch.zeros(len(self.position), 0)}
         self._set_process(GaussianProcess.from_state(tensors | none, header, torch.float64))
         self._restore_spread(tensors)

@@ -15,7 +15,7 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import folds
 from swiftwrf.data.store import Store
-from swiftwrf.gp import dense_weights, inner_products, squared_errors, subsample
+from swiftwrf.gp import dense_weights, inner_products, subsample
 from swiftwrf.models.base import FieldModel
 from swiftwrf.positions import distance, nearest
 from swiftwrf.runtime.checkpoint import Header, expect
@@ -109,10 +109,11 @@ class IDWModel(MemoryModel):
 def _held_out_loss(k: int, position: Tensor, gram: Tensor, fold: Tensor) -> float:
     loss = 0.0
     for number in fold.unique():
-        out, kept = fold == number, fold != number
+        out, kept = fold == number, (fold != number).nonzero()[:, 0]
         near, share = weights(position[out], position[kept], k)
-        weight = torch.zeros(len(near), int(kept.sum()), dtype=gram.dtype).scatter_(1, near, share.to(gram.dtype))
-        loss += float(squared_errors(gram, out, kept, weight).sum())
+        weight = -torch.eye(len(fold), dtype=gram.dtype)[out]  # predicted minus held-out spectra
+        weight.scatter_(1, kept[near], share.to(gram.dtype))
+        loss += float(((weight @ gram) * weight).sum())
     return loss
 
 

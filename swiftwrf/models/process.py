@@ -81,7 +81,7 @@ class ProcessModel(FieldModel):
         model._set_process(model.process.with_kernel(choose_kernel(position, model._weighted_values(), fold)))
         (rows,) = subsample(torch.arange(len(position)), rows=MAX_HELD_OUT)
         old, new = (
-            torch.cat([part.variance for part in leave_folds_out(kernel, position, fold, rows)]).mean().sqrt()
+            torch.cat([variance for *_, variance in leave_folds_out(kernel, position, fold, rows)]).mean().sqrt()
             for kernel in (before, model.process.kernel)
         )
         model._scale_std(float(old / new))  # of noisy values at held-out positions

@@ -224,7 +224,7 @@ class SwiftWRF(ProcessModel):
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         self.process = GaussianProcess.from_state(tensors, header, torch.float64)
-        n, k = len(tensors["mean"]), tensors["coefficient"].shape[1]
+        n, k = len(tensors["mean"]), tensors["value"].shape[1]
         expect(tensors, {"mean": (n, 2), "cholesky": (n, 3), "weight": (1 + k, n)})
         self.mean, self.cholesky, self.weight = (tensors[name] for name in ("mean", "cholesky", "weight"))
         self.calibration = float(header["calibration"])

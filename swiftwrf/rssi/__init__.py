@@ -2,12 +2,12 @@
 
 from swiftwrf.rssi.base import Map, RssiConfig, RssiPredictor
 from swiftwrf.rssi.comparison import RssiComparison, compare
-from swiftwrf.rssi.mixing import LEVEL
 from swiftwrf.rssi.model import RssiModel, fit_rssi
 from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation, estimate_offsets
 from swiftwrf.rssi.pairs import PairModel
 from swiftwrf.rssi.paper import RssiPaperModel
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, log_distance
+from swiftwrf.rssi.training import LEVEL
 
 __all__ = ["LEVEL", "FloorAttenuation", "Map", "PairModel", "PathLoss", "RssiComparison", "RssiConfig"]
 __all__ += ["RssiModel", "RssiPaperModel", "RssiPredictor", "compare", "estimate_floor_attenuation"]

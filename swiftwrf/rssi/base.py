@@ -85,6 +85,8 @@ class RssiPredictor(Configured, Displayed, ABC):
     """whether the positions of the receivers must be known"""
     slow: ClassVar[bool] = False
     """whether a fit takes minutes, so that it is compared only on request"""
+    updates: ClassVar[bool] = False
+    """whether `update` is available; other predictors must be fitted again"""
     max_map_predictions: ClassVar[int] = 2**22
     """predictions of a map at all receivers if its cells are not given"""
     batch_size: ClassVar[int] = 512
@@ -196,8 +198,14 @@ class RssiPredictor(Configured, Displayed, ABC):
         if self.attenuation is not None:
             new = self.attenuation.removed(new)
         if len(new):
+            self.check_updates()
             predictor._update(new)
         return predictor
+
+    def check_updates(self) -> None:
+        """Raise InputError if the predictor must be fitted again to more rows."""
+        if not self.updates:
+            raise InputError(f"a predictor {self.name} cannot be updated; fit it again to all rows")
 
     def check_measurements(self, data: Rssi) -> None:
         """Refuse rows at other receivers than those of the training rows. Unknown positions are not compared.
@@ -222,7 +230,6 @@ class RssiPredictor(Configured, Displayed, ABC):
 
     def _update(self, new: Rssi) -> None:
         """Add checked rows to this copy."""
-        raise InputError(f"a predictor {self.name} cannot be updated; fit it again to all rows")
 
     def region(self) -> Tensor:
         """Return the training positions (n, 3) [m], whose box a map covers."""
@@ -261,12 +268,9 @@ class RssiPredictor(Configured, Displayed, ABC):
         self.check_fitted()
         position = check_positions(position)
         with torch.set_grad_enabled(torch.is_grad_enabled() and position.requires_grad):
-            parts = [self._predict(some) for some in position.split(self.batch_size)]
-        stds = [std for _, std in parts if std is not None]
-        mean = torch.cat([mean for mean, _ in parts])
+            mean, std = in_batches(self._predict, position, self.batch_size)
         if self.attenuation is not None:
             mean = mean + self.attenuation.of(position).to(mean)
-        std = torch.cat(stds) if stds else None
         return Prediction(mean, std, position, receiver_names=self.receiver_names)
 
     @checked
@@ -322,7 +326,8 @@ class SavedRssiPredictor(RssiPredictor, Saved):
             "origin": self.origin,
             "offsets": self.offsets and asdict(self.offsets),
             "attenuation": self.attenuation and asdict(self.attenuation),
-            "detection": self.detection and self.detection.plain(),
+            "detection": self.detection
+            and {name: torch.as_tensor(x).tolist() for name, x in vars(self.detection).items()},
             "receiver_names": self.receiver_names,
             "receiver_position": [None if math.isnan(at[0]) else at for at in self.receiver_position.tolist()],
         }
@@ -340,9 +345,20 @@ class SavedRssiPredictor(RssiPredictor, Saved):
         attenuation = header.get("attenuation")
         predictor.attenuation = from_plain(FloorAttenuation, attenuation) if attenuation else None
         predictor.offsets = Offsets(**header["offsets"]) if header.get("offsets") else None
-        curve = header.get("detection")
-        predictor.detection = Detection.from_plain(curve, len(known)) if curve else None
+        predictor.detection = None
+        if curve := header.get("detection"):
+            types = {"missed": torch.float64, "is_limit": torch.bool}
+            of_receivers = (to_tensor(name, curve[name], dtype, (len(known),)) for name, dtype in types.items())
+            predictor.detection = Detection(float(curve["limit"]), float(curve["width"]), *of_receivers)
         return predictor
+
+
+def in_batches(
+    predict: Callable[[Tensor], tuple[Tensor, Tensor | None]], rows: Tensor, size: int
+) -> tuple[Tensor, Tensor | None]:
+    """Return mean and standard deviation, or None, of all rows, predicted some rows at a time."""
+    means, stds = zip(*map(predict, rows.split(size)), strict=True)
+    return torch.cat(means), None if stds[0] is None else torch.cat(stds)
 
 
 def often_detected(pool: Rssi) -> Tensor:

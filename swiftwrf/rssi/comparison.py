@@ -25,11 +25,11 @@ from swiftwrf.metrics import method_summary
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import distance, nearest
 from swiftwrf.rssi.base import RssiPredictor
-from swiftwrf.rssi.mixing import LEVEL
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.offsets import estimate_offsets
 from swiftwrf.rssi.pairs import PairModel
 from swiftwrf.rssi.paper import RssiPaperModel
+from swiftwrf.rssi.training import LEVEL
 from swiftwrf.runtime.checkpoint import Saved, load
 from swiftwrf.runtime.registry import write_report
 from swiftwrf.runtime.steps import MODEL, Memo, Steps
@@ -129,17 +129,16 @@ class RssiComparison:
         for name in self.values:
             predicted = self._prediction(name).mean
             columns = {
-                "index": test.index[row],
-                "measured_dbm": measured,
-                "predicted_dbm": predicted,
-                "abs_error_db": (predicted - measured).abs(),
-                "from_receiver_m": from_receiver,
-                "from_training_m": from_training,
+                "method": name,
+                "receiver": self._receiver,
+                "index": test.index[row].numpy(),
+                "measured_dbm": measured.numpy(),
+                "predicted_dbm": predicted.numpy(),
+                "abs_error_db": (predicted - measured).abs().numpy(),
+                "from_receiver_m": from_receiver.numpy(),
+                "from_training_m": from_training.numpy(),
             }
-            found = DataFrame({name: values.numpy() for name, values in columns.items()})
-            found.insert(0, "receiver", self._receiver)
-            found.insert(0, "method", name)
-            rows.append(found)
+            rows.append(DataFrame(columns))
         return concat(rows, ignore_index=True)
 
     @cached_property

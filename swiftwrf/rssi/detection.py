@@ -14,14 +14,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
+import numpy as np
 import torch
 from sklearn.linear_model import LogisticRegression
 from torch import Tensor
 
 from swiftwrf.errors import listed
 from swiftwrf.gp import GaussianProcess, Kernel, leave_folds_out, subsample
-from swiftwrf.positions import Neighbours, to_tensor
-from swiftwrf.runtime.checkpoint import Header
+from swiftwrf.positions import Neighbours
 
 NEIGHBOURS, FEWEST = 6, 3  # rows beside a cell, and values among them, that determine its level
 MISSED = 1e-3  # share of random misses at least: no value is impossible
@@ -91,11 +91,11 @@ class Detection:
         kept = (torch.special.log_ndtr((value - limit) / width) + (-misses).log1p()).mean(dim=-1)
         below = torch.special.ndtr((limit - lost_level) / (spread**2 + width.square()).sqrt())
         lost = (misses + (1 - misses) * below).log().mean(dim=-1)
-        best = divmod(int((share * kept + (1 - share) * lost).argmax()), width.numel() * misses.numel())
-        at_width, at_misses = divmod(best[1], misses.numel())
-        found = float(limit.flatten()[best[0]]), float(width.flatten()[at_width])
+        score = share * kept + (1 - share) * lost
+        limits, widths, shares = np.unravel_index(int(score.argmax()), score.shape)
+        found = float(limit.flatten()[limits]), float(width.flatten()[widths])
         strong = usable & (level > found[0] + 2 * math.hypot(spread, found[1]))
-        lost_count = (strong & ~seen).sum(dim=0).double() + MISSES_WORTH * float(misses.flatten()[at_misses])
+        lost_count = (strong & ~seen).sum(dim=0).double() + MISSES_WORTH * float(misses.flatten()[shares])
         return cls(*found, lost_count / (strong.sum(dim=0) + MISSES_WORTH), is_limit)
 
     def note(self, receiver_names: Sequence[str]) -> str:
@@ -116,17 +116,6 @@ class Detection:
     def columns(self, number: Tensor | slice) -> Self:
         """Return the curve of some receivers."""
         return replace(self, missed=self.missed[number], is_limit=self.is_limit[number])
-
-    def plain(self) -> Header:
-        """Return the curve as plain values."""
-        return vars(self) | {"missed": self.missed.tolist(), "is_limit": self.is_limit.tolist()}
-
-    @classmethod
-    def from_plain(cls, values: Header, n_receivers: int) -> Self:
-        """Return the curve of plain values."""
-        types = {"missed": torch.float64, "is_limit": torch.bool}
-        missed, is_limit = (to_tensor(name, values[name], dtype, (n_receivers,)) for name, dtype in types.items())
-        return cls(float(values["limit"]), float(values["width"]), missed, is_limit)
 
     def given_detection(self, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean [dBm] and standard deviation [dB] of the power of detected packets, by those of all, each (n, R)."""
@@ -169,9 +158,9 @@ class DetectionField:
         value, mean = detected.double(), detected.double().mean(dim=0)
         process = GaussianProcess.regress(kernel, position, value - mean)
         share = torch.empty_like(value)
-        for part in leave_folds_out(kernel, position, fold):
-            own = value[part.kept].mean(dim=0)
-            share[part.out] = own + part.weight @ (value[part.kept] - own)
+        for out, kept, weight, _ in leave_folds_out(kernel, position, fold):
+            own = value[kept].mean(dim=0)
+            share[out] = own + weight @ (value[kept] - own)
         known = level.isfinite()
         features = torch.stack([(level - limit) / 10, share], dim=-1)[known]
         detected, order = detected[known].sort(stable=True)  # the first and the last cell, one of each kind, are kept
@@ -188,19 +177,6 @@ class DetectionField:
     def updated(self, position: Tensor, detected: Tensor) -> Self:
         """Return the field with more rows, detections bool (m, R) at positions (m, 3) [m]."""
         return replace(self, process=self.process.updated(position, detected.double() - self.mean))
-
-    def state(self) -> tuple[dict[str, Tensor], Header]:
-        """Return the tensors and plain values of the field by their names in files."""
-        tensors, header = self.process.state("share.")
-        plain = {"limit": self.limit, "weight": self.weight.tolist()}
-        return tensors | {"share.mean": self.mean}, header | {"share": plain}
-
-    @classmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
-        """Return the field of a state."""
-        process = GaussianProcess.from_state(tensors, header, torch.float64, prefix="share.")
-        weight = to_tensor("share.weight", header["share"]["weight"], torch.float64, (3,))
-        return cls(process, tensors["share.mean"].double(), float(header["share"]["limit"]), weight)
 
 
 def empty_given(z: Tensor, missed: Tensor) -> tuple[Tensor, Tensor]:

@@ -69,7 +69,7 @@ def mean_magnitude(rendered: Tensor, latent: Tensor) -> Tensor:
 
 
 class HeadTable:
-    """Piecewise linear `mean_magnitude` of R receivers, tabulated every 0.125 dB, with an error below 2e-3 dB.
+    """Piecewise linear m(c) - m(0) of R receivers, tabulated every 0.125 dB, with an error below 2e-3 dB.
 
     Args:
         rendered: Fields (R, 2, 2, directions).
@@ -77,10 +77,11 @@ class HeadTable:
 
     def __init__(self, rendered: Tensor) -> None:
         node = torch.arange(-TABLE_RANGE_DB, TABLE_RANGE_DB + TABLE_STEP_DB, TABLE_STEP_DB, device=rendered.device)
-        self.value = mean_magnitude(rendered, node[:, None].expand(-1, len(rendered))).double()  # (nodes, R)
+        value = mean_magnitude(rendered, node[:, None].expand(-1, len(rendered))).double()  # (nodes, R)
+        self.value = value - value[len(node) // 2]
 
     def __call__(self, latent: Tensor) -> tuple[Tensor, Tensor]:
-        """Return m(c) and its slope, each (n, R), at a latent field c (n, R) [dB]."""
+        """Return m(c) - m(0) and its slope, each (n, R), at a latent field c (n, R) [dB]."""
         place = (latent + TABLE_RANGE_DB) / TABLE_STEP_DB
         node = place.detach().floor().long().clamp(0, len(self.value) - 2)
         low, high = (self.value.gather(0, n).to(latent) for n in (node, node + 1))

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from functools import partial
+from operator import attrgetter
 from typing import Any, ClassVar, Self
 
 import torch
@@ -18,8 +19,7 @@ from torch import Tensor
 
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.errors import InputError
-from swiftwrf.gp import Kernel, subsample
+from swiftwrf.gp import GaussianProcess, Kernel, subsample
 from swiftwrf.models.base import CPU
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Axes
@@ -28,18 +28,22 @@ from swiftwrf.rssi.base import Map, RssiConfig, SavedRssiPredictor, columns_of, 
 from swiftwrf.rssi.detection import Detection, DetectionField
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
 from swiftwrf.rssi.maps import RssiMap
-from swiftwrf.rssi.mixing import check_comparable, comparable, interval_scale, mixing_weights, rounding_std
-from swiftwrf.rssi.path_loss import N_HARMONICS, harmonics, log_distance
-from swiftwrf.rssi.posterior import FitState, RssiPosterior
-from swiftwrf.rssi.regression import Uncertainty, fit_receiver, held_out_std
-from swiftwrf.rssi.training import MAX_KERNEL_RECEIVERS, RssiTraining, prepare
-from swiftwrf.runtime import checkpoint as files
-from swiftwrf.runtime.checkpoint import Header
+from swiftwrf.rssi.path_loss import harmonics, log_distance
+from swiftwrf.rssi.regression import RssiPosterior, fit_receiver, held_out_std, uncertainty
+from swiftwrf.rssi.training import (
+    MAX_KERNEL_RECEIVERS,
+    check_comparable,
+    interval_scale,
+    mixing_weights,
+    prepare,
+    rounding_std,
+)
+from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import parallel_map, single_thread
 from swiftwrf.runtime.validation import checked
 
-FIELD_ALONE = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)  # mixing weights
+RECEIVERS_AT_ONCE = 64  # between two steps of the progress bar; starting threads costs milliseconds
 
 
 class RssiModel(SavedRssiPredictor):
@@ -67,11 +71,10 @@ class RssiModel(SavedRssiPredictor):
     kind: ClassVar[str] = "rssi model"
     name = "swiftwrf"
     config_type = RssiConfig
+    updates = True
 
     kernel: Kernel
     """kernel of the latent field, lengths in [m]"""
-    n_primitives: int
-    """primitives a receiver; 0 if there is no field"""
     mixing_weight: Tensor
     """weights (4,) of the field and the three simpler predictors at all receivers, contained in the tensors below"""
     centre: Tensor
@@ -80,10 +83,8 @@ class RssiModel(SavedRssiPredictor):
     """RSSI at 1 m, float64 (R,) [dBm]"""
     slope: Tensor
     """float64 (R,) [dB a decade]"""
-    middle: Tensor
-    """log10 of the distance at which levels are compared, float64 (R,)"""
     covariance: Tensor
-    """calibrated covariance of level at that distance and slope, float64 (R, 2, 2)"""
+    """calibrated covariance of level and slope, float64 (R, 2, 2)"""
     detection_field: DetectionField | None
     """probability of a detection; None if every cell has a value, or if empty cells are ignored"""
     directivity: Tensor
@@ -98,9 +99,12 @@ class RssiModel(SavedRssiPredictor):
     """calibrated standard deviation of the field far from all measurements, (R,) [dB]"""
     noise_db: Tensor
     """calibrated standard deviation of a measurement about the field, (R,) [dB]"""
-    _posterior: RssiPosterior | None
-    """least squares of the fit, which `update` continues; None for `RssiPaperModel`"""
+    baseline: Tensor
+    """RSSI at 1 m [dBm] and slope [dB a decade] of the simpler predictors by their mixing weights, float64 (R, 2)"""
+    posterior: RssiPosterior
+    """least squares of the fit, which `update` continues"""
 
+    @single_thread()
     def _fit(
         self,
         train: Rssi,
@@ -117,70 +121,72 @@ class RssiModel(SavedRssiPredictor):
         (often,) = subsample(often, rows=MAX_KERNEL_RECEIVERS)
         # receivers that determine the mixing weights are fitted, too: predictions do not depend on the receivers of `train`
         every = torch.cat([own, often[~torch.isin(often, own)]])
-        training = prepare(pool.columns(every.tolist()), pool, self.config, shift, curve)
+        training = prepare(pool, every, self.config, shift, curve)
         task = partial(fit_receiver, data=training, config=self.config, device=device)
-        parts = [slice(r, r + 1) for r in range(len(every))]
         with progress_bar(progress) as bar:
-            fits = (parallel or _in_threads)(task, parts)
-            results = list(bar.track(fits, total=len(parts), description="receivers"))
-        found = {name: torch.cat([result[name] for result in results]) for name in results[0]}
-        predictors, std = _held_out_predictors(training, found)
-        predictors, std, mine = predictors[:, training.bin_of_row], std[training.bin_of_row], slice(len(own))
+            fits = (parallel or _in_threads)(task, range(len(every)))
+            results = list(bar.track(fits, total=len(every), description="receivers"))
+        found = {name: torch.stack([result[name] for result in results]) for name in results[0]}
+        loss, shift, measured = training.path_loss, training.shift, ~training.rssi.isnan()
+        field = found.pop("held_out").T
+        # held-out predictions of the field and of the simpler predictors, given that the packets were detected
+        predictors = torch.cat([field.where(measured, torch.nan)[None], training.baseline_held_out])
+        prior_db = training.field_db, training.noise_db
+        std = held_out_std(training, training.kernel, prior_db, found["covariance"])
+        if loss.detection is not None:
+            given = [loss.detection.given_detection(mean + shift, std) for mean in predictors]
+            std = given[0][1].where(~predictors[0].isnan(), std)
+            predictors = torch.stack([mean for mean, _ in given]) - shift
+        predictors, std = predictors[:, training.bin_of_row], std[training.bin_of_row]
         # one set of weights for all receivers: the few folds determine none for each of them
         columns = list(map(every.tolist().index, often.tolist()))
-        predicted, measured = predictors[..., columns], pool.rssi_dbm[:, often]
-        is_comparable = bool(comparable(predicted, measured).any())
-        weight = mixing_weights(predicted, measured) if is_comparable else FIELD_ALONE
+        weight = mixing_weights(predictors[..., columns], pool.rssi_dbm[:, often])
+        mine = slice(len(own))
+        found |= {"measured": measured.T.double(), "field_db": prior_db[0], "noise_db": prior_db[1]}
         found = {name: value[mine] for name, value in found.items()}
-        self._assemble(train, training.columns(mine), found, (predictors[..., mine], std[:, mine]), weight)
-
-    @single_thread()
-    def _assemble(
-        self,
-        train: Rssi,
-        training: RssiTraining,
-        found: dict[str, Tensor],
-        held_out: tuple[Tensor, Tensor],
-        weight: Tensor,
-    ) -> None:
-        """Mix the fits of all receivers with the simpler predictors by weights (4,), and calibrate the deviation."""
-        predictors, std = held_out
+        predictors = predictors[..., mine]
         check_comparable(predictors, train.rssi_dbm)
         predicted = torch.einsum("k,knr->nr", weight[weight > 0], predictors[weight > 0])
-        scale = interval_scale(predicted, std, train.rssi_dbm)
-
-        def mixed(own: Tensor, baselines: Tensor) -> Tensor:
-            return weight @ torch.cat([own[None], baselines])
-
-        self.n_primitives, self.kernel, self.mixing_weight = training.n_primitives, training.kernel, weight
-        self.centre, loss = training.centre, training.path_loss
-        self.middle, self.detection = loss.middle, loss.detection
-        self.level = mixed(found["level"], training.baselines.level)
-        self.slope = mixed(found["slope"], training.baselines.slope)
-        self.directivity = (weight[0] * found["directivity"]).float()
-        self.anchor, self.coefficient = training.position.float(), found["coefficient"].T.float().contiguous()
-        self.rendered = found["rendered"]
-        self.detection_field = None
-        if self.detection is not None:
-            level = found["held_out"].T.where(~found["held_out"].T.isnan(), training.baseline_held_out[0])
-            seen = ~training.rssi.isnan()
-            bins = training.position, seen, training.fold, level + training.shift
-            self.detection_field = DetectionField.fit(training.kernel, *bins, self.detection.limit)
-        rows = {name: found[name].T for name in ("dual", "tangent", "variance")}
-        prior = {name: found[name] for name in ("prior_level", "prior_slope", "prior_std")}
-        state = FitState(
-            **rows,
-            **prior,
-            measured=(~training.rssi.isnan()).to(training.rssi),
-            middle=self.middle.clone(),
-            field_variance=training.field_db.square(),
-            noise_variance=training.noise_db.square(),
-        )
-        noise_db = (scale * training.noise_db).clamp_min(rounding_std(train.rssi_dbm))
-        self.field_db, self.noise_db = (scale * training.field_db).float(), noise_db.float()
+        scale = self._calibrate(train.rssi_dbm, predicted, std[:, mine], found["field_db"], found["noise_db"])
         # only two predictors have the receiver's path loss
-        self.covariance = (weight[:2].sum() * scale).square()[:, None, None] * found["covariance"]
-        self._precompute(state)
+        self.covariance = (weight[:2].sum() * scale).square()[:, None, None] * found.pop("covariance")
+        self.mixing_weight, self.kernel, self.centre = weight, training.kernel, training.centre
+        self.rendered = training.rendered[mine]
+        self.baseline = torch.stack([weight[1:] @ values[:, mine] for values in training.baselines], dim=1)
+        self.detection, self.detection_field = loss.detection and loss.detection.columns(mine), None
+        if self.detection is not None:
+            level = field.where(~field.isnan(), training.baseline_held_out[0]) + shift
+            bins = training.position, measured[:, mine], training.fold, level[:, mine]
+            self.detection_field = DetectionField.fit(training.kernel, *bins, self.detection.limit)
+        self._take(found | {"anchor": training.position})
+
+    def _calibrate(self, rssi: Tensor, predicted: Tensor, std: Tensor, field_db: Tensor, noise_db: Tensor) -> Tensor:
+        """Calibrate the standard deviations by held-out predictions of the training rows, and return their factors (R,).
+
+        `rssi`, `predicted` [dBm] and `std` [dB] are (n, R), the prior deviations of latent field and noise are (R,) [dB].
+        """
+        scale = interval_scale(predicted, std, rssi)
+        self.field_db = (scale * field_db).float()
+        self.noise_db = (scale * noise_db).clamp_min(rounding_std(rssi)).float()
+        return scale
+
+    def _take(self, state: dict[str, Any]) -> None:
+        """Take the state of a posterior over; see `RssiPosterior`."""
+        self._table, receiver = HeadTable(self.rendered), self.receiver_position - self.centre
+        self._set_posterior(RssiPosterior(receiver, self.kernel, self._table, self.config.huber, **state))
+
+    def _set_posterior(self, posterior: RssiPosterior) -> None:
+        """Mix a posterior with the simpler predictors, and compute what all predictions share."""
+        self.posterior, weight = posterior, self.mixing_weight[0]
+        self.level, self.slope = (self.baseline + weight * posterior.path_loss).T
+        self.directivity = (weight * posterior.directivity).float()
+        self.anchor, self.coefficient = posterior.anchor.float(), posterior.coefficient.float().contiguous()
+        self._uncertainty = uncertainty(self.kernel, posterior.anchor, posterior.receiver, self.covariance)
+
+    @property
+    def n_primitives(self) -> int:
+        """Number of primitives a receiver; 0 if there is no field."""
+        return self.config.n_primitives if bool(self.rendered.any()) else 0
 
     @property
     def receiver(self) -> Tensor:
@@ -191,34 +197,15 @@ class RssiModel(SavedRssiPredictor):
         """Return the positions (n, 3) [m] of the location bins."""
         return self.anchor.double() + self.centre
 
-    def _precompute(self, state: FitState | None) -> None:
-        """Compute what all predictions share, and the posterior that `update` continues, if there is one."""
-        self._table, receiver = HeadTable(self.rendered), self.receiver_position - self.centre
-        self._offset = self._table(torch.zeros(1, len(self.level)))[0]
-        self._uncertainty, self._posterior = self._uncertainty_of_rows(), None
-        if state is not None:
-            self._posterior = RssiPosterior(state, self.anchor, receiver, self.kernel, self._table, self.config.huber)
-
-    def _uncertainty_of_rows(self) -> Uncertainty:
-        receiver = self.receiver_position - self.centre
-        return Uncertainty(self.kernel, self.anchor.double(), receiver, self.middle, self.covariance)
-
     @single_thread()
     def _update(self, new: Rssi) -> None:
-        posterior = self._checked_posterior()
         if self.offsets is not None:
             new = self.offsets.removed(new)
-        new, before = new.about(self.origin), posterior.linear
-        self._posterior = posterior.updated(new.transmitter_position - self.centre, new.rssi_dbm)
+        new = new.about(self.origin)
+        at = new.transmitter_position - self.centre
         if self.detection_field is not None:
-            at = new.transmitter_position - self.centre
             self.detection_field = self.detection_field.updated(at, new.detected)
-        change = self.mixing_weight[0] * (self._posterior.linear - before).T  # (10, R)
-        self.level, self.slope = self.level + change[0], self.slope + change[1]
-        self.directivity = self.directivity + change[2:].T.float()
-        folded = self._posterior.folded()
-        self.anchor, self.coefficient = folded.anchor.float(), folded.coefficient.float()
-        self._uncertainty = self._uncertainty_of_rows()
+        self._set_posterior(self.posterior.updated(at, new.rssi_dbm))
 
     def with_chosen_kernel(self, without: Tensor | None = None) -> Self:
         """Return the model fitted again to all rows that it has learnt, with kernel, noise and mixing weights chosen again.
@@ -241,7 +228,8 @@ class RssiModel(SavedRssiPredictor):
             50
         """
         self.check_fitted()
-        posterior = self._checked_posterior().folded()
+        self.check_updates()
+        posterior = self.posterior
         kept = torch.ones(len(posterior.anchor), dtype=torch.bool)
         if without is not None:
             kept[without] = False
@@ -258,16 +246,10 @@ class RssiModel(SavedRssiPredictor):
         validation = "block" if self.config.validation == "session" else self.config.validation
         model = type(self)(replace(self.config, validation=validation)).fit(rows)
         model.offsets = self.offsets
-        state = posterior.state
         # a mean of several measurements has a smaller variance than one measurement
-        if bool(((state.variance > 0) & (state.variance < 0.99 * state.noise_variance)).any()):
+        if bool(((posterior.variance > 0) & (posterior.variance < 0.99 * posterior.noise_db.square()[:, None])).any()):
             model.field_db, model.noise_db = self.field_db, self.noise_db
         return model
-
-    def _checked_posterior(self) -> RssiPosterior:
-        if self._posterior is None:
-            raise InputError(f"a predictor {self.name} cannot be updated; fit it again to all rows")
-        return self._posterior
 
     @single_thread()
     def _predict(self, position: Tensor) -> tuple[Tensor, Tensor]:
@@ -276,7 +258,7 @@ class RssiModel(SavedRssiPredictor):
         distance = log_distance(position, self.receiver)
         path_loss = self.level + self.slope * distance
         bearing = harmonics(local, (self.receiver - self.centre).float())
-        head = self._table(self.kernel(local, self.anchor) @ self.coefficient)[0] - self._offset
+        head = self._table(self.kernel(local, self.anchor) @ self.coefficient)[0]
         mean = path_loss.float() + torch.einsum("brh,rh->br", bearing, self.directivity)
         mean = mean + self.mixing_weight[0].float() * head
         variance, trend = self._uncertainty(offset)
@@ -329,32 +311,24 @@ class RssiModel(SavedRssiPredictor):
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         self.check_fitted()
-        tensors = {name: getattr(self, name) for name in _shapes(0, 0)}
-        header = self._header() | {"kernel": asdict(self.kernel), "n_primitives": self.n_primitives}
-        if self.detection_field is not None:
-            of_field = self.detection_field.state()
-            tensors, header = tensors | of_field[0], header | of_field[1]
-        if self._posterior is not None:
-            tensors |= {f"fit.{name}": value for name, value in vars(self._posterior.folded().state).items()}
-        return tensors, header
+        names = _shapes(0, 0, self.detection_field is not None)
+        return {name: attrgetter(name)(self) for name in names}, self._header() | {"kernel": asdict(self.kernel)}
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
         model = cls._of_header(header)
-        model.kernel, model.n_primitives = Kernel(**header["kernel"]), int(header["n_primitives"])
-        shapes = _shapes(len(model.receiver_names), len(tensors["anchor"]))
-        files.expect(tensors, shapes)
-        for name in shapes:
-            setattr(model, name, tensors[name])
-        model.detection_field, n_receivers = None, len(model.receiver_names)
-        if "share" in header:
-            files.expect(
-                tensors,
-                {"share.mean": (n_receivers,), "share.coefficient": (len(tensors["share.position"]), n_receivers)},
-            )
-            model.detection_field = DetectionField.from_state(tensors, header)
-        fitted = "fit.dual" in tensors
-        model._precompute(FitState.of(tensors, n_receivers, len(tensors["anchor"])) if fitted else None)
+        model.kernel, model.detection_field = Kernel(**header["kernel"]), None
+        detections, anchor = any("detection_field." in name for name in tensors), tensors["posterior.anchor"]
+        shapes = _shapes(len(model.receiver_names), len(anchor), detections)
+        expect(tensors, shapes)
+        vars(model).update({name: tensors[name] for name in shapes if "." not in name})
+        if model.detection is not None and detections:
+            of_field = ("process.value", "mean", "weight")
+            value, mean, weight = (tensors[f"detection_field.{name}"].double() for name in of_field)
+            process = GaussianProcess(model.kernel, anchor, value)
+            model.detection_field = DetectionField(process, mean, model.detection.limit, weight)
+        of_fit = (name for name in shapes if name.startswith("posterior."))
+        model._take({name.removeprefix("posterior."): tensors[name].double() for name in of_fit})
         return model
 
 
@@ -371,38 +345,28 @@ def fit_rssi(train: Rssi, config: RssiConfig | None = None, **options: Any) -> R
 
 def _in_threads(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:
     """Apply a function to items as `map` does, in as many threads as torch has."""
-    waiting, n_items = list(items), 4 * torch.get_num_threads()  # starting threads costs milliseconds
-    for start in range(0, len(waiting), n_items):
-        yield from parallel_map(function, waiting[start : start + n_items])
+    waiting = list(items)
+    for start in range(0, len(waiting), RECEIVERS_AT_ONCE):
+        yield from parallel_map(function, waiting[start : start + RECEIVERS_AT_ONCE])
 
 
-def _shapes(n_receivers: int, n_anchors: int) -> dict[str, tuple[int, ...]]:
-    """Return the shape of every saved tensor."""
-    per_receiver = dict.fromkeys(("level", "slope", "middle", "field_db", "noise_db"), (n_receivers,))
-    return per_receiver | {
-        "covariance": (n_receivers, 2, 2),
+def _shapes(n_receivers: int, n_rows: int, detections: bool) -> dict[str, tuple[int, ...]]:
+    """Return the shape of every saved tensor by the name of its attribute."""
+    in_rows = ("posterior.dual", "posterior.tangent", "posterior.variance", "posterior.measured")
+    field = {"mean": (n_receivers,), "weight": (3,), "process.value": (n_rows, n_receivers)} if detections else {}
+    return {
         "mixing_weight": (4,),
+        "baseline": (n_receivers, 2),
+        "covariance": (n_receivers, 2, 2),
         "centre": (3,),
-        "directivity": (n_receivers, N_HARMONICS),
-        "anchor": (n_anchors, 3),
-        "coefficient": (n_anchors, n_receivers),
         "rendered": (n_receivers, 2, 2, N_DIRECTIONS),
+        "field_db": (n_receivers,),
+        "noise_db": (n_receivers,),
+        "posterior.anchor": (n_rows, 3),
+        **dict.fromkeys(in_rows, (n_receivers, n_rows)),
+        "posterior.prior": (n_receivers, 2),
+        "posterior.root": (n_receivers, 2, 2),
+        "posterior.field_db": (n_receivers,),
+        "posterior.noise_db": (n_receivers,),
+        **{f"detection_field.{name}": shape for name, shape in field.items()},
     }
-
-
-def _held_out_predictors(training: RssiTraining, found: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-    """Return predictions of held-out measured bins, and their standard deviation before it is calibrated.
-
-    Returns:
-        Those of the fits `found` and of the simpler predictors after them, (4, n, R) [dBm], given that the packets were
-        detected; and their standard deviation (n, R) [dB].
-    """
-    field = found["held_out"].T.where(~training.rssi.isnan(), torch.nan)
-    predictors = torch.cat([field[None], training.baseline_held_out])
-    prior_db, middle = (training.field_db, training.noise_db), training.path_loss.middle
-    std = held_out_std(training, training.kernel, prior_db, middle, found["covariance"])
-    if (detection := training.path_loss.detection) is not None:
-        given = [detection.given_detection(mean + training.shift, std) for mean in predictors]
-        predictors = torch.stack([mean for mean, _ in given]) - training.shift
-        std = given[0][1].where(~field.isnan(), std)
-    return predictors, std

@@ -20,6 +20,7 @@ from swiftwrf.gp import Kernel
 from swiftwrf.rssi.path_loss import fit_path_losses, log_distance
 from swiftwrf.runtime.threads import single_thread
 
+VAGUE = 1e6  # prior variance of a coefficient relative to the field
 MAX_ROWS = 300  # of a receiver, from which offsets are estimated; the cost grows with their cube
 
 
@@ -136,27 +137,25 @@ def estimate_offsets(train: Rssi, reference: str | None = None) -> Offsets:
     kernel = Kernel(0.25 * extent, matern12_weight=1.0, noise=1.0)  # fading is as large as shadowing
     apart = log_distance(position, train.receiver_position)
     member = torch.nn.functional.one_hot(code, len(names)).double()
-    normal = torch.zeros(len(names), len(names), dtype=torch.float64)
-    right, total = torch.zeros(len(names), dtype=torch.float64), 0.0
+    gram = torch.zeros(len(names) + 1, len(names) + 1, dtype=torch.float64)  # of members and RSSI
     generator = torch.Generator().manual_seed(0)
     for r, rssi in enumerate(train.rssi_dbm.T):
         rows = (~rssi.isnan()).nonzero()[:, 0]
         rows = rows[torch.randperm(len(rows), generator=generator)[:MAX_ROWS]]  # evenly spaced rows may be of one group
         if not len(rows):
             continue
-        precision = torch.linalg.inv(kernel.covariance(position[rows]))
         free = torch.stack([torch.ones_like(apart[rows, r]), apart[rows, r]], dim=1)
-        weighted = precision @ free  # level and slope over log10 distance are fitted with the offsets
-        weight = precision - weighted @ torch.linalg.pinv(free.T @ weighted, hermitian=True) @ weighted.T
-        normal += member[rows].T @ weight @ member[rows]
-        right += member[rows].T @ weight @ rssi[rows]
-        total += float(rssi[rows] @ weight @ rssi[rows])
+        # level and slope over log10 distance are fitted with the offsets, by a linear kernel
+        weight = torch.linalg.inv(kernel.covariance(position[rows]) + VAGUE * free @ free.T)
+        values = torch.cat([member[rows], rssi[rows, None]], dim=1)
+        gram += values.T @ weight @ values
+    normal, right, total = gram[:-1, :-1], gram[:-1, -1], float(gram[-1, -1])
     others = torch.tensor([name != chosen for name in names])
     prior = 0.05 * torch.eye(int(others.sum()), dtype=torch.float64)  # a standard deviation of 10 dB
     precision = normal[others][:, others] + prior
     offset = torch.zeros(len(names), dtype=torch.float64)
     offset[others] = torch.linalg.solve(precision, right[others])
     explained = float(right @ offset) / total if total > 0 else 0.0
-    estimates = dict(zip(names, offset.tolist(), strict=True))
-    known = {name: db for name, db in estimates.items() if frequency[names.index(name)] > 0 or name == chosen}
+    estimates = zip(names, offset.tolist(), frequency.tolist(), strict=True)
+    known = {name: db for name, db, count in estimates if count or name == chosen}
     return Offsets(str(groups.name), chosen, known, explained)

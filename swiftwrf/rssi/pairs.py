@@ -26,9 +26,9 @@ from swiftwrf.gp.process import N_NEIGHBOURS, local_weights
 from swiftwrf.models.base import FieldConfig
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import Neighbours, check_positions, distance, nearest
-from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiPredictor, SavedRssiPredictor
-from swiftwrf.rssi.mixing import LEVEL, rounding_std
+from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiPredictor, SavedRssiPredictor, in_batches
 from swiftwrf.rssi.path_loss import MIN_DISTANCE_M, fit_path_loss
+from swiftwrf.rssi.training import LEVEL, rounding_std
 from swiftwrf.runtime import checkpoint as files
 from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.threads import single_thread
@@ -36,6 +36,7 @@ from swiftwrf.runtime.validation import configuration
 
 RELATIVE_NOISE_VARIANCES = (0.03, 0.1, 0.3, 1.0, 3.0)  # variance of a measurement relative to that of the field
 RATIOS = (0.5, 1.0, 2.0)  # of distances that the transmitter moves to equivalent ones of the receiver
+BATCH_PAIRS = 2048  # predicted at a time, since each needs a matrix of 64 x 64
 MAX_HELD_OUT = 500  # pairs that choose the kernel; more do not change it
 
 
@@ -146,13 +147,8 @@ class PairPredictor(RssiPredictor):
     def _predict(self, position: Tensor) -> tuple[Tensor, Tensor | None]:
         n, r = len(position), len(self.receiver_position)
         pair = torch.cat([position.repeat_interleave(r, dim=0), self.receiver_position.repeat(n, 1)], dim=1)
-        mean, std = self._batches(pair)
+        mean, std = in_batches(self._at_pairs, pair, BATCH_PAIRS)
         return mean.reshape(n, r), None if std is None else std.reshape(n, r)
-
-    def _batches(self, pair: Tensor) -> tuple[Tensor, Tensor | None]:
-        parts = [self._at_pairs(some) for some in pair.split(2048)]  # each needs a matrix of 64 x 64
-        stds = [std for _, std in parts if std is not None]
-        return torch.cat([mean for mean, _ in parts]), torch.cat(stds) if stds else None
 
     def predict_detected(self, data: Rssi) -> Prediction:
         """Predict the RSSI where it is measured; nan elsewhere, which saves time where a row has few receivers."""
@@ -191,7 +187,7 @@ class PairPredictor(RssiPredictor):
         if len(ends[0]) != len(ends[1]):
             raise InputError(f"each pair needs two positions, got {len(ends[0])} and {len(ends[1])}")
         with torch.set_grad_enabled(torch.is_grad_enabled() and any(end.requires_grad for end in ends)):
-            mean, std = self._batches(torch.cat(ends, dim=1))
+            mean, std = in_batches(self._at_pairs, torch.cat(ends, dim=1), BATCH_PAIRS)
         return Prediction(mean if self.attenuation is None else mean + self.attenuation.between(*ends).to(mean), std)
 
 
@@ -232,16 +228,17 @@ class PairModel(PairPredictor, SavedRssiPredictor):
 
     @single_thread()
     def _fit_pairs(self, pair: Tensor, rssi: Tensor, fold: Tensor) -> None:
-        self.path_loss = PairPathLoss.fit(pair, rssi, not self.config.new_places)
-        self.pair, self.residual = pair, rssi - self.path_loss(pair)
+        def path_loss(rows: Tensor) -> PairPathLoss:
+            return PairPathLoss.fit(pair[rows], rssi[rows], by_place=not self.config.new_places)
+
+        self.pair, self.path_loss = pair, path_loss(torch.ones_like(fold, dtype=torch.bool))
+        self.residual = rssi - self.path_loss(pair)
         order = torch.randperm(len(pair), generator=torch.Generator().manual_seed(self.config.seed))
         sample = order[:MAX_HELD_OUT]
         # one region only: none is left to predict it from
         fold = fold if len(fold.unique()) > 1 else torch.arange(len(fold)) % 2
-        held_out = {}  # residuals of the path-loss model fitted without each fold of the sample
-        for number in fold[sample].unique().tolist():
-            kept = fold != number
-            held_out[number] = rssi - PairPathLoss.fit(pair[kept], rssi[kept], not self.config.new_places)(pair)
+        # residuals of the path-loss model fitted without each fold of the sample
+        held_out = {number: rssi - path_loss(fold != number)(pair) for number in fold[sample].unique().tolist()}
         choices = [choice for ratio in RATIOS for choice in self._judged(ratio, fold, sample, held_out)]
         _, self.ratio, self.kernel, score = min(choices, key=lambda choice: choice[0])
         scale = score.quantile(LEVEL)[None] / NormalDist().inv_cdf((1 + LEVEL) / 2)
@@ -253,16 +250,13 @@ class PairModel(PairPredictor, SavedRssiPredictor):
     ) -> list[tuple[float, float, Kernel, Tensor]]:
         """Return kernels with their mean absolute error at held-out pairs, and the errors by their relative deviations."""
         n_near = min(N_NEIGHBOURS, int((fold[:, None] != fold.unique()).sum(dim=0).min()))
-        between, across, value, residual, coordinates = [], [], [], [], scaled(self.pair, ratio)
+        parts, coordinates = [], scaled(self.pair, ratio)
         for number, own in held_out.items():
-            out, kept = sample[fold[sample] == number], fold != number
-            known, query = coordinates[kept], coordinates[out]
-            near = Neighbours(known)(query, n_near)[1]
-            between.append(distance(known[near], known[near]))
-            across.append(distance(query[:, None], known[near])[:, 0])
-            value.append(own[kept][near])
-            residual.append(own[out])
-        r_between, r_across, values, truth = (torch.cat(parts) for parts in (between, across, value, residual))
+            out, kept = sample[fold[sample] == number], (fold != number).nonzero()[:, 0]
+            near = kept[Neighbours(coordinates[kept])(coordinates[out], n_near)[1]]
+            known, query = coordinates[near], coordinates[out]
+            parts.append((distance(known, known), distance(query[:, None], known)[:, 0], own[near], own[out]))
+        r_between, r_across, values, truth = (torch.cat(part) for part in zip(*parts, strict=True))
         # rough fields only, as in the model of each receiver
         kernels = [k for k in candidates(coordinates, RELATIVE_NOISE_VARIANCES) if k.matern12_weight == 1]
         judged = []
@@ -272,8 +266,7 @@ class PairModel(PairPredictor, SavedRssiPredictor):
             for kernel in (kernel for kernel in kernels if kernel.matern12_length == length):
                 weight, variance = local_weights(covariance, cross, kernel.noise)
                 error = (truth - (weight * values).sum(dim=1)).abs()
-                score = error / (variance + kernel.noise).sqrt()
-                judged.append((float(error.mean()), ratio, kernel, score))
+                judged.append((float(error.mean()), ratio, kernel, error / (variance + kernel.noise).sqrt()))
         return judged
 
     def region(self) -> Tensor:
@@ -286,7 +279,7 @@ class PairModel(PairPredictor, SavedRssiPredictor):
 
     @single_thread()
     def _at_pairs(self, pair: Tensor) -> tuple[Tensor, Tensor]:
-        field, variance = self._process.local(scaled(pair, self.ratio))
+        field, variance = self._process.condition(scaled(pair, self.ratio))
         return self.path_loss(pair) + field[:, 0], self.scale_db * (variance + self.kernel.noise).sqrt()
 
     def state(self) -> tuple[dict[str, Tensor], Header]:

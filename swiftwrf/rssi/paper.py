@@ -20,12 +20,10 @@ from swiftwrf.data.rssi import Rssi
 from swiftwrf.errors import FitError
 from swiftwrf.models.base import CPU
 from swiftwrf.rssi.base import Map, RssiConfig, often_detected
-from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
-from swiftwrf.rssi.mixing import check_comparable, interval_scale, rounding_std
-from swiftwrf.rssi.model import FIELD_ALONE, RssiModel
-from swiftwrf.rssi.path_loss import N_HARMONICS
+from swiftwrf.rssi.head import Head, mean_magnitude, render
+from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.regression import held_out_std
-from swiftwrf.rssi.training import Bins, bin_locations, binned, choose_residual_kernel, prior_std
+from swiftwrf.rssi.training import Bins, bin_locations, binned, check_comparable, choose_residual_kernel, prior_std
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, configuration
@@ -63,7 +61,7 @@ class RssiPaperModel(RssiModel):
     kind = "rssi paper model"
     name = "swiftwrf_paper"
     config_type = RssiPaperConfig
-    slow = True
+    slow, updates = True, False
 
     def _fit(
         self,
@@ -94,24 +92,29 @@ class RssiPaperModel(RssiModel):
             fits = (parallel or map)(task, parts)
             results = list(bar.track(fits, total=len(parts), description="receivers"))
         held_out, white, rendered = (torch.cat(values) for values in zip(*results, strict=True))
-        per_receiver, covariance = torch.zeros(n_receivers).double(), torch.zeros(n_receivers, 2, 2).double()
+        covariance = torch.zeros(n_receivers, 2, 2).double()
         out = ~bins.rssi.isnan() & (bins.fold == HELD_OUT_FOLD)[:, None]
         predicted = held_out.T.double().where(out, torch.nan)[bins.bin_of_row]
         check_comparable(predicted[None], train.rssi_dbm)
-        std = held_out_std(bins, self.kernel, prior_db, per_receiver, covariance)[bins.bin_of_row]
-        scale = interval_scale(predicted, std, train.rssi_dbm)
-        self.field_db = (scale * prior_db[0]).float()
-        self.noise_db = (scale * prior_db[1]).clamp_min(rounding_std(train.rssi_dbm)).float()
-        self.n_primitives, self.mixing_weight = config.n_primitives, FIELD_ALONE.clone()
-        self.centre, self.anchor, self.rendered = bins.centre, bins.position.float(), rendered
-        self.level = LEVEL_DBM + HeadTable(rendered)(per_receiver[None])[0][0]
-        self.slope, self.middle = per_receiver, per_receiver.clone()
-        self.detection_field = None
-        self.covariance = covariance
-        self.directivity = torch.zeros(n_receivers, N_HARMONICS)
-        dual = torch.linalg.solve_triangular(root.T, white.T.double() * prior_db[0], upper=True)
-        self.coefficient = dual.float()
-        self._precompute(None)
+        std = held_out_std(bins, self.kernel, prior_db, covariance)[bins.bin_of_row]
+        self._calibrate(train.rssi_dbm, predicted, std, *prior_db)
+        self.mixing_weight, self.baseline = torch.eye(4).double()[0], torch.zeros(n_receivers, 2).double()
+        self.centre, self.rendered, self.covariance, self.detection_field = bins.centre, rendered, covariance, None
+        dual = torch.linalg.solve_triangular(root.T, white.T.double() * prior_db[0], upper=True).T
+        level = LEVEL_DBM + mean_magnitude(rendered, torch.zeros(1, n_receivers))[0].double()
+        # the dual coefficients are those of the kernel alone, without a path loss or noise
+        state = {
+            "anchor": bins.position,
+            "dual": dual,
+            "tangent": torch.ones_like(dual),
+            "variance": torch.zeros_like(dual),
+            "measured": torch.ones_like(dual),
+            "prior": torch.stack([level, torch.zeros_like(level)], dim=1),
+            "root": torch.zeros_like(covariance),
+            "field_db": torch.ones_like(level),
+            "noise_db": torch.zeros_like(level),
+        }
+        self._take(state)
 
 
 @single_thread()

@@ -121,9 +121,8 @@ class PathLosses(NamedTuple):
     Args:
         own: Model of each receiver, (R,); that of all receivers where a receiver has no measurements.
         shared: Model of all receivers of its kind, of known or of unknown position, (R,).
-        middle: log10 of the distance at which levels are compared, (R,); 0 for a receiver of unknown position.
-        std: Standard deviation of the receivers' level at that distance [dB] and of their slope [dB a decade] about the
-            shared ones, with the uncertainty of the latter, (R, 2).
+        root: A factor of the covariance of the receivers' level and slope about the shared ones, with the uncertainty of the
+            latter, root @ root^T, (R, 2, 2). Level and slope are independent at some distance.
         variance: Variance of the measurements about the receiver's model, (R,) [dB^2].
         detection: Curve of detection; None if no cell is empty, or if empty cells are ignored.
         floor_db: Attenuation of a floor for each receiver's kind, (R,) [dB]; 0 without floors.
@@ -131,8 +130,7 @@ class PathLosses(NamedTuple):
 
     own: PathLoss
     shared: PathLoss
-    middle: Tensor
-    std: Tensor
+    root: Tensor
     variance: Tensor
     detection: Detection | None
     floor_db: Tensor
@@ -141,8 +139,7 @@ class PathLosses(NamedTuple):
         """Return the path loss of some receivers."""
         own, shared = (PathLoss(*(value[number] for value in model)) for model in (self.own, self.shared))
         detection = self.detection and self.detection.columns(number)
-        middle, std, variance, floor_db = (x[number] for x in (self.middle, self.std, self.variance, self.floor_db))
-        return PathLosses(own, shared, middle, std, variance, detection, floor_db)
+        return PathLosses(own, shared, self.root[number], self.variance[number], detection, self.floor_db[number])
 
 
 @single_thread()
@@ -194,8 +191,8 @@ def fit_path_losses(
         mean, none = rssi.nanmean().repeat(len(receiver)), torch.zeros(len(receiver), dtype=torch.float64)
         # a kind of receivers that measured nothing has the mean of the others
         fields = {"own_level": mean, "shared_level": mean.clone()}
-        fields |= {name: none.clone() for name in ("own_slope", "shared_slope", "middle", "unexplained", "floor_db")}
-        fields["std"] = torch.full((len(receiver), 2), SPREAD_DB, dtype=torch.float64)
+        fields |= {name: none.clone() for name in ("own_slope", "shared_slope", "unexplained", "floor_db")}
+        fields["root"] = SPREAD_DB * torch.eye(2, dtype=torch.float64).repeat(len(receiver), 1, 1)
         fields["variance"] = torch.full((len(receiver),), SPREAD_DB**2, dtype=torch.float64)
         for kind in (located, ~located):
             if bool(rssi[:, kind].isfinite().any()):
@@ -204,8 +201,8 @@ def fit_path_losses(
                 for name, value in _maximise(*cells, of_kind, repeats).items():
                     fields[name][kind] = value
         own, shared = (PathLoss(fields[f"{of}_level"], fields[f"{of}_slope"] * located) for of in ("own", "shared"))
-        std = torch.stack([fields["std"][:, 0], fields["std"][:, 1] * located], dim=1)
-        losses = PathLosses(own, shared, fields["middle"], std, fields["variance"], curve, fields["floor_db"])
+        fields["root"][~located, :, 1] = 0.0
+        losses = PathLosses(own, shared, fields["root"], fields["variance"], curve, fields["floor_db"])
         return losses, fields["unexplained"]
 
     found, unexplained = fit(detection)
@@ -233,21 +230,15 @@ def _maximise(
     (expected, known), of_floor = SLOPE_PRIOR, FLOOR_STD_DB
     certain = torch.tensor([1e-6, known**-2, of_floor**-2], dtype=torch.float64)
 
-    def sums(value: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return weighted sums over the rows: of products of regressors, of them and the values, of squares, and of 1."""
-        weighted = weight[..., None] * feature
-        gram = torch.einsum("nrk,nrl->rkl", weighted, feature)
-        cross = (weighted * value[..., None]).sum(dim=0)
-        return gram, cross, (weight * value.square()).sum(dim=0), weight.sum(dim=0)
-
-    gram, cross, power, count = sums(rssi.nan_to_num(), seen.double())
+    # unmeasured values, their weights and variances are expectations
+    value, weight, spare = rssi.nan_to_num(), seen.double(), torch.zeros_like(rssi)
     variance = rssi[seen].var(correction=0).clamp_min(1e-6).expand(n_receivers)
     missed = torch.zeros(n_receivers).double() if detection is None else detection.missed
     unexplained, last = missed, None
     limited = torch.zeros_like(seen) if detection is None else ~seen & detection.is_limit
     for _ in range(MAX_ROUNDS):
-        scale = variance * repeats
-        normal, right = gram / scale[:, None, None], cross / scale[:, None]
+        weighted = (weight / (variance * repeats))[..., None] * feature
+        normal, right = torch.einsum("nrk,nrl->rkl", weighted, feature), (weighted * value[..., None]).sum(dim=0)
         shrink = torch.linalg.inv(eye + normal @ spread.diag())
         total = (shrink @ normal).sum(dim=0) + certain.diag()
         pull = (shrink @ right[..., None]).sum(dim=0)[:, 0] + torch.tensor([0.0, expected / known**2, 0.0]).double()
@@ -260,7 +251,8 @@ def _maximise(
         moments = (deviation.square() + posterior.diagonal(dim1=1, dim2=2))[:, :2].sum(dim=0)
         spread[:2] = (moments + SPREAD_WORTH * SPREAD_DB**2) / (n_receivers + SPREAD_WORTH)  # floors are alike
         own = shared + deviation
-        squares = power - 2 * (own * cross).sum(dim=1) + torch.einsum("rk,rkl,rl->r", own, gram, own)
+        mean, count = (feature * own).sum(dim=-1), weight.sum(dim=0)
+        squares = (weight * ((value - mean).square() + spare)).sum(dim=0)
         variance = (squares + ROWS_WORTH * squares.sum() / count.sum()) / (count + ROWS_WORTH)
         variance = variance.clamp_min(1e-6)
         if last is not None and float((own - last).abs().max()) < 0.01:
@@ -268,27 +260,25 @@ def _maximise(
         last = own
         if detection is None or not limited.any():
             continue
-        mean, std = (feature * own).sum(dim=-1), (variance + detection.width**2).sqrt()
+        std = (variance + detection.width**2).sqrt()
         z = (detection.limit - shift - mean) / std
         ratio, weak = empty_given(z, unexplained)
         hazard = (ratio / weak.clamp_min(1e-12)).clamp_max(40)
-        value = rssi.where(seen, mean - variance / std * hazard)
-        gram, cross, power, count = sums(value, torch.where(limited, weak, seen.double()))
-        rest = 1 - variance / std.square() * hazard * (z + hazard)
-        power = power + torch.where(limited, weak * variance * rest.clamp(0, 1), 0.0).sum(dim=0)
+        value, weight = rssi.where(seen, mean - variance / std * hazard), weak.where(limited, seen.double())
+        spare = (variance * (1 - variance / std.square() * hazard * (z + hazard)).clamp(0, 1)).where(limited, 0.0)
         detected, other = seen.sum(dim=0), (1 - weak).where(limited, 0.0).sum(dim=0)
         share = (other + ROWS_WORTH * other.sum() / (detected + other).sum()) / (detected + other + ROWS_WORTH)
         if bool((distance.std(dim=0) > 0).any()):  # without distances no power is expected anywhere
             unexplained = missed.maximum(share)
     own_level, shared_level = own[:, 0] - own[:, 1] * middle, shared[0] - shared[1] * middle
-    uncertain = (spread + total.inverse().diagonal()).sqrt()
+    level_std, slope_std = (spread + total.inverse().diagonal())[:2].sqrt().tolist()
+    root = torch.tensor([[level_std, -float(middle) * slope_std], [0.0, slope_std]], dtype=torch.float64)
     return {
         "own_level": own_level,
         "own_slope": own[:, 1],
         "shared_level": shared_level.expand(n_receivers),
         "shared_slope": shared[1].expand(n_receivers),
-        "middle": middle.expand(n_receivers),
-        "std": uncertain[:2].expand(n_receivers, 2),
+        "root": root.expand(n_receivers, 2, 2),
         "floor_db": shared[2].clamp_min(0).expand(n_receivers),
         "variance": variance,
         "unexplained": unexplained,

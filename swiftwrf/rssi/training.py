@@ -1,22 +1,32 @@
-"""Preparation of a fit: rows by location bin, path-loss models, limits of empty cells, and the kernel."""
+"""Shared by all receivers in a fit: location bins, path-loss models, limits, the kernel, and weights of predictors.
+
+Weights follow by stacking (L. Breiman, Machine Learning 24, 1996), intervals by cross-conformal prediction.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 
+import numpy as np
 import torch
+from scipy.optimize import nnls
 from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import MIN_TRAINING, folds
+from swiftwrf.errors import InputError
 from swiftwrf.gp import Kernel, candidates, held_out_errors, subsample
 from swiftwrf.positions import cells
-from swiftwrf.rssi.base import RssiConfig, columns_of, often_detected
+from swiftwrf.rssi.base import RssiConfig, often_detected
 from swiftwrf.rssi.detection import Detection, empty_given
 from swiftwrf.rssi.head import Head, render
 from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_losses, log_distance
 from swiftwrf.runtime.threads import single_thread
 
+LEVEL = 0.8  # nominal coverage of the interval that the standard deviation is calibrated for
+MAX_PAIRS = 20_000  # measurements that determine the mixing weights
 # variance of a packet relative to the variance of the field: fading is as large as shadowing
 RELATIVE_NOISE_VARIANCES = (0.3, 1.0, 2.0, 3.0)
 MAX_KERNEL_RECEIVERS = 12  # more do not change the chosen kernel or weights
@@ -54,7 +64,6 @@ class RssiTraining(Bins):
 
     Args:
         kernel: Kernel of the latent field, lengths in [m].
-        n_primitives: Number of primitives a receiver.
         rendered: Fields of each receiver's head, (R, 2, 2, directions).
         path_loss: Path loss of the receivers, the prior of the fit.
         shift: Received power less RSSI, by floors and offsets that were removed, (n, R) [dB].
@@ -68,7 +77,6 @@ class RssiTraining(Bins):
     """
 
     kernel: Kernel
-    n_primitives: int
     rendered: Tensor
     path_loss: PathLosses
     shift: Tensor
@@ -78,26 +86,16 @@ class RssiTraining(Bins):
     baselines: PathLoss
     baseline_held_out: Tensor
 
-    def columns(self, number: slice) -> RssiTraining:
-        """Return the training data of some receivers."""
-        names = ("rssi", "count", "shift", "limit", "field_db", "noise_db", "baseline_held_out")
-        return replace(
-            self,
-            receiver_names=self.receiver_names[number],
-            receiver=self.receiver[number],
-            rendered=self.rendered[number],
-            path_loss=self.path_loss.columns(number),
-            baselines=PathLoss(*(value[:, number] for value in self.baselines)),
-            **{name: getattr(self, name)[..., number] for name in names},
-        )
-
 
 @single_thread()
-def prepare(train: Rssi, pool: Rssi, config: RssiConfig, shift: Tensor, curve: Detection | None) -> RssiTraining:
-    """Average the rows by location bin, fit the path-loss models and choose the kernel; see `RssiPredictor._fit`."""
-    bins = binned(train, config)
+def prepare(pool: Rssi, own: Tensor, config: RssiConfig, shift: Tensor, curve: Detection | None) -> RssiTraining:
+    """Average the rows by location bin, fit the path-loss models and choose the kernel; see `RssiPredictor._fit`.
+
+    `own` are the columns of the receivers that are fitted.
+    """
+    bins = binned(pool.columns(own.tolist()), config)
     rssi, fold, every = bins.rssi, bins.fold, bin_locations(pool, config.max_locations)[1]
-    receiver, own = pool.receiver_position.double() - bins.centre, columns_of(train.receiver_names, pool)
+    receiver = pool.receiver_position.double() - bins.centre
     shift = _bin_means(shift, bins.bin_of_row, len(fold))
 
     def fit(rows: Tensor, detection: Detection | None) -> PathLosses:
@@ -118,7 +116,7 @@ def prepare(train: Rssi, pool: Rssi, config: RssiConfig, shift: Tensor, curve: D
     for baseline, rows in zip(partial, kept[1:], strict=True):
         held_out[:, ~rows] = baseline(distance[~rows])
     residual = (every - everything.own(log_distance(bins.position, receiver)))[:, often_detected(pool)]
-    kernel, helps = choose_residual_kernel(bins.position, residual, fold, train.floors is not None)
+    kernel, helps = choose_residual_kernel(bins.position, residual, fold, pool.floors is not None)
     n_primitives = config.n_primitives if helps else 0
     loss = everything.columns(own)
     field_db, noise_db = prior_std(loss.variance, kernel if n_primitives else None)
@@ -126,7 +124,6 @@ def prepare(train: Rssi, pool: Rssi, config: RssiConfig, shift: Tensor, curve: D
     return RssiTraining(
         **vars(bins),
         kernel=kernel,
-        n_primitives=n_primitives,
         rendered=render(heads),
         path_loss=loss,
         shift=shift[:, own],
@@ -239,3 +236,91 @@ def choose_residual_kernel(
     errors = [held_out_errors(precision, dual[:, :, r, None], out)[:, :n, 0] for r, n, out in held_out]
     score, best = torch.cat(errors, dim=1).abs().mean(dim=1).min(dim=0)
     return stretched[int(best)], bool(score < residual.abs().nanmean())
+
+
+def comparable(held_out: Tensor, measured: Tensor) -> Tensor:
+    """Return which measurements exist and are predicted by all predictors, bool (rows, R).
+
+    Args:
+        held_out: Held-out predictions (predictors, rows, R) [dBm], nan where there is none.
+        measured: Measurements (rows, R) [dBm], nan where not detected.
+    """
+    return (~held_out.isnan()).all(dim=0) & ~measured.isnan()
+
+
+def check_comparable(held_out: Tensor, measured: Tensor) -> None:
+    """Raise InputError if held-out predictions (predictors, rows, R) cannot be compared with any measurement (rows, R)."""
+    if not comparable(held_out, measured).any():
+        raise InputError(
+            "no rows can be held out to estimate the error of the model: all measurements are in one part of the "
+            'region; measure elsewhere, too, give a pool of more receivers, or take validation="random"'
+        )
+
+
+def mixing_weights(held_out: Tensor, measured: Tensor, shrinkage: float = 0.05) -> Tensor:
+    """Return the weights of the weighted mean of predictors with the lowest mean absolute error on held-out rows.
+
+    Args:
+        held_out: Held-out predictions (predictors, rows, R) [dBm], nan where there is none.
+        measured: Measurements (rows, R) [dBm], nan where not detected.
+        shrinkage: Ridge penalty on the distance of the weights to those of the first predictor alone, relative to the mean
+            squared error of a predictor. It steadies weights that few folds determine. The default is by nested
+            cross-validation.
+
+    Returns:
+        Non-negative weights of sum 1, float64 (predictors,); those of the first predictor alone without a comparable row.
+
+    Example:
+        >>> held_out = torch.tensor([[[1.0], [2.0], [3.0]], [[9.0], [9.0], [9.0]]])
+        >>> mixing_weights(held_out, held_out[0]).round(decimals=2)
+        tensor([1., 0.], dtype=torch.float64)
+    """
+    usable = comparable(held_out, measured)
+    if not bool(usable.any()):
+        return torch.eye(len(held_out), dtype=torch.float64)[0]
+    predicted, target = subsample(held_out[:, usable].T.double(), measured[usable].double(), rows=MAX_PAIRS)
+    error = (predicted - target[:, None]).numpy()  # the error of a mean with weights of sum 1 is the mean of the errors
+    n = error.shape[1]
+    weight, importance = np.full(n, 1 / n), np.ones(len(error))
+    scale = 1e-9 * max(float((error**2).mean()), 1.0)
+    away = np.eye(n)
+    away[0] -= 1.0  # weights less (1, 0, ...), for weights of sum 1
+    for _ in range(20):  # least absolute errors by weighted least squares
+        gram = (error * importance[:, None]).T @ error / max(len(error), 1)
+        gram += shrinkage * np.trace(gram) / n * away.T @ away
+        # the weights of least squares are proportional to argmin of w' G w / 2 - sum w over w >= 0
+        factor = np.linalg.cholesky(gram + scale * np.eye(n))
+        weight = nnls(factor.T, np.linalg.solve(factor, np.ones(n)))[0]
+        weight /= weight.sum()
+        # absolute errors below 0.5 dB count as squares, so that the solution is unique
+        importance = 1 / np.maximum(np.abs(error @ weight), 0.5)
+    return torch.from_numpy(weight)
+
+
+def interval_scale(predicted: Tensor, std: Tensor, measured: Tensor) -> Tensor:
+    """Return the factors (R,) of the standard deviations with which the 80 % intervals hold 80 % of the held-out rows.
+
+    The interval is cross-conformal (V. Vovk, Annals of Mathematics and Artificial Intelligence 74, 2015): the error of each
+    row is divided by the standard deviation that a model without the row's fold predicts.
+
+    Args:
+        predicted: Held-out predictions of the rows (n, R) [dBm], nan where there is none.
+        std: Their standard deviations (n, R) [dB].
+        measured: Measurements of the rows, (n, R) [dBm].
+    """
+    score = ((measured - predicted) / std).abs()
+    finite = score.where(score.isfinite(), torch.nan)
+    quantile = finite.nanquantile(LEVEL, dim=0)
+    few = (~finite.isnan()).sum(dim=0) < 30  # scores of all receivers count
+    if few.any():
+        quantile = quantile.where(~few, score[score.isfinite()].quantile(LEVEL))
+    return quantile / NormalDist().inv_cdf((1 + LEVEL) / 2)
+
+
+def rounding_std(rssi: Tensor) -> float:
+    """Return the standard deviation of the rounding error of RSSI [dBm], the least of a prediction [dB].
+
+    The step of the values is their least difference, at most 1 dB, which is also that of constant values.
+    """
+    step: float = min([1.0, *rssi[~rssi.isnan()].unique().diff().tolist()])
+    return step / math.sqrt(12)

@@ -23,8 +23,8 @@ from swiftwrf.data.store import Store
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import search
 from swiftwrf.models.geometry.fit import observe
-from swiftwrf.rssi.mixing import rounding_std
 from swiftwrf.rssi.pairs import PairPathLoss
+from swiftwrf.rssi.training import rounding_std
 
 SHORT = {"config": replace(GLANCE, max_extra_planes=1)}  # search for a room
 OPTIONS = {"swiftwrf": {"n_primitives": 4}, "geometry": SHORT, "hybrid": SHORT}

@@ -159,16 +159,15 @@ def test_rssi_in_any_order_solves_the_least_squares_of_all_rows(order, sizes):
     at = floor().transmitter_position[:10] + 0.5
     tolerance = SIGNAL * 60
     torch.testing.assert_close(updated.predict(at).mean, once.predict(at).mean, rtol=0, atol=tolerance)
-    posterior, before = updated._posterior.folded(), model._posterior.state
-    state = posterior.state
+    state, before = updated.posterior, model.posterior
     for r in range(12):  # dense covariance of all rows times the dual coefficients is the data
-        seen = state.variance[:, r] > 0
-        anchor, slope, feature = posterior.anchor[seen], state.tangent[seen, r], posterior._feature[r][seen]
-        field = state.field_variance[r] * slope[:, None] * posterior.kernel(anchor, anchor) * slope
-        whole = field + feature @ feature.T + torch.diag(state.variance[seen, r])
-        old = int((before.variance[:, r] > 0).sum())
-        target = whole[:old, :old] @ before.dual[before.variance[:, r] > 0, r]
-        torch.testing.assert_close((whole @ state.dual[seen, r])[:old], target, rtol=0, atol=1e-2)
+        seen = state.variance[r] > 0
+        anchor, slope, feature = state.anchor[seen], state.tangent[r, seen], state.feature[r, seen]
+        field = slope[:, None] * state.kernel(anchor, anchor) * slope
+        whole = field + feature @ feature.T + torch.diag(state.variance[r, seen])
+        old = before.dual[r, before.variance[r] > 0]
+        target = whole[: len(old), : len(old)] @ old
+        torch.testing.assert_close((whole @ state.dual[r, seen])[: len(old)], target, rtol=0, atol=1e-2)
     assert set(updated.anchor.tolist()[0]) == set(once.anchor.tolist()[0])
 
 
@@ -179,7 +178,7 @@ def test_rssi_is_updated_after_loading_and_beyond_its_rows_in_memory(tmp_path, m
     expected = model.update(rest).predict(at).mean
     loaded = load(tmp_path / "model.safetensors").update(rest)  # the robust weights of the first rows are fixed
     torch.testing.assert_close(loaded.predict(at).mean, expected, atol=0.2, rtol=0)
-    monkeypatch.setattr("swiftwrf.rssi.posterior.MAX_NEW_ROWS", 12)
+    monkeypatch.setattr("swiftwrf.rssi.regression.MAX_NEW_ROWS", 12)
     torch.testing.assert_close(model.update(rest).predict(at).mean, expected, atol=0.2, rtol=0)
 
 
@@ -199,7 +198,7 @@ def test_a_chosen_kernel_is_that_of_a_fit(name):
 
 def test_rssi_follows_from_its_residuals():
     model = fitted_rssi().update(floor().subset(torch.arange(60, 90)))
-    found = model._posterior.folded().rssi
+    found = model.posterior.rssi
     missed = (found - floor().rssi_dbm).abs()
     assert torch.equal(found.isnan(), floor().rssi_dbm.isnan())
     assert missed[:60].nanmean() < 0.1

@@ -185,7 +185,7 @@ class HybridModel(ProcessModel):
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         self._room = GeometryModel.within(self, tensors, header)
         self.process = GaussianProcess.from_state(tensors, header, torch.float32, exact=True)
-        n_scores, pixels = tensors["coefficient"].shape[-1], self.grid.shape[0] * self.grid.shape[1]
+        n_scores, pixels = tensors["value"].shape[-1], self.grid.shape[0] * self.grid.shape[1]
         expect(tensors, {"component": (1 + n_scores, pixels)})
         self._restore_spread(tensors)
         check_value("mixing_weight", header["mixing_weight"], Fraction)

@@ -70,8 +70,8 @@ class PathGains:
     """Gains of the direct path and of each image as functions of position, in F equally plausible fields.
 
     Args:
-        process: Process of the differences of each gain from that of its planes, real and imaginary part, with
-            coefficients float32 (n, F * S * 2).
+        process: Process of the differences of each gain from that of its planes, real and imaginary part, float32
+            (n, F * S * 2).
         n_paths: Number of paths S, the direct one included.
         prior: Name of the prior.
 
@@ -81,7 +81,7 @@ class PathGains:
 
     def __init__(self, process: GaussianProcess, n_paths: int, prior: PriorName = "loose") -> None:
         self.process, self.n_paths, self.prior = process, n_paths, prior
-        if (size := process.coefficient.shape[1]) == 0 or size % (2 * n_paths):
+        if (size := process.value.shape[1]) == 0 or size % (2 * n_paths):
             raise InputError(f"path gains of {n_paths} paths need multiples of {2 * n_paths} coefficients, got {size}")
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
@@ -99,8 +99,8 @@ class PathGains:
 
     def averaged(self) -> PathGains:
         """Return the mean of the fields, as one field."""
-        coefficient = self.process.coefficient.unflatten(1, (-1, 2 * self.n_paths)).mean(dim=1)
-        process = GaussianProcess(self.process.kernel, self.process.known, coefficient, exact=True)
+        value = self.process.value.unflatten(1, (-1, 2 * self.n_paths)).mean(dim=1)
+        process = GaussianProcess(self.process.kernel, self.process.known, value, exact=True)
         return PathGains(process, self.n_paths, self.prior)
 
     def channel(self, geometry: GeometryModel, position: Tensor) -> Tensor:
@@ -136,9 +136,8 @@ def fit_path_gains(
         normal.grad = gradient(normal)
         optimiser.step()
         schedule.step()
-    root, weighted = root.double(), (torch.tensor(prior.std) * normal).flatten(1).double()
-    coefficient = torch.linalg.solve_triangular(root.T, weighted, upper=True).float()
-    return PathGains(GaussianProcess(kernel, scene.moving.double(), coefficient, exact=True), normal.shape[2], name)
+    value = root @ (torch.tensor(prior.std) * normal).flatten(1)
+    return PathGains(GaussianProcess(kernel, scene.moving.double(), value, exact=True), normal.shape[2], name)
 
 
 def posterior_gradient(

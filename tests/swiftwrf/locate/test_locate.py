@@ -267,7 +267,7 @@ def test_spectra_at_one_position_are_held_out_together():
     [
         ("weight", -1.0, "weight must be 0 to 1000"),
         ("weight", 1e30, "weight must be 0 to 1000"),
-        ("path_gains.coefficient", 1e38, "no candidate position has a finite likelihood"),
+        ("path_gains.value", 3.4e38, "no candidate position has a finite likelihood"),
         ("scale", -1.0, "of no distribution"),
     ],
 )

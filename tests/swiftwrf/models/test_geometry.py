@@ -400,7 +400,7 @@ def test_path_gains_follow_a_shadow():
     gained = psnr(hybrid.synthesize(test.position), test.spectrum) - psnr(room.synthesize(test.position), test.spectrum)
     assert float(gained.median()) > 5
     process, paths = hybrid.path_gains.process, hybrid.path_gains.n_paths
-    first = process.coefficient[:, : 2 * paths]  # one of the fields that are averaged
+    first = process.value[:, : 2 * paths]  # one of the fields that are averaged
     one = PathGains(GaussianProcess(process.kernel, process.known, first), paths)
     worse = with_path_gains(hybrid, one).synthesize(test.position)
     better = hybrid.synthesize(test.position)
@@ -501,7 +501,7 @@ def test_spectra_are_differentiable_in_the_position_of_a_receiver():
     room = GeometryModel.of_planes(data, walls)
     hybrid = HybridModel().fit(data, like=room)
     assert hybrid.mixing_weight > 0
-    assert hybrid.process.coefficient.shape[1]
+    assert hybrid.process.value.shape[1]
     position = data.position[:3] + 0.02
     for model in (room, hybrid):
         weight = torch.rand(3, *data.grid.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)

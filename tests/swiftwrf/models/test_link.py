@@ -119,7 +119,7 @@ def test_unknown_positions_of_receivers_are_not_compared(tmp_path):
     ("model", "last_step"),
     [
         (make_model("coarray"), "_set_spread"),
-        (RssiModel(), "_assemble"),
+        (RssiModel(), "_set_posterior"),
         (RssiLocator(n_cells=50), "_calibrate"),
         (
             MatchedField(spacing=4.0, max_cells=100, n_best=10, n_background=5, n_split=2, n_calibration=10),

@@ -15,15 +15,14 @@ from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.gp import Kernel
 from swiftwrf.rssi import RssiConfig, RssiPaperModel, compare
 from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
-from swiftwrf.rssi.mixing import mixing_weights
 from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, harmonics, log_distance
-from swiftwrf.rssi.regression import DIRECTIVITY_STD_DB, fit_receiver
-from swiftwrf.rssi.training import RssiTraining, bin_locations
+from swiftwrf.rssi.regression import DIRECTIVITY_STD_DB, RssiPosterior, fit_receiver
+from swiftwrf.rssi.training import RssiTraining, bin_locations, mixing_weights
 from swiftwrf.runtime.steps import Memo
 
 KERNEL = Kernel(4.0, 1.0, matern12_weight=0.6, noise=1.0)
 FIELD_DB, NOISE_DB, PATH_LOSS_STD_DB = 3.0, 2.0, 30.0
-CPU, FIRST = torch.device("cpu"), slice(0, 1)
+CPU, FIRST = torch.device("cpu"), 0
 
 
 def test_errors_by_the_number_of_training_rows(monkeypatch, tmp_path):
@@ -80,13 +79,11 @@ def training_of(data, n_primitives=50):
         rssi=data.rssi_dbm,
         count=torch.ones(n, r, dtype=torch.float64),
         kernel=KERNEL,
-        n_primitives=n_primitives,
         rendered=render([Head(name, n_primitives, 0).requires_grad_(False) for name in data.receiver_names]),
         path_loss=PathLosses(
             own=path_loss,
             shared=path_loss,
-            middle=torch.zeros(r).double(),
-            std=torch.full((r, 2), PATH_LOSS_STD_DB).double(),
+            root=PATH_LOSS_STD_DB * torch.eye(2).double().repeat(r, 1, 1),
             variance=torch.full((r,), FIELD_DB**2 + NOISE_DB**2).double(),
             detection=None,
             floor_db=torch.zeros(r).double(),
@@ -100,6 +97,15 @@ def training_of(data, n_primitives=50):
     )
 
 
+def posterior(training, found):
+    """The posterior of one receiver's fit."""
+    tensors = {name: value[None] for name, value in found.items() if name not in ("covariance", "held_out")}
+    variances = {"field_db": training.field_db, "noise_db": training.noise_db}
+    measured, table = (~training.rssi.isnan()).T.double(), HeadTable(training.rendered)
+    rest = {"anchor": training.position, "measured": measured, **variances}
+    return RssiPosterior(training.receiver, training.kernel, table, huber=1.345, **tensors, **rest)
+
+
 # --- the regression -------------------------------------------------------------------------------------------------
 
 
@@ -110,7 +116,7 @@ def test_solution_is_the_maximum_of_the_posterior():
     data.rssi_dbm[3] -= 25.0  # outliers, so that the weights matter
     data.rssi_dbm[20] += 15.0
     training, config = training_of(data), RssiConfig()
-    found = {name: value[0] for name, value in fit_receiver(FIRST, training, config, CPU).items()}
+    found = posterior(training, fit_receiver(FIRST, training, config, CPU))
 
     rendered = training.rendered.double()
     gram = KERNEL(training.position, training.position)
@@ -135,10 +141,9 @@ def test_solution_is_the_maximum_of_the_posterior():
 
     options = {"maxiter": 5000, "maxfun": 9000, "ftol": 1e-14}
     best = minimize(objective, np.zeros(50), jac=True, method="L-BFGS-B", options=options)
-    latent = (gram @ found["coefficient"])[:, None]
-    table = HeadTable(training.rendered)
-    mine = found["level"] + found["slope"] * distance + bearing @ found["directivity"]
-    mine = mine + (table(latent)[0] - table(torch.zeros_like(latent))[0])[:, 0]
+    level, slope = found.path_loss[0]
+    mine = level + slope * distance + bearing @ found.directivity[0]
+    mine = mine + found.table(gram @ found.coefficient)[0][:, 0]
     torch.testing.assert_close(mine, predicted(torch.tensor(best.x)), atol=0.06, rtol=0)
 
 
@@ -146,14 +151,15 @@ def test_held_out_is_a_fit_without_the_fold():
     """The formula for held-out rows against fits that never see them; without outliers, so that no weight depends on them,
     and without a head, which the formula takes along its tangent."""
     training, gentle = training_of(with_field(n=60).columns([1]), n_primitives=0), RssiConfig(huber=1e6)
-    whole = fit_receiver(FIRST, training, gentle, CPU)["held_out"][0]
+    whole = fit_receiver(FIRST, training, gentle, CPU)["held_out"]
     for number in range(5):
         out = training.fold == number
         rest = replace(training, rssi=torch.where(out[:, None], torch.nan, training.rssi))
-        alone = fit_receiver(FIRST, rest, gentle, CPU)
-        distance = log_distance(training.position, training.receiver)
-        expected = alone["level"] + alone["slope"] * distance[:, 0]
-        expected = expected + harmonics(training.position, training.receiver)[:, 0] @ alone["directivity"][0]
+        alone = posterior(training, fit_receiver(FIRST, rest, gentle, CPU))
+        level, slope = alone.path_loss[0]
+        distance = log_distance(training.position, training.receiver)[:, 0]
+        expected = level + slope * distance
+        expected = expected + harmonics(training.position, training.receiver)[:, 0] @ alone.directivity[0]
         torch.testing.assert_close(whole[out], expected[out], atol=1e-5, rtol=0)
 
 
@@ -161,7 +167,8 @@ def test_table_is_the_head():
     rendered = render([Head(name, 50, 0).requires_grad_(False) for name in "ab"])
     latent = torch.linspace(-30, 30, 200)[:, None].expand(-1, 2).contiguous()
     value, slope = HeadTable(rendered)(latent)
-    torch.testing.assert_close(value, mean_magnitude(rendered, latent), atol=2e-3, rtol=0)
+    change = mean_magnitude(rendered, latent) - mean_magnitude(rendered, torch.zeros(1, 2))
+    torch.testing.assert_close(value, change, atol=2e-3, rtol=0)
     assert HeadTable(rendered)(torch.zeros(1, 2))[1].sub(1).abs().max() < 0.01  # 1 dB of the field is 1 dB of RSSI
     assert (slope.diff(dim=0) > -1e-3).all()  # convex
 
