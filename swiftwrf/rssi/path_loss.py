@@ -19,7 +19,6 @@ from swiftwrf.rssi.detection import Detection, empty_given
 from swiftwrf.runtime.threads import single_thread
 
 MIN_DISTANCE_M = 0.3  # shorter distances count as this one: the model does not hold in the near field
-N_HARMONICS = 8  # real spherical harmonics of degree 1 and 2
 MAX_ROUNDS = 40  # of expectation maximisation
 SLOPE_PRIOR = -30.0, 15.0  # of the slope of all receivers: path-loss exponents of 1.5 to 4.5 [dB a decade]
 SPREAD_DB, SPREAD_WORTH = 6.0, 4.0  # prior of the spread over receivers, and the number of receivers that it counts as
