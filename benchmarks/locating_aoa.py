@@ -204,13 +204,8 @@ def channel_scores(room: GeometryModel, measured: Spectra, test: Spectra, seed: 
     """
     known, truth = room.channels(measured), room.channels(test)
     value, fold = torch.view_as_real(known.value).flatten(1), folds(measured.position, "random", seed)
-    process = GaussianProcess.regress(
-        choose_kernel(measured.position, value[:, None], fold),
-        measured.position,
-        value,
-        exact=True,
-        dtype=torch.float32,
-    )
+    kernel = choose_kernel(measured.position, value[:, None], fold)
+    process = GaussianProcess(kernel, measured.position, value.float(), exact=True)
     mean = process.mean(test.position).reshape(*truth.value.shape, 2)
     closest = torch.cdist(test.position, measured.position).argmin(dim=1)
     predicted = {

@@ -167,7 +167,7 @@ def model_of(n: int, grid: AngularGrid, device: torch.device) -> SwiftWRF:
     model.grid, model.bounds = grid, torch.tensor([[0.0] * 3, [1.0] * 3], dtype=torch.float64)
     model.mean, model.cholesky, model.calibration = mean[0], cholesky, 1.0
     model.weight = torch.randn(1 + RANK, n, generator=generator)
-    model.process = GaussianProcess.regress(Kernel(), known, value)
+    model.process = GaussianProcess(Kernel(), known, value)
     model._move(device)
     return model
 

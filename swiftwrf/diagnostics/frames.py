@@ -178,50 +178,42 @@ def check_frames(spectra: Spectra, snapshots: Snapshots | None = None) -> tuple[
         result = "explained"
         text = f". All coordinates fill {filled} exactly, so positions look normalised; give metres"
     elif explanations:
-        result, text = "explained", f". That would fit if {'; or if '.join(explanations)}"
+        result = "explained"
+        text = f". That would fit if {'; or if '.join(explanations)}"
     elif turn_deg:
         angle = math.hypot(*turn_deg)
         axis = ", ".join(f"{a / angle:.2f}" for a in turn_deg)
-        result, text = (
-            "turned",
-            (
-                f". A constant rotation of {angle:.0f} degrees about ({axis}) in array coordinates would mend most of it: "
-                "is the orientation right?"
-            ),
+        result = "turned"
+        text = (
+            f". A constant rotation of {angle:.0f} degrees about ({axis}) in array coordinates would mend most of it: "
+            "is the orientation right?"
         )
     elif fits:
-        result, text = "fits", " and follow it: positions, orientation and angles are in one frame"
+        result = "fits"
+        text = " and follow it: positions, orientation and angles are in one frame"
     elif span_deg < MIN_SPAN_DEG:
-        result, text = (
-            "undecided",
-            (
-                f". All lines of sight have nearly one direction ({span_deg:.1f} degrees between two, median), so frames "
-                "cannot be checked"
-            ),
+        result = "undecided"
+        text = (
+            f". All lines of sight have nearly one direction ({span_deg:.1f} degrees between two, median), so frames "
+            "cannot be checked"
         )
     elif peak_span_deg < span_deg / 4:
-        result, text = (
-            "undecided",
-            (
-                f". The spectra hardly differ: two peaks are {peak_span_deg:.1f} degrees apart, two lines of sight "
-                f"{span_deg:.1f} degrees (medians)"
-            ),
+        result = "undecided"
+        text = (
+            f". The spectra hardly differ: two peaks are {peak_span_deg:.1f} degrees apart, two lines of sight "
+            f"{span_deg:.1f} degrees (medians)"
         )
     elif follows:
-        result, text = (
-            "in part",
-            (
-                f". They follow it in part: one frame reaches {limit_deg:.0f} degrees with this array, and "
-                f"{elsewhere:.0%} of the peaks are elsewhere. The rest is unexplained, e.g. reflections or wrong labels"
-            ),
+        result = "in part"
+        text = (
+            f". They follow it in part: one frame reaches {limit_deg:.0f} degrees with this array, and "
+            f"{elsewhere:.0%} of the peaks are elsewhere. The rest is unexplained, e.g. reflections or wrong labels"
         )
     else:
-        result, text = (
-            "undecided",
-            (
-                " and do not follow it in any frame that was tried: unexplained, e.g. reflections are stronger, or the "
-                "elements' phases are not calibrated"
-            ),
+        result = "undecided"
+        text = (
+            " and do not follow it in any frame that was tried: unexplained, e.g. reflections are stronger, or the "
+            "elements' phases are not calibrated"
         )
     by = ", by the angle to the array's axis" if frame.linear else ""
     numbers = {

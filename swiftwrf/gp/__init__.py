@@ -10,14 +10,6 @@ from swiftwrf.gp.choice import (
 )
 from swiftwrf.gp.process import GaussianProcess, Kernel, candidates, dense_weights, held_out_errors, leave_folds_out
 
-__all__ = [
-    "GaussianProcess",
-    "Kernel",
-    "candidates",
-    "choose_kernel",
-    "choose_rank",
-    "dense_weights",
-    "held_out_errors",
-]
+__all__ = ["GaussianProcess", "Kernel", "candidates", "choose_kernel", "choose_rank", "dense_weights"]
 __all__ += ["held_out_errors", "inner_products", "leave_folds_out", "most_informative", "principal_components"]
 __all__ += ["subsample"]

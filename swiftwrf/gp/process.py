@@ -117,7 +117,7 @@ class GaussianProcess:
 
     Example:
         >>> position = torch.rand(20, 3, dtype=torch.float64)
-        >>> process = GaussianProcess.regress(Kernel(noise=1e-6), position, position.sum(dim=1, keepdim=True))
+        >>> process = GaussianProcess(Kernel(noise=1e-6), position, position.sum(dim=1, keepdim=True))
         >>> bool((process.mean(position)[:, 0] - position.sum(dim=1)).abs().max() < 1e-2)
         True
     """
@@ -139,13 +139,6 @@ class GaussianProcess:
         """True if every prediction conditions on all positions."""
         return len(self.known) <= MAX_EXACT if self.exact is None else self.exact
 
-    @classmethod
-    def regress(
-        cls, kernel: Kernel, known: Tensor, value: Tensor, exact: bool | None = None, dtype: torch.dtype = torch.float64
-    ) -> GaussianProcess:
-        """Return the process of values (n, K) at known positions (n, 3), with a posterior mean of the given type."""
-        return cls(kernel, known, value.to(dtype), exact)
-
     @cached_property
     @torch.inference_mode(False)
     def coefficient(self) -> Tensor:
@@ -153,7 +146,7 @@ class GaussianProcess:
         return torch.cholesky_solve(self.value.double(), self._factor).to(self.value)
 
     def updated(self, position: Tensor, value: Tensor) -> GaussianProcess:
-        """Return the process with more values (k, K) at positions (k, 3), equal to `regress` on all values.
+        """Return the process with more values (k, K) at positions (k, 3), equal to that of all values.
 
         The Cholesky factor grows by k rows, in a time proportional to n^2 k (G. H. Golub and C. F. Van Loan, "Matrix
         Computations", 4th ed., 2013, section 6.5.4).

@@ -114,7 +114,7 @@ class Likelihoods(ABC):
         def of_batch(rows: Tensor) -> Tensor:
             waves, target = PathWaves.at(self.room, at[rows], self.frequency), observed.subset(owner[rows])
             none = torch.zeros(len(rows))
-            return torch.stack([part(waves, target) if weight > 0 else none for part, weight in counted])
+            return torch.stack([part(waves, target) if share > 0 else none for part, share in counted])
 
         batches = torch.arange(n * m).split(BATCH_CANDIDATES // len(self.frequency))
         return torch.cat(parallel_map(of_batch, batches), dim=1).reshape(len(counted), n, m)
@@ -162,16 +162,16 @@ class SpectrumLikelihoods(Likelihoods):
         kept = _without_folds(fold)
         fits = parallel_map(fitted, kept)
         residual = torch.empty(2, *features.coarray.shape)
-        for number, (own, gains, _) in enumerate(fits[:-1]):
-            out = fold == number
+        for others, (own, gains, _) in zip(kept[:-1], fits[:-1], strict=True):
+            out = ~others
             waves, observed = PathWaves.at(own, train.position[out]), features.coarray[out]
             residual[:, out] = torch.stack(
                 [predict(waves)[0] - observed for predict in gain_features(own.array, gains)]
             )
         floor = MIN_VARIANCE * float(features.coarray.square().mean())
         found = []
-        for rows, (own, gains, phases) in zip(kept, fits, strict=True):
-            constant, varying = (Student.fit(part[rows], floor) for part in residual)
+        for known, (own, gains, phases) in zip(kept, fits, strict=True):
+            constant, varying = (Student.fit(part[known], floor) for part in residual)
             found.append(cls(own, CARRIER, gains, (constant, varying), phases))
         return features, found
 
@@ -252,11 +252,11 @@ class ChannelLikelihoods(Likelihoods):
 
         kept = _without_folds(fold)
         rooms = parallel_map(fitted, kept)
-        outs = [fold == number for number in range(len(rooms) - 1)]
+        outs = [~others for others in kept[:-1]]
         # every channel, by the room without its fold
         held = [
             (own, PathWaves.at(own, position[out], frequency), features.subset(out))
-            for own, out in zip(rooms, outs, strict=False)
+            for own, out in zip(rooms[:-1], outs, strict=True)
         ]
         missing, error = torch.empty(len(train)), torch.empty_like(features.coarray)
         for out, (_, waves, observed) in zip(outs, held, strict=True):
@@ -272,11 +272,11 @@ class ChannelLikelihoods(Likelihoods):
             channels = (PathWaves.at(own, at, frequency).channel for at in position[rows].split(BATCH_CANDIDATES))
             predicted = torch.cat([channel_numbers(channel, array) for channel in channels])
             difference = features.coarray[rows] - predicted
-            return GaussianProcess.regress(kernel, position[rows], difference, dtype=torch.float32)
+            return GaussianProcess(kernel, position[rows], difference.float())
 
         processes = [*map(process, rooms, kept)]
         residual = torch.empty_like(features.coarray)
-        for nearby, out, (_, waves, observed) in zip(processes, outs, held, strict=False):
+        for nearby, out, (_, waves, observed) in zip(processes[:-1], outs, held, strict=True):
             numbers, std = nearby_numbers(waves.channel, waves.position, array, nearby)
             residual[out] = (numbers - observed.coarray) / std[:, None]
         floor = MIN_VARIANCE * float(features.coarray.square().mean())
@@ -338,11 +338,8 @@ class ChannelLikelihoods(Likelihoods):
         (nearby,) = _distributions(room, tensors, header, 1)
         process = GaussianProcess.from_state(tensors, header, torch.float32, prefix=NEARBY)
         expect(tensors, {f"{NEARBY}value": (len(process.known), len(nearby.scale))})
-        n_snapshots, floor, frequency = (
-            int(header["n_snapshots"]),
-            float(header["floor"]),
-            tensors["frequency"].double(),
-        )
+        n_snapshots, floor = int(header["n_snapshots"]), float(header["floor"])
+        frequency = tensors["frequency"].double()
         counts = {1, len(kept_snapshots(n_snapshots))}
         if not floor > 0 or frequency.dim() != 1 or len(frequency) not in counts or bool((frequency <= 0).any()):
             raise InputError("frequencies and missing coherence are not those of a fitted locator")

@@ -97,7 +97,7 @@ class CoarrayModel(Linked, ProcessModel):
         fold = folds(train.position, self.config.validation, self.config.seed)
         kernel = choose_kernel(train.position, train.store, fold)
         target = torch.cat([score, (offset - offset.mean()).double()], dim=1)
-        self.process = GaussianProcess.regress(kernel, train.position, target)
+        self.process = GaussianProcess(kernel, train.position, target)
         self.offset = offset.mean()[None]
         value = self.process.value
         self._set_spread(train, fold, lambda rows: value[rows], lambda score, _: self._spectra(score, self.grid))

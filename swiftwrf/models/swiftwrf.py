@@ -145,7 +145,7 @@ class SwiftWRF(ProcessModel):
         self.weight = _weights(function, torch.cat([mean, component]))
         flat = component.flatten(1)
         score = torch.cat([(part - mean).flatten(1) @ flat.T for part in train.store.batches()])
-        self.process = GaussianProcess.regress(kernel, train.position, score / flat.square().sum(dim=1))
+        self.process = GaussianProcess(kernel, train.position, (score / flat.square().sum(dim=1)).double())
         predicted, variance = _held_out(some, function, kernel, fold)
         prior = _render(self.weight[1:], function).square().sum(dim=0).clamp_min(1e-12)
         self.calibration = std_factor((predicted - some.spectrum).abs() / (variance[:, None, None] * prior).sqrt())
@@ -155,7 +155,7 @@ class SwiftWRF(ProcessModel):
         self.mean, self.cholesky, self.weight = (x.to(device) for x in self.parameters())
         if device.type != "cpu":
             known, value = self.process.known.to(device), self.process.value.to(device)
-            self.process = GaussianProcess.regress(self.process.kernel, known, value)
+            self.process = GaussianProcess(self.process.kernel, known, value)
         self._bases: dict[AngularGrid, Basis] = {}
 
     def parameters(self) -> tuple[Tensor, Tensor, Tensor]:

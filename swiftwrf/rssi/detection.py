@@ -156,7 +156,7 @@ class DetectionField:
         if bool(detected.all()):
             return None
         value, mean = detected.double(), detected.double().mean(dim=0)
-        process = GaussianProcess.regress(kernel, position, value - mean)
+        process = GaussianProcess(kernel, position, value - mean)
         share = torch.empty_like(value)
         for out, kept, weight, _ in leave_folds_out(kernel, position, fold):
             own = value[kept].mean(dim=0)

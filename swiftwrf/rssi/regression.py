@@ -375,7 +375,7 @@ def uncertainty(
         covariance: Covariance of level and slope of each receiver, (R, 2, 2).
     """
     (known,) = subsample(known, rows=MAX_VARIANCE_POSITIONS)
-    process = GaussianProcess.regress(kernel, known, _trend(known, receiver))
+    process = GaussianProcess(kernel, known, _trend(known, receiver))
     return partial(_variances, process, receiver, covariance)  # a function that can be pickled
 
 

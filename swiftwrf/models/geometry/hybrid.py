@@ -98,7 +98,7 @@ class HybridModel(ProcessModel):
             self.component = torch.cat([mean[None], component])
         else:
             self.mixing_weight = 1.0
-        self.process = GaussianProcess.regress(kernel, train.position, score, exact=True, dtype=torch.float32)
+        self.process = GaussianProcess(kernel, train.position, score.float(), exact=True)
         mean, component = self.component[0], self.component[1:]
 
         def spectrum(held_out: Tensor, rows: Tensor) -> Tensor:

@@ -193,7 +193,7 @@ def test_refuses_a_broken_archive(tmp_path):
         ({"last_point": np.array([object()] * N)}, "plain numbers"),
     ],
 )
-def test_paths_that_say_nothing_are_refused(tmp_path, changes, says):
+def test_paths_without_usable_numbers_are_refused(tmp_path, changes, says):
     with pytest.raises(InputError, match=says):
         load_spectra(write_paths(tmp_path / "p", **changes))
 

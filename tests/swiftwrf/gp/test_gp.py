@@ -34,7 +34,7 @@ def test_regression_is_that_of_scikit_learn(generator):
     mean, deviation = theirs.predict(asked, return_std=True)
     rows, weight = process.weights(asked)
     np.testing.assert_allclose((weight * values[rows]).sum(dim=1), mean, rtol=1e-8, atol=1e-9)
-    regressed = GaussianProcess.regress(KERNEL, known, values[:, None])
+    regressed = GaussianProcess(KERNEL, known, values[:, None])
     np.testing.assert_allclose(regressed.mean(asked)[:, 0], mean, rtol=1e-8, atol=1e-9)
     np.testing.assert_allclose(process.variance(asked).sqrt(), deviation, rtol=1e-6)
 
@@ -54,7 +54,7 @@ def test_kernel_of_many_spectra_is_judged_at_their_own_density(generator):
     errors = _local_errors(position, spectrum, fold)(KERNEL)
     for row, error in list(zip(subsample(torch.arange(500), rows=MAX_LOCAL_ROWS)[0], errors, strict=True))[::50]:
         kept = fold != fold[row]
-        process = GaussianProcess.regress(KERNEL, position[kept], change[kept], exact=False)
+        process = GaussianProcess(KERNEL, position[kept], change[kept], exact=False)
         torch.testing.assert_close(error, (process.mean(position[row, None])[0] - change[row]).square().mean())
 
 
@@ -79,7 +79,7 @@ def test_held_out_predictions_are_those_of_a_process_without_the_fold(generator,
     for number, (out, kept, weight, variance) in enumerate(leave_folds_out(KERNEL, position, fold)):
         assert torch.equal(out, (fold == number).nonzero()[:, 0])
         assert torch.equal(kept, (fold != number).nonzero()[:, 0])
-        process = GaussianProcess.regress(KERNEL, position[kept], value[kept])
+        process = GaussianProcess(KERNEL, position[kept], value[kept])
         torch.testing.assert_close(weight, process.weights(position[out])[1])
         torch.testing.assert_close(variance, process.variance(position[out]) + KERNEL.noise)
         error = held_out_errors(precision, precision @ value, out)
@@ -90,7 +90,7 @@ def test_held_out_predictions_are_those_of_a_process_without_the_fold(generator,
 def test_local_process_of_all_neighbours_is_the_exact_one(generator, dtype):
     known, asked = (torch.rand(n, 3, generator=generator, dtype=torch.float64) for n in (40, 6))
     value = torch.randn(40, 3, generator=generator, dtype=torch.float64)
-    exact, local = (GaussianProcess.regress(KERNEL, known, value, e, dtype) for e in (True, False))
+    exact, local = (GaussianProcess(KERNEL, known, value.to(dtype), e) for e in (True, False))
     torch.testing.assert_close(local.mean(asked), exact.mean(asked).double(), atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(local.variance(asked), exact.variance(asked))
     for process in (exact, local):
@@ -105,7 +105,7 @@ def test_local_predictions_condition_on_the_nearest_positions(generator):
     known = torch.rand(300, 3, generator=generator, dtype=torch.float64)
     value = torch.sin(5 * known)
     asked = known[:20] + 0.01
-    exact, local = (GaussianProcess.regress(KERNEL, known, value, e) for e in (True, False))
+    exact, local = (GaussianProcess(KERNEL, known, value, e) for e in (True, False))
     torch.testing.assert_close(local.mean(asked), exact.mean(asked), atol=0.02, rtol=0)
     rows, weight = local.weights(asked)
     torch.testing.assert_close(weighted(weight, value[rows]), local.mean(asked))
@@ -115,7 +115,7 @@ def test_local_predictions_condition_on_the_nearest_positions(generator):
 def test_slopes_are_those_of_finite_differences(generator, exact):
     position = 2 * torch.rand(70, 3, generator=generator, dtype=torch.float64) - 1
     value = torch.sin(position @ torch.randn(3, 2, generator=generator, dtype=torch.float64))
-    process = GaussianProcess.regress(Kernel(8.0, 0.4, matern12_weight=0.05, noise=1e-2), position, value, exact)
+    process = GaussianProcess(Kernel(8.0, 0.4, matern12_weight=0.05, noise=1e-2), position, value, exact)
     at = (1.6 * torch.rand(3, 3, generator=generator, dtype=torch.float64) - 0.8).requires_grad_()
     for quantity in (process.mean, process.variance):
         (slope,) = torch.autograd.grad(quantity(at).sum(), at)

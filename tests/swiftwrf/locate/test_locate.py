@@ -186,7 +186,7 @@ def test_few_cells_are_enough_where_path_gains_change_with_position():
     room, kernel = GeometryModel.of_planes(spectra, ROOM, order=1), Kernel(20.0, matern12_weight=1.0, noise=1e-3)
     normal = torch.randn(len(spectra), 8, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     value = 2 * torch.linalg.cholesky(kernel.covariance(spectra.position)) @ normal
-    gains = PathGains(GaussianProcess.regress(kernel, spectra.position, value, dtype=torch.float32), 4)
+    gains = PathGains(GaussianProcess(kernel, spectra.position, value.float()), 4)
     spectrum = room.array.spectrum(gains.channel(room, spectra.position), spectra.grid)
     train, test = replace(spectra, store=type(spectra.store)(spectrum)).split()
     few = {"n_best": 8, "n_background": 10, "n_split": 8, "spacing": 0.15, "n_calibration": 40}
