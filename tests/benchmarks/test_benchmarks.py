@@ -57,7 +57,7 @@ def test_a_study_goes_on_after_the_rows_that_are_there(study, tmp_path, monkeypa
     for row in rows.values():
         assert row["ms"]["low"] <= row["ms"]["median"]
         assert (row["n_train"], row["n_test"]) == (24, 6)
-        assert {"command", "commit", "versions", "machine"} == set(row["provenance"])
+        assert {"command", "commit", "date", "versions", "machine"} == set(row["provenance"])
     assert not list(tmp_path.rglob("*.state"))
 
 
@@ -69,7 +69,24 @@ def test_rows_measured_at_different_times_have_a_provenance_each(tmp_path, monke
         record.write_result("made", {"rows": [*record.kept("made", "rows"), new]}, folder=tmp_path, rows=[new])
     measured = [row["provenance"] for row in json.loads((tmp_path / "made.json").read_text())["rows"]]
     assert [row["command"] for row in measured] == ["python first.py", "python second.py --n 2"]
-    assert all(set(row) == {"command", "commit", "versions", "machine"} for row in measured)
+    assert all(set(row) == {"command", "commit", "date", "versions", "machine"} for row in measured)
+
+
+def test_the_age_of_a_table_is_that_of_its_oldest_and_newest_row(tmp_path, monkeypatch):
+    monkeypatch.setattr(record, "RESULTS", tmp_path)
+
+    def measured(day: int, commit: str) -> dict[str, object]:
+        start, packages = f"2026-01-{day:02d}T00:00:00+00:00", {"swiftwrf-tasks": "0.3.0"}
+        return {"commit": commit, "start": start, "packages": packages, "device": "CPU"}
+
+    old = record._provenance("python x.py", measured(2, "b"))
+    content = {"command": "python x.py", "environment": measured(9, "a")}
+    (tmp_path / "rows.json").write_text(json.dumps(content | {"rows": [{"provenance": old}, {"n": [1]}]}))
+    (tmp_path / "whole.json").write_text(json.dumps(content | {"rows": [{"n": 1}]}))
+    assert record.age(["rows"]) == "Measured on 2026-01-02 (version 0.3.0, commit b)."
+    assert record.age(["whole", "rows"]) == (
+        "Measured from 2026-01-02 (version 0.3.0, commit b) to 2026-01-09 (version 0.3.0, commit a)."
+    )
 
 
 def test_uncommitted_code_is_not_measured(monkeypatch):
