@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import torch
 from matplotlib import pyplot
-from quick import cheap, command, sketched
-from small import FLOOR, known_planes
 from packaging.version import Version
+from quick import cheap, command, sketched
 from record import RESULTS, loaded, origins
+from small import FLOOR, known_planes
 from tables import FILES, rewrite
 
 import swiftwrf
