@@ -13,6 +13,7 @@ from swiftwrf.errors import InputError
 
 MAX_COORDINATE_M = 1e9  # of a position: beyond, float64 does not resolve a wavelength
 MAX_COORDINATE = 1e15
+MAX_EXTENTS, MIN_FAR_M = 10.0, 100.0  # between positions and the box of those that a model was fitted to
 MAX_NORMALISED = 1e6  # normalised: beyond, all is equally far, and float32 must not overflow
 MIN_TREE_POSITIONS = 2000  # known positions from which on a tree finds the nearest ones faster than all distances do
 
@@ -95,6 +96,21 @@ def check_positions(
             f"{rows[row].tolist()}"
         )
     return position.to_dense().double() if isinstance(position, Tensor) else checked
+
+
+def check_near(name: str, position: Tensor, known: Tensor) -> None:
+    """Refuse positions (n, 3) [m] so far away from known ones (m, 3) [m] that they are in another unit or frame.
+
+    Raises:
+        InputError: A position more than 100 m and 10 diagonals away from the box around the known ones.
+    """
+    low, high = known.amin(dim=0), known.amax(dim=0)
+    away, extent = (position - position.clamp(low, high)).norm(dim=1), float((high - low).norm())
+    if bool((away > max(MIN_FAR_M, MAX_EXTENTS * extent)).any()):
+        raise InputError(
+            f"{name} has a position {float(away.max()):.3g} m away from those that the model was fitted to, which extend "
+            f"over {extent:.3g} m; give positions in the unit and frame of these"
+        )
 
 
 def frame(position: Tensor) -> tuple[Tensor, Tensor]:

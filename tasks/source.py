@@ -14,8 +14,10 @@ from torch import Tensor
 from swiftwrf import AngularGrid, InputError, Rssi, Spectra
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.archives import array_header, read_rows
+from swiftwrf.data.files import TABLES, read_table
 from swiftwrf.data.formats import RSSI_FORMATS, ReadOptions, read, read_spectra
 from swiftwrf.data.receivers import spelled_as
+from swiftwrf.data.rssi import Offsets
 from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
 from swiftwrf.data.store import Store
 from swiftwrf.datasets import DATA_SETS, fetch
@@ -49,6 +51,18 @@ def _array(spectra: SpectraSource) -> PlanarArray | None:
     if rows == columns:
         return PlanarArray.square(rows, frequency, spacing)
     return PlanarArray.grid(rows, columns, spacing, frequency)
+
+
+def is_table(source: str) -> bool:
+    """Return True for a file of a table."""
+    return os.path.isfile(source) and Path(source).suffix.lower() in TABLES
+
+
+def with_groups(options: ReadOptions, source: str, offsets: Offsets | None) -> ReadOptions:
+    """Return options that read the groups whose offsets a model knows, if the source is a table with their column."""
+    if offsets is None or not is_table(source) or offsets.column not in read_table(Path(source)).columns:
+        return options
+    return replace(options, offset_by=offsets.column)
 
 
 def located(source: str) -> str:

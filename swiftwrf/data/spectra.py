@@ -27,6 +27,7 @@ from swiftwrf.positions import to_tensor
 from swiftwrf.runtime.validation import checked
 
 GRID = AngularGrid.hemisphere(90, 360)  # of spectra that are computed
+OF_SPECTRA = ("line_of_sight", "label", "channel", "frequency_hz")  # arrays beside the spectra in spectrum.npz
 DIRECTION = ("elevation", "azimuth")  # names of the dimensions of a spectrum
 MAX_LABEL = torch.tensor([math.tau, math.pi / 2], dtype=torch.float64) + 1e-6  # azimuth and elevation [rad], rounded
 

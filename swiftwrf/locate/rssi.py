@@ -114,8 +114,7 @@ class RssiLocator(Configured, Saved):
         """
         config = self.config
         if model is not None:
-            model.check_measurements(train)
-            train = train.about(model.origin)
+            train = model.aligned(train)
         self.receiver_names = train.receiver_names
         self.model = model or self._radio_maps(train)
         known = train.transmitter_position

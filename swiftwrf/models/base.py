@@ -22,7 +22,7 @@ from swiftwrf.errors import InputError, with_article
 from swiftwrf.models.link import Link
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Axes, Displayed, extent
-from swiftwrf.positions import check_positions, to_tensor
+from swiftwrf.positions import check_near, check_positions, to_tensor
 from swiftwrf.runtime.checkpoint import Header, Saved, check_folder
 from swiftwrf.runtime.descent import Record
 from swiftwrf.runtime.threads import single_thread, to_device
@@ -162,7 +162,7 @@ class FieldModel(Configured, Saved, Displayed):
         if like is not None and not self.accepts_like(like):
             raise InputError(f"{self.name} cannot reuse the structure of {with_article(like.kind)}")
         if like is not None:
-            like.link.check(train)
+            train = like.link.aligned(train)
         self.grid, self.bounds, self.link = train.grid, bounding_box(train.position), Link.from_spectra(train)
         self._fit(train, like=like, device=device, checkpoint=checkpoint, on_record=on_record, progress=progress)
         return self
@@ -249,7 +249,7 @@ class FieldModel(Configured, Saved, Displayed):
             new: Spectra of the same link on the grid of the training spectra, any number.
 
         Raises:
-            InputError: A model that must be fitted again, or as `check_measurements`.
+            InputError: A model that must be fitted again, or as `aligned`.
 
         Example:
             >>> import swiftwrf
@@ -258,26 +258,29 @@ class FieldModel(Configured, Saved, Displayed):
             >>> model.update(data.subset(torch.arange(40, 50))).process.known.shape
             torch.Size([50, 3])
         """
-        self.check_measurements(new)
+        new = self.aligned(new)
         model = self._copy()
         if len(new):
             model.bounds = bounding_box(torch.cat([self.bounds, new.position]))
             model._update(new)
         return model
 
-    def check_measurements(self, new: Spectra) -> None:
-        """Refuse spectra that were not measured as the training spectra.
+    def aligned(self, new: Spectra) -> Spectra:
+        """Return spectra as the model takes them: snapshots in the order of the training spectra. Refuse other measurements.
 
         Raises:
-            InputError: Another grid or link than that of the training spectra, or a spectrum that is not finite.
+            InputError: Another grid or link than that of the training spectra, positions far away from theirs, or a spectrum
+                that is not finite.
         """
         if new.grid != self._checked_grid(None):
             raise InputError(
                 f"{new.name} has another grid than the training spectra; give spectra of {self.grid.shape}"
             )
         self._check_described(new)
-        self.link.check(new)
+        new = self.link.aligned(new)
+        check_near(new.name, new.position, self.bounds)
         check_training(new, least=0)
+        return new
 
     def forget(self, rows: Numbers) -> Self:
         """Return the model without some of its training spectra; see `update`.

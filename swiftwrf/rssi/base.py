@@ -22,7 +22,7 @@ from swiftwrf.errors import InputError, listed
 from swiftwrf.models.base import FieldConfig
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Displayed
-from swiftwrf.positions import check_positions, to_tensor
+from swiftwrf.positions import check_near, check_positions, to_tensor
 from swiftwrf.rssi.detection import Detection
 from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation
 from swiftwrf.runtime.checkpoint import Header, Saved
@@ -181,10 +181,10 @@ class RssiPredictor(Configured, Displayed, ABC):
         The result equals a fit to all rows with the same kernel, noise, mixing weights and weights of the earlier rows.
 
         Args:
-            new: Rows at the receivers of the training rows, in the same frame, any number.
+            new: Rows at the receivers of the training rows, any number.
 
         Raises:
-            InputError: A predictor that must be fitted again, or as `check_measurements`.
+            InputError: A predictor that must be fitted again, or as `aligned`.
 
         Example:
             >>> import swiftwrf
@@ -193,7 +193,7 @@ class RssiPredictor(Configured, Displayed, ABC):
             >>> len(model.update(data.subset(torch.arange(50, 60))).anchor)
             60
         """
-        self.check_measurements(new)
+        new = self.aligned(new)
         predictor = copy(self)
         if self.attenuation is not None:
             new = self.attenuation.removed(new)
@@ -207,26 +207,54 @@ class RssiPredictor(Configured, Displayed, ABC):
         if not self.updates:
             raise InputError(f"a predictor {self.name} cannot be updated; fit it again to all rows")
 
-    def check_measurements(self, data: Rssi) -> None:
-        """Refuse rows at other receivers than those of the training rows. Unknown positions are not compared.
+    def aligned(self, data: Rssi, *, located: bool = True) -> Rssi:
+        """Return rows as the predictor takes them, and refuse rows that were measured otherwise than the training rows.
+
+        Receivers are in the order of the training rows, positions about the same origin, and offsets that the predictor
+        knows are removed.
+
+        Args:
+            data: Rows at the receivers of the training rows.
+            located: Whether the positions of the transmitter count.
 
         Raises:
-            InputError: Other names, another order, or a receiver more than 1 cm from its position in the training rows.
+            InputError: Other receivers, or one more than 1 cm from its position in the training rows, where both are known;
+                positions in degrees for a predictor in metres or the reverse, on other floors, or far away.
         """
         self.check_fitted()
-        if tuple(map(str, data.receiver_names)) != self.receiver_names:
+        names, own = list(data.receiver_names), list(self.receiver_names)
+        if sorted(names) != sorted(own):
             raise InputError(
-                f"{data.name} has the receivers {listed(data.receiver_names)}, but the predictor was fitted to "
-                f"{listed(self.receiver_names)}; give the same ones in this order"
+                f"{data.name} has the receivers {listed(names)}, but the predictor was fitted to {listed(own)}; give these"
             )
-        position = data.about(self.origin).receiver_position
-        apart = (position - self.receiver_position).norm(dim=1).nan_to_num(0.0)
+        data = (data if names == own else data.columns([names.index(name) for name in own])).about(self.origin)
+        apart = (data.receiver_position - self.receiver_position).norm(dim=1).nan_to_num(0.0)
         if len(moved := (apart > 0.01).nonzero()[:, 0]):
             name, metres = self.receiver_names[int(moved[0])], float(apart[moved[0]])
             raise InputError(
                 f"{data.name} has receiver {name} {metres:.3g} m away from its position in the rows that the predictor was "
                 "fitted to; fit a predictor to rows with the receivers at these positions"
             )
+        if located and len(data):
+            data = self._on_own_floors(data)
+        return data if self.offsets is None else self.offsets.removed(data)
+
+    def _on_own_floors(self, data: Rssi) -> Rssi:
+        """Return rows with the floors of the training rows. Refuse another unit, other floors and positions far away."""
+        if data.origin != self.origin:
+            found, own = ("metres" if origin is None else "degrees" for origin in (data.origin, self.origin))
+            raise InputError(f"{data.name} has positions in {found}, but the predictor was fitted to {own}; give {own}")
+        floors, at = self.attenuation and self.attenuation.floors, data.transmitter_position
+        if data.floors is not None:
+            pairs = zip(data.floors.named(at), floors.named(at) if floors else [""] * len(at), strict=True)
+            if other := {name for name, own in pairs if not {*name.split(", ")} & {*own.split(", ")}}:
+                raise InputError(
+                    f"{data.name} has rows on floor {listed(sorted(other))} at heights of other floors of the rows that the "
+                    f"predictor was fitted to ({listed(floors.names) if floors else 'none'}); fit a predictor to all floors"
+                )
+        if self.updates:
+            check_near(data.name, at, self.region())
+        return data.derived(floors=floors)
 
     def _update(self, new: Rssi) -> None:
         """Add checked rows to this copy."""
@@ -278,10 +306,9 @@ class RssiPredictor(Configured, Displayed, ABC):
         """Predict the RSSI at least where it is measured, with shapes of `predict` at the positions of the data.
 
         Raises:
-            InputError: As `check_measurements`.
+            InputError: As `aligned`.
         """
-        self.check_measurements(data)
-        return self.predict(data.about(self.origin).transmitter_position)
+        return self.predict(self.aligned(data).transmitter_position)
 
     @checked
     def predict_detection(self, position: Numbers, offset_db: Tensor | float = 0.0) -> Tensor:

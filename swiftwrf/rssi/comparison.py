@@ -249,7 +249,7 @@ def compare(
         >>> bool(result.summary().loc["swiftwrf", "median"] < result.summary().loc["mean", "median"])
         True
     """
-    chosen = data.receivers(receivers)
+    chosen = data.as_measured().receivers(receivers)
     train, test = chosen.split(split, seed)
     if not bool(test.detected.any()):
         raise InputError(f"split {split!r} of {data.name} has no test rows that detect these receivers")

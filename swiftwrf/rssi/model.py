@@ -199,9 +199,6 @@ class RssiModel(SavedRssiPredictor):
 
     @single_thread()
     def _update(self, new: Rssi) -> None:
-        if self.offsets is not None:
-            new = self.offsets.removed(new)
-        new = new.about(self.origin)
         at = new.transmitter_position - self.centre
         if self.detection_field is not None:
             self.detection_field = self.detection_field.updated(at, new.detected)
@@ -272,8 +269,9 @@ class RssiModel(SavedRssiPredictor):
         Near the limit of detection it is above the received power of all packets, which `predict` returns.
 
         Raises:
-            InputError: As `check_measurements`.
+            InputError: As `aligned`.
         """
+        data = self.aligned(data)
         prediction = super().predict_detected(data)
         if self.detection is None or self.detection_field is None:
             return prediction

@@ -9,12 +9,16 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import torch
 
 from swiftwrf import FieldModel, InputError, Rssi, Spectra
+from swiftwrf.data.cells import text_of
+from swiftwrf.data.columns import column_of
+from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.files import refusing_unreadable, table_of
 from swiftwrf.data.receivers import spelled_as
 from swiftwrf.errors import CONTENT_ERRORS
@@ -155,14 +159,19 @@ def _number(value: object) -> float:
 
 def _of_row(text: str, config: UpdateConfig, model: RssiModel) -> Rssi:
     """Return the measurement in a table of one row; receivers that the model does not have are left out."""
-    options = reading(config.spectra, config.table)
-    table = table_of("the table", text)
-    data = Rssi.from_frame(table, **{name: getattr(options, name) for name in OF_ROWS}).about(model.origin)
+    options, table, offsets = reading(config.spectra, config.table), table_of("the table", text), model.offsets
+    of_rows = {name: getattr(options, name) for name in OF_ROWS}
+    if offsets is not None and offsets.column in table.columns:
+        of_rows["offset_by"] = offsets.column
+    data = Rssi.from_frame(table, **of_rows)
     rssi = zip(spelled_as(data.receiver_names, model.receiver_names)[0], data.rssi_dbm[0].tolist(), strict=True)
     value = {name: x for name, x in rssi if name in model.receiver_names}
     if not value:
         raise InputError("no receiver of the model detected the transmitter")
-    return _of_receivers(data.transmitter_position.tolist(), value, model)
+    floor = column_of(table, "floor", options.columns or {}) if model.attenuation else None
+    floors = None if floor is None else Floors((text_of(table[floor])[0],), (0.0,))  # of one name, whatever the height
+    row = _of_receivers(data.transmitter_position.tolist(), value, model)
+    return replace(row, origin=data.origin, groups=data.groups, floors=floors, time=data.time)
 
 
 def _of_receivers(position: list[list[float]], value: dict[str, float | None], model: RssiModel) -> Rssi:

@@ -26,7 +26,7 @@ from tasks.environment import environment, invocation
 from tasks.options import plain
 from tasks.page.page import write_page
 from tasks.records import CONFIG, ENVIRONMENT
-from tasks.source import aligned, located, reading
+from tasks.source import aligned, located, reading, with_groups
 from tasks.terminal import console, terminal
 from tasks.update.lines import answer, check_source, lines, measurement
 from tasks.update.record import SUMMARY, Record, page
@@ -81,7 +81,7 @@ def follow(config: UpdateConfig) -> None:
         for line in lines(config.source, *place):
             before = follower.model
             try:
-                new = measurement(line, config, before)
+                new = before.aligned(measurement(line, config, before))  # type: ignore[arg-type]  # of the model's kind
                 step = follower.step(new)
             except InputError as error:  # one bad line does not end a run of days
                 console.print(f"error: {error}", markup=False, soft_wrap=True)
@@ -161,7 +161,9 @@ def _read(source: str, options: ReadOptions, model: FieldModel | RssiModel) -> S
     """Return measurements of the kind that a model predicts, of a folder, file or public data set."""
     source = located(source)
     if isinstance(model, RssiModel):
-        rssi: Any = read(source, options, RSSI_FORMATS)
-        return aligned(rssi.about(model.origin), model.receiver_names, ignore_others=True)
+        rssi: Any = read(source, with_groups(options, source, model.offsets), RSSI_FORMATS)
+        return model.aligned(aligned(rssi, model.receiver_names, ignore_others=True))
     data: Any = read(source, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS)
-    return data.spectra(model.grid, options.beamformer or "phase") if isinstance(data, Snapshots) else data
+    return model.aligned(
+        data.spectra(model.grid, options.beamformer or "phase") if isinstance(data, Snapshots) else data
+    )

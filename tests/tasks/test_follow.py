@@ -6,6 +6,8 @@ import time
 from dataclasses import replace
 from functools import cache
 
+import numpy as np
+import pandas as pd
 import pytest
 import small
 import torch
@@ -15,6 +17,7 @@ from swiftwrf import AngularGrid, Rssi, RssiModel, load, make_model, rssi_room, 
 from swiftwrf.data.writing import write_rssi
 from swiftwrf.models.geometry import GeometryModel, Plane
 from swiftwrf.online import Follower
+from swiftwrf.rssi import estimate_offsets
 from tasks.command import run_command
 from tasks.update.record import Record
 
@@ -253,6 +256,48 @@ def test_bad_rows_of_a_table_are_left_out(model, tmp_path):
     _, answers, said = follow(model, source)
     assert observed(answers) == [-60, -61]
     assert [text.replace(":", "").split()[:3] for text in said.splitlines()] == [["error", "line", n] for n in "345"]
+
+
+@pytest.mark.parametrize("place", [[8.5, 47.3, 400.0], [1e8, 2.0, 1.0]])
+def test_a_line_of_another_unit_is_reported_and_left_out(model, place):
+    code, answers, said = follow(model, content=line(40) + line(41, position=place) + line(42))
+    assert (code, len(answers), said.count("error: ")) == (0, 2, 1)
+    assert "away from those that the model was fitted to" in said
+
+
+def test_rows_in_degrees_are_left_out_by_a_model_in_metres(model, tmp_path):
+    source = tmp_path / "rows.csv"
+    source.write_bytes(b"latitude,longitude,z,receiver01,receiver02\n47.3,8.5,1,-60,-61\n47.3001,8.5,1,-61,-62\n")
+    _, answers, said = follow(model, source)
+    assert not answers
+    assert said.count("has positions in degrees, but the predictor was fitted to metres") == 2
+
+
+@cache
+def two_floors():
+    """RSSI on two floors, heights counted from each; another phone reads 8 dB less."""
+    draw = np.random.default_rng(0)
+    table = pd.DataFrame(draw.uniform(0, 20, (60, 2)), columns=["x", "y"])
+    table = table.assign(z=1.0, floor=np.repeat(["0", "1"], 30), phone=["new", "old"] * 30)
+    loss = 20 * np.log10(np.hypot(table.x, table.y) + 1) + 15 * (table.floor == "1")
+    return table.assign(receiver01=-40 - loss + draw.normal(0, 1, 60) - 8 * (table.phone == "old"))
+
+
+def test_followed_rows_are_of_their_floor_and_phone(tmp_path):
+    """A single row lacks the other floors, from which the height of its own follows."""
+    data = Rssi.from_frame(two_floors(), offset_by="phone")
+    fitted = RssiModel().fit(estimate_offsets(data, "new").removed(data))
+    fitted.save(tmp_path / "floors.safetensors")
+    rows = two_floors().assign(x=lambda table: table.x + 0.1)
+    rows[rows.floor == "0"].tail(2).to_csv(tmp_path / "ground.csv", index=False)
+    rows[rows.floor == "1"].tail(2).to_csv(tmp_path / "first.csv", index=False)
+    _, answers, said = follow(tmp_path / "floors.safetensors", tmp_path / "ground.csv", out=tmp_path / "a")
+    read = rows.receiver01[rows.floor == "0"].tail(2) - np.array([0.0, fitted.offsets.offset_db["old"]])
+    assert [answer["observed"]["receiver01"] for answer in answers] == pytest.approx(read.tolist(), abs=0.01)
+    assert not said
+    _, answers, said = follow(tmp_path / "floors.safetensors", tmp_path / "first.csv", out=tmp_path / "b")
+    assert not answers
+    assert said.count("has rows on floor 1 at heights of other floors") == 2
 
 
 def test_a_character_in_two_parts_is_one(model, tmp_path):

@@ -133,8 +133,9 @@ class GeometryModel(Linked, FieldModel):
         """Return the channels of spectra as the room predicts them, of at most 8 snapshots.
 
         Raises:
-            InputError: Spectra without channels.
+            InputError: Spectra without channels, or of another link.
         """
+        data = self.link.aligned(data)
         if data.channel is None:
             raise InputError(f"{data.name} contains spectra alone; give snapshots, or ray paths with --subcarriers")
         rows = kept_snapshots(data.channel.shape[1])
