@@ -94,18 +94,19 @@ def measure(data: Rssi, split: str, also: tuple[str, ...] = ()) -> Row:
     best = min((name for name in median if name not in OWN), key=lambda name: median[name])
     table = method_summary(result.errors, "abs_error_db", best)
     methods: dict[str, Row] = {}
-    for name, own in result.errors.groupby("method", sort=False)["abs_error_db"]:
+    for name, own in result.errors.groupby("method", sort=False):
         values, change = result.values[name], table.loc[name]
         # few test rows have no interval
         ends = {end: float(change[f"difference_{end}"]) for end in ("low", "high")}
         ends = {end: value for end, value in ends.items() if math.isfinite(value)}
         difference = {"median": median[name] - median[best], "mean": float(change["difference"]), **ends}
         seconds = {part: values[part] for part in ("fit", "predict")}
-        methods[name] = {"abs_error_db": summary(own), "seconds": seconds, "difference_db": difference}
+        error = summary(own["abs_error_db"], own["place"])
+        methods[name] = {"abs_error_db": error, "seconds": seconds, "difference_db": difference}
         if values["std"] is not None:
-            error, std = torch.tensor(own.to_numpy()), torch.as_tensor(values["std"]).double()
+            away, std = torch.tensor(own["abs_error_db"].to_numpy()), torch.as_tensor(values["std"]).double()
             _, half_width = Prediction(torch.zeros_like(std), std).interval(LEVEL)
-            methods[name]["coverage"] = float((error <= half_width).double().mean())
+            methods[name]["coverage"] = float((away <= half_width).double().mean())
     return {
         "n_rows": len(data),
         "n_train": len(result.train),

@@ -115,10 +115,10 @@ def record(result: RssiComparison, folder: Path, notes: Sequence[str] = ()) -> R
         notes.append(f"each of the {len(train.floors.names)} floors takes {attenuation_db:.1f} dB")
     if model.detection is not None:
         notes.append(model.detection.note(train.receiver_names))
-    overall = {name: summary(errors) for name, errors in result.errors.groupby("method")["abs_error_db"]}
-    at_receiver = {
-        key: summary(errors) for key, errors in result.errors.groupby(["receiver", "method"])["abs_error_db"]
-    }
+    overall, at_receiver = (
+        {key: summary(own["abs_error_db"], own["place"]) for key, own in result.errors.groupby(by)}
+        for by in ("method", ["receiver", "method"])
+    )
     return {
         "task": "rssi",
         "data": train.name,

@@ -27,7 +27,7 @@ from tasks.records import Records, notes
 from tasks.rssi.maps import CERTAINTY, COVERED_DBM, MIN_RATIO, WIDTH_PER_STD, Maps
 from tasks.terminal import Answer, Method, NextStep
 
-COLUMNS = ["index", "receiver", "method", "abs_error_db"]  # of the errors of methods
+COLUMNS = ["index", "place", "receiver", "method", "abs_error_db"]  # of the errors of methods
 COLOURS = PREDICTORS
 REFERENCES = ("mean", "mri_pooled")  # which explain no place
 MIN_POSITIONS = 30  # for an interval of one width to show that more positions do not help
@@ -39,8 +39,6 @@ LIMITS = (
     "predictor of the mean has a lower error than this scatter.",
     "Errors are those of detected values. How well empty cells are predicted is a number of its own, and where a packet "
     "is more likely lost than received the maps are hatched.",
-    "Intervals of medians treat pairs as independent. Along a walked path they are not, and the intervals are too "
-    "narrow. The bootstrap of the paired table samples whole test rows, which corrects this in part.",
     "The paper's table (2.91 dB for SwiftWRF, 6.74 dB for MRI) is of other data. Compare methods in this report only.",
 )
 
@@ -87,7 +85,7 @@ def _maps(run: Records, kind: str) -> Section:
 def _errors(run: Records) -> Section:
     caption = (
         f"Column of {model_of(run)}: difference of the mean absolute errors on the same pairs, with its 95 % bootstrap "
-        "interval over test rows. Detection: mean of the fractions of detected and of empty test cells that are predicted "
+        "interval over test places. Detection: mean of the fractions of detected and of empty test cells that are predicted "
         "as such; 0.5 is chance."
     )
     return errors_section(
@@ -130,7 +128,7 @@ def best_baseline(run: Records) -> str:
 
 def conclusion(run: Records) -> list[str]:
     """Return coverage and error, how sure they are, and how the model compares with the best baseline."""
-    best, n_test, interval = best_baseline(run), run.metrics["n_test"], run.metrics["interval"]
+    best, interval = best_baseline(run), run.metrics["interval"]
     own, floors, names = model_of(run), Maps.of_floors(run), list(run.metrics["receivers"])
     who = f"one of {len(names)} receivers" if len(names) > 1 else names[0]
     covered = [f"{maps.covered:.0%} of {maps.place}" for maps in floors]
@@ -141,7 +139,7 @@ def conclusion(run: Records) -> list[str]:
         f"{run.metrics['n_train']} rows ({run.scene})."
     )
     errors = by_method(run.table("errors")[COLUMNS])
-    compared = comparison_sentence(errors, own, best, name=own, unit="dB", rows="pairs", n_test=n_test)
+    compared = comparison_sentence(errors, own, best, name=own, unit="dB", rows="pairs")
     return [
         f"{', '.join(covered)} {'has' if len(covered) == 1 else 'have'} {who} above {COVERED_DBM:g} dBm with "
         f"{CERTAINTY:.0%} certainty; predictions are within {error['median']:.1f} dB (median error).",
@@ -158,9 +156,8 @@ def steps(run: Records) -> list[NextStep]:
     if unknown := int(np.isnan(run.arrays("maps")["receiver"]).any(axis=1).sum()):
         text = f"Give the unknown positions of access points ({unknown}), in `receivers.csv` beside the table"
         own.insert(0, NextStep(text, "receiver,x,y,z"))
-    # the receivers of a row are not independent
-    n_test = min(run.metrics["n_test"], run.metrics["overall"][model_of(run)]["abs_error_db"]["n"])
-    if warning := coverage_warning("intervals", interval["coverage"], interval["nominal"], n_test):
+    n_places = run.table("errors")["place"].nunique()
+    if warning := coverage_warning("intervals", interval["coverage"], interval["nominal"], n_places):
         own.append(NextStep(warning))
     if pairs and run.metrics["split"] != "place":
         own.append(again(run, "Test receivers at positions where they measured nothing", "place"))
