@@ -19,10 +19,12 @@ from torch import Tensor
 
 from augment import Fold, Mixed, synthetic_positions
 from augment.estimators import Estimator, make_estimator
+from augment.estimators.base import estimated
 from swiftwrf.data.splits import places
 from swiftwrf.gp import subsample
 from swiftwrf.locate import MatchedField, MatchedFieldConfig
 from swiftwrf.metrics import angle_errors, paired_change
+from swiftwrf.models.base import synthesized
 from swiftwrf.runtime.threads import parallel_map
 
 STAND_IN = "kernel_regression"  # estimator in place of the network where many or quick trainings are needed
@@ -105,9 +107,10 @@ def held_out_errors(fold: Fold, estimator: Estimator, n_synthetic: int = 0, seed
     if n_synthetic:
         positions = synthetic_positions(fold.train, n_synthetic, seed)
         with _PREDICTING:
-            spectra = fold.model.synthesize(positions.position)
-        train = train.add(positions, spectra.cpu())
-    return _degrees(estimator.fit(train).estimate(fold.test), fold.test.label)
+            spectra = synthesized(fold.model, positions.position)
+        train = train.add(positions, spectra)
+    estimator.fit(train)
+    return _degrees(estimated(estimator, fold.test), fold.test.label)
 
 
 def located_errors(fold: Fold, seed: int) -> Errors:
