@@ -27,7 +27,7 @@ from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.pairs import PairModel
 
 MAX_OPEN_VARIANCE, MAX_WIDENING = 0.5, 1.2  # of the field, and of an interval, at the reach of a scan
-CORRELATION = 0.1  # of the errors of a scan, chosen on held-out training rows by `benchmarks/rssi.py coverage`
+CORRELATION = 0.1  # of the errors of a scan, by held-out training rows in `benchmarks/rssi.py coverage`
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(15)  # of the factor that the errors share
 
 
