@@ -199,9 +199,9 @@ def measure_coverage(data: Rssi, split: str, receivers: int | None = None) -> Ro
 
 
 def thresholds(train: Rssi) -> list[float]:
-    """Return quantiles of the strongest RSSI of scans [dBm], between whole numbers."""
+    """Return quantiles of the strongest RSSI of scans that a receiver detects [dBm], between whole numbers."""
     strongest = train.rssi_dbm.nan_to_num(-math.inf).amax(dim=1)
-    return [float(strongest.quantile(q).floor()) + 0.5 for q in QUANTILES]
+    return [float(strongest[strongest.isfinite()].quantile(q).floor()) + 0.5 for q in QUANTILES]
 
 
 def predicted_above(model: RssiModel, scans: Rssi, threshold: float) -> Tensor:
