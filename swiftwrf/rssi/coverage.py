@@ -27,7 +27,7 @@ from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.pairs import PairModel
 
 MAX_OPEN_VARIANCE, MAX_WIDENING = 0.5, 1.2  # of the field, and of an interval, at the reach of a scan
-CORRELATION = 0.1  # of the errors of a scan, chosen on held-out training rows by `benchmarks/rssi.py coverage`
+CORRELATION = 0.2  # of the errors of a scan, by held-out training rows in `benchmarks/rssi.py coverage`
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(15)  # of the factor that the errors share
 
 
@@ -111,8 +111,8 @@ class Coverage:
             1.0
         """
         threshold_dbm, certainty, number = limits
-        fields = (torch.from_numpy(values) for values in (chart.mean, chart.std, chart.detection))
-        probability = at_least(number, *fields, threshold_dbm).numpy()
+        mean, std, detection = (torch.from_numpy(field) for field in (chart.mean, chart.std, chart.detection))
+        probability = at_least(number, mean, std, detection, threshold_dbm).numpy()
         cells, known = np.stack(np.meshgrid(chart.x, chart.y), axis=-1), scans.transmitter_position[:, :2].numpy()
         enclosed = inside(cells, known) if len(known) else np.zeros(probability.shape, dtype=bool)
         measured = enclosed & (cKDTree(known).query(cells)[0] <= reach)
@@ -121,6 +121,7 @@ class Coverage:
         parts = {"covered": covered, "not_covered": not_covered, "uncertain": ~covered & ~not_covered}
         # a row at a receiver that moves is no scan
         parts |= {"not_measured": ~measured[enclosed], "scans_above": above[: 0 if scans.receiver_moves else None]}
-        values = {"threshold_dbm": threshold_dbm, "certainty": certainty, "n_scans": len(above)}
-        values |= {name: float(part.mean()) if len(part) else None for name, part in parts.items()}
-        return cls(probability, enclosed, measured, values | {"reach_m": reach if math.isfinite(reach) else None})
+        shares = {name: float(part.mean()) if len(part) else None for name, part in parts.items()}
+        limited = {"threshold_dbm": threshold_dbm, "certainty": certainty, "n_scans": len(above)}
+        reach_m = reach if math.isfinite(reach) else None
+        return cls(probability, enclosed, measured, {**limited, "reach_m": reach_m, **shares})

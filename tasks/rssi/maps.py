@@ -28,20 +28,19 @@ RECEIVER = "#cf4a4a"
 WIDTH_PER_STD = 2 * NormalDist().inv_cdf((1 + LEVEL) / 2)  # of the interval of a normal variable
 
 
-def coverage_sentence(found: Row, who: str, where: str = "the measured area") -> str:
-    """Return a coverage in words, by `Coverage.values`, the receivers that are above, and the name of the measured area."""
+def coverage_sentence(found: Row, where: str = "the measured area") -> str:
+    """Return a coverage in words, by `Coverage.values` and the name of the measured area."""
     if found["covered"] is None:
         return f"No cell of the map is in {where}."
+    shares = {name: f"{share:.0%}" for name, share in found.items() if share is not None}
     sentence = (
-        f"{found['covered']:.0%} of {where} has {who} above {found['threshold_dbm']:g} dBm with "
-        f"{found['certainty']:.0%} certainty, {found['not_covered']:.0%} does not, {found['uncertain']:.0%} is uncertain"
+        f"{shares['covered']} of {where} is covered, {shares['not_covered']} is not, {shares['uncertain']} is uncertain"
     )
     if found["scans_above"] is not None:
-        sentence += f"; {found['scans_above']:.0%} of the {found['n_scans']} scans do"
-    if (part := f"{found['not_measured']:.0%}") != "0%":
-        sentence += (
-            f". {part} of the area between the scans is not measured, over {found['reach_m']:.1f} m from any scan"
-        )
+        sentence += f"; {shares['scans_above']} of the {found['n_scans']} scans pass"
+    if (part := shares["not_measured"]) != "0%":
+        far = f"over {found['reach_m']:.1f} m from any scan"
+        sentence += f". {part} of the area between the scans is not measured, {far}"
     return f"{sentence}."
 
 

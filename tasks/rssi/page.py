@@ -25,7 +25,7 @@ from tasks.page.shared import (
     next_steps,
 )
 from tasks.records import Records, notes
-from tasks.rssi.maps import COVERED_DBM, MIN_RATIO, WIDTH_PER_STD, Maps, coverage_sentence
+from tasks.rssi.maps import CERTAINTY, COVERED_DBM, MIN_RATIO, WIDTH_PER_STD, Maps, coverage_sentence
 from tasks.terminal import Answer, Method, NextStep
 
 COLUMNS = ["index", "place", "receiver", "method", "abs_error_db"]  # of the errors of methods
@@ -133,9 +133,9 @@ def best_baseline(run: Records) -> str:
 def conclusion(run: Records) -> list[str]:
     """Return coverage and error, how sure they are, and how the model compares with the best baseline."""
     best, interval = best_baseline(run), run.metrics["interval"]
-    own, names = model_of(run), list(run.metrics["receivers"])
+    own, floors, names = model_of(run), Maps.of_floors(run), list(run.metrics["receivers"])
     who = f"one of {len(names)} receivers" if len(names) > 1 else names[0]
-    covered = [coverage_sentence(maps.coverage, who, maps.place) for maps in Maps.of_floors(run)]
+    covered = [f"{maps.coverage['covered'] or 0:.0%} of {maps.place}" for maps in floors]
     error = run.metrics["overall"][own]["abs_error_db"]
     sure = (
         f"90 % of the errors are below {error['p90']:.1f} dB, and {interval['coverage']:.0%} of the measurements lie in "
@@ -145,7 +145,9 @@ def conclusion(run: Records) -> list[str]:
     errors = by_method(run.table("errors")[COLUMNS])
     compared = comparison_sentence(errors, own, best, name=own, unit="dB", rows="pairs")
     return [
-        f"{' '.join(covered)} Predictions are within {error['median']:.1f} dB (median error).",
+        f"{', '.join(covered)} {'has' if len(covered) == 1 else 'have'} {who} above {COVERED_DBM:g} dBm with "
+        f"{CERTAINTY:.0%} certainty; predictions are within {error['median']:.1f} dB (median error).",
+        *(coverage_sentence(maps.coverage, maps.place) for maps in floors),
         sure,
         compared,
     ]

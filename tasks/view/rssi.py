@@ -183,9 +183,12 @@ class RssiView:
                 text = f"Width of the {LEVEL:.0%} interval of a measurement at {name}.{hatched}"
                 return ColouredMap(text, (high - low)[receiver].numpy(), "magma", 0.0, MAX_WIDTH_DB, "dB", "max")
             case "coverage":
-                text = coverage_sentence(self.coverage(selection, counted=True).values, self._who(selection))
+                text = (
+                    f"Coloured: {self._who(selection)} above {selection.threshold:g} dBm with {selection.certainty:.0%} "
+                    f"certainty. {coverage_sentence(self.coverage(selection, counted=True).values)}"
+                )
                 covered = np.where(self.covered(selection), 0.7, np.nan)
-                return ColouredMap(f"{text} Coloured: covered. Grey: not measured.", covered, "GnBu", 0.0, 1.0, "")
+                return ColouredMap(text, covered, "GnBu", 0.0, 1.0, "")
             case "best receiver":
                 first, part = next(iter(self.best(selection.height).items()))
                 best = f"{self.receivers[first]} on {part:.0%} of the measured area"

@@ -6,6 +6,7 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import fields
+import numpy as np
 import pytest
 import record
 import rssi
@@ -128,6 +129,30 @@ def test_measured_splits_are_skipped_on_resume(results, monkeypatch):
     rssi.main(rssi.Config(data=Path(), resume=True))
     assert [list(sets) for sets in results] == [["a random", "a block", "b random"]]
     assert "split" not in results[-1]["b random"]
+
+
+def test_scans_are_counted_where_coverage_is_predicted(monkeypatch):
+    """A made model whose probabilities are known: 0.95 at the rows of even number, else 0.05."""
+    data, written = rssi_room(n=60), []
+    monkeypatch.setattr(rssi, "COVERAGE", {"simulated-floor-3": ("random",)})
+    monkeypatch.setattr(rssi, "kept", lambda name, key: {})
+    monkeypatch.setattr(rssi, "rssi_room", lambda seed: data)
+    monkeypatch.setattr(rssi, "write_result", lambda name, content, rows: written.append((name, content["scenes"])))
+    monkeypatch.setattr(rssi, "predicted_above", lambda model, scans, _: 0.05 + 0.9 * (scans.index % 2 == 0).double())
+    rssi.main(rssi.Config(data=Path(), study="coverage", receivers=4))
+    ((name, scenes),) = written
+    found, (train, test) = scenes["simulated-floor-3 random"], data.split()
+    assert (name, found["n_receivers"]) == ("coverage_headline", 4)
+    often = np.sort(np.argsort(-data.detected.sum(dim=0).numpy(), kind="stable")[:4])
+    strongest, is_even = (np.nanmax(test.rssi_dbm.numpy()[:, often], axis=1), test.index.numpy() % 2 == 0)
+    known = np.nanmax(train.rssi_dbm.numpy()[:, often], axis=1)
+    for row, quantile in zip(found["rows"][1:], rssi.QUANTILES, strict=True):
+        assert row["threshold_dbm"] == np.floor(np.quantile(known, quantile)) + 0.5
+        above = strongest > row["threshold_dbm"]
+        expected = {"predicted": np.where(is_even, 0.95, 0.05).mean(), "above": above.mean(), "certain": is_even.mean()}
+        expected |= {"n": len(test), "n_certain": is_even.sum(), "certain_above": above[is_even].mean()}
+        assert {name: row[name] for name in expected} == pytest.approx(expected)
+    assert found["brier_by_correlation"].keys() == {str(value) for value in rssi.CORRELATIONS}
 
 
 def test_primitives_in_phase_are_the_identity():

@@ -94,6 +94,13 @@ def _hull(points):
     return corners
 
 
+def test_a_scan_at_the_threshold_is_not_above_it():
+    chart = RssiMap(np.arange(2.0), np.arange(2.0), 1.0, 1.0, *(np.ones((2, 2, 2), np.float32),) * 3, ("a", "b"))
+    rows = Rssi([[-75.0, -90], [-74, -90], [math.nan, -75], [-80, -60]], np.random.default_rng(0).random((4, 3)))
+    found = [Coverage.of(chart, rows, (threshold, 0.9, 1)).values["scans_above"] for threshold in (-75.0, -76.0, -90.0)]
+    assert found == [0.5, 1.0, 1.0]
+
+
 def test_nothing_is_measured_without_scans():
     chart = RssiMap(np.arange(3.0), np.arange(2.0), 1.0, 1.0, *(np.ones((1, 2, 3), np.float32),) * 3, ("a",))
     found = Coverage.of(chart, Rssi(np.empty((0, 1)), np.empty((0, 3))), (-75.0, 0.9, 1))

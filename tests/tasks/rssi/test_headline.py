@@ -79,22 +79,24 @@ def test_one_number_everywhere(building, floor):
     assert {name: metrics["coverage"][floor][name] for name in expected} == pytest.approx(expected)
     shares = {name: f"{share:.0%}" for name, share in expected.items()}
     assert 0.1 < expected[("covered", "not_covered")[floor]] < 0.9
-    place = f" of {('Ground floor', 'floor 1')[floor]}"
+    place = f"the measured area of {('Ground floor', 'floor 1')[floor]}"
+    headline = f"{shares['covered']} of {place}"
     sentence = (
-        f"{shares['covered']} of the measured area{place} has one of 3 receivers above -75 dBm with 90% certainty, "
-        f"{shares['not_covered']} does not, {shares['uncertain']} is uncertain; {shares['scans_above']} of the {rows.sum()} "
-        f"scans do. {shares['not_measured']} of the area between the scans is not measured, over {reach(model):.1f} m from "
-        "any scan."
+        f"{headline} is covered, {shares['not_covered']} is not, {shares['uncertain']} is uncertain; "
+        f"{shares['scans_above']} of the {rows.sum()} scans pass. {shares['not_measured']} of the area between the scans is "
+        f"not measured, over {reach(model):.1f} m from any scan."
     )
-    assert sentence in terminal
     report = unescape(re.sub("<[^>]*>", "", (folder / "report.html").read_text()))
-    assert sentence in report
-    assert re.search(rf"{shares['covered']}\s*of the measured area{place} above -75 dBm", report)
+    for text in (terminal, report):
+        assert sentence in text
+        assert re.search(rf"{headline}[, ].*have one of 3 receivers above -75 dBm with 90% certainty", text)
+    assert re.search(rf"{shares['covered']}\s*of {place} above -75 dBm", report)
     view = open_source(folder)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("swiftwrf.rssi.maps.CELLS", 16)
         shown = view.coloured(MapSelection("coverage", 0, height, at_least=1)).sentence
-    assert shown.startswith(sentence.replace(place, ""))
+    same = sentence.replace(place, "the measured area")
+    assert shown == f"Coloured: one of 3 receivers above -75 dBm with 90% certainty. {same}"
     np.testing.assert_allclose(maps["above"][floor].ravel(), above, atol=1e-4)
 
 

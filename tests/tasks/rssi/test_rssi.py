@@ -272,6 +272,25 @@ def test_where_the_best_server_is_uncertain_is_where_to_measure(tmp_path):
     assert "about 9 dB in the whole measured area" in Maps(run).summary().caption
 
 
+def test_cells_that_are_not_measured_are_hatched(tmp_path, monkeypatch):
+    hatched = []
+    monkeypatch.setattr(
+        "tasks.rssi.maps.hatch", lambda ax, x, y, where, pattern="////": hatched.append((pattern, where))
+    )
+    known = np.arange(20).reshape(1, 4, 5) % 3 == 0
+    detection = np.where(np.arange(5) < 2, 0.4, 0.6) * np.ones((1, 1, 4, 5))
+    run = made_run(tmp_path, known=known, detection=detection)
+    plots = [Maps(run).summary(), *(Maps(run).by_receiver(kind) for kind in ("predicted", "width"))]
+    assert [pattern for pattern, _ in hatched] == ["////", "\\\\\\\\"] * 3
+    for pattern, where in hatched:
+        np.testing.assert_array_equal(where, ~known[0] if pattern == "////" else detection[0, 0] < 0.5)
+    for plot in plots:
+        assert "Hatched like /: not measured, outside the scans or more than 2.0 m from any scan" in plot.caption
+        assert plot.data["measured"].tolist() == known.ravel().tolist()
+    run.metrics["coverage"][0]["reach_m"] = None
+    assert "Hatched like /: not measured, outside the scans; like" in Maps(run).summary().caption
+
+
 def test_each_floor_has_its_maps_its_rows_and_its_widest_place(tmp_path):
     corners = np.array([[0, 0, 0], [4, 0, 0], [0, 3, 0], [4, 3, 0]], dtype=float)
     position = np.concatenate([corners, corners + np.array([0, 0, 4])])
@@ -302,7 +321,7 @@ def test_each_floor_has_its_maps_its_rows_and_its_widest_place(tmp_path):
 
 def test_a_measured_area_without_cells_has_no_coverage(tmp_path):
     found = {"covered": None, "not_covered": None, "uncertain": None, "not_measured": None, "scans_above": None}
-    assert coverage_sentence(found, "a") == "No cell of the map is in the measured area."
+    assert coverage_sentence(found) == "No cell of the map is in the measured area."
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -251,13 +251,10 @@ def test_shares_on_the_page_are_of_the_measured_cells_of_the_report(monkeypatch)
     shares = f"{(above >= 0.7).mean():.0%}", f"{(above <= 0.3).mean():.0%}", f"{1 - measured.sum() / hull.sum():.0%}"
     assert "0%" not in shares
     sentence = view.coloured(selection).sentence
-    assert sentence.startswith(
-        f"{shares[0]} of the measured area has receiver12 above -67 dBm with 70% certainty, {shares[1]} does not"
-    )
-    assert (
-        f"{np.nanmean(data.rssi_dbm[:, 2].nan_to_num(-200) > -67):.0%} of the 50 scans do. {shares[2]} of the"
-        in sentence
-    )
+    assert sentence.startswith("Coloured: receiver12 above -67 dBm with 70% certainty. ")
+    assert f"{shares[0]} of the measured area is covered, {shares[1]} is not" in sentence
+    passed = f"{(data.rssi_dbm[:, 2] > -67).double().mean():.0%} of the 50 scans pass"
+    assert f"{passed}. {shares[2]} of the area between" in sentence
     strongest = RssiMap.predict(view.model, height=1.2).mean.argmax(axis=0).ravel()[measured]
     assert view.best(1.2) == pytest.approx({n: (strongest == n).mean() for n in np.unique(strongest)})
     first, part = next(iter(view.best(1.2).items()))
