@@ -125,8 +125,10 @@ def _growing(path: Path, file: BinaryIO) -> Iterator[bytes]:
                 is_replaced = not os.path.samestat(path.stat(), os.fstat(file.fileno()))
 
 
-def measurement(line: Line, config: UpdateConfig, model: FieldModel | RssiModel) -> Rssi | Spectra:
+def measurement(line: Line, config: UpdateConfig, model: FieldModel | RssiModel, left_out: set[str]) -> Rssi | Spectra:
     """Return the measurement in a line, of the kind that the model predicts.
+
+    Receivers that the model does not have are added to `left_out`.
 
     Raises:
         InputError: No row or JSON object, or other values than the model needs.
@@ -136,11 +138,11 @@ def measurement(line: Line, config: UpdateConfig, model: FieldModel | RssiModel)
         text = (line.header + line.content).decode("utf-8-sig")
         if line.header:
             assert isinstance(model, RssiModel)
-            return _of_row(text, config, model)
+            return _of_row(text, config, model, left_out)
         content = json.loads(text)
         position, value = [list(map(_number, content["position"]))], content[needed]
         if isinstance(model, RssiModel):
-            return _of_receivers(position, value, model)
+            return _of_receivers(position, value, model, left_out)
         spectrum = [[list(map(_number, row)) for row in value]]
         return Spectra(spectrum, position, grid=model.grid, name=f"line {line.number}", **vars(model.link))
     except InputError as error:
@@ -157,27 +159,29 @@ def _number(value: object) -> float:
     return float(value)
 
 
-def _of_row(text: str, config: UpdateConfig, model: RssiModel) -> Rssi:
-    """Return the measurement in a table of one row; receivers that the model does not have are left out."""
+def _of_row(text: str, config: UpdateConfig, model: RssiModel, left_out: set[str]) -> Rssi:
+    """Return the measurement in a table of one row."""
     options, table, offsets = reading(config.spectra, config.table), table_of("the table", text), model.offsets
     of_rows = {name: getattr(options, name) for name in OF_ROWS}
     if offsets is not None and offsets.column in table.columns:
         of_rows["offset_by"] = offsets.column
     data = Rssi.from_frame(table, **of_rows)
-    rssi = zip(spelled_as(data.receiver_names, model.receiver_names)[0], data.rssi_dbm[0].tolist(), strict=True)
-    value = {name: x for name, x in rssi if name in model.receiver_names}
-    if not value:
-        raise InputError("no receiver of the model detected the transmitter")
+    rssi = zip(data.receiver_names, data.rssi_dbm[0].tolist(), strict=True)
     floor = column_of(table, "floor", options.columns or {}) if model.attenuation else None
     floors = None if floor is None else Floors((text_of(table[floor])[0],), (0.0,))  # of one name, whatever the height
-    row = _of_receivers(data.transmitter_position.tolist(), value, model)
+    row = _of_receivers(data.transmitter_position.tolist(), dict(rssi), model, left_out)
     return replace(row, origin=data.origin, groups=data.groups, floors=floors, time=data.time)
 
 
-def _of_receivers(position: list[list[float]], value: dict[str, float | None], model: RssiModel) -> Rssi:
+def _of_receivers(
+    position: list[list[float]], value: dict[str, float | None], model: RssiModel, left_out: set[str]
+) -> Rssi:
     """Return a row at the receivers of the model; those that the line does not name count as not detecting."""
-    if unknown := sorted(value.keys() - set(model.receiver_names)):
-        raise InputError(f"the model has no receiver {unknown[0]!r}; leave it out")
+    value = dict(zip(spelled_as(list(value), model.receiver_names)[0], value.values(), strict=True))
+    unknown = value.keys() - set(model.receiver_names)
+    if unknown and unknown == value.keys():
+        raise InputError("no receiver of the model detected the transmitter")
+    left_out |= unknown
     row = [value.get(name) for name in model.receiver_names]
     return Rssi(
         [[torch.nan if x is None else _number(x) for x in row]],
