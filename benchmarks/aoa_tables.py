@@ -71,6 +71,7 @@ def aoa() -> str:
 WALLS = {  # offset of each wall [m] along -x, +x, -y, +y, -z, +z
     "newrf-bedroom": (-2.28, 2.28, -2.28, 2.28, 0.0, 3.0),
     "newrf-office": (0.010, 5.010, 0.016, 8.016, 0.0, 3.2),
+    "newrf-conference": (-1.5, 1.5, -1.5, 1.5, 0.0, 2.5),
     "simulated-room": (0.0, 6.0, 0.0, 5.0, 0.0, 3.0),
 }
 PARALLEL = 0.9  # cosine between a wall's normal and a plane's, above which it may be that wall

@@ -249,7 +249,7 @@ class FieldModel(Configured, Saved, Displayed):
         """Return the model with more training spectra, by an update of its factorisation. This model stays as it is.
 
         The result equals a fit to all spectra with the same kernel, noise and components. The planes of a room are refined
-        and not searched, which needs 10 new positions.
+        and not searched, which needs 10 new positions. Furniture stays.
 
         Args:
             new: Spectra of the same link on the grid of the training spectra, any number.

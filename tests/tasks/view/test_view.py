@@ -28,6 +28,7 @@ from scipy.stats import norm
 
 from swiftwrf import AngularGrid, InputError, PairModel, Rssi, RssiModel, load, load_rssi, rssi_room
 from swiftwrf.locate import MatchedField, RssiLocator
+from swiftwrf.models.geometry import Plane
 from swiftwrf.online import Follower
 from swiftwrf.rssi.coverage import reach
 from swiftwrf.rssi.maps import RssiMap
@@ -179,10 +180,9 @@ def test_measurements_that_changed_or_went_are_not_shown(aoa_run, tmp_path):
 def test_room_of_another_model_on_the_same_spectra(aoa_run, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(aoa_run, folder)
-    plane = {"normal": [1.0, 0, 0], "offset_m": 6.0, "gain": -0.5, "std_mm": 1.0, "certain": True, "dielectric": True}
+    plane = Plane((1.0, 0.0, 0.0), 6.0, -0.5, 1.0, 0.95, 6.1, dielectric=True).to_json()
     (folder / "geometry-mix1.json").write_text(json.dumps({"planes": [plane]}))
-    shown = plane | {"normal": tuple(plane["normal"])}
-    assert [loaded.planes for loaded in open_source(folder).models] == [[], [shown]]
+    assert [loaded.planes for loaded in open_source(folder).models] == [[], [plane]]
 
 
 def test_maps_are_those_of_the_model(rssi_run):
