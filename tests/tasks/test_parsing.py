@@ -11,12 +11,12 @@ import pytest
 import yaml
 
 from swiftwrf import InputError
+from swiftwrf.runtime.digest import digest
 from tasks import configs
 from tasks.command import COMMANDS, main
 from tasks.command_line import _defaults, command_line, execute, file_options, parse
 from tasks.configs import AoaConfig, InspectConfig, ReportConfig, RssiTaskConfig
 from tasks.options import OffsetSource, Output, by_name, plain
-from tasks.records import digest
 
 SOURCE = ("--data", "x", "--array", "4", "2", "0.06", "2.4e9", "--drop-null")
 
