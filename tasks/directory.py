@@ -226,7 +226,7 @@ class Run(Memo):
     ) -> None:
         self.processes = number_of_processes(device, processes)
         set_threads(max(1, torch.get_num_threads() // self.processes))
-        values = plain(config)
+        values = strict(plain(config))
         self._environment = environment(device, source, self.processes) | {"config_sha256": digest(values)}
         self.write_json(ENVIRONMENT, self._environment)
         self.write_json(CONFIG, {"task": task, "command": invocation(task), "config": values})

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import pickle
 import sys
-from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import cached_property
-from types import CodeType, FunctionType, ModuleType
+from types import CodeType, FunctionType, ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,9 +15,8 @@ from torch import Tensor
 
 from swiftwrf.errors import InputError
 
-PLAIN = (type(None), bool, int, float, complex, str, bytes)
-# packages whose code changes with their version
-OF_VERSIONS = {*sys.stdlib_module_names, "swiftwrf", "augment", "tasks"}
+OF_VERSIONS = {*sys.stdlib_module_names, "swiftwrf", "augment", "tasks"}  # packages whose code changes with a version
+DESCRIPTORS = property | cached_property | staticmethod | classmethod
 
 
 def digest(*values: Any) -> str:
@@ -33,63 +32,52 @@ def digest(*values: Any) -> str:
         True
     """
     found = hashlib.sha256()
+    content = _Content(SimpleNamespace(write=found.update), protocol=4)
+    content.fast = True  # without references, which equal values that are one object would have
     try:
-        _add(values, found, set())
-    except (TypeError, ValueError, RecursionError) as error:
+        content.dump(values)
+    except (pickle.PicklingError, AttributeError, TypeError, ValueError, RecursionError) as error:
         raise InputError(f"results of these values cannot be kept ({error}); leave keep out") from None
     return found.hexdigest()
 
 
-def _add(value: Any, found: Any, seen: set[int]) -> None:
-    """Add a value to a hash. `seen` are the values around it, and all functions and classes before it."""
-    found.update(f"{'list' if isinstance(value, tuple) else type(value).__qualname__} ".encode())
-    if isinstance(value, PLAIN):
-        found.update(repr(value).encode())
-    elif id(value) not in seen:
-        seen.add(id(value))
-        parts = _content(value)
-        found.update(parts if isinstance(parts, bytes) else f"{len(parts)}:".encode())
-        for part in () if isinstance(parts, bytes) else parts:
-            _add(part, found, seen)
-        if not isinstance(value, type | FunctionType):
-            seen.remove(id(value))
+class _Content(pickle._Pickler):
+    """Pickler of what values contain: without what they cache, and with the code of functions and classes of one's own."""
 
+    def reducer_override(self, value: Any) -> Any:
+        parts: list[Any] | None = None
+        if isinstance(value, Tensor):
+            parts = [np.ascontiguousarray(value.detach().cpu().numpy())]
+        elif isinstance(value, set | frozenset):
+            parts = sorted(map(digest, value))
+        elif isinstance(value, ModuleType):
+            parts = [value.__name__]
+        elif isinstance(value, type | FunctionType):
+            parts = self._code(value) if _is_own(value) else None
+        elif isinstance(value, CodeType):
+            parts = [value.co_code, value.co_names, value.co_consts]
+        elif isinstance(value, DESCRIPTORS):
+            parts = [getattr(value, name, None) for name in ("fget", "fset", "func", "__func__")]
+        elif callable(own := getattr(value, "digest", None)):  # of spectra, which exceed the memory
+            parts = [own()]
+        elif is_dataclass(value):
+            parts = [type(value), *(getattr(value, field.name) for field in fields(value))]
+        return NotImplemented if parts is None else (list, (parts,))
 
-def _content(value: Any) -> bytes | list[Any]:
-    """Return the bytes of a value, or the values that determine it."""
-    if isinstance(value, Tensor):
-        value = value.detach().cpu().numpy()
-    if isinstance(value, np.ndarray) and not value.dtype.hasobject:
-        return repr((value.dtype.str, value.shape)).encode() + value.tobytes()
-    if hasattr(value, "tolist"):
-        return [getattr(value, "name", None), value.tolist()]
-    if isinstance(value, Mapping):
-        return [*value.items()]
-    if isinstance(value, list | tuple):
-        return [*value]
-    if isinstance(value, set | frozenset):
-        return sorted(map(digest, value))
-    if isinstance(value, ModuleType):
-        return value.__name__.encode()
-    if isinstance(value, type | FunctionType) and not _is_own(value):
-        return f"{value.__module__}.{value.__qualname__}".encode()
-    if isinstance(value, type):
-        members = {name: x for name, x in vars(value).items() if callable(x) or not name.startswith(("__", "_abc_"))}
-        return [value.__qualname__, *value.__mro__[1:], [(name, members[name]) for name in sorted(members)]]
-    if isinstance(value, FunctionType):
+    def _code(self, value: Any) -> list[Any]:
+        """Return what determines a function or class of one's own; its name alone inside of it."""
+        known = vars(self).setdefault("known", set())
+        if value in known:
+            return [value.__qualname__]
+        known.add(value)
+        if isinstance(value, type):
+            members = {
+                name: x for name, x in vars(value).items() if callable(x) or not name.startswith(("__", "_abc_"))
+            }
+            return [value.__qualname__, *value.__mro__[1:], *sorted(members.items(), key=lambda item: item[0])]
         cells = [cell.cell_contents for cell in value.__closure__ or ()]
         named = {name: value.__globals__[name] for name in _names(value.__code__) if name in value.__globals__}
         return [value.__code__, value.__defaults__, value.__kwdefaults__, cells, named]
-    if isinstance(value, CodeType):
-        return [value.co_code, value.co_names, value.co_consts]
-    if isinstance(value, property | cached_property | staticmethod | classmethod):
-        return [getattr(value, name, None) for name in ("fget", "fset", "func", "__func__")]
-    if callable(own := getattr(value, "digest", None)):  # of spectra, which exceed the memory
-        return str(own()).encode()
-    if is_dataclass(value):  # without what its properties have cached
-        return [type(value), *(getattr(value, field.name) for field in fields(value))]
-    parts = value.__reduce_ex__(4)  # as pickle takes the value apart: class, state, items
-    return parts.encode() if isinstance(parts, str) else [*parts[:3], *map(list, filter(None, parts[3:]))]
 
 
 def _names(code: CodeType) -> list[str]:
