@@ -19,12 +19,13 @@ import torch
 from filelock import FileLock, Timeout
 
 from swiftwrf import InputError
+from swiftwrf.runtime.digest import digest
 from swiftwrf.runtime.durable import rename, strict, write_json
-from swiftwrf.runtime.steps import LOCATOR, MODEL, STEPS, Memo
+from swiftwrf.runtime.steps import LOCATOR, MODEL, STEPS, Memo, check_unchanged
 from swiftwrf.runtime.threads import set_threads
 from tasks.environment import environment, invocation, now, number_of_processes, stamp
 from tasks.options import plain
-from tasks.records import CONFIG, ENVIRONMENT, METRICS, PARTIAL, Row, digest, read_json
+from tasks.records import CONFIG, ENVIRONMENT, METRICS, PARTIAL, Row, read_json
 from tasks.terminal import terminal
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # errors of file systems without locks
@@ -158,13 +159,7 @@ def check_new_file(out: Path, option: str = "") -> None:
 def unchanged_environment(folder: Path, source: dict[str, str]) -> Row:
     """Return the environment in which a run began; refuse other input, by the SHA-256 of everything that it reads."""
     found = read_json(folder / ENVIRONMENT)
-    before = found.get("input_sha256")
-    if before != source:
-        before = before if isinstance(before, dict) else {}
-        changed = sorted(name for name in {*before, *source} if before.get(name) != source.get(name))
-        raise InputError(
-            f"the input has changed since {folder} began ({', '.join(changed)}); restore it or start a new run"
-        )
+    check_unchanged(folder, found.get("input_sha256"), source)
     return found
 
 
@@ -231,7 +226,7 @@ class Run(Memo):
     ) -> None:
         self.processes = number_of_processes(device, processes)
         set_threads(max(1, torch.get_num_threads() // self.processes))
-        values = plain(config)
+        values = strict(plain(config))
         self._environment = environment(device, source, self.processes) | {"config_sha256": digest(values)}
         self.write_json(ENVIRONMENT, self._environment)
         self.write_json(CONFIG, {"task": task, "command": invocation(task), "config": values})
@@ -257,6 +252,9 @@ class Run(Memo):
     def write_json(self, name: str, content: Any) -> None:
         """Write strict JSON: nan and infinity become null."""
         write_json(self.path(name), content)
+
+    def of(self, given: Mapping[str, Any]) -> None:
+        """Do nothing: input and versions of a run were compared when it was resumed, and its options are its own."""
 
     def expect(self, steps: int) -> None:
         terminal.expect(steps)

@@ -59,11 +59,12 @@ def turbo_learning(
         repeats: Number of random measured subsets, whose errors are pooled.
         seed: Seed of everything random.
         device: Device to compute on.
-        keep: Results by the names of steps, in a folder. A call with the same data and options continues after them.
+        keep: Results by the names of steps, in a folder. A call with equal data, options, code of own classes and versions
+            continues after them, others are refused.
         executor: Processes that compute steps side by side, e.g. a `ProcessPoolExecutor`.
 
     Raises:
-        InputError: A split, name or fraction that does not exist, or data that do not suffice.
+        InputError: A split, name or fraction that does not exist, data that do not suffice, or `keep` of another call.
         FitError: A fit diverged.
 
     Source:
@@ -77,11 +78,14 @@ def turbo_learning(
         >>> bool(result.summary().loc["kernel_regression, measured", "median"] < result.summary().loc["peak", "median"])
         True
     """
+    given = locals().copy()
     models = (models,) if isinstance(models, str) else models
     experiment = Experiment(
         *data.split(split, seed), (measured,), models, estimators, extra, preset, repeats, seed, device, split
     )
     if keep is not None:
+        named = [experiment.model_type(name) for name in (*experiment.named, *experiment.candidates)]
+        keep.of(given | {"field models": named, "evaluated": experiment.evaluated})
         return learn(experiment, keep, executor)[0]
     folder = TemporaryDirectory(prefix="swiftwrf-")
     (result,) = learn(experiment, Memo(Path(folder.name)), executor)

@@ -16,6 +16,7 @@ from swiftwrf.runtime.validation import check_value
 
 ROTATION_TOLERANCE = 1e-4  # between the matrices of one orientation
 FREQUENCY_TOLERANCE = 1e-6  # between frequencies, relative to them
+SHAPES = {"fixed_position": (3,), "rotation": (3, 3), "frequency_hz": (None,)}  # of tensors in a file
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,25 +55,18 @@ class Link:
     def from_json(cls, plain: dict[str, Any]) -> Link:
         """Return the link that `to_json` describes."""
         check_value("moving", plain["moving"], Moving)
-        fixed_position, rotation, array = (plain[name] for name in ("fixed_position", "rotation", "array"))
-        frequency_hz = plain.get("frequency_hz")  # earlier files have none
-        return cls(
-            plain["moving"],
-            None if fixed_position is None else to_tensor("fixed_position", fixed_position, float64, (3,)),
-            None if rotation is None else to_tensor("rotation", rotation, float64, (3, 3)),
-            None if array is None else PlanarArray(tensor(array["element"], dtype=float64), array["wavelength"]),
-            None if frequency_hz is None else to_tensor("frequency_hz", frequency_hz, float64, (None,)),
+        array = plain["array"] and PlanarArray(
+            tensor(plain["array"]["element"], dtype=float64), plain["array"]["wavelength"]
         )
+        known = {name: (plain.get(name), shape) for name, shape in SHAPES.items()}  # earlier files have no frequencies
+        values = {name: x and to_tensor(name, x, float64, shape) for name, (x, shape) in known.items()}
+        return cls(moving=plain["moving"], array=array, **values)
 
     def to_json(self) -> dict[str, Any]:
         """Return the link as plain values."""
-        return {
-            "moving": self.moving,
-            "fixed_position": None if self.fixed_position is None else self.fixed_position.tolist(),
-            "rotation": None if self.rotation is None else self.rotation.tolist(),
-            "array": self.array and {"element": self.array.element.tolist(), "wavelength": self.array.wavelength},
-            "frequency_hz": None if self.frequency_hz is None else self.frequency_hz.tolist(),
-        }
+        array = self.array and {"element": self.array.element.tolist(), "wavelength": self.array.wavelength}
+        known = {name: None if getattr(self, name) is None else getattr(self, name).tolist() for name in SHAPES}
+        return {"moving": self.moving, "array": array} | known
 
     def aligned(self, data: Spectra) -> Spectra:
         """Return spectra of this link with their snapshots in its order of frequencies, and refuse those of another link.

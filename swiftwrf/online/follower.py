@@ -281,11 +281,15 @@ class Follower:
         """Score one measurement, test it for a change, and learn it.
 
         Raises:
-            InputError: Any other number of measurements, or as `update`.
+            InputError: Any other number of measurements, one that the model has already learnt, or as `update`.
         """
         if len(new) != 1:
             raise InputError(f"a step follows one measurement, got {len(new)}; give one after the other")
         new = self.model.aligned(new)  # type: ignore[arg-type]  # a measurement of the model's kind
+        if bool(self.model.is_learnt(new).any()):
+            raise InputError(
+                f"{new.name} row {int(new.index[0])}, counted from 0, is already in the model; leave it out"
+            )
         scores = score(self.model, new)
         alarms = self.monitor.observe(scores.position[0], scores.innovation[0])
         words, correlation, notices = list(map(self.monitor.describe, alarms)), None, []

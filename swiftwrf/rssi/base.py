@@ -19,7 +19,7 @@ from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Offsets, Rssi
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.errors import InputError, listed
-from swiftwrf.models.base import FieldConfig
+from swiftwrf.models.base import FieldConfig, Updatable
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Displayed
 from swiftwrf.positions import check_near, check_positions, to_tensor
@@ -63,7 +63,7 @@ class RssiConfig(FieldConfig):
     with fewer than 10 values counts its empty cells"""
 
 
-class RssiPredictor(Configured, Displayed, ABC):
+class RssiPredictor(Updatable, Configured, Displayed, ABC):
     """Base class of all predictors of RSSI at fixed receivers from the position of the transmitter.
 
     If the data have floors, `fit` removes the attenuation of those between transmitter and receiver, and `predict` adds it.
@@ -85,8 +85,6 @@ class RssiPredictor(Configured, Displayed, ABC):
     """whether the positions of the receivers must be known"""
     slow: ClassVar[bool] = False
     """whether a fit takes minutes, so that it is compared only on request"""
-    updates: ClassVar[bool] = False
-    """whether `update` is available; other predictors must be fitted again"""
     max_map_predictions: ClassVar[int] = 2**22
     """predictions of a map at all receivers if its cells are not given"""
     batch_size: ClassVar[int] = 512
@@ -159,6 +157,7 @@ class RssiPredictor(Configured, Displayed, ABC):
             raise InputError(lacking)
         self.receiver_names, self.receiver_position = tuple(map(str, train.receiver_names)), train.receiver_position
         self.origin, self.offsets, self.attenuation = train.origin, train.offsets, None
+        self.row_digests = train.row_digests() if self.updates else self.row_digests
         shift = torch.zeros_like(pool.rssi_dbm)
         if train.offsets is not None:
             shift = shift + train.offsets.of(pool)[:, None]
@@ -181,7 +180,8 @@ class RssiPredictor(Configured, Displayed, ABC):
         The result equals a fit to all rows with the same kernel, noise, mixing weights and weights of the earlier rows.
 
         Args:
-            new: Rows at the receivers of the training rows, any number.
+            new: Rows at the receivers of the training rows, any number. Those that the predictor has already learnt are
+                left out, with a warning.
 
         Raises:
             InputError: A predictor that must be fitted again, or as `aligned`.
@@ -193,13 +193,12 @@ class RssiPredictor(Configured, Displayed, ABC):
             >>> len(model.update(data.subset(torch.arange(50, 60))).anchor)
             60
         """
-        new = self.aligned(new)
+        new = self._not_learnt(self.aligned(new))
         predictor = copy(self)
-        if self.attenuation is not None:
-            new = self.attenuation.removed(new)
         if len(new):
             self.check_updates()
-            predictor._update(new)
+            predictor.row_digests = torch.cat([self.row_digests, new.row_digests()])
+            predictor._update(new if self.attenuation is None else self.attenuation.removed(new))
         return predictor
 
     def check_updates(self) -> None:

@@ -237,13 +237,14 @@ def compare(
         validation: Folds that choose all settings: "random", "block" or "session". Defaults to those like the test rows.
         fewer: Fractions of the training rows that the model and "knn" are fitted to, too, e.g. (0.25, 0.5).
         device: Device to compute on.
-        keep: Results by the names of predictors, in a folder, and the model. A call with the same data and options
-            continues after them.
+        keep: Results by the names of predictors, in a folder, and the model. A call with equal data, options, code and
+            versions continues after them, others are refused.
         executor: Processes that fit receivers side by side, e.g. a `ProcessPoolExecutor`.
         progress: Show a progress bar on a terminal.
 
     Raises:
-        InputError: Unknown receivers, split or predictors, no test row that a receiver detects, or too few rows.
+        InputError: Unknown receivers, split or predictors, no test row that a receiver detects, too few rows, or `keep` of
+            another call.
 
     Example:
         >>> import swiftwrf
@@ -251,6 +252,7 @@ def compare(
         >>> bool(result.summary().loc["swiftwrf", "median"] < result.summary().loc["mean", "median"])
         True
     """
+    given = locals().copy()
     chosen = data.as_measured().receivers(receivers)
     train, test = chosen.split(split, seed)
     if not bool(test.detected.any()):
@@ -263,6 +265,8 @@ def compare(
     kind = train.validation_for(split, test) if validation == "auto" else validation
     options: Values = {"validation": kind, "seed": seed, "new_places": split == PLACE, "not_detected": not_detected}
     names, left_out = compared(chosen, also)
+    if keep is not None:
+        keep.of(given | {"predictors": [RSSI_PREDICTORS[name] for name in names]})
     own, predictors = model_of(train), dict[str, RssiPredictor]()
     parallel = None if executor is None else executor.map
 

@@ -242,7 +242,9 @@ class RssiModel(SavedRssiPredictor):
         # the rows have lost their sessions
         validation = "block" if self.config.validation == "session" else self.config.validation
         model = type(self)(replace(self.config, validation=validation)).fit(rows)
-        model.offsets = self.offsets
+        model.offsets, model.row_digests = self.offsets, self.row_digests
+        if without is not None:
+            model.row_digests = self._digests_without(without, len(posterior.anchor))
         # a mean of several measurements has a smaller variance than one measurement
         if bool(((posterior.variance > 0) & (posterior.variance < 0.99 * posterior.noise_db.square()[:, None])).any()):
             model.field_db, model.noise_db = self.field_db, self.noise_db
@@ -310,12 +312,14 @@ class RssiModel(SavedRssiPredictor):
     def state(self) -> tuple[dict[str, Tensor], Header]:
         self.check_fitted()
         names = _shapes(0, 0, self.detection_field is not None)
-        return {name: attrgetter(name)(self) for name in names}, self._header() | {"kernel": asdict(self.kernel)}
+        tensors = {name: attrgetter(name)(self) for name in (*names, "row_digests")}
+        return tensors, self._header() | {"kernel": asdict(self.kernel)}
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
         model = cls._of_header(header)
         model.kernel, model.detection_field = Kernel(**header["kernel"]), None
+        model.row_digests = tensors.get("row_digests", cls.row_digests)  # earlier files have none
         detections, anchor = any("detection_field." in name for name in tensors), tensors["posterior.anchor"]
         shapes = _shapes(len(model.receiver_names), len(anchor), detections)
         expect(tensors, shapes)

@@ -136,15 +136,16 @@ def measurement(line: Line, config: UpdateConfig, model: FieldModel | RssiModel,
     needed = "rssi_dbm" if isinstance(model, RssiModel) else "spectrum"
     try:
         text = (line.header + line.content).decode("utf-8-sig")
+        index = torch.tensor([line.number - 1 - bool(line.header)])  # as of the rows of the whole file
         if line.header:
             assert isinstance(model, RssiModel)
-            return _of_row(text, config, model, left_out)
+            return _of_row(text, config, model, left_out).derived(index=index)
         content = json.loads(text)
         position, value = [list(map(_number, content["position"]))], content[needed]
         if isinstance(model, RssiModel):
-            return _of_receivers(position, value, model, left_out)
+            return _of_receivers(position, value, model, left_out).derived(index=index)
         spectrum = [[list(map(_number, row)) for row in value]]
-        return Spectra(spectrum, position, grid=model.grid, name=f"line {line.number}", **vars(model.link))
+        return Spectra(spectrum, position, grid=model.grid, index=index, name=f"line {line.number}", **vars(model.link))
     except InputError as error:
         raise InputError(f"line {line.number}: {error}") from None
     except CONTENT_ERRORS as error:

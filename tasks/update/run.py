@@ -15,6 +15,7 @@ from swiftwrf.data import ReadOptions, Snapshots
 from swiftwrf.data.files import sha256
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
 from swiftwrf.errors import with_article
+from swiftwrf.models.base import ALREADY_LEARNT
 from swiftwrf.online import Follower
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime import checkpoint
@@ -38,7 +39,7 @@ def run(config: UpdateConfig) -> None:
     """Write the updated model, a table of the measurements and a page; with --follow, the model after each line.
 
     Raises:
-        InputError: No such model, or measurements that cannot be read or do not fit it.
+        InputError: No such model, measurements that cannot be read or do not fit it, or none that it has not learnt.
     """
     if config.follow:
         follow(config)
@@ -47,6 +48,12 @@ def run(config: UpdateConfig) -> None:
         model = _model(config.model)
         options = reading(config.spectra, config.table)
         new, train = _read(config.source, options, model), _training(config, options, model)
+        if n_known := int((known := model.is_learnt(new)).sum()):
+            said = f"{new.name}: {n_known} of {len(new)} rows {ALREADY_LEARNT}"
+            if n_known == len(new):
+                raise InputError(f"{said}; give others")
+            console.print(said)
+            new = new.subset(~known)
         follower = Follower(model, train, config.false_alarm_rate)
         record = Record(config.source, _unit(model))
         for i, index in enumerate(new.index.tolist()):

@@ -13,7 +13,7 @@ import small
 import torch
 from fuzz.runs import follow
 
-from swiftwrf import AngularGrid, Rssi, RssiModel, load, make_model, rssi_room, simulated_room
+from swiftwrf import AngularGrid, Rssi, RssiModel, load, load_rssi, make_model, rssi_room, simulated_room
 from swiftwrf.data.writing import write_rssi
 from swiftwrf.models.geometry import GeometryModel, Plane
 from swiftwrf.online import Follower
@@ -128,8 +128,8 @@ def observed(answers):
         (HEADER + b"".join(ROWS[:3]), []),
         (HEADER + b"".join(ROWS), [-63, -64]),
         (HEADER + b"".join(ROWS[2:]), [-62, -63, -64]),
-        (HEADER + b"".join(ROWS[:1]), [-60]),
-        (HEADER + ROWS[1] + ROWS[0] + b"".join(ROWS[2:]), [-61, -60, -62, -63, -64]),
+        (HEADER + b"".join(ROWS[1:2]), [-61]),
+        (HEADER + ROWS[1] + ROWS[0] + b"".join(ROWS[2:]), [-61, -60, -63, -64]),  # the third is already learnt
     ],
     ids=["unchanged", "grown", "rewritten", "truncated", "last line the same"],
 )
@@ -216,6 +216,21 @@ def test_an_update_of_a_room_states_the_spectra_that_it_has_not_learnt(tmp_path,
     assert "3 spectra are not learnt" in capsys.readouterr().out
 
 
+def test_an_update_by_the_rows_that_trained_the_model_learns_the_others(model, tmp_path, capsys):
+    (tmp_path / "data").mkdir()
+    write_rssi(floor(), tmp_path / "data")
+    options = [str(model), str(tmp_path / "data"), "--out", str(tmp_path / "out")]
+    assert run_command("update", options, "swiftwrf update") == 0
+    said = capsys.readouterr()
+    assert "data: 40 of 60 rows are already in the model and are left out" in said.err.replace("\n", " ")
+    assert "20 measurements learnt" in said.out
+    assert len(load(tmp_path / "out" / "model.safetensors").anchor) == 60
+    options[0], options[-1] = str(tmp_path / "out" / "model.safetensors"), str(tmp_path / "again")
+    assert run_command("update", options, "swiftwrf update") == 2
+    assert "data: 60 of 60 rows are already in the model and are left out; give others" in capsys.readouterr().err
+    assert not (tmp_path / "again").exists()
+
+
 # lines that are no measurements
 
 
@@ -253,6 +268,23 @@ def test_receivers_that_appear_are_left_out_of_lines_as_of_rows_with_one_note(mo
     code, answers, said = follow(model, tmp_path / "rows.csv", out=tmp_path / "other")
     assert observed(answers) == [-60, -61]
     assert said == "note: receivers that the model does not have are left out, e.g. new\n"
+
+
+def test_lines_that_a_model_has_learnt_are_reported_and_left_out(model, tmp_path):
+    """Also those of a table that trained it."""
+    code, answers, said = follow(model, content=line(40) + line(41), out=tmp_path / "a")
+    assert (code, len(answers), said) == (0, 2, "")
+    code, answers, said = follow(tmp_path / "a" / "model.safetensors", content=line(40) + line(42), out=tmp_path / "b")
+    assert (code, len(answers)) == (0, 1)
+    assert said.startswith("error: ")
+    assert "row 0, counted from 0, is already in the model; leave it out" in said
+    data = floor().subset(torch.arange(44))
+    table = data.to_frame().rename(columns={"x_m": "x", "y_m": "y", "z_m": "z"})
+    table.to_csv(tmp_path / "walk.csv", index=False)
+    trained = RssiModel().fit(load_rssi(tmp_path / "walk.csv").subset(torch.arange(40)))
+    trained.save(tmp_path / "trained.safetensors")
+    _, answers, said = follow(tmp_path / "trained.safetensors", tmp_path / "walk.csv", out=tmp_path / "c")
+    assert (len(answers), said.count("is already in the model")) == (4, 40)
 
 
 def test_booleans_are_no_spectrum(tmp_path):

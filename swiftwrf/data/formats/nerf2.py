@@ -30,7 +30,6 @@ import io
 import math
 import warnings
 from collections.abc import Iterator
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +40,7 @@ from PIL import Image
 from torch import Tensor
 
 from swiftwrf.choices import Moving
-from swiftwrf.data.archives import Arrays, array_header, read_arrays, read_rows, refusing_broken
+from swiftwrf.data.archives import array_header, read_arrays, read_rows, refusing_broken
 from swiftwrf.data.cells import column_of_numbers, seconds, text_of
 from swiftwrf.data.columns import column_of
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin, PlanFrame, without_fix
@@ -110,7 +109,7 @@ class Nerf2(Format[Spectra]):
         )
 
 
-def _read_spectra(folder: Path, n: int) -> tuple[Store, Arrays, dict[str, str]]:
+def _read_spectra(folder: Path, n: int) -> tuple[Store, dict[str, Any], dict[str, str]]:
     """Return spectra (n, H, W) in [0, 1], further arrays of `Spectra` by name, and digests of the files."""
     arrays = [file for file in (folder / "spectrum.npy", folder / "spectrum.npz") if file.is_file()]
     if len(arrays) + (folder / "spectrum").is_dir() > 1:
@@ -119,7 +118,7 @@ def _read_spectra(folder: Path, n: int) -> tuple[Store, Arrays, dict[str, str]]:
         spectrum, digest = _read_images(folder / "spectrum", n)
         return spectrum, {}, {"spectrum/*.png": digest}
     file, digest = arrays[0], sha256(arrays[0])
-    others = read_arrays(file, (), OF_SPECTRA) if file.suffix == ".npz" else {}
+    others: dict[str, Any] = read_arrays(file, (), OF_SPECTRA) if file.suffix == ".npz" else {}
     return _read_values(file, n, digest), others, {file.name: digest}
 
 
@@ -306,15 +305,17 @@ def _properties(file: Path) -> dict[str, Any]:
             raise InputError(f"{file}: receiver_moves must be true or false, got {content['receiver_moves']}")
         found["receiver_moves"] = content["receiver_moves"] == "true"
     with refusing_broken(file, "a description as convert writes it"):
-        if "plan_scale" in content:
-            (found["plan_scale"],) = numbers([content["plan_scale"]], 1)
         if not isinstance(labels := content.get("labels", []), list):
             raise TypeError(f"labels is {labels}, expected a list")
         found["labels"] = tuple(map(str, labels))
-        if "offsets" in content:
-            *text, by_name, explained = (content["offsets"][field.name] for field in fields(Offsets))
-            decibels = numbers([*by_name.values(), explained], len(by_name) + 1)
-            found["offsets"] = Offsets(*text, dict(zip(by_name, decibels[:-1], strict=True)), decibels[-1])
+        offsets = content.get("offsets", {})
+        db = offsets.get("offset_db", {})
+        values = numbers([content.get("plan_scale", "0"), offsets.get("explained", "0"), *db.values()], len(db) + 2)
+        scale, explained, *decibels = values or ()
+        found["plan_scale"] = scale or None
+        if offsets:
+            by_name = dict(zip(db, decibels, strict=True))
+            found["offsets"] = Offsets(str(offsets["column"]), str(offsets["reference"]), by_name, explained)
     return found
 
 
