@@ -16,7 +16,7 @@ from torch import Tensor
 from swiftwrf.errors import InputError
 
 OF_VERSIONS = {*sys.stdlib_module_names, "swiftwrf", "augment", "tasks"}  # packages whose code changes with a version
-DESCRIPTORS = property | cached_property | staticmethod | classmethod
+DESCRIPTORS = (property, cached_property, staticmethod, classmethod)
 
 
 def digest(*values: Any) -> str:
