@@ -112,6 +112,7 @@ class LocateSplit:
         if isinstance(localizer, PosteriorLocalizer):
             weight = localizer.locator.weight.tolist()
             values["weights"] = dict(zip(("values", "detections", "fingerprints"), weight, strict=True))
+            values["held_out"] = localizer.locator.held_out_m
             if folder is not None:
                 localizer.locator.save(folder / LOCATOR)
         return values

@@ -288,8 +288,8 @@ def compare(
                 found = float(above[detected].double().mean()), float((~above)[~detected].double().mean())
         std = None if prediction.std is None else prediction.std[test.detected]
         error = (prediction.mean + offset - test.rssi_dbm)[test.detected].abs()
-        values = {"predicted": prediction.mean[test.detected], "std": std, "median_db": float(error.quantile(0.5))}
-        values["mean_db"] = float(error.mean())
+        values: Values = {"predicted": prediction.mean[test.detected], "std": std, "mean_db": float(error.mean())}
+        values |= {"median_db": float(error.quantile(0.5)), "held_out": getattr(predictor, "held_out_db", {})}
         return seconds | values | {"detection": found, "n_primitives": getattr(predictor, "n_primitives", 0)}
 
     order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))

@@ -103,6 +103,8 @@ class RssiModel(SavedRssiPredictor):
     """RSSI at 1 m [dBm] and slope [dB a decade] of the simpler predictors by their mixing weights, float64 (R, 2)"""
     posterior: RssiPosterior
     """least squares of the fit, which `update` continues"""
+    held_out_db: dict[str, float]
+    """mean absolute errors [dB] of the model and of the receivers' means at held-out rows, set by `fit`, not saved"""
 
     @single_thread()
     def _fit(
@@ -147,6 +149,8 @@ class RssiModel(SavedRssiPredictor):
         predictors = predictors[..., mine]
         check_comparable(predictors, train.rssi_dbm)
         predicted = torch.einsum("k,knr->nr", weight[weight > 0], predictors[weight > 0])
+        means = ((self.name, predicted), ("mean", predictors[-1]))
+        self.held_out_db = {name: float((mean - train.rssi_dbm).abs().nanmean()) for name, mean in means}
         scale = self._calibrate(train.rssi_dbm, predicted, std[:, mine], found["field_db"], found["noise_db"])
         # only two predictors have the receiver's path loss
         self.covariance = (weight[:2].sum() * scale).square()[:, None, None] * found.pop("covariance")

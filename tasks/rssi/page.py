@@ -23,6 +23,7 @@ from tasks.page.shared import (
     errors_section,
     limits,
     next_steps,
+    recommendation,
 )
 from tasks.records import Records, notes
 from tasks.rssi.maps import CERTAINTY, COVERED_DBM, MIN_RATIO, WIDTH_PER_STD, Maps, coverage_sentence
@@ -107,14 +108,15 @@ def _errors(run: Records) -> Section:
 def answer(run: Records) -> Answer:
     """Return the answer of a run."""
     own, errors, methods = model_of(run), by_method(run.table("errors")[COLUMNS]), []
+    chosen = recommendation(run, own, "dB")[0]
     scored = any(entry.get("detection") for entry in run.metrics["overall"].values())
     for name, entry in run.metrics["overall"].items():
         detection = entry.get("detection")
         cells = {f"{own} minus it [dB]": difference(errors, own, name)}
         cells |= {"detection": number(None if detection is None else sum(detection) / 2)} if scored else {}
         seconds = entry["seconds"]["fit"], entry["seconds"]["predict"]
-        methods.append(Method(name, entry["abs_error_db"], name in REFERENCES and name != own, seconds, cells))
-    return Answer("dB", methods, own, conclusion(run), steps(run), (best_baseline(run),))
+        methods.append(Method(name, entry["abs_error_db"], name in REFERENCES and name != chosen, seconds, cells))
+    return Answer("dB", methods, chosen, conclusion(run), steps(run), (own, best_baseline(run)))
 
 
 def model_of(run: Records) -> str:
@@ -145,6 +147,7 @@ def conclusion(run: Records) -> list[str]:
     errors = by_method(run.table("errors")[COLUMNS])
     compared = comparison_sentence(errors, own, best, name=own, unit="dB", rows="pairs")
     return [
+        *recommendation(run, own, "dB")[1],
         f"{', '.join(covered)} {'has' if len(covered) == 1 else 'have'} {who} above {COVERED_DBM:g} dBm with "
         f"{CERTAINTY:.0%} certainty; predictions are within {error['median']:.1f} dB (median error).",
         *(coverage_sentence(maps.coverage, maps.place) for maps in floors),

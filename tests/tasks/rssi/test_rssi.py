@@ -29,10 +29,11 @@ from swiftwrf.rssi import RssiPredictor, compare
 from swiftwrf.rssi.baselines import NEIGHBOUR_COUNTS
 from swiftwrf.rssi.comparison import make_predictor, pool_of
 from swiftwrf.runtime import registry
+from tasks.records import Records
 from tasks.report import merge
 from tasks.rssi import experiment
 from tasks.rssi.maps import Maps, coverage_sentence
-from tasks.rssi.page import where_next
+from tasks.rssi.page import answer, where_next
 
 
 @pytest.mark.parametrize("name", [n for n in RSSI_PREDICTORS if n.startswith(("mri", "gp"))])
@@ -289,6 +290,22 @@ def test_cells_that_are_not_measured_are_hatched(tmp_path, monkeypatch):
         assert plot.data["measured"].tolist() == known.ravel().tolist()
     run.metrics["coverage"][0]["reach_m"] = None
     assert "Hatched like /: not measured, outside the scans; like" in Maps(run).summary().caption
+
+
+def test_the_mean_is_recommended_where_the_model_is_behind_it_on_held_out_rows(rssi_run):
+    run = Records(rssi_run)
+    held_out = run.metrics["held_out"]
+    assert set(held_out) == {"swiftwrf", "mean"}
+    assert answer(run).chosen == min(held_out, key=held_out.get)
+    run.metrics["held_out"] = {"swiftwrf": 3.25, "mean": 3.5}
+    assert answer(run).chosen == "swiftwrf"
+    assert "above -75 dBm" in answer(run).conclusion[0]
+    run.metrics["held_out"] = {"swiftwrf": 3.75, "mean": 3.5}
+    found = answer(run)
+    assert found.chosen == "mean"
+    assert {"swiftwrf", "mean"} <= {one.name for one in found.short()[0]}
+    assert "3.50 dB" in found.conclusion[0]
+    assert "3.75 dB" in found.conclusion[0]
 
 
 def test_each_floor_has_its_maps_its_rows_and_its_widest_place(tmp_path):
