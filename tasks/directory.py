@@ -9,7 +9,7 @@ import secrets
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from os.path import isfile  # unlike Path.is_file, it is False for names that are too long
 from pathlib import Path
@@ -144,16 +144,20 @@ def new_directory(out: Path, what: str) -> Iterator[Path]:
             shutil.rmtree(unfinished)
 
 
-def check_new_file(out: Path, option: str = "") -> None:
+def check_new_file(out: Path, suffixes: Sequence[str], option: str = "") -> None:
     """Refuse the place of a file that a command is to write.
 
     Raises:
-        InputError: `out` exists already, or its folder does not exist.
+        InputError: Another suffix than those that are written, `out` exists already, or its folder does not exist.
     """
     if os.path.lexists(out):
         raise InputError(f"{option}{out} exists already and is never overwritten; choose another")
     if not out.parent.is_dir():
         raise InputError(f"{option}{out} lies in {out.parent}, which is no directory")
+    if out.suffix.lower() not in suffixes:
+        raise InputError(
+            f"{option}{out} must end in {' or '.join(suffixes)}, which can be written; choose another name"
+        )
 
 
 def unchanged_environment(folder: Path, source: dict[str, str]) -> Row:
