@@ -116,10 +116,10 @@ class Claim:
         self._lock.release()
 
 
-def _versions(environment: Row) -> dict[str, str]:
-    """Return the versions on which the results of a run depend: of the packages, and the commit of this project."""
-    packages = environment.get("packages")
-    return (packages if isinstance(packages, dict) else {}) | {"commit": environment.get("commit") or "unknown"}
+def _origin(environment: Row) -> dict[str, str]:
+    """Return what decides the results of a run: digests of its input, versions of packages, commit of this project."""
+    found = [part for name in ("input_sha256", "packages") if isinstance(part := environment.get(name), dict)]
+    return {"commit": environment.get("commit") or "unknown"} | {name: x for part in found for name, x in part.items()}
 
 
 @contextmanager
@@ -158,13 +158,6 @@ def check_new_file(out: Path, suffixes: Sequence[str], option: str = "") -> None
         raise InputError(
             f"{option}{out} must end in {' or '.join(suffixes)}, which can be written; choose another name"
         )
-
-
-def unchanged_environment(folder: Path, source: dict[str, str]) -> Row:
-    """Return the environment in which a run began; refuse other input, by the SHA-256 of everything that it reads."""
-    found = read_json(folder / ENVIRONMENT)
-    check_unchanged(folder, found.get("input_sha256"), source)
-    return found
 
 
 class Run(Memo):
@@ -236,19 +229,14 @@ class Run(Memo):
         self.write_json(CONFIG, {"task": task, "command": invocation(task), "config": values})
 
     def _go_on(self, device: torch.device, source: dict[str, str], processes: int | None) -> None:
-        self._environment = unchanged_environment(self.folder, source)
+        self._environment = read_json(self.folder / ENVIRONMENT)
         threads = self._environment.get("threads")
         if not isinstance(threads, int) or not 1 <= threads <= 1024:
             threads = torch.get_num_threads()
         self.processes = number_of_processes(device, processes, threads)
         set_threads(threads)  # they are part of the seed
         here = environment(device, source, self.processes)
-        versions, own = _versions(self._environment), _versions(here)
-        if versions != own:
-            other = ", ".join(f"{name} {version}" for name, version in versions.items() if own.get(name) != version)
-            raise InputError(
-                f"{self.folder} began with {other or 'other libraries'}; go on with these or start a new run"
-            )
+        check_unchanged(self.folder, _origin(self._environment), _origin(here))
         session = {name: here[name] for name in ("commit", "start", "processes", "device")}
         self._environment["resumed"] = [*self._environment.get("resumed", []), session]
         self.write_json(ENVIRONMENT, self._environment)

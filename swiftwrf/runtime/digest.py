@@ -16,7 +16,6 @@ from torch import Tensor
 from swiftwrf.errors import InputError
 
 OF_VERSIONS = {*sys.stdlib_module_names, "swiftwrf", "augment", "tasks"}  # packages whose code changes with a version
-DESCRIPTORS = property | cached_property | staticmethod | classmethod
 
 
 def digest(*values: Any) -> str:
@@ -56,7 +55,7 @@ class _Content(pickle._Pickler):
             parts = self._code(value) if _is_own(value) else None
         elif isinstance(value, CodeType):
             parts = [value.co_code, value.co_names, value.co_consts]
-        elif isinstance(value, DESCRIPTORS):
+        elif isinstance(value, property | cached_property | staticmethod | classmethod):
             parts = [getattr(value, name, None) for name in ("fget", "fset", "func", "__func__")]
         elif callable(own := getattr(value, "digest", None)):  # of spectra, which exceed the memory
             parts = [own()]

@@ -9,7 +9,6 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -20,14 +19,13 @@ from swiftwrf.data.cells import text_of
 from swiftwrf.data.columns import column_of
 from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.files import refusing_unreadable, table_of
-from swiftwrf.data.receivers import spelled_as
 from swiftwrf.errors import CONTENT_ERRORS
 from swiftwrf.online import Step
 from swiftwrf.online.scores import LEVEL
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime.durable import strict
 from tasks.configs import OF_ROWS, TABLE_SUFFIX, UpdateConfig
-from tasks.source import reading
+from tasks.source import aligned, reading
 
 POLL_S = 0.2  # between two looks at a file that grows
 CHUNK_BYTES = 2**20
@@ -164,15 +162,10 @@ def _of_row(text: str, config: UpdateConfig, model: RssiModel) -> Rssi:
     of_rows = {name: getattr(options, name) for name in OF_ROWS}
     if offsets is not None and offsets.column in table.columns:
         of_rows["offset_by"] = offsets.column
-    data = Rssi.from_frame(table, **of_rows)
-    rssi = zip(spelled_as(data.receiver_names, model.receiver_names)[0], data.rssi_dbm[0].tolist(), strict=True)
-    value = {name: x for name, x in rssi if name in model.receiver_names}
-    if not value:
-        raise InputError("no receiver of the model detected the transmitter")
+    data = aligned(Rssi.from_frame(table, **of_rows), model.receiver_names, ignore_others=True, noted=False)
     floor = column_of(table, "floor", options.columns or {}) if model.attenuation else None
-    floors = None if floor is None else Floors((text_of(table[floor])[0],), (0.0,))  # of one name, whatever the height
-    row = _of_receivers(data.transmitter_position.tolist(), value, model)
-    return replace(row, origin=data.origin, groups=data.groups, floors=floors, time=data.time)
+    # of one name, whatever the height, which follows from the rows of the other floors
+    return data.derived(floors=None if floor is None else Floors((text_of(table[floor])[0],), (0.0,)))
 
 
 def _of_receivers(position: list[list[float]], value: dict[str, float | None], model: RssiModel) -> Rssi:
