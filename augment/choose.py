@@ -26,7 +26,7 @@ from swiftwrf.data.splits import FOLDS, MIN_TRAINING, Validation, folds
 from swiftwrf.gp import subsample
 from swiftwrf.metrics import psnr
 from swiftwrf.models import FIELD_MODELS, FieldModel
-from swiftwrf.models.base import model_type
+from swiftwrf.models.base import model_type, synthesized
 
 BLIND_FOLDS = ((0, 1), (2, 3))  # pairs of folds that one structure search leaves out
 
@@ -166,8 +166,9 @@ def choose_model(
                 for number in blind:
                     train, test = held_out(measured, fold, number)
                     began = time.perf_counter()
-                    model = copy(unfitted).fit(train, like=structure, device=device)
-                    predicted = model.synthesize(test.position).cpu()
+                    model = copy(unfitted)
+                    model.fit(train, like=structure, device=device)
+                    predicted = synthesized(model, test.position)
                     spent += time.perf_counter() - began
                     scored.append(Fold(model, train, test))
                     score.append(psnr(predicted, test.spectrum))
@@ -211,7 +212,8 @@ def _structure(
         if unfitted.accepts_like(model):
             return model, seconds
     began = time.perf_counter()
-    model = copy(unfitted).fit(measured, device=device)
+    model = copy(unfitted)
+    model.fit(measured, device=device)
     searched.append((model, time.perf_counter() - began))
     return searched[-1]
 

@@ -19,9 +19,12 @@ from torch import Tensor
 
 from augment import Fold, Mixed, synthetic_positions
 from augment.estimators import Estimator, make_estimator
+from augment.estimators.base import estimated
+from swiftwrf.data.splits import places
 from swiftwrf.gp import subsample
 from swiftwrf.locate import MatchedField, MatchedFieldConfig
 from swiftwrf.metrics import angle_errors, paired_change
+from swiftwrf.models.base import synthesized
 from swiftwrf.runtime.threads import parallel_map
 
 STAND_IN = "kernel_regression"  # estimator in place of the network where many or quick trainings are needed
@@ -68,11 +71,14 @@ def cross_validate(
 
     alone = fold_errors(0)
     measured_only = np.concatenate(alone)
+    place = places(torch.cat([fold.test.position for fold in folds]), 2)
     validation: dict[str, Any] = {
         "stand_in": STAND_IN,
         "n_held_out": len(measured_only),
         "measured_only_deg": float(np.median(measured_only)),
-        "gains": [{"n_synthetic": number, **paired_change(measured_only, errors(every, number))} for number in numbers],
+        "gains": [
+            {"n_synthetic": number, **paired_change(measured_only, errors(every, number), place)} for number in numbers
+        ],
         "rule": None,
         "recommended_n_synthetic": 0,
         "helps": False,
@@ -80,7 +86,7 @@ def cross_validate(
     if not numbers:
         return validation, alone, []
     by_rule = [fold_errors(best([other for other in every if other != fold]))[fold] for fold in every]
-    rule = validation["rule"] = paired_change(measured_only, np.concatenate(by_rule))
+    rule = validation["rule"] = paired_change(measured_only, np.concatenate(by_rule), place)
     # a gain at one number of positions alone is likely chance, because few spectra are held out
     if all(gain["change"] < 0 for gain in validation["gains"]):
         validation["recommended_n_synthetic"] = best(every)
@@ -101,9 +107,10 @@ def held_out_errors(fold: Fold, estimator: Estimator, n_synthetic: int = 0, seed
     if n_synthetic:
         positions = synthetic_positions(fold.train, n_synthetic, seed)
         with _PREDICTING:
-            spectra = fold.model.synthesize(positions.position)
-        train = train.add(positions, spectra.cpu())
-    return _degrees(estimator.fit(train).estimate(fold.test), fold.test.label)
+            spectra = synthesized(fold.model, positions.position)
+        train = train.add(positions, spectra)
+    estimator.fit(train)
+    return _degrees(estimated(estimator, fold.test), fold.test.label)
 
 
 def located_errors(fold: Fold, seed: int) -> Errors:

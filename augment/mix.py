@@ -11,6 +11,7 @@ from torch import Tensor
 from augment.positions import NO_INDEX, SyntheticPositions
 from swiftwrf import AngularGrid, InputError, Spectra
 from swiftwrf.array.planar import PlanarArray
+from swiftwrf.data.spectra import to_directions, to_magnitudes
 from swiftwrf.data.splits import MIN_TRAINING, random_rows
 from swiftwrf.data.store import Store
 
@@ -27,6 +28,9 @@ class Mixed:
         grid: Directions of the pixels.
         array: Antenna array, if it is known.
 
+    Raises:
+        InputError: A spectrum without direction, or a direction beyond its range.
+
     Example:
         >>> import swiftwrf
         >>> measured, withheld = withhold(swiftwrf.simulated_room(n=40), 0.5, seed=0)
@@ -42,6 +46,11 @@ class Mixed:
     synthetic: Tensor
     grid: AngularGrid
     array: PlanarArray | None = None
+
+    def __post_init__(self) -> None:
+        label = to_directions("label", self.label, len(self.synthetic), missing=True)
+        if unknown := int(label.isnan().any(dim=1).sum()):
+            raise InputError(f"{unknown} of {len(self)} spectra have no direction; give label, or pose and moving end")
 
     def __len__(self) -> int:
         return len(self.label)
@@ -63,7 +72,7 @@ class Mixed:
     def measured(cls, spectra: Spectra) -> Mixed:
         """Return a training set of measured spectra alone."""
         synthetic = torch.zeros(len(spectra), dtype=torch.bool)
-        return cls((spectra.store,), spectra.label, spectra.index, synthetic, spectra.grid, spectra.array)
+        return cls((spectra.store,), spectra.label.clone(), spectra.index, synthetic, spectra.grid, spectra.array)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -85,17 +94,14 @@ class Mixed:
         """Return the training set with spectra (n, H, W) at synthetic positions appended: magnitudes, or bytes (255 is 1).
 
         Raises:
-            InputError: The number of spectra is not that of the positions.
+            InputError: Not one spectrum for each position, another grid, or a value that is no magnitude.
         """
-        if len(synthetic) != len(positions):
-            raise InputError(
-                f"expected one synthetic spectrum for each of {len(positions)} positions, got {len(synthetic)}"
-            )
+        values = to_magnitudes("synthetic spectra", synthetic, (len(positions), *self.grid.shape))
         return Mixed(
-            (*self.stores, Store(synthetic)),
+            (*self.stores, Store(values)),
             torch.cat([self.label, positions.label]),
             torch.cat([self.index, positions.index]),
-            torch.cat([self.synthetic, torch.ones(len(synthetic), dtype=torch.bool)]),
+            torch.cat([self.synthetic, torch.ones(len(values), dtype=torch.bool)]),
             self.grid,
             self.array,
         )
@@ -144,7 +150,7 @@ def mix(measured: Spectra, withheld: SyntheticPositions, synthetic: Tensor) -> M
         synthetic: Synthetic spectra (n, H, W).
 
     Raises:
-        InputError: The number of synthetic spectra is not that of the positions.
+        InputError: Measured spectra without directions, or as `Mixed.add`.
 
     Example:
         >>> import swiftwrf

@@ -145,10 +145,10 @@ def observed_spectra(source: str, options: ReadOptions, grid: AngularGrid, model
     return store, known
 
 
-def aligned(data: Rssi, names: tuple[str, ...], ignore_others: bool, noted: bool = True) -> Rssi:
+def aligned(data: Rssi, names: tuple[str, ...], ignore_others: bool) -> Rssi:
     """Return the data at the receivers of a locator, in its order; those that the data lack count as not detecting.
 
-    Names may differ in case, separators or zeros. With `noted`, the terminal shows what differs.
+    Names may differ in case, separators or zeros.
 
     Raises:
         InputError: The data have none of the receivers, or others that are not ignored.
@@ -169,7 +169,7 @@ def aligned(data: Rssi, names: tuple[str, ...], ignore_others: bool, noted: bool
         )
     if others:
         notes.append(f"receivers that the model does not have are not used: {listed(others)}")
-    for note in notes if noted else ():
+    for note in notes:
         console.print(f"{data.name}: {note}")
     columns = [own.index(name) if name in own else len(own) for name in names]  # the last one is of nothing
     rssi = functional.pad(data.rssi_dbm, (0, 1), value=torch.nan)[:, columns]

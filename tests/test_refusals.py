@@ -380,7 +380,7 @@ AUGMENTATION = [
     (r"in \(0, 1\]", lambda: withhold(ROOM, 0.0, 0)),
     (r"in \(0, 1\]", lambda: withhold(ROOM, 1.1, 0)),
     ("leaves 5 of 24", lambda: withhold(ROOM, 0.2, 0)),
-    ("one synthetic spectrum for each of 12", of_half(3)),
+    (r"synthetic spectra must have shape \(12, .*, got \(3,", of_half(3)),
     ("more than 10 measured spectra, got 10", chosen("nearest", data=ROOM.subset(torch.arange(10)))),
     ("unknown field model 'foo'; choose from", chosen("gp", "foo")),
     ("none of the candidates nearest, gp has an option 'width'", chosen("nearest", "gp", width=3)),

@@ -55,7 +55,7 @@ class AANNConfig(EstimatorConfig):
     def quick(cls, n_spectra: int, **options: Any) -> Self:
         """Return options whose steps grow with the scene: few steps under-fit 1,500 spectra."""
         steps = round(EVALUATIONS * n_spectra / cls.batch)
-        return cls(steps=min(max(steps, cls.steps), MAX_QUICK_STEPS), **options)
+        return cls(**{"steps": min(max(steps, cls.steps), MAX_QUICK_STEPS)} | options)
 
     @classmethod
     def paper(cls, **options: Any) -> Self:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from augment import Mixed
 from swiftwrf import AngularGrid, Spectra
+from swiftwrf.data.spectra import to_directions
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.registry import Registry
 from swiftwrf.runtime.validation import Configured, NonNegativeInt, Preset, configuration
@@ -85,12 +86,22 @@ class Estimator(Configured, ABC):
 
     def estimate(self, data: Spectra) -> Tensor:
         """Return azimuth and elevation (n, 2) [rad] of measurements."""
-        return torch.cat([self.predict(part) for part in data.store.batches()])
+        name, batches = f"directions of {type(self).__name__}", data.store.batches()
+        return torch.cat([to_directions(name, self.predict(part), len(part)) for part in batches])
 
     @classmethod
     def lacking(cls, data: Spectra) -> str:
         """Return a sentence about what the data lack for this estimator, or an empty text if they have it."""
         return ""
+
+
+def estimated(estimator: Estimator, data: Spectra) -> Tensor:
+    """Return the directions of measurements by an estimator of any class, float64 (n, 2) [rad].
+
+    Raises:
+        InputError: As `Estimator.estimate`, or values that are no directions of these measurements.
+    """
+    return to_directions(f"directions of {type(estimator).__name__}", estimator.estimate(data), len(data))
 
 
 class SavedEstimator(Estimator, Saved):

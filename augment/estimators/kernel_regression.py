@@ -35,6 +35,7 @@ from swiftwrf.runtime.checkpoint import Header, expect
 
 WIDTH_CANDIDATES = (10.0, 20.0, 40.0, 80.0)  # gamma times the median squared distance
 PENALTY_CANDIDATES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
+MIN_MEDIAN = 1e-4  # of squared distances, relative to their mean, that gives a width
 MAX_CHOICE_ROWS = 600  # rows of the cross-validation; with fewer rows it chooses too large a penalty
 MAX_ROWS = 4000  # training rows; the time of a fit grows with their cube
 MAX_AZIMUTHS = 60  # columns of coarse spectra; the beams of an array are wider than one of them
@@ -74,7 +75,8 @@ class NadarayaWatson:
             target: Values of these rows.
             seed: Seed of the folds.
         """
-        distance = euclidean_distances(feature, squared=True)
+        # rounding errors grow with the length of rows; between equal ones they would make the kernel indefinite
+        distance = euclidean_distances(feature - feature.mean(axis=0), squared=True)
         some = slice(MAX_CHOICE_ROWS)
         gamma, alpha = choose(distance[some, some], target[some], seed)
         return cls(feature, _dual_coefficients(np.exp(-gamma * distance), target, alpha), gamma)
@@ -120,7 +122,10 @@ def choose(distance: NDArray[Any], target: NDArray[Any], seed: int) -> tuple[flo
         target: Values of the rows, (n, k).
         seed: Seed of the folds.
     """
-    width = 1 / max(float(np.median(distance[~np.eye(len(distance), dtype=bool)])), 1e-9)
+    apart = distance[~np.eye(len(distance), dtype=bool)]
+    typical, mean = float(np.median(apart)), float(apart.mean())
+    # if most rows are nearly equal, e.g. of a constant field model, their median distance is far below that of the others
+    width = 1 / max(typical if typical > MIN_MEDIAN * mean else mean, 1e-9)
     folds = KFold(min(5, len(distance)), shuffle=True, random_state=seed)
     errors: dict[tuple[float, float], float] = {}
     with threadpool_limits(1):  # many small problems: several threads would mostly wait for each other

@@ -13,8 +13,8 @@ from torch import Tensor
 from augment.choose import blind_folds, candidates
 from augment.cross_validation import LOCATOR, STAND_IN
 from augment.estimators import ESTIMATORS, Estimator, make_estimator
-from augment.mix import withhold
-from augment.positions import SyntheticPositions
+from augment.mix import Mixed, withhold
+from augment.positions import SyntheticPositions, check_synthetic
 from augment.turbo.condition import NETWORKS, MeasuredSubset, Row, Training
 from swiftwrf.choices import AUTO
 from swiftwrf.data import Spectra
@@ -58,6 +58,10 @@ class Experiment:
                 f"spectra of {data.name} have {data.grid.shape[0]} x {data.grid.shape[1]} pixels; SSIM, the measure "
                 f"of their quality, needs at least {WINDOW} x {WINDOW}"
             )
+        for part in (self.train, data):
+            Mixed.measured(part)  # refuses spectra without directions
+        if not self.models:
+            raise InputError("models is empty; name at least one, or give 'auto'")
         for name in self.named:
             if missing := self.model_type(name).lacking(data):
                 hint = "give it with --array" if "array" in missing else "the data must contain its position"
@@ -72,7 +76,7 @@ class Experiment:
                 if names.count(name) > 1:
                     raise InputError(f"two {things} have the name {name!r}; leave one out, or give it another name")
         if self.extra:
-            data.direction_at(data.position[:1])  # refuses unknown geometry
+            check_synthetic(data, self.extra)
         for fraction in self.fractions:
             withhold(self.train, fraction, self.seed)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import cached_property
@@ -30,8 +29,9 @@ from augment.turbo.experiment import ROOM_MODEL, Experiment
 from augment.turbo.stages import training_set
 from swiftwrf import load
 from swiftwrf.choices import fraction_key
+from swiftwrf.data.splits import places
 from swiftwrf.locate import MatchedField
-from swiftwrf.metrics import ErrorSummary, angle_errors, paired_change, summary
+from swiftwrf.metrics import ChangeMetrics, ErrorSummary, angle_errors, paired_change, summary
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.runtime.registry import write_report
 
@@ -65,6 +65,8 @@ class TurboResult:
         self.synthesized: list[tuple[Row, Row]] = []  # columns and values of each field model
         self.evaluated: list[tuple[Condition, Row]] = []
         self.history: list[Row] = []
+        # columns of each test spectrum in all tables
+        self._rows = {"index": experiment.test.index, "place": places(experiment.test.position, 2)}
         self.missing: dict[str, str] = {}  # reason for each method that is missing
         self.left_out: list[str] = []
         for name, reason in experiment.lacking.items():
@@ -117,7 +119,7 @@ class TurboResult:
             estimate = torch.tensor(value["estimate"], dtype=torch.float64)
             errors = angle_errors(estimate, test.label)
             columns = {
-                "index": test.index,
+                **self._rows,
                 "line_of_sight": test.line_of_sight,
                 "truth_azimuth_deg": truth[:, 0],
                 "truth_elevation_deg": truth[:, 1],
@@ -136,7 +138,7 @@ class TurboResult:
             if (found := value.get("located")) is None:
                 continue
             estimate = torch.tensor(found["position"], dtype=torch.float64)
-            columns: Row = {"index": test.index}
+            columns: Row = dict(self._rows)
             for name, at in (("truth", test.position), ("estimate", estimate)):
                 columns |= {f"{name}_{axis}_m": at[:, number] for number, axis in enumerate("xyz")}
             columns |= {
@@ -152,8 +154,8 @@ class TurboResult:
     @cached_property
     def synthesis(self) -> DataFrame:
         """A row for each field model and test spectrum: PSNR [dB], SSIM and L1."""
-        index = {"index": self.experiment.test.index}
-        return concat([DataFrame(key | index | value["scores"]) for key, value in self.synthesized], ignore_index=True)
+        tables = [DataFrame(key | self._rows | value["scores"]) for key, value in self.synthesized]
+        return concat(tables, ignore_index=True)
 
     @cached_property
     def metrics(self) -> Row:
@@ -171,7 +173,7 @@ class TurboResult:
             synthesis: Quality of each field model at the test positions, and its mean seconds to `fit` and `synthesize`.
             methods: Condition, errors, mean seconds and `changes` of each method. These are changes of the angular error by
                 synthetic spectra, by the method that it is compared to: the same estimator on measured spectra, and the
-                reference. Their intervals are paired over test positions.
+                reference. Their intervals are paired over test places.
             reference: Method with the smallest test error on measured spectra, without matched-field processing.
             locating: Position error [m], fractions of test positions in their 80 % region and of ambiguous spectra,
                 weights of the likelihoods (first repeat) and mean seconds of each method that locates.
@@ -227,7 +229,7 @@ class TurboResult:
 
         `median`, `p90`, and `low` and `high` of the median's 95 % interval are those of the angle between true and estimated
         direction [deg]. `change` [%] is that of the median by synthetic spectra, relative to the same estimator on the
-        measured spectra alone. Its interval, `change_low` and `change_high`, is paired over the test spectra.
+        measured spectra alone. Its interval, `change_low` and `change_high`, is paired over the places of the test spectra.
         """
         conditions = conditions_of(self.metrics["methods"])
         rows: list[Row] = []
@@ -259,6 +261,11 @@ class TurboResult:
         """Angular errors [deg] of each method, (n, repeats)."""
         return {method: by_repeat(part, "great_circle_deg") for method, part in self.errors.groupby("method")}
 
+    def _change(self, before: str, after: str) -> ChangeMetrics:
+        """Return the change of the angular error between two methods, paired over the places of the test spectra."""
+        place = self._rows["place"][self._rows["index"].argsort()]
+        return paired_change(self._error[before], self._error[after], place)
+
     def _estimator_choice(self) -> Row | None:
         """Return the choice of the estimator by cross-validation. None if field models could not be compared."""
         if self.compared.get("choice") is None:
@@ -278,7 +285,7 @@ class TurboResult:
 
     def _better(self, choice: Row) -> dict[str, str]:
         """Return the methods that are significantly better than the chosen one on the test spectra, and why not chosen."""
-        error, reasons = self._error, {}
+        error, reasons = self._error, dict[str, str]()
         for condition, _ in self.pooled:
             if condition.training == "all measured":
                 continue
@@ -291,7 +298,7 @@ class TurboResult:
             else:
                 reason = f"synthetic spectra are compared by {STAND_IN} and the first field model alone"
             reasons[condition.method] = reason
-        better = [name for name in reasons if paired_change(error[choice["name"]], error[name])["high"] < 0]
+        better = [name for name in reasons if self._change(choice["name"], name)["high"] < 0]
         return {name: reasons[name] for name in sorted(better, key=lambda name: float(np.median(error[name])))}
 
     def _method_metrics(self) -> tuple[dict[str, Row], str]:
@@ -303,11 +310,11 @@ class TurboResult:
         reference = reference_of(
             conditions, {name: entry["great_circle_deg"]["median"] for name, entry in found.items()}
         )
-        error, metrics = self._error, {}
+        metrics = {}
         for method, entry in found.items():
             condition = conditions[method]
             others = dict.fromkeys((condition.measured_only.method, reference)) if condition.is_turbo else ()
-            changes = {other: paired_change(error[other], error[method]) for other in others if other in conditions}
+            changes = {other: self._change(other, method) for other in others if other in conditions}
             metrics[method] = {**condition.description, **entry, "changes": changes, "seconds": seconds[method]}
         return metrics, reference
 
@@ -332,9 +339,15 @@ class TurboResult:
 
 
 def summaries(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dict[str, ErrorSummary]]:
-    """Return a summary of columns of errors over all test rows (`index`) and repeats, for each value of `by`."""
+    """Return a summary of columns of errors for each value of `by`, with the number of test rows that have one.
+
+    It is over all test rows (`index`) and repeats. Errors of one `place` are not independent.
+    """
     return {
-        str(name): {column: repeated_summary(by_repeat(part, column)) for column in columns}
+        str(name): {
+            column: {**summary(part[column], part["place"]), "n": part.dropna(subset=column)["index"].nunique()}
+            for column in columns
+        }
         for name, part in table.groupby(by, sort=False)
     }
 
@@ -343,28 +356,6 @@ def by_repeat(table: DataFrame, column: str) -> NDArray[np.float64]:
     """Return a column with a row for each test row and a column for each repeat, (n, repeats)."""
     values: NDArray[np.float64] = table.pivot(index="index", columns="repeat", values=column).to_numpy(np.float64)
     return values
-
-
-def repeated_summary(values: NDArray[np.float64]) -> ErrorSummary:
-    """Return the summary of all values (n, repeats), with the number of test rows.
-
-    Repeats of a test row are not independent, so they do not narrow the interval of the median as independent values would
-    (quantiles in cluster samples: R. S. Woodruff, JASA 47, 1952).
-
-    Example:
-        >>> once = np.arange(100.0)[:, None]
-        >>> found = repeated_summary(np.repeat(once, 3, axis=1))
-        >>> found["median"], found["n"], (found["low"], found["high"])
-        (49.5, 100, (40.0, 59.0))
-    """
-    found = summary(values.ravel())
-    rows = values[np.isfinite(values).any(axis=1)]
-    if values.shape[1] > 1 and len(rows):
-        below = np.nanmean(np.where(np.isnan(rows), np.nan, rows <= found["median"]), axis=1)
-        margin = 1.96 * below.std() / math.sqrt(len(rows))
-        low, high = np.nanquantile(rows, (max(0.0, 0.5 - margin), min(1.0, 0.5 + margin))).tolist()
-        found = {**found, "low": low, "high": high}
-    return {**found, "n": len(rows)}
 
 
 def averaged(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dict[str, float]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -19,6 +20,7 @@ from augment.cross_validation import (
     located_errors,
 )
 from augment.estimators import SavedEstimator
+from augment.estimators.base import estimated
 from augment.mix import Mixed, mix
 from augment.positions import SyntheticPositions, synthetic_positions
 from augment.turbo.artifacts import LEVEL, as_bytes, model_file, save_examples, save_located, save_model
@@ -28,6 +30,7 @@ from swiftwrf import FitError, GeometryModel, InputError, Spectra, load
 from swiftwrf.data.store import Store
 from swiftwrf.locate import MatchedField, Posterior
 from swiftwrf.metrics import l1, psnr, ssim
+from swiftwrf.models.base import synthesized
 from swiftwrf.runtime.checkpoint import read, write
 from swiftwrf.runtime.steps import STEPS
 
@@ -168,7 +171,8 @@ def synthesize(
     synthesis = f"synthesis_{name}-{subset}"
     try:
         # models that are only compared are as small as in the choice
-        model = experiment.make_model(name, subset.repeat, experiment.preset if trains else "quick").fit(
+        model = experiment.make_model(name, subset.repeat, experiment.preset if trains else "quick")
+        model.fit(
             measured,
             # without a room the models refuse the spectra themselves
             like=_read_room(folder, room["file"]) if room and "file" in room else None,
@@ -178,7 +182,8 @@ def synthesize(
             progress=True,
         )
         fitted = time.perf_counter()
-        test = _as_bytes_at(experiment.test.position, model.synthesize)
+        predict = partial(synthesized, model)
+        test = _as_bytes_at(experiment.test.position, predict)
     except (InputError, FitError) as error:
         if trains:
             raise
@@ -189,7 +194,7 @@ def synthesize(
         parts["extra"] = synthetic_positions(measured, extra, experiment.seed + subset.repeat)
     tensors = {}
     for part, positions in parts.items():
-        tensors[part] = _as_bytes_at(positions.position, model.synthesize)
+        tensors[part] = _as_bytes_at(positions.position, predict)
         tensors |= {f"{part}_{key}": tensor for key, tensor in vars(positions).items()}
     seconds = {
         "fit": fitted - began + earlier + (room or {}).get("seconds", 0.0),
@@ -241,7 +246,7 @@ def evaluate(experiment: Experiment, folder: Path, condition: Condition, saved_a
     estimator = experiment.make_estimator(condition.estimator, condition.repeat)
     estimator.fit(train, device=experiment.device)
     fitted = time.perf_counter()
-    estimate = estimator.estimate(experiment.test)
+    estimate = estimated(estimator, experiment.test)
     if isinstance(estimator, SavedEstimator) and saved_as is not None:
         estimator.save(model_file(folder, saved_as, condition.subset.key))
     seconds = {"train": fitted - began, "estimate": time.perf_counter() - fitted}

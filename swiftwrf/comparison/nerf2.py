@@ -42,7 +42,7 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.comparison.base import Config, Count, Depth, TrainedModel, Training, draw_parameters, restored
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.models.base import CPU, FIXED_END, check_finite
+from swiftwrf.models.base import CPU, FIXED_END, check_predicted
 from swiftwrf.models.mlp import SkipMLP, encode
 from swiftwrf.positions import frame, normalise
 from swiftwrf.rssi.base import SavedRssiPredictor
@@ -309,7 +309,7 @@ class NeRF2Rssi(SavedRssiPredictor):
         n_samples = config.azimuths * config.elevations * config.samples * max(n_receivers, 1)
         some = position.split(max(1, MAX_SAMPLES["cpu"] // n_samples))
         amplitude = torch.cat([self._amplitude(self.field, part) for part in some])
-        return check_finite(100 * (amplitude.double() - 1)), None
+        return check_predicted(self, 100 * (amplitude.double() - 1), amplitude.shape), None
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         self.check_fitted()

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.lib.format import read_array_header_1_0, read_array_header_2_0, read_magic
 from numpy.typing import NDArray
-from scipy.io import loadmat, whosmat
 
+from swiftwrf.data.matlab import Stored, matlab_arrays
 from swiftwrf.errors import InputError, optional_module
 
 MAX_UNPACKED_BYTES, MAX_STORED_BYTES = 2**30, 2**33  # of arrays that are compressed, and not
@@ -22,10 +22,8 @@ MAX_ROWS_BYTES = 2**36  # of an array that is read some rows at a time
 NUMPY, HDF5, MATLAB = (".npz",), (".h5", ".hdf5"), (".mat",)
 ARCHIVES = (*NUMPY, *HDF5, *MATLAB)  # suffixes of files that hold arrays by name
 MATLAB_HDF5 = (b"MATLAB 7.3", b"\x89HDF")  # first bytes of .mat files that are HDF5, of MATLAB and of Octave
-MATLAB_NUMBERS = {"double", "single", "logical", *(f"{sign}int{8 * n}" for sign in ("", "u") for n in (1, 2, 4, 8))}
 NUMBERS = "biufc"  # kinds of NumPy types
 Arrays = dict[str, NDArray[Any]]
-Stored = tuple[int, Callable[[], NDArray[Any]]]  # bytes of an array in memory, and what reads it
 
 
 def array_names(file: Path) -> set[str]:
@@ -64,15 +62,8 @@ def _opened(file: Path, kinds: str = NUMBERS) -> Iterator[tuple[set[str], Callab
         with optional_module("h5py", f"{file} is HDF5, which h5py reads", "formats").File(file, "r") as content:
             yield set(content), partial(_in_hdf5, content)
     elif file.suffix in MATLAB:
-        variables = {name: (math.prod(shape) * 16, kind) for name, shape, kind in whosmat(file)}  # bytes if complex
-
-        def find(name: str) -> Stored:
-            size, kind = variables[name]
-            if kind not in MATLAB_NUMBERS:
-                raise ValueError(f"{name} holds {kind}, expected numbers")
-            return size, lambda: np.ascontiguousarray(loadmat(file, variable_names=[name])[name])
-
-        yield set(variables), find
+        variables = matlab_arrays(file)
+        yield set(variables), variables.__getitem__
     else:
         with np.load(file, allow_pickle=False) as archive:
             members = {info.filename.removesuffix(".npy"): info.file_size for info in archive.zip.infolist()}

@@ -102,14 +102,7 @@ class Spectra(PositionedData):
             raise InputError("Spectra takes spectra and their positions: Spectra(spectra, position, ...)")
         position = to_positions("position", position)
         if store is None:
-            is_bytes = getattr(spectra, "dtype", None) in (torch.uint8, "uint8")
-            values = to_tensor("spectra", spectra, torch.uint8 if is_bytes else torch.float32, (None, None, None))
-            low, high = (0.0, 1.0) if is_bytes or not values.numel() else map(float, values.aminmax())
-            if low < -1e-6 or high > 1 + 1e-6:  # from rounding
-                raise InputError(
-                    f"spectra are magnitudes in [0, 1], got {low:.4g} to {high:.4g}; divide them by the largest"
-                )
-            store = Store(values if is_bytes else values.clamp(0, 1))
+            store = Store(to_magnitudes("spectra", spectra, (None, None, None)))
         grid = grid or AngularGrid.hemisphere(*store.shape[1:])
         if grid.shape != store.shape[1:]:
             raise InputError(f"spectra of shape {store.shape} do not fit a grid of {grid.shape} directions")
@@ -125,12 +118,7 @@ class Spectra(PositionedData):
         if rotation is not None:
             rotation = to_rotation(rotation)
         if label is not None:
-            label = to_tensor("label", label, torch.float64, (None, 2), missing=True)
-            if bool((bad := (label.abs() > MAX_LABEL).any(dim=1)).any()):
-                raise InputError(
-                    "label must be azimuth up to 2 pi and elevation up to pi / 2 [rad], got "
-                    f"{label[bad][0].tolist()}; convert degrees by deg2rad"
-                )
+            label = to_directions("label", label, missing=True)
         elif fixed_position is not None and rotation is not None:
             if bool((same := (position == fixed_position).all(dim=1)).any()):
                 raise InputError(
@@ -250,6 +238,35 @@ class Spectra(PositionedData):
         rows, columns = self.grid.shape
         array = f", {self.array.summary}" if self.array else ""
         return f"{len(self)} spectra of {rows} x {columns} directions{array}, moving {self.moving}"
+
+
+def to_magnitudes(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:
+    """Return spectra of this shape as float32 in [0, 1], or as the bytes that they are.
+
+    Raises:
+        InputError: As `to_tensor`, or a magnitude outside [0, 1].
+    """
+    is_bytes = getattr(value, "dtype", None) in (torch.uint8, "uint8")
+    found = to_tensor(name, value, torch.uint8 if is_bytes else torch.float32, shape)
+    low, high = (0.0, 1.0) if is_bytes or not found.numel() else map(float, found.aminmax())
+    if low < -1e-6 or high > 1 + 1e-6:  # from rounding
+        raise InputError(f"{name} are magnitudes in [0, 1], got {low:.4g} to {high:.4g}; divide them by the largest")
+    return found if is_bytes else found.clamp(0, 1)
+
+
+def to_directions(name: str, value: Any, n: int | None = None, missing: bool = False) -> Tensor:
+    """Return azimuth and elevation [rad] of n spectra, or of any number, as float64 (n, 2); nan only if `missing`.
+
+    Raises:
+        InputError: As `to_tensor`, or an angle beyond the range of directions, e.g. in degrees.
+    """
+    found = to_tensor(name, value, torch.float64, (n, 2), missing)
+    if bool((bad := (found.abs() > MAX_LABEL).any(dim=1)).any()):
+        raise InputError(
+            f"{name} must be azimuth up to 2 pi and elevation up to pi / 2 [rad], got {found[bad][0].tolist()}; convert "
+            "degrees by deg2rad"
+        )
+    return found
 
 
 def snapshot_frequencies(frequency_hz: Numbers | None, channel: Tensor) -> Tensor | None:

@@ -20,6 +20,7 @@ from swiftwrf.positions import Neighbours, distance
 from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.validation import Fraction, configuration
 
+MIN_NOISE = 1e-8  # variance of the noise, relative to that of the field
 MAX_EXACT = 2000  # positions up to which a process is exact; time and memory grow with their cube and square
 Scale = Annotated[float, Gt(0), Lt(math.inf)]
 N_NEIGHBOURS = 64  # positions that a local prediction conditions on; farther ones hardly change the mean
@@ -38,7 +39,7 @@ class Kernel:
         matern12_length: Correlation length l of the rough part, in the unit of the positions.
         matern32_length: Correlation length s of the smooth part.
         matern12_weight: Variance w of the rough part, in [0, 1].
-        noise: Variance that does not depend on position, relative to k(0) = 1.
+        noise: Variance that does not depend on position, relative to k(0) = 1. Less than 1e-8 is 1e-8.
         vertical: Factor of differences in z, e.g. between floors.
 
     Raises:
@@ -54,6 +55,10 @@ class Kernel:
     matern12_weight: Fraction = 0.6
     noise: Annotated[float, Ge(0), Lt(math.inf)] = 1e-2
     vertical: Scale = 1.0
+
+    def check(self) -> None:
+        """Raise the noise to what makes every covariance positive definite, also that of repeated positions."""
+        object.__setattr__(self, "noise", max(self.noise, MIN_NOISE))
 
     @property
     def correlation_length(self) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Iterable
@@ -17,8 +18,9 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.choices import FIELD_MODELS, PUBLISHED, Moving
 from swiftwrf.data.dataset import Data, Numbers, PositionedData
-from swiftwrf.data.spectra import Spectra, check_training
+from swiftwrf.data.spectra import Spectra, check_training, to_magnitudes
 from swiftwrf.data.splits import Validation
+from swiftwrf.data.store import Store
 from swiftwrf.errors import InputError, with_article
 from swiftwrf.models.link import Link
 from swiftwrf.models.prediction import Prediction
@@ -133,6 +135,8 @@ class FieldModel(Updatable, Configured, Saved, Displayed):
 
     def __init_subclass__(cls, **options: Any) -> None:
         cls.name, cls.kind = (vars(cls).get(attribute, cls.__name__) for attribute in ("name", "kind"))
+        if not re.fullmatch(r"\w[\w .+-]*", cls.name):  # files have it in their names
+            raise InputError(f"name of {cls.__name__} must begin with a letter and hold no slash, got {cls.name!r}")
         super().__init_subclass__(**options)
 
     @classmethod
@@ -242,8 +246,10 @@ class FieldModel(Updatable, Configured, Saved, Displayed):
 
         def evaluate(some: Tensor) -> tuple[Tensor, Tensor | None]:
             mean, std = self._predict(some, grid, with_std)
+            shape = len(some), *grid.shape
+            mean = check_predicted(self, mean, shape).float().clamp(0, 1)
             # images of 8 bits, in which spectra are stored, have steps of 1 / 255
-            return mean.float().clamp(0, 1), None if std is None else std.float().clamp_min(1 / 255)
+            return mean, None if std is None else check_predicted(self, std, shape).float().clamp_min(1 / 255)
 
         differentiable = position.requires_grad or any(tensor.requires_grad for tensor in self.parameters())
         with torch.set_grad_enabled(torch.is_grad_enabled() and differentiable):
@@ -259,7 +265,7 @@ class FieldModel(Updatable, Configured, Saved, Displayed):
                     if part is not None:
                         std = torch.empty_like(mean) if std is None else std
                         std[rows] = part
-        return Prediction(check_finite(mean), std, position, grid)
+        return Prediction(mean, std, position, grid)
 
     @single_thread()
     @checked
@@ -267,7 +273,7 @@ class FieldModel(Updatable, Configured, Saved, Displayed):
         """Return the model with more training spectra, by an update of its factorisation. This model stays as it is.
 
         The result equals a fit to all spectra with the same kernel, noise and components. The planes of a room are refined
-        and not searched, which needs 10 new positions.
+        and not searched, which needs 10 new positions. Furniture stays.
 
         Args:
             new: Spectra of the same link on the grid of the training spectra, any number. Those that the model has already
@@ -469,15 +475,29 @@ def bounding_box(position: Tensor) -> Tensor:
     return torch.stack([position.amin(dim=0), position.amax(dim=0)])
 
 
-def check_finite(spectrum: Tensor) -> Tensor:
-    """Return the spectra unchanged if they are finite.
+def check_predicted(model: object, value: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """Return what a model predicts, unchanged, if it is a floating-point tensor of this shape with finite values.
 
     Raises:
-        InputError: The parameters are so large that their sums overflow.
+        InputError: It is not; the message names the class of the model.
     """
-    if not bool(spectrum.detach().sum().isfinite()):
-        raise InputError("the model predicts values that are not finite; its parameters overflow, so fit it again")
-    return spectrum
+    name = type(model).__name__
+    if not isinstance(value, Tensor) or not value.is_floating_point() or value.shape != shape:
+        found = f"{value.dtype} {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+        raise InputError(f"{name} must predict a floating-point tensor of shape {shape}, got {found}")
+    if not bool(value.detach().sum().isfinite()):
+        raise InputError(f"{name} predicts values that are not finite; if its parameters overflow, fit it again")
+    return value
+
+
+def synthesized(model: FieldModel, position: Tensor) -> Tensor:
+    """Return the spectra that a model of any class synthesizes at positions (n, 3), float32 (n, H, W) on the CPU.
+
+    Raises:
+        InputError: As `FieldModel.synthesize`, or values that are no spectra on the grid of the model.
+    """
+    shape, spectra = (len(position), *model.grid.shape), model.synthesize(position)
+    return Store(to_magnitudes(f"spectra of {type(model).__name__}", spectra, shape))[:]
 
 
 @checked

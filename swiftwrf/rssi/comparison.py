@@ -19,7 +19,7 @@ from swiftwrf.choices import RSSI_PREDICTORS, NotDetected
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.rssi import PLACE
-from swiftwrf.data.splits import MIN_TRAINING, Validation
+from swiftwrf.data.splits import MIN_TRAINING, Validation, places
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import method_summary
 from swiftwrf.models.prediction import Prediction
@@ -120,9 +120,10 @@ class RssiComparison:
 
     @cached_property
     def errors(self) -> DataFrame:
-        """Errors, a row for each method and detected pair of test row and receiver."""
+        """Errors, a row for each method and detected pair of test row and receiver, with the number of the row's place."""
         test, (row, column) = self.test, self._pairs
         measured = test.rssi_dbm[row, column]
+        place = places(test.transmitter_position, 2)[row].numpy()
         from_training = nearest(test.transmitter_position, self.train.transmitter_position, 1)[0][row, 0]
         from_receiver = distance(test.transmitter_position, test.receiver_position)[row, column]
         rows = []
@@ -132,6 +133,7 @@ class RssiComparison:
                 "method": name,
                 "receiver": self._receiver,
                 "index": test.index[row].numpy(),
+                "place": place,
                 "measured_dbm": measured.numpy(),
                 "predicted_dbm": predicted.numpy(),
                 "abs_error_db": (predicted - measured).abs().numpy(),

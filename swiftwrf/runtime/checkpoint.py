@@ -5,6 +5,7 @@ Every fitted model derives from `Saved`, and `load` opens any of them.
 
 from __future__ import annotations
 
+import hashlib
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
@@ -29,9 +30,18 @@ Header = dict[str, Any]  # values that JSON can store
 
 def write(path: str | Path, kind: str, tensors: dict[str, Tensor], header: Header) -> None:
     """Write a file atomically: an interrupted write leaves the old file. `read` refuses another kind of content."""
+    plain = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
     metadata = {"kind": kind, "format": str(FORMAT), "header": json.dumps(header)}
-    content = save({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, metadata)
-    write_bytes(Path(path), content)
+    write_bytes(Path(path), save(plain, metadata | {"sha256": _digest(plain, metadata)}))
+
+
+def _digest(tensors: dict[str, Tensor], metadata: dict[str, str]) -> str:
+    """Return the SHA-256 of all tensors and of the metadata beside it."""
+    described = {name: (str(t.dtype), list(t.shape)) for name, t in tensors.items()}
+    digest = hashlib.sha256(json.dumps([described, metadata], sort_keys=True).encode())
+    for name in sorted(tensors):
+        digest.update(tensors[name].flatten().view(torch.uint8).numpy().data)
+    return digest.hexdigest()
 
 
 def check_folder(path: str | Path, what: str) -> None:
@@ -48,7 +58,8 @@ def read(path: str | Path, *kinds: str) -> tuple[str, dict[str, Tensor], Header]
     """Return kind, tensors and header of a file of one of the given kinds.
 
     Raises:
-        InputError: No such file, not a safetensors file, another kind or a newer format, or a value that is not finite.
+        InputError: No such file, not a safetensors file, another kind or a newer format, content that is not as it was
+            written, or a value that is not finite.
     """
     try:
         with safe_open(path, framework="pt") as file:
@@ -61,6 +72,9 @@ def read(path: str | Path, *kinds: str) -> tuple[str, dict[str, Tensor], Header]
                 )
             header = json.loads(metadata.get("header", ""))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+            # files of 0.3.0 have no digest
+            if (known := metadata.pop("sha256", None)) is not None and known != _digest(tensors, metadata):
+                raise InputError(f"{path} is damaged: its content is not what was written; create the file again")
             for name, tensor in tensors.items():
                 if not bool(torch.isfinite(tensor).all()):
                     raise InputError(f"{path}: {name} holds a value that is not finite; create the file again")

@@ -16,6 +16,7 @@ from torch import Tensor
 from swiftwrf.errors import InputError
 
 OF_VERSIONS = {*sys.stdlib_module_names, "swiftwrf", "augment", "tasks"}  # packages whose code changes with a version
+DESCRIPTORS = (property, cached_property, staticmethod, classmethod)
 
 
 def digest(*values: Any) -> str:
@@ -55,7 +56,7 @@ class _Content(pickle._Pickler):
             parts = self._code(value) if _is_own(value) else None
         elif isinstance(value, CodeType):
             parts = [value.co_code, value.co_names, value.co_consts]
-        elif isinstance(value, property | cached_property | staticmethod | classmethod):
+        elif isinstance(value, DESCRIPTORS):
             parts = [getattr(value, name, None) for name in ("fget", "fset", "func", "__func__")]
         elif callable(own := getattr(value, "digest", None)):  # of spectra, which exceed the memory
             parts = [own()]

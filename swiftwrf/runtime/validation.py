@@ -173,7 +173,8 @@ def checked(function: Function) -> Function:
     """Check the arguments of a function against their annotations.
 
     Raises:
-        InputError: At a call, for the first argument with a value that its annotation does not allow.
+        InputError: At a call, for the first argument with a value that its annotation does not allow, and for an argument
+            that the function does not take.
 
     Example:
         >>> @checked
@@ -187,7 +188,12 @@ def checked(function: Function) -> Function:
     @functools.wraps(function)
     def wrapped(*arguments: Any, **options: Any) -> Any:
         hints = _hints(function)
-        for name, value in signature.bind(*arguments, **options).arguments.items():
+        try:
+            bound = signature.bind(*arguments, **options)
+        except TypeError as error:
+            taken = ", ".join(name for name in signature.parameters if name != "self")
+            raise InputError(f"{function.__name__}() {error}; it takes {taken}") from None
+        for name, value in bound.arguments.items():
             if name in hints:
                 check_value(name, value, hints[name])
         return function(*arguments, **options)

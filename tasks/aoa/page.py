@@ -24,8 +24,6 @@ LIMITS = (
     "after furniture moved, or with another array.",
     "The label is the geometric direction of the transmitter, computed from positions. If the direct path is blocked, the "
     "spectrum may not contain it.",
-    "Intervals treat test spectra as independent draws. Along a measured path they are not, so on such data the intervals "
-    "are too narrow.",
 )
 MAX_SPREAD = 0.5  # of the labels about their mean, relative to the error of the peaks, where paths are fingerprints
 LOOK_UP = (
@@ -99,7 +97,7 @@ def _errors(fraction: FractionRecords) -> Section:
     caption = (
         "Near the zenith azimuth errors are large without meaning. Held out: on measured "
         "spectra, which decide the choice. By synthetic spectra: change of the median of the same estimator on measured "
-        "spectra, a paired bootstrap over the test positions."
+        "spectra, a paired bootstrap over the test places."
     )
     errors = fraction.table("errors")[["repeat", "index", "method", "great_circle_deg"]]
     return errors_section(

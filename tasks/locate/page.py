@@ -42,8 +42,6 @@ COLOURS = labels.LOCALIZERS
 LIMITS = (
     "Rows that no receiver detected have no position. They are left out of the errors.",
     "Candidate positions lie in and around the training positions. A transmitter elsewhere is located at their edge.",
-    "Intervals of medians treat test rows as independent. Along a walked path they are not, and the intervals are too "
-    "narrow.",
     "Training and test rows are of one device and one time, unless the split separates these. Another device has "
     "another offset, which --offset-by COLUMN estimates if the table names devices.",
 )
@@ -87,7 +85,8 @@ def _errors(run: Records) -> Section:
         COLOURS,
         name=run.file_name,
         quantity="position error",
-        caption=f"Column of {OWN}: difference of the mean errors on the same rows, with its 95 % bootstrap interval.",
+        caption=f"Column of {OWN}: difference of the mean errors on the same rows, with its 95 % bootstrap interval over "
+        "test places.",
         paragraphs=[f"Test rows that no receiver detected are left out: {n_undetected}."] if n_undetected else [],
     )
 
@@ -122,8 +121,8 @@ def _overview(run: Records, name: str) -> Plot:
 
 
 def _calibration(run: Records) -> Plot:
-    """Return measured against nominal coverage, with its 95 % interval (Wilson)."""
-    rows, n = [], run.metrics["n_test"]
+    """Return measured against nominal coverage, with its 95 % interval (Wilson), as if each place were one row."""
+    rows, n = [], run.table("errors")["place"].nunique()
     for level, value in run.metrics["calibration"].items():
         interval = binomtest(round(value * n), n).proportion_ci(method="wilson")
         rows.append((float(level), value, float(interval.low), float(interval.high)))
@@ -210,14 +209,13 @@ def conclusion(run: Records) -> list[str]:
             name="the posterior",
             unit="m",
             rows="rows",
-            n_test=n_test,
         ),
     ]
 
 
 def _steps(run: Records) -> list[NextStep]:
     own, coverage = [], run.metrics["calibration"][str(LEVEL)]
-    if warning := coverage_warning("credible regions", coverage, LEVEL, run.metrics["n_test"]):
+    if warning := coverage_warning("credible regions", coverage, LEVEL, run.table("errors")["place"].nunique()):
         own.append(NextStep(warning))
     if run.metrics["split"] == "random":
         own.append(again(run, "Test a region where nothing was measured", "block"))

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -19,13 +20,14 @@ from swiftwrf.data.cells import text_of
 from swiftwrf.data.columns import column_of
 from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.files import refusing_unreadable, table_of
+from swiftwrf.data.receivers import spelled_as
 from swiftwrf.errors import CONTENT_ERRORS
 from swiftwrf.online import Step
 from swiftwrf.online.scores import LEVEL
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime.durable import strict
 from tasks.configs import OF_ROWS, TABLE_SUFFIX, UpdateConfig
-from tasks.source import aligned, reading
+from tasks.source import reading
 
 POLL_S = 0.2  # between two looks at a file that grows
 CHUNK_BYTES = 2**20
@@ -123,8 +125,10 @@ def _growing(path: Path, file: BinaryIO) -> Iterator[bytes]:
                 is_replaced = not os.path.samestat(path.stat(), os.fstat(file.fileno()))
 
 
-def measurement(line: Line, config: UpdateConfig, model: FieldModel | RssiModel) -> Rssi | Spectra:
+def measurement(line: Line, config: UpdateConfig, model: FieldModel | RssiModel, left_out: set[str]) -> Rssi | Spectra:
     """Return the measurement in a line, of the kind that the model predicts.
+
+    Receivers that the model does not have are added to `left_out`.
 
     Raises:
         InputError: No row or JSON object, or other values than the model needs.
@@ -135,11 +139,11 @@ def measurement(line: Line, config: UpdateConfig, model: FieldModel | RssiModel)
         index = torch.tensor([line.number - 1 - bool(line.header)])  # as of the rows of the whole file
         if line.header:
             assert isinstance(model, RssiModel)
-            return _of_row(text, config, model).derived(index=index)
+            return _of_row(text, config, model, left_out).derived(index=index)
         content = json.loads(text)
         position, value = [list(map(_number, content["position"]))], content[needed]
         if isinstance(model, RssiModel):
-            return _of_receivers(position, value, model).derived(index=index)
+            return _of_receivers(position, value, model, left_out).derived(index=index)
         spectrum = [[list(map(_number, row)) for row in value]]
         return Spectra(spectrum, position, grid=model.grid, index=index, name=f"line {line.number}", **vars(model.link))
     except InputError as error:
@@ -156,22 +160,29 @@ def _number(value: object) -> float:
     return float(value)
 
 
-def _of_row(text: str, config: UpdateConfig, model: RssiModel) -> Rssi:
-    """Return the measurement in a table of one row; receivers that the model does not have are left out."""
+def _of_row(text: str, config: UpdateConfig, model: RssiModel, left_out: set[str]) -> Rssi:
+    """Return the measurement in a table of one row."""
     options, table, offsets = reading(config.spectra, config.table), table_of("the table", text), model.offsets
     of_rows = {name: getattr(options, name) for name in OF_ROWS}
     if offsets is not None and offsets.column in table.columns:
         of_rows["offset_by"] = offsets.column
-    data = aligned(Rssi.from_frame(table, **of_rows), model.receiver_names, ignore_others=True, noted=False)
+    data = Rssi.from_frame(table, **of_rows)
+    rssi = zip(data.receiver_names, data.rssi_dbm[0].tolist(), strict=True)
     floor = column_of(table, "floor", options.columns or {}) if model.attenuation else None
-    # of one name, whatever the height, which follows from the rows of the other floors
-    return data.derived(floors=None if floor is None else Floors((text_of(table[floor])[0],), (0.0,)))
+    floors = None if floor is None else Floors((text_of(table[floor])[0],), (0.0,))  # of one name, whatever the height
+    row = _of_receivers(data.transmitter_position.tolist(), dict(rssi), model, left_out)
+    return replace(row, origin=data.origin, groups=data.groups, floors=floors, time=data.time)
 
 
-def _of_receivers(position: list[list[float]], value: dict[str, float | None], model: RssiModel) -> Rssi:
+def _of_receivers(
+    position: list[list[float]], value: dict[str, float | None], model: RssiModel, left_out: set[str]
+) -> Rssi:
     """Return a row at the receivers of the model; those that the line does not name count as not detecting."""
-    if unknown := sorted(value.keys() - set(model.receiver_names)):
-        raise InputError(f"the model has no receiver {unknown[0]!r}; leave it out")
+    value = dict(zip(spelled_as(list(value), model.receiver_names)[0], value.values(), strict=True))
+    unknown = value.keys() - set(model.receiver_names)
+    if unknown and unknown == value.keys():
+        raise InputError("no receiver of the model detected the transmitter")
+    left_out |= unknown
     row = [value.get(name) for name in model.receiver_names]
     return Rssi(
         [[torch.nan if x is None else _number(x) for x in row]],

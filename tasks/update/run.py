@@ -71,7 +71,7 @@ def run(config: UpdateConfig) -> None:
 
 
 def follow(config: UpdateConfig) -> None:
-    """Print the answer to each line, then record it and replace the model; a line lost with a kill is answered again."""
+    """Record each line, replace the model, then print the answer: what was answered is learnt, whatever ends the run."""
     digests = {"model": sha256(Path(config.model))}
     model, rate = _model(config.model), config.false_alarm_rate
     check_source(config.source, model)
@@ -85,18 +85,23 @@ def follow(config: UpdateConfig) -> None:
             record = Record.read(folder, follower.count)
         record.write(folder)
         _write_config(config, folder)
+        left_out, is_noted = set[str](), False
         for line in lines(config.source, *place):
             before = follower.model
             try:
-                new = before.aligned(measurement(line, config, before))  # type: ignore[arg-type]  # of the model's kind
+                new = before.aligned(measurement(line, config, before, left_out))  # type: ignore[arg-type]  # of the model's kind
                 step = follower.step(new)
             except InputError as error:  # one bad line does not end a run of days
                 console.print(f"error: {error}", markup=False, soft_wrap=True)
                 continue
+            if left_out and not is_noted:
+                is_noted = True
+                note = f"note: receivers that the model does not have are left out, e.g. {min(left_out)}"
+                console.print(note, markup=False, soft_wrap=True)
             index = follower.count - 1
-            print(answer(index, new, before, step), flush=True)
             record.append(folder, record.add(index, step))
             _save(follower, file, line.end, line.sha256)
+            print(answer(index, new, before, step), flush=True)
 
 
 @contextmanager

@@ -17,6 +17,7 @@ import pandas as pd
 import pytest
 import torch
 from samples import (
+    snapshot_arrays,
     snapshots,
     survey_rows,
     write_captures,
@@ -29,6 +30,7 @@ from samples import (
     write_snapshots,
     write_survey,
 )
+from scipy.io import savemat
 from small import FLOOR, PUBLISHED, PUBLISHED_RSSI
 
 from augment import Mixed
@@ -101,6 +103,11 @@ def rssi_as_written(folder: Path) -> None:
 def captures(folder: Path, **form: Any) -> None:
     pytest.importorskip("csiread", reason="needs the extra csi")
     write_captures(folder, n=3, **form)
+
+
+def snapshots_mat(folder: Path, **options: Any) -> None:
+    arrays = {name: np.atleast_2d(value) for name, value in snapshot_arrays(SNAPSHOTS).items()}
+    savemat(folder / "snapshots.mat", arrays, **options)
 
 
 def survey_parquet(folder: Path) -> None:
@@ -245,7 +252,7 @@ def go_on(folder: Path) -> SwiftWRFPaper:
     return SwiftWRFPaper(TINY).fit(_room(), checkpoint=folder / "state")
 
 
-KINDS: dict[str, tuple[Callable[[Path], object], Reader]] = {
+DATA: dict[str, tuple[Callable[[Path], object], Reader]] = {
     "format of spectra nerf2": (spectra_nerf2, read_spectra),
     "format of spectra paths": (write_paths, read_spectra),
     "format of spectra deepmimo": (functools.partial(write_deepmimo, n=N), read_snapshots),
@@ -258,11 +265,15 @@ KINDS: dict[str, tuple[Callable[[Path], object], Reader]] = {
     "spectra with channels": (spectra_as_written, read_spectra),
     "RSSI with groups": (rssi_as_written, read_rssi),
     "snapshots in HDF5": (functools.partial(write_snapshots, name="snapshots.h5", data=SNAPSHOTS), read_snapshots),
+    "snapshots in MATLAB": (snapshots_mat, read_snapshots),
+    "snapshots in compressed MATLAB": (functools.partial(snapshots_mat, do_compression=True), read_snapshots),
     "format of RSSI nerf2": (rssi_nerf2, read_rssi),
     "survey in Parquet": (survey_parquet, read_rssi),
     "format of RSSI survey": (rssi_survey, read_rssi),
     "survey in JSON": (survey_json, lambda folder: read_rssi(folder / "walk.json")),
     "track in GPX": (track_gpx, lambda folder: read_rssi(folder / "walk.gpx")),
+}
+KINDS = DATA | {
     **{
         name: (functools.partial(save, name), lambda folder, name=name: answer(name, load(folder / "model")))
         for name in MODELS

@@ -5,9 +5,11 @@ more, and 200 command lines.
 """
 
 import inspect
+import multiprocessing
 import random
 import resource
 import shutil
+import signal
 from contextlib import suppress
 from pathlib import Path
 
@@ -18,7 +20,7 @@ from hypothesis import strategies as st
 from quick import run
 
 from fuzz.commands import command_lines
-from fuzz.kinds import ATTEMPTS, KINDS, MODELS, Attempt, answer, fitted, save
+from fuzz.kinds import ATTEMPTS, DATA, KINDS, MODELS, Attempt, answer, fitted, save
 from fuzz.mutate import damages, spoil
 from swiftwrf import FitError, InputError, load
 from swiftwrf.data.files import read_table, read_yaml
@@ -51,6 +53,48 @@ def attack(kind: str, folder: Path, seeds: range) -> dict[str, int]:
         else:
             ends["read"] += 1
     return ends
+
+
+def forked(function, *arguments):
+    """Return what a function returns in a forked process: a compiled parser that ends its process ends no other.
+
+    Raises:
+        AssertionError: The process ended without a result.
+    """
+    receiver, sender = multiprocessing.Pipe(duplex=False)
+
+    def call() -> None:
+        torch.set_num_threads(1)  # the threads of this process are not in the other
+        try:
+            found = function(*arguments)
+        except BaseException as error:
+            found = error
+        sender.send(found)
+
+    process = multiprocessing.get_context("fork").Process(target=call)
+    process.start()
+    sender.close()
+    try:
+        found = receiver.recv()
+    except EOFError:
+        process.join()
+        raise AssertionError(f"{arguments[0]}: the process ended with code {process.exitcode}") from None
+    process.join()
+    if isinstance(found, BaseException):
+        raise found
+    return found
+
+
+def test_a_forked_process_returns_its_result_or_the_signal_that_ended_it():
+    assert forked(abs, -1) == 1
+    with pytest.raises(AssertionError, match="seed 3"):
+        forked(_refuse, "seed 3")
+    with pytest.raises(AssertionError, match=f"code {-signal.SIGKILL}"):
+        forked(signal.raise_signal, signal.SIGKILL)
+
+
+def _refuse(words):
+    raise AssertionError(words)
 
 
 def _spoiling(kind: str, sound: Path) -> Attempt:
@@ -96,7 +140,7 @@ def few_or_many(few: int, many: int):
 @few_or_many(8, -(-10_000 // len(KINDS)))
 @pytest.mark.parametrize("kind", KINDS)
 def test_mutations(kind, seeds, tmp_path):
-    ends = attack(kind, tmp_path, seeds)
+    ends = forked(attack, kind, tmp_path, seeds) if kind in DATA else attack(kind, tmp_path, seeds)
     assert ends["refused"] > 0
 
 

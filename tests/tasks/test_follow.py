@@ -167,7 +167,8 @@ def killed(*arguments):
 def test_a_row_without_its_model_is_dropped(model, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr("tasks.update.run._save", killed)
-        assert follow(model, content=line(40))[0] == 130
+        code, answers, _ = follow(model, content=line(40))
+        assert (code, answers) == (130, [])  # no answer to what is not learnt
     assert indices(tmp_path / "out") == [0]
     assert follow(model, content=line(41))[0] == 0
     assert indices(tmp_path / "out") == [0]
@@ -254,6 +255,19 @@ def test_a_bad_line_is_reported_and_left_out(model, bad):
     assert (code, len(answers), said.count("error: ")) == (0, 2, 1)
     assert said.startswith("error: line 2")
     assert said.count("\n") == 1
+
+
+def test_receivers_that_appear_are_left_out_of_lines_as_of_rows_with_one_note(model, tmp_path):
+    scans = [{"receiver01": -60.0, "receiver02": -61.0, f"new{n}": -40.0} for n in range(3)]
+    content = b"".join(line(40 + n, rssi_dbm=scan) for n, scan in enumerate(scans))
+    code, answers, said = follow(model, content=content + line(43, rssi_dbm={"Receiver01": -60.0}))
+    assert (code, observed(answers)) == (0, [-60] * 4)  # a name counts in any spelling, as in a table
+    assert said == "note: receivers that the model does not have are left out, e.g. new0\n"
+    assert all(answer["observed"].keys() == answers[0]["observed"].keys() for answer in answers)
+    (tmp_path / "rows.csv").write_bytes(b"x,y,z,receiver01,new\n1,2,1,-60,-40\n2,2,1,-61,-40\n")
+    code, answers, said = follow(model, tmp_path / "rows.csv", out=tmp_path / "other")
+    assert observed(answers) == [-60, -61]
+    assert said == "note: receivers that the model does not have are left out, e.g. new\n"
 
 
 def test_lines_that_a_model_has_learnt_are_reported_and_left_out(model, tmp_path):

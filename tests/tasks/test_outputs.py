@@ -142,9 +142,14 @@ def test_a_geotiff_has_values_place_and_projection(geodetic, tmp_path):
     with Image.open(tmp_path / "a.tif") as image:
         tags = dict(image.tag_v2)
         np.testing.assert_array_equal(np.asarray(image), one.mean[0, ::-1])
-    assert tags[33550][:2] == (1.5, 1.5)
-    assert tags[33922][3:5] == pytest.approx((one.x[0] - 0.75, one.y[-1] + 0.75))
-    keys = geokeys(tags)
+    column, row, _, x, y, _ = tags[
+        33922
+    ]  # a pixel and its place; whole numbers are corners of pixels (raster type: area)
+    keys, (dx, dy) = geokeys(tags), tags[33550][:2]
+    assert keys[1025] == 1
+    middle = np.arange(len(one.x)) + 0.5, np.arange(len(one.y)) + 0.5
+    np.testing.assert_allclose(x + (middle[0] - column) * dx, one.x)
+    np.testing.assert_allclose(y - (middle[1] - row) * dy, one.y[::-1])
     assert (keys[3075], keys[3089], keys[3088]) == (12, ORIGIN.latitude, ORIGIN.longitude)
     (description,) = ElementTree.fromstring(tags[42112])
     assert unescape(description.text) == "hall & <stairs>"

@@ -137,3 +137,17 @@ def test_suggested_positions_beat_random_ones(generator):
     torch.testing.assert_close(left[-1], remaining(chosen), atol=1e-5, rtol=1e-4)
     random = [remaining(torch.randperm(200, generator=generator)[:8]) for _ in range(20)]
     assert left[-1] < min(random)
+
+
+@pytest.mark.parametrize(("n", "places"), [(200, 1), (200, 7), (2100, 3)])
+def test_repeated_positions_without_noise_have_an_answer(n, places):
+    place = torch.rand(places, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    position = place[torch.arange(n) % places]
+    value, kernel = position.sum(dim=1, keepdim=True), Kernel(1.0, 1.0, noise=0.0)
+    process = GaussianProcess(kernel, position, value)
+    for one in (process, process.updated(position[:5], value[:5])):
+        torch.testing.assert_close(one.mean(place), place.sum(dim=1, keepdim=True), atol=1e-6, rtol=0)
+        assert one.variance(place).max() < 1e-6
+    for out, kept, weight, _ in leave_folds_out(kernel, position, torch.arange(n) // places % 2):
+        torch.testing.assert_close(weight @ value[kept], value[out], atol=1e-5, rtol=0)
+    assert len(most_informative(kernel, position, torch.rand(9, 3), 2)[0]) == 2

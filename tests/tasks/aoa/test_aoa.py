@@ -302,11 +302,17 @@ def test_networks_are_seeded_and_leave_the_global_generator_alone(room, kind):
     assert torch.equal(torch.get_rng_state(), state)
 
 
-def pretended(monkeypatch, room, errors):
-    """Return the cross-validation for four folds with these errors by fold and number of synthetic positions."""
-    monkeypatch.setattr(cross_validation, "held_out_errors", lambda fold, _, number, seed: errors(fold.test, number))
-    model = make_model("idw").fit(room)
-    folds = [SimpleNamespace(model=model, test=fold) for fold in range(4)]
+def pretended(monkeypatch, room, errors, repeats=1):
+    """Return the cross-validation for four folds with these errors by fold and number of synthetic positions.
+
+    So many consecutive spectra of a fold are at one place.
+    """
+    monkeypatch.setattr(cross_validation, "held_out_errors", lambda fold, _, number, seed: errors(fold.number, number))
+    model, folds = make_model("idw").fit(room), []
+    for fold in range(4):
+        position = torch.full((len(errors(fold, 0)), 3), float(fold))
+        position[:, 0] = torch.arange(len(position)) // repeats
+        folds.append(SimpleNamespace(model=model, number=fold, test=SimpleNamespace(position=position)))
     return cross_validation.cross_validate(folds, n_synthetic=3000, seed=0)[0]
 
 
@@ -334,6 +340,18 @@ def test_the_interval_of_cross_validation_is_that_of_the_rule(monkeypatch, room)
     expected = np.median([drawn[fold, number] for fold, number in best.items()])
     assert given["rule"]["median_deg"] == pytest.approx(expected)
     assert given["rule"]["median_deg"] > min(gain["median_deg"] for gain in given["gains"])
+
+
+def test_held_out_spectra_of_one_place_count_once_in_the_interval_of_a_gain(monkeypatch, room):
+    generator = np.random.default_rng(2)
+    drawn = {fold: generator.uniform(0.5, 1.5, 10).repeat(6) for fold in range(4)}
+
+    def errors(fold, number):
+        return drawn[fold][:: -1 if number else 1]
+
+    alone, together = (pretended(monkeypatch, room, errors, repeats) for repeats in (1, 6))
+    for found, other in zip([alone["rule"], *alone["gains"]], [together["rule"], *together["gains"]], strict=True):
+        assert other["high"] - other["low"] > 1.8 * (found["high"] - found["low"])
 
 
 def test_a_training_is_as_long_as_the_scene_needs():

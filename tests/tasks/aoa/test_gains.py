@@ -11,7 +11,7 @@ from pandas import DataFrame
 from augment.cross_validation import LOCATOR
 from augment.turbo.condition import Condition, MeasuredSubset, pooled
 from augment.turbo.experiment import Experiment
-from augment.turbo.results import TurboResult, repeated_summary, summaries
+from augment.turbo.results import TurboResult, summaries
 from swiftwrf import simulated_room
 from swiftwrf.metrics import median_interval, paired_change
 from swiftwrf.metrics import summary as error_summary
@@ -45,13 +45,19 @@ def test_the_interval_of_a_change_covers_the_truth_as_often_as_it_says():
     assert covered >= 52  # 95 % of 60 are 57
 
 
+def summary_of(values):
+    """Return the summary of errors (rows, repeats), each row at a place of its own."""
+    index, repeat = (number.ravel() for number in np.indices(values.shape))
+    table = DataFrame({"index": index, "place": index, "repeat": repeat, "error": values.ravel()})
+    return summaries(table.assign(method="a"), "method", ["error"])["a"]["error"]
+
+
 def test_a_median_over_repeats_is_that_of_all_errors():
     """One error of three is large, of another repeat in each row."""
     rows = np.arange(60)
-    table = DataFrame([(row, repeat, 30.0 if repeat == row % 3 else 0.1) for row in rows for repeat in range(3)])
-    found = summaries(table.set_axis(["index", "repeat", "error"], axis=1).assign(method="a"), "method", ["error"])
-    assert found["a"]["error"]["median"] == 0.1
-    assert found["a"]["error"]["n"] == 60
+    found = summary_of(np.where(rows[:, None] % 3 == np.arange(3), 30.0, 0.1))
+    assert found["median"] == 0.1
+    assert found["n"] == 60
 
 
 def test_intervals_over_repeats_contain_the_true_median_at_the_stated_rate():
@@ -60,7 +66,7 @@ def test_intervals_over_repeats_contain_the_true_median_at_the_stated_rate():
     covered = alike = 0
     for _ in range(200):
         values = generator.normal(size=(80, 1)) + generator.normal(size=(80, 3)) / 2
-        found = repeated_summary(values)
+        found = summary_of(values)
         covered += found["low"] <= 0 <= found["high"]
         alike += median_interval(values.ravel())[0] <= 0 <= median_interval(values.ravel())[1]
     assert covered >= 182  # 95 % of 200 are 190
@@ -69,7 +75,7 @@ def test_intervals_over_repeats_contain_the_true_median_at_the_stated_rate():
 
 def test_one_repeat_has_the_interval_of_independent_values():
     values = np.random.default_rng(3).gamma(2, size=(50, 1))
-    assert repeated_summary(values) == error_summary(values.ravel())
+    assert summary_of(values) == error_summary(values.ravel())
 
 
 def results_of(errors):

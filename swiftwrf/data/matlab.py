@@ -1,0 +1,97 @@
+"""Arrays of numbers in MATLAB files (MathWorks, "MAT-File Format").
+
+SciPy's parser of version 5 is compiled and believes the sizes in a file: one damaged byte can end the process.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.io import loadmat, whosmat
+
+TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}  # of elements
+MATRIX, COMPRESSED = 14, 15  # types of variables
+OPAQUE, NUMBERS = 17, range(6, 16)  # classes of variables: an object without shape, and double to uint64
+CLASS, COMPLEX = 0xFF, 0x800  # bits of the flags of a variable
+HEAD_BYTES = 1024  # of flags, shape and name, at most
+Stored = tuple[int, Callable[[], NDArray[Any]]]  # bytes of an array in memory, and what reads it
+
+
+def matlab_arrays(file: Path) -> dict[str, Stored]:
+    """Return the bytes in memory of each variable, at most, and the function that reads it.
+
+    Raises:
+        Exception: The file is broken. The functions raise it, too, and for a variable that holds no numbers.
+    """
+    found: dict[str, Stored] = {}
+    with file.open("rb") as stream:
+        header, end = stream.read(128), file.stat().st_size
+        if 0 in header[:4]:  # version 4, whose parser is not compiled
+            known = [(name, shape) for name, shape, kind in whosmat(file) if kind not in ("char", "sparse")]
+            return {name: (16 * math.prod(shape), partial(_of_version_4, file, name)) for name, shape in known}
+        order = {b"IM": "<", b"MI": ">"}[header[126:]]
+        while tag := stream.read(8):
+            kind, size = np.frombuffer(tag, f"{order}u4", 2).tolist()
+            start = stream.tell()
+            if kind not in (MATRIX, COMPRESSED) or start + size > end:
+                raise ValueError("a variable is not complete")
+            content = partial(_content, file, start, size, kind == COMPRESSED)
+            flags, shape, name = islice(_elements(content(HEAD_BYTES), order), 3)
+            text = (shape if flags[0] & CLASS == OPAQUE else name).tobytes().decode()
+            if text in found:
+                raise ValueError(f"{text} is stored twice")
+            sizes = shape.tolist()
+            found[text] = 16 * math.prod(sizes), partial(_array, content, order, int(flags[0]), sizes)  # if complex
+            stream.seek(start + size)
+    return found
+
+
+def _of_version_4(file: Path, name: str) -> NDArray[Any]:
+    return np.ascontiguousarray(loadmat(file, variable_names=[name])[name])
+
+
+def _content(file: Path, start: int, size: int, is_compressed: bool, most: int) -> bytes:
+    """Return the elements of a variable from its bytes in the file, at most so many bytes."""
+    with file.open("rb") as stream:
+        stream.seek(start)
+        if not is_compressed:
+            return stream.read(min(size, most))
+        return zlib.decompressobj().decompress(stream.read(size), most + 8)[8:]  # without the tag inside
+
+
+def _elements(content: bytes, order: str) -> Iterator[NDArray[Any]]:
+    """Yield the elements of a variable: flags, shape, name, real and imaginary parts."""
+    at = 0
+    while at < len(content):
+        kind, size = np.frombuffer(content, f"{order}u4", 2, at).tolist()
+        start, step = at + 8, 8 + -(-size // 8) * 8
+        if kind >> 16:  # a small element, whose tag contains it
+            kind, size, start, step = kind & 0xFFFF, kind >> 16, at + 4, 8
+        if kind not in TYPES:
+            raise ValueError(f"it has an element of the unknown type {kind}")
+        dtype = np.dtype(order + TYPES[kind])
+        yield np.frombuffer(content, dtype, size // dtype.itemsize, start)
+        at += step
+
+
+def _array(content: Callable[[int], bytes], order: str, flags: int, shape: list[int]) -> NDArray[Any]:
+    """Return a variable, in the type in which it is stored."""
+    if flags & CLASS not in NUMBERS:
+        raise ValueError("it holds a cell, structure, text or object, expected numbers")
+    count = math.prod(shape)
+    parts = list(islice(_elements(content(17 * count + HEAD_BYTES), order), 3, None))
+    if len(parts) != 1 + bool(flags & COMPLEX) or any(len(part) != count for part in parts):
+        raise ValueError(f"an array does not hold the {shape} numbers that it claims")
+    values = parts[0].astype(parts[0].dtype.newbyteorder("="))
+    if len(parts) > 1:
+        values = values.astype(np.result_type(values, np.complex64))
+        values.imag = parts[1]
+    return np.ascontiguousarray(values.reshape(shape, order="F"))
