@@ -102,13 +102,10 @@ def _positions_of_rssi(locator: RssiLocator, data: Rssi, track: float | None, tr
 
 
 def _positions_of_spectra(locator: MatchedField, store: Store, known: Spectra | None, track: float | None) -> Columns:
-    known = None if known is None else locator.room.link.aligned(known)
     found: list[Tensor] = []
     index = torch.arange(len(store)) if known is None else known.index
-    batches: Iterable[Tensor] = (part for batch in store.batches() for part in batch.split(BATCH_ROWS))
-    if locator.by_channels and known is not None and known.channel is not None:
-        batches = known.channel.split(BATCH_ROWS)
-    posteriors: Iterable[Posterior] = map(locator.locate, batches)
+    rows = torch.arange(len(store)).split(BATCH_ROWS)
+    posteriors: Iterable[Posterior] = (locator.locate(store[some] if known is None else known[some]) for some in rows)
     if track is not None:
         posteriors = _tracked(posteriors, index.double(), track)
 

@@ -9,7 +9,7 @@ import secrets
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from os.path import isfile  # unlike Path.is_file, it is False for names that are too long
 from pathlib import Path
@@ -116,10 +116,10 @@ class Claim:
         self._lock.release()
 
 
-def _versions(environment: Row) -> dict[str, str]:
-    """Return the versions on which the results of a run depend: of the packages, and the commit of this project."""
-    packages = environment.get("packages")
-    return (packages if isinstance(packages, dict) else {}) | {"commit": environment.get("commit") or "unknown"}
+def _origin(environment: Row) -> dict[str, str]:
+    """Return what decides the results of a run: digests of its input, versions of packages, commit of this project."""
+    found = [part for name in ("input_sha256", "packages") if isinstance(part := environment.get(name), dict)]
+    return {"commit": environment.get("commit") or "unknown"} | {name: x for part in found for name, x in part.items()}
 
 
 @contextmanager
@@ -144,23 +144,20 @@ def new_directory(out: Path, what: str) -> Iterator[Path]:
             shutil.rmtree(unfinished)
 
 
-def check_new_file(out: Path, option: str = "") -> None:
+def check_new_file(out: Path, suffixes: Sequence[str], option: str = "") -> None:
     """Refuse the place of a file that a command is to write.
 
     Raises:
-        InputError: `out` exists already, or its folder does not exist.
+        InputError: Another suffix than those that are written, `out` exists already, or its folder does not exist.
     """
     if os.path.lexists(out):
         raise InputError(f"{option}{out} exists already and is never overwritten; choose another")
     if not out.parent.is_dir():
         raise InputError(f"{option}{out} lies in {out.parent}, which is no directory")
-
-
-def unchanged_environment(folder: Path, source: dict[str, str]) -> Row:
-    """Return the environment in which a run began; refuse other input, by the SHA-256 of everything that it reads."""
-    found = read_json(folder / ENVIRONMENT)
-    check_unchanged(folder, found.get("input_sha256"), source)
-    return found
+    if out.suffix.lower() not in suffixes:
+        raise InputError(
+            f"{option}{out} must end in {' or '.join(suffixes)}, which can be written; choose another name"
+        )
 
 
 class Run(Memo):
@@ -232,19 +229,14 @@ class Run(Memo):
         self.write_json(CONFIG, {"task": task, "command": invocation(task), "config": values})
 
     def _go_on(self, device: torch.device, source: dict[str, str], processes: int | None) -> None:
-        self._environment = unchanged_environment(self.folder, source)
+        self._environment = read_json(self.folder / ENVIRONMENT)
         threads = self._environment.get("threads")
         if not isinstance(threads, int) or not 1 <= threads <= 1024:
             threads = torch.get_num_threads()
         self.processes = number_of_processes(device, processes, threads)
         set_threads(threads)  # they are part of the seed
         here = environment(device, source, self.processes)
-        versions, own = _versions(self._environment), _versions(here)
-        if versions != own:
-            other = ", ".join(f"{name} {version}" for name, version in versions.items() if own.get(name) != version)
-            raise InputError(
-                f"{self.folder} began with {other or 'other libraries'}; go on with these or start a new run"
-            )
+        check_unchanged(self.folder, _origin(self._environment), _origin(here))
         session = {name: here[name] for name in ("commit", "start", "processes", "device")}
         self._environment["resumed"] = [*self._environment.get("resumed", []), session]
         self.write_json(ENVIRONMENT, self._environment)

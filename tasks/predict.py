@@ -39,10 +39,11 @@ def run(config: PredictConfig) -> None:
             apply to the model, or `out` exists.
     """
     out = Path(config.out or f"predicted-{stamp()}.csv")
-    check_new_file(out, "--out ")
+    check_new_file(out, (".csv", ".mat"), "--out ")
     file = saved_file(Path(config.model))
     model = load(file)
     at_positions = isinstance(model, FieldModel | RssiPredictor)
+    check_new_file(out, (".csv", ".mat") if at_positions else (".csv",), "--out ")
     for kinds, options in (("RSSI", config.table), ("spectra", config.spectra)):
         is_read = not at_positions and isinstance(model, RssiLocator) == (kinds == "RSSI")
         if not is_read and (unused := given(options)):

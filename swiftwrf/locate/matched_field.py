@@ -104,11 +104,6 @@ class MatchedField(Configured, Saved):
         """Grid of the training spectra."""
         return self.room.grid
 
-    @property
-    def by_channels(self) -> bool:
-        """True if the locator was fitted to channels, and locates by these."""
-        return isinstance(self.likelihoods, ChannelLikelihoods)
-
     @all_or_nothing
     @checked
     def fit(

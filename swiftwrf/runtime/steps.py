@@ -38,16 +38,18 @@ def packages() -> dict[str, str]:
 
 
 def check_unchanged(folder: Path, before: Any, now: Mapping[str, str]) -> None:
-    """Refuse to continue what began with other input, by the digests or versions of all that decides the results.
+    """Refuse to continue what began with other input, by the digests and versions of all that decides the results.
 
     Raises:
-        InputError: They differ; the message names those that do.
+        InputError: They differ; the message names those that do, and earlier versions.
     """
     if before != now:
         before = before if isinstance(before, dict) else {}
         changed = sorted(name for name in {*before, *now} if before.get(name) != now.get(name))
+        was = (f"{name} {known}" if len(known := str(before.get(name, ""))) < 64 else name for name in changed)
         raise InputError(
-            f"the input has changed since {folder} began ({', '.join(changed)}); restore it or begin in a new folder"
+            f"the input or a version has changed since {folder} began ({', '.join(map(str.strip, was))}); restore it or "
+            "begin in a new folder"
         )
 
 

@@ -20,13 +20,13 @@ from swiftwrf.online import Follower
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime import checkpoint
 from swiftwrf.runtime.durable import write_json
-from swiftwrf.runtime.steps import MODEL
+from swiftwrf.runtime.steps import MODEL, check_unchanged
 from tasks.configs import UpdateConfig
-from tasks.directory import Claim, begun, new_directory, unchanged_environment
+from tasks.directory import Claim, begun, new_directory
 from tasks.environment import environment, invocation
 from tasks.options import plain
 from tasks.page.page import write_page
-from tasks.records import CONFIG, ENVIRONMENT
+from tasks.records import CONFIG, ENVIRONMENT, read_json
 from tasks.source import aligned, located, reading, with_groups
 from tasks.terminal import console, terminal
 from tasks.update.lines import answer, check_source, lines, measurement
@@ -113,7 +113,7 @@ def _followed(folder: Path, digests: dict[str, str]) -> Iterator[Path]:
     """
     is_continued = (folder / ENVIRONMENT).exists() and (folder / SUMMARY).exists()  # other updates have no environment
     if is_continued:
-        unchanged_environment(folder, digests)
+        check_unchanged(folder, read_json(folder / ENVIRONMENT).get("input_sha256"), digests)
     elif folder.exists() and (not folder.is_dir() or begun(folder)):
         raise InputError(f"{folder} exists already and holds no run of update --follow; choose another --out")
     claim = Claim(folder, new=not is_continued)

@@ -125,7 +125,9 @@ def test_kept_results_are_those_of_one_call(tmp_path, task):
     pd.testing.assert_frame_equal(compare(**options, keep=Memo(tmp_path), executor=None).summary(), first)
     for other, change, named in OTHER_CALLS:
         if other == task:
-            with pytest.raises(InputError, match=rf"the input has changed since .* began \({named}\); restore it or"):
+            with pytest.raises(
+                InputError, match=rf"the input or a version has changed since .* began \({named}\); restore it or"
+            ):
                 compare(**options | change, keep=Memo(tmp_path))
     pd.testing.assert_frame_equal(compare(**options, keep=Memo(tmp_path)).summary(), first)
 

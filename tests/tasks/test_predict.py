@@ -175,6 +175,19 @@ def test_spectra_and_rssi_at_the_positions_of_a_table(small, tmp_path):
     assert all(len(text.rpartition(".")[2]) <= 2 for text in table["predicted_dbm"].astype(str))
 
 
+@pytest.mark.parametrize("suffix", [".xlsx", ".mat", "", ".parquet"])
+def test_tables_of_other_kinds_are_refused(finished, small, tmp_path, capsys, suffix):
+    """A table of directions is CSV; predictions at positions are MATLAB files, too."""
+    make_model("idw").fit(small).save(tmp_path / "field.safetensors")
+    pd.DataFrame(small.position[:5].numpy(), columns=["x", "y", "z"]).to_csv(tmp_path / "at.csv", index=False)
+    np.save(tmp_path / "spectra.npy", small.spectrum.numpy())
+    estimator, out = finished / "kernel_regression-mix0.5.safetensors", tmp_path / f"out{suffix}"
+    assert run("predict", estimator, tmp_path / "spectra.npy", "--out", out) == 2
+    assert "must end in .csv" in said(capsys)
+    code = run("predict", tmp_path / "field.safetensors", tmp_path / "at.csv", "--out", out)
+    assert (code, out.exists()) == ((0, True) if suffix == ".mat" else (2, False))
+
+
 def test_positions_on_floors_have_the_heights_of_the_measurements(tmp_path, capsys):
     draw = np.random.default_rng(0)
     survey = pd.DataFrame(draw.uniform(0, 9, (60, 2)), columns=["x", "y"])

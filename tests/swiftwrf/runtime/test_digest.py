@@ -173,7 +173,7 @@ def test_a_folder_without_results_takes_any_call(tmp_path):
     memo.of({"seed": 1, "progress": True})
     memo.keep("a", {"value": 1}, 0.0)
     Memo(tmp_path).of({"seed": 1, "progress": False})
-    with pytest.raises(InputError, match=r"the input has changed since .* began \(seed\)"):
+    with pytest.raises(InputError, match=r"the input or a version has changed since .* began \(seed\)"):
         Memo(tmp_path).of({"seed": 2})
 
 
