@@ -24,7 +24,7 @@ NAMES = ("Ground floor", "1")
 
 @pytest.fixture(scope="module")
 def building(tmp_path_factory):
-    """A run on two floors, weak signals above, where every packet is detected: folder, and what the terminal says."""
+    """A run on two floors, weak signals above, where every packet is detected: folder and terminal."""
     folder = tmp_path_factory.mktemp("building")
     data = rssi_room(n=90).columns([0, 5, 11])
     position, rssi = data.transmitter_position.clone(), data.rssi_dbm.nan_to_num(-66.0) - 6.7
