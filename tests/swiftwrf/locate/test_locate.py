@@ -27,9 +27,9 @@ from swiftwrf.models.geometry.path_gains import PathGains
 
 SMALL = {"n_best": 60, "n_background": 40, "n_split": 8, "spacing": 0.4, "n_calibration": 40}
 ROOM = [
-    Plane((-1.0, 0.0, 0.0), 0.0, -0.6, 0.1, True),
-    Plane((0.0, 1.0, 0.0), 5.0, -0.6, 0.1, True),
-    Plane((0.0, 0.0, -1.0), 0.0, -0.6, 0.1, True),
+    Plane((-1.0, 0.0, 0.0), 0.0, -0.6, 0.1),
+    Plane((0.0, 1.0, 0.0), 5.0, -0.6, 0.1),
+    Plane((0.0, 0.0, -1.0), 0.0, -0.6, 0.1),
 ]
 
 
