@@ -1,14 +1,20 @@
 """tasks.inspect on valid measurements: findings and page. Wrong ones are in test_wrong_conventions.py."""
 
 import json
+import re
 
+import numpy as np
 import pytest
 import quick
 import torch
 from samples import WAVELENGTH, snapshots, write_snapshots, write_survey
+from scipy.spatial.distance import cdist
 
-from swiftwrf import AngularGrid, simulated_room
+from swiftwrf import AngularGrid, rssi_room, simulated_room
 from swiftwrf.data.writing import write_spectra
+from swiftwrf.diagnostics.inspection import Findings
+from tasks.configs import InspectConfig
+from tasks.inspect import page
 
 
 def run(*arguments):
@@ -61,3 +67,31 @@ def test_positions_that_repeat(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "30 rows are at 15 different positions" in said
     assert "other position is 0.000 m" not in said
+
+
+def test_the_page_of_spectra_has_the_numbers_of_the_data():
+    data = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
+    shown, position = page(Findings(data), "spectra", InspectConfig("a")), data.position.numpy()
+    plan, directions, neighbours = shown.plots
+    sides = [float(side) for side in re.findall(r"\d+\.\d+", shown.summary.numbers[-1].value)]
+    assert sides == pytest.approx(np.ptp(position, axis=0), abs=0.00501)
+    for panel, axes in zip(plan.panels, ([0, 1], [0, 2]), strict=True):
+        arrows = panel.axes[0].collections[0]
+        assert np.stack([arrows.U, arrows.V]) == pytest.approx(
+            0.25 * max(sides) * data.rotation.numpy()[axes], rel=0.01
+        )
+    (azimuth, elevation), (a, e) = data.grid.peak_direction(data.spectrum).T.numpy(), data.label.T.numpy()
+    cosine = np.sin(elevation) * np.sin(e) + np.cos(elevation) * np.cos(e) * np.cos(azimuth - a)
+    away = np.rad2deg(np.arccos(cosine))[data.line_of_sight.numpy()]
+    assert directions.data["peak_from_line_deg"].to_numpy() == pytest.approx(away, abs=1e-3)
+    nearest = np.sort(cdist(position, position), axis=1)[:, 1]
+    assert neighbours.data["nearest_m"].to_numpy() == pytest.approx(nearest)
+    assert neighbours.panels[0].axes[0].lines[0].get_xdata()[0] == pytest.approx(data.array.wavelength / 2)
+
+
+def test_the_page_of_a_survey_has_the_numbers_of_the_data():
+    data = rssi_room(n=30)
+    plan, path_loss = page(Findings(data), "RSSI", InspectConfig("a")).plots
+    assert plan.data["strongest_dbm"].tolist() == np.nanmax(data.rssi_dbm.numpy(), axis=1).tolist()
+    away = cdist(data.transmitter_position.numpy(), data.receiver_position.numpy())[data.detected.numpy()]
+    assert path_loss.data["distance_m"].to_numpy() == pytest.approx(away)

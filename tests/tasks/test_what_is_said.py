@@ -29,6 +29,7 @@ from augment.turbo.results import TurboResult
 from swiftwrf import AngularGrid, Rssi, RssiModel, calibrate, rssi_room, simulated_room
 from swiftwrf.data.cells import seconds
 from swiftwrf.data.coordinates import Floors
+from swiftwrf.data.rssi import Offsets
 from swiftwrf.locate import Posterior
 from swiftwrf.locate.comparison import LocateComparison, LocateSplit
 from swiftwrf.metrics import summary
@@ -120,14 +121,17 @@ def said_of(text):
 
 @pytest.fixture(scope="module")
 def of_rssi():
-    """Fifty test rows at two receivers."""
+    """Fifty test rows at two receivers, by two devices whose offset is known."""
     room = rssi_room(n=60).columns([0, 5])
     train, test = room.subset(torch.arange(30)), room.subset(torch.arange(10, 60))
     position = test.transmitter_position[:25].repeat_interleave(2, 0)
-    test = test.derived(transmitter_position=position, rssi_dbm=torch.full((50, 2), -60.0))
+    groups = pd.Series(["a", "b"] * 25, name="phone")
+    test = test.derived(transmitter_position=position, rssi_dbm=torch.full((50, 2), -60.0), groups=groups)
+    train = train.derived(offsets=Offsets("phone", "a", {"a": 0.0, "b": -8.0}, 0.5))
 
     def value(error):
-        return TIMES | {"predicted": -60 + SIGN * error, "std": None, "detection": None, "n_primitives": 0}
+        without_offset = -60 + SIGN * error + 8 * (N // 2 % 2)
+        return TIMES | {"predicted": without_offset, "std": None, "detection": None, "n_primitives": 0}
 
     values = {name: value(error) for name, error in ERRORS["rssi"].items()}
     values["swiftwrf"] |= {"std": STD, "detection": (0.9, 0.6)}
