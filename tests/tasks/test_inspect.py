@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,10 +10,11 @@ import quick
 import torch
 from samples import WAVELENGTH, snapshots, write_snapshots, write_survey
 from scipy.spatial.distance import cdist
+from test_rssi_model import path_loss_only
 
 from swiftwrf import AngularGrid, rssi_room, simulated_room
 from swiftwrf.data.writing import write_spectra
-from swiftwrf.diagnostics.inspection import Findings
+from swiftwrf.diagnostics.inspection import Findings, inspect
 from tasks.configs import InspectConfig
 from tasks.inspect import page
 
@@ -95,3 +97,39 @@ def test_the_page_of_a_survey_has_the_numbers_of_the_data():
     assert plan.data["strongest_dbm"].tolist() == np.nanmax(data.rssi_dbm.numpy(), axis=1).tolist()
     away = cdist(data.transmitter_position.numpy(), data.receiver_position.numpy())[data.detected.numpy()]
     assert path_loss.data["distance_m"].to_numpy() == pytest.approx(away)
+
+
+def numbers(findings, words):
+    """Return the numbers of the only sentence with these words."""
+    (text,) = [text for _, text in findings.sentences if words in text]
+    return [float(found) for found in re.findall(r"(?<![\w.])-?\d+(?:\.\d+)?", text)]
+
+
+def ranges(position):
+    return [end for axis in position.T.tolist() for end in (min(axis), max(axis))]
+
+
+def test_findings_are_the_numbers_of_snapshots():
+    split = {"walk": (torch.arange(45), torch.arange(45, 60))}
+    time = torch.arange(60.0) ** 3 / 1000
+    data = replace(snapshots(n=60, count=2), line_of_sight=torch.arange(60) < 45, named_splits=split, time=time)
+    found, position = inspect(data, grid=(8, 32)), data.position.numpy()
+    nearest = np.median(np.sort(cdist(position, position), axis=1)[:, 1])
+    for words, expected in (
+        ("snapshots of", [60, 2, 16, 0.5, 2.4]),
+        ("Taken over", [205.4, np.median(np.diff(time))]),
+        ("positions, x", [60, *ranges(position)]),
+        ("nearest other", [nearest, nearest / WAVELENGTH]),
+        ("line of sight, or", [75]),
+        ("Split walk", [45, 15]),
+    ):
+        assert numbers(found, words) == pytest.approx(expected, abs=0.0501), words
+
+
+def test_findings_are_the_numbers_of_a_survey():
+    data = path_loss_only()
+    data.rssi_dbm[:9, 0] = torch.nan
+    found, detected = inspect(data), data.rssi_dbm[data.detected].numpy()
+    extremes = [pytest.approx(end, abs=0.001) for end in (detected.min(), detected.max())]
+    assert numbers(found, "rows of RSSI") == [60, 3, 95, *extremes]
+    assert numbers(found, "Path-loss models") == [100, -50, 1, 2.0]

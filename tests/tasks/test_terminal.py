@@ -88,7 +88,7 @@ def test_one_display_has_the_fraction_of_all_steps():
     assert "inner" not in shown.console.file.getvalue()
 
 
-@pytest.mark.parametrize(("seconds", "words"), [(None, "fit"), (99, "fit, 99 s left"), (150, "fit, 2 min left")])
+@pytest.mark.parametrize(("seconds", "words"), [(None, "fit"), (99, "fit, 99 s left"), (200, "fit, 3 min left")])
 def test_the_time_left_is_in_seconds_or_minutes(seconds, words):
     assert str(_Line().render(SimpleNamespace(description="fit", time_remaining=seconds))) == words
 
