@@ -12,14 +12,16 @@ import pytest
 import small
 import torch
 from fuzz.runs import follow
+from scipy.spatial.distance import cdist
 
 from swiftwrf import AngularGrid, Rssi, RssiModel, load, load_rssi, make_model, rssi_room, simulated_room
 from swiftwrf.data.writing import write_rssi
 from swiftwrf.models.geometry import GeometryModel, Plane
-from swiftwrf.online import Follower
+from swiftwrf.online import Follower, Step
+from swiftwrf.online.scores import Scores
 from swiftwrf.rssi import estimate_offsets
 from tasks.command import run_command
-from tasks.update.record import Record
+from tasks.update.record import Record, map_plot, page
 
 
 @cache
@@ -474,3 +476,29 @@ def test_a_record_comes_back_as_it_was_and_is_cut_to_what_the_model_has_learnt(t
         kept.write(tmp_path)
         assert [row["index"] for row in Record.read(tmp_path).rows] == [41, 42][:number]
         assert kept.table["error"].tolist() == pytest.approx(record.table["error"][:number].tolist(), nan_ok=True)
+
+
+def test_the_numbers_of_a_record_are_those_of_its_measurements(tmp_path):
+    draw, record = np.random.default_rng(0), Record("source", "dB")
+    position, error, covered = draw.random((40, 3)), draw.gamma(2, size=40), draw.random(40)
+    innovation = draw.normal(size=(40, 3))
+    innovation[20:, 1] = np.nan  # not detected
+    for k in range(40):
+        scores = Scores(*(torch.from_numpy(values[k : k + 1]) for values in (position, error, innovation, covered)))
+        record.add(k, Step(scores, ("hall weaker",) * (k == 7), None, ""))
+    root_mean_square = np.sqrt(np.nanmean(innovation**2, axis=1))
+    running = [error[max(0, k - 29) : k + 1].mean() for k in range(40)]
+    for column, values in (("error", error), ("running_error", running), ("innovation", root_mean_square)):
+        assert record.table[column].tolist() == pytest.approx(list(values))
+    shown = page(record, "name", tmp_path)
+    mean, last = f"{error.mean():.3g} dB", f"{running[-1]:.3g} dB"
+    assert [number.value for number in shown.summary.numbers] == ["40", mean, "1", f"{covered.mean():.0%}"]
+    first, second, third = record.sentences()
+    assert first == "1 change detected, 40 measurements learnt."
+    assert (mean in second, second.endswith(f"30: {last}."), "measurement 7" in third) == (True, True, True)
+    cells = shown.sections[0].tables[0].rows
+    assert [int(row[0]) for row in cells] == np.argsort(-root_mean_square)[:10].tolist()
+    worst = root_mean_square.argmax()
+    assert cells[0][1:] == [f"{x:.3g}" for x in (*position[worst], error[worst], root_mean_square[worst])]
+    near = np.argsort(cdist(position, position), axis=1)[:, :5]
+    assert map_plot(record).data["innovation"].tolist() == pytest.approx(root_mean_square[near].mean(axis=1).tolist())

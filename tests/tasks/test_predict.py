@@ -15,7 +15,9 @@ from augment.estimators.aann import AANN
 from augment.estimators.aann_kernel import AANNKernel
 from swiftwrf import AngularGrid, InputError, Rssi, RssiModel, Spectra, load, make_model, rssi_room, simulated_room
 from swiftwrf.data.writing import write_spectra
+from swiftwrf.locate import Posterior
 from swiftwrf.metrics import angle_errors
+from swiftwrf.predicting import _located
 from swiftwrf.runtime.checkpoint import read, write
 from tasks.aoa.page import steps
 from tasks.aoa.records import FractionRecords
@@ -217,3 +219,25 @@ def test_the_directory_of_a_run_is_enough(finished, small, tmp_path, capsys):
     assert run("predict", finished, tmp_path / "new.npy", "--out", tmp_path / "other.csv") == 0
     assert f"applied: {file}" in capsys.readouterr().err.replace("\n", "")
     assert (tmp_path / "one.csv").read_bytes() == (tmp_path / "other.csv").read_bytes()
+
+
+def test_the_columns_of_positions_are_those_of_the_posteriors():
+    """Equal masses on a cross: 0.1 to 1 m along x either way, half as far along y, a tenth along z."""
+    step = torch.arange(-10, 11)[torch.arange(21) != 10] / 10.0
+    at = torch.cat([side * step[:, None] for side in torch.diag(torch.tensor([1, 0.5, 0.1]))]).double()
+    mass = torch.full((2, 60), 1 / 60, dtype=torch.float64).log()
+    found = _located([Posterior(at.expand(2, -1, -1), mass)], torch.arange(2), torch.tensor([[3.0, 0, 4], [0, 0, 1]]))
+    assert [float(found[f"std_{axis}_m"][0]) for axis in "xyz"] == pytest.approx(at.numpy().std(axis=0))
+    assert found["credible_radius_80_m"].tolist() == [0.5, 0.5]
+    assert found["position_error_m"].tolist() == pytest.approx([5, 1])
+
+
+def test_the_median_error_of_a_table(small, monkeypatch, tmp_path, capsys):
+    errors = pd.DataFrame({"great_circle_deg": [1.0, 2.0, 9.0], "position_error_m": [0.1, 0.2, 3.0], "x_m": 0.0})
+    (tmp_path / "a.safetensors").touch()
+    monkeypatch.setattr("tasks.predict.load", lambda file: AANN())
+    monkeypatch.setattr(AANN, "grid", GRID, raising=False)
+    monkeypatch.setattr("tasks.predict.observed_spectra", lambda *_: (small.store, small))
+    monkeypatch.setattr("tasks.predict.predict", lambda *_, **__: errors)
+    assert run("predict", tmp_path / "a.safetensors", tmp_path, "--out", tmp_path / "out.csv") == 0
+    assert "3 positions, median error 2 degrees and 0.2 m" in capsys.readouterr().out

@@ -4,6 +4,7 @@ import io
 import json
 import re
 from html import unescape
+from types import SimpleNamespace
 
 import pytest
 import quick
@@ -11,7 +12,7 @@ from rich.console import Console
 
 from swiftwrf.runtime.progress import progress
 from tasks.options import Output
-from tasks.terminal import Answer, Method, NextStep, Terminal, terminal
+from tasks.terminal import Answer, Method, NextStep, Terminal, _Line, terminal
 
 ERROR = {"median": 2.36, "p90": 7.0, "mean": 3.1, "low": 2.0, "high": 2.9, "n": 40}
 
@@ -85,6 +86,11 @@ def test_one_display_has_the_fraction_of_all_steps():
             seen.append(task.completed / task.total)
     assert seen == [0.5, 0.5, 1.0, 1.0]
     assert "inner" not in shown.console.file.getvalue()
+
+
+@pytest.mark.parametrize(("seconds", "words"), [(None, "fit"), (99, "fit, 99 s left"), (200, "fit, 3 min left")])
+def test_the_time_left_is_in_seconds_or_minutes(seconds, words):
+    assert str(_Line().render(SimpleNamespace(description="fit", time_remaining=seconds))) == words
 
 
 def test_into_a_file_steps_have_a_line_at_their_start_and_their_end():
