@@ -180,4 +180,6 @@ def _maps(model: RssiModel | PairModel, train: Rssi) -> tuple[dict[str, Any], li
         "floor_of_row": number.numpy(),
     }
     maps = maps if train.origin is None else maps | {"origin": np.array(train.origin)}
-    return maps, [found.values for found in coverage]
+    return maps, [
+        {"floor": str(name), **found.values} for name, found in zip(maps["floor_names"], coverage, strict=True)
+    ]

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -153,6 +154,14 @@ def test_a_packet_counts_if_it_is_detected_and_above(threshold):
         expected = 0.8 * norm.sf(threshold, truth, 2.0)
         share = expected[found.inside.ravel()].mean()
         assert found.probability[found.inside].mean() == pytest.approx(share, abs=0.04)
+
+
+def test_unknown_positions_of_receivers_leave_the_coverage_as_it_is():
+    known = rssi_room(n=120)
+    unknown = replace(known, receiver_position=torch.full_like(known.receiver_position, torch.nan))
+    for data in (known, unknown):
+        chart = RssiMap.predict(RssiModel().fit(data), 1.0, detected=True)
+        assert Coverage.of(chart, data, (-75.0, 0.9, 1)).values["covered"] > 0.99
 
 
 def test_held_out_scans_pass_as_predicted():
