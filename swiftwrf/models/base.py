@@ -301,7 +301,7 @@ class FieldModel(Updatable, Configured, Saved, Displayed):
         """Return spectra as the model takes them: snapshots in the order of the training spectra. Refuse other measurements.
 
         Raises:
-            InputError: Another grid or link than that of the training spectra, positions far away from theirs, or a spectrum
+            InputError: Another grid or link than that of the training spectra, positions far away from them, or a spectrum
                 that is not finite.
         """
         if new.grid != self._checked_grid(None):

@@ -117,6 +117,22 @@ def test_what_is_known_of_rssi_comes_back(tmp_path):
     assert load_rssi(tmp_path).groups is None
 
 
+def test_a_walk_of_several_phones_in_degrees_keeps_them(tmp_path, capsys):
+    draw = np.random.default_rng(0)
+    table = pd.DataFrame({"latitude": 48 + draw.uniform(0, 2e-4, 60), "longitude": 11 + draw.uniform(0, 2e-4, 60)})
+    table = table.assign(z=1.0, phone=["old", "new", "other"] * 20, hall=draw.uniform(-80, -50, 60).round(1))
+    table.to_csv(tmp_path / "walk.csv", index=False)
+    assert run(tmp_path / "walk.csv", tmp_path / "own", "--offset-by", "phone=new") == 0
+    data = load_rssi(tmp_path / "walk.csv", offset_by="phone")
+    assert_same(load_rssi(tmp_path / "own"), data)
+    assert_same(load_rssi(tmp_path / "own", offset_by="phone"), data)
+    with pytest.raises(InputError, match="has groups of phone, not of floor; convert the table again by these"):
+        load_rssi(tmp_path / "own", offset_by="floor")
+    assert run(tmp_path / "walk.csv", tmp_path / "without") == 0
+    assert "rows differ in phone" in capsys.readouterr().err
+    assert load_rssi(tmp_path / "without").labels == ("phone",)
+
+
 @pytest.mark.parametrize("column", ["groups", "time"])
 def test_rows_without_a_group_or_time_stay_rows(tmp_path, column):
     """A line without content is no row of a table."""
