@@ -19,6 +19,7 @@ from swiftwrf.data.coordinates import Floors, GeodeticOrigin
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.data.rssi import SURVEY
 from swiftwrf.data.writing import write_rssi, write_spectra
+from swiftwrf.metrics import angle_errors
 
 GRID = ("--grid", 24, 96)
 
@@ -149,6 +150,7 @@ def test_calibration_sees_the_training_part_alone(tmp_path):
     mended = load_spectra(tmp_path / "own")
     usual = snapshots(n=150).spectra(AngularGrid.hemisphere(24, 96))
     assert float((mended.spectrum - usual.spectrum).abs().mean()) < 0.01
+    assert float(angle_errors(mended.label, usual.label)["great_circle"].rad2deg().max()) < 2
     assert {name: (len(a), len(b)) for name, (a, b) in mended.named_splits.items()} == {"block": (120, 30)}
     assert torch.equal(mended.split("block")[1].index, data.split("block", 1)[1].index)
 

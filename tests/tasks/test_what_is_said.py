@@ -58,23 +58,15 @@ OTHER = 0.5 * OWN + 0.2 * np.random.default_rng(0).permutation(100)
 SIGN = np.where(N % 3, 1.0, -1.0)
 STD = np.where(N % 2, 10.0, 60.0)  # of the predictions of RSSI
 ALONG = torch.tensor([0.6, 0.0, 0.8])  # direction of the errors of positions
-TIMES = {
-    "fit": 1.0,
-    "predict": 2.0,
-    "train": 1.0,
-    "estimate": 2.0,
-    "synthesize": 6.0,
-    "draw": 7.0,
-    "room": 8.0,
-    "locate": 9.0,
-}
+TIMES = {"fit": 1.0, "predict": 2.0, "train": 1.0, "estimate": 2.0, "room": 8.0, "locate": 9.0}
+TIMES |= {"synthesize": 6.0, "draw": 7.0}
 GAIN = {"n_synthetic": 300, "median_deg": 1.5, "change": -0.25, "low": -0.4, "high": -0.1}
 GAINS = [GAIN | {"n_synthetic": 1000, "median_deg": 1.7}, GAIN]
 RULE = {"median_deg": 1.6, "change": -0.2, "low": -0.35, "high": -0.05}
 VALIDATION = {"stand_in": "kernel_regression", "n_held_out": 30, "measured_only_deg": 2.0, "gains": GAINS, "rule": RULE}
 ERRORS = {
-    "rssi": {"swiftwrf": OWN, "knn": OTHER, "mean": THIRD},
-    "locate": {"posterior": OWN / 10, "knn": OTHER / 10, "knn_difference": OTHER / 5, "mean": THIRD / 10},
+    "rssi": {"swiftwrf": OWN, "knn": OTHER, "gp": THIRD},
+    "locate": {"posterior": OWN / 10, "knn": OTHER / 10, "knn_difference": OTHER / 5, "gp": THIRD / 10},
     "aoa": {
         "network, measured + synthetic (gp)": OWN / 20,
         "network, measured": OTHER / 10,
@@ -215,7 +207,7 @@ def test_every_table_has_medians_90_percent_and_intervals_over_places(said, task
     terminal = {name: [said_of(cell) for cell in cells] for name, *cells in terminal}
     assert [name for name in terminal if name.startswith("*")] == [f"* {answer.chosen}"]
     terminal = {name[2:]: cells for name, cells in terminal.items()}
-    usable = [name for name in terminal if name in errors and name not in ("mean", "peak")]
+    usable = [name for name in terminal if name in errors and name != "peak"]
     assert usable == sorted(usable, key=lambda name: np.median(errors[name]))
     plain = {one["method"]: one for one in answer.values()["rows"]}
     report = {row[0]: row for row in section.tables[0].rows}
@@ -240,12 +232,12 @@ def test_every_table_has_medians_90_percent_and_intervals_over_places(said, task
 def test_rssi(said):
     run, result = said["rssi"]
     answer, inside = rssi_page.answer(run), norm.ppf(0.9) * STD >= OWN
-    assert rssi_page.best_baseline(run) == "knn"  # its median is less than that of mean, its 90 % are more
+    assert rssi_page.best_baseline(run) == "knn"  # its median is less than that of gp, its 90 % are more
     (sure,) = [text for text in answer.conclusion if "90 % of the errors are below" in text]
     assert said_of(sure) == [90, round(np.quantile(OWN, 0.9), 1), 100 * inside.mean(), 80, 100, 30]
     assert said_of(answer.conclusion[-1]) == difference_of(OWN, OTHER)
     cells = {one.name: [said_of(cell) for cell in one.cells.values()] for one in answer.methods}
-    expected = {name: [difference_of(OWN, ERRORS["rssi"][name]), []] for name in ("knn", "mean")}
+    expected = {name: [difference_of(OWN, ERRORS["rssi"][name]), []] for name in ("knn", "gp")}
     assert cells == expected | {"swiftwrf": [[], [0.75]]}
     assert [80, 100 * inside.mean()] in [said_of(step.text) for step in answer.next_steps]
     shown = [number.value for number in rssi_page._summary(run).numbers][-3:]
@@ -272,9 +264,10 @@ def test_rssi(said):
     for column, away in (("low", -1), ("high", 1), ("predicted", 0)):
         assert table[column].to_numpy() == pytest.approx(-60 + SIGN * OWN + away * norm.ppf(0.9) * STD, abs=0.00501)
     assert np.array_equal(run.arrays("maps")["measured_position"], known)
-    repeated = pd.DataFrame({"x": N // 5, "y": 0, "z": 0, "receiver": "a", "measured": OWN})
+    repeated = pd.DataFrame({"x": np.sqrt(N).astype(int), "y": 0, "z": 0, "receiver": "a", "measured": OWN})
     with mock.patch.dict(run._tables, predictions=repeated):
-        within = np.sqrt(OWN.reshape(20, 5).var(axis=1, ddof=1).mean())
+        squares = [(part - part.mean()) ** 2 for part in np.split(OWN, np.arange(1, 10) ** 2)]
+        within = math.sqrt(np.concatenate(squares).sum() / (100 - 10))
         assert rssi_page.scatter_of_repeats(run) == pytest.approx(2 * norm.ppf(0.9) * within)
 
 
