@@ -48,6 +48,7 @@ from tasks.page.shared import compared, comparison_sentence, coverage_warning
 from tasks.records import CONFIG, Records
 from tasks.rssi import experiment as rssi
 from tasks.rssi import page as rssi_page
+from tasks.source import split_notes
 from tasks.terminal import _table
 from tasks.view.locating import Located
 
@@ -474,6 +475,17 @@ def test_an_interval_contains_its_share_of_draws(level):
 def test_a_lone_place_has_the_range_of_its_errors():
     found = summary([1.0, 2.0, 5.0], [0, 0, 0])
     assert (found["low"], found["high"]) == (1, 5)
+
+
+@pytest.mark.parametrize(("shared", "expected"), [(0, [40, 15]), (4, [40])])
+def test_rows_at_one_position_are_noted(shared, expected):
+    """Thirty training rows are at ten positions, ten test rows at five others, or some of them at a training position."""
+    room = rssi_room(n=40)
+    place = torch.cat([torch.arange(30) // 3, 10 + torch.arange(10) // 2])
+    place[30 : 30 + shared] = 0
+    data = room.derived(transmitter_position=room.transmitter_position[place])
+    (note,) = split_notes(data.subset(torch.arange(30)), data.subset(torch.arange(30, 40)), "random")
+    assert said_of(note) == expected
 
 
 class Known(RssiPredictor):
