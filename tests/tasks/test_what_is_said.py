@@ -1,4 +1,4 @@
-"""What results say is what they are: printed numbers against plain NumPy, on results whose truth is known.
+"""Numbers that results print, compared with plain NumPy on results of known truth.
 
 Errors are 0 to 99, skewed so that mean and median order methods otherwise, four of similar size at each of 25 places.
 """
