@@ -244,6 +244,7 @@ def test_rssi(said):
     shown = [number.value for number in rssi_page._summary(run).numbers][-3:]
     assert shown == [f"{np.median(OWN):.2f} dB", f"{np.median(OTHER):.2f} dB", f"{inside.mean():.0%}"]
     assert (run.metrics["n_train"], run.metrics["n_test"]) == (30, 50)
+    assert any("b -8.0 dB" in note for note in run.metrics["notes"])
     for name, line in zip(("swiftwrf", "knn"), rssi_page._by_rows(run)[0].axes[0].lines, strict=True):
         assert (line.get_xdata().tolist(), line.get_ydata().tolist()) == ([10, 30], result.by_rows[name].tolist())
     (plot,) = rssi_page._differences(run)
@@ -326,6 +327,7 @@ def test_directions(said):
     turbo, alone = errors["network, measured + synthetic (gp)"], errors["network, measured"]
     found, sure, against = answer.conclusion
     median, low, high = median_of(turbo)
+    assert said_of(repr(result)) == [4, median]
     assert said_of(found) == [median, 90, round(np.quantile(turbo, 0.9), 1)]
     assert said_of(sure) == [95, low, high, 100, 30, 60]
     changes = [change_of(turbo, alone), change_of(turbo, errors["peak"])]
