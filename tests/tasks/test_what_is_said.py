@@ -28,7 +28,7 @@ from augment.turbo.experiment import Experiment
 from augment.turbo.results import TurboResult
 from swiftwrf import AngularGrid, Rssi, RssiModel, calibrate, rssi_room, simulated_room
 from swiftwrf.data.cells import seconds
-from swiftwrf.data.coordinates import Floors
+from swiftwrf.data.coordinates import Floors, GeodeticOrigin
 from swiftwrf.data.rssi import Offsets
 from swiftwrf.locate import Posterior
 from swiftwrf.locate.comparison import LocateComparison, LocateSplit
@@ -567,3 +567,14 @@ def test_synthetic_positions_are_as_near_as_the_positions_lie():
 def test_the_near_field_begins_at_30_centimetres():
     at = torch.tensor([[0.1, 0, 0], [0.3, 0, 0], [0.5, 0, 0], [2.0, 0, 0]])
     assert log_distance(at, torch.zeros(1, 3))[:, 0].tolist() == pytest.approx(np.log10([0.3, 0.3, 0.5, 2.0]).tolist())
+
+
+def test_degrees_are_metres_of_the_ellipsoid():
+    """A step of 1e-4 degrees north and 2e-4 east, by the radii of curvature of WGS84."""
+    for latitude, longitude in ((48.0, 11.0), (-33.9, -70.2)):
+        flat = 1 - 0.00669437999014 * math.sin(math.radians(latitude)) ** 2
+        north = math.radians(1e-4) * 6378137 * (1 - 0.00669437999014) / flat**1.5
+        east = math.radians(2e-4) * 6378137 / math.sqrt(flat) * math.cos(math.radians(latitude))
+        origin, degrees = GeodeticOrigin(latitude, longitude), np.array([[latitude + 1e-4, longitude + 2e-4]])
+        assert origin.to_metres(degrees)[0] == pytest.approx([east, north], abs=1e-3)
+        assert origin.to_degrees(np.array([[east, north]])) == pytest.approx(degrees, abs=1e-8)
