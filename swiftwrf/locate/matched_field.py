@@ -208,10 +208,12 @@ class MatchedField(Configured, Saved):
                 both.
 
         Raises:
-            InputError: Spectra on another grid, no channels where the training data had them, a number that is not finite,
-                or a locator that is not fitted.
+            InputError: No row, spectra on another grid, no channels where the training data had them, a number that is not
+                finite, or a locator that is not fitted.
         """
         self.check_fitted()
+        if not len(spectrum):
+            raise InputError("there is no row to locate")
         observed = self.likelihoods.features(spectrum, self.config.seed)
         parts = list(self._searched(observed, self.likelihoods))
         position = torch.cat([cells.position for cells, _ in parts])
