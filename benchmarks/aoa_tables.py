@@ -37,6 +37,12 @@ def turbo_condition(mix: dict[str, Any]) -> Condition:
     return chosen(conditions_of(mix["methods"]).values())
 
 
+def reference(mix: dict[str, Any]) -> str:
+    """Return the estimator of smallest median error among those without synthetic spectra, in words."""
+    name: str = mix["reference"]
+    return name.partition(",")[0].replace("_", " ")
+
+
 def change_text(found: ChangeMetrics) -> str:
     """Return a change with its interval."""
     return f"{found['change']:+.0%} [{found['low']:+.0%}, {found['high']:+.0%}]"
@@ -51,7 +57,7 @@ def aoa() -> str:
         median = {name: f"{method['great_circle_deg']['median']:.2f}" for name, method in methods.items()}
         cells = [
             median["peak"],
-            f"{median[best]} ({best.partition(',')[0].replace('_', ' ')})",
+            f"{median[best]} ({reference(mix)})",
             median[MEASURED_NETWORK],
         ]
         cells += [median[turbo], change_text(methods[turbo]["changes"][MEASURED_NETWORK])]
@@ -65,6 +71,7 @@ def aoa() -> str:
 WALLS = {  # offset of each wall [m] along -x, +x, -y, +y, -z, +z
     "newrf-bedroom": (-2.28, 2.28, -2.28, 2.28, 0.0, 3.0),
     "newrf-office": (0.010, 5.010, 0.016, 8.016, 0.0, 3.2),
+    "newrf-conference": (-1.5, 1.5, -1.5, 1.5, 0.0, 2.5),
     "simulated-room": (0.0, 6.0, 0.0, 5.0, 0.0, 3.0),
 }
 PARALLEL = 0.9  # cosine between a wall's normal and a plane's, above which it may be that wall

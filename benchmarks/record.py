@@ -6,7 +6,7 @@ import json
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,6 +20,7 @@ ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
 CPU = torch.device("cpu")
 Options = TypeVar("Options")
+loaded: list[str] = []  # names of the results that were read
 
 
 def options(config_type: type[Options]) -> Options:
@@ -55,6 +56,7 @@ def _provenance(command: str, environment: dict[str, Any]) -> dict[str, Any]:
     return {
         "command": command,
         "commit": environment["commit"],
+        "date": environment["start"][:10],
         "versions": environment["packages"],
         "machine": environment["device"],
     }
@@ -87,9 +89,32 @@ def write_result(
 
 def load(name: str) -> dict[str, Any]:
     """Return one result, empty if it was not measured yet."""
+    loaded.append(name)
     file = RESULTS / f"{name}.json"
     content: dict[str, Any] = json.loads(file.read_text()) if file.is_file() else {}
     return content
+
+
+def origins(name: str) -> list[dict[str, Any]]:
+    """Return the provenance of each row of a result, or of the result as a whole if its rows have none."""
+
+    def rows(content: Any) -> Iterator[dict[str, Any]]:
+        if isinstance(content, dict):
+            yield from [content["provenance"]] if "provenance" in content else []
+            content = list(content.values())
+        for part in content if isinstance(content, list) else []:
+            yield from rows(part)
+
+    content = load(name)
+    whole = _provenance(content["command"], content["environment"])
+    return [{"date": whole["date"], **row} for row in rows(content)] or [whole]
+
+
+def age(names: Iterable[str]) -> str:
+    """Return when and at which commits results were measured, as a sentence."""
+    found = {(row["date"], row["versions"]["swiftwrf-tasks"], row["commit"]) for name in names for row in origins(name)}
+    ends = [f"{date} (version {number}, commit {commit})" for date, number, commit in (min(found), max(found))]
+    return f"Measured on {ends[0]}." if len(found) == 1 else f"Measured from {ends[0]} to {ends[1]}."
 
 
 def kept(name: str, key: str) -> Any:

@@ -1,11 +1,17 @@
-"""Compare all predictors on every measured RSSI data set: errors on the same test pairs, intervals and seconds.
-
-`identity` is `swiftwrf` with heads whose primitives are in phase in all directions, so that they do not change the field.
+"""Compare all predictors on every measured RSSI data set, and count held-out scans where coverage is predicted.
 
 python benchmarks/rssi.py --data DATA
+python benchmarks/rssi.py coverage --data DATA
 
-Every predictor is fitted to the training rows of a split and predicts its test rows. The result is
-written after each split, and `--resume` skips the splits that it contains.
+`errors`: every predictor is fitted to the training rows of a split and predicts its test rows. `identity` is `swiftwrf` with
+heads whose primitives are in phase in all directions, so that they do not change the field.
+
+`coverage`: `swiftwrf` is fitted to the training rows of simulated floors and of measured sets with several receivers. The
+probability that any receiver is above a threshold is compared with the test scans that pass. The correlation of errors in a
+scan (`swiftwrf.rssi.coverage.CORRELATION`) is the one with the lowest Brier score on a fifth of the training rows, which the
+fit for it leaves out.
+
+The result is written after each split, and `--resume` skips the splits that it contains.
 """
 
 from __future__ import annotations
@@ -15,18 +21,20 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 from unittest.mock import patch
 
 import torch
+import tyro
 from record import kept, options, write_result
 from torch import Tensor
 
-from swiftwrf import Rssi, load_rssi
+from swiftwrf import Rssi, load_rssi, rssi_room
 from swiftwrf.metrics import method_summary, summary
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.rssi import LEVEL, RssiModel
 from swiftwrf.rssi.comparison import compare
+from swiftwrf.rssi.coverage import at_least, reach
 from swiftwrf.rssi.head import DB_PER_UNIT, Head, render
 from swiftwrf.runtime.steps import Memo
 
@@ -42,6 +50,18 @@ SPLITS = {
     "wifi-rooms/corridor": ("random", "block"),
 }
 TRANSMITTER = {"dcm-rssi": ("receiver",)}  # column with the second end of the link, where both ends move
+COVERAGE = {
+    **{f"simulated-floor-{seed}": ("random",) for seed in range(10)},
+    "tetam-tracks": ("random", "block"),
+    "kolak": ("random", "block"),
+    **{f"wifi-rooms/{room}": ("random", "block") for room in ("office", "lecture-theatre", "corridor")},
+    "dae-2025": ("random", "block"),
+    **{f"ts-{name}": ("random", "block") for name in ("ujib1", "dsi1", "tut2", "tut5")},
+}
+COVERAGE_RESULT = "coverage_headline"
+COVERED_DBM, CERTAINTY = -75.0, 0.9
+QUANTILES = (0.1, 0.3, 0.5, 0.7)  # of the strongest RSSI of the training scans, further thresholds
+CORRELATIONS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5)
 IDENTITY = "identity"
 OWN = ("swiftwrf", IDENTITY, "pairs")  # all others are baselines
 Row = dict[str, Any]
@@ -51,8 +71,12 @@ Row = dict[str, Any]
 class Config:
     data: Path
     """folder of the data sets"""
+    study: tyro.conf.Positional[Literal["errors", "coverage"]] = "errors"
+    """errors of all predictors, or scans where coverage is predicted"""
     sets: tuple[str, ...] = ()
     """data sets to measure. Defaults to all; the results of others are kept"""
+    receivers: int | None = None
+    """most detected receivers of a set that the study of coverage fits. Defaults to all"""
     also: tuple[str, ...] = ()
     """predictors that are compared only when named, e.g. nerf2, whose fit is slow"""
     resume: bool = False
@@ -60,7 +84,9 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Measure each split and write `results/rssi.json`."""
+    """Measure each split and write `results/rssi.json` or `results/coverage_headline.json`."""
+    if config.study == "coverage":
+        return measure_coverages(config)
     found: dict[str, Row] = dict(kept(RESULT, "sets"))
     for name, split in splits(config.sets):
         key = f"{name} {split}"
@@ -84,7 +110,8 @@ def splits(names: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]:
 def measure(data: Rssi, split: str, also: tuple[str, ...] = ()) -> Row:
     """Return errors, differences to the best baseline, coverage of intervals and seconds of every predictor on a split."""
     result = compare(data, split=split, also=also)
-    with TemporaryDirectory() as folder, patch("swiftwrf.rssi.training.render", in_phase):
+    # results of the others are those of the call above
+    with TemporaryDirectory() as folder, patch("swiftwrf.rssi.training.render", in_phase), patch.object(Memo, "of"):
         others = Memo(Path(folder))
         for name in result.values.keys() - {RssiModel.name, result.model}:
             others.keep(name, result.values[name], 0.0)
@@ -94,18 +121,19 @@ def measure(data: Rssi, split: str, also: tuple[str, ...] = ()) -> Row:
     best = min((name for name in median if name not in OWN), key=lambda name: median[name])
     table = method_summary(result.errors, "abs_error_db", best)
     methods: dict[str, Row] = {}
-    for name, own in result.errors.groupby("method", sort=False)["abs_error_db"]:
+    for name, own in result.errors.groupby("method", sort=False):
         values, change = result.values[name], table.loc[name]
         # few test rows have no interval
         ends = {end: float(change[f"difference_{end}"]) for end in ("low", "high")}
         ends = {end: value for end, value in ends.items() if math.isfinite(value)}
         difference = {"median": median[name] - median[best], "mean": float(change["difference"]), **ends}
         seconds = {part: values[part] for part in ("fit", "predict")}
-        methods[name] = {"abs_error_db": summary(own), "seconds": seconds, "difference_db": difference}
+        error = summary(own["abs_error_db"], own["place"])
+        methods[name] = {"abs_error_db": error, "seconds": seconds, "difference_db": difference}
         if values["std"] is not None:
-            error, std = torch.tensor(own.to_numpy()), torch.as_tensor(values["std"]).double()
+            away, std = torch.tensor(own["abs_error_db"].to_numpy()), torch.as_tensor(values["std"]).double()
             _, half_width = Prediction(torch.zeros_like(std), std).interval(LEVEL)
-            methods[name]["coverage"] = float((error <= half_width).double().mean())
+            methods[name]["coverage"] = float((away <= half_width).double().mean())
     return {
         "n_rows": len(data),
         "n_train": len(result.train),
@@ -115,6 +143,84 @@ def measure(data: Rssi, split: str, also: tuple[str, ...] = ()) -> Row:
         "best_baseline": best,
         "methods": methods,
     }
+
+
+def measure_coverages(config: Config) -> None:
+    """Measure the coverage of each scene and split, and write the result."""
+    found: dict[str, Row] = dict(kept(COVERAGE_RESULT, "scenes"))
+    keys = [(name, split) for name in config.sets or COVERAGE for split in COVERAGE[name]]
+    for name, split in keys:
+        key = f"{name} {split}"
+        if config.resume and key in found:
+            continue
+        seed = name.removeprefix("simulated-floor-")
+        data = load_rssi(config.data / name) if seed == name else rssi_room(seed=int(seed))
+        found[key] = measure_coverage(data, split, config.receivers)
+        for row in found[key]["rows"]:
+            print(key, row, flush=True)
+        print(key, {name: value for name, value in found[key].items() if name != "rows"}, flush=True)
+        write_result(COVERAGE_RESULT, {"scenes": found}, rows=[found[key]])
+
+
+def measure_coverage(data: Rssi, split: str, receivers: int | None = None) -> Row:
+    """Return the predicted and the counted shares of test scans with a receiver above thresholds, by floor.
+
+    A row has the threshold, the number of test scans, the mean `predicted` probability, the counted share `above`, the share
+    with a probability of at least 0.9, `certain`, and the counted share of those, `certain_above`.
+    """
+    data = data.receivers(["all"])
+    often = data.detected.sum(dim=0).argsort(descending=True, stable=True)[:receivers].sort().values
+    train, test = data.columns(often.tolist()).split(split)
+    validation = train.validation_for(split, test)
+    model, limits = RssiModel(validation=validation).fit(train), thresholds(train)
+    floor = torch.zeros(len(test)).long() if test.floors is None else test.floors.number(test.transmitter_position)
+    rows = []
+    for number in floor.unique().tolist():
+        scans = test[floor == number]
+        for threshold in (COVERED_DBM, *limits):
+            probability, above = (
+                predicted_above(model, scans, threshold),
+                (scans.rssi_dbm > threshold).any(dim=1).double(),
+            )
+            certain, row = probability >= CERTAINTY, {"threshold_dbm": threshold, "n": len(scans)}
+            row |= {"floor": test.floors.names[number]} if test.floors else {}
+            row |= {"predicted": float(probability.mean()), "above": float(above.mean())}
+            row |= {"certain": float(certain.double().mean()), "n_certain": int(certain.sum())}
+            rows.append(row | ({"certain_above": float(above[certain].mean())} if certain.any() else {}))
+    fitted, held_out = train.split(split, seed=1) if split in ("random", "block") else train.split()
+    inner = RssiModel(validation=validation).fit(fitted)
+    scores = {str(correlation): brier(inner, held_out, thresholds(fitted), correlation) for correlation in CORRELATIONS}
+    far = reach(model)
+    return {
+        "n_train": len(train),
+        "n_receivers": len(train.receiver_names),
+        "reach_m": far if math.isfinite(far) else None,
+        "brier_by_correlation": scores,
+        "rows": rows,
+    }
+
+
+def thresholds(train: Rssi) -> list[float]:
+    """Return quantiles of the strongest RSSI of scans that a receiver detects [dBm], between whole numbers."""
+    strongest = train.rssi_dbm.nan_to_num(-math.inf).amax(dim=1)
+    return [float(strongest[strongest.isfinite()].quantile(q).floor()) + 0.5 for q in QUANTILES]
+
+
+def predicted_above(model: RssiModel, scans: Rssi, threshold: float) -> Tensor:
+    """Return the probability that any receiver of each scan is above a threshold, (n,)."""
+    found, detection = model.predict_detected(scans), model.predict_detection(scans.transmitter_position)
+    assert found.std is not None
+    return at_least(1, found.mean.T, found.std.T, detection.T, threshold)
+
+
+def brier(model: RssiModel, scans: Rssi, limits: list[float], correlation: float) -> float:
+    """Return the mean squared error of the probability that any receiver is above thresholds, by the correlation."""
+    with patch("swiftwrf.rssi.coverage.CORRELATION", correlation):
+        errors = [
+            (predicted_above(model, scans, limit) - (scans.rssi_dbm > limit).any(dim=1).double()).square().mean()
+            for limit in limits
+        ]
+    return float(torch.stack(errors).mean())
 
 
 def in_phase(heads: Iterable[Head]) -> Tensor:

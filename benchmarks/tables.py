@@ -12,9 +12,9 @@ import field_tables
 import rssi_tables
 import speed_tables
 import tyro
-from record import ROOT, load, markdown
+from record import ROOT, age, load, loaded, markdown
 
-from augment.turbo.condition import LOCATED, MEASURED_NETWORK
+from augment.turbo.condition import LOCATED
 from swiftwrf.choices import ROOMS, RSSI_PREDICTORS
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.datasets import catalogue
@@ -43,6 +43,17 @@ def random_rooms() -> str:
     return markdown(
         ["gains", "phase noise", "rooms", "planes", "identifiable", "of them wrong", "processor time"], rows
     )
+
+
+def explanations() -> str:
+    """Return how often the inspection names the cause of an error, and a cause of errors that have no name."""
+    rows = []
+    for kind, counted in (("known", "right"), ("unknown", "false")):
+        cases = [one for one in load(f"explanations_{kind}").values() if isinstance(one, dict) and counted in one]
+        scenes, found = (sum(one[key] for one in cases) for key in ("scenes", counted))
+        cells = [f"{found} of {scenes}", ""]
+        rows.append([f"{kind}, {len(cases)} kinds", *(cells if kind == "known" else cells[::-1])])
+    return markdown(["cause", "named rightly", "a cause named wrongly"], rows)
 
 
 def hard_cases() -> str:
@@ -79,6 +90,7 @@ def headline() -> str:
     degree = {}
     for share, mix, result in aoa_tables.aoa_shares():
         errors = {name: f"{m['great_circle_deg']['median']:.2f}°" for name, m in mix["methods"].items()}
+        errors["other"] = f"{aoa_tables.reference(mix)} {errors[mix['reference']]}"
         errors["synthetic"] = f"{errors[aoa_tables.turbo_condition(mix).method]} with synthetic spectra"
         degree[result["metrics"]["data"], result["metrics"]["split"], share] = errors
     office, tag = degree["newrf-office", "random", "0.3"], degree["s23-200", "block", "0.3"]
@@ -100,8 +112,8 @@ def headline() -> str:
         [f"1-NN {mean['nearest']:.2f} m", f"`knn` {mean['knn']:.2f} m", f"{mean['posterior']:.2f} m"],
         [f"nearest {coherence['nearest']}", f"Gaussian process {coherence['gaussian_process']}", channels],
         *by_channels,
-        [f"strongest peak {office['peak']}", f"network {office[MEASURED_NETWORK]}", room],
-        [f"mean {tag['constant']}", f"network {tag[MEASURED_NETWORK]}", tag["synthetic"]],
+        [f"strongest peak {office['peak']}", office["other"], room],
+        [f"mean {tag['constant']}", tag["other"], tag["synthetic"]],
     ]
     columns = ["question", "data, split", "simplest method", "best other method", "SwiftWRF"]
     return markdown(columns, [[*row, *three] for row, three in zip(rows, cells, strict=True)])
@@ -186,10 +198,12 @@ FILES = ("README.md", *sorted(file.relative_to(ROOT).as_posix() for file in (ROO
 
 
 def table(name: str) -> str:
-    """Return a table by the name of its function, here or in one of the modules."""
+    """Return a table by the name of its function, here or in one of the modules, and the age of what it shows."""
     functions = [getattr(module, name) for module in MODULES if hasattr(module, name)]
+    first = len(loaded)
     text: str = (functions[0] if functions else globals()[name])()
-    return text
+    shown = dict.fromkeys(loaded[first:])
+    return f"{text}\n\n*{age(shown)}*" if shown else text
 
 
 def rewrite(text: str) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import torch
-from record import load, options, write_result
+from record import kept, options, write_result
 from rooms import room_with_box
 
 import swiftwrf
@@ -68,7 +68,7 @@ def spectra(config: Config) -> list[dict[str, Any]]:
     return rows
 
 
-def rssi(config: Config) -> dict[str, Any]:
+def rssi(config: Config) -> list[dict[str, Any]]:
     """Measure the update of an RSSI model by one row, beside a fit."""
     n = config.n_rows
     data = rssi_room(n=n + REPEATS + 1)
@@ -79,7 +79,7 @@ def rssi(config: Config) -> dict[str, Any]:
     model = fitted.update(data.subset(torch.tensor([n + REPEATS])))
     first = time.perf_counter() - began
     found = milliseconds(lambda number: model.update(data.subset(torch.tensor([n + number]))))
-    return {"rows": n, "bins": len(fitted.anchor), "fit_s": fit, "first_update_s": first, **found}
+    return [{"rows": n, "bins": len(fitted.anchor), "fit_s": fit, "first_update_s": first, **found}]
 
 
 def scene(moving: Any, part: str, n: int, place: tuple[float, float] | None = None) -> Spectra:
@@ -133,7 +133,7 @@ def unchanged(config: Config) -> list[dict[str, Any]]:
     return rows
 
 
-def tracks(config: Config) -> dict[str, Any]:
+def tracks(config: Config) -> list[dict[str, Any]]:
     """Measure prequential errors along walks, of a model that learns beside one that does not."""
     assert config.tracks is not None
     data: Rssi = load_rssi(config.tracks)
@@ -155,7 +155,7 @@ def tracks(config: Config) -> dict[str, Any]:
             "coverage": float(scores.covered.nanmean()),
         }
 
-    return {
+    row = {
         "name": data.name,
         "training_rows": n,
         "rows": len(new),
@@ -163,17 +163,17 @@ def tracks(config: Config) -> dict[str, Any]:
         "learning": summary(learning),
         "change_db": {"mean": float(change.nanmean()), "low": low, "high": high},
     }
+    return [row]
 
 
 def main(config: Config) -> None:
     """Measure each part and write `results/update.json`."""
-    kept = load("update")
-    found = {part: kept[part] for part in get_args(Part) if part in kept}
+    found: dict[str, list[dict[str, Any]]] = {part: kept("update", part) for part in get_args(Part)}
     for part in config.only:
         if part == "tracks" and config.tracks is None:
             continue
         found[part] = globals()[part](config)
-        write_result("update", {"threads": torch.get_num_threads(), **found})
+        write_result("update", {"threads": torch.get_num_threads(), **found}, rows=found[part])
 
 
 if __name__ == "__main__":

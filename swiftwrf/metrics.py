@@ -7,7 +7,7 @@ SSIM is scikit-image's default (7 x 7 uniform window, sample covariance, borders
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 from typing import TypedDict
 
@@ -22,8 +22,9 @@ from swiftwrf.array.angles import angular_distance, to_direction, wrap
 from swiftwrf.errors import InputError
 
 WINDOW = 7
-MIN_ROWS = 10  # of a test, for an interval of differences
-N_BOOTSTRAP = 2000  # resamplings for the interval of a change
+MIN_GROUPS = 10  # of test rows, for an interval of differences
+N_BOOTSTRAP = 1000  # resamplings of an interval
+N_CHANGE = 2000  # of a change, whose distribution has long tails
 SMALLEST_ERROR_DEG = 1e-9  # a change is relative to at least this median
 NORMAL_80 = 1.2816  # standard deviations about the mean that hold 80 % of a normal variable
 
@@ -180,18 +181,37 @@ class ErrorSummary(TypedDict):
     n: int
 
 
-def resampled(group: ArrayLike, n: int = 1000) -> Iterator[NDArray[np.int64]]:
-    """Yield n bootstrap samples of rows (rows,) in which rows of one group, e.g. scans at one place, stay together.
+def resampled(group: ArrayLike, n: int = N_BOOTSTRAP) -> Iterator[NDArray[np.int64]]:
+    """Yield n bootstrap samples of rows (rows,), ascending, in which rows of one group, e.g. of one place, stay together.
 
     Example:
-        >>> [sorted(rows.tolist()) for rows in resampled(["a", "a", "b"], 2)]
+        >>> [rows.tolist() for rows in resampled(["a", "a", "b"], 2)]
         [[2, 2], [0, 1, 2]]
     """
     number = np.unique(np.asarray(group), return_inverse=True, axis=0)[1]
-    rows = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number))[:-1])
-    draw = np.random.default_rng(0)
+    n_groups, draw = int(number.max()) + 1, np.random.default_rng(0)
     for _ in range(n):
-        yield np.concatenate([rows[chosen] for chosen in draw.integers(len(rows), size=len(rows))])
+        times = np.bincount(draw.integers(n_groups, size=n_groups), minlength=n_groups)
+        yield np.repeat(np.arange(len(number)), times[number])
+
+
+def bootstrap_interval(
+    statistic: Callable[[NDArray[np.int64]], float], group: ArrayLike, n: int = N_BOOTSTRAP
+) -> tuple[float, float]:
+    """Return the 95 % interval of a statistic of rows, by a bootstrap over groups of rows that are not independent.
+
+    Args:
+        statistic: Function of row numbers (k,), which may repeat.
+        group: Group of each row, e.g. its place, (rows,) or (rows, k).
+        n: Number of bootstrap samples.
+
+    Example:
+        >>> error, place = np.array([1.0, 1.0, 1.0, 4.0, 4.0, 4.0]), [0, 0, 0, 1, 1, 1]
+        >>> bootstrap_interval(lambda rows: float(np.median(error[rows])), place)
+        (1.0, 4.0)
+    """
+    low, high = np.percentile([statistic(rows) for rows in resampled(group, n)], (2.5, 97.5)).tolist()
+    return low, high
 
 
 def summary(errors: ArrayLike, group: ArrayLike | None = None) -> ErrorSummary:
@@ -200,7 +220,7 @@ def summary(errors: ArrayLike, group: ArrayLike | None = None) -> ErrorSummary:
     Args:
         errors: Errors (n,).
         group: Group of each error, e.g. its place, (n,) or (n, k). Errors of one group are not independent, so the interval
-            is a bootstrap over groups. Defaults to independent errors.
+            is a bootstrap over groups, and that of a single group the range of its errors. Defaults to independent errors.
 
     Example:
         >>> found = summary([1.0, 2.0, 3.0, float("nan")])
@@ -215,9 +235,10 @@ def summary(errors: ArrayLike, group: ArrayLike | None = None) -> ErrorSummary:
         return ErrorSummary(median=nan, p90=nan, mean=nan, low=nan, high=nan, n=0)
     low, high = median_interval(values)
     group = None if group is None else np.asarray(group)[finite]
-    if group is not None and len(np.unique(group, axis=0)) < len(values):
-        medians = [float(np.median(values[rows])) for rows in resampled(group)]
-        low, high = (float(bound) for bound in np.percentile(medians, (2.5, 97.5)))
+    if group is not None and (n_groups := len(np.unique(group, axis=0))) < len(values):
+        low, high = float(values.min()), float(values.max())
+        if n_groups > 1:
+            low, high = bootstrap_interval(lambda rows: float(np.median(values[rows])), group)
     return {
         "median": float(np.median(values)),
         "p90": float(np.percentile(values, 90)),
@@ -237,15 +258,16 @@ class ChangeMetrics(TypedDict):
     high: float
 
 
-def paired_change(before: ArrayLike, after: ArrayLike) -> ChangeMetrics:
+def paired_change(before: ArrayLike, after: ArrayLike, group: ArrayLike | None = None) -> ChangeMetrics:
     """Return the median of `after`, its change relative to the median of `before`, and the change's 95 % interval.
 
-    The interval is a bootstrap over test rows. All errors of a row are resampled together, so that differences between rows
-    do not widen it, and repeats do not narrow it.
+    The interval is a bootstrap over groups of test rows. All errors of a group are resampled together, so that differences
+    between rows do not widen it, and repeats do not narrow it.
 
     Args:
         before: Errors (n,) of test rows, or (n, repeats).
         after: Errors of the same rows and repeats.
+        group: Group of each row, e.g. its place, (n,). Defaults to independent rows.
 
     Example:
         >>> change = paired_change([1.0, 2.0, 3.0], [0.5, 1.0, 1.5])
@@ -253,21 +275,21 @@ def paired_change(before: ArrayLike, after: ArrayLike) -> ChangeMetrics:
         (-0.5, -0.5, -0.5)
     """
     first, second = np.asarray(before, dtype=float), np.asarray(after, dtype=float)
-    rows = np.random.default_rng(0).integers(len(first), size=(N_BOOTSTRAP, len(first)))
-    reference, changed = (np.median(x[rows].reshape(N_BOOTSTRAP, -1), axis=1) for x in (first, second))
-    ratio = changed / np.maximum(reference, SMALLEST_ERROR_DEG)
-    low, high = np.percentile(ratio - 1, (2.5, 97.5))
-    median = float(np.median(second))
-    change = median / max(float(np.median(first)), SMALLEST_ERROR_DEG) - 1
-    return {"median_deg": median, "change": change, "low": float(low), "high": float(high)}
+
+    def change(rows: NDArray[np.int64]) -> float:
+        return float(np.median(second[rows]) / max(np.median(first[rows]), SMALLEST_ERROR_DEG) - 1)
+
+    every = np.arange(len(first))
+    low, high = bootstrap_interval(change, every if group is None else group, N_CHANGE)
+    return {"median_deg": float(np.median(second)), "change": change(every), "low": low, "high": high}
 
 
 def paired_difference(errors: DataFrame, method: str, other: str) -> tuple[float, float, float]:
     """Return the mean of one method's errors minus another's on equal pairs, and its 95 % interval.
 
-    The interval is a bootstrap over test rows, because the receivers of one row are not independent, or over places if rows
-    repeat them. It is nan for fewer than 10 of them with a pair, with which a bootstrap finds false differences. Without any
-    pair all three are nan.
+    The interval is a bootstrap over the places of test rows, or over test rows if places are unknown, because the receivers
+    of one row are not independent. It is nan for fewer than 10 of them with a pair, with which a bootstrap finds false
+    differences. Without any pair all three are nan.
 
     Args:
         errors: Errors with a column for each method and a row for each pair, indexed by `index` (the test row), and
@@ -276,24 +298,20 @@ def paired_difference(errors: DataFrame, method: str, other: str) -> tuple[float
         other: Column of the method that it is compared to.
     """
     level = "place" if "place" in errors.index.names else "index"
-    difference = (errors[method] - errors[other]).dropna().groupby(level=level).agg(["sum", "count"]).to_numpy()
-    if not len(difference):
-        return math.nan, math.nan, math.nan
-    mean = float(difference[:, 0].sum() / difference[:, 1].sum())
-    if len(difference) < MIN_ROWS:
-        return mean, math.nan, math.nan
-    draws = np.random.default_rng(0).integers(len(difference), size=(1000, len(difference)))
-    sums = difference[draws].sum(axis=1)
-    low, high = np.percentile(sums[:, 0] / sums[:, 1], (2.5, 97.5))
-    return mean, float(low), float(high)
+    found = (errors[method] - errors[other]).dropna()
+    group, values = found.index.get_level_values(level), found.to_numpy()
+    low = high = math.nan
+    if group.nunique() >= MIN_GROUPS:
+        low, high = bootstrap_interval(lambda rows: float(values[rows].mean()), group)
+    return float(found.mean()), low, high
 
 
 def method_summary(errors: DataFrame, column: str, reference: str) -> DataFrame:
     """Return a summary of the errors of each method, and their mean difference to those of a reference.
 
     Args:
-        errors: A row for each `method` and test row `index`, `receiver` where a row has several errors, and `place` where
-            rows repeat places.
+        errors: A row for each `method` and test row `index`, `receiver` where a row has several errors, and `place` of the
+            row if it is known.
         column: Column of errors.
         reference: Method of the differences, which are paired over test rows.
 
@@ -307,7 +325,7 @@ def method_summary(errors: DataFrame, column: str, reference: str) -> DataFrame:
     for name, own in errors.groupby("method", sort=False):
         mean, low, high = paired_difference(pairs, name, reference)
         rows[name] = {
-            **summary(own[column], own.get("place")),
+            **summary(own[column], own.get("place", own["index"])),
             "difference": mean,
             "difference_low": low,
             "difference_high": high,

@@ -49,7 +49,7 @@ def predict(
         no receiver detected are left out.
 
     Raises:
-        InputError: Measurements of other receivers, of another array or grid, or nothing detected; rows without time or a
+        InputError: Measurements of other receivers, of another link or grid, or nothing detected; rows without time or a
             walk that is too long; or a model that predicts nothing.
 
     Example:
@@ -89,7 +89,7 @@ def predict(
 
 
 def _positions_of_rssi(locator: RssiLocator, data: Rssi, track: float | None, truth: bool) -> Columns:
-    locator.model.check_measurements(data)
+    data = locator.model.aligned(data, located=truth)
     data = data.subset(data.detected.any(dim=1))
     if not len(data):
         raise InputError(f"no receiver detected the transmitter in any row of {data.name}")
@@ -102,14 +102,10 @@ def _positions_of_rssi(locator: RssiLocator, data: Rssi, track: float | None, tr
 
 
 def _positions_of_spectra(locator: MatchedField, store: Store, known: Spectra | None, track: float | None) -> Columns:
-    if known is not None and known.array is not None and known.array != locator.room.array:
-        raise InputError(f"{known.name} has spectra of another array than those that the locator was fitted to")
     found: list[Tensor] = []
     index = torch.arange(len(store)) if known is None else known.index
-    batches: Iterable[Tensor] = (part for batch in store.batches() for part in batch.split(BATCH_ROWS))
-    if locator.by_channels and known is not None and known.channel is not None:
-        batches = known.channel.split(BATCH_ROWS)
-    posteriors: Iterable[Posterior] = map(locator.locate, batches)
+    rows = torch.arange(len(store)).split(BATCH_ROWS)
+    posteriors: Iterable[Posterior] = (locator.locate(store[some] if known is None else known[some]) for some in rows)
     if track is not None:
         posteriors = _tracked(posteriors, index.double(), track)
 

@@ -68,7 +68,7 @@ def _write_new_file(config: ConvertConfig, model: RssiModel | None) -> None:
         )
     if model is not None and (options := reading(config.spectra, config.table).given):
         raise InputError(f"{config.source} is a model; --{next(iter(options)).replace('_', '-')} is for measurements")
-    check_new_file(out)
+    check_new_file(out, FILES)
     if model is None:
         _answer(config, write_file(reading(config.spectra, config.table).spectra_of(_read(config)), out))
     else:

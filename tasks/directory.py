@@ -9,7 +9,7 @@ import secrets
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from os.path import isfile  # unlike Path.is_file, it is False for names that are too long
 from pathlib import Path
@@ -19,12 +19,13 @@ import torch
 from filelock import FileLock, Timeout
 
 from swiftwrf import InputError
+from swiftwrf.runtime.digest import digest
 from swiftwrf.runtime.durable import rename, strict, write_json
-from swiftwrf.runtime.steps import LOCATOR, MODEL, STEPS, Memo
+from swiftwrf.runtime.steps import LOCATOR, MODEL, STEPS, Memo, check_unchanged
 from swiftwrf.runtime.threads import set_threads
 from tasks.environment import environment, invocation, now, number_of_processes, stamp
 from tasks.options import plain
-from tasks.records import CONFIG, ENVIRONMENT, METRICS, PARTIAL, Row, digest, read_json
+from tasks.records import CONFIG, ENVIRONMENT, METRICS, PARTIAL, Row, read_json
 from tasks.terminal import terminal
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # errors of file systems without locks
@@ -115,10 +116,10 @@ class Claim:
         self._lock.release()
 
 
-def _versions(environment: Row) -> dict[str, str]:
-    """Return the versions on which the results of a run depend: of the packages, and the commit of this project."""
-    packages = environment.get("packages")
-    return (packages if isinstance(packages, dict) else {}) | {"commit": environment.get("commit") or "unknown"}
+def _origin(environment: Row) -> dict[str, str]:
+    """Return what decides the results of a run: digests of its input, versions of packages, commit of this project."""
+    found = [part for name in ("input_sha256", "packages") if isinstance(part := environment.get(name), dict)]
+    return {"commit": environment.get("commit") or "unknown"} | {name: x for part in found for name, x in part.items()}
 
 
 @contextmanager
@@ -143,29 +144,20 @@ def new_directory(out: Path, what: str) -> Iterator[Path]:
             shutil.rmtree(unfinished)
 
 
-def check_new_file(out: Path, option: str = "") -> None:
+def check_new_file(out: Path, suffixes: Sequence[str], option: str = "") -> None:
     """Refuse the place of a file that a command is to write.
 
     Raises:
-        InputError: `out` exists already, or its folder does not exist.
+        InputError: Another suffix than those that are written, `out` exists already, or its folder does not exist.
     """
     if os.path.lexists(out):
         raise InputError(f"{option}{out} exists already and is never overwritten; choose another")
     if not out.parent.is_dir():
         raise InputError(f"{option}{out} lies in {out.parent}, which is no directory")
-
-
-def unchanged_environment(folder: Path, source: dict[str, str]) -> Row:
-    """Return the environment in which a run began; refuse other input, by the SHA-256 of everything that it reads."""
-    found = read_json(folder / ENVIRONMENT)
-    before = found.get("input_sha256")
-    if before != source:
-        before = before if isinstance(before, dict) else {}
-        changed = sorted(name for name in {*before, *source} if before.get(name) != source.get(name))
+    if out.suffix.lower() not in suffixes:
         raise InputError(
-            f"the input has changed since {folder} began ({', '.join(changed)}); restore it or start a new run"
+            f"{option}{out} must end in {' or '.join(suffixes)}, which can be written; choose another name"
         )
-    return found
 
 
 class Run(Memo):
@@ -231,25 +223,20 @@ class Run(Memo):
     ) -> None:
         self.processes = number_of_processes(device, processes)
         set_threads(max(1, torch.get_num_threads() // self.processes))
-        values = plain(config)
+        values = strict(plain(config))
         self._environment = environment(device, source, self.processes) | {"config_sha256": digest(values)}
         self.write_json(ENVIRONMENT, self._environment)
         self.write_json(CONFIG, {"task": task, "command": invocation(task), "config": values})
 
     def _go_on(self, device: torch.device, source: dict[str, str], processes: int | None) -> None:
-        self._environment = unchanged_environment(self.folder, source)
+        self._environment = read_json(self.folder / ENVIRONMENT)
         threads = self._environment.get("threads")
         if not isinstance(threads, int) or not 1 <= threads <= 1024:
             threads = torch.get_num_threads()
         self.processes = number_of_processes(device, processes, threads)
         set_threads(threads)  # they are part of the seed
         here = environment(device, source, self.processes)
-        versions, own = _versions(self._environment), _versions(here)
-        if versions != own:
-            other = ", ".join(f"{name} {version}" for name, version in versions.items() if own.get(name) != version)
-            raise InputError(
-                f"{self.folder} began with {other or 'other libraries'}; go on with these or start a new run"
-            )
+        check_unchanged(self.folder, _origin(self._environment), _origin(here))
         session = {name: here[name] for name in ("commit", "start", "processes", "device")}
         self._environment["resumed"] = [*self._environment.get("resumed", []), session]
         self.write_json(ENVIRONMENT, self._environment)
@@ -257,6 +244,9 @@ class Run(Memo):
     def write_json(self, name: str, content: Any) -> None:
         """Write strict JSON: nan and infinity become null."""
         write_json(self.path(name), content)
+
+    def of(self, given: Mapping[str, Any]) -> None:
+        """Do nothing: input and versions of a run were compared when it was resumed, and its options are its own."""
 
     def expect(self, steps: int) -> None:
         terminal.expect(steps)

@@ -10,14 +10,14 @@ import subprocess
 import sys
 from contextlib import suppress
 from datetime import UTC, datetime
-from functools import cache
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from swiftwrf import InputError
+from swiftwrf.runtime.steps import packages
 from swiftwrf.runtime.threads import to_device
 from tasks.preload import MAX_PROCESSES
 
@@ -91,16 +91,6 @@ def environment(device: torch.device, source: dict[str, str], processes: int = 1
         "input_sha256": source,
         "start": now(),
     }
-
-
-@cache  # looked up at every step of a run
-def packages() -> dict[str, str]:
-    """Return the versions of this project and of the libraries on which results depend."""
-    found = {}
-    for name in ("swiftwrf-tasks", "torch", "torchvision", "numpy", "scipy", "scikit-learn", "numba"):
-        with suppress(PackageNotFoundError):  # numba is an extra
-            found[name] = version(name)
-    return found
 
 
 def _commit() -> str | None:

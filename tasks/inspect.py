@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from swiftwrf.array.beamforming import PHASE
 from swiftwrf.data import Rssi, Snapshots, Spectra
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
 from swiftwrf.diagnostics.inspection import Findings, inspect, propose_offsets
+from swiftwrf.errors import InputError
 from swiftwrf.positions import nearest
 from swiftwrf.rssi import fit_path_loss, log_distance
 from swiftwrf.runtime.durable import write_json
@@ -47,7 +49,8 @@ def run(config: InspectConfig) -> None:
         kind = "RSSI" if isinstance(data, Rssi) else "array snapshots" if isinstance(data, Snapshots) else "spectra"
         findings = inspect(data, grid=options.grid, beamformer=options.beamformer or PHASE)
         for column in data.labels if isinstance(data, Rssi) else ():
-            propose_offsets(read(source, replace(options, offset_by=column), RSSI_FORMATS), findings)
+            with suppress(InputError):  # the toolkit's own layout has the names of these columns alone
+                propose_offsets(read(source, replace(options, offset_by=column), RSSI_FORMATS), findings)
         content = {
             "source": config.source,
             "kind": kind,

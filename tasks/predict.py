@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from os.path import isfile  # unlike Path.is_file, it is False for names that are too long
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from augment.estimators import SavedEstimator
 from swiftwrf import FieldModel, InputError, Prediction, Rssi, load, predict
 from swiftwrf.data import ReadOptions
 from swiftwrf.data.coordinates import PlanFrame
-from swiftwrf.data.files import TABLES, read_table
+from swiftwrf.data.files import read_table
 from swiftwrf.data.formats import RSSI_FORMATS, read
 from swiftwrf.data.receivers import read_places
 from swiftwrf.data.survey import has_positions
@@ -26,7 +25,7 @@ from tasks.directory import check_new_file, kept_model
 from tasks.environment import stamp
 from tasks.options import given
 from tasks.records import CONFIG, Records, Row, rounded, write_table
-from tasks.source import aligned, located, observed_spectra, reading
+from tasks.source import aligned, is_table, located, observed_spectra, reading, with_groups
 from tasks.terminal import console, terminal
 
 MEDIANS = {"great_circle_deg": "degrees", "position_error_m": "m"}  # columns of errors and their units
@@ -40,10 +39,11 @@ def run(config: PredictConfig) -> None:
             apply to the model, or `out` exists.
     """
     out = Path(config.out or f"predicted-{stamp()}.csv")
-    check_new_file(out, "--out ")
+    check_new_file(out, (".csv", ".mat"), "--out ")
     file = saved_file(Path(config.model))
     model = load(file)
     at_positions = isinstance(model, FieldModel | RssiPredictor)
+    check_new_file(out, (".csv", ".mat") if at_positions else (".csv",), "--out ")
     for kinds, options in (("RSSI", config.table), ("spectra", config.spectra)):
         is_read = not at_positions and isinstance(model, RssiLocator) == (kinds == "RSSI")
         if not is_read and (unused := given(options)):
@@ -107,19 +107,12 @@ def measured_at(locator: RssiLocator, config: PredictConfig) -> tuple[Rssi, bool
     Raises:
         InputError: RSSI that cannot be read, or receivers that the locator does not have.
     """
-    source, options = config.source, reading(config.spectra, config.table)
     offsets = locator.model.offsets
-    if offsets is not None and _is_table(source) and offsets.column in read_table(Path(source)).columns:
-        options = replace(options, offset_by=offsets.column)
-    data, is_known = read_rssi(source, options)
-    origin = locator.model.origin
-    if is_known and data.origin is not None and origin is None:
-        raise InputError(f"{source} has positions in degrees, {config.model} was fitted to metres; give metres")
-    if offsets is not None:
-        if data.groups is None:
-            console.print(f"{data.name}: rows count as those of {offsets.column} {offsets.reference}")
-        data = offsets.removed(data)
-    return aligned(data.about(origin), locator.receiver_names, config.ignore_receivers), is_known
+    options = with_groups(reading(config.spectra, config.table), config.source, offsets)
+    data, is_known = read_rssi(config.source, options)
+    if offsets is not None and data.groups is None:
+        console.print(f"{data.name}: rows count as those of {offsets.column} {offsets.reference}")
+    return aligned(data, locator.receiver_names, config.ignore_receivers), is_known
 
 
 def read_rssi(source: str, options: ReadOptions) -> tuple[Rssi, bool]:
@@ -128,7 +121,7 @@ def read_rssi(source: str, options: ReadOptions) -> tuple[Rssi, bool]:
     Raises:
         InputError: RSSI that cannot be read.
     """
-    if _is_table(source):
+    if is_table(source):
         file = Path(source)
         frame = read_table(file)
         if not has_positions(frame, options.columns or {}):
@@ -137,7 +130,3 @@ def read_rssi(source: str, options: ReadOptions) -> tuple[Rssi, bool]:
             data = Rssi.from_frame(somewhere, **{name: getattr(options, name) for name in names}, name=file.stem)
             return data, False
     return read(located(source), options, RSSI_FORMATS), True
-
-
-def _is_table(source: str) -> bool:
-    return Path(source).is_file() and Path(source).suffix.lower() in TABLES

@@ -6,7 +6,6 @@ of that kind is written behind an apostrophe, which those programs take for a ma
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import re
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from swiftwrf.errors import InputError
-from swiftwrf.runtime.durable import strict, write_text
+from swiftwrf.runtime.durable import write_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -57,11 +56,6 @@ def read_json(file: Path) -> Row:
     if not isinstance(content, dict):
         raise InputError(f"{file} must hold a JSON object, got a {type(content).__name__}; restore it")
     return content
-
-
-def digest(config: Any) -> str:
-    """Return the SHA-256 of a configuration of plain values."""
-    return hashlib.sha256(json.dumps(strict(config), sort_keys=True).encode()).hexdigest()
 
 
 def write_table(file: Path, rows: Iterable[Row]) -> None:

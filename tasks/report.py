@@ -47,9 +47,9 @@ def write(task: str, result: Any, file: Path) -> None:
         file: New file.
 
     Raises:
-        InputError: The file exists already, or its folder does not.
+        InputError: The file is no .html, exists already, or its folder does not.
     """
-    check_new_file(file)
+    check_new_file(file, (".html", ".htm"))
     with TemporaryDirectory() as name:
         folder = Path(name)
         match task:

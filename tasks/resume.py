@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from swiftwrf.errors import InputError
+from swiftwrf.runtime.digest import digest
 from tasks import configs
 from tasks.command import COMMANDS, run_task
 from tasks.command_line import parse
 from tasks.configs import ResumeConfig
-from tasks.records import CONFIG, ENVIRONMENT, digest, read_json
+from tasks.records import CONFIG, ENVIRONMENT, read_json
 
 
 def run(config: ResumeConfig) -> None:

@@ -10,12 +10,15 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from swiftwrf import AngularGrid, InputError, Rssi, Spectra
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.archives import array_header, read_rows
+from swiftwrf.data.files import TABLES, read_table
 from swiftwrf.data.formats import RSSI_FORMATS, ReadOptions, read, read_spectra
 from swiftwrf.data.receivers import spelled_as
+from swiftwrf.data.rssi import Offsets
 from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
 from swiftwrf.data.store import Store
 from swiftwrf.datasets import DATA_SETS, fetch
@@ -49,6 +52,18 @@ def _array(spectra: SpectraSource) -> PlanarArray | None:
     if rows == columns:
         return PlanarArray.square(rows, frequency, spacing)
     return PlanarArray.grid(rows, columns, spacing, frequency)
+
+
+def is_table(source: str) -> bool:
+    """Return True for a file of a table."""
+    return os.path.isfile(source) and Path(source).suffix.lower() in TABLES
+
+
+def with_groups(options: ReadOptions, source: str, offsets: Offsets | None) -> ReadOptions:
+    """Return options that read the groups whose offsets a model knows, if the source is a table with their column."""
+    if offsets is None or not is_table(source) or offsets.column not in read_table(Path(source)).columns:
+        return options
+    return replace(options, offset_by=offsets.column)
 
 
 def located(source: str) -> str:
@@ -139,31 +154,26 @@ def aligned(data: Rssi, names: tuple[str, ...], ignore_others: bool) -> Rssi:
         InputError: The data have none of the receivers, or others that are not ignored.
     """
     own, notes = spelled_as(data.receiver_names, names)
-    for note in notes:
-        console.print(f"{data.name}: {note}")
-    place = {name: column for column, name in enumerate(own)}
-    if not place.keys() & set(names):
+    missing, others = [name for name in names if name not in own], [name for name in own if name not in names]
+    if len(missing) == len(names):
         raise InputError(
             f"{data.name} has other receivers ({listed(data.receiver_names)}) than the model ({listed(names)}); their names "
             "must be the same"
         )
-    missing = [name for name in names if name not in place]
     if missing:
-        console.print(f"{data.name}: receivers of the model that are missing count as not detecting: {listed(missing)}")
-    others = [name for name in own if name not in names]
+        notes.append(f"receivers of the model that are missing count as not detecting: {listed(missing)}")
     if others and not ignore_others:
         raise InputError(
             f"{data.name} has receivers that the model does not have ({listed(others)}); leave them out by "
             "--ignore-receivers"
         )
     if others:
-        console.print(f"{data.name}: receivers that the model does not have are not used: {listed(others)}")
-    rssi = torch.full((len(data), len(names)), torch.nan, dtype=torch.float64)
-    position = torch.full((len(names), 3), torch.nan, dtype=torch.float64)
-    for column, name in enumerate(names):
-        if name in place:
-            rssi[:, column] = data.rssi_dbm[:, place[name]]
-            position[column] = data.receiver_position[place[name]]
+        notes.append(f"receivers that the model does not have are not used: {listed(others)}")
+    for note in notes:
+        console.print(f"{data.name}: {note}")
+    columns = [own.index(name) if name in own else len(own) for name in names]  # the last one is of nothing
+    rssi = functional.pad(data.rssi_dbm, (0, 1), value=torch.nan)[:, columns]
+    position = functional.pad(data.receiver_position, (0, 0, 0, 1), value=torch.nan)[columns]
     return replace(data, rssi_dbm=rssi, receiver_names=names, receiver_position=position)
 
 

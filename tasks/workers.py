@@ -28,10 +28,10 @@ import torch
 
 from swiftwrf import FitError, InputError
 from swiftwrf.runtime.progress import silent
-from swiftwrf.runtime.steps import POLL_S, STEPS
+from swiftwrf.runtime.steps import POLL_S, STEPS, packages
 from swiftwrf.runtime.threads import set_threads, to_device
 from tasks.directory import Run
-from tasks.environment import machine, packages
+from tasks.environment import machine
 from tasks.preload import begin, process_context, without_main
 from tasks.terminal import console
 

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 import torch
 from matplotlib import pyplot
+from packaging.version import Version
 from quick import cheap, command, sketched
+from record import RESULTS, loaded, origins
 from small import FLOOR, known_planes
 from tables import FILES, rewrite
 
@@ -32,6 +34,28 @@ MAX_BYTES = 300_000  # of a notebook
 def test_tables_come_from_the_results(name):
     text = (ROOT / name).read_text()
     assert rewrite(text) == text, "run python benchmarks/tables.py"
+
+
+def shown_results() -> list[str]:
+    """Return the names of the results that tables of README and docs show."""
+    first = len(loaded)
+    for name in FILES:
+        rewrite((ROOT / name).read_text())
+    return sorted(set(loaded[first:]))
+
+
+@pytest.mark.parametrize("name", shown_results())
+def test_a_shown_result_is_of_the_last_release_or_later_and_of_a_command_that_exists(name):
+    released = re.findall(r"^## \[(\d[\d.]*)\]", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)[0]
+    for row in origins(name):
+        assert Version(row["versions"]["swiftwrf-tasks"]) >= Version(released), f"measure again: {row}"
+        assert "dirty" not in row["commit"]
+        script = row["command"].removeprefix("python ").split()[0]
+        assert script in {"swiftwrf", "-m"} or (ROOT / "benchmarks" / script).is_file(), row["command"]
+
+
+def test_each_result_is_shown():
+    assert sorted(file.stem for file in RESULTS.glob("*.json")) == shown_results()
 
 
 def test_each_public_name_has_a_line_in_the_reference():

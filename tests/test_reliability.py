@@ -119,10 +119,10 @@ def test_a_failed_start_leaves_nothing(tmp_path, monkeypatch):
     ("file", "keys", "value", "says"),
     [
         ("config.json", ("config", "seed"), 1, "not what the run began with"),
-        ("environment.json", ("packages", "torch"), "0.1", "began with torch 0.1; go on with these"),
-        ("environment.json", ("packages", "swiftwrf-tasks"), "0.0.1", "began with swiftwrf-tasks 0.0.1; go on"),
-        ("environment.json", ("commit",), "0123456789ab", "began with commit 0123456789ab; go on with these"),
-        ("environment.json", ("packages",), 3, "began with other libraries"),
+        ("environment.json", ("packages", "torch"), "0.1", "began (torch 0.1); restore it"),
+        ("environment.json", ("packages", "swiftwrf-tasks"), "0.0.1", "began (swiftwrf-tasks 0.0.1); restore it"),
+        ("environment.json", ("commit",), "0123456789ab", "began (commit 0123456789ab); restore it"),
+        ("environment.json", ("packages",), 3, ", torch, torchvision"),
     ],
 )
 def test_resume_refuses_another_configuration_and_other_versions(stopped, capsys, file, keys, value, says):

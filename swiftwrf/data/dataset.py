@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 Numbers = Any  # a tensor, array, list or table of numbers
 Rows = Any  # numbers of rows (tensor, array or list), a mask, or a slice
 Data = TypeVar("Data", bound="PositionedData")
+MAX_DIGEST_VALUES = 64  # of a row, about; more take time and tell no rows apart
 ROTATION_TOLERANCE = 1e-3  # of the products of its columns, from rounding
 Arrays = dict[str, Any]  # in the form of xarray: dimensions, values, and a dictionary of units if there are any
 DEGREE_UNITS = {"latitude": "degrees_north", "longitude": "degrees_east"}
@@ -165,6 +167,19 @@ class PositionedData(Labelled, Displayed):
         return self.derived(**kept, named_splits={})
 
     __getitem__ = subset
+
+    def row_digests(self) -> Tensor:
+        """Return a digest of each row by its number, its time, its position and some of its values, int64 (n,)."""
+        values, time = getattr(self, self.row_fields[1]), getattr(self, "time", None)
+        number = torch.stack([self.index.double(), torch.zeros(len(self)).double() if time is None else time], dim=1)
+        found = [b""]
+        for rows in [slice(None)] if isinstance(values, Tensor) else values.parts():
+            part = values[rows].flatten(1)
+            some = part[:, :: max(1, part.shape[1] // MAX_DIGEST_VALUES)].double()
+            known = torch.cat([number[rows], self._position[rows], some], dim=1)
+            cells = (1000 * known).round().nan_to_num(-1.0).long().numpy()  # to a millisecond and a millimetre
+            found += [hashlib.blake2b(cell.tobytes(), digest_size=8).digest() for cell in cells]
+        return torch.from_numpy(np.frombuffer(b"".join(found), np.int64).copy())
 
     def derived(self: Data, **fields: Any) -> Data:
         """Return a copy with other values of some fields, which follow from checked ones and are not checked again."""

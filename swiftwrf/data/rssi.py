@@ -179,6 +179,12 @@ class Rssi(PositionedData):
         """True where a receiver detected the transmitter, bool (n, R)."""
         return ~self.rssi_dbm.isnan()
 
+    def as_measured(self) -> Rssi:
+        """Return the data with the offsets that were removed from them."""
+        if self.offsets is None:
+            return self
+        return self.derived(rssi_dbm=self.rssi_dbm + self.offsets.of(self)[:, None], offsets=None)
+
     def about(self, origin: GeodeticOrigin | None) -> Rssi:
         """Return the data in local metres about another origin. With None, or if the data have none, nothing changes."""
         if origin is None or self.origin is None or origin == self.origin:
@@ -352,7 +358,7 @@ class Offsets:
 
     def removed(self, data: Rssi) -> Rssi:
         """Return the data as the reference group would have measured them."""
-        return data.derived(rssi_dbm=data.rssi_dbm - self.of(data)[:, None], offsets=self)
+        return data.derived(rssi_dbm=data.as_measured().rssi_dbm - self.of(data)[:, None], offsets=self)
 
     def note(self) -> str:
         """Return a sentence with all offsets."""

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import Annotated, Any, ClassVar
 
@@ -25,9 +23,11 @@ from swiftwrf.errors import InputError
 from swiftwrf.metrics import WINDOW
 from swiftwrf.plotting import Axes, mark_direction, polar_spectrum
 from swiftwrf.positions import to_tensor
+from swiftwrf.runtime.digest import digest
 from swiftwrf.runtime.validation import check_value, checked
 
 GRID = AngularGrid.hemisphere(90, 360)  # of spectra that are computed
+OF_SPECTRA = ("line_of_sight", "label", "channel", "frequency_hz")  # arrays beside the spectra in spectrum.npz
 DIRECTION = ("elevation", "azimuth")  # names of the dimensions of a spectrum
 MAX_LABEL = torch.tensor([math.tau, math.pi / 2], dtype=torch.float64) + 1e-6  # azimuth and elevation [rad], rounded
 
@@ -308,16 +308,15 @@ def array_spectra(array: PlanarArray, channel: Tensor, grid: AngularGrid, beamfo
     Raises:
         InputError: As `PlanarArray.spectrum`, or a cache directory without room.
     """
-
-    def key() -> str:
-        how = version("swiftwrf-tasks"), beamformer, array.wavelength, array.element.tolist(), grid
-        digest = hashlib.sha256(repr(how).encode())
-        digest.update(channel.contiguous().numpy().data)
-        return digest.hexdigest()
-
     shape = (len(channel), *grid.shape)
     rows = torch.arange(len(channel)).split(max(1, BATCH_PIXELS // math.prod(grid.shape)))
-    return stored(shape, torch.float32, key, lambda: (array.spectrum(channel[r], grid, beamformer) for r in rows))
+    how = version("swiftwrf-tasks"), beamformer, array, grid
+    return stored(
+        shape,
+        torch.float32,
+        lambda: digest(how, channel),
+        lambda: (array.spectrum(channel[r], grid, beamformer) for r in rows),
+    )
 
 
 def direction_of_link(
@@ -378,10 +377,6 @@ def check_training(train: Spectra, least: int = MIN_TRAINING) -> None:
 
 
 def fingerprint(train: Spectra, *settings: Any) -> str:
-    """Return a digest of the spectra, the description of their scene, and settings (plain values)."""
-    array = train.array and [train.array.wavelength, train.array.element.tolist()]
-    known = [None if value is None else value.tolist() for value in (train.rotation, train.fixed_position)]
-    scene = [asdict(train.grid), train.moving, array, *known]
-    digest = hashlib.sha256(json.dumps([*settings, scene, train.store.digest()]).encode())
-    digest.update(train.position.numpy().tobytes())
-    return digest.hexdigest()
+    """Return a digest of the spectra, their channels, the description of their scene, and settings."""
+    scene = train.grid, train.moving, train.array, train.rotation, train.fixed_position
+    return digest(*settings, scene, train.store, train.position, train.channel, train.frequency_hz)

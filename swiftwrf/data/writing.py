@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from swiftwrf.data.dataset import Labelled
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.powers import NOT_DETECTED_DBM
 from swiftwrf.data.rssi import META, SURVEY, Rssi
-from swiftwrf.data.spectra import Spectra
+from swiftwrf.data.spectra import OF_SPECTRA, Spectra
 from swiftwrf.data.store import write_npy
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.durable import replacing, write_npz, write_text
@@ -52,16 +53,21 @@ def write_spectra(data: Spectra, folder: Path) -> None:
         with archive.open("spectrum.npy", "w", force_zip64=True) as stream:
             dtype, batches = data.store.exact()
             write_npy(stream, data.store.shape, dtype, batches)
-        with archive.open("line_of_sight.npy", "w") as stream:
-            np.save(stream, data.line_of_sight.numpy())
+        others = {name: getattr(data, name) for name in OF_SPECTRA}
+        if torch.equal(data.label, data.direction_at(data.position)):
+            del others["label"]  # follows from the positions
+        for name, values in others.items():
+            if values is not None:
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
+                    np.save(stream, values.numpy())
     write_splits(data.named_splits, folder, first=1)
 
 
 def write_rssi(data: Rssi, folder: Path) -> None:
     """Write tx_pos.csv, gateway_rssi.csv, the splits, and what else is known of the measurements, into a folder.
 
-    That is meta.csv with sessions and times, gateway_position.yml with positions of receivers, and survey.yml with the
-    origin of the coordinates, the floors, and whether the receiver moves.
+    That is meta.csv with sessions, times and groups, gateway_position.yml with positions of receivers, and survey.yml with
+    the origin of the coordinates, the floors, offsets that were removed, and further properties of all measurements.
 
     Measurements of exactly -100 dBm, which the layout uses for not detected, are written as -99.99.
     """
@@ -72,13 +78,17 @@ def write_rssi(data: Rssi, folder: Path) -> None:
         known = zip(data.receiver_names, data.receiver_position.tolist(), data.receiver_located.tolist(), strict=True)
         places = {name: position for name, position, is_located in known if is_located}
         write_text(folder / "gateway_position.yml", yaml.safe_dump(places, sort_keys=False, allow_unicode=True))
-    of_rows = {"session": data.session, "time": data.time}
-    if columns := {name: values.numpy() for name, values in of_rows.items() if values is not None}:
-        write_text(folder / META, pd.DataFrame(columns).to_csv(index=False))
+    of_rows = {"session": data.session, "time": data.time, "group": data.groups}
+    if columns := {name: np.asarray(values) for name, values in of_rows.items() if values is not None}:
+        write_text(folder / META, pd.DataFrame(columns).to_csv(index_label="row"))  # whose lines are never empty
     survey = {
         "origin": data.origin and list(data.origin),
         "floors": data.floors and dict(zip(data.floors.names, data.floors.height_m, strict=True)),
         "receiver_moves": data.receiver_moves,
+        "groups": None if data.groups is None else str(data.groups.name),
+        "offsets": data.offsets and asdict(data.offsets),
+        "labels": list(data.labels),
+        "plan_scale": data.plan_scale,
     }
     if survey := {name: value for name, value in survey.items() if value}:
         write_text(folder / SURVEY, yaml.safe_dump(survey, sort_keys=False, allow_unicode=True))

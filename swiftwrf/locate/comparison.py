@@ -112,6 +112,7 @@ class LocateSplit:
         if isinstance(localizer, PosteriorLocalizer):
             weight = localizer.locator.weight.tolist()
             values["weights"] = dict(zip(("values", "detections", "fingerprints"), weight, strict=True))
+            values["held_out"] = localizer.locator.held_out_m
             if folder is not None:
                 localizer.locator.save(folder / LOCATOR)
         return values
@@ -224,11 +225,13 @@ def compare(
         seed: Seed of everything random.
         n_cells: Number of candidate positions of the posterior.
         reference: Group whose offset is 0. Defaults to the most frequent one.
-        keep: Results by the names of steps, in a folder. A call with the same data and options continues after them.
+        keep: Results by the names of steps, in a folder. A call with equal data, options, code and versions continues
+            after them, others are refused.
         executor: Processes that compute steps side by side, e.g. a `ProcessPoolExecutor`.
 
     Raises:
-        InputError: Receivers that move, unknown receivers or split, or too few rows that a receiver detected.
+        InputError: Receivers that move, unknown receivers or split, too few rows that a receiver detected, or `keep` of
+            another call.
 
     Example:
         >>> import swiftwrf
@@ -236,7 +239,10 @@ def compare(
         >>> bool(result.summary().loc["posterior", "median"] < result.summary().loc["mean", "median"])
         True
     """
+    given = locals().copy()
     measured = LocateSplit.of(data.receivers(receivers), split, n_cells, seed, reference)
+    if keep is not None:
+        keep.of(given | {"localizers": [LOCALIZERS[name] for name in LOCALIZERS]})
     with TemporaryDirectory(prefix="swiftwrf-") as folder:
         memo = keep or Memo(Path(folder))
         steps = Steps(measured, memo, executor)

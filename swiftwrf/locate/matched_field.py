@@ -104,11 +104,6 @@ class MatchedField(Configured, Saved):
         """Grid of the training spectra."""
         return self.room.grid
 
-    @property
-    def by_channels(self) -> bool:
-        """True if the locator was fitted to channels, and locates by these."""
-        return isinstance(self.likelihoods, ChannelLikelihoods)
-
     @all_or_nothing
     @checked
     def fit(
@@ -135,6 +130,7 @@ class MatchedField(Configured, Saved):
             raise InputError(f"{with_article(room.kind)} has no room to locate by; fit geometry or hybrid")
         seed, position = self.config.seed, train.position
         own = GeometryModel(seed=seed).fit(train, like=room, progress=progress)
+        train = own.link.aligned(train)
         fold = places(position, FOLDS) % FOLDS
         kind = SpectrumLikelihoods if train.channel is None else ChannelLikelihoods
         features, (*parts, self.likelihoods) = kind.fit(train, own, fold, seed)
@@ -208,12 +204,14 @@ class MatchedField(Configured, Saved):
                 both.
 
         Raises:
-            InputError: No row, spectra on another grid, no channels where the training data had them, a number that is not
-                finite, or a locator that is not fitted.
+            InputError: No row, spectra on another grid or of another link, no channels where the training data had them, a
+                number that is not finite, or a locator that is not fitted.
         """
         self.check_fitted()
         if not len(spectrum):
             raise InputError("there is no row to locate")
+        if isinstance(spectrum, Spectra):
+            spectrum = self.room.link.aligned(spectrum)
         observed = self.likelihoods.features(spectrum, self.config.seed)
         parts = list(self._searched(observed, self.likelihoods))
         position = torch.cat([cells.position for cells, _ in parts])

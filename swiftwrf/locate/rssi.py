@@ -94,6 +94,8 @@ class RssiLocator(Configured, Saved):
     """radio maps of the receivers, set by `fit`"""
     receiver_names: tuple[str, ...]
     """names of the receivers, set by `fit`"""
+    held_out_m: dict[str, float]
+    """mean errors [m] of the posterior and of the mean training position at held-out rows, set by `fit`, not saved"""
 
     @all_or_nothing
     @checked
@@ -114,8 +116,7 @@ class RssiLocator(Configured, Saved):
         """
         config = self.config
         if model is not None:
-            model.check_measurements(train)
-            train = train.about(model.origin)
+            train = model.aligned(train)
         self.receiver_names = train.receiver_names
         self.model = model or self._radio_maps(train)
         known = train.transmitter_position
@@ -163,7 +164,7 @@ class RssiLocator(Configured, Saved):
 
         The distributions are those of all folds, whose few parameters depend little on a single one.
         """
-        truth, values, positions, masses = [], [], [], []
+        truth, values, positions, masses, centres = [], [], [], [], []
         for part in parts:
             own = replace(self.likelihoods.fingerprints, fingerprints=part.fingerprints)
             likelihoods = replace(self.likelihoods, fingerprints=own)
@@ -175,10 +176,15 @@ class RssiLocator(Configured, Saved):
             prior = replace(part.region, margin=self.region.margin, outside=self.region.outside)
             masses.append(prior.log_mass(self.cells.position).expand(len(rssi), -1))
             positions.append(at)
+            centres.append(part.region.known.mean(dim=0).expand_as(at))
         candidates, position, volume = torch.cat(values, dim=1), torch.cat(positions), torch.cat(masses)
         self.weight = pooled_weights(torch.cat(truth, dim=1), candidates, volume)
         log_mass = torch.einsum("k,knm->nm", self.weight, candidates) + volume
         held_out = self._posterior(log_mass)
+        self.held_out_m = {
+            name: float((at - position).norm(dim=1).mean())
+            for name, at in (("posterior", held_out.median), ("mean", torch.cat(centres)))
+        }
         # the coverage at new places is then 80 % or more with a probability of 90 %; rows of one place count once
         margin = NORMAL_80 * (LEVEL * (1 - LEVEL) / len(position.unique(dim=0))) ** 0.5
         self.inflation = inflation(held_out, position, LEVEL, margin)

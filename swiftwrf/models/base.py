@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Iterable
 from copy import copy
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.choices import FIELD_MODELS, PUBLISHED, Moving
-from swiftwrf.data.dataset import Numbers
+from swiftwrf.data.dataset import Data, Numbers, PositionedData
 from swiftwrf.data.spectra import Spectra, check_training, to_magnitudes
 from swiftwrf.data.splits import Validation
 from swiftwrf.data.store import Store
@@ -24,7 +25,7 @@ from swiftwrf.errors import InputError, with_article
 from swiftwrf.models.link import Link
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Axes, Displayed, extent
-from swiftwrf.positions import check_positions, to_tensor
+from swiftwrf.positions import check_near, check_positions, to_tensor
 from swiftwrf.runtime.checkpoint import Header, Saved, check_folder
 from swiftwrf.runtime.descent import Record
 from swiftwrf.runtime.threads import single_thread, to_device
@@ -40,6 +41,7 @@ from swiftwrf.runtime.validation import (
 
 ARRAY, FIXED_END = "array", "fixed end"  # requirements that a model can declare
 CPU = torch.device("cpu")
+ALREADY_LEARNT = "are already in the model and are left out"
 
 
 @configuration
@@ -57,7 +59,30 @@ class FieldConfig:
     """seed of everything random"""
 
 
-class FieldModel(Configured, Saved, Displayed):
+class Updatable:
+    """Base class of models that recognise the rows that they have learnt, so that they learn none twice."""
+
+    updates: ClassVar[bool] = False
+    """whether `update` is available; other models must be fitted again"""
+    row_digests: Tensor = torch.zeros(0, dtype=torch.int64)
+    """digests of the rows that the model has learnt, in their order, set by `fit` and `update`"""
+
+    def is_learnt(self, new: PositionedData) -> Tensor:
+        """Return True for rows that the model has learnt, by their number, time, position and values, bool (n,)."""
+        return torch.isin(new.row_digests(), self.row_digests)
+
+    def _not_learnt(self, new: Data) -> Data:
+        """Return the rows that the model has not learnt, and warn of the others."""
+        if n_known := int((known := self.is_learnt(new)).sum()):
+            warnings.warn(f"{new.name}: {n_known} of {len(new)} rows {ALREADY_LEARNT}", stacklevel=4)
+        return new.subset(~known) if n_known else new
+
+    def _digests_without(self, rows: Tensor, n: int) -> Tensor:
+        """Return the digests without those of some rows by their numbers among n, of which the last have a digest."""
+        return self.row_digests[~torch.isin(torch.arange(-len(self.row_digests), 0), rows - n)]
+
+
+class FieldModel(Updatable, Configured, Saved, Displayed):
     """Base class of all field models.
 
     A subclass implements `_fit` and `_predict`, and for `save` and `load` also `_state` and `_restore`. Its `name` and its
@@ -94,8 +119,6 @@ class FieldModel(Configured, Saved, Displayed):
     """properties of the data that the model needs: ARRAY, FIXED_END"""
     searches: ClassVar[bool] = False
     """whether `fit` searches a structure that it can reuse from another model"""
-    updates: ClassVar[bool] = False
-    """whether `update` is available; other models must be fitted again"""
     slow: ClassVar[bool] = False
     """whether a fit takes minutes, so that it is compared only on request"""
     any_grid: ClassVar[bool] = False
@@ -166,8 +189,9 @@ class FieldModel(Configured, Saved, Displayed):
         if like is not None and not self.accepts_like(like):
             raise InputError(f"{self.name} cannot reuse the structure of {with_article(like.kind)}")
         if like is not None:
-            like.link.check(train)
+            train = like.link.aligned(train)
         self.grid, self.bounds, self.link = train.grid, bounding_box(train.position), Link.from_spectra(train)
+        self.row_digests = train.row_digests() if self.updates else self.row_digests
         self._fit(train, like=like, device=device, checkpoint=checkpoint, on_record=on_record, progress=progress)
         return self
 
@@ -249,13 +273,14 @@ class FieldModel(Configured, Saved, Displayed):
         """Return the model with more training spectra, by an update of its factorisation. This model stays as it is.
 
         The result equals a fit to all spectra with the same kernel, noise and components. The planes of a room are refined
-        and not searched, which needs 10 new positions.
+        and not searched, which needs 10 new positions. Furniture stays.
 
         Args:
-            new: Spectra of the same link on the grid of the training spectra, any number.
+            new: Spectra of the same link on the grid of the training spectra, any number. Those that the model has already
+                learnt are left out, with a warning.
 
         Raises:
-            InputError: A model that must be fitted again, or as `check_measurements`.
+            InputError: A model that must be fitted again, or as `aligned`.
 
         Example:
             >>> import swiftwrf
@@ -264,26 +289,30 @@ class FieldModel(Configured, Saved, Displayed):
             >>> model.update(data.subset(torch.arange(40, 50))).process.known.shape
             torch.Size([50, 3])
         """
-        self.check_measurements(new)
+        new = self._not_learnt(self.aligned(new))
         model = self._copy()
         if len(new):
             model.bounds = bounding_box(torch.cat([self.bounds, new.position]))
             model._update(new)
+            model.row_digests = torch.cat([self.row_digests, new.row_digests()])
         return model
 
-    def check_measurements(self, new: Spectra) -> None:
-        """Refuse spectra that were not measured as the training spectra.
+    def aligned(self, new: Spectra) -> Spectra:
+        """Return spectra as the model takes them: snapshots in the order of the training spectra. Refuse other measurements.
 
         Raises:
-            InputError: Another grid or link than that of the training spectra, or a spectrum that is not finite.
+            InputError: Another grid or link than that of the training spectra, positions far away from theirs, or a spectrum
+                that is not finite.
         """
         if new.grid != self._checked_grid(None):
             raise InputError(
                 f"{new.name} has another grid than the training spectra; give spectra of {self.grid.shape}"
             )
         self._check_described(new)
-        self.link.check(new)
+        new = self.link.aligned(new)
+        check_near(new.name, new.position, self.bounds)
         check_training(new, least=0)
+        return new
 
     def forget(self, rows: Numbers) -> Self:
         """Return the model without some of its training spectra; see `update`.
@@ -294,8 +323,9 @@ class FieldModel(Configured, Saved, Displayed):
         Raises:
             InputError: A model that must be fitted again, all of its spectra, or a number outside the range.
         """
-        model = self._copy()
-        model._forget(to_tensor("rows", rows, torch.int64, (None,)))
+        model, rows = self._copy(), to_tensor("rows", rows, torch.int64, (None,))
+        model._forget(rows)
+        model.row_digests = self._digests_without(rows, len(self.region()))
         return model
 
     @checked
@@ -380,7 +410,7 @@ class FieldModel(Configured, Saved, Displayed):
         grid = self._checked_grid(None)
         tensors, header = self._state()
         described = {"grid": asdict(grid), "bounds": self.bounds.tolist(), "link": self.link.to_json()}
-        return tensors, {"options": asdict(self.config)} | described | header
+        return tensors | {"row_digests": self.row_digests}, {"options": asdict(self.config)} | described | header
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
         """Return the fitted tensors by name, and plain values beside options, grid and link."""
@@ -391,6 +421,7 @@ class FieldModel(Configured, Saved, Displayed):
         model = cls(from_plain(cls.config_type, header.get("options", {})))
         model.grid = AngularGrid(**header["grid"])
         model.bounds = bounding_box(torch.tensor(header["bounds"], dtype=torch.float64))
+        model.row_digests = tensors.get("row_digests", cls.row_digests)  # earlier files have none
         model.link = Link.from_json(header["link"])
         if lacking := cls.lacking(model.link):
             raise InputError(f"it lacks the {' and the '.join(lacking)}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from torch import Tensor, float64, tensor
@@ -15,6 +15,8 @@ from swiftwrf.positions import to_tensor
 from swiftwrf.runtime.validation import check_value
 
 ROTATION_TOLERANCE = 1e-4  # between the matrices of one orientation
+FREQUENCY_TOLERANCE = 1e-6  # between frequencies, relative to them
+SHAPES = {"fixed_position": (3,), "rotation": (3, 3), "frequency_hz": (None,)}  # of tensors in a file
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,12 +28,14 @@ class Link:
         fixed_position: Position of the fixed end, float64 (3,) [m].
         rotation: Rotation from array to world coordinates, float64 (3, 3).
         array: Antenna array with its carrier.
+        frequency_hz: Frequencies of the snapshots of channels, float64 (S,) [Hz].
 
     Example:
         >>> import swiftwrf
         >>> link = Link.from_spectra(swiftwrf.simulated_room(n=10))
-        >>> link.check(swiftwrf.simulated_room(n=20, seed=1))
-        >>> link.check(swiftwrf.simulated_room(n=20, moving="receiver"))
+        >>> len(link.aligned(swiftwrf.simulated_room(n=20, seed=1)))
+        20
+        >>> link.aligned(swiftwrf.simulated_room(n=20, moving="receiver"))
         Traceback (most recent call last):
         swiftwrf.errors.InputError: simulated-room was measured over another link than ...
     """
@@ -40,41 +44,44 @@ class Link:
     fixed_position: Tensor | None
     rotation: Tensor | None
     array: PlanarArray | None
+    frequency_hz: Tensor | None = None
 
     @classmethod
     def from_spectra(cls, data: Spectra) -> Link:
         """Return the link that spectra describe."""
-        return cls(data.moving, data.fixed_position, data.rotation, data.array)
+        return cls(data.moving, data.fixed_position, data.rotation, data.array, data.frequency_hz)
 
     @classmethod
     def from_json(cls, plain: dict[str, Any]) -> Link:
         """Return the link that `to_json` describes."""
         check_value("moving", plain["moving"], Moving)
-        fixed_position, rotation, array = (plain[name] for name in ("fixed_position", "rotation", "array"))
-        return cls(
-            plain["moving"],
-            None if fixed_position is None else to_tensor("fixed_position", fixed_position, float64, (3,)),
-            None if rotation is None else to_tensor("rotation", rotation, float64, (3, 3)),
-            None if array is None else PlanarArray(tensor(array["element"], dtype=float64), array["wavelength"]),
+        array = plain["array"] and PlanarArray(
+            tensor(plain["array"]["element"], dtype=float64), plain["array"]["wavelength"]
         )
+        known = {name: (plain.get(name), shape) for name, shape in SHAPES.items()}  # earlier files have no frequencies
+        values = {name: x and to_tensor(name, x, float64, shape) for name, (x, shape) in known.items()}
+        return cls(moving=plain["moving"], array=array, **values)
 
     def to_json(self) -> dict[str, Any]:
         """Return the link as plain values."""
-        return {
-            "moving": self.moving,
-            "fixed_position": None if self.fixed_position is None else self.fixed_position.tolist(),
-            "rotation": None if self.rotation is None else self.rotation.tolist(),
-            "array": self.array and {"element": self.array.element.tolist(), "wavelength": self.array.wavelength},
-        }
+        array = self.array and {"element": self.array.element.tolist(), "wavelength": self.array.wavelength}
+        known = {name: None if getattr(self, name) is None else getattr(self, name).tolist() for name in SHAPES}
+        return {"moving": self.moving, "array": array} | known
 
-    def check(self, data: Spectra) -> None:
-        """Refuse spectra of another link. Values that one of both does not describe are not compared.
+    def aligned(self, data: Spectra) -> Spectra:
+        """Return spectra of this link with their snapshots in its order of frequencies, and refuse those of another link.
 
-        Lengths may differ by 0.001 wavelengths (by 1 mm if the wavelength is unknown), elements of the rotation by 0.0001.
+        Values that one of both does not describe are not compared. Lengths may differ by 0.001 wavelengths (by 1 mm if the
+        wavelength is unknown), elements of the rotation by 0.0001, frequencies by a millionth.
 
         Raises:
-            InputError: Another moving end, fixed position, rotation or array.
+            InputError: Another moving end, fixed position, rotation, array or other frequencies.
         """
+        known, given = self.frequency_hz, data.frequency_hz
+        if known is not None and given is not None and data.channel is not None and len(known) == len(given):
+            order = given.argsort(stable=True)[known.argsort(stable=True).argsort()]
+            if bool((given != (given := given[order])).any()):
+                data = replace(data, channel=data.channel[:, order], frequency_hz=given)
         own, other = self.array, data.array
         array = own or other
         length = 1e-3 * array.wavelength if array else 1e-3
@@ -84,12 +91,14 @@ class Link:
             "orientation of the array": _differ(self.rotation, data.rotation, ROTATION_TOLERANCE),
             "arrangement of the elements": own and other and _differ(own.element, other.element, length),
             "carrier": own and other and abs(own.wavelength - other.wavelength) > length,
+            "set of frequencies": known is not None and _differ(known, given, FREQUENCY_TOLERANCE * float(known.max())),
         }
         if found := [what for what, differs in compared.items() if differs]:
             raise InputError(
                 f"{data.name} was measured over another link than the training spectra, with another {', '.join(found)}; "
                 "give spectra of the same link or fit another model"
             )
+        return data
 
 
 class Linked:

@@ -125,13 +125,13 @@ class Monitor:
         learnt are lower than those of new ones, which would raise false alarms.
 
         Raises:
-            InputError: As `FieldModel.check_measurements`, or training spectra at other positions than those of the model.
+            InputError: As `FieldModel.aligned`, or training spectra at other positions than those of the model.
         """
         if isinstance(model, RssiModel):
             return cls(model.region(), model.receiver_names, None, false_alarm_rate)
         reference = None
         if isinstance(train, Spectra):
-            model.check_measurements(train)
+            train = model.aligned(train)
             if isinstance(model, ProcessModel):  # each fifth is predicted without itself
                 known = model.region()
                 if known.shape != train.position.shape or not torch.allclose(known, train.position, rtol=0, atol=1e-3):
@@ -281,10 +281,15 @@ class Follower:
         """Score one measurement, test it for a change, and learn it.
 
         Raises:
-            InputError: Any other number of measurements, or as `update`.
+            InputError: Any other number of measurements, one that the model has already learnt, or as `update`.
         """
         if len(new) != 1:
             raise InputError(f"a step follows one measurement, got {len(new)}; give one after the other")
+        new = self.model.aligned(new)  # type: ignore[arg-type]  # a measurement of the model's kind
+        if bool(self.model.is_learnt(new).any()):
+            raise InputError(
+                f"{new.name} row {int(new.index[0])}, counted from 0, is already in the model; leave it out"
+            )
         scores = score(self.model, new)
         alarms = self.monitor.observe(scores.position[0], scores.innovation[0])
         words, correlation, notices = list(map(self.monitor.describe, alarms)), None, []
@@ -390,6 +395,5 @@ def joined(parts: list[Spectra]) -> Spectra:
         grid=first.grid,
         name=first.name,
         channel=torch.cat(channels) if len(channels) == len(parts) else None,
-        frequency_hz=first.frequency_hz,
         **vars(Link.from_spectra(first)),
     )

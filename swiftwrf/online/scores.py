@@ -64,7 +64,7 @@ def score(model: FieldModel | RssiPredictor, new: Spectra | Rssi) -> Scores:
     """Return the scores of measurements that a model has not learnt.
 
     Raises:
-        InputError: As `check_measurements` and `predict`.
+        InputError: As `aligned` of the model.
 
     Example:
         >>> import swiftwrf
@@ -72,7 +72,7 @@ def score(model: FieldModel | RssiPredictor, new: Spectra | Rssi) -> Scores:
         >>> score(swiftwrf.make_model("coarray").fit(train), test).innovation.shape
         torch.Size([10, 1])
     """
-    model.check_measurements(new)  # type: ignore[arg-type]  # measurements of the model's kind
+    new = model.aligned(new)  # type: ignore[arg-type]  # measurements of the model's kind
     if isinstance(model, RssiPredictor):
         assert isinstance(new, Rssi)
         position, measured = new.transmitter_position, new.rssi_dbm

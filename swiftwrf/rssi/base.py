@@ -19,10 +19,10 @@ from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Offsets, Rssi
 from swiftwrf.data.splits import MIN_TRAINING
 from swiftwrf.errors import InputError, listed
-from swiftwrf.models.base import FieldConfig
+from swiftwrf.models.base import FieldConfig, Updatable
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Displayed
-from swiftwrf.positions import check_positions, to_tensor
+from swiftwrf.positions import check_near, check_positions, to_tensor
 from swiftwrf.rssi.detection import Detection
 from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation
 from swiftwrf.runtime.checkpoint import Header, Saved
@@ -63,7 +63,7 @@ class RssiConfig(FieldConfig):
     with fewer than 10 values counts its empty cells"""
 
 
-class RssiPredictor(Configured, Displayed, ABC):
+class RssiPredictor(Updatable, Configured, Displayed, ABC):
     """Base class of all predictors of RSSI at fixed receivers from the position of the transmitter.
 
     If the data have floors, `fit` removes the attenuation of those between transmitter and receiver, and `predict` adds it.
@@ -85,8 +85,6 @@ class RssiPredictor(Configured, Displayed, ABC):
     """whether the positions of the receivers must be known"""
     slow: ClassVar[bool] = False
     """whether a fit takes minutes, so that it is compared only on request"""
-    updates: ClassVar[bool] = False
-    """whether `update` is available; other predictors must be fitted again"""
     max_map_predictions: ClassVar[int] = 2**22
     """predictions of a map at all receivers if its cells are not given"""
     batch_size: ClassVar[int] = 512
@@ -159,6 +157,7 @@ class RssiPredictor(Configured, Displayed, ABC):
             raise InputError(lacking)
         self.receiver_names, self.receiver_position = tuple(map(str, train.receiver_names)), train.receiver_position
         self.origin, self.offsets, self.attenuation = train.origin, train.offsets, None
+        self.row_digests = train.row_digests() if self.updates else self.row_digests
         shift = torch.zeros_like(pool.rssi_dbm)
         if train.offsets is not None:
             shift = shift + train.offsets.of(pool)[:, None]
@@ -181,10 +180,11 @@ class RssiPredictor(Configured, Displayed, ABC):
         The result equals a fit to all rows with the same kernel, noise, mixing weights and weights of the earlier rows.
 
         Args:
-            new: Rows at the receivers of the training rows, in the same frame, any number.
+            new: Rows at the receivers of the training rows, any number. Those that the predictor has already learnt are
+                left out, with a warning.
 
         Raises:
-            InputError: A predictor that must be fitted again, or as `check_measurements`.
+            InputError: A predictor that must be fitted again, or as `aligned`.
 
         Example:
             >>> import swiftwrf
@@ -193,13 +193,12 @@ class RssiPredictor(Configured, Displayed, ABC):
             >>> len(model.update(data.subset(torch.arange(50, 60))).anchor)
             60
         """
-        self.check_measurements(new)
+        new = self._not_learnt(self.aligned(new))
         predictor = copy(self)
-        if self.attenuation is not None:
-            new = self.attenuation.removed(new)
         if len(new):
             self.check_updates()
-            predictor._update(new)
+            predictor.row_digests = torch.cat([self.row_digests, new.row_digests()])
+            predictor._update(new if self.attenuation is None else self.attenuation.removed(new))
         return predictor
 
     def check_updates(self) -> None:
@@ -207,26 +206,54 @@ class RssiPredictor(Configured, Displayed, ABC):
         if not self.updates:
             raise InputError(f"a predictor {self.name} cannot be updated; fit it again to all rows")
 
-    def check_measurements(self, data: Rssi) -> None:
-        """Refuse rows at other receivers than those of the training rows. Unknown positions are not compared.
+    def aligned(self, data: Rssi, *, located: bool = True) -> Rssi:
+        """Return rows as the predictor takes them, and refuse rows that were measured otherwise than the training rows.
+
+        Receivers are in the order of the training rows, positions about the same origin, and offsets that the predictor
+        knows are removed.
+
+        Args:
+            data: Rows at the receivers of the training rows.
+            located: Whether the positions of the transmitter count.
 
         Raises:
-            InputError: Other names, another order, or a receiver more than 1 cm from its position in the training rows.
+            InputError: Other receivers, or one more than 1 cm from its position in the training rows, where both are known;
+                positions in degrees for a predictor in metres or the reverse, on other floors, or far away.
         """
         self.check_fitted()
-        if tuple(map(str, data.receiver_names)) != self.receiver_names:
+        names, own = list(data.receiver_names), list(self.receiver_names)
+        if sorted(names) != sorted(own):
             raise InputError(
-                f"{data.name} has the receivers {listed(data.receiver_names)}, but the predictor was fitted to "
-                f"{listed(self.receiver_names)}; give the same ones in this order"
+                f"{data.name} has the receivers {listed(names)}, but the predictor was fitted to {listed(own)}; give these"
             )
-        position = data.about(self.origin).receiver_position
-        apart = (position - self.receiver_position).norm(dim=1).nan_to_num(0.0)
+        data = (data if names == own else data.columns([names.index(name) for name in own])).about(self.origin)
+        apart = (data.receiver_position - self.receiver_position).norm(dim=1).nan_to_num(0.0)
         if len(moved := (apart > 0.01).nonzero()[:, 0]):
             name, metres = self.receiver_names[int(moved[0])], float(apart[moved[0]])
             raise InputError(
                 f"{data.name} has receiver {name} {metres:.3g} m away from its position in the rows that the predictor was "
                 "fitted to; fit a predictor to rows with the receivers at these positions"
             )
+        if located and len(data):
+            data = self._on_own_floors(data)
+        return data if self.offsets is None else self.offsets.removed(data)
+
+    def _on_own_floors(self, data: Rssi) -> Rssi:
+        """Return rows with the floors of the training rows. Refuse another unit, other floors and positions far away."""
+        if data.origin != self.origin:
+            found, own = ("metres" if origin is None else "degrees" for origin in (data.origin, self.origin))
+            raise InputError(f"{data.name} has positions in {found}, but the predictor was fitted to {own}; give {own}")
+        floors, at = self.attenuation and self.attenuation.floors, data.transmitter_position
+        if data.floors is not None:
+            pairs = zip(data.floors.named(at), floors.named(at) if floors else [""] * len(at), strict=True)
+            if other := {name for name, own in pairs if not {*name.split(", ")} & {*own.split(", ")}}:
+                raise InputError(
+                    f"{data.name} has rows on floor {listed(sorted(other))} at heights of other floors of the rows that the "
+                    f"predictor was fitted to ({listed(floors.names) if floors else 'none'}); fit a predictor to all floors"
+                )
+        if self.updates:
+            check_near(data.name, at, self.region())
+        return data.derived(floors=floors)
 
     def _update(self, new: Rssi) -> None:
         """Add checked rows to this copy."""
@@ -278,10 +305,9 @@ class RssiPredictor(Configured, Displayed, ABC):
         """Predict the RSSI at least where it is measured, with shapes of `predict` at the positions of the data.
 
         Raises:
-            InputError: As `check_measurements`.
+            InputError: As `aligned`.
         """
-        self.check_measurements(data)
-        return self.predict(data.about(self.origin).transmitter_position)
+        return self.predict(self.aligned(data).transmitter_position)
 
     @checked
     def predict_detection(self, position: Numbers, offset_db: Tensor | float = 0.0) -> Tensor:

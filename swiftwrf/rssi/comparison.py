@@ -19,7 +19,7 @@ from swiftwrf.choices import RSSI_PREDICTORS, NotDetected
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.rssi import PLACE
-from swiftwrf.data.splits import MIN_TRAINING, Validation
+from swiftwrf.data.splits import MIN_TRAINING, Validation, places
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import method_summary
 from swiftwrf.models.prediction import Prediction
@@ -120,9 +120,10 @@ class RssiComparison:
 
     @cached_property
     def errors(self) -> DataFrame:
-        """Errors, a row for each method and detected pair of test row and receiver."""
+        """Errors, a row for each method and detected pair of test row and receiver, with the number of the row's place."""
         test, (row, column) = self.test, self._pairs
         measured = test.rssi_dbm[row, column]
+        place = places(test.transmitter_position, 2)[row].numpy()
         from_training = nearest(test.transmitter_position, self.train.transmitter_position, 1)[0][row, 0]
         from_receiver = distance(test.transmitter_position, test.receiver_position)[row, column]
         rows = []
@@ -132,6 +133,7 @@ class RssiComparison:
                 "method": name,
                 "receiver": self._receiver,
                 "index": test.index[row].numpy(),
+                "place": place,
                 "measured_dbm": measured.numpy(),
                 "predicted_dbm": predicted.numpy(),
                 "abs_error_db": (predicted - measured).abs().numpy(),
@@ -235,13 +237,14 @@ def compare(
         validation: Folds that choose all settings: "random", "block" or "session". Defaults to those like the test rows.
         fewer: Fractions of the training rows that the model and "knn" are fitted to, too, e.g. (0.25, 0.5).
         device: Device to compute on.
-        keep: Results by the names of predictors, in a folder, and the model. A call with the same data and options
-            continues after them.
+        keep: Results by the names of predictors, in a folder, and the model. A call with equal data, options, code and
+            versions continues after them, others are refused.
         executor: Processes that fit receivers side by side, e.g. a `ProcessPoolExecutor`.
         progress: Show a progress bar on a terminal.
 
     Raises:
-        InputError: Unknown receivers, split or predictors, no test row that a receiver detects, or too few rows.
+        InputError: Unknown receivers, split or predictors, no test row that a receiver detects, too few rows, or `keep` of
+            another call.
 
     Example:
         >>> import swiftwrf
@@ -249,7 +252,8 @@ def compare(
         >>> bool(result.summary().loc["swiftwrf", "median"] < result.summary().loc["mean", "median"])
         True
     """
-    chosen = data.receivers(receivers)
+    given = locals().copy()
+    chosen = data.as_measured().receivers(receivers)
     train, test = chosen.split(split, seed)
     if not bool(test.detected.any()):
         raise InputError(f"split {split!r} of {data.name} has no test rows that detect these receivers")
@@ -261,6 +265,8 @@ def compare(
     kind = train.validation_for(split, test) if validation == "auto" else validation
     options: Values = {"validation": kind, "seed": seed, "new_places": split == PLACE, "not_detected": not_detected}
     names, left_out = compared(chosen, also)
+    if keep is not None:
+        keep.of(given | {"predictors": [RSSI_PREDICTORS[name] for name in names]})
     own, predictors = model_of(train), dict[str, RssiPredictor]()
     parallel = None if executor is None else executor.map
 
@@ -282,8 +288,8 @@ def compare(
                 found = float(above[detected].double().mean()), float((~above)[~detected].double().mean())
         std = None if prediction.std is None else prediction.std[test.detected]
         error = (prediction.mean + offset - test.rssi_dbm)[test.detected].abs()
-        values = {"predicted": prediction.mean[test.detected], "std": std, "median_db": float(error.quantile(0.5))}
-        values["mean_db"] = float(error.mean())
+        values: Values = {"predicted": prediction.mean[test.detected], "std": std, "mean_db": float(error.mean())}
+        values |= {"median_db": float(error.quantile(0.5)), "held_out": getattr(predictor, "held_out_db", {})}
         return seconds | values | {"detection": found, "n_primitives": getattr(predictor, "n_primitives", 0)}
 
     order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))

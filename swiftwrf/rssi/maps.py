@@ -24,7 +24,7 @@ from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
 from swiftwrf.data.dataset import DEGREE_UNITS, Arrays, Labelled, Numbers
-from swiftwrf.data.rssi import receiver_row
+from swiftwrf.data.rssi import Rssi, receiver_row
 from swiftwrf.errors import InputError, listed
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Axes, Displayed, corners_of, hatch, plan_map
@@ -73,6 +73,7 @@ class RssiMap(Labelled, Displayed):
         cell: float | None = None,
         height: float | None = None,
         region: Numbers | None = None,
+        detected: bool = False,
     ) -> RssiMap:
         """Return the map of a fitted model over the box of a region.
 
@@ -81,6 +82,7 @@ class RssiMap(Labelled, Displayed):
             cell: Edge of a cell [m]. Defaults to 1/120 of the longer side, larger if predictions of the model are slow.
             height: Height of the transmitter [m]. Defaults to the median of the training positions.
             region: Positions (n, 2 or 3) [m]. Defaults to the training positions and the known positions of receivers.
+            detected: Predict mean and standard deviation of detected packets, as of `predict_detected`.
 
         Raises:
             InputError: A cell that is not positive, a region of no or other positions, a map of more than 2^22 cells, or a
@@ -114,8 +116,14 @@ class RssiMap(Labelled, Displayed):
         x, y = (start + cell * np.arange(int(size)) for start, size in zip(first, sizes, strict=True))
         z = float(known[:, 2].median()) if height is None else height
         grid = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), z)], axis=-1).reshape(-1, 3)
+        cells = Rssi(
+            np.full((len(grid), len(receiver)), np.nan),
+            grid,
+            receiver_position=receiver,
+            receiver_names=model.receiver_names,
+        )
         with torch.no_grad():
-            found = model.predict(grid)
+            found = model.predict_detected(cells) if detected else model.predict(grid)
         assert found.std is not None
         each = (found.mean, found.std, model.predict_detection(grid))
         mean, std, detection = (values.T.reshape(-1, len(y), len(x)).float().numpy() for values in each)

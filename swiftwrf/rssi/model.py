@@ -103,6 +103,8 @@ class RssiModel(SavedRssiPredictor):
     """RSSI at 1 m [dBm] and slope [dB a decade] of the simpler predictors by their mixing weights, float64 (R, 2)"""
     posterior: RssiPosterior
     """least squares of the fit, which `update` continues"""
+    held_out_db: dict[str, float]
+    """mean absolute errors [dB] of the model and of the receivers' means at held-out rows, set by `fit`, not saved"""
 
     @single_thread()
     def _fit(
@@ -147,6 +149,8 @@ class RssiModel(SavedRssiPredictor):
         predictors = predictors[..., mine]
         check_comparable(predictors, train.rssi_dbm)
         predicted = torch.einsum("k,knr->nr", weight[weight > 0], predictors[weight > 0])
+        means = ((self.name, predicted), ("mean", predictors[-1]))
+        self.held_out_db = {name: float((mean - train.rssi_dbm).abs().nanmean()) for name, mean in means}
         scale = self._calibrate(train.rssi_dbm, predicted, std[:, mine], found["field_db"], found["noise_db"])
         # only two predictors have the receiver's path loss
         self.covariance = (weight[:2].sum() * scale).square()[:, None, None] * found.pop("covariance")
@@ -199,9 +203,6 @@ class RssiModel(SavedRssiPredictor):
 
     @single_thread()
     def _update(self, new: Rssi) -> None:
-        if self.offsets is not None:
-            new = self.offsets.removed(new)
-        new = new.about(self.origin)
         at = new.transmitter_position - self.centre
         if self.detection_field is not None:
             self.detection_field = self.detection_field.updated(at, new.detected)
@@ -245,7 +246,9 @@ class RssiModel(SavedRssiPredictor):
         # the rows have lost their sessions
         validation = "block" if self.config.validation == "session" else self.config.validation
         model = type(self)(replace(self.config, validation=validation)).fit(rows)
-        model.offsets = self.offsets
+        model.offsets, model.row_digests = self.offsets, self.row_digests
+        if without is not None:
+            model.row_digests = self._digests_without(without, len(posterior.anchor))
         # a mean of several measurements has a smaller variance than one measurement
         if bool(((posterior.variance > 0) & (posterior.variance < 0.99 * posterior.noise_db.square()[:, None])).any()):
             model.field_db, model.noise_db = self.field_db, self.noise_db
@@ -272,8 +275,9 @@ class RssiModel(SavedRssiPredictor):
         Near the limit of detection it is above the received power of all packets, which `predict` returns.
 
         Raises:
-            InputError: As `check_measurements`.
+            InputError: As `aligned`.
         """
+        data = self.aligned(data)
         prediction = super().predict_detected(data)
         if self.detection is None or self.detection_field is None:
             return prediction
@@ -312,12 +316,14 @@ class RssiModel(SavedRssiPredictor):
     def state(self) -> tuple[dict[str, Tensor], Header]:
         self.check_fitted()
         names = _shapes(0, 0, self.detection_field is not None)
-        return {name: attrgetter(name)(self) for name in names}, self._header() | {"kernel": asdict(self.kernel)}
+        tensors = {name: attrgetter(name)(self) for name in (*names, "row_digests")}
+        return tensors, self._header() | {"kernel": asdict(self.kernel)}
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
         model = cls._of_header(header)
         model.kernel, model.detection_field = Kernel(**header["kernel"]), None
+        model.row_digests = tensors.get("row_digests", cls.row_digests)  # earlier files have none
         detections, anchor = any("detection_field." in name for name in tensors), tensors["posterior.anchor"]
         shapes = _shapes(len(model.receiver_names), len(anchor), detections)
         expect(tensors, shapes)

@@ -95,7 +95,7 @@ def estimate_floor_attenuation(data: Rssi) -> FloorAttenuation:
 
 @single_thread()
 def estimate_offsets(train: Rssi, reference: str | None = None) -> Offsets:
-    """Estimate the offset of each group of rows by generalised least squares.
+    """Estimate the offset of each group of measured rows by generalised least squares.
 
     RSSI at a receiver is its path-loss model, plus a Gaussian process of the position, plus the offset of the row's group,
     plus noise. An offset is the same at all receivers.
@@ -139,7 +139,7 @@ def estimate_offsets(train: Rssi, reference: str | None = None) -> Offsets:
     member = torch.nn.functional.one_hot(code, len(names)).double()
     gram = torch.zeros(len(names) + 1, len(names) + 1, dtype=torch.float64)  # of members and RSSI
     generator = torch.Generator().manual_seed(0)
-    for r, rssi in enumerate(train.rssi_dbm.T):
+    for r, rssi in enumerate(train.as_measured().rssi_dbm.T):
         rows = (~rssi.isnan()).nonzero()[:, 0]
         rows = rows[torch.randperm(len(rows), generator=generator)[:MAX_ROWS]]  # evenly spaced rows may be of one group
         if not len(rows):

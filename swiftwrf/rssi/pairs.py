@@ -152,10 +152,9 @@ class PairPredictor(RssiPredictor):
 
     def predict_detected(self, data: Rssi) -> Prediction:
         """Predict the RSSI where it is measured; nan elsewhere, which saves time where a row has few receivers."""
-        self.check_measurements(data)
+        data = self.aligned(data)
         row, column = data.detected.nonzero(as_tuple=True)
-        position = data.about(self.origin).transmitter_position
-        found = self.predict_pairs(position[row], self.receiver_position[column])
+        found = self.predict_pairs(data.transmitter_position[row], self.receiver_position[column])
 
         def spread(values: Tensor) -> Tensor:
             return torch.full(data.rssi_dbm.shape, torch.nan).double().index_put((row, column), values.double())

@@ -6,10 +6,11 @@ import json
 import re
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
-from contextlib import contextmanager
-from functools import partial
+from contextlib import contextmanager, suppress
+from functools import cache, partial
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from pickle import PicklingError
 from typing import Any, Generic, TypeVar
@@ -19,6 +20,8 @@ from swiftwrf.runtime.durable import strict, write_json
 
 STEPS = "steps"  # folder, beside the results, of kept values and of files that only later steps read
 MODEL, LOCATOR = "model.safetensors", "locator.safetensors"  # fitted models of RSSI, among the results
+ORIGIN = "origin"  # what the kept results are of
+NOT_OF_RESULTS = ("keep", "executor", "progress")  # arguments on which no result depends
 POLL_S = 2  # between two checks that there are workers
 
 Row = dict[str, Any]
@@ -39,6 +42,32 @@ def refusing_executor(executor: Executor | None) -> Iterator[None]:
             raise
         remedy = "give an open one, models and estimators of classes that a module defines, or leave it out"
         raise InputError(f"the executor does not compute the steps ({error}); {remedy}") from None
+
+
+@cache  # looked up at every step of a run
+def packages() -> dict[str, str]:
+    """Return the versions of this project and of the libraries on which results depend."""
+    found = {}
+    for name in ("swiftwrf-tasks", "torch", "torchvision", "numpy", "scipy", "scikit-learn", "numba"):
+        with suppress(PackageNotFoundError):  # numba is an extra
+            found[name] = version(name)
+    return found
+
+
+def check_unchanged(folder: Path, before: Any, now: Mapping[str, str]) -> None:
+    """Refuse to continue what began with other input, by the digests and versions of all that decides the results.
+
+    Raises:
+        InputError: They differ; the message names those that do, and earlier versions.
+    """
+    if before != now:
+        before = before if isinstance(before, dict) else {}
+        changed = sorted(name for name in {*before, *now} if before.get(name) != now.get(name))
+        was = (f"{name} {known}" if len(known := str(before.get(name, ""))) < 64 else name for name in changed)
+        raise InputError(
+            f"the input or a version has changed since {folder} began ({', '.join(map(str.strip, was))}); restore it or "
+            "begin in a new folder"
+        )
 
 
 class Memo:
@@ -79,6 +108,20 @@ class Memo:
         plain: Row = strict(value)
         write_json(self.folder / STEPS / f"{name}.json", {"value": plain, "seconds": seconds})
         return plain
+
+    def of(self, given: Mapping[str, Any]) -> None:
+        """Keep the results of a call with these arguments, by name, and refuse a folder with results of another one.
+
+        Raises:
+            InputError: Results of other arguments, of a class of one's own before it was changed, or of another version.
+        """
+        from swiftwrf.runtime.digest import digest  # imports torch, which commands that compute nothing do not need
+
+        origin = packages() | {name: digest(value) for name, value in given.items() if name not in NOT_OF_RESULTS}
+        if any(file.suffix == ".json" and file.stem != ORIGIN for file in (self.folder / STEPS).iterdir()):
+            check_unchanged(self.folder, self.kept(ORIGIN), origin)
+        else:
+            self.keep(ORIGIN, origin, seconds=0.0)
 
     def expect(self, steps: int) -> None:
         """Take notice of further steps."""

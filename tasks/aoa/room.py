@@ -13,6 +13,7 @@ from pandas import DataFrame, concat
 
 from augment.turbo.condition import LOCATED
 from swiftwrf.models import FIELD_MODELS
+from swiftwrf.models.geometry.planes import IDENTIFIABLE
 from swiftwrf.plotting import corners_of, hatch
 from tasks import labels
 from tasks.aoa.records import FractionRecords
@@ -111,6 +112,8 @@ def room_section(fraction: FractionRecords) -> Section | None:
             _described(plane),
             f"{plane['gain']:+.2f}" + " (dielectric)" * plane["dielectric"],
             number(plane["std_mm"], 1),
+            f"{plane['probability']:.1%}",
+            "none" if plane["rival_m"] is None else _described({**plane, "offset_m": plane["rival_m"]}),
             "yes" if plane["certain"] else "no",
         ]
         for plane in room["planes"]
@@ -118,11 +121,13 @@ def room_section(fraction: FractionRecords) -> Section | None:
     caption = (
         f"Mirror planes, also in `geometry-mix{fraction.key}.json`; images up to order {room['order']}. The room explains "
         f"{1 - room['unexplained']:.0%} of the power of the spectra. Its spectra have a correlation of "
-        f"{1 - room['score_held_out']:.3f} with measured ones that the first stage of the search did not use. Not "
-        "identifiable: another place explains the spectra nearly as well, or held-out spectra hardly need the plane. The "
-        "gain of a dielectric is that at normal incidence."
+        f"{1 - room['score_held_out']:.3f} with measured ones that the first stage of the search did not use. Half a "
+        "phase period away, with the other sign of its gain, a plane explains the spectra nearly as well. Probability: that "
+        "the plane is not at such an alternative. Standard deviation: without alternatives. Identifiable: a probability of "
+        f"at least {IDENTIFIABLE:.0%}. The gain of a dielectric is that at normal incidence."
     )
-    table = Table(["plane", "gain", "standard deviation [mm]", "identifiable"], rows, caption)
+    heading = ["plane", "gain", "standard deviation [mm]", "probability", "strongest alternative", "identifiable"]
+    table = Table(heading, rows, caption)
     points = fraction.arrays("room")
     first = points["image"][points["order"] == 1]
     places = {"measured": points["measured"], "fixed end": points["fixed"][None], "image of first order": first}
@@ -133,7 +138,7 @@ def room_section(fraction: FractionRecords) -> Section | None:
     plot = Plot(
         f"room-{fraction.file_name}",
         [figure],
-        "The planes in plan (dashed: uncertain), measured positions, the fixed end and its images of first "
+        "The planes in plan (dashed: not identifiable), measured positions, the fixed end and its images of first "
         "order. The images of a moving transmitter are those of the array that sees it.",
         concat([DataFrame(at, columns=["x_m", "y_m", "z_m"]).assign(what=what) for what, at in places.items()]),
     )
@@ -177,7 +182,7 @@ def _described(plane: dict[str, Any]) -> str:
 def _plan(
     planes: list[dict[str, Any]], points: dict[str, NDArray[Any]], width: float, height: float
 ) -> tuple[Figure, Axes]:
-    """Return a panel with the planes and the fixed end in plan; planes are dashed if they are uncertain."""
+    """Return a panel with the planes and the fixed end in plan; planes that are not identifiable are dashed."""
     low, high = extent(planes, np.concatenate([points["measured"], points["fixed"][None]]))
     figure, plan = figures.panel(width, height)
     for plane in planes:

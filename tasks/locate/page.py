@@ -27,6 +27,7 @@ from tasks.page.shared import (
     errors_section,
     limits,
     next_steps,
+    recommendation,
     suggestion_section,
 )
 from tasks.records import Records, notes
@@ -42,8 +43,6 @@ COLOURS = labels.LOCALIZERS
 LIMITS = (
     "Rows that no receiver detected have no position. They are left out of the errors.",
     "Candidate positions lie in and around the training positions. A transmitter elsewhere is located at their edge.",
-    "Intervals of medians treat test rows as independent. Along a walked path they are not, and the intervals are too "
-    "narrow.",
     "Training and test rows are of one device and one time, unless the split separates these. Another device has "
     "another offset, which --offset-by COLUMN estimates if the table names devices.",
 )
@@ -87,7 +86,8 @@ def _errors(run: Records) -> Section:
         COLOURS,
         name=run.file_name,
         quantity="position error",
-        caption=f"Column of {OWN}: difference of the mean errors on the same rows, with its 95 % bootstrap interval.",
+        caption=f"Column of {OWN}: difference of the mean errors on the same rows, with its 95 % bootstrap interval over "
+        "test places.",
         paragraphs=[f"Test rows that no receiver detected are left out: {n_undetected}."] if n_undetected else [],
     )
 
@@ -122,8 +122,8 @@ def _overview(run: Records, name: str) -> Plot:
 
 
 def _calibration(run: Records) -> Plot:
-    """Return measured against nominal coverage, with its 95 % interval (Wilson)."""
-    rows, n = [], run.metrics["n_test"]
+    """Return measured against nominal coverage, with its 95 % interval (Wilson), as if each place were one row."""
+    rows, n = [], run.table("errors")["place"].nunique()
     for level, value in run.metrics["calibration"].items():
         interval = binomtest(round(value * n), n).proportion_ci(method="wilson")
         rows.append((float(level), value, float(interval.low), float(interval.high)))
@@ -182,14 +182,16 @@ def posteriors(maps: Mapping[str, NDArray[Any]]) -> list[Figure]:
 
 def answer(run: Records) -> Answer:
     """Return the answer of a run."""
+    chosen, _ = recommendation(run, OWN, "m")
     errors, methods = by_method(run.table("errors")[COLUMNS]), []
     for name, entry in run.metrics["overall"].items():
         cells = {"median in plan [m]": number(entry["horizontal_error_m"]["median"])}
         cells |= {"floors right": f"{entry['floor_hit_rate']:.1%}"} if "floor_hit_rate" in entry else {}
         cells |= {f"{OWN} minus it [m]": difference(errors, OWN, name)}
         seconds = entry["seconds"]["fit"], entry["seconds"]["predict"]
-        methods.append(Method(name, entry["position_error_m"], name == "mean", seconds, cells))
-    return Answer("m", methods, OWN, conclusion(run), _steps(run), NEIGHBOURS)
+        is_reference = name == "mean" != chosen
+        methods.append(Method(name, entry["position_error_m"], is_reference, seconds, cells))
+    return Answer("m", methods, chosen, conclusion(run), _steps(run), NEIGHBOURS)
 
 
 def conclusion(run: Records) -> list[str]:
@@ -198,6 +200,7 @@ def conclusion(run: Records) -> list[str]:
     best = min((name for name in error if name != OWN), key=lambda name: error[name]["median"])
     own, receivers, n_test = error[OWN], run.metrics["n_receivers"], run.metrics["n_test"]
     return [
+        *recommendation(run, OWN, "m")[1],
         f"Positions are found within {own['median']:.2f} m (median error; 90 % within {own['p90']:.1f} m).",
         f"The median's 95 % interval is {own['low']:.2f} to {own['high']:.2f} m, and "
         f"{run.metrics['calibration'][str(LEVEL)]:.0%} of the true positions lie in the {LEVEL:.0%} region that comes with "
@@ -210,14 +213,13 @@ def conclusion(run: Records) -> list[str]:
             name="the posterior",
             unit="m",
             rows="rows",
-            n_test=n_test,
         ),
     ]
 
 
 def _steps(run: Records) -> list[NextStep]:
     own, coverage = [], run.metrics["calibration"][str(LEVEL)]
-    if warning := coverage_warning("credible regions", coverage, LEVEL, run.metrics["n_test"]):
+    if warning := coverage_warning("credible regions", coverage, LEVEL, run.table("errors")["place"].nunique()):
         own.append(NextStep(warning))
     if run.metrics["split"] == "random":
         own.append(again(run, "Test a region where nothing was measured", "block"))

@@ -1,4 +1,4 @@
-"""Maps in plan: values as colours, hatched where they are extrapolated, above the image of a floor."""
+"""Maps in plan: values as colours above the image of a floor."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from typing import BinaryIO
 
 import numpy as np
 from matplotlib import colormaps
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
-from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
 from swiftwrf import InputError
 from swiftwrf.positions import MAX_COORDINATE_M
@@ -18,31 +17,10 @@ from swiftwrf.runtime.checkpoint import refusing
 from swiftwrf.runtime.durable import write_npz
 from tasks.records import read_npz
 
-MIN_REACH = 1.5  # of the largest distance between neighbours, for positions on a line
 TRANSPARENT = 255  # palette index of pixels without a value
 MAX_PLAN_PIXELS = 2**24
 STORED = "floor-plan.npz"  # in the directory of a run
 Corners = tuple[float, float, float, float]  # x0, x1, y0, y1 [m]
-
-
-def inside(position: ArrayLike, known: ArrayLike) -> NDArray[np.bool_]:
-    """Return whether positions (..., 2 or 3) [m] lie inside the convex hull of known ones (n, 2 or 3), in plan.
-
-    Known positions on a line have no hull. There a position is inside if it lies near one of them.
-
-    Example:
-        >>> inside([[0.5, 0.2], [2.0, 0.2]], [[0, 0], [1, 0], [0, 1], [1, 1]]).tolist()
-        [True, False]
-    """
-    at, points = np.asarray(position, dtype=float)[..., :2], np.asarray(known, dtype=float)[:, :2]
-    try:
-        corners = points[ConvexHull(points).vertices]
-        return np.asarray(Delaunay(corners).find_simplex(at) >= 0)
-    except (QhullError, ValueError):
-        places = np.unique(points, axis=0)
-        tree = cKDTree(places)
-        apart = tree.query(places, min(2, len(places)))[0].reshape(len(places), -1)[:, -1]
-        return np.asarray(tree.query(at)[0] <= MIN_REACH * max(float(apart.max()), 1e-6))
 
 
 def colour_image(values: NDArray[np.floating], colours: str, low: float = 0.0, high: float = 1.0) -> Image.Image:

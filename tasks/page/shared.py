@@ -29,6 +29,10 @@ MAX_NUMBERED = 30  # suggestions with their rank beside them; more would hide ea
 MAX_COVERAGE_ERROR = 0.05  # difference from the nominal coverage below which intervals count as calibrated
 MIN_RELEVANT = 0.02  # difference of mean errors, relative to them, below which methods are equal in practice
 NONE = (np.nan, np.nan, np.nan)
+INDEPENDENT = (
+    "95 % intervals take test places as independent: all errors at one place count together. Neighbouring places along a "
+    "path are not independent, so there the intervals are too narrow."
+)
 
 
 def errors_section(
@@ -67,7 +71,10 @@ def errors_section(
         for one in answer.methods
     ]
     columns = ["method", f"median [{unit}]", f"90 % below [{unit}]", *further, "fit + apply [s]"]
-    caption = f"{quantity.capitalize()} on the test rows; medians with their 95 % intervals. {caption}".strip()
+    caption = (
+        f"{quantity.capitalize()} on the test rows; medians with their 95 % intervals. Shaded: {answer.chosen}, which is "
+        f"recommended. {caption}"
+    ).strip()
     values = {"error": [interval(one.error) for one in short]}
     names = [one.name for one in short]
     dots = figures.dots(names, values, {"error": MEASURED}, f"median {quantity} [{unit}]", log=True)
@@ -100,7 +107,7 @@ def limits(run: Records, *texts: str) -> Section:
         texts += (
             "These data are simulated. They show that the software works, and not how accurate it is on measurements.",
         )
-    return Section("What this does not show", list(texts))
+    return Section("What this does not show", [*texts, INDEPENDENT])
 
 
 def difference(errors: DataFrame, own: str, other: str) -> str:
@@ -236,16 +243,15 @@ def worth(left: NDArray[Any]) -> str:
     return "This is worth it where the variance falls most: begin with the first positions."
 
 
-def comparison_sentence(
-    errors: DataFrame, method: str, other: str, *, name: str, unit: str, rows: str, n_test: int
-) -> str:
+def comparison_sentence(errors: DataFrame, method: str, other: str, *, name: str, unit: str, rows: str) -> str:
     """Return one sentence that compares the mean errors of a method, under its name there, with those of another one.
 
     The errors are those of `by_method`; their rows have a word, e.g. pairs.
     """
     mean, low, high = paired_difference(errors, method, other)
     if math.isnan(low):
-        return f"{n_test} test rows are too few to compare {name} with {other}."
+        n_places = errors.index.get_level_values("place").nunique()
+        return f"{n_places} test places are too few to compare {name} with {other}."
     interval = f"{mean:+.2f} {unit} [{low:+.2f}, {high:+.2f}]"
     if max(abs(low), abs(high)) < MIN_RELEVANT * float(errors[other].mean()):
         return f"On the same {rows} {name} and {other} are equal in practice: mean errors differ by {interval}."
@@ -259,18 +265,30 @@ def comparison_sentence(
     return f"On the same {rows} the errors of {name} and {other} do not differ significantly: {interval}."
 
 
-def coverage_warning(name: str, coverage: float, nominal: float, n_test: int) -> str:
+def recommendation(run: Records, model: str, unit: str) -> tuple[str, list[str]]:
+    """Return the model of a run, or `mean` with a sentence if that has the smaller mean error at held-out training rows."""
+    held_out: Mapping[str, float] = run.metrics["held_out"]
+    chosen = min(held_out, key=lambda name: held_out[name], default=model)
+    if chosen == model:
+        return model, []
+    return chosen, [
+        f"Recommended is {chosen} and not {model}: its mean error at held-out training rows is {held_out[chosen]:.2f} "
+        f"{unit}, that of {model} {held_out[model]:.2f} {unit}. These rows do not show how RSSI depends on the place."
+    ]
+
+
+def coverage_warning(name: str, coverage: float, nominal: float, n_places: int) -> str:
     """Return a warning if intervals or regions cover significantly more or less than they should, else nothing.
 
-    Their name is in the plural, and test rows are independent.
+    Their name is in the plural. Test places are independent, rows of one place are not.
 
     Example:
-        >>> coverage_warning("intervals", 0.87, 0.8, n_test=100)
+        >>> coverage_warning("intervals", 0.87, 0.8, n_places=100)
         ''
-        >>> coverage_warning("intervals", 0.6, 0.8, n_test=100)
+        >>> coverage_warning("intervals", 0.6, 0.8, n_places=100)
         'The 80 % intervals contain 60 % of the test values: they are too narrow here.'
     """
-    two_deviations = 2 * math.sqrt(nominal * (1 - nominal) / n_test)
+    two_deviations = 2 * math.sqrt(nominal * (1 - nominal) / n_places)
     if abs(coverage - nominal) <= max(MAX_COVERAGE_ERROR, two_deviations):
         return ""
     size = "narrow" if coverage < nominal else "wide"

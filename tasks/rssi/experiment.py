@@ -14,6 +14,7 @@ from swiftwrf.data.files import sha256
 from swiftwrf.metrics import summary
 from swiftwrf.rssi import LEVEL, PairModel, RssiComparison, RssiModel, compare
 from swiftwrf.rssi.comparison import compared
+from swiftwrf.rssi.coverage import Coverage, reach
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.runtime.durable import write_npz
 from tasks.configs import RssiTaskConfig
@@ -22,6 +23,7 @@ from tasks.environment import choose_device
 from tasks.page.maps import FloorPlan, read_pixels
 from tasks.page.page import finish
 from tasks.records import Row, write_table
+from tasks.rssi.maps import CERTAINTY, COVERED_DBM
 from tasks.rssi.page import answer, page
 from tasks.source import measured_rssi, offset_notes, split_notes
 from tasks.terminal import console, terminal
@@ -103,7 +105,8 @@ def record(result: RssiComparison, folder: Path, notes: Sequence[str] = ()) -> R
     assert isinstance(model, RssiModel | PairModel)
     write_table(folder / "errors.csv", result.errors.to_dict("records"))
     write_table(folder / "predictions.csv", result.predictions.to_dict("records"))
-    write_npz(folder / "maps.npz", _maps(model, train))
+    maps, coverage = _maps(model, train)
+    write_npz(folder / "maps.npz", maps)
     seconds: dict[str, Row] = {
         name: {"fit": value["fit"], "predict": value["predict"]} for name, value in result.values.items()
     }
@@ -115,10 +118,10 @@ def record(result: RssiComparison, folder: Path, notes: Sequence[str] = ()) -> R
         notes.append(f"each of the {len(train.floors.names)} floors takes {attenuation_db:.1f} dB")
     if model.detection is not None:
         notes.append(model.detection.note(train.receiver_names))
-    overall = {name: summary(errors) for name, errors in result.errors.groupby("method")["abs_error_db"]}
-    at_receiver = {
-        key: summary(errors) for key, errors in result.errors.groupby(["receiver", "method"])["abs_error_db"]
-    }
+    overall, at_receiver = (
+        {key: summary(own["abs_error_db"], own["place"]) for key, own in result.errors.groupby(by)}
+        for by in ("method", ["receiver", "method"])
+    )
     return {
         "task": "rssi",
         "data": train.name,
@@ -136,8 +139,10 @@ def record(result: RssiComparison, folder: Path, notes: Sequence[str] = ()) -> R
             for receiver in result.test.receiver_names
         },
         "model": result.model,
+        "held_out": result.values[result.model]["held_out"],
         "seconds": seconds[result.model],
         "interval": {"nominal": LEVEL, "coverage": result.coverage},
+        "coverage": coverage,
         "by_rows": {str(n): {str(name): mean for name, mean in row.items()} for n, row in result.by_rows.iterrows()},
         "chosen": {
             "n_primitives": max(value["n_primitives"] for value in result.values.values()),
@@ -146,13 +151,17 @@ def record(result: RssiComparison, folder: Path, notes: Sequence[str] = ()) -> R
     }
 
 
-def _maps(model: RssiModel | PairModel, train: Rssi) -> dict[str, Any]:
-    """Return predictions, widths of intervals and probabilities of a detection on each floor, (floors, R, H, W).
+def _maps(model: RssiModel | PairModel, train: Rssi) -> tuple[dict[str, Any], list[Row]]:
+    """Return maps of each floor, (floors, R, H, W) or (floors, H, W), and the coverage of each floor.
 
     Without floors there is one map, at the median height of the measurements.
     """
-    floors = train.floors
-    charts = [RssiMap.predict(model, height=height) for height in (floors.height_m if floors else [None])]
+    floors, limits = train.floors, (COVERED_DBM, CERTAINTY, 1)
+    heights = floors.height_m if floors else [None]
+    charts = [RssiMap.predict(model, height=height) for height in heights]
+    number = floors.number(train.transmitter_position) if floors else torch.zeros(len(train), dtype=torch.int64)
+    detected = [RssiMap.predict(model, height=height, detected=True) for height in heights]
+    coverage = [Coverage.of(each, train[number == n], limits, reach(model)) for n, each in enumerate(detected)]
     lower, upper = zip(*(chart.prediction.interval(LEVEL) for chart in charts), strict=True)
     maps = {
         "x": charts[0].x,
@@ -160,11 +169,15 @@ def _maps(model: RssiModel | PairModel, train: Rssi) -> dict[str, Any]:
         "predicted": np.stack([chart.mean for chart in charts]),
         "width": (torch.stack(upper) - torch.stack(lower)).numpy(),
         "detection": np.stack([chart.detection for chart in charts]),
+        "above": np.stack([found.probability for found in coverage]),
+        "inside": np.stack([found.inside for found in coverage]),
+        "known": np.stack([found.measured for found in coverage]),
         "measured_position": train.transmitter_position.numpy(),
         "measured": train.rssi_dbm.numpy(),
         "receiver": train.receiver_position.numpy(),
         "receiver_names": np.array(train.receiver_names),
         "floor_names": np.array(floors.names if floors else [""]),
-        "floor_of_row": floors.number(train.transmitter_position).numpy() if floors else np.zeros(len(train), int),
+        "floor_of_row": number.numpy(),
     }
-    return maps if train.origin is None else maps | {"origin": np.array(train.origin)}
+    maps = maps if train.origin is None else maps | {"origin": np.array(train.origin)}
+    return maps, [found.values for found in coverage]

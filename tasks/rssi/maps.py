@@ -17,7 +17,7 @@ from swiftwrf.plotting import corners_of, hatch
 from swiftwrf.rssi import LEVEL
 from tasks.page import figures, maps
 from tasks.page.page import Plot
-from tasks.records import Records
+from tasks.records import Records, Row
 
 MAX_MAPS = 24  # receivers with a map in the report; all are in the tables
 MAX_WIDTH_DB = 30.0  # end of the scale of interval widths of the page
@@ -26,10 +26,22 @@ MIN_RATIO = 1.2  # of the widest interval inside to the median one, for which th
 COVERED_DBM, CERTAINTY = -75.0, 0.9  # coverage of the summary
 RECEIVER = "#cf4a4a"
 WIDTH_PER_STD = 2 * NormalDist().inv_cdf((1 + LEVEL) / 2)  # of the interval of a normal variable
-HATCHED = (
-    "Hatched like /: outside the measured positions, where predictions are extrapolated; like \\: a packet is more likely "
-    "lost than received."
-)
+
+
+def coverage_sentence(found: Row, where: str = "the measured area") -> str:
+    """Return a coverage in words, by `Coverage.values` and the name of the measured area."""
+    if found["covered"] is None:
+        return f"No cell of the map is in {where}."
+    shares = {name: f"{share:.0%}" for name, share in found.items() if share is not None}
+    sentence = (
+        f"{shares['covered']} of {where} is covered, {shares['not_covered']} is not, {shares['uncertain']} is uncertain"
+    )
+    if found["scans_above"] is not None:
+        sentence += f"; {shares['scans_above']} of the {found['n_scans']} scans pass"
+    if (part := shares["not_measured"]) != "0%":
+        far = f"over {found['reach_m']:.1f} m from any scan"
+        sentence += f". {part} of the area between the scans is not measured, {far}"
+    return f"{sentence}."
 
 
 @dataclass(frozen=True)
@@ -49,7 +61,8 @@ class Maps:
         """Content of `maps.npz` for this floor."""
         found = dict(self.run.arrays("maps"))
         rows = found["floor_of_row"] == self.floor
-        found |= {name: found[name][self.floor] for name in ("predicted", "width", "detection")}
+        of_floor = ("predicted", "width", "detection", "above", "inside", "known")
+        found |= {name: found[name][self.floor] for name in of_floor}
         return found | {name: found[name][rows] for name in ("measured_position", "measured")}
 
     @cached_property
@@ -62,9 +75,21 @@ class Maps:
         return f"{title}, {self.arrays['floor_names'][self.floor]}" if self.suffix else title
 
     @property
+    def name(self) -> str:
+        """Name of the floor, in sentences."""
+        name = str(self.arrays["floor_names"][self.floor])
+        return name if "floor" in name.lower() else f"floor {name}"
+
+    @property
     def place(self) -> str:
-        """Name of what the maps cover, in sentences."""
-        return f"floor {self.arrays['floor_names'][self.floor]}" if self.suffix else "the measured area"
+        """Name of the measured area, in sentences."""
+        return f"the measured area of {self.name}" if self.suffix else "the measured area"
+
+    @property
+    def coverage(self) -> Row:
+        """Result of `Coverage.values` for this floor."""
+        found: Row = self.run.metrics["coverage"][self.floor]
+        return found
 
     @property
     def suffix(self) -> str:
@@ -83,17 +108,12 @@ class Maps:
         kinds = ("predicted", "width", "detection")
         return {kind: np.take_along_axis(self.arrays[kind], server, 0)[0] for kind in kinds}
 
-    @cached_property
-    def inside(self) -> NDArray[np.bool_]:
-        """True for each cell inside the measured positions, (H, W)."""
-        at = np.stack(np.meshgrid(self.arrays["x"], self.arrays["y"]), axis=-1)
-        return maps.inside(at, self.arrays["measured_position"])
-
     @property
-    def covered(self) -> float:
-        """Fraction of the cells inside where a measurement at the best server is above `COVERED_DBM` with `CERTAINTY`."""
-        lower = self.best["predicted"] - NormalDist().inv_cdf(CERTAINTY) * self.best["width"] / WIDTH_PER_STD
-        return float((lower >= COVERED_DBM)[self.inside].mean()) if self.inside.any() else float("nan")
+    def hatched(self) -> str:
+        """Legend of the hatches."""
+        reach = self.coverage["reach_m"]
+        far = "" if reach is None else f" or more than {reach:.1f} m from any scan"
+        return f"Hatched like /: not measured, outside the scans{far}; like \\: a packet is more likely lost than received."
 
     def summary(self) -> Plot:
         """Return map and uncertainty of the only receiver, or of the best server."""
@@ -102,18 +122,18 @@ class Maps:
         title = self.titled("best server" if several else self.names[0])
         kinds = ("predicted", "width") if self.varies else ("predicted",)
         panels = [self._panel(self.best, kind, title, receiver, 4.6 if self.varies else 5.4) for kind in kinds]
-        width = np.median(self.best["width"][self.inside]) if self.inside.any() else np.median(self.best["width"])
         widths = f"width of the {LEVEL:.0%} interval of a measurement"
-        widths = f", and the {widths}" if self.varies else f"; the {widths} is about {width:.0f} dB everywhere"
-        caption = f"Predicted RSSI{widths}. {HATCHED}" + (
+        same = f"; the {widths} is about {self.widest[3]:.0f} dB in the whole measured area"
+        widths = f", and the {widths}" if self.varies else same
+        caption = f"Predicted RSSI{widths}. {self.hatched}" + (
             " The best server is the receiver with the highest prediction; crosses mark receivers."
             if several
             else " Dots: training measurements in the colours of the map, hollow where nothing was received; the cross "
             "marks the receiver."
         )
-        return Plot(
-            f"summary{self.suffix}", panels, caption, self._cells({k: v[None] for k, v in self.best.items()}, [title])
-        )
+        fields = self.best | {"above": self.arrays["above"]}
+        data = self._cells({kind: values[None] for kind, values in fields.items()}, [title])
+        return Plot(f"summary{self.suffix}", panels, caption, data)
 
     def by_receiver(self, kind: str) -> Plot:
         """Return maps of the receivers that detected most rows: "predicted", or "width" for that of the intervals."""
@@ -126,7 +146,9 @@ class Maps:
             self._panel(each, kind, self.titled(self.names[i]), i, 3.6) for each, i in zip(values, shown, strict=True)
         ]
         what = "Predicted RSSI" if kind == "predicted" else f"Width of the {LEVEL:.0%} interval"
-        caption = f"{what} at each receiver. {HATCHED} Hollow dots: nothing was received. A cross marks the receiver."
+        caption = (
+            f"{what} at each receiver. {self.hatched} Hollow dots: nothing was received. A cross marks the receiver."
+        )
         name = "map" if kind == "predicted" else "width"
         return Plot(f"{name}-{self.run.file_name}{self.suffix}", panels, caption, data)
 
@@ -149,7 +171,7 @@ class Maps:
         drawn = ax.imshow(
             values, origin="lower", extent=(x0, x1, y0, y1), alpha=opacity, zorder=1, aspect=aspect, **style
         )
-        hatch(ax, a["x"], a["y"], ~self.inside)
+        hatch(ax, a["x"], a["y"], ~a["known"])
         hatch(ax, a["x"], a["y"], fields["detection"] < 0.5, "\\\\\\\\")
         ax.set(xlabel="x [m]", ylabel="y [m]")
         ax.grid(visible=False)
@@ -170,10 +192,20 @@ class Maps:
         return figure
 
     @property
+    def widest(self) -> tuple[float, float, float, float]:
+        """Cell between the scans where the interval at the best server is widest: x, y [m], width, and median width [dB].
+
+        The median is that of the measured cells, or of all if there are none.
+        """
+        a, width = self.arrays, self.best["width"]
+        row, column = np.unravel_index(np.where(a["inside"], width, -np.inf).argmax(), width.shape)
+        typical = np.median(width[a["known"] if a["known"].any() else ...])
+        return float(a["x"][column]), float(a["y"][row]), float(width[row, column]), float(typical)
+
+    @property
     def varies(self) -> bool:
-        """True if the widths of the intervals inside the measured positions differ so much that a map shows it."""
-        known = self.best["width"][self.inside]
-        return bool(len(known)) and float(known.max()) >= MIN_RATIO * float(np.median(known))
+        """True if the widths of the intervals inside the scans differ so much that a map shows it."""
+        return self.widest[2] >= MIN_RATIO * self.widest[3]
 
     @cached_property
     def _widths(self) -> tuple[float, float]:
@@ -194,7 +226,7 @@ class Maps:
         origin = GeodeticOrigin(*a["origin"].tolist()) if "origin" in a else None
         degrees = {name: value.round(7) for name, value in degree_columns(origin, np.stack([xs, ys], axis=1)).items()}
         columns = {"receiver": names, "x_m": xs.round(3), "y_m": ys.round(3)} | degrees
-        named = {"predicted": "predicted_dbm", "width": "width_db", "detection": "detection"}
+        named = {"predicted": "predicted_dbm", "width": "width_db", "detection": "detection", "above": "above"}
         columns |= {named[name]: values.ravel().round(2) for name, values in fields.items()}
-        columns["inside"] = np.tile(self.inside.ravel(), len(receivers))
+        columns["measured"] = np.tile(a["known"].ravel(), len(receivers))
         return DataFrame(columns)

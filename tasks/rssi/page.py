@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.metrics import paired_difference
+from swiftwrf.rssi import LEVEL
 from tasks.labels import PREDICTORS, colour, meanings
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of
@@ -22,12 +23,13 @@ from tasks.page.shared import (
     errors_section,
     limits,
     next_steps,
+    recommendation,
 )
 from tasks.records import Records, notes
-from tasks.rssi.maps import CERTAINTY, COVERED_DBM, MIN_RATIO, WIDTH_PER_STD, Maps
+from tasks.rssi.maps import CERTAINTY, COVERED_DBM, MIN_RATIO, WIDTH_PER_STD, Maps, coverage_sentence
 from tasks.terminal import Answer, Method, NextStep
 
-COLUMNS = ["index", "receiver", "method", "abs_error_db"]  # of the errors of methods
+COLUMNS = ["index", "place", "receiver", "method", "abs_error_db"]  # of the errors of methods
 COLOURS = PREDICTORS
 REFERENCES = ("mean", "mri_pooled")  # which explain no place
 MIN_POSITIONS = 30  # for an interval of one width to show that more positions do not help
@@ -39,8 +41,6 @@ LIMITS = (
     "predictor of the mean has a lower error than this scatter.",
     "Errors are those of detected values. How well empty cells are predicted is a number of its own, and where a packet "
     "is more likely lost than received the maps are hatched.",
-    "Intervals of medians treat pairs as independent. Along a walked path they are not, and the intervals are too "
-    "narrow. The bootstrap of the paired table samples whole test rows, which corrects this in part.",
     "The paper's table (2.91 dB for SwiftWRF, 6.74 dB for MRI) is of other data. Compare methods in this report only.",
 )
 
@@ -71,7 +71,10 @@ def _summary(run: Records) -> Summary:
     error = {name: entry["abs_error_db"] for name, entry in run.metrics["overall"].items()}
     best = best_baseline(run)
     numbers = [
-        *(Number(f"{maps.covered:.0%}", f"of {maps.place} above {COVERED_DBM:g} dBm") for maps in floors),
+        *(
+            Number(f"{maps.coverage['covered'] or 0:.0%}", f"of {maps.place} above {COVERED_DBM:g} dBm")
+            for maps in floors
+        ),
         Number(f"{error[found.chosen]['median']:.2f} dB", f"median absolute error of {found.chosen}"),
         Number(f"{error[best]['median']:.2f} dB", f"that of {best}, the best other method"),
         Number(f"{interval['coverage']:.0%}", f"of the test measurements in their {interval['nominal']:.0%} interval"),
@@ -87,7 +90,7 @@ def _maps(run: Records, kind: str) -> Section:
 def _errors(run: Records) -> Section:
     caption = (
         f"Column of {model_of(run)}: difference of the mean absolute errors on the same pairs, with its 95 % bootstrap "
-        "interval over test rows. Detection: mean of the fractions of detected and of empty test cells that are predicted "
+        "interval over test places. Detection: mean of the fractions of detected and of empty test cells that are predicted "
         "as such; 0.5 is chance."
     )
     return errors_section(
@@ -105,14 +108,15 @@ def _errors(run: Records) -> Section:
 def answer(run: Records) -> Answer:
     """Return the answer of a run."""
     own, errors, methods = model_of(run), by_method(run.table("errors")[COLUMNS]), []
+    chosen = recommendation(run, own, "dB")[0]
     scored = any(entry.get("detection") for entry in run.metrics["overall"].values())
     for name, entry in run.metrics["overall"].items():
         detection = entry.get("detection")
         cells = {f"{own} minus it [dB]": difference(errors, own, name)}
         cells |= {"detection": number(None if detection is None else sum(detection) / 2)} if scored else {}
         seconds = entry["seconds"]["fit"], entry["seconds"]["predict"]
-        methods.append(Method(name, entry["abs_error_db"], name in REFERENCES and name != own, seconds, cells))
-    return Answer("dB", methods, own, conclusion(run), steps(run), (best_baseline(run),))
+        methods.append(Method(name, entry["abs_error_db"], name in REFERENCES and name != chosen, seconds, cells))
+    return Answer("dB", methods, chosen, conclusion(run), steps(run), (own, best_baseline(run)))
 
 
 def model_of(run: Records) -> str:
@@ -130,10 +134,10 @@ def best_baseline(run: Records) -> str:
 
 def conclusion(run: Records) -> list[str]:
     """Return coverage and error, how sure they are, and how the model compares with the best baseline."""
-    best, n_test, interval = best_baseline(run), run.metrics["n_test"], run.metrics["interval"]
+    best, interval = best_baseline(run), run.metrics["interval"]
     own, floors, names = model_of(run), Maps.of_floors(run), list(run.metrics["receivers"])
     who = f"one of {len(names)} receivers" if len(names) > 1 else names[0]
-    covered = [f"{maps.covered:.0%} of {maps.place}" for maps in floors]
+    covered = [f"{maps.coverage['covered'] or 0:.0%} of {maps.place}" for maps in floors]
     error = run.metrics["overall"][own]["abs_error_db"]
     sure = (
         f"90 % of the errors are below {error['p90']:.1f} dB, and {interval['coverage']:.0%} of the measurements lie in "
@@ -141,10 +145,12 @@ def conclusion(run: Records) -> list[str]:
         f"{run.metrics['n_train']} rows ({run.scene})."
     )
     errors = by_method(run.table("errors")[COLUMNS])
-    compared = comparison_sentence(errors, own, best, name=own, unit="dB", rows="pairs", n_test=n_test)
+    compared = comparison_sentence(errors, own, best, name=own, unit="dB", rows="pairs")
     return [
+        *recommendation(run, own, "dB")[1],
         f"{', '.join(covered)} {'has' if len(covered) == 1 else 'have'} {who} above {COVERED_DBM:g} dBm with "
         f"{CERTAINTY:.0%} certainty; predictions are within {error['median']:.1f} dB (median error).",
+        *(coverage_sentence(maps.coverage, maps.place) for maps in floors),
         sure,
         compared,
     ]
@@ -158,9 +164,8 @@ def steps(run: Records) -> list[NextStep]:
     if unknown := int(np.isnan(run.arrays("maps")["receiver"]).any(axis=1).sum()):
         text = f"Give the unknown positions of access points ({unknown}), in `receivers.csv` beside the table"
         own.insert(0, NextStep(text, "receiver,x,y,z"))
-    # the receivers of a row are not independent
-    n_test = min(run.metrics["n_test"], run.metrics["overall"][model_of(run)]["abs_error_db"]["n"])
-    if warning := coverage_warning("intervals", interval["coverage"], interval["nominal"], n_test):
+    n_places = run.table("errors")["place"].nunique()
+    if warning := coverage_warning("intervals", interval["coverage"], interval["nominal"], n_places):
         own.append(NextStep(warning))
     if pairs and run.metrics["split"] != "place":
         own.append(again(run, "Test receivers at positions where they measured nothing", "place"))
@@ -171,30 +176,29 @@ def steps(run: Records) -> list[NextStep]:
 
 
 def where_next(run: Records) -> str:
-    """Return where to measure next, inside the measured positions, or that more positions hardly help."""
-    most = int(np.bincount(run.arrays("maps")["floor_of_row"]).argmax())
-    maps, known = Maps(run, most).arrays, Maps(run, most).inside
-    width = maps["width"].mean(axis=0)
-    if not known.any():
+    """Return where to measure next, between the scans, or that more positions hardly help."""
+    floors = Maps.of_floors(run)
+    if not any(maps.arrays["inside"].any() for maps in floors):
         return "Measure in a second dimension: the measured positions lie on a line."
-    typical = float(np.median(width[known]))
-    row, column = np.unravel_index(np.argmax(np.where(known, width, -np.inf)), width.shape)
-    if width[row, column] < MIN_RATIO * typical:
-        if (n := len(np.unique(run.arrays("maps")["measured_position"], axis=0))) < MIN_POSITIONS:
-            return f"Measure at more positions: {n} are too few to show how RSSI varies between them."
-        scatter = scatter_of_repeats(run)
-        reason = "and the model explains no more"
-        if scatter is not None and typical < MAX_RATIO_TO_SCATTER * scatter:
-            reason = "which is the scatter of repeated measurements at one place"
-        elif scatter is not None:
-            reason += f", though repeated measurements at one place lie within {scatter:.0f} dB"
-        return (
-            f"More positions inside the measured area are not worth it: the 80 % interval is about {typical:.0f} dB wide "
-            f"everywhere in it, {reason}."
-        )
+    if varied := [maps for maps in floors if maps.varies]:
+        places = []
+        for maps in varied:
+            x, y, width, typical = maps.widest
+            at = f"x = {x:.1f} m, y = {y:.1f} m{f' on {maps.name}' if maps.suffix else ''}"
+            places.append(f"{at} ({width:.0f} dB instead of {typical:.0f} dB)")
+        best = " of the best server" if len(floors[0].names) > 1 else ""
+        return f"Measure around {', '.join(places)}: the {LEVEL:.0%} interval{best} is widest there."
+    if (n := len(np.unique(run.arrays("maps")["measured_position"], axis=0))) < MIN_POSITIONS:
+        return f"Measure at more positions: {n} are too few to show how RSSI varies between them."
+    typical, scatter = max(maps.widest[3] for maps in floors), scatter_of_repeats(run)
+    reason = "and the model explains no more"
+    if scatter is not None and typical < MAX_RATIO_TO_SCATTER * scatter:
+        reason = "which is the scatter of repeated measurements at one place"
+    elif scatter is not None:
+        reason += f", though repeated measurements at one place lie within {scatter:.0f} dB"
     return (
-        f"Measure around x = {maps['x'][column]:.1f} m, y = {maps['y'][row]:.1f} m: inside the measured area the 80 % "
-        f"interval is widest there, {width[row, column]:.0f} dB instead of {typical:.0f} dB."
+        f"More positions between the scans are not worth it: the {LEVEL:.0%} interval is about {typical:.0f} dB wide, and "
+        f"less than {MIN_RATIO:g} times as wide in any place, {reason}."
     )
 
 

@@ -9,12 +9,16 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import torch
 
 from swiftwrf import FieldModel, InputError, Rssi, Spectra
+from swiftwrf.data.cells import text_of
+from swiftwrf.data.columns import column_of
+from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.files import refusing_unreadable, table_of
 from swiftwrf.data.receivers import spelled_as
 from swiftwrf.errors import CONTENT_ERRORS
@@ -132,15 +136,16 @@ def measurement(line: Line, config: UpdateConfig, model: FieldModel | RssiModel,
     needed = "rssi_dbm" if isinstance(model, RssiModel) else "spectrum"
     try:
         text = (line.header + line.content).decode("utf-8-sig")
+        index = torch.tensor([line.number - 1 - bool(line.header)])  # as of the rows of the whole file
         if line.header:
             assert isinstance(model, RssiModel)
-            return _of_row(text, config, model, left_out)
+            return _of_row(text, config, model, left_out).derived(index=index)
         content = json.loads(text)
         position, value = [list(map(_number, content["position"]))], content[needed]
         if isinstance(model, RssiModel):
-            return _of_receivers(position, value, model, left_out)
+            return _of_receivers(position, value, model, left_out).derived(index=index)
         spectrum = [[list(map(_number, row)) for row in value]]
-        return Spectra(spectrum, position, grid=model.grid, name=f"line {line.number}", **vars(model.link))
+        return Spectra(spectrum, position, grid=model.grid, index=index, name=f"line {line.number}", **vars(model.link))
     except InputError as error:
         raise InputError(f"line {line.number}: {error}") from None
     except CONTENT_ERRORS as error:
@@ -157,11 +162,16 @@ def _number(value: object) -> float:
 
 def _of_row(text: str, config: UpdateConfig, model: RssiModel, left_out: set[str]) -> Rssi:
     """Return the measurement in a table of one row."""
-    options = reading(config.spectra, config.table)
-    table = table_of("the table", text)
-    data = Rssi.from_frame(table, **{name: getattr(options, name) for name in OF_ROWS}).about(model.origin)
+    options, table, offsets = reading(config.spectra, config.table), table_of("the table", text), model.offsets
+    of_rows = {name: getattr(options, name) for name in OF_ROWS}
+    if offsets is not None and offsets.column in table.columns:
+        of_rows["offset_by"] = offsets.column
+    data = Rssi.from_frame(table, **of_rows)
     rssi = zip(data.receiver_names, data.rssi_dbm[0].tolist(), strict=True)
-    return _of_receivers(data.transmitter_position.tolist(), dict(rssi), model, left_out)
+    floor = column_of(table, "floor", options.columns or {}) if model.attenuation else None
+    floors = None if floor is None else Floors((text_of(table[floor])[0],), (0.0,))  # of one name, whatever the height
+    row = _of_receivers(data.transmitter_position.tolist(), dict(rssi), model, left_out)
+    return replace(row, origin=data.origin, groups=data.groups, floors=floors, time=data.time)
 
 
 def _of_receivers(

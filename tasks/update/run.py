@@ -15,18 +15,19 @@ from swiftwrf.data import ReadOptions, Snapshots
 from swiftwrf.data.files import sha256
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
 from swiftwrf.errors import with_article
+from swiftwrf.models.base import ALREADY_LEARNT
 from swiftwrf.online import Follower
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime import checkpoint
 from swiftwrf.runtime.durable import write_json
-from swiftwrf.runtime.steps import MODEL
+from swiftwrf.runtime.steps import MODEL, check_unchanged
 from tasks.configs import UpdateConfig
-from tasks.directory import Claim, begun, new_directory, unchanged_environment
+from tasks.directory import Claim, begun, new_directory
 from tasks.environment import environment, invocation
 from tasks.options import plain
 from tasks.page.page import write_page
-from tasks.records import CONFIG, ENVIRONMENT
-from tasks.source import aligned, located, reading
+from tasks.records import CONFIG, ENVIRONMENT, read_json
+from tasks.source import aligned, located, reading, with_groups
 from tasks.terminal import console, terminal
 from tasks.update.lines import answer, check_source, lines, measurement
 from tasks.update.record import SUMMARY, Record, page
@@ -38,7 +39,7 @@ def run(config: UpdateConfig) -> None:
     """Write the updated model, a table of the measurements and a page; with --follow, the model after each line.
 
     Raises:
-        InputError: No such model, or measurements that cannot be read or do not fit it.
+        InputError: No such model, measurements that cannot be read or do not fit it, or none that it has not learnt.
     """
     if config.follow:
         follow(config)
@@ -47,6 +48,12 @@ def run(config: UpdateConfig) -> None:
         model = _model(config.model)
         options = reading(config.spectra, config.table)
         new, train = _read(config.source, options, model), _training(config, options, model)
+        if n_known := int((known := model.is_learnt(new)).sum()):
+            said = f"{new.name}: {n_known} of {len(new)} rows {ALREADY_LEARNT}"
+            if n_known == len(new):
+                raise InputError(f"{said}; give others")
+            console.print(said)
+            new = new.subset(~known)
         follower = Follower(model, train, config.false_alarm_rate)
         record = Record(config.source, _unit(model))
         for i, index in enumerate(new.index.tolist()):
@@ -82,7 +89,7 @@ def follow(config: UpdateConfig) -> None:
         for line in lines(config.source, *place):
             before = follower.model
             try:
-                new = measurement(line, config, before, left_out)
+                new = before.aligned(measurement(line, config, before, left_out))  # type: ignore[arg-type]  # of the model's kind
                 step = follower.step(new)
             except InputError as error:  # one bad line does not end a run of days
                 console.print(f"error: {error}", markup=False, soft_wrap=True)
@@ -106,7 +113,7 @@ def _followed(folder: Path, digests: dict[str, str]) -> Iterator[Path]:
     """
     is_continued = (folder / ENVIRONMENT).exists() and (folder / SUMMARY).exists()  # other updates have no environment
     if is_continued:
-        unchanged_environment(folder, digests)
+        check_unchanged(folder, read_json(folder / ENVIRONMENT).get("input_sha256"), digests)
     elif folder.exists() and (not folder.is_dir() or begun(folder)):
         raise InputError(f"{folder} exists already and holds no run of update --follow; choose another --out")
     claim = Claim(folder, new=not is_continued)
@@ -166,7 +173,9 @@ def _read(source: str, options: ReadOptions, model: FieldModel | RssiModel) -> S
     """Return measurements of the kind that a model predicts, of a folder, file or public data set."""
     source = located(source)
     if isinstance(model, RssiModel):
-        rssi: Any = read(source, options, RSSI_FORMATS)
-        return aligned(rssi.about(model.origin), model.receiver_names, ignore_others=True)
+        rssi: Any = read(source, with_groups(options, source, model.offsets), RSSI_FORMATS)
+        return model.aligned(aligned(rssi, model.receiver_names, ignore_others=True))
     data: Any = read(source, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS)
-    return data.spectra(model.grid, options.beamformer or "phase") if isinstance(data, Snapshots) else data
+    return model.aligned(
+        data.spectra(model.grid, options.beamformer or "phase") if isinstance(data, Snapshots) else data
+    )

@@ -11,21 +11,19 @@ import numpy as np
 import pandas as pd
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from swiftwrf import Prediction, Rssi, RssiModel
 from swiftwrf.data.coordinates import Floors
 from swiftwrf.locate.posterior import PlanMap
 from swiftwrf.rssi import LEVEL
+from swiftwrf.rssi.coverage import Coverage, reach
 from swiftwrf.rssi.maps import RssiMap
-from tasks.page import maps
 from tasks.page.maps import Corners, FloorPlan
 from tasks.records import as_table, read_npz, rounded
-from tasks.rssi.maps import MAX_WIDTH_DB
+from tasks.rssi.maps import MAX_WIDTH_DB, coverage_sentence
 from tasks.view.locating import RssiLocating
 
 RECEIVER_COLOURS, N_RECEIVER_COLOURS = "tab20", 20
-MIN_STD_DB = 1e-6
 MAX_MAPS = 8  # in memory, e.g. those of as many floors
 MapKind = Literal["RSSI", "interval", "coverage", "best receiver", "posterior", "expected error"]
 LOCATING: tuple[MapKind, ...] = ("posterior", "expected error")
@@ -93,9 +91,14 @@ class RssiView:
         if self.folder is not None:
             self.plan = FloorPlan.load(self.folder)
         self.map = lru_cache(maxsize=MAX_MAPS)(
-            lambda height: RssiMap.predict(self.model, height=height, region=self.region)
+            lambda height, counted=False, detected=False: RssiMap.predict(
+                self.model, height=height, region=None if counted else self.region, detected=detected
+            )
         )
-        """Return the map at a height of the transmitter [m]; the last ones are cached for all visitors."""
+        """Return the map at a height of the transmitter [m], on the cells that are shown, or `counted`: those of the report.
+
+        It is that of all packets, or of `detected` ones. The last ones are cached for all visitors.
+        """
 
     @property
     def receivers(self) -> tuple[str, ...]:
@@ -146,10 +149,9 @@ class RssiView:
         receiver = self.rows.receiver_position[self.rows.receiver_located]
         return np.concatenate([self.model.region().numpy()[:, :2], receiver.numpy()[:, :2], corners])
 
-    def inside(self, height: float) -> NDArray[np.bool_]:
-        """Return which cells of a map are inside the measured positions, in plan (rows, columns)."""
-        chart = self.map(height)
-        return maps.inside(np.stack(np.meshgrid(chart.x, chart.y), axis=-1), self.position)
+    def known(self, height: float, counted: bool = False) -> NDArray[np.bool_]:
+        """Return the measured cells of a map, (rows, columns)."""
+        return self.coverage(MapSelection("coverage", 0, height), chart=self.map(height, counted)).measured
 
     def silent(self, selection: MapSelection) -> NDArray[np.bool_]:
         """Return where a packet is more likely lost than received, at the selected receiver or at all of them."""
@@ -166,7 +168,7 @@ class RssiView:
             most = float(np.nanpercentile(found.values, 98))
             return ColouredMap(self.locating.summary, found.values, "viridis", 0.0, most, "m", "max", found.corners)
         chart, receiver = self.map(selection.height), selection.receiver
-        mean, name, number = chart.mean, self.receivers[receiver], selection.at_least
+        mean, name = chart.mean, self.receivers[receiver]
         hatched = " Hatched: a packet is more likely lost than received." if self.silent(selection).any() else ""
         match selection.kind:
             case "RSSI":
@@ -181,19 +183,16 @@ class RssiView:
                 text = f"Width of the {LEVEL:.0%} interval of a measurement at {name}.{hatched}"
                 return ColouredMap(text, (high - low)[receiver].numpy(), "magma", 0.0, MAX_WIDTH_DB, "dB", "max")
             case "coverage":
-                covered, known = self._covered(selection), self.inside(selection.height)
-                who = {0: name, 1: "at least one receiver"}.get(number, f"at least {number} receivers")
-                area = f", {covered[known].mean():.0%} of the measured area" if known.any() else ""
                 text = (
-                    f"{covered.mean():.0%} of the map{area} is coloured: there a measurement at {who} is above "
-                    f"{selection.threshold:g} dBm with {selection.certainty:.0%} certainty, if it is detected at all."
+                    f"Coloured: {self._who(selection)} above {selection.threshold:g} dBm with {selection.certainty:.0%} "
+                    f"certainty. {coverage_sentence(self.coverage(selection, counted=True).values)}"
                 )
-                return ColouredMap(text, np.where(covered, 0.7, np.nan), "GnBu", 0.0, 1.0, "")
+                covered = np.where(self.covered(selection), 0.7, np.nan)
+                return ColouredMap(text, covered, "GnBu", 0.0, 1.0, "")
             case "best receiver":
                 first, part = next(iter(self.best(selection.height).items()))
-                text = (
-                    f"Receiver with the highest prediction: {self.receivers[first]} on {part:.0%} of the map.{hatched}"
-                )
+                best = f"{self.receivers[first]} on {part:.0%} of the measured area"
+                text = f"Receiver with the highest prediction: {best}.{hatched}"
                 values = mean.argmax(axis=0) % N_RECEIVER_COLOURS + 0.5
                 return ColouredMap(text, values, RECEIVER_COLOURS, 0, N_RECEIVER_COLOURS, "")
         raise AssertionError(selection.kind)
@@ -208,15 +207,30 @@ class RssiView:
             else self.locating.located(selection.row).density
         )
 
-    def _covered(self, selection: MapSelection) -> NDArray[np.bool_]:
-        probability = probability_above(self.map(selection.height).prediction, selection)
-        if selection.at_least == 0:
-            return (probability[selection.receiver] >= selection.certainty).numpy()
-        return (at_least(probability, selection.at_least) >= selection.certainty).numpy()
+    def _who(self, selection: MapSelection) -> str:
+        """Return the receivers of the selected coverage, in words."""
+        names = {0: self.receivers[selection.receiver], 1: f"one of {len(self.receivers)} receivers"}
+        return names.get(selection.at_least, f"at least {selection.at_least} receivers")
+
+    def coverage(self, selection: MapSelection, counted: bool = False, chart: RssiMap | None = None) -> Coverage:
+        """Return the selected coverage, in the cells of a map of detected packets if one is given; see `map`."""
+        chart = chart or self.map(selection.height, counted, detected=True)
+        scans, number = self.rows.subset(self.on_floor(selection.height)), selection.at_least
+        if number == 0:
+            chart, scans = chart.receivers([self.receivers[selection.receiver]]), scans.columns([selection.receiver])
+        return Coverage.of(chart, scans, (selection.threshold, selection.certainty, max(number, 1)), reach(self.model))
+
+    def covered(self, selection: MapSelection) -> NDArray[np.bool_]:
+        """Return the cells of the map that is shown that are covered, measured or not, (rows, columns)."""
+        return self.coverage(selection).probability >= selection.certainty
 
     def best(self, height: float) -> dict[int, float]:
-        """Return the fraction of cells where each receiver has the highest prediction, the largest first."""
-        counts = np.bincount(self.map(height).mean.argmax(axis=0).ravel())
+        """Return the fraction of the measured cells where each receiver has the highest prediction, the largest first.
+
+        All cells count on a floor without scans.
+        """
+        best, known = self.map(height, counted=True).mean.argmax(axis=0), self.known(height, counted=True)
+        counts = np.bincount(best[known if known.any() else ...].ravel())
         order = [int(number) for number in np.argsort(-counts, kind="stable") if counts[number]]
         return {number: float(counts[number] / counts.sum()) for number in order}
 
@@ -242,7 +256,9 @@ class RssiView:
             f"{self.receivers[r]}: {mean[r]:.1f} dBm, {LEVEL:.0%} of measurements in [{low[r]:.1f}, {high[r]:.1f}] dBm",
         ]
         if selection.kind == "coverage":
-            lines.append(f"above {selection.threshold:g} dBm with {probability_above(rssi, selection)[r]:.0%}")
+            here = RssiMap.predict(self.model, 1.0, selection.height, np.array([[x, y]]), detected=True)
+            above = float(self.coverage(selection, chart=here).probability[0, 0])
+            lines.append(f"{self._who(selection)} above {selection.threshold:g} dBm with {above:.0%}")
         if len(self.receivers) > 1:
             lines.append(f"best receiver: {self.receivers[int(mean.argmax())]}, {mean.max():.1f} dBm")
         return "\n".join(lines)
@@ -259,29 +275,6 @@ class RssiView:
         low, high = (end[r].double().numpy().ravel() for end in chart.prediction.interval(LEVEL))
         table = chart.receivers([self.receivers[r]]).to_frame().drop(columns="std_db")
         table = table.assign(low_dbm=low, high_dbm=high)
-        table[f"above_{selection.threshold:g}_dbm_with_{selection.certainty:.0%}"] = (
-            self._covered(selection).ravel() * 1
-        )
+        table[f"above_{selection.threshold:g}_dbm_with_{selection.certainty:.0%}"] = self.covered(selection).ravel() * 1
         table["best_receiver"] = np.array(self.receivers)[chart.mean.argmax(axis=0).ravel()]
         return as_table(rounded(table.to_dict("records")))
-
-
-def probability_above(rssi: Prediction, selection: MapSelection) -> Tensor:
-    """Return the probability that a measurement exceeds the threshold, of the shape of the prediction."""
-    assert rssi.std is not None
-    probability: Tensor = torch.special.ndtr((rssi.mean - selection.threshold) / rssi.std.clamp_min(MIN_STD_DB))
-    return probability
-
-
-def at_least(probability: Tensor, number: int) -> Tensor:
-    """Return the probability that at least a number of receivers exceed the threshold, from those of each one, (R, ...).
-
-    Example:
-        >>> at_least(torch.tensor([0.5, 0.5]), 1)
-        tensor(0.7500)
-    """
-    counts = [torch.ones_like(probability[0]), *(torch.zeros_like(probability[0]) for _ in range(number - 1))]
-    for own in probability:  # probabilities of 0 to number - 1 receivers
-        fewer = [torch.zeros_like(own), *counts[:-1]]
-        counts = [count * (1 - own) + less * own for count, less in zip(counts, fewer, strict=True)]
-    return 1 - torch.stack(counts).sum(dim=0)

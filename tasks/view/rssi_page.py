@@ -75,7 +75,8 @@ class RssiPage:
             self._certainty = slider("certainty", 50, 99, 90, "%", self._update)
             numbers = {0: "at this receiver", 1: "at any receiver"}
             numbers |= {number: f"at {number} receivers or more" for number in range(2, len(names) + 1)}
-            self._at_least = ui.select(numbers if len(names) > 1 else {0: numbers[0]}, value=0, on_change=self._update)
+            numbers = numbers if len(names) > 1 else {0: numbers[0]}
+            self._at_least = ui.select(numbers, value=int(len(names) > 1), on_change=self._update)
             self._at_least.props("outlined dense options-dense").classes("w-full").set_visibility(len(names) > 1)
         with ui.column().classes("w-full gap-0") as self._choice:
             self._row = ui.number("row", format="%d", on_change=self._update).props("outlined dense")
@@ -158,9 +159,9 @@ class RssiPage:
         data["map"] = picture(image, coloured.corners or corners, 0.7 if view.plan else 1.0)
         if view.plan:
             data["floor"] = picture(Image.fromarray(view.plan.pixels), view.plan.corners)
-        if selection.kind not in LOCATING:  # grey where the map is extrapolated
+        if selection.kind not in LOCATING:  # grey where no scan determines the map
             data["outside"] = picture(
-                colour_image(np.where(view.inside(selection.height), np.nan, 0.5)[::-1], "gray"), corners, 0.55
+                colour_image(np.where(view.known(selection.height), np.nan, 0.5)[::-1], "gray"), corners, 0.55
             )
             data["silent"] = picture(colour_image(stripes(view.silent(selection))[::-1], "gray"), corners, 0.6)
         if selection.kind == "RSSI":

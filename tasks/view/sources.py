@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from os.path import isdir, isfile  # unlike methods of Path, they are False for names that are too long
 from pathlib import Path
 from typing import Any
@@ -153,7 +152,7 @@ def _aoa_run(folder: Path, content: Row) -> SpectraView:
 def _planes_of_run(file: Path) -> list[dict[str, Any]]:
     """Return the planes that another model of the run found from the same spectra."""
     planes = read_json(file)["planes"] if file.is_file() else []
-    return [asdict(Plane(**plane | {"normal": tuple(plane["normal"])})) for plane in planes]
+    return [Plane.from_json(plane).to_json() for plane in planes]
 
 
 def _locate_run(folder: Path, content: Row) -> RssiView:

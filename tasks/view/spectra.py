@@ -20,9 +20,8 @@ from swiftwrf.choices import Moving
 from swiftwrf.data.spectra import direction_of_link
 from swiftwrf.errors import with_article
 from swiftwrf.locate import MatchedField
-from swiftwrf.positions import distance
+from swiftwrf.positions import distance, inside
 from tasks.aoa.room import MARGIN, extent
-from tasks.page.maps import inside
 from tasks.view.locating import Located
 
 MAX_DRAG_SECONDS = 0.02  # of one prediction while the moving end is dragged

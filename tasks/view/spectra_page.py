@@ -152,7 +152,7 @@ class SpectraPage:
         if self._view.fixed is not None:
             entries.append((FIXED, "✕", "fixed end"))
         if any(loaded.planes for loaded in self._view.models):
-            entries.append(("inherit", "━", "walls found, dashed where uncertain"))
+            entries.append(("inherit", "━", "walls found, dashed where not identifiable"))
         if any(loaded.model.room is not None for loaded in self._view.models):
             entries.append((FIXED, "━", "strong paths, dotted where furniture hides them"))
         return entries

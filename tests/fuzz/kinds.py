@@ -34,6 +34,7 @@ from scipy.io import savemat
 from small import FLOOR, PUBLISHED, PUBLISHED_RSSI
 
 from augment import Mixed
+from augment.estimators.baselines import NearestSpectrum
 from augment.estimators.kernel_regression import KernelRegression
 from fuzz import runs
 from fuzz.commands import config_file
@@ -54,7 +55,9 @@ from swiftwrf import (
     simulated_room,
 )
 from swiftwrf.comparison import NeRF2Rssi
-from swiftwrf.data.writing import write_spectra
+from swiftwrf.data.coordinates import Floors
+from swiftwrf.data.rssi import Offsets
+from swiftwrf.data.writing import write_rssi, write_spectra
 from swiftwrf.gp import Kernel
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.coarray import CoarrayModel
@@ -82,6 +85,20 @@ def rssi_nerf2(folder: Path) -> None:
     write_nerf2_rssi(folder, "a,b", "a: [0, 0, 1]\nb: [5, 0, 1]\n", ["-50,-100"] * N)
     (folder / "train_index.txt").write_text("".join(f"{i}\n" for i in range(10)))
     (folder / "test_index.txt").write_text("10\n11\n")
+
+
+def spectra_as_written(folder: Path) -> None:
+    data = SNAPSHOTS.spectra(GRID)
+    label, frequency = data.label.flip(0), 915e6 + 1e6 * torch.arange(2).double()
+    write_spectra(replace(data, label=label, frequency_hz=frequency), folder)
+
+
+def rssi_as_written(folder: Path) -> None:
+    phones = pd.Series(["old", "new"] * (N // 2), name="phone")
+    offsets = Offsets("phone", "new", {"new": 0.0, "old": -8.0}, 0.5)
+    known = {"floors": Floors(("0", "1"), (1.0, 4.0)), "time": torch.arange(float(N)), "plan_scale": 20.0}
+    data = replace(_floor().subset(range(N)), groups=phones, offsets=offsets, labels=("phone",), **known)
+    write_rssi(data, folder)
 
 
 def captures(folder: Path, **form: Any) -> None:
@@ -156,6 +173,7 @@ MODELS: dict[str, Callable[[], Any]] = {
     "dcgan model": lambda: FIELD_MODELS["dcgan"](PUBLISHED["dcgan"]).fit(_room()),
     "rssi pair model": lambda: PairModel(new_places=False).fit(_floor()),
     "kernel regression": lambda: KernelRegression().fit(Mixed.measured(_room())),
+    "nearest spectrum": lambda: NearestSpectrum().fit(Mixed.measured(_room())),
     "RSSI locator": lambda: RssiLocator(n_cells=200).fit(rssi_room(n=40)),
     "matched-field locator": _matched_field,
 }
@@ -199,7 +217,7 @@ def predicted(model: Any) -> torch.Tensor:
 
 
 def estimated(estimator: Any) -> torch.Tensor:
-    assert isinstance(estimator, KernelRegression)
+    assert isinstance(estimator, KernelRegression | NearestSpectrum)
     return estimator.predict(_room().spectrum[:2].flip(2))
 
 
@@ -210,7 +228,10 @@ def located(locator: Any) -> torch.Tensor:
     return locator.locate(_room().spectrum[:1]).median
 
 
-ANSWERS = {"kernel regression": estimated, "RSSI locator": located, "matched-field locator": located}  # others predict
+ANSWERS = {  # others predict
+    **dict.fromkeys(("kernel regression", "nearest spectrum"), estimated),
+    **dict.fromkeys(("RSSI locator", "matched-field locator"), located),
+}
 
 
 @functools.cache
@@ -246,6 +267,8 @@ DATA: dict[str, tuple[Callable[[Path], object], Reader]] = {
     "format of array snapshots captures": (captures, read_snapshots),
     "captures in pcap": (functools.partial(captures, suffix=".pcap", tones=64), read_snapshots),
     "spectra as an array": (lambda folder: write_spectra(_room(), folder), read_spectra),
+    "spectra with channels": (spectra_as_written, read_spectra),
+    "RSSI with groups": (rssi_as_written, read_rssi),
     "snapshots in HDF5": (functools.partial(write_snapshots, name="snapshots.h5", data=SNAPSHOTS), read_snapshots),
     "snapshots in MATLAB": (snapshots_mat, read_snapshots),
     "snapshots in compressed MATLAB": (functools.partial(snapshots_mat, do_compression=True), read_snapshots),

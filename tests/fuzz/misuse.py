@@ -149,7 +149,7 @@ ARRAYS: dict[str, Call] = {
     **each(AngularGrid.hemisphere, n_elevation=2, n_azimuth=4),
     **each(AngularGrid, elevation_start=0.0, elevation_step=0.1, n_elevation=4, azimuth_start=0.0, n_azimuth=8),
     **each(ArrayPose, position=(0.0, 0.0, 1.0), orientation=(0.0, 0.0, 0.0, 1.0)),
-    **each(Plane, normal=(1.0, 0.0, 0.0), offset_m=0.0, gain=-0.5, std_mm=0.0),
+    **each(Plane, normal=(1.0, 0.0, 0.0), offset_m=0.0, gain=-0.5, std_mm=0.0, probability=0.5, rival_m=1.0),
     **each(GeometryModel.of_planes, link=spectra(), planes=[], order=2),
 }
 MODELS: dict[str, Call] = {

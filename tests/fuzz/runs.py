@@ -31,6 +31,7 @@ from swiftwrf import (
     simulated_room,
 )
 from swiftwrf.errors import MAX_LENGTH
+from swiftwrf.models.geometry import Plane
 from swiftwrf.online import Follower
 from swiftwrf.runtime.durable import write_json
 from tasks.aoa.room import in_plan
@@ -67,8 +68,7 @@ def run_of_rssi(folder: Path) -> None:
 def run_of_aoa(folder: Path) -> None:
     model = fit(simulated_room(n=20, grid=AngularGrid.hemisphere(4, 8)), n_primitives=3)
     model.save(folder / "swiftwrf-mix1.safetensors")
-    plane = {"normal": [1.0, 0, 0], "offset_m": 6.0, "gain": -0.5, "std_mm": 1.0, "certain": True}
-    write_json(folder / "geometry-mix1.json", {"planes": [plane]})
+    write_json(folder / "geometry-mix1.json", {"planes": [Plane((1.0, 0.0, 0.0), 6.0, -0.5, 1.0, 0.95, 6.1).to_json()]})
     write_json(folder / "config.json", {"task": "aoa", "config": plain(AoaConfig(mix=(1.0,), data="gone"))})
     write_json(folder / "environment.json", {"input_sha256": {}})
 

@@ -2,10 +2,12 @@
 
 import json
 import re
-from dataclasses import replace
+import zipfile
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import quick
 import torch
@@ -17,7 +19,7 @@ from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data import ReadOptions
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
-from swiftwrf.data.rssi import SURVEY
+from swiftwrf.data.rssi import SURVEY, Offsets
 from swiftwrf.data.writing import write_rssi, write_spectra
 
 GRID = ("--grid", 24, 96)
@@ -67,8 +69,26 @@ def test_rssi_comes_back_as_it_was(tmp_path):
     assert torch.equal(after.named_splits["random"][1], before.named_splits["random"][1])
 
 
-def test_what_is_known_of_the_measurements_comes_back(tmp_path):
+def assert_same(found, data, left_out=()):
+    """Every field of the data comes back, those that are added to the class, too."""
+    assert type(found) is type(data)
+    for field in {field.name for field in fields(data)} - {"name", "source", "notes", *left_out}:
+        value, back = getattr(data, field), getattr(found, field)
+        if isinstance(value, torch.Tensor):
+            torch.testing.assert_close(back, value, rtol=0, atol=0, equal_nan=True, msg=field)
+        elif isinstance(value, pd.Series):
+            pd.testing.assert_series_equal(back, value)
+        elif field == "named_splits":
+            assert {name: [rows.tolist() for rows in parts] for name, parts in back.items()} == {
+                name: [rows.tolist() for rows in parts] for name, parts in value.items()
+            }
+        else:
+            assert back == value, field
+
+
+def test_what_is_known_of_rssi_comes_back(tmp_path):
     """Also names and values for which the layout has signs."""
+    phones = pd.Series((["new", "007", "NA", None] * 10)[:40], name="Phone ID")
     known = {
         "receiver_names": ('a,"b"', "NA", "1"),
         "receiver_position": torch.eye(3, dtype=torch.float64),
@@ -76,17 +96,78 @@ def test_what_is_known_of_the_measurements_comes_back(tmp_path):
         "floors": Floors(("0", "1, 2"), (1.0, 5.25)),
         "receiver_moves": True,
         "session": torch.arange(40) // 20,
-        "time": torch.arange(40).double() / 3,
+        "time": (torch.arange(40).double() / 3).index_fill(0, torch.tensor([7]), torch.nan),
+        "groups": phones,
+        "offsets": Offsets("Phone ID", "new", {"new": 0.0, "007": -1 / 3, "NA": 2.5}, 0.125),
+        "labels": ("Phone ID", "channel: 1"),
+        "plan_scale": 20.7,
+        "named_splits": {"walk": (torch.arange(30), torch.arange(30, 40))},
     }
     data = replace(load_rssi(write_survey(tmp_path / "a")), **known)
-    data.rssi_dbm[0, 0] = -100.0
+    assert all(getattr(data, field.name) is not None for field in fields(data)), "each field has a value here"
     write_rssi(data, tmp_path)
     back = load_rssi(tmp_path)
-    for name, value in known.items():
-        found = getattr(back, name)
-        assert torch.equal(found, value) if isinstance(value, torch.Tensor) else found == value, name
-    assert back.rssi_dbm[0, 0] == -99.99
+    assert_same(back, data)
     assert SURVEY in back.source
+    assert quick.run("inspect", tmp_path, "--out", tmp_path / "inspection") == 0
+    data.rssi_dbm[0, 0] = -100.0
+    write_rssi(data, tmp_path)
+    assert load_rssi(tmp_path).rssi_dbm[0, 0] == -99.99
+    (tmp_path / "meta.csv").unlink()
+    assert load_rssi(tmp_path).groups is None
+
+
+@pytest.mark.parametrize("column", ["groups", "time"])
+def test_rows_without_a_group_or_time_stay_rows(tmp_path, column):
+    """A line without content is no row of a table."""
+    value = {
+        "groups": pd.Series(["old", None] * 20, name="phone"),
+        "time": torch.arange(40.0).where(torch.arange(40) % 2 == 0, torch.nan),
+    }[column]
+    data = replace(load_rssi(write_survey(tmp_path / "a")), **{column: value})
+    write_rssi(data, tmp_path)
+    assert_same(load_rssi(tmp_path), data)
+
+
+def test_what_is_known_of_spectra_comes_back(tmp_path):
+    draw = torch.Generator().manual_seed(0)
+    room = simulated_room(n=20, grid=AngularGrid.hemisphere(8, 32))
+    label = torch.rand(20, 2, generator=draw, dtype=torch.float64).index_fill(0, torch.tensor([3]), torch.nan)
+    known = {
+        "label": label,
+        "line_of_sight": torch.arange(20) % 3 > 0,
+        "channel": torch.randn(20, 3, 16, dtype=torch.complex64, generator=draw),
+        "frequency_hz": 915e6 + 1e6 * torch.arange(3).double(),
+        "named_splits": {"walk": (torch.arange(12), torch.arange(12, 20))},
+    }
+    data = replace(room, **known)
+    assert all(getattr(data, field.name) is not None for field in fields(data)), "each field has a value here"
+    write_spectra(data, tmp_path)
+    back = load_spectra(tmp_path)
+    torch.testing.assert_close(back.rotation, data.rotation)  # by a quaternion
+    torch.testing.assert_close(back.array.element, data.array.element)
+    assert torch.equal(back.spectrum, data.spectrum)
+    assert_same(back, data, left_out=("rotation", "array", "store"))
+    write_spectra(room, tmp_path)
+    assert "label.npy" not in zipfile.ZipFile(tmp_path / "spectrum.npz").namelist(), "it follows from the positions"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "plan_scale: wide",
+        "plan_scale: [1, 2]",
+        "offsets: 3",
+        "offsets: {column: a}",
+        "labels: 3",
+        "offsets: {column: a, reference: b, explained: nan, offset_db: {b: 0}}",
+    ],
+)
+def test_damaged_properties_of_a_survey_are_refused(tmp_path, text):
+    write_rssi(load_rssi(write_survey(tmp_path / "a")), tmp_path)
+    (tmp_path / SURVEY).write_text(text)
+    with pytest.raises(InputError, match=r"survey\.yml is not a description as convert writes it"):
+        load_rssi(tmp_path)
 
 
 def test_moving_receivers_and_splits_come_back(tmp_path):

@@ -6,17 +6,22 @@ import time
 from dataclasses import replace
 from functools import cache
 
+import numpy as np
+import pandas as pd
 import pytest
 import small
 import torch
 from fuzz.runs import follow
+from scipy.spatial.distance import cdist
 
-from swiftwrf import AngularGrid, Rssi, RssiModel, load, make_model, rssi_room, simulated_room
+from swiftwrf import AngularGrid, Rssi, RssiModel, load, load_rssi, make_model, rssi_room, simulated_room
 from swiftwrf.data.writing import write_rssi
 from swiftwrf.models.geometry import GeometryModel, Plane
-from swiftwrf.online import Follower
+from swiftwrf.online import Follower, Step
+from swiftwrf.online.scores import Scores
+from swiftwrf.rssi import estimate_offsets
 from tasks.command import run_command
-from tasks.update.record import Record
+from tasks.update.record import Record, map_plot, page
 
 
 @cache
@@ -125,8 +130,8 @@ def observed(answers):
         (HEADER + b"".join(ROWS[:3]), []),
         (HEADER + b"".join(ROWS), [-63, -64]),
         (HEADER + b"".join(ROWS[2:]), [-62, -63, -64]),
-        (HEADER + b"".join(ROWS[:1]), [-60]),
-        (HEADER + ROWS[1] + ROWS[0] + b"".join(ROWS[2:]), [-61, -60, -62, -63, -64]),
+        (HEADER + b"".join(ROWS[1:2]), [-61]),
+        (HEADER + ROWS[1] + ROWS[0] + b"".join(ROWS[2:]), [-61, -60, -63, -64]),  # the third is already learnt
     ],
     ids=["unchanged", "grown", "rewritten", "truncated", "last line the same"],
 )
@@ -213,6 +218,21 @@ def test_an_update_of_a_room_states_the_spectra_that_it_has_not_learnt(tmp_path,
     assert "3 spectra are not learnt" in capsys.readouterr().out
 
 
+def test_an_update_by_the_rows_that_trained_the_model_learns_the_others(model, tmp_path, capsys):
+    (tmp_path / "data").mkdir()
+    write_rssi(floor(), tmp_path / "data")
+    options = [str(model), str(tmp_path / "data"), "--out", str(tmp_path / "out")]
+    assert run_command("update", options, "swiftwrf update") == 0
+    said = capsys.readouterr()
+    assert "data: 40 of 60 rows are already in the model and are left out" in said.err.replace("\n", " ")
+    assert "20 measurements learnt" in said.out
+    assert len(load(tmp_path / "out" / "model.safetensors").anchor) == 60
+    options[0], options[-1] = str(tmp_path / "out" / "model.safetensors"), str(tmp_path / "again")
+    assert run_command("update", options, "swiftwrf update") == 2
+    assert "data: 60 of 60 rows are already in the model and are left out; give others" in capsys.readouterr().err
+    assert not (tmp_path / "again").exists()
+
+
 # lines that are no measurements
 
 
@@ -252,6 +272,23 @@ def test_receivers_that_appear_are_left_out_of_lines_as_of_rows_with_one_note(mo
     assert said == "note: receivers that the model does not have are left out, e.g. new\n"
 
 
+def test_lines_that_a_model_has_learnt_are_reported_and_left_out(model, tmp_path):
+    """Also those of a table that trained it."""
+    code, answers, said = follow(model, content=line(40) + line(41), out=tmp_path / "a")
+    assert (code, len(answers), said) == (0, 2, "")
+    code, answers, said = follow(tmp_path / "a" / "model.safetensors", content=line(40) + line(42), out=tmp_path / "b")
+    assert (code, len(answers)) == (0, 1)
+    assert said.startswith("error: ")
+    assert "row 0, counted from 0, is already in the model; leave it out" in said
+    data = floor().subset(torch.arange(44))
+    table = data.to_frame().rename(columns={"x_m": "x", "y_m": "y", "z_m": "z"})
+    table.to_csv(tmp_path / "walk.csv", index=False)
+    trained = RssiModel().fit(load_rssi(tmp_path / "walk.csv").subset(torch.arange(40)))
+    trained.save(tmp_path / "trained.safetensors")
+    _, answers, said = follow(tmp_path / "trained.safetensors", tmp_path / "walk.csv", out=tmp_path / "c")
+    assert (len(answers), said.count("is already in the model")) == (4, 40)
+
+
 def test_booleans_are_no_spectrum(tmp_path):
     make_model("gp").fit(room().subset(torch.arange(40))).save(tmp_path / "gp.safetensors")
     bad = json.dumps({"position": [1, 1, 1], "spectrum": [[True] * 72] * 18}).encode() + b"\n"
@@ -267,6 +304,48 @@ def test_bad_rows_of_a_table_are_left_out(model, tmp_path):
     _, answers, said = follow(model, source)
     assert observed(answers) == [-60, -61]
     assert [text.replace(":", "").split()[:3] for text in said.splitlines()] == [["error", "line", n] for n in "345"]
+
+
+@pytest.mark.parametrize("place", [[8.5, 47.3, 400.0], [1e8, 2.0, 1.0]])
+def test_a_line_of_another_unit_is_reported_and_left_out(model, place):
+    code, answers, said = follow(model, content=line(40) + line(41, position=place) + line(42))
+    assert (code, len(answers), said.count("error: ")) == (0, 2, 1)
+    assert "away from those that the model was fitted to" in said
+
+
+def test_rows_in_degrees_are_left_out_by_a_model_in_metres(model, tmp_path):
+    source = tmp_path / "rows.csv"
+    source.write_bytes(b"latitude,longitude,z,receiver01,receiver02\n47.3,8.5,1,-60,-61\n47.3001,8.5,1,-61,-62\n")
+    _, answers, said = follow(model, source)
+    assert not answers
+    assert said.count("has positions in degrees, but the predictor was fitted to metres") == 2
+
+
+@cache
+def two_floors():
+    """RSSI on two floors, heights counted from each; another phone reads 8 dB less."""
+    draw = np.random.default_rng(0)
+    table = pd.DataFrame(draw.uniform(0, 20, (60, 2)), columns=["x", "y"])
+    table = table.assign(z=1.0, floor=np.repeat(["0", "1"], 30), phone=["new", "old"] * 30)
+    loss = 20 * np.log10(np.hypot(table.x, table.y) + 1) + 15 * (table.floor == "1")
+    return table.assign(receiver01=-40 - loss + draw.normal(0, 1, 60) - 8 * (table.phone == "old"))
+
+
+def test_followed_rows_are_of_their_floor_and_phone(tmp_path):
+    """A single row lacks the other floors, from which the height of its own follows."""
+    data = Rssi.from_frame(two_floors(), offset_by="phone")
+    fitted = RssiModel().fit(estimate_offsets(data, "new").removed(data))
+    fitted.save(tmp_path / "floors.safetensors")
+    rows = two_floors().assign(x=lambda table: table.x + 0.1)
+    rows[rows.floor == "0"].tail(2).to_csv(tmp_path / "ground.csv", index=False)
+    rows[rows.floor == "1"].tail(2).to_csv(tmp_path / "first.csv", index=False)
+    _, answers, said = follow(tmp_path / "floors.safetensors", tmp_path / "ground.csv", out=tmp_path / "a")
+    read = rows.receiver01[rows.floor == "0"].tail(2) - np.array([0.0, fitted.offsets.offset_db["old"]])
+    assert [answer["observed"]["receiver01"] for answer in answers] == pytest.approx(read.tolist(), abs=0.01)
+    assert not said
+    _, answers, said = follow(tmp_path / "floors.safetensors", tmp_path / "first.csv", out=tmp_path / "b")
+    assert not answers
+    assert said.count("has rows on floor 1 at heights of other floors") == 2
 
 
 def test_a_character_in_two_parts_is_one(model, tmp_path):
@@ -397,3 +476,29 @@ def test_a_record_comes_back_as_it_was_and_is_cut_to_what_the_model_has_learnt(t
         kept.write(tmp_path)
         assert [row["index"] for row in Record.read(tmp_path).rows] == [41, 42][:number]
         assert kept.table["error"].tolist() == pytest.approx(record.table["error"][:number].tolist(), nan_ok=True)
+
+
+def test_the_numbers_of_a_record_are_those_of_its_measurements(tmp_path):
+    draw, record = np.random.default_rng(0), Record("source", "dB")
+    position, error, covered = draw.random((40, 3)), draw.gamma(2, size=40), draw.random(40)
+    innovation = draw.normal(size=(40, 3))
+    innovation[20:, 1] = np.nan  # not detected
+    for k in range(40):
+        scores = Scores(*(torch.from_numpy(values[k : k + 1]) for values in (position, error, innovation, covered)))
+        record.add(k, Step(scores, ("hall weaker",) * (k == 7), None, ""))
+    root_mean_square = np.sqrt(np.nanmean(innovation**2, axis=1))
+    running = [error[max(0, k - 29) : k + 1].mean() for k in range(40)]
+    for column, values in (("error", error), ("running_error", running), ("innovation", root_mean_square)):
+        assert record.table[column].tolist() == pytest.approx(list(values))
+    shown = page(record, "name", tmp_path)
+    mean, last = f"{error.mean():.3g} dB", f"{running[-1]:.3g} dB"
+    assert [number.value for number in shown.summary.numbers] == ["40", mean, "1", f"{covered.mean():.0%}"]
+    first, second, third = record.sentences()
+    assert first == "1 change detected, 40 measurements learnt."
+    assert (mean in second, second.endswith(f"30: {last}."), "measurement 7" in third) == (True, True, True)
+    cells = shown.sections[0].tables[0].rows
+    assert [int(row[0]) for row in cells] == np.argsort(-root_mean_square)[:10].tolist()
+    worst = root_mean_square.argmax()
+    assert cells[0][1:] == [f"{x:.3g}" for x in (*position[worst], error[worst], root_mean_square[worst])]
+    near = np.argsort(cdist(position, position), axis=1)[:, :5]
+    assert map_plot(record).data["innovation"].tolist() == pytest.approx(root_mean_square[near].mean(axis=1).tolist())

@@ -1,6 +1,7 @@
 """Results of the library, which need no directory, process or terminal."""
 
 import json
+from contextlib import nullcontext
 from functools import partial
 from unittest import mock
 
@@ -11,6 +12,8 @@ from quick import cheap, sketched
 import augment
 import swiftwrf
 from swiftwrf import AngularGrid, InputError
+from swiftwrf.choices import RSSI_PREDICTORS
+from swiftwrf.models.neighbours import IDWModel
 from swiftwrf.runtime.steps import Memo
 
 
@@ -79,6 +82,72 @@ def test_a_comparison_continues_after_its_kept_results(tmp_path, compare):
         again = compare(data, receivers=["1", "6", "12"], keep=Memo(tmp_path))
     pd.testing.assert_frame_equal(again.errors, first.errors)
     again.report(tmp_path / "report.html")
+
+
+def weaker(data):
+    return data.derived(rssi_dbm=data.rssi_dbm - 20)
+
+
+def of_own_model(synthesize):
+    """Return a class as a notebook defines it again after a change."""
+    return type("Mine", (IDWModel,), {"synthesize": synthesize, "__module__": "__main__"})
+
+
+FLOOR, SPECTRA = swiftwrf.rssi_room(n=60), swiftwrf.simulated_room(n=40, grid=AngularGrid.hemisphere(10, 40))
+MINE = {"models": [of_own_model(lambda model, position: IDWModel.synthesize(model, position) * 0 + 0.5)()]}
+MENDED = {"models": [of_own_model(lambda model, position: IDWModel.synthesize(model, position))()]}
+KEPT = {
+    "rssi": (swiftwrf.rssi.compare, {"data": FLOOR, "receivers": ["6"]}),
+    "locate": (swiftwrf.locate.compare, {"data": FLOOR, "n_cells": 200}),
+    "aoa": (
+        augment.turbo_learning,
+        {"data": SPECTRA, "measured": 0.5, "models": ["idw"], "estimators": ["peak"], "extra": 0} | MINE,
+    ),
+}
+OTHER_CALLS = [
+    ("rssi", {"data": weaker(FLOOR)}, "data"),
+    ("rssi", {"receivers": ["5"]}, "receivers"),
+    ("rssi", {"seed": 3}, "seed"),
+    ("rssi", {"not_detected": "unknown"}, "not_detected"),
+    ("locate", {"data": weaker(FLOOR)}, "data"),
+    ("locate", {"seed": 5}, "seed"),
+    ("aoa", {"data": swiftwrf.simulated_room(n=40, seed=7, grid=SPECTRA.grid)}, "data"),
+    ("aoa", {"seed": 4}, "seed"),
+    ("aoa", {"measured": 0.6}, "measured"),
+    ("aoa", MENDED, "field models, models"),
+]
+
+
+@pytest.mark.parametrize("task", KEPT)
+def test_kept_results_are_those_of_one_call(tmp_path, task):
+    compare, options = KEPT[task]
+    first = compare(**options, keep=Memo(tmp_path)).summary()
+    pd.testing.assert_frame_equal(compare(**options, keep=Memo(tmp_path), executor=None).summary(), first)
+    for other, change, named in OTHER_CALLS:
+        if other == task:
+            with pytest.raises(
+                InputError, match=rf"the input or a version has changed since .* began \({named}\); restore it or"
+            ):
+                compare(**options | change, keep=Memo(tmp_path))
+    pd.testing.assert_frame_equal(compare(**options, keep=Memo(tmp_path)).summary(), first)
+
+
+def test_a_predictor_of_ones_own_is_continued_as_it_was(tmp_path, monkeypatch):
+    mean = RSSI_PREDICTORS["mean"]
+    monkeypatch.setattr(RSSI_PREDICTORS, "_registered", {"swiftwrf": RSSI_PREDICTORS["swiftwrf"], "mean": mean})
+    options = {"receivers": ["6"], "also": ["mine"], "keep": Memo(tmp_path)}
+    for factor, says in ((1.0, None), (2.0, r"\(predictors\)")):
+
+        class Mine(mean):
+            name = "mine"
+
+            def _predict(self, position, factor=factor):
+                found, std = super()._predict(position)
+                return factor * found, std
+
+        RSSI_PREDICTORS._registered["mine"] = Mine
+        with nullcontext() if says is None else pytest.raises(InputError, match=says):
+            assert "mine" in swiftwrf.rssi.compare(FLOOR, **options).summary().index
 
 
 COMPARISONS = {

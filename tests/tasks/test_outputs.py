@@ -142,9 +142,14 @@ def test_a_geotiff_has_values_place_and_projection(geodetic, tmp_path):
     with Image.open(tmp_path / "a.tif") as image:
         tags = dict(image.tag_v2)
         np.testing.assert_array_equal(np.asarray(image), one.mean[0, ::-1])
-    assert tags[33550][:2] == (1.5, 1.5)
-    assert tags[33922][3:5] == pytest.approx((one.x[0] - 0.75, one.y[-1] + 0.75))
-    keys = geokeys(tags)
+    column, row, _, x, y, _ = tags[
+        33922
+    ]  # a pixel and its place; whole numbers are corners of pixels (raster type: area)
+    keys, (dx, dy) = geokeys(tags), tags[33550][:2]
+    assert keys[1025] == 1
+    middle = np.arange(len(one.x)) + 0.5, np.arange(len(one.y)) + 0.5
+    np.testing.assert_allclose(x + (middle[0] - column) * dx, one.x)
+    np.testing.assert_allclose(y - (middle[1] - row) * dy, one.y[::-1])
     assert (keys[3075], keys[3089], keys[3088]) == (12, ORIGIN.latitude, ORIGIN.longitude)
     (description,) = ElementTree.fromstring(tags[42112])
     assert unescape(description.text) == "hall & <stairs>"
@@ -202,6 +207,18 @@ def test_an_image_has_a_world_file(geodetic, model, with_origin, tmp_path):
 def chart_of(x, y, cell, rssi, origin=None):
     rssi = np.array(rssi, dtype=np.float32).reshape(1, len(y), len(x))
     return RssiMap(np.array(x), np.array(y), 1.0, cell, rssi, rssi, rssi, ("hall",), origin)
+
+
+def test_a_map_is_hatched_where_nothing_is_received_at_the_median_height(model, floor, monkeypatch):
+    hatched = []
+    monkeypatch.setattr("swiftwrf.rssi.maps.hatch", lambda ax, x, y, where: hatched.append(where))
+    chart = RssiMap.predict(model, cell=4.0)
+    detection = np.linspace(0, 1, chart.mean.size).reshape(chart.mean.shape)
+    replace(chart, detection=detection).plot()
+    assert np.array_equal(hatched[0], (detection < 0.5).all(axis=0))
+    assert chart.height == pytest.approx(np.median(floor.transmitter_position[:, 2]), abs=0.01)
+    middle = (model.region()[:, :2].amin(dim=0) + model.region()[:, :2].amax(dim=0)) / 2
+    assert (chart.x[0] <= middle[0] <= chart.x[-1], chart.y[0] <= middle[1] <= chart.y[-1]) == (True, True)
 
 
 def test_a_world_file_of_one_cell_has_its_size(tmp_path):

@@ -12,6 +12,7 @@ from pandas import DataFrame
 
 from swiftwrf import AngularGrid, Rssi, Spectra, plotting
 from swiftwrf.diagnostics.inspection import Findings
+from swiftwrf.positions import inside
 from tasks import labels
 from tasks.aoa.records import CHOSEN, LOWER_REFERENCE, UPPER_REFERENCE
 from tasks.aoa.synthesis import SCALES, spectra
@@ -19,7 +20,7 @@ from tasks.configs import InspectConfig
 from tasks.inspect import page as inspection
 from tasks.locate.page import posteriors
 from tasks.page import figures
-from tasks.page.maps import colour_image, inside
+from tasks.page.maps import colour_image
 from tasks.page.page import Number, Page, Plot, Section, Summary, write_page
 from tasks.page.shared import again
 from tasks.records import read_table

@@ -11,12 +11,13 @@ import pytest
 import yaml
 
 from swiftwrf import InputError
+from swiftwrf.runtime.digest import digest
+from swiftwrf.runtime.durable import strict
 from tasks import configs
 from tasks.command import COMMANDS, main
 from tasks.command_line import _defaults, command_line, execute, file_options, parse
 from tasks.configs import AoaConfig, InspectConfig, ReportConfig, RssiTaskConfig
 from tasks.options import OffsetSource, Output, by_name, plain
-from tasks.records import digest
 
 SOURCE = ("--data", "x", "--array", "4", "2", "0.06", "2.4e9", "--drop-null")
 
@@ -150,7 +151,7 @@ def test_resume_changes_no_result(tmp_path, given, capsys):
     folder.mkdir()
     values = plain(RssiTaskConfig(("1",), scheduler="tcp://old:1"))
     (folder / "config.json").write_text(json.dumps({"task": "rssi", "config": values}))
-    (folder / "environment.json").write_text(json.dumps({"config_sha256": digest(values)}))
+    (folder / "environment.json").write_text(json.dumps({"config_sha256": digest(strict(values))}))
     with mock.patch("tasks.resume.run_task") as task:
         assert main(["resume", str(folder), "--json"]) == 0
         assert main(["resume", str(folder), "--scheduler", "tcp://new:1"]) == 0

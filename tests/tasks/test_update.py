@@ -1,5 +1,6 @@
 """Updates equal a fit to all data with the same kernel; what is forgotten, aged, saved and refused."""
 
+import warnings
 from copy import copy
 from dataclasses import replace
 from functools import cache
@@ -14,7 +15,9 @@ from swiftwrf import AngularGrid, InputError, RssiModel, load, make_model
 from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.simulated import rssi_room, simulated_room
 from swiftwrf.gp import GaussianProcess, Kernel
+from swiftwrf.online import Follower
 from swiftwrf.rssi import FloorAttenuation
+from swiftwrf.runtime import checkpoint
 
 SIGNAL = 1e-5  # of the signal: magnitudes up to 1, RSSI over 60 dB
 OPTIONS = {"swiftwrf": {"n_primitives": 24}}
@@ -220,3 +223,64 @@ def test_an_update_removes_the_attenuation_of_floors():
     at = floor().transmitter_position[:10]
     updated = below.update(replace(new, rssi_dbm=new.rssi_dbm - 20))
     torch.testing.assert_close(updated.predict(at).mean, model.update(new).predict(at).mean - 20, atol=1e-3, rtol=0)
+
+
+MODELS = {name: (lambda name=name: fitted(name), data, N) for name in (*PROCESSES, "geometry")}
+MODELS["rssi"] = (fitted_rssi, floor, 60)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_rows_that_a_model_has_learnt_are_not_learnt_twice(name, tmp_path):
+    model, rows, n = (part() if callable(part) else part for part in MODELS[name])
+    new, last = rows[n:], slice(len(rows) - 2, None)
+    assert model.is_learnt(rows).tolist() == [True] * n + [False] * len(new)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        expected = model.update(new)
+    expected.save(tmp_path / "model")
+    known = f"{rows.name}: {n} of {len(rows)} rows are already in the model and are left out"
+    with pytest.warns(UserWarning, match=known):
+        found = model.update(rows)
+    at = (rows.position if name != "rssi" else rows.transmitter_position)[:5] + 0.03
+    assert torch.equal(found.predict(at).mean, expected.predict(at).mean)
+    for same in (expected, load(tmp_path / "model")):
+        with pytest.warns(UserWarning, match=f"{rows.name}: 2 of 2 rows are already in the model"):
+            assert torch.equal(same.update(rows[last]).predict(at).mean, same.predict(at).mean)
+        with pytest.raises(InputError, match="row 3, counted from 0, is already in the model; leave it out"):
+            Follower(same).step(rows[[3]])
+
+
+def test_a_measurement_that_repeats_another_is_no_copy_of_it():
+    """Equal values at one place are new if they are another row or of another time."""
+    known = floor()[:60]
+    again = replace(known[:4], index=torch.arange(60, 64))
+    assert len(fitted_rssi().update(again).anchor) == 64
+    timed = replace(known, time=torch.arange(60.0).index_fill(0, torch.tensor([2]), torch.nan))
+    model = RssiModel().fit(timed)
+    assert model.is_learnt(timed).all()
+    for change in (
+        {"index": torch.arange(60, 120)},
+        {"time": torch.arange(60.0, 120.0)},
+        {"rssi_dbm": timed.rssi_dbm + 0.1},
+        {"transmitter_position": timed.transmitter_position + 0.01},
+    ):
+        assert not model.is_learnt(replace(timed, **change)).any()
+
+
+def test_rows_that_are_forgotten_are_learnt_again():
+    model, gone = fitted("gp").update(data()[N:]), torch.tensor([2, N + 1])
+    again = model.forget(gone)
+    assert again.is_learnt(data()).tolist() == [row not in gone.tolist() for row in range(N + M)]
+    assert len(again.update(data()).position) == N + M
+    rssi = fitted_rssi().update(floor()[60:]).with_chosen_kernel(without=torch.arange(85, 90))
+    assert rssi.is_learnt(floor()).tolist() == [True] * 85 + [False] * 5
+
+
+def test_a_file_from_before_digests_recognises_what_it_learns_from_now_on(tmp_path):
+    fitted("gp").save(tmp_path / "model")
+    kind, tensors, header = checkpoint.read(tmp_path / "model", "pixel Gaussian process")
+    del tensors["row_digests"], header["link"]["frequency_hz"]
+    checkpoint.write(tmp_path / "model", kind, tensors, header)
+    model = load(tmp_path / "model").update(data()[N:])
+    assert model.is_learnt(data()).tolist() == [False] * N + [True] * M
+    assert model.forget(torch.tensor([0, N])).is_learnt(data()).tolist() == [False] * (N + 1) + [True] * (M - 1)

@@ -8,7 +8,7 @@ Spectra:
 | `tx_pos.csv` or `rx_pos.csv` | header `x,y,z`: positions of the end that moves |
 | `spectrum/00001.png`, ... | 8-bit grey; row 0 the lowest elevation (90/H degrees), column 0 azimuth 0 |
 | `spectrum.npy` | alternative: floating point (n, elevations, azimuths) in [0, 1], or unsigned integers |
-| `spectrum.npz` | alternative: `spectrum` as above and optional `line_of_sight` (n,) bool |
+| `spectrum.npz` | alternative: `spectrum`; optional `line_of_sight`, `label`, `channel`, `frequency_hz` as of `Spectra` |
 
 RSSI, in a table with positions of the same rows:
 
@@ -17,8 +17,8 @@ RSSI, in a table with positions of the same rows:
 | `gateway_rssi.csv` | a column per receiver, named in the header [dBm]; -100 stands for not detected |
 | `tx_pos.csv` or `rx_pos.csv` | header `x,y,z`: positions of the end that moves |
 | `gateway_position.yml` | optional: `NAME: [x, y, z]` of receivers with known positions |
-| `meta.csv` | optional: a row per measurement, with its session (`session`, `run` or `walk`) and `time` [s] |
-| `survey.yml` | optional: `origin: [latitude, longitude]`, `floors: {NAME: height}` [m], `receiver_moves: true` |
+| `meta.csv` | optional: a row per measurement, with its session (`session`, `run` or `walk`), `time` [s] and `group` |
+| `survey.yml` | optional: `origin: [latitude, longitude]`, `floors: {NAME: height}` [m], `receiver_moves: true`, ... |
 
 The BLE data of the NeRF2 paper are read unchanged: `rssi.csv`, `beacon_pos.csv` and `gateway_pos.csv`.
 """
@@ -40,7 +40,7 @@ from PIL import Image
 from torch import Tensor
 
 from swiftwrf.choices import Moving
-from swiftwrf.data.archives import array_header, array_names, read_arrays, read_rows, refusing_broken
+from swiftwrf.data.archives import array_header, read_arrays, read_rows, refusing_broken
 from swiftwrf.data.cells import column_of_numbers, seconds, text_of
 from swiftwrf.data.columns import column_of
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin, PlanFrame, without_fix
@@ -49,16 +49,17 @@ from swiftwrf.data.formats.base import RSSI_FORMATS, SPECTRA_FORMATS, Format, Re
 from swiftwrf.data.formats.snapshots import array_of, described_arrays, pose_of
 from swiftwrf.data.powers import NOT_DETECTED_DBM, find_fillers, without_fillers
 from swiftwrf.data.receivers import read_receivers
-from swiftwrf.data.rssi import META, SURVEY, Rssi
-from swiftwrf.data.spectra import Spectra, check_pixels
+from swiftwrf.data.rssi import META, SURVEY, Offsets, Rssi
+from swiftwrf.data.spectra import OF_SPECTRA, Spectra, check_pixels
 from swiftwrf.data.splits import kept_splits, read_splits
 from swiftwrf.data.store import BATCH_PIXELS, Store, stored
 from swiftwrf.errors import InputError, listed
-from swiftwrf.positions import check_positions, to_tensor
+from swiftwrf.positions import check_positions
 
 TABLES = ("gateway_rssi.csv", "rssi.csv")
 POSITIONS = ("tx_pos.csv", "rx_pos.csv", "beacon_pos.csv")
 RECEIVERS = ("gateway_position.yml", "gateway_pos.csv")
+PROPERTIES = ("origin", "floors", "receiver_moves", "groups", "offsets", "labels", "plan_scale")  # in survey.yml
 FILES = ("gateway_rssi.csv", *POSITIONS, *RECEIVERS)  # any of which marks the layout
 
 
@@ -93,37 +94,32 @@ class Nerf2(Format[Spectra]):
             )
         moving: Moving = "transmitter" if tables[0].name == "tx_pos.csv" else "receiver"
         position = check_positions(read_xyz(tables[0]), f"positions of {tables[0]}")
-        store, line_of_sight, read = _read_spectra(path, len(position))
+        store, others, read = _read_spectra(path, len(position))
         return Spectra(
             store=store,
             position=position,
             array=array or options.array,
-            line_of_sight=line_of_sight,
             moving=moving,
             name=path.resolve().name,
             fixed_position=pose.position,
             rotation=pose.rotation,
             named_splits=read_splits(path, len(position), first=1),
             source=digests([described, tables[0]], path) | read,
+            **others,
         )
 
 
-def _read_spectra(folder: Path, n: int) -> tuple[Store, Tensor, dict[str, str]]:
-    """Return spectra (n, H, W) in [0, 1], whether the line of sight is unobstructed, and digests of the files."""
-    free = torch.ones(n, dtype=torch.bool)
+def _read_spectra(folder: Path, n: int) -> tuple[Store, dict[str, Any], dict[str, str]]:
+    """Return spectra (n, H, W) in [0, 1], further arrays of `Spectra` by name, and digests of the files."""
     arrays = [file for file in (folder / "spectrum.npy", folder / "spectrum.npz") if file.is_file()]
     if len(arrays) + (folder / "spectrum").is_dir() > 1:
         raise InputError(f"{folder} holds spectra twice; keep one of spectrum/, spectrum.npy and spectrum.npz")
     if not arrays:
         spectrum, digest = _read_images(folder / "spectrum", n)
-        return spectrum, free, {"spectrum/*.png": digest}
-    file = arrays[0]
-    if file.suffix == ".npz" and "line_of_sight" in array_names(file):
-        free = to_tensor(
-            f"{file}: line_of_sight", read_arrays(file, ["line_of_sight"])["line_of_sight"], torch.bool, (n,)
-        )
-    digest = sha256(file)
-    return _read_values(file, n, digest), free, {file.name: digest}
+        return spectrum, {}, {"spectrum/*.png": digest}
+    file, digest = arrays[0], sha256(arrays[0])
+    others: dict[str, Any] = read_arrays(file, (), OF_SPECTRA) if file.suffix == ".npz" else {}
+    return _read_values(file, n, digest), others, {file.name: digest}
 
 
 def _read_values(file: Path, n: int, digest: str) -> Store:
@@ -249,10 +245,10 @@ class Nerf2Rssi(Format[Rssi]):
             missing.append(
                 "the receiver moves; RSSI is reciprocal, so it counts as the transmitter and the others as receivers"
             )
-        meta = path / META
-        of_rows, units = _of_rows(meta, len(rssi)) if meta.is_file() else ({}, [])
-        survey = path / SURVEY
+        survey, meta = path / SURVEY, path / META
         properties = _properties(survey) if survey.is_file() else {}
+        groups = properties.pop("groups", None)
+        of_rows, units = _of_rows(meta, len(rssi), groups) if meta.is_file() else ({}, [])
         stated = (positions, table, receivers, of_rows and meta, properties and survey)
         return Rssi(
             rssi[row],
@@ -269,8 +265,8 @@ class Nerf2Rssi(Format[Rssi]):
         )
 
 
-def _of_rows(file: Path, n: int) -> tuple[dict[str, Any], list[str]]:
-    """Return session and time of each of n rows, (n,), as far as a table has these columns, and a note on times."""
+def _of_rows(file: Path, n: int, groups: str | None) -> tuple[dict[str, Any], list[str]]:
+    """Return session, time and named group of n rows, as far as a table has these columns, and a note on times."""
     frame = read_table(file)
     session, time = (column_of(frame, role, {}) for role in ("session", "time"))
     found: dict[str, Any] = {}
@@ -279,17 +275,20 @@ def _of_rows(file: Path, n: int) -> tuple[dict[str, Any], list[str]]:
         found["session"] = text_of(frame[session]).to_numpy()
     if time is not None:
         found["time"], notes = seconds(frame[time])
+    if groups is not None and "group" in frame:
+        group = text_of(frame["group"])
+        found["groups"] = group.where(group != "").rename(groups)
     if found and len(frame) != n:
         raise InputError(f"{file} has {len(frame)} rows, the RSSI {n}; they must match")
     return found, notes
 
 
 def _properties(file: Path) -> dict[str, Any]:
-    """Return the origin of the coordinates, the floors, and whether the receiver moves, as far as a file states them."""
+    """Return the origin of the coordinates and other properties of all rows, as far as a file states them."""
     content = read_yaml(file)
-    found: dict[str, Any] = {}
-    if unknown := content.keys() - {"origin", "floors", "receiver_moves"}:
-        raise InputError(f"{file} states {listed(sorted(unknown))}; it holds origin, floors and receiver_moves only")
+    found: dict[str, Any] = {name: str(content[name]) for name in ("groups",) if name in content}
+    if unknown := content.keys() - set(PROPERTIES):
+        raise InputError(f"{file} states {listed(sorted(unknown))}; it holds {listed(PROPERTIES)} only")
     if "origin" in content:
         degrees = numbers(content["origin"], 2)
         if degrees is None or abs(degrees[0]) > 90 or abs(degrees[1]) > 180:
@@ -305,6 +304,18 @@ def _properties(file: Path) -> dict[str, Any]:
         if content["receiver_moves"] not in ("true", "false"):
             raise InputError(f"{file}: receiver_moves must be true or false, got {content['receiver_moves']}")
         found["receiver_moves"] = content["receiver_moves"] == "true"
+    with refusing_broken(file, "a description as convert writes it"):
+        if not isinstance(labels := content.get("labels", []), list):
+            raise TypeError(f"labels is {labels}, expected a list")
+        found["labels"] = tuple(map(str, labels))
+        offsets = content.get("offsets", {})
+        db = offsets.get("offset_db", {})
+        values = numbers([content.get("plan_scale", "0"), offsets.get("explained", "0"), *db.values()], len(db) + 2)
+        scale, explained, *decibels = values or ()
+        found["plan_scale"] = scale or None
+        if offsets:
+            by_name = dict(zip(db, decibels, strict=True))
+            found["offsets"] = Offsets(str(offsets["column"]), str(offsets["reference"]), by_name, explained)
     return found
 
 

@@ -33,7 +33,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
-import google_crc32c
 import numpy as np
 from annotated_types import Ge, Lt
 from numpy.typing import NDArray
@@ -43,7 +42,7 @@ from swiftwrf.data.files import read_text
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions, station
 from swiftwrf.data.formats.snapshots import snapshots_of
 from swiftwrf.data.snapshots import Snapshots
-from swiftwrf.errors import InputError
+from swiftwrf.errors import InputError, optional_module
 from swiftwrf.positions import MAX_COORDINATE_M, check_positions
 from swiftwrf.runtime.validation import PositiveFloat, check_value
 
@@ -258,7 +257,7 @@ def checksum(content: bytes) -> bytes:
         >>> checksum(b"123456789").hex()
         'e5b08ac7'
     """
-    crc = google_crc32c.value(content)
+    crc = optional_module("google_crc32c", "records are checked by google-crc32c", "formats").value(content)
     return struct.pack("<I", ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF)
 
 

@@ -25,7 +25,7 @@ from swiftwrf.models.geometry.planes import (
     RoomEstimate,
     advantage,
     correlation_score,
-    offset_covariance,
+    plane_set,
     refine,
     refine_all,
     robust_advantage,
@@ -40,7 +40,7 @@ from swiftwrf.models.geometry.search import (
     find_rooms,
     oblique_planes,
 )
-from swiftwrf.models.geometry.uncertainty import assess, phase_alternatives
+from swiftwrf.models.geometry.uncertainty import assess, conclusion, phase_alternatives
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, configuration
@@ -73,8 +73,6 @@ class GeometryConfig(FieldConfig):
     """standard errors by which held-out spectra must be better explained for a plane or a higher order to be added"""
     min_gain: NonNegativeFloat = 0.01
     """reflection gain below which a plane is dropped; 0.01 is 1e-4 of the power, the level of rounding and misfit"""
-    certainty: NonNegativeFloat = 3.0
-    """standard errors by which a plane must explain the spectra better than its alternatives to be certain"""
 
 
 @single_thread()
@@ -115,34 +113,57 @@ def search_room(train: Spectra, config: GeometryConfig, progress: bool) -> RoomE
         if train.channel is not None:
             room = with_dielectrics(room, scene, splits, config)
     final = refine(observed, room.shifted(used.fixed_position))
-    return assess(used, observed, final, score, config.search_distance_m, config.certainty)
+    return assess(used, observed, final, score, searched=True)
 
 
 @single_thread()
-def update_room(room: RoomEstimate, planes: PlaneSet, new: Spectra, config: GeometryConfig) -> RoomEstimate:
-    """Refine a room on more spectra, each estimate weighed by its covariance (R. E. Kalman, 1960), without a search.
+def refine_room(room: RoomEstimate, train: Spectra, config: GeometryConfig) -> RoomEstimate:
+    """Refine a room on other spectra of the scene, without a search.
+
+    Uncertainty, scores and conclusion are those of these spectra, and no plane moves to an alternative.
+
+    Args:
+        room: Estimate from the earlier spectra.
+        train: Spectra with array, rotation and fixed end.
+        config: Options of the search.
+
+    Raises:
+        InputError: As `search_room`.
+    """
+    scene, _ = observe(train, config)
+    assert train.array is not None
+    planes, fold = plane_set(room.planes, room.order), folds(scene.moving, config.validation, config.seed)
+    held, kept = (scene.subset(rows.nonzero()[:, 0]) for rows in (fold == 0, fold != 0))
+    score = correlation_score(held, refine(kept, planes), train.array)
+    return assess(train, scene, refine(scene, planes), score, searched=False)
+
+
+def update_room(room: RoomEstimate, new: Spectra, config: GeometryConfig) -> RoomEstimate:
+    """Refine a room on more spectra, without a search. The scores remain those of the earlier spectra.
+
+    Each estimate is weighed by its covariance (R. E. Kalman, 1960), and the odds of each plane are multiplied.
 
     Args:
         room: Estimate from earlier spectra.
-        planes: Its planes as tensors.
         new: More spectra of the scene, which replace none of the earlier ones.
         config: Options, of which the seed and the number of spectra count.
 
     Raises:
         InputError: As `search_room`.
     """
-    scene, _ = observe(new, config)
-    found = refine(scene, planes)
-    covariance = offset_covariance(scene, found)
-    weight = room.covariance @ torch.linalg.pinv(room.covariance + covariance, hermitian=True)
-    offset = planes.offset[0] + weight @ (found.offset - planes.offset)[0]
-    gain = planes.gain[0] + weight.diagonal().float() * (found.gain - planes.gain)[0]
+    found = refine_room(room, new, config)
+    weight = room.covariance @ torch.linalg.pinv(room.covariance + found.covariance, hermitian=True)
+    old, own = (plane_set(r.planes, r.order) for r in (room, found))
+    offset = old.offset[0] + weight @ (own.offset - old.offset)[0]
+    gain = old.gain[0] + weight.diagonal().float() * (own.gain - old.gain)[0]
     remaining = room.covariance - weight @ room.covariance
     ratio = (remaining.diagonal() / room.covariance.diagonal()).nan_to_num(1.0)  # 0 / 0 for planes without uncertainty
     scale = ratio.clamp(0, 1).sqrt()
-    values = zip(room.planes, offset.tolist(), gain.tolist(), scale.tolist(), strict=True)
-    refined = [replace(p, offset_m=o, gain=g, std_mm=s * p.std_mm) for p, o, g, s in values]
-    return replace(room, planes=refined, covariance=remaining)
+    both = [(p.probability, f.probability) for p, f in zip(room.planes, found.planes, strict=True)]
+    probability = [p * q / (p * q + (1 - p) * (1 - q)) for p, q in both]
+    values = zip(room.planes, offset.tolist(), gain.tolist(), scale.tolist(), probability, strict=True)
+    planes = [replace(p, offset_m=o, gain=g, std_mm=s * p.std_mm, probability=q) for p, o, g, s, q in values]
+    return replace(room, planes=planes, covariance=remaining, conclusion=conclusion(planes))
 
 
 def _evenly(train: Spectra, most: int) -> tuple[Spectra, Tensor]:

@@ -19,7 +19,7 @@ from swiftwrf.data.splits import folds
 from swiftwrf.errors import InputError
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, bounding_box
 from swiftwrf.models.geometry.channels import Channels, field, waves
-from swiftwrf.models.geometry.fit import GeometryConfig, observe, search_room, update_room
+from swiftwrf.models.geometry.fit import GeometryConfig, refine_room, search_room, update_room
 from swiftwrf.models.geometry.furniture import Furniture, find_furniture, fit_furniture, orders
 from swiftwrf.models.geometry.images import PhaseObservations, PlaneSet, Sequence, images, mirror
 from swiftwrf.models.geometry.planes import Plane, RoomEstimate, plane_set, refine
@@ -110,7 +110,7 @@ class GeometryModel(Linked, FieldModel):
             self.estimate, self.furniture, self.fingerprint = known.estimate, known.furniture, owner
             return
         else:
-            self.estimate = known.refined_on(observe(train, self.config)[0]).estimate
+            self.estimate = refine_room(known.estimate, train, self.config)
         self.fingerprint = owner
         self._furnish(train)
 
@@ -133,8 +133,9 @@ class GeometryModel(Linked, FieldModel):
         """Return the channels of spectra as the room predicts them, of at most 8 snapshots.
 
         Raises:
-            InputError: Spectra without channels.
+            InputError: Spectra without channels, or of another link.
         """
+        data = self.link.aligned(data)
         if data.channel is None:
             raise InputError(f"{data.name} contains spectra alone; give snapshots, or ray paths with --subcarriers")
         rows = kept_snapshots(data.channel.shape[1])
@@ -144,7 +145,7 @@ class GeometryModel(Linked, FieldModel):
 
     def _update(self, new: Spectra) -> None:
         if self.planes:
-            self.estimate, self.fingerprint = update_room(self.estimate, self.tensors(), new, self.config), ""
+            self.estimate, self.fingerprint = update_room(self.estimate, new, self.config), ""
 
     @single_thread()
     def refined_on(self, scene: PhaseObservations) -> Self:
@@ -305,7 +306,7 @@ class GeometryModel(Linked, FieldModel):
         self.fingerprint = str(header["fingerprint"])
         self.furniture = Furniture.from_state(tensors, header, len(planes)) if "voxel_m" in header else None
         self.estimate = RoomEstimate(
-            planes=[Plane(**{**plane, "normal": tuple(plane["normal"])}) for plane in planes],
+            planes=[Plane.from_json(plane) for plane in planes],
             order=order,
             score_held_out=float(header["score_held_out"]),
             unexplained=float(header["unexplained"]),

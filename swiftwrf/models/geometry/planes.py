@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Annotated, Any
 
 import torch
-from annotated_types import Ge, Le
+from annotated_types import Ge, Gt, Le
 from torch import Tensor
 
 from swiftwrf.array.planar import PlanarArray
@@ -29,6 +29,7 @@ from swiftwrf.runtime.validation import NonNegativeFloat, check_value, configura
 MAX_PLANES, MAX_ORDER = 64, 4  # of a room, whose image sources number MAX_PLANES^MAX_ORDER at most
 MIN_MISSING = 1e-5  # missing coherence by rounding of spectra and phases
 MIN_FIELD, MIN_GAIN = 1e-9, 1e-6  # moduli by which derivatives are divided
+IDENTIFIABLE = 0.9  # least probability of a plane that counts as identifiable
 
 
 @configuration
@@ -39,8 +40,9 @@ class Plane:
         normal: Unit vector out of the room.
         offset_m: Offset [m].
         gain: Reflection gain (amplitude) with its sign, of a dielectric that at normal incidence.
-        std_mm: Standard deviation of the offset [mm].
-        certain: No alternative offset explains the spectra nearly as well, and held-out spectra need the plane.
+        std_mm: Standard deviation of the offset within its mode [mm], which is a quarter of a phase period to either side.
+        probability: Probability of that mode, in (0, 1]. The rest is that of alternative offsets.
+        rival_m: Offset of the strongest alternative [m]. None if no alternative has a probability of 1 %.
         dielectric: The gain depends on the angle of incidence by Fresnel's equations for vertically polarised antennas.
 
     Raises:
@@ -51,8 +53,23 @@ class Plane:
     offset_m: float
     gain: float
     std_mm: NonNegativeFloat = 0.0
-    certain: bool = True
+    probability: Annotated[float, Gt(0), Le(1)] = 1.0
+    rival_m: float | None = None
     dielectric: bool = False
+
+    @property
+    def certain(self) -> bool:
+        """True if the plane is identifiable: its mode has a probability of at least 0.9."""
+        return self.probability >= IDENTIFIABLE
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields and `certain` as plain values."""
+        return asdict(self) | {"normal": list(self.normal), "certain": self.certain}
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> Plane:
+        """Return the plane that `to_json` describes."""
+        return cls(**{f.name: values[f.name] for f in fields(cls)} | {"normal": tuple(values["normal"])})
 
     def check(self) -> None:
         """Refuse a normal of another length and infinite numbers."""
@@ -96,9 +113,8 @@ class RoomEstimate:
 
     def to_json(self) -> dict[str, Any]:
         """Return the planes (normal . x = offset in world coordinates), order and scores as plain values."""
-        planes = [{**asdict(plane), "normal": list(plane.normal)} for plane in self.planes]
         scores = {"score_held_out": self.score_held_out, "unexplained": self.unexplained}
-        return {"planes": planes, "order": self.order} | scores
+        return {"planes": [plane.to_json() for plane in self.planes], "order": self.order} | scores
 
 
 def plane_set(planes: list[Plane], order: int) -> PlaneSet:

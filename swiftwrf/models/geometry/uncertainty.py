@@ -9,6 +9,7 @@ farther away, and half periods around the best of these.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -29,9 +30,12 @@ from swiftwrf.models.geometry.planes import (
     refine_all,
     sign_alternatives,
 )
-from swiftwrf.models.geometry.search import N_RESCORED, SteeringResponses
+from swiftwrf.models.geometry.search import N_RESCORED, SIGNS, SteeringResponses
 from swiftwrf.runtime.threads import parallel_map
 
+MIN_PROBABILITY = 1e-6  # of a plane
+MIN_RIVAL = 0.01  # of an alternative that is named
+SIGN_ODDS = 0.6  # prior of a sign other than usual, by the study in docs/development/architecture.md
 MIN_SPREAD_RAD = 0.8  # of phase: positions with less spread in any direction count as flat
 CARRIER_SCALES = (0.95, 0.97, 0.98, 0.99, 1.01, 1.02, 1.03, 1.05)  # of alternative carriers
 MAX_PERIODS = 4  # to either side
@@ -41,60 +45,100 @@ N_COARSE, N_FINE = 24, 8  # rooms that are refined with some positions, and with
 HalfPeriods = tuple[int, ...]  # by which each plane is moved
 
 
-def assess(
-    train: Spectra, scene: PhaseObservations, room: PlaneSet, score: float, reach: float, certainty: float
-) -> RoomEstimate:
-    """Return the planes of a room with their standard deviations, and which of them are identifiable.
+def assess(train: Spectra, scene: PhaseObservations, room: PlaneSet, score: float, searched: bool) -> RoomEstimate:
+    """Return the planes of a room with their standard deviations, probabilities and strongest alternatives.
 
     Args:
         train: Training spectra, for the array.
         scene: Observed phases.
         room: Refined planes in world coordinates.
         score: Score at held-out positions.
-        reach: Standard deviation [m] of planes that are not identifiable.
-        certainty: Standard errors by which a plane must explain the spectra better than its alternatives.
+        searched: True to take the most probable room, also of those in which several planes move. False for planes that
+            stay, compared with rooms in which one of them moves.
     """
     assert train.array is not None
+    n_planes = room.normal.shape[1]
+    if n_planes:
+        period = torch.tensor([phase_period_m(scene, room, plane) for plane in range(n_planes)], dtype=torch.float64)
+        beside = parallel_map(lambda plane: _beside(scene, room, plane), range(n_planes))
+        others = phase_alternatives(scene, room) if searched else []
+        modes, mode_probability = _modes(scene, [room, *others, *itertools.chain(*beside)], period)
+        offset = torch.cat([mode.offset for mode in modes])  # (J, P)
+        own = int(mode_probability.argmax() if searched else ((offset - room.offset).abs() / period).amax(1).argmin())
+        room = refine(scene, modes[own])
     unexplained = 1 - (1 - correlation_score(scene, room, train.array)) ** 2
-    if not room.normal.shape[1]:
+    if not n_planes:
         nothing = torch.zeros(0, 0, dtype=torch.float64)
         return RoomEstimate([], room.order, score, unexplained, "no plane explains the spectra", nothing)
     covariance = offset_covariance(scene, room)
     systematic = 0.02 * train.array.wavelength * math.sqrt(max(unexplained, 0))  # unmodelled paths are no noise
-    covariance = covariance + systematic**2 * torch.eye(len(covariance), dtype=torch.float64)
-    reason = _flat(scene) or _other_carrier(scene, room, certainty)
-    std = covariance.diagonal().clamp_min(0).sqrt().tolist()
-    alternatives = [(other, log_explained(other.coherence(scene))) for other in phase_alternatives(scene, room)]
-    nearest = parallel_map(lambda plane: _nearest_alternative(scene, room, plane, alternatives), range(len(std)))
-    # beyond half a radian of phase, too, a plane is not certain
-    lost = [lead <= certainty or s * scene.wavenumber > 0.5 for s, (lead, _) in zip(std, nearest, strict=True)]
-    # a room most of whose planes have alternatives may be wrong as a whole, because each plane holds the others
-    all_lost = bool(reason) or sum(lost) > len(lost) / 2
-    planes = []
-    for i, (lead, distance) in enumerate(nearest):
-        away = reach if all_lost else distance if lead <= certainty else 0.0
+    covariance = covariance + systematic**2 * torch.eye(n_planes, dtype=torch.float64)
+    std = covariance.diagonal().clamp_min(0).sqrt()
+    reason = _flat(scene) or _other_carrier(scene, room)
+    same = ((offset[:, None] - offset).abs() <= period / 4).double()  # (J, J, P)
+    # with a reason against the room, rooms that were not compared count as much as all that were
+    inside = torch.erf(period / 4 / (math.sqrt(2) * std)) * (0.5 if reason else 1.0)
+    probability = (mode_probability @ same[own] * inside).clamp(MIN_PROBABILITY, 1.0).tolist()
+    away = mode_probability[:, None] * (1 - same[own])
+    rival, planes = (torch.einsum("kp,jkp->jp", away, same) * (1 - same[own])).max(0), []
+    for i in range(n_planes):
         x, y, z = room.normal[0, i].tolist()
-        offset, gain = float(room.offset[0, i]), float(room.gain[0, i])
-        dielectric = room.dielectric is not None and bool(room.dielectric[i])
-        std_mm, certain = 1000 * max(std[i], away), not (lost[i] or all_lost)
-        planes.append(Plane((x, y, z), offset, gain, std_mm, certain, dielectric))
-    conclusion = f"{len(planes)} planes, {sum(plane.certain for plane in planes)} of them certain{reason}"
-    return RoomEstimate(planes, room.order, score, unexplained, conclusion, covariance)
+        planes.append(
+            Plane(
+                normal=(x, y, z),
+                offset_m=float(room.offset[0, i]),
+                gain=float(room.gain[0, i]),
+                std_mm=1000 * float(std[i]),
+                probability=probability[i],
+                rival_m=float(offset[rival.indices[i], i]) if rival.values[i] > MIN_RIVAL else None,
+                dielectric=room.dielectric is not None and bool(room.dielectric[i]),
+            )
+        )
+    return RoomEstimate(planes, room.order, score, unexplained, conclusion(planes) + reason, covariance)
 
 
-def _nearest_alternative(
-    scene: PhaseObservations, room: PlaneSet, plane: int, alternatives: list[tuple[PlaneSet, Tensor]]
-) -> tuple[float, float]:
-    """Return the standard errors by which a plane explains the spectra better than its best alternative.
+def conclusion(planes: list[Plane]) -> str:
+    """Return how many planes are identifiable, in words."""
+    return f"{len(planes)} planes, {sum(plane.certain for plane in planes)} of them identifiable"
 
-    Also return the distance of that alternative [m]. Alternatives are the best offset of a scan around the plane and the
-    offsets at which a wave of the other sign has the same phase, each refined together with all other planes.
+
+def _modes(scene: PhaseObservations, rooms: list[PlaneSet], period: Tensor) -> tuple[list[PlaneSet], Tensor]:
+    """Return the rooms that differ by more than a quarter period (P,) [m] in any plane, and their probabilities (J,).
+
+    Of rooms that differ by less, the one that explains the spectra best counts.
+    """
+    found: list[PlaneSet] = []
+    for room in sorted(rooms, key=lambda room: -float(log_explained(room.coherence(scene)).mean())):
+        if all(bool(((room.offset - mode.offset).abs() > period / 4).any()) for mode in found):
+            found.append(room)
+    deviating = [int((r.gain.sign() != SIGNS[:, r.side[0]]).sum(1).min()) for r in found]
+    explained = torch.stack([log_explained(room.coherence(scene)) for room in found])
+    return found, mode_probabilities(explained, math.log(SIGN_ODDS) * torch.tensor(deviating, dtype=torch.float64))
+
+
+def mode_probabilities(explained: Tensor, log_prior: Tensor) -> Tensor:
+    """Return the probabilities of rooms (J,) from how well they explain the spectra at all positions.
+
+    The lead z of one room over another is the mean difference of `log_explained` in standard errors. The log likelihood
+    ratio is z |z|, because a Gaussian ratio that is calibrated has a mean in proportion to its variance.
 
     Args:
-        scene: Observed phases.
-        room: Refined planes.
-        plane: Number of the plane.
-        alternatives: Rooms in which several planes are moved, and how well each explains the spectra.
+        explained: `log_explained` of the rooms, the best one first, (J, n).
+        log_prior: Logarithms of the prior probabilities, up to a constant, (J,).
+
+    Example:
+        >>> even = torch.tensor([[1.0, 2.0, 1.5, 1.5], [2.0, 1.0, 1.5, 1.5]])
+        >>> mode_probabilities(even, torch.zeros(2))
+        tensor([0.5000, 0.5000])
+    """
+    lead = torch.tensor([advantage(explained[0], other) for other in explained], dtype=log_prior.dtype)
+    return torch.softmax(log_prior - lead * lead.abs(), dim=0)
+
+
+def _beside(scene: PhaseObservations, room: PlaneSet, plane: int) -> list[PlaneSet]:
+    """Return refined rooms in which one plane is elsewhere.
+
+    It is at the best offset of a scan around it, and at the offsets at which a wave of the other sign has the same phase.
     """
     period = phase_period_m(scene, room, plane)
     step = torch.arange(period / 2, 3.5 * period, 0.4 / scene.wavenumber, dtype=torch.float64)
@@ -107,14 +151,7 @@ def _nearest_alternative(
     value = scene.score(replace(room, only=tuple(rest)).field(scene) + field(scene, scanned))
     moved = room.offset.clone()
     moved[:, plane] += beside[value.argmin()]
-    here = log_explained(room.coherence(scene))
-    nearest = math.inf, 0.0
-    near = refine_all(scene, [replace(room, offset=moved), *sign_alternatives(scene, room, plane)], 5)
-    for other, there in [*((o, log_explained(o.coherence(scene))) for o in near), *alternatives]:
-        distance = abs(float(other.offset[0, plane] - room.offset[0, plane]))
-        if distance > period / 4:
-            nearest = min(nearest, (advantage(here, there), distance))
-    return nearest
+    return refine_all(scene, [replace(room, offset=moved), *sign_alternatives(scene, room, plane)], 5)
 
 
 def _flat(scene: PhaseObservations) -> str:
@@ -126,7 +163,7 @@ def _flat(scene: PhaseObservations) -> str:
     return f"; the positions lie on {shape}, from where many rooms look alike"
 
 
-def _other_carrier(scene: PhaseObservations, room: PlaneSet, certainty: float) -> str:
+def _other_carrier(scene: PhaseObservations, room: PlaneSet, significance: float = 3.0) -> str:
     """Return the reason if another carrier explains the spectra significantly better, else nothing."""
     here = room.coherence(scene)
 
@@ -135,7 +172,7 @@ def _other_carrier(scene: PhaseObservations, room: PlaneSet, certainty: float) -
         return advantage(refine(other, room, 6).coherence(other), here)
 
     for scale, found in zip(CARRIER_SCALES, parallel_map(lead, CARRIER_SCALES), strict=True):
-        if found > certainty:
+        if found > significance:
             return f"; a carrier {100 * (scale - 1):+.0f} % from the given one explains the spectra better"
     return ""
 

@@ -363,7 +363,7 @@ def test_the_synthesizer_draws_the_spectra_of_its_scene(ray_tracer, tmp_path):
 
 def test_planes_of_a_found_room_reflect_as_strongly_as_the_spectra_say(ray_tracer):
     data = simulated_room(n=4, grid=AngularGrid.hemisphere(15, 60))
-    wall = Plane(normal=(1.0, 0.0, 0.0), offset_m=6.0, gain=-0.6, std_mm=1.0, certain=True)
+    wall = Plane(normal=(1.0, 0.0, 0.0), offset_m=6.0, gain=-0.6, std_mm=1.0)
     made = surfaces(GeometryModel.of_planes(data, [wall]))
     scene = Scene(made, data.array.frequency_hz)
     position = data.fixed_position + torch.tensor([[2.0, 0, 0]], dtype=torch.float64)

@@ -13,6 +13,7 @@ from rooms import mirror_room
 from swiftwrf import AngularGrid, InputError, Rssi, load, rssi_room, simulated_room
 from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.data.coordinates import Floors
+from swiftwrf.data.splits import folds
 from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.locate import MatchedField, Posterior, Region, RssiLocator, smoothed
 from swiftwrf.locate import posterior as module
@@ -26,9 +27,9 @@ from swiftwrf.models.geometry.path_gains import PathGains
 
 SMALL = {"n_best": 60, "n_background": 40, "n_split": 8, "spacing": 0.4, "n_calibration": 40}
 ROOM = [
-    Plane((-1.0, 0.0, 0.0), 0.0, -0.6, 0.1, True),
-    Plane((0.0, 1.0, 0.0), 5.0, -0.6, 0.1, True),
-    Plane((0.0, 0.0, -1.0), 0.0, -0.6, 0.1, True),
+    Plane((-1.0, 0.0, 0.0), 0.0, -0.6, 0.1),
+    Plane((0.0, 1.0, 0.0), 5.0, -0.6, 0.1),
+    Plane((0.0, 0.0, -1.0), 0.0, -0.6, 0.1),
 ]
 
 
@@ -47,6 +48,21 @@ def closed_form():
     exact = replace(spectra, store=type(spectra.store)(room.synthesize(spectra.position)))
     train, test = exact.split()
     return train, test, MatchedField(**SMALL, n_rounds=9).fit(train, room=GeometryModel.of_planes(train, ROOM))
+
+
+def test_errors_at_held_out_rows_are_those_of_the_posterior_and_of_the_mean_position():
+    """RSSI that does not depend on the position locates nothing, RSSI of a floor does."""
+    generator = np.random.default_rng(0)
+    position = np.column_stack([generator.uniform(0, 20, (60, 2)), np.ones(60)])
+    noise = Rssi(generator.normal(-60, 4, (60, 3)).round(), position)
+    fold = folds(noise.transmitter_position, "random", 0).numpy()
+    mean = np.stack([position[fold != own].mean(axis=0) for own in fold])
+    expected = np.linalg.norm(mean - position, axis=1).mean()
+    found = RssiLocator(n_cells=300).fit(noise).held_out_m
+    assert found["mean"] == pytest.approx(expected, abs=1e-3)
+    assert found["posterior"] > 0.8 * expected
+    found = RssiLocator(n_cells=300).fit(rssi_room(n=80)).held_out_m
+    assert found["posterior"] < 0.7 * found["mean"]
 
 
 def gaussian_on_a_line(centre, std, n=400):

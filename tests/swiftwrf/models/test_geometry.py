@@ -3,18 +3,20 @@
 from copy import copy
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from rooms import ARRAY, GRID, built_in_walls, mirror_room
 from small import GLANCE
 from threadpoolctl import ThreadpoolController
 
+from augment.mix import withhold
 from swiftwrf import AngularGrid, InputError, simulated_room
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.store import Store
 from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.metrics import psnr
-from swiftwrf.models.geometry import GeometryConfig, GeometryModel, Plane, path_gains, search
+from swiftwrf.models.geometry import GeometryConfig, GeometryModel, Plane, path_gains, search, uncertainty
 from swiftwrf.models.geometry.fit import _pruned, _with_weak_planes, _without_aliases, observe, split
 from swiftwrf.models.geometry.hybrid import HybridModel
 from swiftwrf.models.geometry.images import SIDES, PhaseObservations, PlaneSet, field
@@ -28,9 +30,9 @@ from swiftwrf.models.geometry.path_gains import (
     posterior_gradient,
 )
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation, correlations, retrieve_phases
-from swiftwrf.models.geometry.planes import image_jacobian, phase_jacobian, refine, refine_all
+from swiftwrf.models.geometry.planes import image_jacobian, offset_covariance, phase_jacobian, refine, refine_all
 from swiftwrf.models.geometry.search import N_SPHERE_NORMALS, SIGNS, SteeringResponses
-from swiftwrf.models.geometry.uncertainty import _AlternativeTable, phase_alternatives
+from swiftwrf.models.geometry.uncertainty import _AlternativeTable, assess, mode_probabilities, phase_alternatives
 from swiftwrf.models.neighbours import NearestModel
 
 QUICK = GeometryConfig(search_distance_m=2.0, beam_width=2)
@@ -293,7 +295,7 @@ def test_positions_in_a_plane_leave_no_plane_certain():
     model = fit(data, max_extra_planes=0, beam_width=1, max_order=2)
     assert not any(p.certain for p in model.planes)
     assert "the positions lie on a plane" in model.conclusion
-    assert all(error < 3 * std for error, std in errors(model, SIX) if model.planes)
+    assert all(0 < p.probability <= 0.5 and p.std_mm < 500 for p in model.planes)
 
 
 @pytest.mark.usefixtures("short_searches")
@@ -304,6 +306,98 @@ def test_pure_noise_has_no_certain_plane():
     noise = replace(data, store=Store(ARRAY.spectrum(channel, GRID)))
     model = GeometryModel(GLANCE).fit(noise)
     assert not any(p.certain for p in model.planes)
+
+
+def test_probabilities_of_rooms_follow_from_their_leads():
+    generator = torch.Generator().manual_seed(0)
+    explained = 3 + 0.5 * torch.randn(4, 60, generator=generator) - torch.tensor([0.0, 0.1, 0.2, 0.5])[:, None]
+    log_prior = torch.tensor([-0.5, 0.0, 0.3, 0.0]).double()
+    difference = (explained[:1] - explained[1:]).double().numpy()
+    lead = difference.mean(axis=1) / (difference.std(axis=1, ddof=1) / np.sqrt(60))
+    weight = np.exp(log_prior.numpy() - np.array([0.0, *(lead * np.abs(lead))]))
+    np.testing.assert_allclose(mode_probabilities(explained, log_prior), weight / weight.sum(), rtol=1e-4)
+
+
+@pytest.mark.parametrize(("every", "low", "high"), [(2, 0.45, 0.55), (3, 0.9, 1.0), (61, 0.99, 1.0)])
+def test_a_wall_has_the_probability_that_the_spectra_leave_it(monkeypatch, every, low, high):
+    """Every second, third or no spectrum is of a wall elsewhere, which is the only alternative."""
+    region = {"low": (0.5, 0.5, 0.5), "high": (4.3, 3.5, 2.2)}
+    here, there = (mirror_room({(1, 0, 0): offset}, n=60, noise=0.1, **region) for offset in (4.6, 5.4))
+    of_other = torch.arange(60) % every == every - 1
+    mixed = replace(here, store=Store(torch.where(of_other[:, None, None], there.spectrum, here.spectrum)))
+    scene, _ = observe(mixed)
+    rooms = [GeometryModel.of_planes(here, [Plane((1, 0, 0), o, -0.6)], 1).tensors() for o in (4.6, 5.4)]
+    wall, other = (refine(scene, room, 20) for room in rooms)
+    monkeypatch.setattr(uncertainty, "_beside", lambda *_: [other])
+    (plane,) = assess(mixed, scene, wall, 0.0, searched=False).planes
+    missing = [1 - room.coherence(scene).double().numpy() + 1e-5 for room in (wall, other)]
+    difference = np.log(missing[1]) - np.log(missing[0])
+    lead = difference.mean() / (difference.std(ddof=1) / np.sqrt(60))
+    assert plane.probability == pytest.approx(1 / (1 + np.exp(-lead * abs(lead))), abs=0.01)
+    assert low <= plane.probability <= high
+    assert plane.certain == (plane.probability >= 0.9)
+    assert plane.rival_m == (pytest.approx(float(other.offset)) if plane.probability < 0.99 else None)
+
+
+def test_a_search_takes_the_most_probable_room_and_a_known_room_stays():
+    """Half a phase period away a wall of the other sign explains the spectra nearly as well."""
+    data = mirror_room({(1, 0, 0): 4.6}, n=60, noise=0.1, low=(0.5, 0.5, 0.5), high=(4.3, 3.5, 2.2))
+    scene, _ = observe(data)
+    alias = refine(scene, GeometryModel.of_planes(data, [Plane((1, 0, 0), 4.69, 0.6)], 1).tensors())
+    ((moved,), (kept,)) = (assess(data, scene, alias, 0.0, searched).planes for searched in (True, False))
+    assert (moved.offset_m, moved.gain) == pytest.approx((4.6, -0.6), abs=0.02)
+    assert moved.certain
+    assert (kept.offset_m, kept.gain) == pytest.approx((4.69, 0.6), abs=0.05)
+    assert kept.probability < 0.1
+    assert kept.rival_m == pytest.approx(4.6, abs=0.01)
+
+
+def test_a_room_on_other_spectra_has_their_uncertainty_and_scores(room):
+    """The new spectra are a fifth as many, with three times the noise."""
+    other = mirror_room(SIX, n=20, noise=0.3, seed=3)
+    found = GeometryModel().fit(other, like=room)
+    scene, _ = observe(other)
+    power = [
+        autocorrelation(channel, ARRAY).numpy().ravel()
+        for channel in (found.tensors().channel(scene).sgn(), scene.channel[:, 0])
+    ]
+    correlation = np.vdot(*power).real / np.sqrt(np.vdot(power[0], power[0]).real * np.vdot(power[1], power[1]).real)
+    assert found.estimate.unexplained == pytest.approx(1 - correlation**2, abs=1e-4)
+    systematic = (0.02 * ARRAY.wavelength) ** 2 * (1 - correlation**2)
+    variance = offset_covariance(scene, found.tensors()).diagonal() + systematic
+    assert [p.std_mm for p in found.planes] == pytest.approx((1000 * variance.sqrt()).tolist(), rel=1e-3)
+    assert min(p.std_mm for p in found.planes) > 1.5 * max(p.std_mm for p in room.planes)
+    assert found.estimate.score_held_out > 2 * room.estimate.score_held_out
+    certain = sum(p.probability >= 0.9 for p in found.planes)
+    assert found.conclusion == f"6 planes, {certain} of them identifiable"
+
+
+def test_an_update_multiplies_the_odds_of_each_plane(room):
+    other = mirror_room(SIX, n=20, noise=0.3, seed=3)
+    own = GeometryModel().fit(other, like=room)
+    planes = [replace(p, probability=q) for p, q in zip(room.planes, (0.2, 0.5, 0.9, 1.0, 0.6, 0.3), strict=True)]
+    doubtful = copy(room)
+    doubtful.estimate = replace(room.estimate, planes=planes)
+    found = doubtful.update(other)
+    for before, new, after in zip(planes, own.planes, found.planes, strict=True):
+        odds = np.float64(before.probability) * new.probability
+        other_odds = (1 - before.probability) * (1 - new.probability)
+        assert after.probability == pytest.approx(odds / (odds + other_odds))
+    certain = sum(p.probability >= 0.9 for p in found.planes)
+    assert found.conclusion == f"6 planes, {certain} of them identifiable"
+
+
+@pytest.mark.long
+def test_the_default_room_of_the_report_has_a_deviation_of_its_own_for_each_wall():
+    """The spectra are those of `swiftwrf aoa --mix 0.3`. A box hides the wall y = 0, whose alternatives are as good."""
+    train, _ = simulated_room().split("random")
+    measured, _ = withhold(train, 0.3, 0)
+    model = GeometryModel(validation="random").fit(measured)
+    walls = {(-1, 0, 0): 0.0, (1, 0, 0): 6.0, (0, -1, 0): 0.0, (0, 1, 0): 5.0, (0, 0, -1): 0.0, (0, 0, 1): 3.0}
+    assert all(error < 15 and std < 15 for error, std in errors(model, walls))
+    certain = [p.normal for p in model.planes if p.certain]
+    assert (0, -1, 0) not in certain
+    assert len(certain) >= 4
 
 
 def test_an_array_that_does_not_produce_the_spectra_is_refused():
@@ -321,7 +415,16 @@ def test_the_same_seed_finds_the_same_room(noisy):
 def test_json_and_images_describe_the_room(room):
     content = room.to_json()
     assert set(content) == {"planes", "order", "score_held_out", "unexplained"}
-    assert set(content["planes"][0]) == {"normal", "offset_m", "gain", "std_mm", "certain", "dielectric"}
+    assert set(content["planes"][0]) == {
+        "normal",
+        "offset_m",
+        "gain",
+        "std_mm",
+        "probability",
+        "rival_m",
+        "certain",
+        "dielectric",
+    }
     position, gain, order = room.image_sources()
     assert len(position) == len(gain) == len(order) == 25
     assert torch.equal(position[0], room.fixed_position)

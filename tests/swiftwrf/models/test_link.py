@@ -1,9 +1,11 @@
 """A model is applied to measurements of the link that it was fitted to, and to no other."""
 
 from dataclasses import replace
+from unittest import mock
 
 import pytest
 import torch
+from rooms import mirror_room
 from small import FLOOR as FLOOR_PLANE
 from small import few_kernels, short_path_gains
 
@@ -19,9 +21,10 @@ from swiftwrf import (
     RssiModel,
     load,
     make_model,
+    predict,
     rssi_room,
 )
-from swiftwrf.array.planar import PlanarArray
+from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.models.geometry import HybridModel
 from swiftwrf.online import Follower, score
 
@@ -34,6 +37,13 @@ OTHER_LINKS = {
     "another arrangement of the elements, carrier; give": {"array": PlanarArray.square(4, 5.2e9)},
 }
 other_links = pytest.mark.parametrize(("says", "change"), OTHER_LINKS.items(), ids=["end", "place", "pose", "array"])
+
+
+OTHER_BANDS = {
+    "40 MHz higher": lambda frequency: frequency + 40e6,
+    "half the bandwidth": lambda frequency: frequency[0] + (frequency - frequency[0]) / 2,
+    "one subcarrier moved": lambda frequency: torch.cat([frequency[:-1], frequency[-1:] + 1e5]),
+}
 
 
 def given_room(data):
@@ -75,8 +85,76 @@ def test_a_structure_of_another_link_is_refused(room, says, change):
             fit()
 
 
+@pytest.fixture(scope="module")
+def channels():
+    """Spectra of the channels of one plane at five subcarriers, which rise in frequency."""
+    base = mirror_room({}, moving="transmitter", n=40)
+    carrier = LIGHT_SPEED / base.array.wavelength
+    frequency = carrier + 1e6 * torch.tensor([-20.0, -9, 1, 8, 20], dtype=torch.float64)
+    return replace(base, channel=given_room(base).channel(base.position, frequency), frequency_hz=frequency)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def without_furniture():
+    """Its search takes most of the time of a fit to channels, and has tests of its own."""
+    with mock.patch.object(GeometryModel, "_furnish"):
+        yield
+
+
+@pytest.fixture(scope="module")
+def locator(channels):
+    small = {"spacing": 1.0, "max_cells": 500, "n_best": 20, "n_background": 10, "n_split": 4, "n_rounds": 2}
+    return MatchedField(**small).fit(channels.subset(range(30)), room=given_room(channels))
+
+
+@pytest.fixture
+def descending(channels):
+    return replace(channels, channel=channels.channel.flip(1), frequency_hz=channels.frequency_hz.flip(0))
+
+
+def test_subcarriers_in_another_order_are_the_same_channels(channels, descending, locator, tmp_path):
+    new, other = channels.subset(range(30, 40)), descending.subset(range(30, 40))
+    locator.save(tmp_path / "locator")
+    for same in (locator, load(tmp_path / "locator")):
+        expected = same.locate(new.channel).median
+        torch.testing.assert_close(same.locate(other).median, expected)
+        torch.testing.assert_close(torch.tensor(predict(same, other)[["x_m", "y_m", "z_m"]].to_numpy()), expected)
+    refitted = MatchedField(locator.config).fit(descending.subset(range(30)), room=given_room(channels))
+    torch.testing.assert_close(refitted.locate(other).median, locator.locate(new).median)
+    room = given_room(channels)
+    found = [room.update(data).planes[0].offset_m for data in (channels, descending)]
+    assert found[0] == found[1]
+
+
+@pytest.mark.parametrize("band", OTHER_BANDS.values(), ids=OTHER_BANDS)
+def test_channels_of_another_band_are_refused(channels, locator, band):
+    other = replace(channels, frequency_hz=band(channels.frequency_hz))
+    room, gp = given_room(channels), make_model("gp").fit(channels)
+    for use in (
+        locator.locate,
+        locator.predict,
+        lambda new: predict(locator, new),
+        lambda new: MatchedField(locator.config).fit(new, room=room),
+        lambda new: GeometryModel().fit(new, like=room),
+        room.update,
+        gp.update,
+        lambda new: score(gp, new),
+    ):
+        with pytest.raises(
+            InputError, match="another link than the training spectra, with another set of frequencies;"
+        ):
+            use(other)
+
+
+@other_links
+def test_a_locator_refuses_measurements_of_another_link(channels, locator, says, change):
+    for use in (locator.locate, locator.predict, lambda new: predict(locator, new)):
+        with pytest.raises(InputError, match=says):
+            use(replace(channels, **change))
+
+
 def test_what_spectra_do_not_describe_is_not_compared(room, models):
-    bare = replace(room, rotation=None, fixed_position=None)
+    bare = replace(room, rotation=None, fixed_position=None, index=torch.arange(40, 80))
     assert len(models[0].update(bare).position) == 2 * len(room)
     with pytest.raises(InputError, match="geometry needs the fixed end"):
         models[2].update(bare)
@@ -90,8 +168,8 @@ def test_rows_at_other_receivers_are_refused(short_fits, tmp_path, predictor):
     model = load(tmp_path / "model")
     moved = replace(FLOOR, receiver_position=FLOOR.receiver_position.flip(0))
     for other, says in (
-        (FLOOR.columns([*range(12)][::-1]), "give the same ones in this order"),
-        (FLOOR.columns([0, 1, 2]), "give the same ones in this order"),
+        (replace(FLOOR, receiver_names=(*FLOOR.receiver_names[:-1], "other")), "give these"),
+        (FLOOR.columns([0, 1, 2]), "give these"),
         (moved, "receiver01 .* m away from its position"),
     ):
         with pytest.raises(InputError, match=says):
@@ -111,7 +189,7 @@ def test_unknown_positions_of_receivers_are_not_compared(tmp_path):
     model.save(tmp_path / "model")
     again = load(tmp_path / "model")
     assert again.receiver_position.isnan().all()
-    new = FLOOR.subset(torch.arange(5))
+    new = replace(FLOOR.subset(torch.arange(5)), index=torch.arange(100, 105))
     torch.testing.assert_close(again.update(new).level, model.update(new).level)
 
 

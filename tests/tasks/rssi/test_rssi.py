@@ -29,10 +29,11 @@ from swiftwrf.rssi import RssiPredictor, compare
 from swiftwrf.rssi.baselines import NEIGHBOUR_COUNTS
 from swiftwrf.rssi.comparison import make_predictor, pool_of
 from swiftwrf.runtime import registry
+from tasks.records import Records
 from tasks.report import merge
 from tasks.rssi import experiment
-from tasks.rssi.maps import Maps
-from tasks.rssi.page import where_next
+from tasks.rssi.maps import Maps, coverage_sentence
+from tasks.rssi.page import answer, where_next
 
 
 @pytest.mark.parametrize("name", [n for n in RSSI_PREDICTORS if n.startswith(("mri", "gp"))])
@@ -212,53 +213,118 @@ def test_neighbours_are_those_that_a_grid_search_chooses():
         assert {"n_neighbors": found.n_neighbors, "weights": found.weights} == search.fit(x, y).best_params_
 
 
-def test_an_interval_of_one_width_sends_nobody_to_measure():
-    x, y = np.arange(5.0), np.arange(4.0)
+def made_run(tmp_path, **changes):
+    """A run of one receiver, or several, on one floor of 5 x 4 cells, between four corners that were measured."""
     corners = np.array([[0, 0, 1], [4, 0, 1], [0, 3, 1], [4, 3, 1]], dtype=float)
-    width = np.tile([[[[7.0]], [[8.0]]]], (1, 1, 4, 5))
-    maps = {"x": x, "y": y, "measured_position": corners, "measured": corners[:, :2], "width": width}
-    maps |= {"predicted": width, "detection": width, "floor_of_row": np.zeros(4, int)}
-    run = SimpleNamespace(arrays=lambda name: maps)
-    assert where_next(run).startswith("Measure at more positions: 4 are too few")
-    between = np.linspace([0, 0, 1], [4, 3, 1], 30)
-    position = np.concatenate([corners, between])
-    maps |= {"measured_position": position, "measured": position[:, :2], "floor_of_row": np.zeros(34, int)}
-    tested = pd.DataFrame({"x": x, "y": 0.0, "z": 1.0, "receiver": "a", "measured": -60.0})
-    run = SimpleNamespace(arrays=lambda name: maps, table=lambda name: tested)
-    assert "not worth it" in where_next(run)
-    assert "the model explains no more" in where_next(run)
-    for spread, reason in ((2.7, "which is the scatter of repeated"), (0.5, "lie within 1 dB")):
-        tested = pd.DataFrame(
-            {"x": 1.0, "y": 0.0, "z": 1.0, "receiver": "a", "measured": [-60.0 - spread, -60 + spread] * 20}
-        )
-        assert reason in where_next(run)
-    maps["width"][:, :, 2, 3] += 4
-    assert where_next(run).startswith("Measure around x = 3.0 m, y = 2.0 m")
-    maps |= {
-        "measured_position": corners[:3],
-        "measured": corners[:3, :2],
-        "floor_of_row": np.zeros(3, int),
-    }  # x = 3, y = 2 is outside now
-    assert "x = 3.0 m, y = 2.0 m" not in where_next(run)
-
-
-def test_each_floor_has_its_maps_its_rows_and_its_coverage(tmp_path):
-    corners = np.array([[0, 0, 0], [4, 0, 0], [0, 3, 0], [4, 3, 0]], dtype=float)
-    position = np.concatenate([corners, corners + np.array([0, 0, 4])])
-    level = np.stack([np.full((1, 4, 5), dbm) for dbm in (-50.0, -90.0)])
+    level = np.full((1, 1, 4, 5), -60.0)
     maps = {
         "x": np.arange(5.0),
         "y": np.arange(4.0),
         "predicted": level,
-        "width": 0 * level,
+        "width": 0 * level + 7,
         "detection": 0 * level + 1,
     }
-    maps |= {"measured_position": position, "measured": position[:, 2:], "floor_of_row": np.repeat([0, 1], 4)}
-    maps |= {"floor_names": np.array(["Ground", "First"]), "receiver_names": np.array(["a"]), "receiver": corners[:1]}
-    run = SimpleNamespace(arrays=lambda name: maps, file_name="run", folder=tmp_path)
-    ground, first = Maps.of_floors(run)
-    assert (ground.covered, first.covered) == (1, 0)
-    assert (ground.place, first.titled("a")) == ("floor Ground", "a, First")
+    maps |= {"above": level[:, 0], "inside": level[:, 0] < 0, "known": level[:, 0] < 0, "receiver": corners[:1]}
+    maps |= {"measured_position": corners, "measured": corners[:, :1], "floor_of_row": np.zeros(4, int)}
+    maps |= {"floor_names": np.array([""]), "receiver_names": np.array(["a"])} | changes
+    tested = pd.DataFrame({"x": np.arange(5.0), "y": 0.0, "z": 1.0, "receiver": "a", "measured": -60.0})
+    tables, coverage = {"predictions": tested}, [{"reach_m": 2.0}] * len(maps["floor_names"])
+    return SimpleNamespace(
+        arrays=lambda name: maps,
+        table=tables.__getitem__,
+        tables=tables,
+        maps=maps,
+        file_name="run",
+        folder=tmp_path,
+        metrics={"coverage": coverage},
+    )
+
+
+def test_an_interval_of_one_width_sends_nobody_to_measure(tmp_path):
+    run = made_run(tmp_path)
+    assert where_next(run).startswith("Measure at more positions: 4 are too few")
+    position = np.concatenate([run.maps["measured_position"], np.linspace([0, 0, 1], [4, 3, 1], 30)])
+    run.maps |= {"measured_position": position, "measured": position[:, :1], "floor_of_row": np.zeros(34, int)}
+    assert "not worth it: the 80% interval is about 7 dB wide, and less than 1.2 times as wide" in where_next(run)
+    assert "the model explains no more" in where_next(run)
+    for spread, reason in ((2.7, "which is the scatter of repeated"), (0.5, "lie within 1 dB")):
+        measured = [-60.0 - spread, -60 + spread] * 20
+        run.tables["predictions"] = pd.DataFrame({"x": 1.0, "y": 0.0, "z": 1.0, "receiver": "a", "measured": measured})
+        assert reason in where_next(run)
+    run.tables["predictions"]["x"] = np.arange(40.0)  # no place was measured twice
+    assert "at one place" not in where_next(run)
+
+
+def test_where_the_best_server_is_uncertain_is_where_to_measure(tmp_path):
+    """The mean over receivers is 9.5 dB in all cells; the picture shows that of the stronger one."""
+    predicted = np.stack([np.full((4, 5), dbm) for dbm in (-50.0, -70.0)])[None]
+    width = np.stack([np.full((4, 5), 9.0), np.full((4, 5), 10.0)])[None]
+    width[0, :, 2, 3] = 14.0, 5.0
+    fields = {"predicted": predicted, "width": width, "detection": np.ones_like(width), "measured": np.zeros((4, 2))}
+    run = made_run(tmp_path, **fields, receiver_names=np.array(["a", "b"]), receiver=np.full((2, 3), np.nan))
+    assert width.mean(axis=1).max() == width.mean(axis=1).min()
+    sentence = (
+        "Measure around x = 3.0 m, y = 2.0 m (14 dB instead of 9 dB): the 80% interval of the best server is widest"
+    )
+    assert where_next(run).startswith(sentence)
+    assert [ax.get_title() for panel in Maps(run).summary().panels for ax in panel.axes[:1]] == ["best server"] * 2
+    run.maps["inside"] = run.maps["inside"] & (np.arange(5) < 3)  # x = 3 is outside now
+    assert "not worth it" in where_next(run) or "too few" in where_next(run)
+    assert "about 9 dB in the whole measured area" in Maps(run).summary().caption
+
+
+def test_cells_that_are_not_measured_are_hatched(tmp_path, monkeypatch):
+    hatched = []
+    monkeypatch.setattr(
+        "tasks.rssi.maps.hatch", lambda ax, x, y, where, pattern="////": hatched.append((pattern, where))
+    )
+    known = np.arange(20).reshape(1, 4, 5) % 3 == 0
+    detection = np.where(np.arange(5) < 2, 0.4, 0.6) * np.ones((1, 1, 4, 5))
+    run = made_run(tmp_path, known=known, detection=detection)
+    plots = [Maps(run).summary(), *(Maps(run).by_receiver(kind) for kind in ("predicted", "width"))]
+    assert [pattern for pattern, _ in hatched] == ["////", "\\\\\\\\"] * 3
+    for pattern, where in hatched:
+        np.testing.assert_array_equal(where, ~known[0] if pattern == "////" else detection[0, 0] < 0.5)
+    for plot in plots:
+        assert "Hatched like /: not measured, outside the scans or more than 2.0 m from any scan" in plot.caption
+        assert plot.data["measured"].tolist() == known.ravel().tolist()
+    run.metrics["coverage"][0]["reach_m"] = None
+    assert "Hatched like /: not measured, outside the scans; like" in Maps(run).summary().caption
+
+
+def test_the_mean_is_recommended_where_the_model_is_behind_it_on_held_out_rows(rssi_run):
+    run = Records(rssi_run)
+    held_out = run.metrics["held_out"]
+    assert set(held_out) == {"swiftwrf", "mean"}
+    assert answer(run).chosen == min(held_out, key=held_out.get)
+    run.metrics["held_out"] = {"swiftwrf": 3.25, "mean": 3.5}
+    assert answer(run).chosen == "swiftwrf"
+    assert "above -75 dBm" in answer(run).conclusion[0]
+    run.metrics["held_out"] = {"swiftwrf": 3.75, "mean": 3.5}
+    found = answer(run)
+    assert found.chosen == "mean"
+    assert {"swiftwrf", "mean"} <= {one.name for one in found.short()[0]}
+    assert "3.50 dB" in found.conclusion[0]
+    assert "3.75 dB" in found.conclusion[0]
+
+
+def test_each_floor_has_its_maps_its_rows_and_its_widest_place(tmp_path):
+    corners = np.array([[0, 0, 0], [4, 0, 0], [0, 3, 0], [4, 3, 0]], dtype=float)
+    position = np.concatenate([corners, corners + np.array([0, 0, 4])])
+    level = np.stack([np.full((1, 4, 5), dbm) for dbm in (-50.0, -90.0)])
+    width = np.full((2, 1, 4, 5), 7.0)
+    width[0, 0, 1, 2], width[1, 0, 3, 4] = 14.0, 21.0
+    fields = {name: np.ones((2, 4, 5), bool) for name in ("inside", "known")} | {"above": level[:, 0]}
+    fields |= {"predicted": level, "width": width, "detection": 0 * level + 1, "measured": position[:, 2:]}
+    fields |= {"measured_position": position, "floor_of_row": np.repeat([0, 1], 4)}
+    run = made_run(tmp_path, **fields, floor_names=np.array(["Ground floor", "1"]))
+    maps, (ground, first) = run.maps, Maps.of_floors(run)
+    assert (ground.place, first.place) == ("the measured area of Ground floor", "the measured area of floor 1")
+    assert first.titled("a") == "a, 1"
+    assert where_next(run).startswith(
+        "Measure around x = 2.0 m, y = 1.0 m on Ground floor (14 dB instead of 7 dB), "
+        "x = 4.0 m, y = 3.0 m on floor 1 (21 dB instead of 7 dB): the 80% interval is widest there"
+    )
     assert first.arrays["measured"].ravel().tolist() == [4.0] * 4
     assert first.summary().name == "summary-1"
     maps["y"] = np.arange(4.0) / 20  # a corridor, which would be a line to scale
@@ -268,6 +334,11 @@ def test_each_floor_has_its_maps_its_rows_and_its_coverage(tmp_path):
     _, first = Maps.of_floors(run)
     low, high = first.summary().panels[0].axes[0].images[0].get_clim()
     assert -100 < low < -90 < high < -80
+
+
+def test_a_measured_area_without_cells_has_no_coverage(tmp_path):
+    found = {"covered": None, "not_covered": None, "uncertain": None, "not_measured": None, "scans_above": None}
+    assert coverage_sentence(found) == "No cell of the map is in the measured area."
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -4,7 +4,6 @@ import asyncio
 import base64
 import copy
 import io
-import itertools
 import json
 import shutil
 import socket
@@ -23,10 +22,15 @@ import small
 import torch
 from fuzz import kinds
 from PIL import Image
+from scipy.optimize import linprog
+from scipy.spatial.distance import cdist
+from scipy.stats import norm
 
 from swiftwrf import AngularGrid, InputError, PairModel, Rssi, RssiModel, load, load_rssi, rssi_room
 from swiftwrf.locate import MatchedField, RssiLocator
+from swiftwrf.models.geometry import Plane
 from swiftwrf.online import Follower
+from swiftwrf.rssi.coverage import reach
 from swiftwrf.rssi.maps import RssiMap
 from tasks.configs import LocateConfig
 from tasks.convert import saved_model
@@ -35,7 +39,7 @@ from tasks.page.maps import FloorPlan, colour_image
 from tasks.update.record import Record, snapshot
 from tasks.view import charts, spectra
 from tasks.view.locating import RssiLocating
-from tasks.view.rssi import MapSelection, RssiView, at_least, probability_above
+from tasks.view.rssi import MapSelection, RssiView
 from tasks.view.sources import open_source
 
 GRID = AngularGrid.hemisphere(15, 60)
@@ -176,10 +180,9 @@ def test_measurements_that_changed_or_went_are_not_shown(aoa_run, tmp_path):
 def test_room_of_another_model_on_the_same_spectra(aoa_run, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(aoa_run, folder)
-    plane = {"normal": [1.0, 0, 0], "offset_m": 6.0, "gain": -0.5, "std_mm": 1.0, "certain": True, "dielectric": True}
+    plane = Plane((1.0, 0.0, 0.0), 6.0, -0.5, 1.0, 0.95, 6.1, dielectric=True).to_json()
     (folder / "geometry-mix1.json").write_text(json.dumps({"planes": [plane]}))
-    shown = plane | {"normal": tuple(plane["normal"])}
-    assert [loaded.planes for loaded in open_source(folder).models] == [[], [shown]]
+    assert [loaded.planes for loaded in open_source(folder).models] == [[], [plane]]
 
 
 def test_maps_are_those_of_the_model(rssi_run):
@@ -218,13 +221,45 @@ def test_coverage_is_where_the_probability_is_high_enough(rssi_run):
     view = open_source(rssi_run)
     threshold = float(view.map(1.2).prediction.interval(0.8)[0][2].median())
     selection = MapSelection("coverage", 2, 1.2, threshold, 0.9)
-    covered = np.isfinite(view.coloured(selection).values)
-    assert covered.mean() == pytest.approx(0.5, abs=0.01)
-    assert view.coloured(selection).sentence.startswith("50% of the map")
-    for cells, sign in ((covered, 1), (~covered, -1)):
-        i, j = np.argwhere(cells)[0]
-        above = float(probability_above(view.at(selection, view.map(1.2).x[j], view.map(1.2).y[i]), selection)[2])
-        assert sign * above >= sign * 0.9 - 1e-3
+    covered, chart = np.isfinite(view.coloured(selection).values), view.map(1.2, detected=True)
+    assert 0.1 < covered.mean() < 0.9
+    expected = chart.detection[2] * norm.sf(threshold, chart.mean[2], chart.std[2])
+    np.testing.assert_array_equal(covered, expected >= 0.9)
+    i, j = np.argwhere(covered)[0]
+    at = float(chart.x[j]), float(chart.y[i])
+    assert f"receiver12 above {threshold:g} dBm with {expected[i, j]:.0%}" in view.describe(selection, *at)
+    assert "one of 3 receivers above" in view.describe(replace(selection, at_least=1), *at)
+
+
+def test_shares_on_the_page_are_of_the_measured_cells_of_the_report(monkeypatch):
+    """Whatever the plan below the map shows; distances and hull by other functions than the page's."""
+    monkeypatch.setattr("swiftwrf.rssi.maps.CELLS", 20)
+    data = rssi_room(n=50).columns([0, 5, 11])
+    view = RssiView("floor", RssiModel().fit(data), data)
+    view.place(FloorPlan(np.zeros((2, 2, 3), np.uint8), (-30.0, 50.0, -20.0, 40.0)))
+    chart, selection = (
+        RssiMap.predict(view.model, height=1.2, detected=True),
+        MapSelection("coverage", 2, 1.2, -67.0, 0.7),
+    )
+    assert chart.mean.shape[1:] != view.map(1.2).mean.shape[1:]
+    cells, at = np.stack(np.meshgrid(chart.x, chart.y), axis=-1).reshape(-1, 2), view.position[:, :2]
+    corners = np.vstack([at.T, np.ones(len(at))])
+    hull = np.array([linprog(np.zeros(len(at)), A_eq=corners, b_eq=[*cell, 1]).success for cell in cells])
+    measured = hull & (cdist(cells, at).min(axis=1) <= reach(view.model))
+    assert measured.sum() < hull.sum() < len(cells)
+    above = (chart.detection[2] * norm.sf(-67.0, chart.mean[2], chart.std[2])).ravel()[measured]
+    shares = f"{(above >= 0.7).mean():.0%}", f"{(above <= 0.3).mean():.0%}", f"{1 - measured.sum() / hull.sum():.0%}"
+    assert "0%" not in shares
+    sentence = view.coloured(selection).sentence
+    assert sentence.startswith("Coloured: receiver12 above -67 dBm with 70% certainty. ")
+    assert f"{shares[0]} of the measured area is covered, {shares[1]} is not" in sentence
+    passed = f"{(data.rssi_dbm[:, 2] > -67).double().mean():.0%} of the 50 scans pass"
+    assert f"{passed}. {shares[2]} of the area between" in sentence
+    strongest = RssiMap.predict(view.model, height=1.2).mean.argmax(axis=0).ravel()[measured]
+    assert view.best(1.2) == pytest.approx({n: (strongest == n).mean() for n in np.unique(strongest)})
+    first, part = next(iter(view.best(1.2).items()))
+    sentence = view.coloured(MapSelection("best receiver", 0, 1.2)).sentence
+    assert f"{view.receivers[first]} on {part:.0%} of the measured area" in sentence
 
 
 def test_exports(rssi_run):
@@ -233,18 +268,10 @@ def test_exports(rssi_run):
     rssi = view.map(1.2).prediction
     assert len(table) == rssi.mean[0].numel()
     np.testing.assert_allclose(table["predicted_dbm"], rssi.mean[1].flatten(), atol=0.006)
-    np.testing.assert_array_equal(table["above_-70_dbm_with_90%"], rssi.interval(0.8)[0][1].flatten() >= -70)
+    chart = view.map(1.2, detected=True)
+    above = chart.detection[1] * norm.sf(-70, chart.mean[1], chart.std[1])
+    np.testing.assert_array_equal(table["above_-70_dbm_with_90%"], above.ravel() >= 0.9)
     assert list(table["best_receiver"]) == [view.receivers[best] for best in rssi.mean.argmax(dim=0).flatten()]
-
-
-def test_fractions_of_the_best_receivers(rssi_run):
-    view = open_source(rssi_run)
-    mean, fraction = view.map(1.2).mean, view.best(1.2)
-    assert list(fraction.values()) == sorted(fraction.values(), reverse=True)
-    assert sum(fraction.values()) == pytest.approx(1)
-    first, part = next(iter(fraction.items()))
-    assert part == pytest.approx((mean.argmax(axis=0) == first).mean())
-    assert f"{view.receivers[first]} on {part:.0%}" in view.coloured(MapSelection("best receiver", 0, 1.2)).sentence
 
 
 def test_one_receiver_has_no_best(rssi_run):
@@ -270,6 +297,10 @@ def test_floors_and_what_was_not_received_are_shown_apart():
     assert view.on_floor(above.height).tolist() == upper.tolist()
     assert view.silent(above).mean() > 0.9 > 0.1 > view.silent(lower).mean()
     assert ("Hatched" in view.coloured(above).sentence, "Hatched" in view.coloured(lower).sentence) == (True, False)
+    floor = RssiView("one floor measured", view.model, data.subset(~upper))
+    assert (floor.known(above.height).any(), floor.known(lower.height).any()) == (False, True)
+    assert sum(floor.best(above.height).values()) == pytest.approx(1)
+    assert "No cell" in floor.coloured(replace(above, kind="coverage")).sentence
     assert np.nanmean(charts.stripes(view.silent(above))) == 1
 
 
@@ -452,12 +483,12 @@ def test_a_dropped_floor_plan_lies_at_its_scale_and_origin_and_stays(rssi_run, t
     folder = tmp_path / "run"
     shutil.copytree(rssi_run, folder)
     view = open_source(folder)
-    before = view.inside(1.0).shape
+    before = view.known(1.0).shape
     pixels = np.full((30, 80, 3), 9, dtype=np.uint8)
     view.place(FloorPlan.scaled(pixels, 0.5, (4, 26)))  # y counts down from the upper edge
     assert view.plan.corners == (-2, 38, -2, 13)
     assert view.map(1.0).corners[1] == pytest.approx(38)
-    assert view.inside(1.0).shape == view.map(1.0).mean.shape[1:] != before
+    assert view.known(1.0).shape == view.map(1.0).mean.shape[1:] != before
     again = open_source(folder).plan
     assert again.corners == (-2, 38, -2, 13)
     np.testing.assert_array_equal(again.pixels, pixels)
@@ -494,21 +525,12 @@ def test_total_coverage_counts_receivers(rssi_run):
     view = open_source(rssi_run)
 
     def covered(**selected):
-        return view._covered(MapSelection("coverage", height=1.2, threshold=-60, certainty=0.7, **selected)).mean()
+        return view.covered(MapSelection("coverage", height=1.2, threshold=-60, certainty=0.7, **selected)).mean()
 
     fraction = [covered(receiver=0, at_least=number) for number in (1, 2, 3)]
     single = [covered(receiver=receiver) for receiver in range(3)]
     assert 0 < max(single) <= fraction[0]
     assert fraction[0] > fraction[1] >= fraction[2]
-    generator = torch.Generator().manual_seed(0)
-    probability = torch.rand(3, 4, generator=generator, dtype=torch.float64)
-    every = torch.tensor(list(itertools.product((0.0, 1.0), repeat=3)), dtype=torch.float64)
-    weight = torch.stack(
-        [(row[:, None] * probability + (1 - row[:, None]) * (1 - probability)).prod(dim=0) for row in every]
-    )
-    for number in (1, 2, 3):
-        expected = weight[every.sum(dim=1) >= number].sum(dim=0)
-        torch.testing.assert_close(at_least(probability, number), expected)
 
 
 def test_positions_outside_of_the_measured_ones_are_extrapolated(aoa_run):

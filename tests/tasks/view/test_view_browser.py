@@ -245,7 +245,7 @@ def test_page_of_a_locator(browser, chromium, serve, locate_run):
 
     first = until(lambda: "dBm" in point(30, 20) and said(browser, "here"))
     until(lambda: point(-120, 80) != first)
-    sentences = {"coverage": "% of the map", "best receiver": "highest prediction", "uncertainty": "interval"}
+    sentences = {"coverage": "% of the measured area", "best receiver": "highest prediction", "uncertainty": "interval"}
     for kind, sentence in sentences.items():
         press(browser, kind)
         until(lambda sentence=sentence: sentence in said(browser, "sentence"))

@@ -1,0 +1,127 @@
+"""Coverage: where a scan has receivers above a threshold with some certainty, and which cells the scans determine.
+
+A scan is one packet at each of R receivers. Receiver r is above the threshold t with probability
+
+    p_r = p(r detects the packet) Phi((mean_r - t) / std_r),
+
+where mean and standard deviation are those of detected packets. The errors of a scan have a common correlation, e.g. by a
+body beside the device (one-factor Gaussian copula).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from swiftwrf.data.rssi import Rssi
+from swiftwrf.positions import inside
+from swiftwrf.rssi.maps import RssiMap
+from swiftwrf.rssi.model import RssiModel
+from swiftwrf.rssi.pairs import PairModel
+
+MAX_OPEN_VARIANCE, MAX_WIDENING = 0.5, 1.2  # of the field, and of an interval, at the reach of a scan
+CORRELATION = 0.2  # of the errors of a scan, by held-out training rows in `benchmarks/rssi.py coverage`
+NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(15)  # of the factor that the errors share
+
+
+def at_least(number: int, mean: Tensor, std: Tensor, detection: Tensor, threshold_dbm: float) -> Tensor:
+    """Return the probability that a scan has at least a number of R receivers above a threshold, float64 (...).
+
+    Args:
+        number: Number of receivers, from 1.
+        mean: Mean of detected packets (R, ...) [dBm].
+        std: Their standard deviation (R, ...) [dB].
+        detection: Probability of a detection (R, ...).
+        threshold_dbm: Threshold.
+
+    Example:
+        >>> at_least(1, torch.tensor([-75.0]), torch.tensor([4.0]), torch.tensor([0.8]), -75.0).round(decimals=3)
+        tensor(0.4000, dtype=torch.float64)
+    """
+    z = (mean.double() - threshold_dbm) / std.double().clamp_min(1e-6)
+    score = torch.special.ndtri(detection.double() * torch.special.ndtr(z))
+    total = torch.zeros_like(score[0])
+    for node, weight in zip(NODES, WEIGHTS / WEIGHTS.sum(), strict=True):
+        given = torch.special.ndtr((score + math.sqrt(CORRELATION) * node) / math.sqrt(1 - CORRELATION))
+        counts = [torch.ones_like(total), *(torch.zeros_like(total) for _ in range(number - 1))]
+        for own in given:  # probabilities of 0 to number - 1 receivers
+            fewer = [torch.zeros_like(own), *counts[:-1]]
+            counts = [count * (1 - own) + less * own for count, less in zip(counts, fewer, strict=True)]
+        total += weight * (1 - torch.stack(counts).sum(dim=0))
+    return total
+
+
+def reach(model: RssiModel | PairModel) -> float:
+    """Return the distance [m] from a scan up to which it determines the field of a fitted model.
+
+    Beyond, more than half of the variance of the field is open, and the interval of a measurement is more than 1.2 times as
+    wide as at the scan. It is infinite if no interval is so wide, since the field explains little.
+
+    Example:
+        >>> import swiftwrf
+        >>> round(reach(swiftwrf.RssiModel().fit(swiftwrf.rssi_room())), 2)
+        1.64
+    """
+    kernel = model.kernel  # whose rough part alone has a weight: exp(-r / l)
+    open_variance = max(MAX_OPEN_VARIANCE, (MAX_WIDENING**2 - 1) * kernel.noise)
+    is_flat = isinstance(model, RssiModel) and not bool(model.field_db.any())
+    return math.inf if is_flat or open_variance >= 1 else -kernel.matern12_length / 2 * math.log(1 - open_variance)
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """Probability that a scan has at least a number of receivers above a threshold, on the cells of one floor.
+
+    Args:
+        probability: Probability in each cell of a map, float64 (rows, columns).
+        inside: Cells inside the scans, bool (rows, columns).
+        measured: Those of them that a scan determines, bool (rows, columns).
+        values: Fractions of the measured cells that are `covered` (probability of at least `certainty`), `not_covered` (at
+            most 1 - `certainty`) and `uncertain`, of the cells inside that are `not_measured`, and of the `n_scans` scans
+            that are above, `scans_above`; with `threshold_dbm` and `reach_m`. None is a fraction of nothing, and no limit.
+    """
+
+    probability: NDArray[np.float64]
+    inside: NDArray[np.bool_]
+    measured: NDArray[np.bool_]
+    values: dict[str, Any]
+
+    @classmethod
+    def of(cls, chart: RssiMap, scans: Rssi, limits: tuple[float, float, int], reach: float = math.inf) -> Self:
+        """Return the coverage of a map of detected packets, `RssiMap.predict(model, detected=True)`.
+
+        Args:
+            chart: Map.
+            scans: Measured rows on the floor of the map, at its receivers.
+            limits: Threshold [dBm], probability from which a cell is covered, above 0.5, and number of receivers.
+            reach: Distance from a scan up to which it determines cells, in plan [m].
+
+        Example:
+            >>> import swiftwrf
+            >>> floor = swiftwrf.rssi_room(n=60)
+            >>> chart = RssiMap.predict(swiftwrf.RssiModel().fit(floor), detected=True)
+            >>> Coverage.of(chart, floor, (-75.0, 0.9, 1)).values["covered"]
+            1.0
+        """
+        threshold_dbm, certainty, number = limits
+        mean, std, detection = (torch.from_numpy(field) for field in (chart.mean, chart.std, chart.detection))
+        probability = at_least(number, mean, std, detection, threshold_dbm).numpy()
+        cells, known = np.stack(np.meshgrid(chart.x, chart.y), axis=-1), scans.transmitter_position[:, :2].numpy()
+        enclosed = inside(cells, known) if len(known) else np.zeros(probability.shape, dtype=bool)
+        measured = enclosed & (cKDTree(known).query(cells)[0] <= reach)
+        above = ((scans.rssi_dbm > threshold_dbm).sum(dim=1) >= number).numpy()
+        covered, not_covered = (probability >= certainty)[measured], (probability <= 1 - certainty)[measured]
+        parts = {"covered": covered, "not_covered": not_covered, "uncertain": ~covered & ~not_covered}
+        # a row at a receiver that moves is no scan
+        parts |= {"not_measured": ~measured[enclosed], "scans_above": above[: 0 if scans.receiver_moves else None]}
+        shares = {name: float(part.mean()) if len(part) else None for name, part in parts.items()}
+        limited = {"threshold_dbm": threshold_dbm, "certainty": certainty, "n_scans": len(above)}
+        reach_m = reach if math.isfinite(reach) else None
+        return cls(probability, enclosed, measured, {**limited, "reach_m": reach_m, **shares})

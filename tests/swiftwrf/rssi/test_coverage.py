@@ -1,0 +1,173 @@
+"""Coverage against independent computations: one-factor integrals, distances, counts, and held-out scans."""
+
+import itertools
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.path import Path
+from scipy.integrate import quad
+from scipy.spatial.distance import cdist
+from scipy.stats import norm
+from test_not_detected import RECEIVER, survey
+
+from swiftwrf import PairModel, Rssi, RssiModel, rssi_room
+from swiftwrf.gp import Kernel
+from swiftwrf.rssi import coverage
+from swiftwrf.rssi.coverage import Coverage, at_least, reach
+from swiftwrf.rssi.maps import RssiMap
+from swiftwrf.rssi.path_loss import log_distance
+
+MEAN, STD, DETECTED = np.array([-70.0, -78.0, -74.0]), np.array([4.0, 6.0, 5.0]), np.array([0.9, 1.0, 0.6])
+
+
+def at_least_by_enumeration(probability, number):
+    """The probability over all outcomes of independent receivers."""
+    outcomes = itertools.product((0, 1), repeat=len(probability))
+    chosen = [np.array(outcome, dtype=bool) for outcome in outcomes if sum(outcome) >= number]
+    return sum(np.prod(np.where(each, probability, 1 - probability)) for each in chosen)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.1, 0.6])
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_receivers_above_a_threshold_are_an_integral_over_the_factor_of_the_scan(number, correlation, monkeypatch):
+    monkeypatch.setattr(coverage, "CORRELATION", correlation)
+    score = norm.ppf(DETECTED * norm.sf(-75, MEAN, STD))
+
+    def integrand(factor):
+        given = norm.cdf((score + math.sqrt(correlation) * factor) / math.sqrt(1 - correlation))
+        return norm.pdf(factor) * at_least_by_enumeration(given, number)
+
+    found = at_least(number, *map(torch.tensor, (MEAN, STD, DETECTED)), -75.0)
+    assert float(found) == pytest.approx(quad(integrand, -8, 8)[0], abs=1e-4)
+
+
+def test_one_receiver_has_the_probability_of_its_normal_distribution():
+    mean = torch.tensor([[-70.0, -75.0, -90.0]])
+    found = at_least(1, mean, torch.full_like(mean, 4.0), torch.full_like(mean, 0.8), -75.0)
+    np.testing.assert_allclose(found, 0.8 * norm.sf(-75, mean[0], 4.0), atol=1e-5)
+
+
+def test_shares_are_of_the_cells_near_scans_inside_their_hull():
+    generator = np.random.default_rng(0)
+    x, y = np.arange(0.5, 20), np.arange(0.5, 12)
+    at = generator.random((25, 2)) * (14, 9) + (2, 1)
+    rssi = generator.normal(-76, 6, (25, 2))
+    mean = generator.normal(-76, 8, (2, 12, 20)).astype(np.float32)
+    chart = RssiMap(x, y, 1.0, 1.0, mean, np.full_like(mean, 3.0), np.full_like(mean, 0.97), ("a", "b"))
+    found = Coverage.of(chart, Rssi(rssi, np.c_[at, np.ones(25)]), (-75.0, 0.9, 1), 1.7)
+    cells = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    hull = Path(at[_hull(at)]).contains_points(cells)
+    near = cdist(cells, at).min(axis=1) <= 1.7
+    probability = found.probability.ravel()
+    np.testing.assert_array_equal(found.inside.ravel(), hull)
+    np.testing.assert_array_equal(found.measured.ravel(), hull & near)
+    of_measured = probability[hull & near]
+    expected = {
+        "covered": (of_measured >= 0.9).mean(),
+        "not_covered": (of_measured <= 0.1).mean(),
+        "uncertain": ((of_measured > 0.1) & (of_measured < 0.9)).mean(),
+        "not_measured": 1 - near[hull].mean(),
+        "scans_above": (rssi.max(axis=1) > -75).mean(),
+    }
+    assert min(expected.values()) > 0.05
+    assert {name: found.values[name] for name in expected} == pytest.approx(expected)
+    assert (found.values["n_scans"], found.values["reach_m"]) == (25, 1.7)
+    both = Coverage.of(chart, Rssi(rssi, np.c_[at, np.ones(25)]), (-75.0, 0.9, 2), math.inf)
+    assert both.values["scans_above"] == (rssi.min(axis=1) > -75).mean()
+    assert (both.measured == both.inside).all()
+    assert both.values["reach_m"] is None
+
+
+def _hull(points):
+    """Corners of the convex hull by gift wrapping."""
+    corners = [int(points[:, 0].argmin())]
+    while len(corners) == 1 or corners[-1] != corners[0]:
+        here, best = points[corners[-1]], 0
+        for candidate in range(len(points)):
+            (ax, ay), (bx, by) = points[best] - here, points[candidate] - here
+            if (best == corners[-1]) or ax * by - ay * bx < 0:
+                best = candidate
+        corners.append(best)
+    return corners
+
+
+def test_a_scan_at_the_threshold_is_not_above_it():
+    chart = RssiMap(np.arange(2.0), np.arange(2.0), 1.0, 1.0, *(np.ones((2, 2, 2), np.float32),) * 3, ("a", "b"))
+    rows = Rssi([[-75.0, -90], [-74, -90], [math.nan, -75], [-80, -60]], np.random.default_rng(0).random((4, 3)))
+    found = [Coverage.of(chart, rows, (threshold, 0.9, 1)).values["scans_above"] for threshold in (-75.0, -76.0, -90.0)]
+    assert found == [0.5, 1.0, 1.0]
+
+
+def test_nothing_is_measured_without_scans():
+    chart = RssiMap(np.arange(3.0), np.arange(2.0), 1.0, 1.0, *(np.ones((1, 2, 3), np.float32),) * 3, ("a",))
+    found = Coverage.of(chart, Rssi(np.empty((0, 1)), np.empty((0, 3))), (-75.0, 0.9, 1))
+    assert not found.inside.any()
+    assert found.values["covered"] is None
+    assert found.values["scans_above"] is None
+
+
+def test_a_row_at_a_receiver_that_moves_is_no_scan():
+    data = rssi_room(n=30)
+    chart = RssiMap.predict(PairModel().fit(data), 4.0, detected=True)
+    moving = Rssi(
+        data.rssi_dbm, data.transmitter_position, receiver_position=data.receiver_position, receiver_moves=True
+    )
+    assert Coverage.of(chart, moving, (-75.0, 0.9, 1)).values["scans_above"] is None
+
+
+@pytest.mark.parametrize("noise", [0.3, 1.0, 2.0, 3.0])
+def test_at_the_reach_half_of_the_field_is_open_or_the_interval_is_a_fifth_wider(noise):
+    kernel = Kernel(7.0, matern12_weight=1.0, noise=noise)
+    found = reach(SimpleNamespace(kernel=kernel))
+    cells = torch.tensor([[0.0, 0, 0], [min(found, 1e6), 0, 0]], dtype=torch.float64)
+    covariance = kernel(cells, cells).numpy()
+    is_open = covariance[1, 1] - covariance[0, 1] ** 2 / covariance[0, 0]  # variance given the field at the scan
+    wider = math.sqrt((noise + is_open) / noise)
+    if math.isfinite(found):
+        assert is_open == pytest.approx(0.5, abs=1e-6) or wider == pytest.approx(1.2, abs=1e-6)
+    assert is_open <= 0.5 + 1e-6 or wider <= 1.2 + 1e-6
+    assert math.isinf(found) == (noise == 3.0)
+
+
+def test_a_model_without_a_field_is_determined_everywhere():
+    model = RssiModel().fit(rssi_room(n=60))
+    assert math.isfinite(reach(model))
+    model.field_db = torch.zeros_like(model.field_db)
+    assert math.isinf(reach(model))
+    assert reach(PairModel().fit(rssi_room(n=30))) > 0
+
+
+@pytest.mark.parametrize("threshold", [-86.0, -75.0])
+def test_a_packet_counts_if_it_is_detected_and_above(threshold):
+    """Against the true power of a survey, a fifth of whose packets are lost at any power; the limit is at -88 dBm."""
+    data, _ = survey(n=400, missed=0.2)
+    chart = RssiMap.predict(RssiModel().fit(data), detected=True)
+    at = np.stack([*np.meshgrid(chart.x, chart.y), np.ones(chart.mean.shape[1:])], axis=-1).reshape(-1, 3)
+    for number, name in enumerate(chart.receiver_names):
+        found = Coverage.of(chart.receivers([name]), data.columns([number]), (threshold, 0.9, 1))
+        distance = log_distance(torch.tensor(at), RECEIVER)[:, number].numpy()
+        truth = -42 - 38 * distance + 3 * np.sin(at[:, 0] / 4 + number)
+        expected = 0.8 * norm.sf(threshold, truth, 2.0)
+        share = expected[found.inside.ravel()].mean()
+        assert found.probability[found.inside].mean() == pytest.approx(share, abs=0.04)
+
+
+def test_held_out_scans_pass_as_predicted():
+    """At thresholds that half to nine tenths of the scans pass, on floors that the correlation was not chosen by."""
+    predicted, passed = [], []
+    for seed in (100, 101):
+        train, test = rssi_room(n=400, seed=seed).split()
+        model = RssiModel().fit(train)
+        strongest = test.rssi_dbm.nan_to_num(-torch.inf).amax(dim=1)
+        fields = (model.predict_detected(test).mean.T, model.predict_detected(test).std.T)
+        detection = model.predict_detection(test.transmitter_position).T
+        for quantile in (0.1, 0.3, 0.5):
+            threshold = float(strongest.quantile(quantile)) - 0.5
+            predicted.append(at_least(1, *fields, detection, threshold).numpy())
+            passed.append((strongest > threshold).numpy())
+    predicted, passed = np.stack(predicted), np.stack(passed)
+    np.testing.assert_allclose(predicted.mean(axis=1), passed.mean(axis=1), atol=0.1)
+    assert passed[predicted > 0.9].mean() >= 0.85

@@ -1,0 +1,112 @@
+"""The coverage that a run states: the same in its report, JSON, terminal and page, by an independent computation."""
+
+import json
+import re
+from html import unescape
+
+import numpy as np
+import pandas as pd
+import pytest
+import quick
+import torch
+from scipy.integrate import quad
+from scipy.spatial import ConvexHull
+from scipy.spatial.distance import cdist
+from scipy.stats import norm
+
+from swiftwrf import load, rssi_room
+from swiftwrf.rssi.coverage import CORRELATION, reach
+from tasks.view.rssi import MapSelection
+from tasks.view.sources import open_source
+
+NAMES = ("Ground floor", "1")
+
+
+@pytest.fixture(scope="module")
+def building(tmp_path_factory):
+    """A run on two floors, weak signals above, where every packet is detected: folder and terminal."""
+    folder = tmp_path_factory.mktemp("building")
+    data = rssi_room(n=90).columns([0, 5, 11])
+    position, rssi = data.transmitter_position.clone(), data.rssi_dbm.nan_to_num(-66.0) - 6.7
+    upper = torch.arange(90) % 3 == 0
+    position[upper, 2] += 4.0
+    rssi[upper] -= 13.0
+    table = pd.DataFrame(torch.cat([position, rssi], dim=1).numpy(), columns=["x", "y", "z", "a", "b", "c"])
+    table.insert(3, "floor", np.where(upper, NAMES[1], NAMES[0]))
+    table.to_csv(folder / "walk.csv", index=False)
+    with quick.recorded(folder), quick.sketched(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr("swiftwrf.rssi.maps.CELLS", 16)
+        assert quick.command("rssi", "--rx", "all", "--data", folder / "walk.csv", "--out", folder / "run") == 0
+    return folder / "run", (folder / "out.txt").read_text()
+
+
+def probability(mean, std):
+    """Probability that one of the receivers (R,) is above -75 dBm."""
+    score = norm.ppf(norm.sf(-75, mean, std))
+
+    def none(factor):
+        return norm.pdf(factor) * norm.sf((score + np.sqrt(CORRELATION) * factor) / np.sqrt(1 - CORRELATION)).prod()
+
+    return 1 - quad(none, -8, 8)[0]
+
+
+def inside_by_halfspaces(cells, at):
+    equations = ConvexHull(at).equations
+    return (cells @ equations[:, :2].T + equations[:, 2] <= 0).all(axis=1)
+
+
+@pytest.mark.parametrize("floor", [0, 1])
+def test_one_number_everywhere(building, floor):
+    folder, terminal = building
+    model, metrics = load(folder / "model.safetensors"), json.loads((folder / "metrics.json").read_text())
+    with np.load(folder / "maps.npz") as stored:
+        maps = dict(stored)
+    rows = maps["floor_of_row"] == floor
+    height, at = model.attenuation.floors.height_m[floor], maps["measured_position"][rows, :2]
+    cells = np.stack(np.meshgrid(maps["x"], maps["y"]), axis=-1).reshape(-1, 2)
+    found = model.predict(np.c_[cells, np.full(len(cells), height)])
+    above = np.array([probability(mean, std) for mean, std in zip(found.mean, found.std, strict=True)])
+    inside, near = inside_by_halfspaces(cells, at), cdist(cells, at).min(axis=1) <= reach(model)
+    known = inside & near
+    assert known.sum() < inside.sum()
+    expected = {
+        "covered": (above[known] >= 0.9).mean(),
+        "not_covered": (above[known] <= 0.1).mean(),
+        "uncertain": ((above > 0.1) & (above < 0.9))[known].mean(),
+        "not_measured": 1 - near[inside].mean(),
+        "scans_above": (maps["measured"][rows].max(axis=1) > -75).mean(),
+    }
+    assert {name: metrics["coverage"][floor][name] for name in expected} == pytest.approx(expected)
+    shares = {name: f"{share:.0%}" for name, share in expected.items()}
+    assert 0.1 < expected[("covered", "not_covered")[floor]] < 0.9
+    place = f"the measured area of {('Ground floor', 'floor 1')[floor]}"
+    headline = f"{shares['covered']} of {place}"
+    sentence = (
+        f"{headline} is covered, {shares['not_covered']} is not, {shares['uncertain']} is uncertain; "
+        f"{shares['scans_above']} of the {rows.sum()} scans pass. {shares['not_measured']} of the area between the scans is "
+        f"not measured, over {reach(model):.1f} m from any scan."
+    )
+    report = unescape(re.sub("<[^>]*>", "", (folder / "report.html").read_text()))
+    for text in (terminal, report):
+        assert sentence in text
+        assert re.search(rf"{headline}[, ].*have one of 3 receivers above -75 dBm with 90% certainty", text)
+    assert re.search(rf"{shares['covered']}\s*of {place} above -75 dBm", report)
+    view = open_source(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("swiftwrf.rssi.maps.CELLS", 16)
+        shown = view.coloured(MapSelection("coverage", 0, height, at_least=1)).sentence
+    same = sentence.replace(place, "the measured area")
+    assert shown == f"Coloured: one of 3 receivers above -75 dBm with 90% certainty. {same}"
+    np.testing.assert_allclose(maps["above"][floor].ravel(), above, atol=1e-4)
+
+
+def test_widths_are_those_of_the_80_percent_interval(building):
+    folder, _ = building
+    model = load(folder / "model.safetensors")
+    with np.load(folder / "maps.npz") as stored:
+        maps = dict(stored)
+    cells = np.stack(np.meshgrid(maps["x"], maps["y"]), axis=-1).reshape(-1, 2)
+    for floor, height in enumerate(model.attenuation.floors.height_m):
+        std = model.predict(np.c_[cells, np.full(len(cells), height)]).std.numpy()
+        width = np.subtract(*norm.interval(0.8, scale=std)[::-1])
+        np.testing.assert_allclose(maps["width"][floor], width.T.reshape(maps["width"].shape[1:]), rtol=1e-4)
