@@ -99,6 +99,8 @@ def sample_positions(known: Tensor, n: int, seed: int) -> Tensor:
         >>> sample_positions(corners, 100, seed=0)[:, 2].unique()
         tensor([1.], dtype=torch.float64)
     """
+    if not len(known):
+        raise InputError("synthetic positions need the region of known ones, and there is none")
     generator = np.random.default_rng(seed)
     centre = known.mean(dim=0)
     _, extent, axes = torch.linalg.svd(known - centre, full_matrices=False)

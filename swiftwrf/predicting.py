@@ -177,6 +177,8 @@ def _located(
         (each.median, each.std, each.credible_radius(0.8), each.ambiguous, each.floor_probability.amax(dim=1))
         for each in posteriors
     )
+    if not len(index):
+        raise InputError("there is no row to locate")
     position, std, radius, ambiguous, probability = (torch.cat(values) for values in zip(*parts, strict=True))
     columns: Columns = {"index": index}
     columns |= dict(zip(("x_m", "y_m", "z_m"), position.T, strict=True))

@@ -204,7 +204,7 @@ class Terminal:
     def _print(self, values: Mapping[str, Any], page: Path | None, *parts: str | Table) -> None:
         if self._output.json:
             report = {"report": str(page)} if page else {}
-            print(json.dumps(strict({**values, **report}), allow_nan=False, ensure_ascii=False))
+            print(json.dumps(strict({**values, **report}), allow_nan=False))
         else:
             width = None if sys.stdout.isatty() else PLAIN_WIDTH
             out = Console(file=sys.stdout, highlight=False, soft_wrap=True, width=width)

@@ -6,9 +6,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
+from annotated_types import Ge, Lt
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid, ArrayPose, to_angles
@@ -23,7 +24,7 @@ from swiftwrf.metrics import WINDOW
 from swiftwrf.plotting import Axes, mark_direction, polar_spectrum
 from swiftwrf.positions import to_tensor
 from swiftwrf.runtime.digest import digest
-from swiftwrf.runtime.validation import checked
+from swiftwrf.runtime.validation import check_value, checked
 
 GRID = AngularGrid.hemisphere(90, 360)  # of spectra that are computed
 OF_SPECTRA = ("line_of_sight", "label", "channel", "frequency_hz")  # arrays beside the spectra in spectrum.npz
@@ -205,11 +206,15 @@ class Spectra(PositionedData):
             row: Number of the spectrum.
             ax: Polar axes to draw into. Defaults to those of a new figure.
 
+        Raises:
+            InputError: No spectrum of this number.
+
         Example:
             >>> import swiftwrf
             >>> swiftwrf.simulated_room(n=20).plot(3).get_title()
             'simulated-room 3 at ... m'
         """
+        check_value("row", row, Annotated[int, Ge(-len(self)), Lt(len(self))])
         one = self.subset(torch.arange(len(self))[[row]])
         ax = polar_spectrum(one.spectrum[0], self.grid, ax)
         if bool(one.label.isfinite().all()):

@@ -78,7 +78,7 @@ def inspect(
         beamformer: Beamformer of the spectra of snapshots.
 
     Raises:
-        InputError: An unknown beamformer, or too few snapshots for it.
+        InputError: No measurement, an unknown beamformer, or too few snapshots for it.
 
     Example:
         >>> import swiftwrf
@@ -86,6 +86,8 @@ def inspect(
         >>> len(findings.warnings), findings.numbers["frame"]
         (1, 'fits')
     """
+    if not (data.detected.any() if isinstance(data, Rssi) else len(data)):
+        raise InputError(f"{data.name} holds no measurement to inspect")
     spectra = data.spectra(grid, beamformer) if isinstance(data, Snapshots) else data
     findings = Findings(spectra)
     for note in data.notes:

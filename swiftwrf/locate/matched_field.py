@@ -204,10 +204,12 @@ class MatchedField(Configured, Saved):
                 both.
 
         Raises:
-            InputError: Spectra on another grid or of another link, no channels where the training data had them, a number
-                that is not finite, or a locator that is not fitted.
+            InputError: No row, spectra on another grid or of another link, no channels where the training data had them, a
+                number that is not finite, or a locator that is not fitted.
         """
         self.check_fitted()
+        if not len(spectrum):
+            raise InputError("there is no row to locate")
         if isinstance(spectrum, Spectra):
             spectrum = self.room.link.aligned(spectrum)
         observed = self.likelihoods.features(spectrum, self.config.seed)

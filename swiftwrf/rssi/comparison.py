@@ -32,7 +32,7 @@ from swiftwrf.rssi.paper import RssiPaperModel
 from swiftwrf.rssi.training import LEVEL
 from swiftwrf.runtime.checkpoint import Saved, load
 from swiftwrf.runtime.registry import write_report
-from swiftwrf.runtime.steps import MODEL, Memo, Steps
+from swiftwrf.runtime.steps import MODEL, Memo, Steps, refusing_executor
 from swiftwrf.runtime.validation import Fraction, Preset, checked
 
 Values = dict[str, Any]
@@ -301,7 +301,7 @@ def compare(
         less = {str(len(rows)): {name: compute(_, folder, name, rows)["mean_db"] for name in studied} for rows in parts}
         return less | {str(len(train)): {name: values[name]["mean_db"] for name in studied}}
 
-    with TemporaryDirectory(prefix="swiftwrf-") as temporary:
+    with TemporaryDirectory(prefix="swiftwrf-") as temporary, refusing_executor(executor):
         memo = keep or Memo(Path(temporary))
         steps = Steps(None, memo)
         started = [steps.start(name, name, compute, name) for name in names]

@@ -2,15 +2,20 @@
 
 import io
 import json
+import os
 import re
+import subprocess
+import sys
 from html import unescape
 from types import SimpleNamespace
 
 import pytest
 import quick
 from rich.console import Console
+from samples import write_survey
 
 from swiftwrf.runtime.progress import progress
+from tasks.command import run_command
 from tasks.options import Output
 from tasks.terminal import Answer, Method, NextStep, Terminal, _Line, terminal
 
@@ -136,3 +141,30 @@ def test_quiet_runs_show_the_answer_alone(tmp_path, capsys):
     assert "above -75 dBm" in out.splitlines()[0]
     assert err == ""
     assert not terminal.console.quiet
+
+
+@pytest.mark.parametrize(
+    ("stream", "options"), [("", ""), ("", "--json"), (">&-", ""), (">&- 2>&-", "--json")], ids=str
+)
+def test_no_stream_and_no_setting_of_a_session_ends_a_command(tmp_path, stream, options):
+    """Neither an encoding without the characters of a file, nor a closed stream, nor a name of windows of matplotlib."""
+    write_survey(tmp_path, "caf\u00e9.csv")
+    environment = {"PYTHONIOENCODING": "ascii", "MPLBACKEND": "nope", "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = f"{sys.executable} -m tasks inspect caf\u00e9.csv --out out {options} {stream}"
+    done = subprocess.run(
+        command, cwd=tmp_path, env=os.environ | environment, shell=True, capture_output=True, check=False
+    )
+    assert (done.returncode, done.stderr.count(b"Traceback")) == (0, 0), done.stderr[-500:]
+    assert (tmp_path / "out" / "report.html").exists()
+    if stream == "":
+        out = done.stdout.decode("ascii")
+        assert json.loads(out)["source"] == "caf\u00e9.csv" if options else out.startswith("caf\\xe9.csv: RSSI")
+
+
+def test_a_library_that_cannot_be_loaded_is_one_sentence(monkeypatch, capsys):
+    def broken(*_):
+        raise ImportError("libtorch.so: failed to map segment from shared object")
+
+    monkeypatch.setattr("tasks.command.run_task", broken)
+    assert run_command("inspect", ["x", "--out", "y"], "swiftwrf inspect") == 2
+    assert capsys.readouterr().err.startswith("error: a library cannot be loaded (libtorch.so: failed to map")
