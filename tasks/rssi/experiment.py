@@ -139,7 +139,7 @@ def record(result: RssiComparison, folder: Path, notes: Sequence[str] = ()) -> R
             for receiver in result.test.receiver_names
         },
         "model": result.model,
-        "held_out": result.values[result.model]["held_out"],
+        "held_out": result.values[result.model].get("held_out", {}),
         "seconds": seconds[result.model],
         "interval": {"nominal": LEVEL, "coverage": result.coverage},
         "coverage": coverage,
