@@ -157,7 +157,7 @@ def _maps(model: RssiModel | PairModel, train: Rssi) -> tuple[dict[str, Any], li
     Without floors there is one map, at the median height of the measurements.
     """
     floors, limits = train.floors, (COVERED_DBM, CERTAINTY, 1)
-    heights = floors.height_m if floors else [None]
+    names, heights = (floors.names, floors.height_m) if floors else ([""], [None])
     charts = [RssiMap.predict(model, height=height) for height in heights]
     number = floors.number(train.transmitter_position) if floors else torch.zeros(len(train), dtype=torch.int64)
     detected = [RssiMap.predict(model, height=height, detected=True) for height in heights]
@@ -176,10 +176,8 @@ def _maps(model: RssiModel | PairModel, train: Rssi) -> tuple[dict[str, Any], li
         "measured": train.rssi_dbm.numpy(),
         "receiver": train.receiver_position.numpy(),
         "receiver_names": np.array(train.receiver_names),
-        "floor_names": np.array(floors.names if floors else [""]),
+        "floor_names": np.array(names),
         "floor_of_row": number.numpy(),
     }
     maps = maps if train.origin is None else maps | {"origin": np.array(train.origin)}
-    return maps, [
-        {"floor": str(name), **found.values} for name, found in zip(maps["floor_names"], coverage, strict=True)
-    ]
+    return maps, [{"floor": name} | found.values for name, found in zip(names, coverage, strict=True)]
