@@ -26,7 +26,7 @@ from augment.turbo.artifacts import save_examples
 from augment.turbo.condition import Condition, MeasuredSubset
 from augment.turbo.experiment import Experiment
 from augment.turbo.results import TurboResult
-from swiftwrf import AngularGrid, Rssi, RssiModel, calibrate, rssi_room, simulated_room
+from swiftwrf import AngularGrid, Rssi, RssiModel, calibrate, make_model, rssi_room, simulated_room
 from swiftwrf.data.cells import seconds
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin
 from swiftwrf.data.rssi import Offsets
@@ -510,6 +510,16 @@ def test_innovations_have_the_deviation_that_their_false_alarms_assume():
     assert float((found.innovation.abs() > 1.96).double().mean()) == pytest.approx(0.05, abs=0.006)
     assert float(found.covered.mean()) == pytest.approx(0.8, abs=0.01)
     assert torch.equal(found.error, (draws + 60).abs().mean(dim=1))
+
+
+def test_the_error_of_a_spectrum_is_a_root_mean_square_and_its_interval_a_part_of_0_to_1():
+    room = simulated_room(n=20, grid=AngularGrid.hemisphere(8, 32))
+    model = make_model("gp").fit(room.subset(torch.arange(12)))
+    found, new = model.predict(room.position[12:]), room.subset(torch.arange(12, 20))
+    expected = np.sqrt(((found.mean - new.spectrum).numpy() ** 2).mean(axis=(1, 2)))
+    assert score(model, new).error.numpy() == pytest.approx(expected, rel=1e-5)
+    low, high = replace(found, std=10 * torch.ones_like(found.mean)).interval()
+    assert (low.unique().tolist(), high.unique().tolist()) == ([0], [1])
 
 
 @pytest.mark.parametrize("mass", [0.09, 0.11, 0.3, 0.5])
