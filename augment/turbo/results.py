@@ -15,7 +15,6 @@ from pandas import DataFrame, concat
 
 from augment.cross_validation import LOCATOR, STAND_IN, choose_estimator
 from augment.estimators import Estimator
-from augment.turbo.artifacts import LEVEL
 from augment.turbo.condition import (
     LOCATED,
     Condition,
@@ -31,7 +30,7 @@ from augment.turbo.stages import training_set
 from swiftwrf import load
 from swiftwrf.choices import fraction_key
 from swiftwrf.locate import MatchedField
-from swiftwrf.metrics import ErrorSummary, angle_errors, paired_change, summary
+from swiftwrf.metrics import LEVEL, ErrorSummary, angle_errors, paired_change, summary
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.runtime.registry import write_report
 

@@ -21,13 +21,13 @@ from augment.cross_validation import (
 from augment.estimators import SavedEstimator
 from augment.mix import Mixed, mix
 from augment.positions import SyntheticPositions, synthetic_positions
-from augment.turbo.artifacts import LEVEL, as_bytes, model_file, save_examples, save_located, save_model
+from augment.turbo.artifacts import as_bytes, model_file, save_examples, save_located, save_model
 from augment.turbo.condition import NETWORKS, Condition, MeasuredSubset, Row
 from augment.turbo.experiment import ROOM_MODEL, Experiment
 from swiftwrf import FitError, GeometryModel, InputError, Spectra, load
 from swiftwrf.data.store import Store
 from swiftwrf.locate import MatchedField, Posterior
-from swiftwrf.metrics import l1, psnr, ssim
+from swiftwrf.metrics import LEVEL, l1, psnr, ssim
 from swiftwrf.runtime.checkpoint import read, write
 from swiftwrf.runtime.steps import STEPS
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
+import torch
 from matplotlib.figure import Figure
 
 from swiftwrf.choices import RSSI_PREDICTORS
+from swiftwrf.data.splits import places
 from swiftwrf.metrics import paired_difference
 from tasks.labels import PREDICTORS, colour, meanings
 from tasks.page import figures
@@ -200,7 +202,9 @@ def where_next(run: Records) -> str:
 
 def scatter_of_repeats(run: Records) -> float | None:
     """Return the width of the 80 % interval of repeated measurements at one place [dB], None if there are too few."""
-    same = run.table("predictions").groupby(["x", "y", "z", "receiver"])["measured"]
+    table = run.table("predictions")
+    place = places(torch.from_numpy(table[["x", "y", "z"]].to_numpy(dtype=float)))
+    same = table.groupby([place.numpy(), "receiver"])["measured"]
     repeats = same.count() - 1
     n = int(repeats.clip(lower=0).sum())
     return float(WIDTH_PER_STD * np.sqrt((same.var() * repeats).sum() / n)) if n >= MIN_REPEATS else None

@@ -16,7 +16,7 @@ from torch import Tensor
 from swiftwrf import Prediction, Rssi, RssiModel
 from swiftwrf.data.coordinates import Floors
 from swiftwrf.locate.posterior import PlanMap
-from swiftwrf.rssi import LEVEL
+from swiftwrf.metrics import LEVEL
 from swiftwrf.rssi.maps import RssiMap
 from tasks.page import maps
 from tasks.page.maps import Corners, FloorPlan
