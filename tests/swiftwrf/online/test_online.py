@@ -221,3 +221,11 @@ def test_a_followed_geometry_is_refined_with_every_ten_spectra():
     assert models[11] is models[9]
     offset = walls().tensors().offset  # of planes without uncertainty
     torch.testing.assert_close(models[9].tensors().offset, offset)
+
+
+def test_an_alarm_names_the_receiver_the_direction_and_the_region():
+    place = torch.tensor([[0.0, 0.0, 1.0], [5.0, 3.0, 1.0]])
+    for at, where in zip(place, ("around 0.0, 0.0, 1.0 m", "around 5.0, 3.0, 1.0 m"), strict=True):
+        monitor = Monitor(place.repeat(20, 1), ["hall", "office"], n_regions=2)
+        alarms = [alarm for _ in range(9) for alarm in monitor.observe(at, torch.tensor([torch.nan, -3.0]))]
+        assert {monitor.describe(alarm) for alarm in alarms} == {f"office weaker {where}", "office weaker everywhere"}
