@@ -33,7 +33,7 @@ def matlab_arrays(file: Path) -> dict[str, Stored]:
         if 0 in header[:4]:  # version 4, whose parser is not compiled
             for name, shape, kind in whosmat(file):
                 if kind not in ("char", "sparse"):
-                    found[name] = 16 * math.prod(shape), lambda n=name: np.array(loadmat(file)[n], order="C")
+                    found[name] = 16 * math.prod(shape), partial(_of_version_4, file, name)
             return found
         order = {b"IM": "<", b"MI": ">"}[header[126:]]
         while tag := stream.read(8):
@@ -50,6 +50,10 @@ def matlab_arrays(file: Path) -> dict[str, Stored]:
             found[name] = 16 * math.prod(sizes), partial(_array, content, order, int(flags[0]), sizes)  # if complex
             stream.seek(start + size)
     return found
+
+
+def _of_version_4(file: Path, name: str) -> NDArray[Any]:
+    return np.ascontiguousarray(loadmat(file, variable_names=[name])[name])
 
 
 def _content(file: Path, start: int, size: int, is_compressed: bool, most: int) -> bytes:
