@@ -321,7 +321,7 @@ class ConvertConfig(Options):
     """height of the transmitter on the map [m] (default: the median of the training positions)"""
     output: Answered = Answered()
     spectra: SpectraSource = SpectraSource()
-    table: TableSource = TableSource()
+    table: OffsetSource = OffsetSource()
 
     @property
     def suffix(self) -> str:

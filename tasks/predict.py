@@ -107,12 +107,9 @@ def measured_at(locator: RssiLocator, config: PredictConfig) -> tuple[Rssi, bool
     Raises:
         InputError: RSSI that cannot be read, or receivers that the locator does not have.
     """
-    offsets = locator.model.offsets
-    options = with_groups(reading(config.spectra, config.table), config.source, offsets)
+    options = with_groups(reading(config.spectra, config.table), config.source, locator.model.offsets)
     data, is_known = read_rssi(config.source, options)
-    if offsets is not None and data.groups is None:
-        console.print(f"{data.name}: rows count as those of {offsets.column} {offsets.reference}")
-    return aligned(data, locator.receiver_names, config.ignore_receivers), is_known
+    return aligned(data, locator.model, config.ignore_receivers), is_known
 
 
 def read_rssi(source: str, options: ReadOptions) -> tuple[Rssi, bool]:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from swiftwrf import AngularGrid, InputError, Rssi, Spectra
+from swiftwrf import AngularGrid, InputError, Rssi, RssiModel, Spectra
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.archives import array_header, read_rows
 from swiftwrf.data.files import TABLES, read_table
@@ -145,15 +145,18 @@ def observed_spectra(source: str, options: ReadOptions, grid: AngularGrid, model
     return store, known
 
 
-def aligned(data: Rssi, names: tuple[str, ...], ignore_others: bool) -> Rssi:
-    """Return the data at the receivers of a locator, in its order; those that the data lack count as not detecting.
+def aligned(data: Rssi, model: RssiModel, ignore_others: bool) -> Rssi:
+    """Return the data at the receivers of a model, in its order; those that the data lack count as not detecting.
 
     Names may differ in case, separators or zeros.
 
     Raises:
         InputError: The data have none of the receivers, or others that are not ignored.
     """
+    names, offsets = model.receiver_names, model.offsets
     own, notes = spelled_as(data.receiver_names, names)
+    if offsets is not None and data.groups is None:
+        notes.append(f"rows count as those of {offsets.column} {offsets.reference}")
     missing, others = [name for name in names if name not in own], [name for name in own if name not in names]
     if len(missing) == len(names):
         raise InputError(

@@ -125,7 +125,7 @@ class GeodeticOrigin(NamedTuple):
     @classmethod
     def amid(cls, degrees: Floats) -> GeodeticOrigin:
         """Return the median of latitudes and longitudes (n, 2) [deg], on either side of the antimeridian."""
-        first = degrees[0, 1]
+        first = float(degrees[0, 1])
         east = (degrees[:, 1] - first + 180) % 360 - 180
         longitude = (first + float(np.median(east)) + 180) % 360 - 180
         return cls(round(float(np.median(degrees[:, 0])), 7), round(longitude, 7))

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 Numbers = Any  # a tensor, array, list or table of numbers
 Rows = Any  # numbers of rows (tensor, array or list), a mask, or a slice
 Data = TypeVar("Data", bound="PositionedData")
-MAX_DIGEST_VALUES = 64  # of a row, about; more take time and tell no rows apart
+MAX_DIGEST_VALUES = 64  # of a row, about; more take time and distinguish no more rows
 ROTATION_TOLERANCE = 1e-3  # of the products of its columns, from rounding
 Arrays = dict[str, Any]  # in the form of xarray: dimensions, values, and a dictionary of units if there are any
 DEGREE_UNITS = {"latitude": "degrees_north", "longitude": "degrees_east"}

@@ -32,6 +32,7 @@ from swiftwrf.locate.rssi_likelihood import (
 from swiftwrf.metrics import NORMAL_80
 from swiftwrf.positions import to_tensor
 from swiftwrf.rssi import RssiModel
+from swiftwrf.rssi.detection import Detection
 from swiftwrf.runtime.checkpoint import Header, Saved, expect
 from swiftwrf.runtime.progress import progress as tracked
 from swiftwrf.runtime.validation import Configured, NonNegativeInt, PositiveInt, all_or_nothing, checked, configuration
@@ -137,9 +138,11 @@ class RssiLocator(Configured, Saved):
         part, centre, estimate = (torch.cat(values) for values in zip(*(part.votes for part in parts), strict=True))
         # positions are measured to a few centimetres at best
         smallest_m = max(self.cells.edge_m, 0.05)
+        curve = Detection.estimate(train.transmitter_position, train.rssi_dbm)
+        limit = torch.zeros(len(self.receiver_names)).double() if curve is None else curve.limit
         self.likelihoods = RssiLikelihoods(
             ValueLikelihood.fit((mean, std), rssi),
-            DetectionLikelihood.fit(mean, ~rssi.isnan()),
+            DetectionLikelihood.fit(mean, ~rssi.isnan(), limit),
             FingerprintLikelihood.fit(fingerprints, (part, centre, estimate), position, smallest_m),
         )
         self._calibrate(parts)
@@ -246,6 +249,7 @@ class RssiLocator(Configured, Saved):
         """Return the fitted tensors by name, and plain values."""
         tensors, header = self.model.state()
         values, likelihood = self.likelihoods.values, self.likelihoods.fingerprints
+        detections = self.likelihoods.detections
         known = likelihood.fingerprints
         own = {
             "known": known.position,
@@ -259,7 +263,7 @@ class RssiLocator(Configured, Saved):
             "k": known.k,
             "miss": likelihood.miss,
             "values": [values.common_db, values.scale, None if math.isinf(values.degrees) else values.degrees],
-            "detections": asdict(self.likelihoods.detections),
+            "detections": vars(detections) | {"threshold": detections.threshold.tolist()},
             "inflation": self.inflation,
         }
         at, prior = self.region.state()
@@ -277,9 +281,9 @@ class RssiLocator(Configured, Saved):
         values = ValueLikelihood(float(common_db), float(scale), math.inf if degrees is None else float(degrees))
         if not 1 <= k <= n or metric not in METRICS:
             raise InputError(f"k must be 1 to the number of rows, the metric {listed(METRICS)}; got {k} and {metric!r}")
-        detections = DetectionLikelihood(
-            *(float(header["detections"][name]) for name in ("threshold", "width", "loss"))
-        )
+        saved = header["detections"]
+        threshold = to_tensor("threshold", saved["threshold"], torch.float64, (r,))
+        detections = DetectionLikelihood(threshold, float(saved["width"]), float(saved["loss"]))
         positive = values.common_db >= 0 and min(values.scale, values.degrees, detections.width) > 0
         fractions = 0 < float(header["miss"]) < 1 and 0 <= detections.loss < 1
         if not (positive and fractions and bool((tensors["scale_m"] > 0).all())):

@@ -301,7 +301,7 @@ class FieldModel(Updatable, Configured, Saved, Displayed):
         """Return spectra as the model takes them: snapshots in the order of the training spectra. Refuse other measurements.
 
         Raises:
-            InputError: Another grid or link than that of the training spectra, positions far away from theirs, or a spectrum
+            InputError: Another grid or link than that of the training spectra, positions far away from them, or a spectrum
                 that is not finite.
         """
         if new.grid != self._checked_grid(None):
@@ -410,7 +410,8 @@ class FieldModel(Updatable, Configured, Saved, Displayed):
         grid = self._checked_grid(None)
         tensors, header = self._state()
         described = {"grid": asdict(grid), "bounds": self.bounds.tolist(), "link": self.link.to_json()}
-        return tensors | {"row_digests": self.row_digests}, {"options": asdict(self.config)} | described | header
+        learnt = {"row_digests": self.row_digests} if self.updates else {}
+        return tensors | learnt, {"options": asdict(self.config)} | described | header
 
     def _state(self) -> tuple[dict[str, Tensor], Header]:
         """Return the fitted tensors by name, and plain values beside options, grid and link."""

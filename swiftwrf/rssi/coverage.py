@@ -110,7 +110,7 @@ class Coverage:
             >>> Coverage.of(chart, floor, (-75.0, 0.9, 1)).values["covered"]
             1.0
         """
-        threshold_dbm, certainty, number = limits
+        (threshold_dbm, certainty, number), scans = limits, scans.about(chart.origin)
         mean, std, detection = (torch.from_numpy(field) for field in (chart.mean, chart.std, chart.detection))
         probability = at_least(number, mean, std, detection, threshold_dbm).numpy()
         cells, known = np.stack(np.meshgrid(chart.x, chart.y), axis=-1), scans.transmitter_position[:, :2].numpy()

@@ -121,6 +121,7 @@ class RssiMap(Labelled, Displayed):
             grid,
             receiver_position=receiver,
             receiver_names=model.receiver_names,
+            origin=model.origin,
         )
         with torch.no_grad():
             found = model.predict_detected(cells) if detected else model.predict(grid)

@@ -32,7 +32,7 @@ def coverage_sentence(found: Row, where: str = "the measured area") -> str:
     """Return a coverage in words, by `Coverage.values` and the name of the measured area."""
     if found["covered"] is None:
         return f"No cell of the map is in {where}."
-    shares = {name: f"{share:.0%}" for name, share in found.items() if share is not None}
+    shares = {name: f"{share:.0%}" for name, share in found.items() if isinstance(share, float)}
     sentence = (
         f"{shares['covered']} of {where} is covered, {shares['not_covered']} is not, {shares['uncertain']} is uncertain"
     )

@@ -197,8 +197,8 @@ def where_next(run: Records) -> str:
     elif scatter is not None:
         reason += f", though repeated measurements at one place lie within {scatter:.0f} dB"
     return (
-        f"More positions between the scans are not worth it: the {LEVEL:.0%} interval is about {typical:.0f} dB wide, and "
-        f"less than {MIN_RATIO:g} times as wide in any place, {reason}."
+        f"More positions between the scans would hardly narrow the {LEVEL:.0%} interval: it is about {typical:.0f} dB wide, "
+        f"and less than {MIN_RATIO:g} times as wide in any place, {reason}."
     )
 
 

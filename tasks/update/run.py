@@ -174,7 +174,7 @@ def _read(source: str, options: ReadOptions, model: FieldModel | RssiModel) -> S
     source = located(source)
     if isinstance(model, RssiModel):
         rssi: Any = read(source, with_groups(options, source, model.offsets), RSSI_FORMATS)
-        return model.aligned(aligned(rssi, model.receiver_names, ignore_others=True))
+        return model.aligned(aligned(rssi, model, ignore_others=True))
     data: Any = read(source, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS)
     return model.aligned(
         data.spectra(model.grid, options.beamformer or "phase") if isinstance(data, Snapshots) else data

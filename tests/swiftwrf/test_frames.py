@@ -43,6 +43,8 @@ from swiftwrf.data.coordinates import Floors, GeodeticOrigin
 from swiftwrf.online import Follower, Monitor, adapted, prequential, score
 from swiftwrf.rssi import FloorAttenuation, comparison, estimate_floor_attenuation, estimate_offsets
 from swiftwrf.rssi.base import RssiPredictor
+from swiftwrf.rssi.coverage import Coverage
+from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.pairs import PairPredictor
 
 HERE = GeodeticOrigin(48.0, 11.0)
@@ -158,6 +160,14 @@ def located_by_new(data):
     return own.locate(new_rows().columns([list(RECEIVERS).index(name) for name in own.receiver_names]).rssi_dbm).median
 
 
+def covered(data):
+    """Return the fraction of cells that rows of a map determine, and of rows above a threshold."""
+    upper = data[data.transmitter_position[:, 2] > 3]
+    chart = RssiMap.predict(model(), detected=True, height=4.0)
+    values = Coverage.of(chart, upper, (-75.0, 0.9, 1), 3.0).values
+    return torch.tensor([values["not_measured"], values["scans_above"]])
+
+
 # a fit estimates neither offsets nor, without their names, floors: there these are other data
 FIT = ("nothing", "origin", "heights of floors", "order")
 OF_RSSI = {
@@ -182,6 +192,7 @@ OF_RSSI = {
         lambda data: torch.tensor([*estimate_offsets(data, "new").offset_db.values()]),
         tuple(CHANGES),
     ),
+    Coverage.of: (new_rows, covered, (*FIT, "no floors")),
     estimate_floor_attenuation: (
         training_rows,
         lambda data: torch.tensor([estimate_floor_attenuation(data).db]),

@@ -11,7 +11,6 @@ from swiftwrf.metrics import (
     covered,
     median_interval,
     method_summary,
-    paired_difference,
     ssim,
     summary,
 )
@@ -60,22 +59,6 @@ def test_four_fifths_of_a_normal_variable_are_covered():
     share = covered(torch.zeros_like(noise), 2 * torch.ones_like(noise), 2 * noise)
     assert share.tolist() == pytest.approx([0.8] * 3, abs=0.01)
     assert covered(noise, torch.zeros_like(noise), noise).tolist() == [1, 1, 1]
-
-
-def test_repeated_rows_do_not_narrow_an_interval():
-    draw = np.random.default_rng(0)
-    place, error = np.arange(40), draw.gamma(2.0, size=40)
-    repeated, group = error.repeat(10), place.repeat(10)
-    once, blind, aware = (summary(*values) for values in ((error,), (repeated,), (repeated, group)))
-    width = [one["high"] - one["low"] for one in (once, blind, aware)]
-    assert width[1] < 0.6 * width[0]
-    assert width[2] == pytest.approx(width[0], rel=0.35)
-    table = pd.DataFrame({"index": np.arange(400), "place": group, "a": repeated, "b": 1.0})
-    by_place, by_row = (
-        paired_difference(table.set_index(names), "a", "b") for names in (["index", "place"], ["index"])
-    )
-    assert by_place[0] == by_row[0]
-    assert by_place[2] - by_place[1] > 2 * (by_row[2] - by_row[1])
 
 
 @pytest.mark.parametrize(("n_pairs", "mean", "has_interval"), [(0, np.nan, False), (9, 1.0, False), (10, 1.0, True)])

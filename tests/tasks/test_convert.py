@@ -21,6 +21,7 @@ from swiftwrf.data.coordinates import Floors, GeodeticOrigin
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.data.rssi import SURVEY, Offsets
 from swiftwrf.data.writing import write_rssi, write_spectra
+from swiftwrf.metrics import angle_errors
 
 GRID = ("--grid", 24, 96)
 
@@ -115,6 +116,22 @@ def test_what_is_known_of_rssi_comes_back(tmp_path):
     assert load_rssi(tmp_path).rssi_dbm[0, 0] == -99.99
     (tmp_path / "meta.csv").unlink()
     assert load_rssi(tmp_path).groups is None
+
+
+def test_a_walk_of_several_phones_in_degrees_keeps_them(tmp_path, capsys):
+    draw = np.random.default_rng(0)
+    table = pd.DataFrame({"latitude": 48 + draw.uniform(0, 2e-4, 60), "longitude": 11 + draw.uniform(0, 2e-4, 60)})
+    table = table.assign(z=1.0, phone=["old", "new", "other"] * 20, hall=draw.uniform(-80, -50, 60).round(1))
+    table.to_csv(tmp_path / "walk.csv", index=False)
+    assert run(tmp_path / "walk.csv", tmp_path / "own", "--offset-by", "phone=new") == 0
+    data = load_rssi(tmp_path / "walk.csv", offset_by="phone")
+    assert_same(load_rssi(tmp_path / "own"), data)
+    assert_same(load_rssi(tmp_path / "own", offset_by="phone"), data)
+    with pytest.raises(InputError, match="has groups of phone, not of floor; convert the table again by these"):
+        load_rssi(tmp_path / "own", offset_by="floor")
+    assert run(tmp_path / "walk.csv", tmp_path / "without") == 0
+    assert "rows differ in phone" in capsys.readouterr().err
+    assert load_rssi(tmp_path / "without").labels == ("phone",)
 
 
 @pytest.mark.parametrize("column", ["groups", "time"])
@@ -221,15 +238,21 @@ def test_an_array_of_any_rows_and_columns(tmp_path, asked, array):
     assert torch.equal(load_spectra(tmp_path / "own").spectrum, expected.spectrum)
 
 
-def test_calibration_sees_the_training_part_alone(tmp_path):
+def test_calibration_sees_the_training_part_alone(tmp_path, capsys):
     data, *_ = spoilt(snapshots(n=150))
     folder = write_snapshots(tmp_path / "source", data=data)
     assert run(folder, tmp_path / "own", *GRID, "--calibrate", "--split", "block", "--seed", 1) == 0
     record = json.loads((tmp_path / "own" / "conversion.json").read_text())["calibration"]
     assert np.linalg.norm(record["turn_deg"]) == pytest.approx(20, abs=1.5)
+    (printed,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("calibrated on")]
+    degrees = max(record["phase_std_deg"]), np.linalg.norm(record["turn_deg"]), max(record["turn_std_deg"])
+    shares = (100 * record[f"line_of_sight_share_{name}"] for name in ("after", "before"))
+    expected = (record["clear_positions"], *(round(x, 1) for x in degrees), *map(round, shares))
+    assert tuple(map(float, re.findall(r"\d+(?:\.\d+)?", printed))) == expected
     mended = load_spectra(tmp_path / "own")
     usual = snapshots(n=150).spectra(AngularGrid.hemisphere(24, 96))
     assert float((mended.spectrum - usual.spectrum).abs().mean()) < 0.01
+    assert float(angle_errors(mended.label, usual.label)["great_circle"].rad2deg().max()) < 2
     assert {name: (len(a), len(b)) for name, (a, b) in mended.named_splits.items()} == {"block": (120, 30)}
     assert torch.equal(mended.split("block")[1].index, data.split("block", 1)[1].index)
 

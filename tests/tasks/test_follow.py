@@ -13,6 +13,7 @@ import small
 import torch
 from fuzz.runs import follow
 from scipy.spatial.distance import cdist
+from scipy.stats import norm
 
 from swiftwrf import AngularGrid, Rssi, RssiModel, load, load_rssi, make_model, rssi_room, simulated_room
 from swiftwrf.data.writing import write_rssi
@@ -21,6 +22,7 @@ from swiftwrf.online import Follower, Step
 from swiftwrf.online.scores import Scores
 from swiftwrf.rssi import estimate_offsets
 from tasks.command import run_command
+from tasks.update.lines import answer
 from tasks.update.record import Record, map_plot, page
 
 
@@ -502,3 +504,22 @@ def test_the_numbers_of_a_record_are_those_of_its_measurements(tmp_path):
     assert cells[0][1:] == [f"{x:.3g}" for x in (*position[worst], error[worst], root_mean_square[worst])]
     near = np.argsort(cdist(position, position), axis=1)[:, :5]
     assert map_plot(record).data["innovation"].tolist() == pytest.approx(root_mean_square[near].mean(axis=1).tolist())
+
+
+def test_an_answer_has_what_was_predicted_its_interval_and_what_was_observed():
+    model, new = rssi_model(), floor().subset(torch.tensor([41]))
+    found = json.loads(answer(41, new, model, Follower(model).step(new)))
+    predicted = model.predict(new.transmitter_position)
+    for name, away in (("predicted", 0), ("low", -1), ("high", 1)):
+        expected = (predicted.mean + away * norm.ppf(0.9) * predicted.std)[0].tolist()
+        assert found[name] == pytest.approx(dict(zip(model.receiver_names, expected, strict=True)), abs=0.00501)
+    observed = dict(zip(model.receiver_names, new.rssi_dbm[0].tolist(), strict=True))
+    known = {name: x for name, x in found["observed"].items() if x is not None}
+    assert known == pytest.approx({name: x for name, x in observed.items() if x == x}, abs=0.00501)
+    data = simulated_room(n=41, grid=AngularGrid.hemisphere(8, 32))
+    train, new = data.subset(torch.arange(40)), data.subset(torch.tensor([40]))
+    field = make_model("gp").fit(train)
+    found = json.loads(answer(40, new, field, Follower(field, train).step(new)))
+    for name, spectrum in (("predicted", field.synthesize(new.position)), ("observed", new.spectrum)):
+        peak = data.grid.peak_direction(spectrum)[0].rad2deg().tolist()
+        assert found[f"{name}_peak_deg"] == pytest.approx(peak, abs=0.0501)

@@ -1,4 +1,4 @@
-"""What results say is what they are: printed numbers against plain NumPy, on results whose truth is known.
+"""Numbers that results print, compared with plain NumPy on results of known truth.
 
 Errors are 0 to 99, skewed so that mean and median order methods otherwise, four of similar size at each of 25 places.
 """
@@ -26,9 +26,9 @@ from augment.turbo.artifacts import save_examples
 from augment.turbo.condition import Condition, MeasuredSubset
 from augment.turbo.experiment import Experiment
 from augment.turbo.results import TurboResult
-from swiftwrf import AngularGrid, Rssi, RssiModel, calibrate, rssi_room, simulated_room
+from swiftwrf import AngularGrid, Rssi, RssiModel, calibrate, make_model, rssi_room, simulated_room
 from swiftwrf.data.cells import seconds
-from swiftwrf.data.coordinates import Floors
+from swiftwrf.data.coordinates import Floors, GeodeticOrigin
 from swiftwrf.data.rssi import Offsets
 from swiftwrf.locate import Posterior
 from swiftwrf.locate.comparison import LocateComparison, LocateSplit
@@ -48,6 +48,7 @@ from tasks.page.shared import compared, comparison_sentence, coverage_warning
 from tasks.records import CONFIG, Records
 from tasks.rssi import experiment as rssi
 from tasks.rssi import page as rssi_page
+from tasks.source import split_notes
 from tasks.terminal import _table
 from tasks.view.locating import Located
 
@@ -58,23 +59,15 @@ OTHER = 0.5 * OWN + 0.2 * np.random.default_rng(0).permutation(100)
 SIGN = np.where(N % 3, 1.0, -1.0)
 STD = np.where(N % 2, 10.0, 60.0)  # of the predictions of RSSI
 ALONG = torch.tensor([0.6, 0.0, 0.8])  # direction of the errors of positions
-TIMES = {
-    "fit": 1.0,
-    "predict": 2.0,
-    "train": 1.0,
-    "estimate": 2.0,
-    "synthesize": 6.0,
-    "draw": 7.0,
-    "room": 8.0,
-    "locate": 9.0,
-}
+TIMES = {"fit": 1.0, "predict": 2.0, "train": 1.0, "estimate": 2.0, "room": 8.0, "locate": 9.0}
+TIMES |= {"synthesize": 6.0, "draw": 7.0}
 GAIN = {"n_synthetic": 300, "median_deg": 1.5, "change": -0.25, "low": -0.4, "high": -0.1}
 GAINS = [GAIN | {"n_synthetic": 1000, "median_deg": 1.7}, GAIN]
 RULE = {"median_deg": 1.6, "change": -0.2, "low": -0.35, "high": -0.05}
 VALIDATION = {"stand_in": "kernel_regression", "n_held_out": 30, "measured_only_deg": 2.0, "gains": GAINS, "rule": RULE}
 ERRORS = {
-    "rssi": {"swiftwrf": OWN, "knn": OTHER, "mean": THIRD},
-    "locate": {"posterior": OWN / 10, "knn": OTHER / 10, "knn_difference": OTHER / 5, "mean": THIRD / 10},
+    "rssi": {"swiftwrf": OWN, "knn": OTHER, "gp": THIRD},
+    "locate": {"posterior": OWN / 10, "knn": OTHER / 10, "knn_difference": OTHER / 5, "gp": THIRD / 10},
     "aoa": {
         "network, measured + synthetic (gp)": OWN / 20,
         "network, measured": OTHER / 10,
@@ -215,7 +208,7 @@ def test_every_table_has_medians_90_percent_and_intervals_over_places(said, task
     terminal = {name: [said_of(cell) for cell in cells] for name, *cells in terminal}
     assert [name for name in terminal if name.startswith("*")] == [f"* {answer.chosen}"]
     terminal = {name[2:]: cells for name, cells in terminal.items()}
-    usable = [name for name in terminal if name in errors and name not in ("mean", "peak")]
+    usable = [name for name in terminal if name in errors and name != "peak"]
     assert usable == sorted(usable, key=lambda name: np.median(errors[name]))
     plain = {one["method"]: one for one in answer.values()["rows"]}
     report = {row[0]: row for row in section.tables[0].rows}
@@ -240,17 +233,18 @@ def test_every_table_has_medians_90_percent_and_intervals_over_places(said, task
 def test_rssi(said):
     run, result = said["rssi"]
     answer, inside = rssi_page.answer(run), norm.ppf(0.9) * STD >= OWN
-    assert rssi_page.best_baseline(run) == "knn"  # its median is less than that of mean, its 90 % are more
+    assert rssi_page.best_baseline(run) == "knn"  # its median is less than that of gp, its 90 % are more
     (sure,) = [text for text in answer.conclusion if "90 % of the errors are below" in text]
     assert said_of(sure) == [90, round(np.quantile(OWN, 0.9), 1), 100 * inside.mean(), 80, 100, 30]
     assert said_of(answer.conclusion[-1]) == difference_of(OWN, OTHER)
     cells = {one.name: [said_of(cell) for cell in one.cells.values()] for one in answer.methods}
-    expected = {name: [difference_of(OWN, ERRORS["rssi"][name]), []] for name in ("knn", "mean")}
+    expected = {name: [difference_of(OWN, ERRORS["rssi"][name]), []] for name in ("knn", "gp")}
     assert cells == expected | {"swiftwrf": [[], [0.75]]}
     assert [80, 100 * inside.mean()] in [said_of(step.text) for step in answer.next_steps]
     shown = [number.value for number in rssi_page._summary(run).numbers][-3:]
     assert shown == [f"{np.median(OWN):.2f} dB", f"{np.median(OTHER):.2f} dB", f"{inside.mean():.0%}"]
     assert (run.metrics["n_train"], run.metrics["n_test"]) == (30, 50)
+    assert any("b -8.0 dB" in note for note in run.metrics["notes"])
     for name, line in zip(("swiftwrf", "knn"), rssi_page._by_rows(run)[0].axes[0].lines, strict=True):
         assert (line.get_xdata().tolist(), line.get_ydata().tolist()) == ([10, 30], result.by_rows[name].tolist())
     (plot,) = rssi_page._differences(run)
@@ -272,9 +266,10 @@ def test_rssi(said):
     for column, away in (("low", -1), ("high", 1), ("predicted", 0)):
         assert table[column].to_numpy() == pytest.approx(-60 + SIGN * OWN + away * norm.ppf(0.9) * STD, abs=0.00501)
     assert np.array_equal(run.arrays("maps")["measured_position"], known)
-    repeated = pd.DataFrame({"x": N // 5, "y": 0, "z": 0, "receiver": "a", "measured": OWN})
+    repeated = pd.DataFrame({"x": np.sqrt(N).astype(int), "y": 0, "z": 0, "receiver": "a", "measured": OWN})
     with mock.patch.dict(run._tables, predictions=repeated):
-        within = np.sqrt(OWN.reshape(20, 5).var(axis=1, ddof=1).mean())
+        squares = [(part - part.mean()) ** 2 for part in np.split(OWN, np.arange(1, 10) ** 2)]
+        within = math.sqrt(np.concatenate(squares).sum() / (100 - 10))
         assert rssi_page.scatter_of_repeats(run) == pytest.approx(2 * norm.ppf(0.9) * within)
 
 
@@ -332,6 +327,7 @@ def test_directions(said):
     turbo, alone = errors["network, measured + synthetic (gp)"], errors["network, measured"]
     found, sure, against = answer.conclusion
     median, low, high = median_of(turbo)
+    assert said_of(repr(result)) == [4, median]
     assert said_of(found) == [median, 90, round(np.quantile(turbo, 0.9), 1)]
     assert said_of(sure) == [95, low, high, 100, 30, 60]
     changes = [change_of(turbo, alone), change_of(turbo, errors["peak"])]
@@ -483,6 +479,17 @@ def test_a_lone_place_has_the_range_of_its_errors():
     assert (found["low"], found["high"]) == (1, 5)
 
 
+@pytest.mark.parametrize(("shared", "expected"), [(0, [40, 15]), (4, [40])])
+def test_rows_at_one_position_are_noted(shared, expected):
+    """Thirty training rows are at ten positions, ten test rows at five others, or some of them at a training position."""
+    room = rssi_room(n=40)
+    place = torch.cat([torch.arange(30) // 3, 10 + torch.arange(10) // 2])
+    place[30 : 30 + shared] = 0
+    data = room.derived(transmitter_position=room.transmitter_position[place])
+    (note,) = split_notes(data.subset(torch.arange(30)), data.subset(torch.arange(30, 40)), "random")
+    assert said_of(note) == expected
+
+
 class Known(RssiPredictor):
     """-60 dBm with a standard deviation of 4 dB."""
 
@@ -503,6 +510,16 @@ def test_innovations_have_the_deviation_that_their_false_alarms_assume():
     assert float((found.innovation.abs() > 1.96).double().mean()) == pytest.approx(0.05, abs=0.006)
     assert float(found.covered.mean()) == pytest.approx(0.8, abs=0.01)
     assert torch.equal(found.error, (draws + 60).abs().mean(dim=1))
+
+
+def test_the_error_of_a_spectrum_is_a_root_mean_square_and_its_interval_a_part_of_0_to_1():
+    room = simulated_room(n=20, grid=AngularGrid.hemisphere(8, 32))
+    model = make_model("gp").fit(room.subset(torch.arange(12)))
+    found, new = model.predict(room.position[12:]), room.subset(torch.arange(12, 20))
+    expected = np.sqrt(((found.mean - new.spectrum).numpy() ** 2).mean(axis=(1, 2)))
+    assert score(model, new).error.numpy() == pytest.approx(expected, rel=1e-5)
+    low, high = replace(found, std=10 * torch.ones_like(found.mean)).interval()
+    assert (low.unique().tolist(), high.unique().tolist()) == ([0], [1])
 
 
 @pytest.mark.parametrize("mass", [0.09, 0.11, 0.3, 0.5])
@@ -560,3 +577,14 @@ def test_synthetic_positions_are_as_near_as_the_positions_lie():
 def test_the_near_field_begins_at_30_centimetres():
     at = torch.tensor([[0.1, 0, 0], [0.3, 0, 0], [0.5, 0, 0], [2.0, 0, 0]])
     assert log_distance(at, torch.zeros(1, 3))[:, 0].tolist() == pytest.approx(np.log10([0.3, 0.3, 0.5, 2.0]).tolist())
+
+
+def test_degrees_are_metres_of_the_ellipsoid():
+    """A step of 1e-4 degrees north and 2e-4 east, by the radii of curvature of WGS84."""
+    for latitude, longitude in ((48.0, 11.0), (-33.9, -70.2)):
+        flat = 1 - 0.00669437999014 * math.sin(math.radians(latitude)) ** 2
+        north = math.radians(1e-4) * 6378137 * (1 - 0.00669437999014) / flat**1.5
+        east = math.radians(2e-4) * 6378137 / math.sqrt(flat) * math.cos(math.radians(latitude))
+        origin, degrees = GeodeticOrigin(latitude, longitude), np.array([[latitude + 1e-4, longitude + 2e-4]])
+        assert origin.to_metres(degrees)[0] == pytest.approx([east, north], abs=1e-3)
+        assert origin.to_degrees(np.array([[east, north]])) == pytest.approx(degrees, abs=1e-8)

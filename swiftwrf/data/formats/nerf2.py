@@ -218,7 +218,7 @@ def _decode(
 class Nerf2Rssi(Format[Rssi]):
     """One row a position of the end that moves, one column a receiver."""
 
-    takes = frozenset({"filler"})
+    takes = frozenset({"filler", "offset_by"})
 
     def recognises(self, path: Path) -> bool:
         raw = (path / TABLES[1]).is_file() and any((path / name).is_file() for name in POSITIONS)
@@ -248,6 +248,10 @@ class Nerf2Rssi(Format[Rssi]):
         survey, meta = path / SURVEY, path / META
         properties = _properties(survey) if survey.is_file() else {}
         groups = properties.pop("groups", None)
+        if options.offset_by not in (None, groups):
+            raise InputError(
+                f"{path} has groups of {groups}, not of {options.offset_by}; convert the table again by these"
+            )
         of_rows, units = _of_rows(meta, len(rssi), groups) if meta.is_file() else ({}, [])
         stated = (positions, table, receivers, of_rows and meta, properties and survey)
         return Rssi(

@@ -387,9 +387,19 @@ def test_detections_are_learnt():
     generator = torch.Generator().manual_seed(0)
     mean = -100 + 60 * torch.rand(500, 4, generator=generator)
     detected = torch.rand(500, 4, generator=generator) < 0.9 * torch.sigmoid((mean + 85) / 3)
-    found = DetectionLikelihood.fit(mean, detected)
-    assert found.threshold == pytest.approx(-85, abs=2)
+    found = DetectionLikelihood.fit(mean, detected, torch.zeros(4))
+    assert found.threshold.tolist() == pytest.approx([-85] * 4, abs=2)
     assert found.loss == pytest.approx(0.1, abs=0.05)
+
+
+def test_detections_of_receivers_of_other_sensitivity(tmp_path):
+    """Half of the receivers detect nothing below -60 dBm; a saved locator knows them, too."""
+    room = rssi_room(n=120)
+    limit = torch.tensor([-90.0, -60.0]).repeat(6)
+    data = replace(room, rssi_dbm=room.rssi_dbm.where(room.rssi_dbm >= limit, torch.nan))
+    RssiLocator(n_cells=100, n_calibration=50).fit(data).save(tmp_path / "locator.safetensors")
+    threshold = load(tmp_path / "locator.safetensors").likelihoods.detections.threshold
+    assert float(threshold[1::2].mean() - threshold[::2].mean()) > 15
 
 
 def test_variances_of_phases_that_no_room_explains_stay_finite():

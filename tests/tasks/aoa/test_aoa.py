@@ -316,7 +316,7 @@ def test_networks_are_seeded_and_leave_the_global_generator_alone(room, kind):
 def pretended(monkeypatch, room, errors, repeats=1):
     """Return the cross-validation for four folds with these errors by fold and number of synthetic positions.
 
-    So many consecutive spectra of a fold are at one place.
+    `repeats` consecutive spectra of a fold are at one place.
     """
     monkeypatch.setattr(cross_validation, "held_out_errors", lambda fold, number, seed: errors(fold.number, number))
     model, folds = make_model("idw").fit(room), []

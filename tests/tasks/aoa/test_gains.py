@@ -15,7 +15,7 @@ from augment.turbo.results import TurboResult, summaries
 from swiftwrf import simulated_room
 from swiftwrf.metrics import median_interval, paired_change
 from swiftwrf.metrics import summary as error_summary
-from tasks.aoa.page import answer, comparison, conclusion, first_screen
+from tasks.aoa.page import answer, conclusion, first_screen
 from tasks.aoa.records import FractionRecords
 from tasks.configs import AoaConfig
 from tasks.records import Records
@@ -33,16 +33,6 @@ def test_what_positions_differ_in_does_not_widen_the_interval_of_a_change():
     assert -0.6 < change["low"] < -0.5 < change["high"] < -0.4
     shuffled = paired_change(before, generator.permutation(after))
     assert shuffled["high"] - shuffled["low"] > 5 * (change["high"] - change["low"])
-
-
-def test_the_interval_of_a_change_covers_the_truth_as_often_as_it_says():
-    generator = np.random.default_rng(1)
-    covered = 0
-    for _ in range(60):
-        before = generator.gamma(2, size=80)
-        change = paired_change(before, generator.gamma(2, size=80))
-        covered += change["low"] <= 0 <= change["high"]
-    assert covered >= 52  # 95 % of 60 are 57
 
 
 def summary_of(values):
@@ -182,16 +172,6 @@ def test_repeats_do_not_narrow_the_interval_of_a_gain():
     )
     assert often["low"] == pytest.approx(once["low"], abs=1e-6)
     assert often["high"] == pytest.approx(once["high"], abs=1e-6)
-
-
-def test_the_report_states_gain_interval_and_judgement(aoa_run):
-    fraction = FractionRecords.of(Records(aoa_run))[0]
-    sentence = comparison(fraction)
-    for other, change in fraction.mix["methods"]["network, measured + synthetic (swiftwrf)"]["changes"].items():
-        assert f"{change['change']:+.0%} [{change['low']:+.0%}, {change['high']:+.0%}] against `{other}`" in sentence
-    assert any(text in sentence for text in ("a gain", "a loss", "not significant"))
-    changed = {one.name for one in answer(fraction).methods if one.cells["by synthetic spectra"]}
-    assert changed >= {"network, measured + synthetic (swiftwrf)", "kernel_regression, measured + synthetic (swiftwrf)"}
 
 
 def test_the_summary_begins_with_the_estimator_that_cross_validation_chose(aoa_run):

@@ -172,7 +172,7 @@ def test_receivers_of_the_model_are_found_by_name(locate_run, capsys):
     data = rssi_room(n=80)
     some = replace(data.columns([1, 0]), receiver_names=("receiver02", "kitchen"))
     locator = load(locate_run / MODEL)
-    placed = aligned(some, locator.receiver_names, ignore_others=True)
+    placed = aligned(some, locator.model, ignore_others=True)
     assert placed.receiver_names == locator.receiver_names
     torch.testing.assert_close(placed.rssi_dbm[:, 1], data.rssi_dbm[:, 1], equal_nan=True)
     assert placed.detected[:, 2:].sum() == 0

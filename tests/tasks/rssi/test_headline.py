@@ -77,6 +77,7 @@ def test_one_number_everywhere(building, floor):
         "scans_above": (maps["measured"][rows].max(axis=1) > -75).mean(),
     }
     assert {name: metrics["coverage"][floor][name] for name in expected} == pytest.approx(expected)
+    assert metrics["coverage"][floor]["floor"] == NAMES[floor]
     shares = {name: f"{share:.0%}" for name, share in expected.items()}
     assert 0.1 < expected[("covered", "not_covered")[floor]] < 0.9
     place = f"the measured area of {('Ground floor', 'floor 1')[floor]}"
