@@ -81,7 +81,7 @@ def run_command(name: str, options: Sequence[str], program: str) -> int:
         os.environ.setdefault("GOMP_SPINCOUNT", "30000")
     os.environ["MPLBACKEND"] = "agg"  # figures go into files, whatever a session has set for its windows
     if sys.stdout is None:  # closed by the caller, e.g. a timer
-        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 (to the end of the process)
+        sys.stdout = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
     with suppress(AttributeError):  # of a stream of a notebook
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     gc.disable()  # loading libraries leaves no garbage, and to look for it takes a fifth of the time

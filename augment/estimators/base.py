@@ -97,11 +97,7 @@ class Estimator(Configured, ABC):
 
 
 def estimated(estimator: Estimator, data: Spectra) -> Tensor:
-    """Return the directions of measurements by an estimator of any class, float64 (n, 2) [rad].
-
-    Raises:
-        InputError: As `Estimator.estimate`, or values that are no directions of these measurements.
-    """
+    """Return the directions of measurements by an estimator of any class, checked, float64 (n, 2) [rad]."""
     return to_directions(f"directions of {type(estimator).__name__}", estimator.estimate(data), len(data))
 
 

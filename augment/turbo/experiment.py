@@ -14,7 +14,7 @@ from augment.choose import blind_folds, candidates, held_out
 from augment.cross_validation import LOCATOR, STAND_IN
 from augment.estimators import ESTIMATORS, Estimator, make_estimator
 from augment.mix import Mixed, withhold
-from augment.positions import SyntheticPositions, check_synthetic
+from augment.positions import SyntheticPositions
 from augment.turbo.condition import NETWORKS, MeasuredSubset, Row, Training
 from swiftwrf.choices import AUTO
 from swiftwrf.data import Spectra
@@ -78,7 +78,7 @@ class Experiment:
                 if names.count(name) > 1:
                     raise InputError(f"two {things} have the name {name!r}; leave one out, or give it another name")
         if self.extra:
-            check_synthetic(data, self.extra)
+            data.direction_at(data.position[:1])  # refuses unknown geometry
         for fraction in self.fractions:
             withhold(self.train, fraction, self.seed)
 

@@ -15,6 +15,7 @@ import torch
 from augment.choose import candidates
 from augment.cross_validation import LOCATOR, STAND_IN
 from augment.estimators import Estimator, SavedEstimator
+from augment.positions import Count
 from augment.turbo.condition import CHOSEN, LOCATED, NETWORKS, Condition, MeasuredSubset, Training
 from augment.turbo.experiment import ROOM_MODEL, Experiment
 from augment.turbo.results import TurboResult
@@ -34,7 +35,7 @@ def turbo_learning(
     split: str = "random",
     models: str | Sequence[str | FieldModel] = AUTO,
     estimators: Sequence[str | Estimator] | None = None,
-    extra: NonNegativeInt | None = None,
+    extra: Count | None = None,
     preset: Preset = "quick",
     repeats: PositiveInt = 1,
     seed: NonNegativeInt = 0,

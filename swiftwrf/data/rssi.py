@@ -104,7 +104,7 @@ class Rssi(PositionedData):
         names = tuple(default if receiver_names is None else receiver_names)
         if wrong := [x for x in names if not x.strip() or NO_NAME.search(x)]:
             raise InputError(
-                f"{name}: receiver_names must be texts without tabs or line breaks, none empty, got {wrong[0]!r}"
+                f"{name}: receiver_names must be a list of texts, none empty or with tabs or line breaks, got {wrong[0]!r}"
             )
         if len(names) != count or len(set(names)) < count:
             raise InputError(

@@ -246,11 +246,7 @@ class Spectra(PositionedData):
 
 
 def to_magnitudes(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:
-    """Return spectra of this shape as float32 in [0, 1], or as the bytes that they are.
-
-    Raises:
-        InputError: As `to_tensor`, or a magnitude outside [0, 1].
-    """
+    """Return spectra as float32, or as the bytes that they are; refuse magnitudes outside [0, 1] and other shapes."""
     is_bytes = getattr(value, "dtype", None) in (torch.uint8, "uint8")
     found = to_tensor(name, value, torch.uint8 if is_bytes else torch.float32, shape)
     low, high = (0.0, 1.0) if is_bytes or not found.numel() else map(float, found.aminmax())
@@ -260,11 +256,7 @@ def to_magnitudes(name: str, value: Any, shape: tuple[int | None, ...]) -> Tenso
 
 
 def to_directions(name: str, value: Any, n: int | None = None, missing: bool = False) -> Tensor:
-    """Return azimuth and elevation [rad] of n spectra, or of any number, as float64 (n, 2); nan only if `missing`.
-
-    Raises:
-        InputError: As `to_tensor`, or an angle beyond the range of directions, e.g. in degrees.
-    """
+    """Return azimuth and elevation [rad] of n spectra as float64 (n, 2); refuse other numbers, e.g. degrees."""
     found = to_tensor(name, value, torch.float64, (n, 2), missing)
     if bool((bad := (found.abs() > MAX_LABEL).any(dim=1)).any()):
         raise InputError(

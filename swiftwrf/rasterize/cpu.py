@@ -246,18 +246,12 @@ def render_backward(grad, mean, cholesky, weight, origin, step, shape, reach2, b
             d_weight[b, i, 1] = d_im
 
 
-@cache
-def _first_process() -> int:
-    return os.getpid()
+_first_process = cache(os.getpid)
 
 
 def _threads() -> int:
-    """Give numba as many threads as torch has, and return their number. Numba starts its threads at the first call.
-
-    Raises:
-        InputError: This process was forked from one that has used the backend, whose threads it lacks.
-    """
-    if _first_process() != os.getpid():
+    """Give numba as many threads as torch has, and return their number. Numba starts its threads at the first call."""
+    if _first_process() != os.getpid():  # which lacks these threads, and OpenMP would end it
         raise InputError(
             "the compiled rasterizer does not work in a process forked from one that used it; start processes by spawn: "
             'ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"))'

@@ -35,10 +35,8 @@ def refusing_executor(executor: Executor | None) -> Iterator[None]:
     try:
         yield
     except (AttributeError, PicklingError, RuntimeError, TypeError) as error:
-        is_lost = isinstance(error, BrokenExecutor) or re.search("pickle|after (?:interpreter )?shutdown", str(error))
-        if (
-            executor is None or hasattr(executor, "slots") or not is_lost
-        ):  # workers of a command have their own sentences
+        is_of_user = executor is not None and not hasattr(executor, "slots")  # workers of a command have own sentences
+        if not is_of_user or not (isinstance(error, BrokenExecutor) or re.search("pickle|shutdown", str(error))):
             raise
         remedy = "give an open one, models and estimators of classes that a module defines, or leave it out"
         raise InputError(f"the executor does not compute the steps ({error}); {remedy}") from None
