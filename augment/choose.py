@@ -164,7 +164,7 @@ def choose_model(
                     structure, searching = _structure(unfitted, measured.subset(without(fold, *blind)), fitted, device)
                     spent += searching
                 for number in blind:
-                    train, test = held_out(measured, fold, number)
+                    train, test = held_out(measured, fold, (number,))
                     began = time.perf_counter()
                     model = copy(unfitted)
                     model.fit(train, like=structure, device=device)
@@ -184,10 +184,10 @@ def choose_model(
     return ModelChoice(best, psnr_db, seconds, found, left_out)
 
 
-def held_out(measured: Spectra, fold: Tensor, number: int) -> tuple[Spectra, Spectra]:
-    """Return the spectra outside of a fold, and at most 1000 of those in it: more do not change the choice."""
-    rows, *_ = subsample((fold == number).nonzero()[:, 0], rows=1000)
-    return measured.subset(without(fold, number)), measured.subset(rows)
+def held_out(measured: Spectra, fold: Tensor, numbers: tuple[int, ...], most: int = 1000) -> tuple[Spectra, Spectra]:
+    """Return the spectra outside of some folds, and at most `most` of those in them: more do not change the choice."""
+    rows, *_ = subsample(torch.isin(fold, torch.tensor(numbers)).nonzero()[:, 0], rows=most)
+    return measured.subset(without(fold, *numbers)), measured.subset(rows)
 
 
 def blind_folds(measured: Spectra, validation: Validation, seed: int) -> tuple[Tensor, tuple[tuple[int, ...], ...]]:

@@ -1,12 +1,16 @@
 """Cross-validation on the measured spectra: do synthetic spectra reduce the error, how many, and which estimator is best?
 
-Kernel regression stands in for the network, because it trains in a second. Withheld spectra and test spectra take no
-part. The number of synthetic positions is chosen by the errors, so the error at the chosen number is too optimistic. The
-interval is therefore that of the rule: for each fold, the number is chosen on the other folds.
+Withheld spectra and test spectra take no part. Kernel regression stands in for the network where the number of synthetic
+positions is chosen, because it trains in a second. The number is chosen by the errors, so the error at the chosen number is
+too optimistic. The interval is therefore that of the rule: for each fold, the number is chosen on the other folds.
+
+The estimator is chosen among all methods, the network included, whose trainings take long. Each is trained once without
+the spectra of two folds, and all are compared on these spectra.
 """
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
@@ -14,32 +18,26 @@ from typing import Any, cast
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from augment import Fold, Mixed, synthetic_positions
-from augment.estimators import Estimator, make_estimator
-from augment.estimators.base import estimated
+from augment.estimators import make_estimator
 from swiftwrf.data.splits import places
-from swiftwrf.gp import subsample
-from swiftwrf.locate import MatchedField, MatchedFieldConfig
 from swiftwrf.metrics import angle_errors, paired_change
 from swiftwrf.models.base import synthesized
 from swiftwrf.runtime.threads import parallel_map
 
 STAND_IN = "kernel_regression"  # estimator in place of the network where many or quick trainings are needed
 LOCATOR = "matched_field"  # estimator that locates the moving end by the room; it needs positions, array and fixed end
+BASELINE = "constant"  # estimator that a chosen one must not be behind
 N_SYNTHETIC_CANDIDATES = (300, 1000, 3000)
-MAX_LOCATED = 60  # held-out spectra of a fold that are located
-FOLD_LOCATOR = MatchedFieldConfig(n_calibration=40, max_cells=100_000, spacing=0.2)  # half the time of the defaults
 Errors = NDArray[np.float64]
 _PREDICTING = threading.Lock()  # folds are computed side by side, but parallel loops of numba take one caller at a time
 
 
-def cross_validate(
-    folds: Sequence[Fold], n_synthetic: int, seed: int
-) -> tuple[dict[str, Any], list[Errors], list[Errors]]:
-    """Return the change of the error on held-out measured spectra by synthetic spectra of one field model.
+def cross_validate(folds: Sequence[Fold], n_synthetic: int, seed: int) -> dict[str, Any]:
+    """Return the change of the error on held-out measured spectra by synthetic spectra of one field model, for metrics.json.
 
     Args:
         folds: Field model fitted without each fold in turn, at least two folds.
@@ -47,20 +45,16 @@ def cross_validate(
         seed: Seed of positions and stand-in.
 
     Returns:
-        metrics: Values for metrics.json. `gains` has the change by every number that was compared, `rule` that by the number
-            chosen on the other folds. Further positions are recommended if every number reduces the error; `helps` requires
-            that the interval of `rule` excludes zero, too.
-        measured_only: Angular errors [deg] on the held-out spectra of each fold, trained on measured spectra alone.
-        turbo: The same with synthetic spectra, their number chosen on the other folds. Empty without extra positions.
+        `gains` has the change by every number that was compared, `rule` that by the number chosen on the other folds.
+        Further positions are recommended if every number reduces the error; `helps` requires that the interval of `rule`
+        excludes zero, too.
     """
     numbers = sorted({*(n for n in N_SYNTHETIC_CANDIDATES if n < n_synthetic), *([n_synthetic] if n_synthetic else [])})
     every = range(len(folds))
 
     @cache
     def fold_errors(number: int) -> list[Errors]:
-        return parallel_map(
-            lambda fold: held_out_errors(fold, make_estimator(STAND_IN, seed=seed), number, seed), folds
-        )
+        return parallel_map(lambda fold: held_out_errors(fold, number, seed), folds)
 
     def errors(some: Iterable[int], number: int) -> Errors:
         return np.concatenate([fold_errors(number)[fold] for fold in some])
@@ -69,8 +63,7 @@ def cross_validate(
         """Return the number of positions with the least error on some folds."""
         return min(numbers, key=lambda number: float(np.median(errors(some, number))))
 
-    alone = fold_errors(0)
-    measured_only = np.concatenate(alone)
+    measured_only = errors(every, 0)
     place = places(torch.cat([fold.test.position for fold in folds]), 2)
     validation: dict[str, Any] = {
         "stand_in": STAND_IN,
@@ -84,24 +77,23 @@ def cross_validate(
         "helps": False,
     }
     if not numbers:
-        return validation, alone, []
+        return validation
     by_rule = [fold_errors(best([other for other in every if other != fold]))[fold] for fold in every]
     rule = validation["rule"] = paired_change(measured_only, np.concatenate(by_rule), place)
     # a gain at one number of positions alone is likely chance, because few spectra are held out
     if all(gain["change"] < 0 for gain in validation["gains"]):
         validation["recommended_n_synthetic"] = best(every)
         validation["helps"] = rule["high"] < 0
-    return validation, alone, by_rule
+    return validation
 
 
-def held_out_errors(fold: Fold, estimator: Estimator, n_synthetic: int = 0, seed: int = 0) -> Errors:
-    """Return the angular errors [deg] of an estimator, trained on the spectra of a fold, on the held-out spectra.
+def held_out_errors(fold: Fold, n_synthetic: int, seed: int) -> Errors:
+    """Return the angular errors [deg] of the stand-in, trained on the spectra of a fold, on the held-out spectra.
 
     Args:
         fold: Training and held-out spectra, and the field model of the synthetic spectra.
-        estimator: Estimator, which is trained here.
         n_synthetic: Number of synthetic spectra that are added to the measured ones.
-        seed: Seed of their positions.
+        seed: Seed of their positions and of the stand-in.
     """
     train = Mixed.measured(fold.train)
     if n_synthetic:
@@ -109,57 +101,44 @@ def held_out_errors(fold: Fold, estimator: Estimator, n_synthetic: int = 0, seed
         with _PREDICTING:
             spectra = synthesized(fold.model, positions.position)
         train = train.add(positions, spectra)
-    estimator.fit(train)
-    return _degrees(estimated(estimator, fold.test), fold.test.label)
+    return degrees(make_estimator(STAND_IN, seed=seed).fit(train).estimate(fold.test), fold.test.label)
 
 
-def located_errors(fold: Fold, seed: int) -> Errors:
-    """Return the angular errors [deg] of matched-field processing on held-out spectra of a fold.
+def choose_estimator(errors: Mapping[str, Errors], place: ArrayLike | None = None) -> dict[str, Any]:
+    """Return the method with the smallest error on held-out measured spectra, for metrics.json.
 
-    Args:
-        fold: Model with a room and its spectra. At most 60 of the held-out spectra are located.
-        seed: Seed of the locator.
-
-    Raises:
-        InputError: Spectra that do not suffice, or a model without a room.
-    """
-    test = fold.test.subset(_located_rows(len(fold.test)))
-    locator = MatchedField(FOLD_LOCATOR, seed=seed).fit(fold.train, room=fold.model)
-    return _degrees(locator.predict(test), test.label)
-
-
-def choose_estimator(
-    errors: Mapping[str, Sequence[Errors]], located: Mapping[int, Errors | None], locator: str = LOCATOR
-) -> dict[str, Any]:
-    """Return name and error of the estimator with the smallest median error on held-out measured spectra, for metrics.json.
-
-    Matched-field processing is compared on a fold of each of two searches, because its fits take seconds. It is a candidate
-    only if planes were found without the spectra of each of these folds. All estimators are then compared on the spectra
-    that it located.
+    The median decides. Among the methods whose median equals the smallest one up to chance (95 % interval of a paired
+    bootstrap) the mean decides, which contains the large errors. A method whose median is larger than that of the mean
+    direction is not chosen.
 
     Args:
-        errors: Angular errors [deg] on the held-out spectra of each fold, by name of the method.
-        located: `located_errors` by number of the fold. Empty without a field model that has a room.
-        locator: Name of matched-field processing among the methods.
+        errors: Angular errors (n,) [deg] on the same held-out spectra, by name of the method. nan, a spectrum without an
+            estimate, counts as 180 degrees.
+        place: Place of each spectrum, (n,). Defaults to one place each.
+
+    Returns:
+        `name` of the chosen method, median `held_out_deg` and mean `held_out_mean_deg` of each method, and the number
+        `n_held_out` of spectra.
+
+    Example:
+        >>> skewed = np.array([1.0] * 18 + [90.0] * 2)
+        >>> choice = choose_estimator({"skewed": skewed, "even": np.full(20, 3.0)})
+        >>> choice["name"], choice["held_out_deg"]
+        ('skewed', {'skewed': 1.0, 'even': 3.0})
     """
-    compared = {name: np.concatenate(parts) for name, parts in errors.items()}
-    found = {number: own for number, own in located.items() if own is not None}
-    if found and len(found) == len(located):
-        compared = {
-            name: np.concatenate([parts[number][_located_rows(len(parts[number])).numpy()] for number in found])
-            for name, parts in errors.items()
-        }
-        compared[locator] = np.concatenate(list(found.values()))
-    held_out = {name: float(np.median(values)) for name, values in compared.items()}
-    best = min(held_out, key=lambda name: held_out[name])
-    return {"name": best, "held_out_deg": held_out, "n_held_out": len(compared[best])}
+    compared = {name: np.nan_to_num(values, nan=180.0) for name, values in errors.items()}
+    median, mean = ({name: float(of(x)) for name, x in compared.items()} for of in (np.median, np.mean))
+    best = min(median, key=lambda name: median[name])
+
+    def is_equal(name: str) -> bool:
+        return name == best or paired_change(compared[best], compared[name], place)["low"] <= 0
+
+    usable = [name for name in compared if median[name] <= median.get(BASELINE, math.inf)]
+    chosen = next(name for name in sorted(usable, key=lambda name: mean[name]) if is_equal(name))
+    n = len(compared[chosen])
+    return {"name": chosen, "held_out_deg": median, "held_out_mean_deg": mean, "n_held_out": n}
 
 
-def _located_rows(n: int) -> Tensor:
-    """Return the numbers of those of n held-out spectra that are located."""
-    return subsample(torch.arange(n), rows=MAX_LOCATED)[0]
-
-
-def _degrees(estimate: Tensor, label: Tensor) -> Errors:
+def degrees(estimate: Tensor, label: Tensor) -> Errors:
     """Return the angular errors [deg] of directions (n, 2) [rad]."""
     return cast(Errors, angle_errors(estimate, label)["great_circle"].rad2deg().double().numpy())

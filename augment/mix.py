@@ -132,7 +132,7 @@ def withhold(train: Spectra, measured_fraction: float, seed: int) -> tuple[Spect
     if n < MIN_TRAINING:
         raise InputError(
             f"a measured fraction of {measured_fraction:g} leaves {n} of {len(train)} training spectra; "
-            f"at least {MIN_TRAINING} are needed, a fraction of {MIN_TRAINING / len(train):.2g}"
+            f"at least {MIN_TRAINING} are needed, a fraction of {MIN_TRAINING / max(len(train), 1):.2g}"
         )
     rows = random_rows(train.position, n, seed)
     others = train.subset(torch.ones(len(train), dtype=torch.bool).index_fill(0, rows, value=False))

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Ge, Le
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 from torch import Tensor
 
 from swiftwrf import InputError, Spectra
+from swiftwrf.data.splits import centres, places
 from swiftwrf.positions import nearest
+from swiftwrf.runtime.validation import checked
 
 NO_INDEX = -1  # index of a position that is not in the data set
 MIN_RELATIVE_EXTENT = (
     1e-3  # extent of the region along an axis, relative to the largest, below which the axis is dropped
 )
-MAX_SYNTHETIC_BYTES = 2**32  # of the spectra at synthetic positions, a byte a pixel
+Count = Annotated[int, Ge(0), Le(10**6)]  # of positions, whose spectra are in memory
 MIN_HULL_FRACTION = 1e-3  # smallest fraction of the convex hull that the region covers
 
 
@@ -46,7 +49,8 @@ class SyntheticPositions:
         return len(self.position)
 
 
-def synthetic_positions(measured: Spectra, n: int, seed: int) -> SyntheticPositions:
+@checked
+def synthetic_positions(measured: Spectra, n: Count, seed: int) -> SyntheticPositions:
     """Return random positions in the region of the measured ones, with directions from the known geometry.
 
     Args:
@@ -55,28 +59,15 @@ def synthetic_positions(measured: Spectra, n: int, seed: int) -> SyntheticPositi
         seed: Seed of the positions.
 
     Raises:
-        InputError: The fixed end or the orientation of the array is unknown, or spectra of all positions exceed 4 GiB.
+        InputError: The fixed end or the orientation of the array is unknown, or more than a million positions.
 
     Example:
         >>> import swiftwrf
         >>> synthetic_positions(swiftwrf.simulated_room(n=20), 5, seed=0).label.shape
         torch.Size([5, 2])
     """
-    check_synthetic(measured, n)
     position = sample_positions(measured.position, n, seed)
     return SyntheticPositions(position, measured.direction_at(position), torch.full((n,), NO_INDEX))
-
-
-def check_synthetic(measured: Spectra, n: int) -> None:
-    """Refuse n synthetic positions whose directions are unknown or whose spectra exceed the memory.
-
-    Raises:
-        InputError: As `synthetic_positions`.
-    """
-    measured.direction_at(measured.position[:1])
-    most = MAX_SYNTHETIC_BYTES // math.prod(measured.grid.shape)
-    if n > most:
-        raise InputError(f"spectra at {n} synthetic positions do not fit into memory; give at most {most}")
 
 
 def sample_positions(known: Tensor, n: int, seed: int) -> Tensor:
@@ -99,14 +90,16 @@ def sample_positions(known: Tensor, n: int, seed: int) -> Tensor:
         >>> sample_positions(corners, 100, seed=0)[:, 2].unique()
         tensor([1.], dtype=torch.float64)
     """
+    if not len(known):
+        raise InputError("synthetic positions need the region of known ones, and there is none")
     generator = np.random.default_rng(seed)
     centre = known.mean(dim=0)
     _, extent, axes = torch.linalg.svd(known - centre, full_matrices=False)
     axes = axes[extent > MIN_RELATIVE_EXTENT * extent[0].clamp_min(1e-12)]
     projected = ((known - centre) @ axes.T).numpy()
-    places = known.unique(dim=0)
+    spots = centres(known, places(known))
     # each is its own nearest, and the next may be the step along a path
-    distance, _ = nearest(places, places, min(9, len(places)))
+    distance, _ = nearest(spots, spots, min(9, len(spots)))
     spacing = float(distance[:, -1].quantile(0.95))
     samples, tried = torch.empty(0, 3, dtype=torch.float64), 0
     while len(samples) < n:

@@ -23,6 +23,7 @@ from scipy.stats import norm
 
 import swiftwrf
 from swiftwrf.plotting import hatch, mark_direction, polar_spectrum
+from swiftwrf.positions import inside
 from swiftwrf.rssi.maps import RssiMap
 from tasks.page.figures import as_svg
 
@@ -200,7 +201,7 @@ def _image(
 ) -> AxesImage:
     """Draw a map, hatched outside of the measured positions."""
     image = axes.imshow(values, origin="lower", extent=chart.corners, **style)
-    hatch(axes, chart.x, chart.y, known)
+    hatch(axes, chart.x, chart.y, ~inside(np.stack(np.meshgrid(chart.x, chart.y), axis=-1), known))
     axes.figure.colorbar(image, ax=axes, label=label)
     axes.set(xlabel="x [m]", ylabel="y [m]")
     return image

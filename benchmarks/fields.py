@@ -36,6 +36,7 @@ from swiftwrf import load_spectra as read
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.choices import Moving
 from swiftwrf.data.raytraced import ROOMS
+from swiftwrf.data.splits import places
 from swiftwrf.gp import subsample
 from swiftwrf.metrics import covered, l1, psnr, ssim, summary
 from swiftwrf.models import FIELD_MODELS
@@ -214,7 +215,8 @@ def measure(part: Part, fit: Fit, state: Path) -> Row:
     row |= numbers
     if "covered_by_80" in scores:
         row["covered_by_80"] = float(scores.pop("covered_by_80").mean())
-    row |= {name: summary(score) for name, score in scores.items()}
+    place = places(test.position, 2)
+    row |= {name: summary(score, place) for name, score in scores.items()}
     return row | {"provenance": provenance(torch.device(fit.device))}
 
 

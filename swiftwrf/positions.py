@@ -44,7 +44,8 @@ def to_tensor(
             tensor = value.detach().cpu().to_dense()
         else:
             array = np.asarray(value)
-            is_wide = array.dtype.kind == "u" and array.itemsize > 1  # torch does not compute with these
+            # torch does not compute with these
+            is_wide = (array.dtype.kind == "u" and array.itemsize > 1) or array.dtype == np.longdouble
             tensor = torch.from_numpy(array.astype(np.float64 if is_wide else array.dtype.newbyteorder("=")))
     except (TypeError, ValueError, RuntimeError):
         raise InputError(f"{name} must be numbers of equal rows, got {type(value).__name__}") from None

@@ -174,9 +174,11 @@ def _located(
 ) -> Columns:
     """Return the columns of a table with the positions of observations, batch by batch."""
     parts = (
-        (each.median, each.std, each.credible_radius(0.8), each.ambiguous, each.floor_probability.amax(dim=1))
+        (each.median, each.std, each.credible_radius(), each.ambiguous, each.floor_probability.amax(dim=1))
         for each in posteriors
     )
+    if not len(index):
+        raise InputError("there is no row to locate")
     position, std, radius, ambiguous, probability = (torch.cat(values) for values in zip(*parts, strict=True))
     columns: Columns = {"index": index}
     columns |= dict(zip(("x_m", "y_m", "z_m"), position.T, strict=True))

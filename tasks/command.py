@@ -10,6 +10,7 @@ import gc
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -78,6 +79,11 @@ def run_command(name: str, options: Sequence[str], program: str) -> int:
         # threads that share a loop wait busily for milliseconds by default, which makes the steps of a network up to eight
         # times slower if other work uses the same cores; libgomp reads the variable when torch is loaded
         os.environ.setdefault("GOMP_SPINCOUNT", "30000")
+    os.environ["MPLBACKEND"] = "agg"  # figures go into files, whatever a session has set for its windows
+    if sys.stdout is None:  # closed by the caller, e.g. a timer
+        sys.stdout = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
+    with suppress(AttributeError):  # of a stream of a notebook
+        sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     gc.disable()  # loading libraries leaves no garbage, and to look for it takes a fifth of the time
     try:
         from tasks.command_line import command_line

@@ -56,6 +56,8 @@ def command_line(
         return _report(f"cannot read or write {file} ({reason}); choose another path", 2)
     except MemoryError as error:
         return _report(f"not enough memory ({error}); use less data or a smaller model", 2)
+    except ImportError as error:
+        return _report(f"a library cannot be loaded ({error}); install it again, or allow more memory", 2)
     except KeyboardInterrupt:
         return 130
     return 0

@@ -71,7 +71,8 @@ class Claim:
                 folder.mkdir()
                 self.made = True
             except FileExistsError:
-                self._refuse_begun()
+                if not (folder / LOCK).is_file():  # of another process, which may be at work
+                    self._refuse_begun()
         self._lock = FileLock(folder / LOCK, thread_local=False)
         try:
             self._lock.acquire(timeout=0)

@@ -89,8 +89,8 @@ def rounded(rows: Iterable[Row]) -> list[Row]:
     Metres have 3 decimals, dB and dBm 2, degrees 4, latitudes and longitudes 8. Magnitudes have 4 significant digits.
 
     Example:
-        >>> rounded([{"rssi_dbm": -200 / 3, "x_m": 1 / 3, "magnitude": 2 / 3000}])
-        [{'rssi_dbm': -66.67, 'x_m': 0.333, 'magnitude': 0.0006667}]
+        >>> rounded([{"rssi_dbm": -200 / 3, "x_m": 1 / 3, "magnitude": 2 / 3000, "latitude_deg": 1 / 3}])
+        [{'rssi_dbm': -66.67, 'x_m': 0.333, 'magnitude': 0.0006667, 'latitude_deg': 0.33333333}]
     """
     return [{name: _rounded(name, value) for name, value in row.items()} for row in rows]
 

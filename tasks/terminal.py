@@ -193,9 +193,9 @@ class Terminal:
             self._progress.update(self._progress.task_ids[0], description=title, completed=done, total=total)
 
     def answer(self, found: Answer, page: Path) -> None:
-        """Print the answer of a run: a short table, next steps, the conclusion, and the place of the report."""
+        """Print the answer of a run: the conclusion, a short table, next steps, and the place of the report."""
         steps = [f"{step.text}: {step.code}" if step.code else step.text for step in found.next_steps]
-        self._print(found.values(), page, _table(found), "", *steps, "", *found.conclusion)
+        self._print(found.values(), page, *found.conclusion, "", _table(found), "", *steps)
 
     def page(self, values: Mapping[str, Any], text: str, page: Path | None = None) -> None:
         """Print the text of a command, or its values with `--json`, and the place of its page. Both may be missing."""
@@ -204,7 +204,7 @@ class Terminal:
     def _print(self, values: Mapping[str, Any], page: Path | None, *parts: str | Table) -> None:
         if self._output.json:
             report = {"report": str(page)} if page else {}
-            print(json.dumps(strict({**values, **report}), allow_nan=False, ensure_ascii=False))
+            print(json.dumps(strict({**values, **report}), allow_nan=False))
         else:
             width = None if sys.stdout.isatty() else PLAIN_WIDTH
             out = Console(file=sys.stdout, highlight=False, soft_wrap=True, width=width)
@@ -220,7 +220,7 @@ def _table(found: Answer) -> Table:
     """Return the short table of an answer, in two blocks."""
     table = Table(box=None, pad_edge=False, header_style="bold")
     unit = found.unit
-    table.add_column("what you can use")
+    table.add_column("what you can use (* recommended)")
     for name in (f"median [{unit}]", "95 % interval", f"90 % below [{unit}]"):
         table.add_column(name, justify="right")
     for number, block in enumerate(found.short()):

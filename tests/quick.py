@@ -24,7 +24,6 @@ from small import (
     with_defaults,
 )
 
-from augment import cross_validation
 from augment.estimators import ESTIMATORS, kernel_regression
 from augment.estimators.baselines import Constant
 from augment.turbo.condition import NETWORKS
@@ -100,7 +99,7 @@ def cheap() -> Iterator[None]:
         glances(),
         small_swiftwrf(),
         mock.patch.object(MatchedField, "config_type", with_defaults(FEW_CELLS)),
-        mock.patch.object(cross_validation, "FOLD_LOCATOR", FEW_CELLS),
+        mock.patch("augment.turbo.stages.HELD_OUT_LOCATOR", FEW_CELLS),
         mock.patch.multiple(kernel_regression, MAX_ROWS=400, MAX_CHOICE_ROWS=150),
         few_folds(),
         few_kernels(),

@@ -11,7 +11,7 @@ from fuzz import kinds
 from fuzz.misuse import fitted, locator, planes, rssi, rssi_model, spectra
 from hard_cases import GRID, HARD_CASES, random_scene
 
-from augment import choose_model, mix, turbo_learning, withhold
+from augment import choose_model, mix, synthetic_positions, turbo_learning, withhold
 from augment.estimators import make_estimator
 from augment.suggest import suggest, suggest_positions
 from swiftwrf import (
@@ -29,6 +29,7 @@ from swiftwrf import (
     SwiftWRF,
     fit,
     fit_rssi,
+    inspect,
     load,
     load_snapshots,
     load_spectra,
@@ -54,11 +55,12 @@ from swiftwrf.online import Follower, prequential
 from swiftwrf.rssi import RssiPaperModel, compare, estimate_floor_attenuation, estimate_offsets
 from swiftwrf.rssi.comparison import compared, make_predictor
 from swiftwrf.rssi.maps import RssiMap
+from swiftwrf.runtime.registry import write_report
 
 ROOM = simulated_room(n=24, grid=AngularGrid.hemisphere(9, 36))
 NAN_POSITION = ROOM.position.where(torch.arange(24)[:, None] != 3, torch.nan)
 FACING_X = ArrayPose((0.1, 2.4, 1.2), (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)))
-FOUR = PlanarArray.square(2, 1e9)
+FOUR, POINT = PlanarArray.square(2, 1e9), PlanarArray([[0.0, 0.0]], 0.1)
 NAN, INF = math.nan, math.inf
 WAVE = torch.ones(2, 5, 4, dtype=torch.complex128)  # (positions, snapshots, elements)
 WIDE = PlanarArray.grid(2, 2, spacing=0.1, frequency_hz=2.4e9)
@@ -96,6 +98,7 @@ DATA = [
     ("position must be finite; row 3", of_spectra(position=NAN_POSITION)),
     (r"position must have shape \(n, 3\)", of_spectra(position=ROOM.position[:, :2])),
     ("position must be numbers", of_spectra(position=[["a", "b", "c"]] * 24)),
+    (r"none empty or with tabs or line breaks, got 'a\\tb'$", of_rssi([[0.0, 0.0]], receiver_names=["b", "a\tb"])),
     ("label has 7 rows", of_room(label=ROOM.label[:7])),
     ("label must have shape", of_spectra(label=ROOM.label[:, 0])),
     ("line_of_sight has 3 rows", of_room(line_of_sight=torch.ones(3))),
@@ -400,8 +403,32 @@ AUGMENTATION = [
 ]
 
 
+NONE = torch.arange(0)
+EMPTY = [
+    (
+        "holds no measurement to inspect",
+        lambda: inspect(of_snapshots(torch.ones(5, 4).cfloat(), pose=FACING_X)().subset(NONE)),
+    ),
+    ("holds no measurement to inspect", lambda: inspect(ROOM.subset(NONE))),
+    ("holds no measurement to inspect", lambda: inspect(ROWS.subset(NONE))),
+    ("holds no measurement to inspect", lambda: inspect(replace(ROWS, rssi_dbm=ROWS.rssi_dbm * NAN))),
+    ("all 1 elements of the array are at one place", lambda: POINT.spectrum(WAVE[..., :1], GRID)),
+    ("all 4 elements of the array are at one place", lambda: PlanarArray(torch.ones(4, 2), 0.1).spectrum(WAVE, GRID)),
+    ("no row to locate", lambda: kinds.fitted("matched-field locator").locate(torch.zeros(0, 8, 32))),
+    ("no row to locate", lambda: predict(kinds.fitted("matched-field locator"), kinds._room().subset(NONE))),
+    ("no receiver detected", lambda: predict(locator(), rssi().subset(NONE))),
+    ("leaves 0 of 0", lambda: withhold(ROOM.subset(NONE), 0.5, 0)),
+    ("need the region of known ones", lambda: synthetic_positions(ROOM.subset(NONE), 3, 0)),
+    ("number must be .* below 24, got 24", lambda: fitted("gp").predict(ROOM.position).plot(24)),
+    ("number must be .* below 3, got 'a'", lambda: rssi_model().predict(rssi().transmitter_position).plot("a")),
+    ("row must be .* below 24, got 99", lambda: ROOM.plot(99)),
+    ("row must be .* below 0, got 0", lambda: ROOM.subset(NONE).plot()),
+    ("file must be a text or an instance of Path, got None", lambda: write_report("aoa", None, None)),
+]
+
+
 @pytest.mark.parametrize(
-    ("words", "call"), [*DATA, *ARRAYS, *PRIMITIVES, *MODELS, *PREDICTORS, *LOCATORS, *AUGMENTATION]
+    ("words", "call"), [*DATA, *ARRAYS, *PRIMITIVES, *MODELS, *PREDICTORS, *LOCATORS, *AUGMENTATION, *EMPTY]
 )
 def test_a_call_without_an_answer_is_refused(words, call):
     with pytest.raises(InputError, match=words):

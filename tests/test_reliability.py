@@ -193,7 +193,12 @@ def test_one_process_at_a_time(stopped, tmp_path, capsys):
     new = Claim(tmp_path / "new.partial", new=True)
     with pytest.raises(InputError, match="another process"):
         Claim(tmp_path / "new.partial", new=True)
+    (tmp_path / "new.partial" / "config.json").write_text("{}")  # a run that has begun, too
+    with pytest.raises(InputError, match="another process is at work"):
+        Claim(tmp_path / "new.partial", new=True)
     new.release()
+    with pytest.raises(InputError, match="go on with swiftwrf resume"):
+        Claim(tmp_path / "new.partial", new=True)
 
 
 def test_report_leaves_the_interrupted_work_of_others(finished, tmp_path):

@@ -87,7 +87,8 @@ class Estimator(Configured, ABC):
     def estimate(self, data: Spectra) -> Tensor:
         """Return azimuth and elevation (n, 2) [rad] of measurements."""
         name, batches = f"directions of {type(self).__name__}", data.store.batches()
-        return torch.cat([to_directions(name, self.predict(part), len(part)) for part in batches])
+        found = [to_directions(name, self.predict(part), len(part)) for part in batches]
+        return torch.cat(found) if found else torch.empty(0, 2, dtype=torch.float64)
 
     @classmethod
     def lacking(cls, data: Spectra) -> str:
@@ -96,11 +97,7 @@ class Estimator(Configured, ABC):
 
 
 def estimated(estimator: Estimator, data: Spectra) -> Tensor:
-    """Return the directions of measurements by an estimator of any class, float64 (n, 2) [rad].
-
-    Raises:
-        InputError: As `Estimator.estimate`, or values that are no directions of these measurements.
-    """
+    """Return the directions of measurements by an estimator of any class, checked, float64 (n, 2) [rad]."""
     return to_directions(f"directions of {type(estimator).__name__}", estimator.estimate(data), len(data))
 
 

@@ -6,9 +6,11 @@ import torch
 from torch import Tensor
 
 from augment import Mixed
-from augment.estimators.base import ESTIMATORS, Estimator
+from augment.estimators.base import ESTIMATORS, Estimator, SavedEstimator
 from swiftwrf.array.angles import to_angles, to_direction
 from swiftwrf.array.planar import folded_angles
+from swiftwrf.data.store import Store
+from swiftwrf.runtime.checkpoint import Header, expect
 
 SHORTLIST = 8  # candidates found by inner products, whose differences are then computed
 
@@ -55,7 +57,7 @@ class Constant(Estimator):
 
 
 @ESTIMATORS.register("nearest_spectrum")
-class NearestSpectrum(Estimator):
+class NearestSpectrum(SavedEstimator):
     """The label of the training spectrum with the least squared difference, hard to beat on a dense path.
 
     Inner products find candidates fast, but lose the digits in which similar spectra differ. Among the candidates, the
@@ -68,6 +70,8 @@ class NearestSpectrum(Estimator):
         >>> torch.equal(predicted, room.label)
         True
     """
+
+    kind = "nearest spectrum"
 
     def _fit(self, train: Mixed, device: torch.device) -> None:
         self._train = train
@@ -85,3 +89,11 @@ class NearestSpectrum(Estimator):
                 least, label[nearer] = torch.minimum(distance, least), self._train.label[start + number[nearer]]
             start += len(batch)
         return label
+
+    def _state(self) -> tuple[dict[str, Tensor], Header]:
+        return {"spectrum": self._train.spectrum.half(), "label": self._train.label}, {}
+
+    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
+        expect(tensors, {"spectrum": (n := len(tensors["label"]), *self.grid.shape), "label": (n, 2)})
+        index, synthetic = torch.full((n,), -1), torch.zeros(n, dtype=torch.bool)
+        self._train = Mixed((Store(tensors["spectrum"].float()),), tensors["label"], index, synthetic, self.grid)

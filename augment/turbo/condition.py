@@ -5,12 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from augment.cross_validation import LOCATOR, STAND_IN
 from augment.estimators import ESTIMATORS
-from augment.turbo.artifacts import model_file
 from swiftwrf.choices import AUTO, fraction_key
 from swiftwrf.runtime.validation import Preset
 
@@ -20,7 +18,7 @@ NETWORK = "network"  # name of a run's network in its results
 NETWORKS: dict[Preset, str] = {"quick": "aann_kernel", "paper": "aann"}  # which one it is
 MEASURED_NETWORK, FULL_NETWORK = f"{NETWORK}, measured", f"{NETWORK}, all measured"  # lower and upper reference
 LOCATED = f"{LOCATOR}, measured"
-MEASURED_STAND_IN = f"{STAND_IN}-measured"  # file of it without synthetic spectra
+CHOSEN = "chosen"  # file of the chosen estimator if it is not among those that every run keeps
 Value = TypeVar("Value")
 
 
@@ -30,9 +28,10 @@ class MeasuredSubset:
 
     measured_fraction: float
     repeat: int = 0
+    without: tuple[int, ...] = ()  # folds that are held out
 
     def __str__(self) -> str:
-        return f"mix{self.key}-r{self.repeat}"
+        return "_".join((f"mix{self.key}-r{self.repeat}", *map(str, self.without)))
 
     @property
     def key(self) -> str:
@@ -115,15 +114,6 @@ DESCRIPTION = ("estimator", "training", "synthesizer", "n_synthetic")
 def conditions_of(methods: Mapping[str, Mapping[str, Any]]) -> dict[str, Condition]:
     """Return the condition of each method of metrics.json."""
     return {method: Condition(**{name: entry[name] for name in DESCRIPTION}) for method, entry in methods.items()}
-
-
-def chosen_file(folder: Path, measured_fraction: str, condition: Condition | None) -> Path | None:
-    """Return the file of the condition that cross-validation chose, in the directory of a run, or None if there is none."""
-    if condition is None:
-        return None
-    alone = condition.estimator == STAND_IN and condition.training == "measured"
-    file = model_file(folder, MEASURED_STAND_IN if alone else condition.name, measured_fraction)
-    return file if file.is_file() else None
 
 
 def headline(conditions: Iterable[Condition]) -> Condition:

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy, deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from augment.choose import blind_folds, candidates
+from augment.choose import blind_folds, candidates, held_out
 from augment.cross_validation import LOCATOR, STAND_IN
 from augment.estimators import ESTIMATORS, Estimator, make_estimator
 from augment.mix import Mixed, withhold
-from augment.positions import SyntheticPositions, check_synthetic
+from augment.positions import SyntheticPositions
 from augment.turbo.condition import NETWORKS, MeasuredSubset, Row, Training
 from swiftwrf.choices import AUTO
 from swiftwrf.data import Spectra
 from swiftwrf.errors import InputError
+from swiftwrf.locate.matched_field import MIN_SPECTRA
 from swiftwrf.metrics import WINDOW
 from swiftwrf.models import FIELD_MODELS, FieldModel
 from swiftwrf.models.base import model_type
@@ -26,6 +27,7 @@ from swiftwrf.runtime.validation import Preset
 
 ROOM_MODEL = "geometry"  # field model that finds the room for all models with one
 DEFAULT_EXTRA = 3000  # extra synthetic positions where cross-validation recommends some
+MIN_HELD_OUT, MAX_HELD_OUT = 20, 120  # spectra that all methods are compared on at once; more take longer to locate
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +78,7 @@ class Experiment:
                 if names.count(name) > 1:
                     raise InputError(f"two {things} have the name {name!r}; leave one out, or give it another name")
         if self.extra:
-            check_synthetic(data, self.extra)
+            data.direction_at(data.position[:1])  # refuses unknown geometry
         for fraction in self.fractions:
             withhold(self.train, fraction, self.seed)
 
@@ -114,12 +116,26 @@ class Experiment:
         return [MeasuredSubset(fraction, repeat) for repeat in range(self.repeats) for fraction in self.fractions]
 
     def withhold(self, subset: MeasuredSubset) -> tuple[Spectra, SyntheticPositions]:
-        """Return the measured spectra, and the positions of the others."""
-        return withhold(self.train, subset.measured_fraction, self.seed + subset.repeat)
+        """Return the measured spectra, less those that are held out, and the positions that are not measured."""
+        measured, withheld = withhold(self.train, subset.measured_fraction, self.seed + subset.repeat)
+        return self.held_out(subset)[0] if subset.without else measured, withheld
 
     def blind_folds(self, subset: MeasuredSubset) -> tuple[Tensor, tuple[tuple[int, ...], ...]]:
         """Return the fold of each measured spectrum, and the folds that each search for a room leaves out."""
-        return blind_folds(self.withhold(subset)[0], "random", self.seed + subset.repeat)
+        return blind_folds(self.withhold(replace(subset, without=()))[0], "random", self.seed + subset.repeat)
+
+    def held_out(self, subset: MeasuredSubset) -> tuple[Spectra, Spectra]:
+        """Return the measured spectra less those that the subset holds out, and at most 120 of the latter."""
+        whole = replace(subset, without=())
+        return held_out(self.withhold(whole)[0], self.blind_folds(whole)[0], subset.without, MAX_HELD_OUT)
+
+    def parts(self, subset: MeasuredSubset) -> list[MeasuredSubset]:
+        """Return the subset less spectra that methods are compared on, once or twice; no part if too few are measured."""
+        blind = self.blind_folds(subset)[1][:2]
+        parts = [replace(subset, without=folds) for folds in blind]
+        if not parts or len(self.withhold(parts[0])[0]) < MIN_SPECTRA:  # of the locator
+            return [replace(subset, without=folds[:1]) for folds in blind]
+        return parts[:1] if len(self.held_out(parts[0])[1]) >= MIN_HELD_OUT else parts
 
     def trainings(self, validation: Row | None) -> list[tuple[Training, int]]:
         """Return the training sets with spectra of a field model, and their numbers of extra synthetic positions."""

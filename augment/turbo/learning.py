@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,11 +14,12 @@ import torch
 
 from augment.choose import candidates
 from augment.cross_validation import LOCATOR, STAND_IN
-from augment.estimators import Estimator
-from augment.turbo.condition import LOCATED, MEASURED_STAND_IN, NETWORKS, Condition, MeasuredSubset, Training
+from augment.estimators import Estimator, SavedEstimator
+from augment.positions import Count
+from augment.turbo.condition import CHOSEN, LOCATED, NETWORKS, Condition, MeasuredSubset, Training
 from augment.turbo.experiment import ROOM_MODEL, Experiment
 from augment.turbo.results import TurboResult
-from augment.turbo.stages import compare, evaluate, find_room, locate, locate_held_out, room_name, synthesize
+from augment.turbo.stages import compare, evaluate, find_room, hold_out, locate, synthesize
 from swiftwrf.choices import AUTO
 from swiftwrf.data import Spectra
 from swiftwrf.models import FieldModel
@@ -33,7 +35,7 @@ def turbo_learning(
     split: str = "random",
     models: str | Sequence[str | FieldModel] = AUTO,
     estimators: Sequence[str | Estimator] | None = None,
-    extra: NonNegativeInt | None = None,
+    extra: Count | None = None,
     preset: Preset = "quick",
     repeats: PositiveInt = 1,
     seed: NonNegativeInt = 0,
@@ -100,6 +102,13 @@ def learn(experiment: Experiment, keep: Memo, executor: Executor | None = None) 
     subsets = [_learn(experiment, one, steps, results[one.measured_fraction]) for one in experiment.subsets]
     for _ in zip_longest(*subsets):
         pass
+    for result in results.values():
+        if result.chosen is None or (condition := result.chosen[0]).method in result.files:
+            continue
+        if isinstance(experiment.make_estimator(condition.estimator, 0), SavedEstimator):
+            title = f"{condition.method}, which is recommended"
+            steps[steps.start(f"chosen-{condition.result_name}", title, evaluate, condition, CHOSEN)]
+            result.files[condition.method] = CHOSEN
     return list(results.values())
 
 
@@ -112,45 +121,59 @@ def _learn(
         estimator: str, training: Training = "measured", extra: int = 0, synthesizer: str = "", *, saved: bool = False
     ) -> Condition:
         condition = Condition(estimator, training, synthesizer, extra, subset.measured_fraction, subset.repeat)
-        name = condition.name if condition.is_turbo else MEASURED_STAND_IN
-        saved_as = name if saved and subset.repeat == 0 else None
+        saved_as = None
+        if saved and subset.repeat == 0:
+            saved_as = condition.name if condition.is_turbo else f"{condition.name}-measured"
+            result.files[condition.method] = saved_as
         # trainings on synthetic spectra begin last and take longest
         steps.start(condition.result_name, condition.method, evaluate, condition, saved_as, first=condition.is_turbo)
         return condition
+
+    def hold(conditions: list[Condition], with_room: bool = False) -> None:
+        if parts:
+            rooms = [steps[room_of(part)] for part in parts if with_room]
+            # the training of the paper's network takes too long to be repeated
+            repeated = [one for one in conditions if not (one.is_network and experiment.preset == "paper")]
+            name, title = f"held_out_{conditions[0].result_name}", f"held-out spectra, {conditions[0].training_set}"
+            first = conditions[0].is_turbo
+            held_out.append(steps.start(name, title, hold_out, subset, repeated, rooms, first=first))
 
     # from the measured spectra alone: the room is found, with and without held-out folds, and references are trained
     fast = [name for name in experiment.named if not experiment.model_type(name).slow]
     is_compared = bool(fast or not experiment.named)
     searches = ROOM_MODEL in experiment.candidates
     compared_models = [*experiment.candidates, *(fast or candidates(experiment.train))]
-    blind: tuple[tuple[int, ...], ...] = ()
+    parts = experiment.parts(subset) if subset.repeat == 0 else []
+    blind = parts if searches else []
     if is_compared and any(map(experiment.finds_room, compared_models)):
-        _, blind = experiment.blind_folds(subset)
+        blind = [replace(subset, without=some) for some in experiment.blind_folds(subset)[1]]
 
-    def find(*some: int) -> str:
-        return steps.start(room_name(subset, some), "finding the room", find_room, subset, some, first=True)
+    def find(some: MeasuredSubset = subset) -> str:
+        return steps.start(f"room-{some}", "finding the room", find_room, some, first=True)
 
-    for some in blind:
-        find(*some)
+    def room_of(part: MeasuredSubset) -> str:
+        return find(next(some for some in blind if set(part.without) <= set(some.without)))
+
+    for part in blind:
+        find(part)
     if searches:
         find()
     conditions = [
         train(name, saved=name == STAND_IN) for name in experiment.evaluated if name not in experiment.lacking
     ]
     full = [train(name, "all measured") for name in experiment.trainable]
+    held_out: list[str] = []
+    hold(conditions)
 
     yield
     # field models are compared; held-out spectra and test spectra are located by the room
-    choice, held_out = f"choice-{subset}", {}
+    choice = f"choice-{subset}"
     if is_compared:
-        found = [steps[find(*some)] for some in blind]
+        found = [steps[find(part)] for part in blind]
         steps.start(choice, "comparing field models", compare, subset, fast, found, first=True)
-        if searches and subset.repeat == 0:
-            title = "locating held-out spectra"
-            for (number, *_), without in list(zip(blind, found, strict=True))[:2]:
-                name = f"held_out_{number}-{subset}"
-                held_out[number] = steps.start(name, title, locate_held_out, subset, number, without)
     located = Condition(LOCATOR, "measured", "", 0, subset.measured_fraction, subset.repeat)
+    if searches and all(steps[room_of(part)].get("planes") for part in parts):
+        hold([located], with_room=True)
     if searches and steps[find()].get("planes"):
         steps.start(located.result_name, LOCATED, locate, subset, steps[find()])
 
@@ -170,15 +193,20 @@ def _learn(
 
     yield
     # estimators are trained on measured and synthetic spectra
+    kept = (*NETWORKS.values(), STAND_IN)
     for name in names:
         steps[f"synthesis_{name}-{subset}"]
+        turbo: list[Condition] = []
         for training, extra in trainings[name]:
             is_last = (training, extra) == trainings[name][-1]
-            conditions += [
-                train(one, training, extra, name, saved=is_last and experiment.is_first(name))
+            turbo += [
+                train(one, training, extra, name, saved=is_last and experiment.is_first(name) and one in kept)
                 for one in experiment.trainable
                 if is_last or one not in NETWORKS.values()  # whose training takes most of the time
             ]
+        conditions += turbo
+        if not experiment.model_type(name).slow:
+            hold(turbo, experiment.finds_room(name))
 
     yield
     for name in models:
@@ -192,4 +220,6 @@ def _learn(
     for condition in full:
         result.add(condition, steps[condition.result_name])
     if subset.repeat == 0:
-        result.compared = compared | {"located": {number: steps[name]["errors"] for number, name in held_out.items()}}
+        result.compared = compared
+    for name in held_out:
+        result.held_out |= steps[name]["errors"]

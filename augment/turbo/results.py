@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 
@@ -12,15 +11,14 @@ import torch
 from numpy.typing import NDArray
 from pandas import DataFrame, concat
 
-from augment.cross_validation import LOCATOR, STAND_IN, choose_estimator
+from augment.cross_validation import LOCATOR, choose_estimator
 from augment.estimators import Estimator
-from augment.turbo.artifacts import LEVEL
+from augment.turbo.artifacts import model_file
 from augment.turbo.condition import (
     LOCATED,
     Condition,
     MeasuredSubset,
     Row,
-    chosen_file,
     conditions_of,
     pooled,
     reference_of,
@@ -31,7 +29,7 @@ from swiftwrf import load
 from swiftwrf.choices import fraction_key
 from swiftwrf.data.splits import places
 from swiftwrf.locate import MatchedField
-from swiftwrf.metrics import ChangeMetrics, ErrorSummary, angle_errors, paired_change, summary
+from swiftwrf.metrics import LEVEL, ChangeMetrics, ErrorSummary, angle_errors, paired_change, summary
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.runtime.registry import write_report
 
@@ -55,13 +53,16 @@ class TurboResult:
         >>> import augment, swiftwrf
         >>> data = swiftwrf.simulated_room(n=40, grid=swiftwrf.AngularGrid.hemisphere(10, 40))
         >>> result = augment.turbo_learning(data, measured=0.5, models=["nearest"], estimators=["peak"], extra=0)
-        >>> result.choice["name"], type(result.best).__name__
-        ('kernel_regression, measured', 'KernelRegression')
+        >>> result.choice["name"] in result.summary().index, result.best.is_fitted
+        (True, True)
     """
 
     def __init__(self, experiment: Experiment, fraction: float, folder: Path) -> None:
         self.experiment, self.fraction, self.folder = experiment, fraction, folder
         self.compared: Row = {}  # comparison of the field models in the first repeat
+        # in the first repeat: errors [deg] of its methods on held-out spectra, and names of the files of its methods
+        self.held_out: dict[str, list[float]] = {}
+        self.files = {LOCATED: LOCATOR}
         self.synthesized: list[tuple[Row, Row]] = []  # columns and values of each field model
         self.evaluated: list[tuple[Condition, Row]] = []
         self.history: list[Row] = []
@@ -90,7 +91,7 @@ class TurboResult:
         if "refused" in value:
             self._note(f"{name} is left out of the comparison: {value['refused']}")
             return
-        key = asdict(subset) | {"synthesizer": name}
+        key = {"measured_fraction": subset.measured_fraction, "repeat": subset.repeat, "synthesizer": name}
         self.synthesized.append((key, value | {"trains": trains}))
         self.history += [key | row for row in value["history"]]
 
@@ -167,9 +168,9 @@ class TurboResult:
             choice: Chosen field model, trimmed mean PSNR [dB] and seconds of each candidate, and reasons why others could
                 not be fitted. This and the next two are of the first repeat, None without a comparison.
             cross_validation: Change of the error by extra synthetic spectra, by field model; see `cross_validate`.
-            estimator_choice: Name of the method with the smallest median angular error on held-out measured spectra, that
-                error of each candidate, and `better`: the methods with a significantly smaller error on the test spectra,
-                best first, and why they are not chosen.
+            estimator_choice: Choice by the errors on held-out measured spectra, see `choose_estimator`; the `file` of the
+                chosen estimator; and `better`: the methods with a significantly smaller error on the test spectra, or a
+                smaller one and none on held-out spectra, best first, and why they are not chosen.
             synthesis: Quality of each field model at the test positions, and its mean seconds to `fit` and `synthesize`.
             methods: Condition, errors, mean seconds and `changes` of each method. These are changes of the angular error by
                 synthetic spectra, by the method that it is compared to: the same estimator on measured spectra, and the
@@ -213,16 +214,29 @@ class TurboResult:
         """The estimator that cross-validation chose, as the first repeat trained it. None if nothing was compared."""
         if self.choice is None:
             return None
-        chosen, experiment = conditions_of(self.metrics["methods"])[self.choice["name"]], self.experiment
-        if file := chosen_file(self.folder, fraction_key(self.fraction), chosen):
-            found = load(file)
+        if self.choice["file"]:
+            found = load(self.folder / self.choice["file"])
             assert isinstance(found, Estimator | MatchedField)
             return found
-        own = next((one for one, _ in self.evaluated if one.repeat == 0 and one.method == chosen.method), None)
-        if own is None:
-            return None
+        assert self.chosen is not None
+        (own, _), experiment = self.chosen, self.experiment
         estimator = experiment.make_estimator(own.estimator, 0)
         return estimator.fit(training_set(experiment, self.folder, own), device=experiment.device)
+
+    @cached_property
+    def chosen(self) -> tuple[Condition, Row] | None:
+        """Condition of the first repeat that held-out spectra chose, and their choice. None if none were held out."""
+        own = {id(value): condition for condition, value in self.evaluated}
+        # methods have other names than in the first repeat if other repeats chose another field model
+        first = {condition.method: own[id(value)] for condition, value in self.pooled if condition.repeat == 0}
+        held_out = {method: self.held_out.get(condition.method) for method, condition in first.items()}
+        errors = {method: np.array(values) for method, values in held_out.items() if values}
+        if not errors:
+            return None
+        parts = self.experiment.parts(MeasuredSubset(self.fraction))
+        position = torch.cat([self.experiment.held_out(part)[1].position for part in parts])
+        choice = choose_estimator(errors, places(position, 2))
+        return first[choice["name"]], choice
 
     def summary(self) -> DataFrame:
         """Return a row for each method, the smallest median first.
@@ -267,39 +281,34 @@ class TurboResult:
         return paired_change(self._error[before], self._error[after], place)
 
     def _estimator_choice(self) -> Row | None:
-        """Return the choice of the estimator by cross-validation. None if field models could not be compared."""
-        if self.compared.get("choice") is None:
+        """Return the choice of the estimator, its file, and why better methods are not chosen."""
+        if self.chosen is None:
             return None
-        methods = [condition for condition, _ in self.pooled]
-        # where repeats chose differently, the stand-in with synthetic spectra has another name than in the first repeat
-        other = next((c.method for c in methods if c.is_turbo and c.estimator == STAND_IN), None)
-        own = {condition.method for condition in methods}
-        errors = {
-            name if name in own else other or name: [np.array(fold) for fold in folds]
-            for name, folds in self.compared["errors"].items()
-        }
-        located = self.compared["located"] if LOCATED in own else {}  # otherwise its fit was refused
-        found = {int(number): None if fold is None else np.array(fold) for number, fold in located.items()}
-        choice = choose_estimator(errors, found, LOCATED)
-        return {**choice, "better": self._better(choice)}
+        condition, choice = self.chosen
+        file = model_file(self.folder, self.files.get(condition.method, ""), fraction_key(self.fraction))
+        return choice | {"better": self._better(choice), "file": file.name if file.is_file() else None}
 
     def _better(self, choice: Row) -> dict[str, str]:
-        """Return the methods that are significantly better than the chosen one on the test spectra, and why not chosen."""
-        error, reasons = self._error, dict[str, str]()
+        """Return the methods that are better than the chosen one on the test spectra, and why they are not chosen.
+
+        Methods that were compared on held-out spectra count if they are significantly better, others in any case.
+        """
+        error, held_out, name, reasons = self._error, choice["held_out_deg"], choice["name"], dict[str, str]()
+        slow = [name for name in self.experiment.named if self.experiment.model_type(name).slow]
         for condition, _ in self.pooled:
-            if condition.training == "all measured":
+            method, is_compared = condition.method, condition.method in held_out
+            change = self._change(name, method)["high" if is_compared else "change"]
+            if condition.training == "all measured" or change >= 0:
                 continue
-            if condition.method in choice["held_out_deg"]:
-                reason = "its error on held-out measured spectra is larger"
-            elif condition.is_network:
-                reason = f"{STAND_IN} stands in for the network, whose training takes too long for cross-validation"
-            elif condition.estimator == LOCATOR:
-                reason = "no planes were found without the held-out spectra"
+            if is_compared:
+                measure = "median" if held_out[method] > held_out[name] else "mean"
+                reason = f"its {measure} error on held-out measured spectra is larger"
+            elif (condition.is_network and self.experiment.preset == "paper") or condition.synthesizer in slow:
+                reason = "its training takes too long to be repeated without the held-out spectra"
             else:
-                reason = f"synthetic spectra are compared by {STAND_IN} and the first field model alone"
-            reasons[condition.method] = reason
-        better = [name for name in reasons if self._change(choice["name"], name)["high"] < 0]
-        return {name: reasons[name] for name in sorted(better, key=lambda name: float(np.median(error[name])))}
+                reason = "it cannot be fitted without the held-out spectra"
+            reasons[method] = reason
+        return {method: reasons[method] for method in sorted(reasons, key=lambda one: float(np.median(error[one])))}
 
     def _method_metrics(self) -> tuple[dict[str, Row], str]:
         """Return the metrics of each method, and the reference of changes."""

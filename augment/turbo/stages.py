@@ -11,25 +11,19 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from augment.choose import Fold, choose_model, held_out, without
-from augment.cross_validation import (
-    LOCATOR,
-    STAND_IN,
-    cross_validate,
-    held_out_errors,
-    located_errors,
-)
+from augment.choose import choose_model
+from augment.cross_validation import LOCATOR, cross_validate, degrees
 from augment.estimators import SavedEstimator
 from augment.estimators.base import estimated
 from augment.mix import Mixed, mix
 from augment.positions import SyntheticPositions, synthetic_positions
-from augment.turbo.artifacts import LEVEL, as_bytes, model_file, save_examples, save_located, save_model
-from augment.turbo.condition import NETWORKS, Condition, MeasuredSubset, Row
+from augment.turbo.artifacts import as_bytes, model_file, save_examples, save_located, save_model
+from augment.turbo.condition import Condition, MeasuredSubset, Row
 from augment.turbo.experiment import ROOM_MODEL, Experiment
 from swiftwrf import FitError, GeometryModel, InputError, Spectra, load
 from swiftwrf.data.store import Store
-from swiftwrf.locate import MatchedField, Posterior
-from swiftwrf.metrics import l1, psnr, ssim
+from swiftwrf.locate import MatchedField, MatchedFieldConfig, Posterior
+from swiftwrf.metrics import LEVEL, l1, psnr, ssim
 from swiftwrf.models.base import synthesized
 from swiftwrf.runtime.checkpoint import read, write
 from swiftwrf.runtime.steps import STEPS
@@ -38,15 +32,13 @@ KIND = "synthetic spectra"
 SCORE = {"psnr_db": psnr, "ssim": ssim, "l1": l1}
 BATCH_POSITIONS = 4096  # spectra predicted before they are rounded: half a gigabyte of 90 x 360 pixels
 BATCH_SPECTRA = 256  # spectra located at a time: a posterior has a thousand candidates
+# where all methods are compared on held-out spectra: half the time of the defaults, and a third of the extra positions
+HELD_OUT_LOCATOR = MatchedFieldConfig(n_calibration=40, max_cells=100_000, spacing=0.2)
+MAX_HELD_OUT_EXTRA = 1000
 
 
 def _file(name: str) -> str:
     return f"{STEPS}/{name}.safetensors"
-
-
-def room_name(subset: MeasuredSubset, blind: tuple[int, ...] = ()) -> str:
-    """Return the name of the step that finds the room without some folds."""
-    return "_".join((f"room-{subset}", *map(str, blind)))
 
 
 def compare(experiment: Experiment, folder: Path, subset: MeasuredSubset, compared: list[str], rooms: list[Row]) -> Row:
@@ -73,66 +65,72 @@ def compare(experiment: Experiment, folder: Path, subset: MeasuredSubset, compar
         # field models asked for by name need no comparison
         return {"choice": None, "cross_validation": {}}
     trained = [name for name in compared if name in choice.folds] or [choice.name]
-    validation = {name: cross_validate(choice.folds[name], experiment.n_synthetic, seed) for name in trained}
-    (first, measured_only, turbo), folds = validation[trained[0]], choice.folds[trained[0]]
-    errors = {Condition(STAND_IN, "measured").method: measured_only}
-    if turbo:
-        training, _ = experiment.trainings(first)[-1]
-        errors[Condition(STAND_IN, training, trained[0]).method] = turbo
-    for name in experiment.evaluated:
-        if name not in (*NETWORKS.values(), STAND_IN, *experiment.lacking):
-            errors[Condition(name, "measured").method] = [
-                held_out_errors(fold, experiment.make_estimator(name, subset.repeat)) for fold in folds
-            ]
     return {
         "choice": {name: value for name, value in vars(choice).items() if name != "folds"},
-        "cross_validation": {name: metrics for name, (metrics, *_) in validation.items()},
-        "errors": errors,
+        "cross_validation": {
+            name: cross_validate(choice.folds[name], experiment.n_synthetic, seed) for name in trained
+        },
     }
 
 
-def locate_held_out(experiment: Experiment, folder: Path, subset: MeasuredSubset, number: int, room: Row) -> Row:
-    """Return the errors of directions by matched-field processing on the held-out spectra of a fold.
+def hold_out(
+    experiment: Experiment, folder: Path, subset: MeasuredSubset, conditions: list[Condition], rooms: list[Row]
+) -> Row:
+    """Return the angular errors [deg] of conditions on held-out measured spectra, by method; none if a fit is refused.
 
     Args:
         experiment: Data and options.
         folder: Folder of the files.
-        subset: Measured spectra.
-        number: Number of the fold.
-        room: Result of `find_room` without the fold.
+        subset: Measured spectra, whose `parts` hold some out.
+        conditions: Conditions with one field model, or without any.
+        rooms: Results of `find_room` for the parts, if the field model or the locator is built on a room.
     """
-    measured, _ = experiment.withhold(subset)
-    seed = experiment.seed + subset.repeat
-    train, test = held_out(measured, experiment.blind_folds(subset)[0], number)
-    if not room.get("planes"):
-        return {"errors": None}
-    try:
-        blind = _read_room(folder, room["file"])
-        model = experiment.make_model(ROOM_MODEL, subset.repeat).fit(train, like=blind, device=experiment.device)
-        return {"errors": located_errors(Fold(model, train, test), seed)}
-    except (InputError, FitError):
-        return {"errors": None}
+    seed, synthesizer = experiment.seed + subset.repeat, conditions[0].synthesizer
+    extra = min(max(condition.n_synthetic for condition in conditions), MAX_HELD_OUT_EXTRA)
+    errors: dict[str, list[float]] = {condition.method: [] for condition in conditions}
+    for number, part in enumerate(experiment.parts(subset)):
+        (measured, withheld), test = experiment.withhold(part), experiment.held_out(part)[1]
+        room = _read_room(folder, rooms[number]["file"]) if rooms and "file" in rooms[number] else None
+        train = {"measured": Mixed.measured(measured)}
+        try:
+            if synthesizer:
+                model = experiment.make_model(synthesizer, subset.repeat)
+                model.fit(measured, like=room, device=experiment.device)
+                predict = partial(synthesized, model)
+                mixed = mix(measured, withheld, _as_bytes_at(withheld.position, predict))
+                train["measured + synthetic"] = train["measured + synthetic + extra"] = mixed
+            if extra:
+                positions = synthetic_positions(measured, extra, seed)
+                mixed = mixed.add(positions, _as_bytes_at(positions.position, predict))
+                train["measured + synthetic + extra"] = mixed
+            for condition in conditions:
+                if condition.estimator == LOCATOR:
+                    estimate = MatchedField(HELD_OUT_LOCATOR, seed=seed).fit(measured, room=room).predict(test)
+                else:
+                    estimator = experiment.make_estimator(condition.estimator, subset.repeat)
+                    estimator.fit(train[condition.training], device=experiment.device)
+                    estimate = estimated(estimator, test)
+                errors[condition.method] += degrees(estimate, test.label).tolist()
+        except (InputError, FitError):
+            return {"errors": {}}
+    return {"errors": errors}
 
 
-def find_room(experiment: Experiment, folder: Path, subset: MeasuredSubset, blind: tuple[int, ...] = ()) -> Row:
+def find_room(experiment: Experiment, folder: Path, subset: MeasuredSubset) -> Row:
     """Find the room in the measured spectra, once for all field models that are built on it and for the locator.
 
     Args:
         experiment: Data and options.
         folder: Folder of the files.
-        subset: Measured spectra.
-        blind: Folds that are left out.
+        subset: Measured spectra, of which some may be held out.
     """
     measured, _ = experiment.withhold(subset)
-    name = room_name(subset, blind)
-    if blind:
-        measured = measured.subset(without(experiment.blind_folds(subset)[0], *blind))
     began = time.perf_counter()
     try:
         model = experiment.make_model(ROOM_MODEL, subset.repeat).fit(measured, device=experiment.device, progress=True)
     except (InputError, FitError) as error:
         return {"refused": str(error)}
-    file = _file(name)
+    file = _file(f"room-{subset}")
     model.save(folder / file)
     planes = len(model.room.planes) if model.room else 0
     return {"seconds": time.perf_counter() - began, "planes": planes, "file": file}

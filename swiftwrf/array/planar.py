@@ -259,9 +259,13 @@ def basis(array: PlanarArray, grid: AngularGrid, dtype: torch.dtype = torch.floa
     """Return the functions whose sums are squared spectra: 1, P cosines and P sines, (1 + 2 P, pixels).
 
     Raises:
-        InputError: The functions take more than 2 GiB on this grid.
+        InputError: All elements are at one place, or the functions take more than 2 GiB on this grid.
     """
     n_functions = 1 + 2 * len(differences(array))
+    if n_functions == 1:
+        raise InputError(
+            f"all {len(array.element)} elements of the array are at one place, which receives no direction"
+        )
     if (values := n_functions * math.prod(grid.shape)) > MAX_BASIS_VALUES:
         raise InputError(
             f"the {n_functions} functions of this array take {values:.2g} values on a grid of {grid.shape}, more "

@@ -65,6 +65,8 @@ def _opened(file: Path, kinds: str = NUMBERS) -> Iterator[tuple[set[str], Callab
         variables = matlab_arrays(file)
         yield set(variables), variables.__getitem__
     else:
+        if not zipfile.is_zipfile(file):  # NumPy would advise to load it as a pickle
+            raise ValueError("it is no zip archive")
         with np.load(file, allow_pickle=False) as archive:
             members = {info.filename.removesuffix(".npy"): info.file_size for info in archive.zip.infolist()}
 

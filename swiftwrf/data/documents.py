@@ -7,7 +7,8 @@ of their own, with the values of the record around them.
 from __future__ import annotations
 
 import json
-from collections import Counter
+import re
+from collections import ChainMap, Counter
 from typing import Any
 from xml.etree import ElementTree
 
@@ -22,9 +23,11 @@ POINTS = ("wpt", "rtept", "trkpt", "Placemark")  # elements of GPX and KML
 VIEWS = ("LookAt", "Camera")  # of KML, which hold the position of the viewer
 NAMED = ("Data", "SimpleData")  # of KML, whose name is an attribute
 AXES = ("longitude", "latitude", "altitude")  # of coordinates in GeoJSON and KML
-MAX_CELLS = 2**26
+MAX_CELLS, MIN_CELLS = 2**26, 2**22  # that are read of any document, and of a short one
+MAX_LISTS, MAX_DEPTH, MAX_NAMES = 1000, 50, 2**14  # lists and levels of a document, values of a record
+HALF_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]")  # in JSON, where the other half may be missing
 Keys = tuple[str, ...]  # keys that lead to a value or a list
-Row = dict[Keys, Any]
+Row = ChainMap[Keys, Any]  # values of a record, then those of each record around it, which the rows inside share
 
 
 def table_in_document(label: object, text: str, suffix: str) -> pd.DataFrame:
@@ -47,10 +50,17 @@ def table_in_document(label: object, text: str, suffix: str) -> pd.DataFrame:
     """
     records: dict[Keys, list[Row]] = {}
     with refusing_broken(label, f"a complete {suffix.lstrip('.').upper()} document"):
-        _collect(_points(text) if suffix in XML else json.loads(text), (), {}, records)
+        content = _points(text) if suffix in XML else json.loads(text)
+        if HALF_CHARACTER.search(text):
+            json.dumps(content, ensure_ascii=False).encode()  # raises an error for half a character
+        _collect(content, (), ChainMap(), records)
     if not records:
         raise InputError(f"{label} holds no records with names, e.g. points with positions and RSSI")
-    tables = {path: _table(label, rows) for path, rows in records.items()}
+    if len(records) > MAX_LISTS:
+        raise InputError(f"{label} has lists of records under {len(records)} names; at most {MAX_LISTS} are read")
+    # values around many records make a table far larger than the document
+    most = min(MAX_CELLS, max(MIN_CELLS, len(text)))
+    tables = {path: _table(label, rows, most) for path, rows in records.items()}
     path = max(tables, key=lambda path: (_n_known(tables[path]), -len(path), len(tables[path])))
     tables[path].attrs["notes"] = [f"rows are the records in {' > '.join(path)}"] if path else []
     return tables[path]
@@ -58,11 +68,13 @@ def table_in_document(label: object, text: str, suffix: str) -> pd.DataFrame:
 
 def _collect(node: Any, path: Keys, around: Row, records: dict[Keys, list[Row]]) -> None:
     """Add a record or a list of them, with the values around it, to those of its path; then the records inside it."""
+    if len(path) > MAX_DEPTH:
+        raise ValueError(f"it nests records more than {MAX_DEPTH} deep")
     if isinstance(node, list):
         for item in node:
             _collect(item, path, around, records)
     elif isinstance(node, dict):
-        row, lists = dict(around), dict[Keys, Any]()
+        row, lists = around.new_child(), dict[Keys, Any]()
         _flatten(node, path, row, lists)
         records.setdefault(path, []).append(row)
         for where, inside in lists.items():
@@ -95,14 +107,24 @@ def _is_scan(value: Any) -> bool:
     )
 
 
-def _table(label: object, rows: list[Row]) -> pd.DataFrame:
+def _table(label: object, rows: list[Row], most: int) -> pd.DataFrame:
     """Return rows as a table. Columns have the last key, or all keys where several have one last key."""
-    paths = list(dict.fromkeys(path for row in rows for path in row))
-    if len(rows) * len(paths) > MAX_CELLS:
-        raise InputError(f"{label} has {len(rows)} records of {len(paths)} values; at most {MAX_CELLS} cells are read")
+    parts = {id(part): part for row in rows for part in reversed(row.maps)}
+    paths = list(dict.fromkeys(path for part in parts.values() for path in part))
+    if len(paths) > MAX_NAMES or len(rows) * len(paths) > most:
+        raise InputError(
+            f"{label} has {len(rows)} records of {len(paths)} values; at most {most} cells and {MAX_NAMES} values of a "
+            "record are read"
+        )
+    text = {key: {path: "" if x is None else str(x) for path, x in part.items()} for key, part in parts.items()}
     count = Counter(path[-1] for path in paths)
     names = [path[-1] if count[path[-1]] == 1 else "_".join(path) for path in paths]
-    cells = [["" if (value := row.get(path)) is None else str(value) for path in paths] for row in rows]
+    cells = []
+    for row in rows:
+        whole: dict[Keys, str] = {}
+        for part in reversed(row.maps):
+            whole |= text[id(part)]
+        cells.append([whole.get(path, "") for path in paths])
     return pd.DataFrame(cells, columns=names, dtype=object)
 
 

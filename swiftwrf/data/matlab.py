@@ -1,6 +1,6 @@
-"""Arrays of numbers in MATLAB files (MathWorks, "MAT-File Format").
+"""Arrays of numbers in MATLAB files (MathWorks, "MAT-File Format"), read without the compiled parser of SciPy.
 
-SciPy's parser of version 5 is compiled and believes the sizes in a file: one damaged byte can end the process.
+That parser believes the sizes in a file of version 5: one damaged byte can end the process.
 """
 
 from __future__ import annotations
@@ -19,24 +19,22 @@ from scipy.io import loadmat, whosmat
 
 TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}  # of elements
 MATRIX, COMPRESSED = 14, 15  # types of variables
-OPAQUE, NUMBERS = 17, range(6, 16)  # classes of variables: an object without shape, and double to uint64
+OPAQUE, NUMBERS = 17, range(6, 16)  # classes of variables: objects without shape, and double to uint64
 CLASS, COMPLEX = 0xFF, 0x800  # bits of the flags of a variable
 HEAD_BYTES = 1024  # of flags, shape and name, at most
 Stored = tuple[int, Callable[[], NDArray[Any]]]  # bytes of an array in memory, and what reads it
 
 
 def matlab_arrays(file: Path) -> dict[str, Stored]:
-    """Return the bytes in memory of each variable, at most, and the function that reads it.
-
-    Raises:
-        Exception: The file is broken. The functions raise it, too, and for a variable that holds no numbers.
-    """
+    """Return the variables of a file by name. A broken file, or one without numbers, raises an error of any type."""
     found: dict[str, Stored] = {}
     with file.open("rb") as stream:
         header, end = stream.read(128), file.stat().st_size
         if 0 in header[:4]:  # version 4, whose parser is not compiled
-            known = [(name, shape) for name, shape, kind in whosmat(file) if kind not in ("char", "sparse")]
-            return {name: (16 * math.prod(shape), partial(_of_version_4, file, name)) for name, shape in known}
+            for name, shape, kind in whosmat(file):
+                if kind not in ("char", "sparse"):
+                    found[name] = 16 * math.prod(shape), partial(_of_version_4, file, name)
+            return found
         order = {b"IM": "<", b"MI": ">"}[header[126:]]
         while tag := stream.read(8):
             kind, size = np.frombuffer(tag, f"{order}u4", 2).tolist()
@@ -44,12 +42,12 @@ def matlab_arrays(file: Path) -> dict[str, Stored]:
             if kind not in (MATRIX, COMPRESSED) or start + size > end:
                 raise ValueError("a variable is not complete")
             content = partial(_content, file, start, size, kind == COMPRESSED)
-            flags, shape, name = islice(_elements(content(HEAD_BYTES), order), 3)
-            text = (shape if flags[0] & CLASS == OPAQUE else name).tobytes().decode()
-            if text in found:
-                raise ValueError(f"{text} is stored twice")
+            flags, shape, text = islice(_elements(content(HEAD_BYTES), order), 3)
+            name = (shape if flags[0] & CLASS == OPAQUE else text).tobytes().decode()
+            if name in found:
+                raise ValueError(f"{name} is stored twice")
             sizes = shape.tolist()
-            found[text] = 16 * math.prod(sizes), partial(_array, content, order, int(flags[0]), sizes)  # if complex
+            found[name] = 16 * math.prod(sizes), partial(_array, content, order, int(flags[0]), sizes)  # if complex
             stream.seek(start + size)
     return found
 
@@ -90,8 +88,9 @@ def _array(content: Callable[[int], bytes], order: str, flags: int, shape: list[
     parts = list(islice(_elements(content(17 * count + HEAD_BYTES), order), 3, None))
     if len(parts) != 1 + bool(flags & COMPLEX) or any(len(part) != count for part in parts):
         raise ValueError(f"an array does not hold the {shape} numbers that it claims")
-    values = parts[0].astype(parts[0].dtype.newbyteorder("="))
+    values = parts[0].astype(
+        np.result_type(parts[0], np.complex64) if len(parts) > 1 else parts[0].dtype.newbyteorder("=")
+    )
     if len(parts) > 1:
-        values = values.astype(np.result_type(values, np.complex64))
         values.imag = parts[1]
     return np.ascontiguousarray(values.reshape(shape, order="F"))

@@ -102,10 +102,9 @@ class Rssi(PositionedData):
         count = rssi.shape[1]
         default = (f"receiver{number}" for number in range(1, count + 1))
         names = tuple(default if receiver_names is None else receiver_names)
-        usable = (isinstance(label, str) and label.strip() and not NO_NAME.search(label) for label in names)
-        if isinstance(receiver_names, str) or not all(usable):
+        if wrong := [x for x in names if not x.strip() or NO_NAME.search(x)]:
             raise InputError(
-                f"{name}: receiver_names must be a list of texts, none empty or with line breaks, got {receiver_names!r}"
+                f"{name}: receiver_names must be a list of texts, none empty or with tabs or line breaks, got {wrong[0]!r}"
             )
         if len(names) != count or len(set(names)) < count:
             raise InputError(

@@ -6,9 +6,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
+from annotated_types import Ge, Lt
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid, ArrayPose, to_angles
@@ -23,7 +24,7 @@ from swiftwrf.metrics import WINDOW
 from swiftwrf.plotting import Axes, mark_direction, polar_spectrum
 from swiftwrf.positions import to_tensor
 from swiftwrf.runtime.digest import digest
-from swiftwrf.runtime.validation import checked
+from swiftwrf.runtime.validation import check_value, checked
 
 GRID = AngularGrid.hemisphere(90, 360)  # of spectra that are computed
 OF_SPECTRA = ("line_of_sight", "label", "channel", "frequency_hz")  # arrays beside the spectra in spectrum.npz
@@ -205,11 +206,15 @@ class Spectra(PositionedData):
             row: Number of the spectrum.
             ax: Polar axes to draw into. Defaults to those of a new figure.
 
+        Raises:
+            InputError: No spectrum of this number.
+
         Example:
             >>> import swiftwrf
             >>> swiftwrf.simulated_room(n=20).plot(3).get_title()
             'simulated-room 3 at ... m'
         """
+        check_value("row", row, Annotated[int, Ge(-len(self)), Lt(len(self))])
         one = self.subset(torch.arange(len(self))[[row]])
         ax = polar_spectrum(one.spectrum[0], self.grid, ax)
         if bool(one.label.isfinite().all()):
@@ -241,11 +246,7 @@ class Spectra(PositionedData):
 
 
 def to_magnitudes(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:
-    """Return spectra of this shape as float32 in [0, 1], or as the bytes that they are.
-
-    Raises:
-        InputError: As `to_tensor`, or a magnitude outside [0, 1].
-    """
+    """Return spectra as float32, or as the bytes that they are; refuse magnitudes outside [0, 1] and other shapes."""
     is_bytes = getattr(value, "dtype", None) in (torch.uint8, "uint8")
     found = to_tensor(name, value, torch.uint8 if is_bytes else torch.float32, shape)
     low, high = (0.0, 1.0) if is_bytes or not found.numel() else map(float, found.aminmax())
@@ -255,11 +256,7 @@ def to_magnitudes(name: str, value: Any, shape: tuple[int | None, ...]) -> Tenso
 
 
 def to_directions(name: str, value: Any, n: int | None = None, missing: bool = False) -> Tensor:
-    """Return azimuth and elevation [rad] of n spectra, or of any number, as float64 (n, 2); nan only if `missing`.
-
-    Raises:
-        InputError: As `to_tensor`, or an angle beyond the range of directions, e.g. in degrees.
-    """
+    """Return azimuth and elevation [rad] of n spectra as float64 (n, 2); refuse other numbers, e.g. degrees."""
     found = to_tensor(name, value, torch.float64, (n, 2), missing)
     if bool((bad := (found.abs() > MAX_LABEL).any(dim=1)).any()):
         raise InputError(

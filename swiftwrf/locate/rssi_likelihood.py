@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
@@ -18,7 +18,7 @@ from torch import Tensor
 from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.splits import places
+from swiftwrf.data.splits import centres, places
 from swiftwrf.errors import InputError
 from swiftwrf.locate.spectrum_likelihood import DEGREES
 from swiftwrf.rssi import RssiModel
@@ -110,40 +110,44 @@ class ValueLikelihood:
         return constant - half * torch.log1p(distance / self.degrees) - determinant
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DetectionLikelihood:
     """Likelihood of which receivers detect the transmitter: logistic in the predicted RSSI, with losses at any power.
 
     Args:
-        threshold: RSSI at which half of the packets are detected [dBm].
+        threshold: RSSI at which each receiver detects half of the packets, float64 (R,) [dBm].
         width: Width of the transition [dB].
         loss: Probability that a strong packet is lost.
     """
 
-    threshold: float
+    threshold: Tensor
     width: float
     loss: float
 
     @classmethod
-    def fit(cls, mean: Tensor, detected: Tensor) -> DetectionLikelihood:
-        """Fit to predicted RSSI (n, R) [dBm] and detections, bool (n, R), of held-out rows."""
+    def fit(cls, mean: Tensor, detected: Tensor, limit: Tensor) -> DetectionLikelihood:
+        """Fit to predicted RSSI (n, R) [dBm] and detections, bool (n, R), of held-out rows.
+
+        The thresholds differ as the limits of detection, (R,) [dBm], do.
+        """
         step = -(-mean.numel() // MAX_DETECTIONS)
-        m, d = mean.double().flatten()[::step], detected.flatten()[::step]
+        m, d = (mean.double() - limit).flatten()[::step], detected.flatten()[::step]
 
         def loss(raw: NDArray[np.float64]) -> float:
             chance = cls._of(raw).probability(m).clamp(1e-4, 1 - 1e-4)
             return -float(torch.where(d, chance.log(), (-chance).log1p()).mean())
 
         start = np.array([float(m.quantile(0.1)), 1.5, -2.0])
-        return cls._of(minimize(loss, start, method="Nelder-Mead", options={"maxiter": 300}).x)
+        found = cls._of(minimize(loss, start, method="Nelder-Mead", options={"maxiter": 300}).x)
+        return replace(found, threshold=found.threshold + limit)
 
     @classmethod
     def _of(cls, raw: NDArray[np.float64]) -> DetectionLikelihood:
-        return cls(float(raw[0]), float(np.exp(np.clip(raw[1], -1, 4))), float(0.9 * expit(raw[2])))
+        return cls(torch.tensor(raw[0]), float(np.exp(np.clip(raw[1], -1, 4))), float(0.9 * expit(raw[2])))
 
     def probability(self, mean: Tensor) -> Tensor:
-        """Return the probability of a detection for each predicted RSSI [dBm], of the same shape."""
-        return (1 - self.loss) * torch.sigmoid((mean - self.threshold) / self.width)
+        """Return the probability of a detection for each predicted RSSI (..., R) [dBm], of the same shape."""
+        return (1 - self.loss) * torch.sigmoid((mean - self.threshold.to(mean)) / self.width)
 
     def log_likelihood(self, mean: Tensor, rssi: Tensor) -> Tensor:
         """Return log-likelihoods (n, m) of the detections in RSSI (n, R) at candidates of predicted RSSI (m, R)."""
@@ -204,7 +208,7 @@ class Fingerprints:
         held_out = torch.zeros(len(train), dtype=torch.bool).index_fill(0, order[:MAX_HELD_OUT], value=True)
         parts = [((fold == number) & held_out, fold != number) for number in fold.unique()]
         errors: dict[tuple[str, int], Tensor] = {}
-        fewest = min(len(train.transmitter_position[kept].unique(dim=0)) for _, kept in parts)
+        fewest = min(int(places(train.transmitter_position[kept]).max()) + 1 for _, kept in parts)
         counts = [k for k in NEIGHBOUR_COUNTS if k <= fewest]
         for metric in METRICS:
             error = []
@@ -224,9 +228,9 @@ class Fingerprints:
 
     @cached_property
     def _places(self) -> tuple[Tensor, Tensor]:
-        """Positions of the places (P, 3) [m] in the order of the rows, which decides ties, and the place of each row."""
-        row = places(self.position, 1)
-        return self.position[torch.zeros(int(row.max()) + 1).long().scatter_(0, row, torch.arange(len(row)))], row
+        """Positions of the places (P, 3) [m], whose order decides ties, and the place of each row."""
+        place = places(self.position)
+        return centres(self.position, place), place
 
     @cached_property
     def _known(self) -> tuple[Tensor, Tensor]:

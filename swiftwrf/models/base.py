@@ -481,11 +481,7 @@ def bounding_box(position: Tensor) -> Tensor:
 
 
 def check_predicted(model: object, value: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """Return what a model predicts, unchanged, if it is a floating-point tensor of this shape with finite values.
-
-    Raises:
-        InputError: It is not; the message names the class of the model.
-    """
+    """Return what a model predicts unchanged; refuse all but finite numbers in a floating-point tensor of this shape."""
     name = type(model).__name__
     if not isinstance(value, Tensor) or not value.is_floating_point() or value.shape != shape:
         found = f"{value.dtype} {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
@@ -496,11 +492,7 @@ def check_predicted(model: object, value: Tensor, shape: tuple[int, ...]) -> Ten
 
 
 def synthesized(model: FieldModel, position: Tensor) -> Tensor:
-    """Return the spectra that a model of any class synthesizes at positions (n, 3), float32 (n, H, W) on the CPU.
-
-    Raises:
-        InputError: As `FieldModel.synthesize`, or values that are no spectra on the grid of the model.
-    """
+    """Return the spectra of a model of any class at positions (n, 3), checked, float32 (n, H, W) on the CPU."""
     shape, spectra = (len(position), *model.grid.shape), model.synthesize(position)
     return Store(to_magnitudes(f"spectra of {type(model).__name__}", spectra, shape))[:]
 

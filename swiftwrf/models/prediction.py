@@ -8,7 +8,7 @@ from typing import Annotated
 
 import numpy as np
 import pandas as pd
-from annotated_types import Gt, Lt
+from annotated_types import Ge, Gt, Lt
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -16,8 +16,9 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.dataset import Arrays, Labelled, position_coordinates
 from swiftwrf.data.spectra import DIRECTION, direction_coordinates
 from swiftwrf.errors import InputError
+from swiftwrf.metrics import LEVEL
 from swiftwrf.plotting import Axes, Displayed, plan, polar_spectrum
-from swiftwrf.runtime.validation import checked
+from swiftwrf.runtime.validation import check_value, checked
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +55,7 @@ class Prediction(Labelled, Displayed):
             ax: Axes to draw into, polar for a spectrum. Defaults to those of a new figure.
 
         Raises:
-            InputError: A prediction without directions or positions.
+            InputError: A prediction without directions or positions, or a number beyond it.
 
         Example:
             >>> import torch
@@ -62,6 +63,8 @@ class Prediction(Labelled, Displayed):
             >>> Prediction(torch.tensor([[-50.0], [-60.0]]), position=at).plot().get_ylabel()
             'y [m]'
         """
+        count = len(self.mean) if self.grid is not None else self.mean.shape[-1]
+        check_value("number", number, Annotated[int, Ge(-count), Lt(count)])
         if self.grid is not None:
             return polar_spectrum(self.mean[number], self.grid, ax)
         if self.position is None or self.mean.dim() != 2:
@@ -84,7 +87,7 @@ class Prediction(Labelled, Displayed):
         return {"shape": f"{tuple(self.mean.shape)}", "mean": span(self.mean), "std": span(self.std)}
 
     @checked
-    def interval(self, level: Annotated[float, Gt(0), Lt(1)] = 0.8) -> tuple[Tensor, Tensor]:
+    def interval(self, level: Annotated[float, Gt(0), Lt(1)] = LEVEL) -> tuple[Tensor, Tensor]:
         """Return the lower and upper end of the central interval that contains a measurement with probability `level`.
 
         Intervals of spectra are clipped to [0, 1], the range of magnitudes.

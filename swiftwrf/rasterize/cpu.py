@@ -11,6 +11,8 @@ by a polynomial. Threads share positions and, if positions are few, bands of row
 from __future__ import annotations
 
 import math
+import os
+from functools import cache
 from typing import Any
 
 import numba
@@ -20,6 +22,7 @@ from numba import njit, prange
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
+from swiftwrf.errors import InputError
 from swiftwrf.runtime.threads import threads_kept
 
 BASE2 = np.float32(-0.5 / math.log(2))  # exp(-x / 2) = 2^(BASE2 x)
@@ -243,8 +246,16 @@ def render_backward(grad, mean, cholesky, weight, origin, step, shape, reach2, b
             d_weight[b, i, 1] = d_im
 
 
+_first_process = cache(os.getpid)
+
+
 def _threads() -> int:
     """Give numba as many threads as torch has, and return their number. Numba starts its threads at the first call."""
+    if _first_process() != os.getpid():  # which lacks these threads, and OpenMP would end it
+        raise InputError(
+            "the compiled rasterizer does not work in a process forked from one that used it; start processes by spawn: "
+            'ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"))'
+        )
     number: int = min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     numba.set_num_threads(number)
     return number

@@ -373,9 +373,9 @@ class SavedRssiPredictor(RssiPredictor, Saved):
         predictor.offsets = Offsets(**header["offsets"]) if header.get("offsets") else None
         predictor.detection = None
         if curve := header.get("detection"):
-            types = {"missed": torch.float64, "is_limit": torch.bool}
-            of_receivers = (to_tensor(name, curve[name], dtype, (len(known),)) for name, dtype in types.items())
-            predictor.detection = Detection(float(curve["limit"]), float(curve["width"]), *of_receivers)
+            types = {"limit": torch.float64, "missed": torch.float64, "is_limit": torch.bool}
+            of_receivers = {n: to_tensor(n, curve[n], dtype, (len(known),)) for n, dtype in types.items()}
+            predictor.detection = Detection(width=float(curve["width"]), **of_receivers)
         return predictor
 
 

@@ -21,7 +21,7 @@ from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.rssi import PLACE
 from swiftwrf.data.splits import MIN_TRAINING, Validation, places
 from swiftwrf.errors import InputError
-from swiftwrf.metrics import method_summary
+from swiftwrf.metrics import LEVEL, method_summary
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import distance, nearest
 from swiftwrf.rssi.base import RssiPredictor
@@ -29,10 +29,9 @@ from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.offsets import estimate_offsets
 from swiftwrf.rssi.pairs import PairModel
 from swiftwrf.rssi.paper import RssiPaperModel
-from swiftwrf.rssi.training import LEVEL
 from swiftwrf.runtime.checkpoint import Saved, load
 from swiftwrf.runtime.registry import write_report
-from swiftwrf.runtime.steps import MODEL, Memo, Steps
+from swiftwrf.runtime.steps import MODEL, Memo, Steps, refusing_executor
 from swiftwrf.runtime.validation import Fraction, Preset, checked
 
 Values = dict[str, Any]
@@ -288,8 +287,8 @@ def compare(
                 found = float(above[detected].double().mean()), float((~above)[~detected].double().mean())
         std = None if prediction.std is None else prediction.std[test.detected]
         error = (prediction.mean + offset - test.rssi_dbm)[test.detected].abs()
-        values = {"predicted": prediction.mean[test.detected], "std": std, "median_db": float(error.quantile(0.5))}
-        values["mean_db"] = float(error.mean())
+        values: Values = {"predicted": prediction.mean[test.detected], "std": std, "mean_db": float(error.mean())}
+        values |= {"median_db": float(error.quantile(0.5)), "held_out": getattr(predictor, "held_out_db", {})}
         return seconds | values | {"detection": found, "n_primitives": getattr(predictor, "n_primitives", 0)}
 
     order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))
@@ -301,7 +300,7 @@ def compare(
         less = {str(len(rows)): {name: compute(_, folder, name, rows)["mean_db"] for name in studied} for rows in parts}
         return less | {str(len(train)): {name: values[name]["mean_db"] for name in studied}}
 
-    with TemporaryDirectory(prefix="swiftwrf-") as temporary:
+    with TemporaryDirectory(prefix="swiftwrf-") as temporary, refusing_executor(executor):
         memo = keep or Memo(Path(temporary))
         steps = Steps(None, memo)
         started = [steps.start(name, name, compute, name) for name in names]

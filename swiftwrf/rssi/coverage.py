@@ -77,7 +77,7 @@ def reach(model: RssiModel | PairModel) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Where a scan has at least a number of receivers above a threshold, on one floor.
+    """Probability that a scan has at least a number of receivers above a threshold, on the cells of one floor.
 
     Args:
         probability: Probability in each cell of a map, float64 (rows, columns).

@@ -1,10 +1,10 @@
 """Empty cells: the curve of detection, and received power given that a packet was, or was not, detected.
 
-    p(detected | y) = (1 - missed_r) Phi((y - limit) / width)
+    p(detected | y) = (1 - missed_r) Phi((y - limit_r) / width)
 
-y is the received power of a packet, limit and width are those of all receivers, and missed_r is the share of packets that
-receiver r misses whatever their power. An empty cell is then an upper limit that may be wrong (censored regression with
-misclassification: J. Tobin, Econometrica 26, 1958; J. A. Hausman et al., Journal of Econometrics 87, 1998).
+y is the received power of a packet, limit_r the limit of receiver r, width that of all receivers, and missed_r the share of
+packets that receiver r misses whatever their power. An empty cell is then an upper limit that may be wrong (censored
+regression with misclassification: J. Tobin, Econometrica 26, 1958; J. A. Hausman et al., Journal of Econometrics 87, 1998).
 """
 
 from __future__ import annotations
@@ -24,9 +24,17 @@ from swiftwrf.gp import GaussianProcess, Kernel, leave_folds_out, subsample
 from swiftwrf.positions import Neighbours
 
 NEIGHBOURS, FEWEST = 6, 3  # rows beside a cell, and values among them, that determine its level
+OWN_FEWEST = 2  # of these values for the limit of one receiver, which has fewer cells
 MISSED = 1e-3  # share of random misses at least: no value is impossible
 MISSES_WORTH = 30.0  # strong cells of a receiver that count as much as the share of misses of all receivers
-MAX_ROWS, MAX_CELLS = 1500, 1000  # that determine the curve
+MISSES = torch.tensor([MISSED, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3], dtype=torch.float64)  # shares that are compared
+WIDTHS_DB = 0.5, 1.0, 2.0, 3.0, 5.0, 8.0
+LIMIT_STD_DB = 20.0  # prior of a receiver's limit about that of all; `benchmarks/not_detected.py --insensitive-dbm -70`
+OFFSETS_DB = torch.arange(-40.0, 41.0, dtype=torch.float64)  # of a receiver's limit that are compared
+SAME_LIMIT_DB = 3.0  # difference of limits that is not worth a sentence
+MAX_ROUNDS = 5  # of the limits of all receivers and of each
+MAX_ROWS, MAX_CELLS, MAX_OWN_CELLS = 1500, 1000, 50_000  # that determine the curve, and the limits of the receivers
+Cells = tuple[Tensor, Tensor, float]  # values [dB], their receivers, and the number of cells that each stands for
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,18 +42,18 @@ class Detection:
     """The curve of detection of R receivers.
 
     Args:
-        limit: Received power at which half of the packets are detected [dBm].
+        limit: Received power at which each receiver detects half of the packets, float64 (R,) [dBm].
         width: Standard deviation of the limit over packets [dB].
         missed: Share of packets of any power that each receiver misses, float64 (R,).
         is_limit: Whether an empty cell is an upper limit for its receiver, bool (R,); else it is ignored.
 
     Example:
-        >>> curve = Detection(-90.0, 1.0, torch.tensor([0.001]).double(), torch.tensor([True]))
+        >>> curve = Detection(torch.tensor([-90.0]), 1.0, torch.tensor([0.001]).double(), torch.tensor([True]))
         >>> curve.given_detection(torch.tensor([[-80.0], [-95.0]]), torch.tensor(4.0))[0].round()[:, 0]
         tensor([-80., -88.])
     """
 
-    limit: float
+    limit: Tensor
     width: float
     missed: Tensor
     is_limit: Tensor
@@ -55,48 +63,57 @@ class Detection:
         """Estimate the curve by greatest likelihood, from cells with values beside them; no model of the power is needed.
 
         What is missing beside strong values is missed at random, and what is missing beside weak ones is below the limit.
+        Limit and width of all receivers, and the limit of each with a normal prior about that of all, follow in turn.
 
         Args:
             position: Positions of the rows, (n, 3) [m].
             rssi: Measurements (n, R) [dBm], nan where not detected; at least one value.
 
         Returns:
-            The curve; None if every cell has a value. With fewer than 5 empty cells beside values the limit is the lowest
+            The curve; None if every cell has a value. With fewer than 5 empty cells beside values all limits are the lowest
             value.
 
         Example:
             >>> import swiftwrf
             >>> room = swiftwrf.rssi_room(n=200)
             >>> weak = room.rssi_dbm.where(room.rssi_dbm > -60, torch.nan)
-            >>> -61 < Detection.estimate(room.transmitter_position, weak).limit < -58
+            >>> -61 < float(Detection.estimate(room.transmitter_position, weak).limit.median()) < -58
             True
         """
         if bool(rssi.isfinite().all()) or len(position) < 2:
             return None
         is_limit, lowest = rssi.isnan().any(dim=0), float(rssi[~rssi.isnan()].min())
         position, rssi = subsample(position, rssi, rows=MAX_ROWS)
-        seen = ~rssi.isnan()
+        seen, missed = ~rssi.isnan(), torch.full((rssi.shape[1],), MISSED, dtype=torch.float64)
         number = Neighbours(position)(position, min(NEIGHBOURS + 1, len(position)))[1]
         near = rssi[number].masked_fill((number == torch.arange(len(rssi))[:, None])[..., None], torch.nan)  # (n, 7, R)
-        level, usable = near.nanmean(dim=1), (~near.isnan()).sum(dim=1) >= FEWEST
-        missed = torch.full((rssi.shape[1],), MISSED, dtype=torch.float64)
+        level, n_near = near.nanmean(dim=1), (~near.isnan()).sum(dim=1)
+        usable, own = n_near >= FEWEST, torch.zeros_like(missed)
         if int((usable & ~seen).sum()) < 5 or int((usable & seen).sum()) < 5:
-            return cls(lowest, 0.5, missed, is_limit)
-        value, kept_level, lost_level = rssi[usable & seen], level[usable & seen], level[usable & ~seen]
-        spread, share = 1.25 * float((value - kept_level).abs().mean()), len(value) / int(usable.sum())
-        value, lost_level = (subsample(v.sort().values, rows=MAX_CELLS)[0] for v in (value, lost_level))
-        limit = torch.linspace(float(rssi[seen].min()) - 0.5, float(value.median()), 30).double()[:, None, None, None]
-        width = torch.tensor([0.5, 1, 2, 3, 5, 8]).double()[:, None, None]
-        misses = torch.tensor([MISSED, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3]).double()[:, None]
-        kept = (torch.special.log_ndtr((value - limit) / width) + (-misses).log1p()).mean(dim=-1)
-        below = torch.special.ndtr((limit - lost_level) / (spread**2 + width.square()).sqrt())
-        lost = (misses + (1 - misses) * below).log().mean(dim=-1)
-        score = share * kept + (1 - share) * lost
-        limits, widths, shares = np.unravel_index(int(score.argmax()), score.shape)
-        found = float(limit.flatten()[limits]), float(width.flatten()[widths])
-        strong = usable & (level > found[0] + 2 * math.hypot(spread, found[1]))
-        lost_count = (strong & ~seen).sum(dim=0).double() + MISSES_WORTH * float(misses.flatten()[shares])
-        return cls(*found, lost_count / (strong.sum(dim=0) + MISSES_WORTH), is_limit)
+            return cls(own + lowest, 0.5, missed, is_limit)
+        spread = 1.25 * float((rssi - level)[usable & seen].abs().mean())
+
+        def cells(value: Tensor, where: Tensor) -> Cells:
+            every = where.nonzero()
+            (some,) = subsample(every, rows=MAX_OWN_CELLS)
+            return value[tuple(some.T)], some[:, 1], max(1.0, len(every) / MAX_OWN_CELLS)
+
+        shared, each = (
+            (cells(rssi, seen & (n_near >= least)), cells(level, ~seen & (n_near >= least)))
+            for least in (FEWEST, OWN_FEWEST)
+        )
+        for _ in range(MAX_ROUNDS):
+            limit, width, misses = _shared_curve([(db - own[r], w) for db, r, w in shared], spread)
+            kept, lost = ((db - limit, r, w) for db, r, w in each)
+            score = _log_likelihoods(kept, lost, OFFSETS_DB, (width, math.hypot(spread, width)), len(own))
+            score += MISSES_WORTH * (misses * MISSES.log() + (1 - misses) * (-MISSES).log1p())[:, None, None]
+            score -= (OFFSETS_DB / LIMIT_STD_DB).square()[:, None] / 2
+            previous, own = own, OFFSETS_DB[score.amax(dim=0).argmax(dim=0)]
+            if torch.equal(previous, own):
+                break
+        strong = usable & (level > limit + own + 2 * math.hypot(spread, width))
+        lost_count = (strong & ~seen).sum(dim=0).double() + MISSES_WORTH * misses
+        return cls(limit + own, width, lost_count / (strong.sum(dim=0) + MISSES_WORTH), is_limit)
 
     def note(self, receiver_names: Sequence[str]) -> str:
         """Return a sentence on the meaning of empty cells of these R receivers."""
@@ -105,7 +122,9 @@ class Detection:
         missed = float(self.missed[self.is_limit].mean()) if weak else 0.0
         said = []
         if weak:
-            said.append(f"an empty cell means that the signal was below about {self.limit:.0f} dBm")
+            low, high = (float(x) for x in self.limit[self.is_limit].aminmax())
+            limit = f"{low:.0f} to {high:.0f} dBm, by receiver" if high - low > SAME_LIMIT_DB else f"{high:.0f} dBm"
+            said.append(f"an empty cell means that the signal was below about {limit}")
             if missed > 0.03:
                 said.append(f"{missed:.0%} of all packets are missed at any power")
         if others:
@@ -115,7 +134,7 @@ class Detection:
 
     def columns(self, number: Tensor | slice) -> Self:
         """Return the curve of some receivers."""
-        return replace(self, missed=self.missed[number], is_limit=self.is_limit[number])
+        return replace(self, **{name: getattr(self, name)[number] for name in ("limit", "missed", "is_limit")})
 
     def given_detection(self, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean [dBm] and standard deviation [dB] of the power of detected packets, by those of all, each (n, R)."""
@@ -127,6 +146,37 @@ class Detection:
         return given[0].where(self.is_limit, mean), given[1].where(self.is_limit, std)
 
 
+def _shared_curve(cells: Sequence[tuple[Tensor, float]], spread: float) -> tuple[float, float, float]:
+    """Return limit [dBm], width [dB] and share of misses that fit detected values and the levels beside empty cells best.
+
+    Both have the number of cells that each stands for; `spread` is the standard deviation of values about levels [dB].
+    """
+    some = [subsample(db.sort().values, rows=MAX_CELLS)[0] for db, _ in cells]
+    weight = [stands_for * len(db) / len(few) for (db, stands_for), few in zip(cells, some, strict=True)]
+    kept, lost = ((few, torch.zeros(len(few), dtype=torch.int64), w) for few, w in zip(some, weight, strict=True))
+    limit = torch.linspace(float(some[0][0]) - 0.5, float(some[0].median()), 30, dtype=torch.float64)
+    scores = torch.stack(
+        [_log_likelihoods(kept, lost, limit, (width, math.hypot(spread, width)), 1)[..., 0] for width in WIDTHS_DB]
+    )
+    best = np.unravel_index(int(scores.argmax()), scores.shape)
+    return float(limit[best[2]]), WIDTHS_DB[best[0]], float(MISSES[best[1]])
+
+
+def _log_likelihoods(kept: Cells, lost: Cells, limit: Tensor, width: tuple[float, float], n_receivers: int) -> Tensor:
+    """Return log-likelihoods (7, L, R) of cells for all shares of misses and limits (L,), which both kinds of cells count.
+
+    The widths are those of the curve over values and over levels [dB].
+    """
+    above = torch.special.log_ndtr((kept[0] - limit[:, None]) / width[0])
+    below = torch.special.ndtr((limit[:, None] - lost[0]) / width[1])
+
+    def summed(logarithm: Tensor, cells: Cells) -> Tensor:
+        none = torch.zeros(len(limit), n_receivers, dtype=torch.float64)
+        return cells[2] * none.index_add(1, cells[1], logarithm)
+
+    return torch.stack([summed(above + (-m).log1p(), kept) + summed((m + (1 - m) * below).log(), lost) for m in MISSES])
+
+
 @dataclass(frozen=True, eq=False)
 class DetectionField:
     """Probability that a packet is detected: logistic in the received power and in the share of detections nearby.
@@ -136,18 +186,18 @@ class DetectionField:
     Args:
         process: Process of the detections (1 or 0) less their mean at each receiver, (n, R) at n bins.
         mean: Fraction of the bins where each receiver detects something, float64 (R,).
-        limit: Received power that the logistic curve counts from [dBm].
+        limit: Received power that the logistic curve of each receiver counts from, float64 (R,) [dBm].
         weight: Constant, weight of the power [per 10 dB], and weight of the share, float64 (3,).
     """
 
     process: GaussianProcess
     mean: Tensor
-    limit: float
+    limit: Tensor
     weight: Tensor
 
     @classmethod
     def fit(
-        cls, kernel: Kernel, position: Tensor, detected: Tensor, fold: Tensor, level: Tensor, limit: float
+        cls, kernel: Kernel, position: Tensor, detected: Tensor, fold: Tensor, level: Tensor, limit: Tensor
     ) -> Self | None:
         """Fit to bins, detected or not, bool (n, R), with held-out predictions `level` of their power, (n, R) [dBm].
 

@@ -97,7 +97,7 @@ class RssiPaperModel(RssiModel):
         predicted = held_out.T.double().where(out, torch.nan)[bins.bin_of_row]
         check_comparable(predicted[None], train.rssi_dbm)
         std = held_out_std(bins, self.kernel, prior_db, covariance)[bins.bin_of_row]
-        self._calibrate(train.rssi_dbm, predicted, std, *prior_db)
+        self._calibrate(train, predicted, std, *prior_db)
         self.mixing_weight, self.baseline = torch.eye(4).double()[0], torch.zeros(n_receivers, 2).double()
         self.centre, self.rendered, self.covariance, self.detection_field = bins.centre, rendered, covariance, None
         dual = torch.linalg.solve_triangular(root.T, white.T.double() * prior_db[0], upper=True).T

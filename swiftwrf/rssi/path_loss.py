@@ -265,8 +265,9 @@ def _maximise(
         hazard = (ratio / weak.clamp_min(1e-12)).clamp_max(40)
         value, weight = rssi.where(seen, mean - variance / std * hazard), weak.where(limited, seen.double())
         spare = (variance * (1 - variance / std.square() * hazard * (z + hazard)).clamp(0, 1)).where(limited, 0.0)
-        detected, other = seen.sum(dim=0), (1 - weak).where(limited, 0.0).sum(dim=0)
-        share = (other + ROWS_WORTH * other.sum() / (detected + other).sum()) / (detected + other + ROWS_WORTH)
+        # weak packets are missed at random, too
+        n_cells, other = (seen | limited).sum(dim=0), (1 - weak).where(limited, 0.0).sum(dim=0)
+        share = (other + ROWS_WORTH * other.sum() / n_cells.sum()) / (n_cells + ROWS_WORTH)
         if bool((distance.std(dim=0) > 0).any()):  # without distances no power is expected anywhere
             unexplained = missed.maximum(share)
     own_level, shared_level = own[:, 0] - own[:, 1] * middle, shared[0] - shared[1] * middle

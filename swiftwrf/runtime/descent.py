@@ -83,7 +83,9 @@ class Descent(ABC, Generic[Model]):
         """
         try:
             loss = self.objective()
-        except InputError as error:  # the parameters diverged, so that the rasterizer refuses them
+        except InputError as error:  # after a step: the parameters diverged, so that the rasterizer refuses them
+            if self.step == 0:
+                raise
             raise FitError(f"the fit broke at step {self.step}: {error}; {self._advice()}") from None
         self.optimiser.zero_grad()
         loss.backward()

@@ -18,6 +18,7 @@ from types import MappingProxyType
 from typing import Any, TypeVar
 
 from swiftwrf.errors import InputError
+from swiftwrf.runtime.validation import checked
 
 Made = TypeVar("Made")
 Registered = TypeVar("Registered", bound=Callable[..., Any])
@@ -120,6 +121,7 @@ def _entry_points(group: str, path: tuple[str, ...]) -> tuple[Any, ...]:
     return tuple(entry_points(group=group))
 
 
+@checked
 def write_report(task: str, result: Any, file: str | Path) -> None:
     """Write the report of a task's result by the entry point of the group `swiftwrf.reports`.
 

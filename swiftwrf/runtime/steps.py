@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import time
-from collections.abc import Callable, Mapping
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
+from contextlib import contextmanager, suppress
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from pickle import PicklingError
 from typing import Any, Generic, TypeVar
 
 from swiftwrf.errors import InputError
@@ -25,6 +27,19 @@ POLL_S = 2  # between two checks that there are workers
 Row = dict[str, Any]
 Context = TypeVar("Context")
 """data and configuration that all steps share"""
+
+
+@contextmanager
+def refusing_executor(executor: Executor | None) -> Iterator[None]:
+    """Raise InputError for a user's executor that is shut down, loses its processes or cannot be sent what they compute."""
+    try:
+        yield
+    except (AttributeError, PicklingError, RuntimeError, TypeError) as error:
+        is_of_user = executor is not None and not hasattr(executor, "slots")  # workers of a command have own sentences
+        if not is_of_user or not (isinstance(error, BrokenExecutor) or re.search("pickle|shutdown", str(error))):
+            raise
+        remedy = "give an open one, models and estimators of classes that a module defines, or leave it out"
+        raise InputError(f"the executor does not compute the steps ({error}); {remedy}") from None
 
 
 @cache  # looked up at every step of a run
@@ -172,10 +187,12 @@ class Steps(Generic[Context]):
             if self._executor is None:
                 self._values[name] = self.memo.keep(name, *self._compute(*call))
                 return
-            self._pending[self._executor.submit(self._compute, *call)] = name
+            with refusing_executor(self._executor):
+                self._pending[self._executor.submit(self._compute, *call)] = name
         for future in wait(self._pending, POLL_S, FIRST_COMPLETED).done:
             name = self._pending.pop(future)
-            self._values[name] = self.memo.keep(name, *future.result())
+            with refusing_executor(self._executor):
+                self._values[name] = self.memo.keep(name, *future.result())
 
 
 def _compute(context: Context, folder: Path, function: Callable[..., Row], *arguments: Any) -> tuple[Row, float]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
-from functools import cache
+from functools import cache, partial
 from typing import Generic, TypeVar
 
 import torch
@@ -59,6 +60,10 @@ _threads = torch.get_num_threads()
 # of `parallel_map`: all threads that torch has at the start, also where processes of a run share them, because an idle
 # process leaves its own to the others; 1 inside
 _workers: ContextVar[int] = ContextVar("workers", default=_threads)
+
+
+if hasattr(os, "register_at_fork"):  # a forked process would wait for threads of OpenMP that it does not have
+    os.register_at_fork(after_in_child=partial(torch.set_num_threads, 1))
 
 
 def to_device(device: torch.device | str) -> torch.device:

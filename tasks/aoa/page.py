@@ -6,7 +6,8 @@ from dataclasses import replace
 
 from augment.cross_validation import LOCATOR
 from augment.estimators import ESTIMATORS
-from augment.turbo.condition import FULL_NETWORK, LOCATED, MEASURED_NETWORK, MEASURED_STAND_IN, NETWORK, NETWORKS
+from augment.turbo.condition import FULL_NETWORK, LOCATED, MEASURED_NETWORK, NETWORK, NETWORKS
+from augment.turbo.stages import MAX_HELD_OUT_EXTRA
 from swiftwrf.metrics import ChangeMetrics
 from tasks import labels
 from tasks.aoa.records import FractionRecords, palette
@@ -95,9 +96,10 @@ def first_screen(fraction: FractionRecords) -> Summary:
 
 def _errors(fraction: FractionRecords) -> Section:
     caption = (
-        "Near the zenith azimuth errors are large without meaning. Held out: on measured "
-        "spectra, which decide the choice. By synthetic spectra: change of the median of the same estimator on measured "
-        "spectra, a paired bootstrap over the test places."
+        "Near the zenith azimuth errors are large without meaning. Held out: median and mean error on measured spectra that "
+        "decide the choice, all methods trained on the other measured spectra and on at most "
+        f"{MAX_HELD_OUT_EXTRA:,} extra positions. By synthetic spectra: change of the median of the same estimator on "
+        "measured spectra, a paired bootstrap over the test places."
     )
     errors = fraction.table("errors")[["repeat", "index", "method", "great_circle_deg"]]
     return errors_section(
@@ -157,15 +159,15 @@ def _terms() -> dict[str, str]:
 def answer(fraction: FractionRecords) -> Answer:
     """Return the answer of one measured fraction."""
     mix, chosen = fraction.mix, fraction.chosen
-    held_out = mix["estimator_choice"]["held_out_deg"] if mix["estimator_choice"] else {}
-    methods = []
+    choice = mix["estimator_choice"] or {"held_out_deg": {}, "held_out_mean_deg": {}}
+    methods, held_out = [], (choice["held_out_deg"], choice["held_out_mean_deg"])
     for name, found in mix["methods"].items():
         condition = fraction.conditions[name]
         change = found["changes"].get(condition.measured_only.method)
         cells = {
             "azimuth [deg]": number(found["azimuth_deg"]["median"]),
             "elevation [deg]": number(found["elevation_deg"]["median"]),
-            "held out [deg]": number(held_out[name]) if name in held_out else "",
+            "held out [deg]": ", ".join(number(errors[name]) for errors in held_out if name in errors),
             "by synthetic spectra": change_text(change) if change else "",
         }
         seconds = found["seconds"]["train"], found["seconds"]["estimate"]
@@ -186,7 +188,9 @@ def answer_of(run: Records) -> Answer:
     chosen = [f"{of.chosen}, {share} measured" for share, of in answers.items()]
     sentences = [f"{share} measured: {of.conclusion[0]}" for share, of in answers.items()]
     every = list(dict.fromkeys(step for of in answers.values() for step in of.next_steps))
-    return Answer("deg", named, chosen[0], sentences, every, chosen)
+    # `swiftwrf predict` applies the choice of the largest fraction
+    most = max(range(len(fractions)), key=lambda number: float(fractions[number].key))
+    return Answer("deg", named, chosen[most], sentences, every, chosen)
 
 
 def conclusion(fraction: FractionRecords) -> list[str]:
@@ -202,11 +206,16 @@ def conclusion(fraction: FractionRecords) -> list[str]:
     )
     if choice:
         sure += (
-            f" Cross-validation on the measured spectra chose it: {choice['held_out_deg'][chosen]:.2f} degrees on "
-            f"{choice['n_held_out']} held-out ones."
+            f" Measured spectra that were held out chose it: {choice['held_out_deg'][chosen]:.2f} degrees on "
+            f"{choice['n_held_out']} of them (mean {choice['held_out_mean_deg'][chosen]:.2f})."
         )
-        for name, reason in list(choice["better"].items())[:1]:
+        if (first := min(choice["held_out_deg"], key=choice["held_out_deg"].__getitem__)) != chosen:
+            sure += f" The median of `{first}` is smaller there by chance only, and its mean error is larger."
+        # one sentence a reason, about the best of its methods
+        for reason, name in {reason: name for name, reason in reversed(choice["better"].items())}.items():
             sure += f" `{name}` has {medians[name]:.2f} degrees, but is not recommended: {reason}."
+    else:
+        sure += " It is not compared with others: too few spectra are measured to hold some out."
     compared = comparison(fraction)
     if "peak" in medians and chosen != "peak":
         compared += f" The strongest peak, which needs no training, is within {medians['peak']:.2f} degrees."
@@ -248,8 +257,7 @@ def steps(fraction: FractionRecords) -> list[NextStep]:
     """Return what to do next."""
     run, key, path = fraction.run, fraction.key, fraction.run.path
     ending = f"-mix{key}.safetensors"
-    files = {file.name.removesuffix(ending) for file in run.folder.glob(f"*{ending}")}
-    models = sorted(files - {*ESTIMATORS, LOCATOR, MEASURED_STAND_IN, NETWORK})
+    models = sorted(name for name in fraction.mix["synthesis"] if (run.folder / f"{name}{ending}").is_file())
     own, several = [], len(run.metrics["mixes"]) > 1
     if fraction.chosen_file is None and fraction.mix["estimator_choice"]:
         make = f"augment.estimators.make_estimator({fraction.conditions[fraction.chosen].estimator!r})"

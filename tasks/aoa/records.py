@@ -11,7 +11,7 @@ from typing import Any
 from numpy.typing import NDArray
 from pandas import DataFrame
 
-from augment.turbo.condition import Condition, Row, chosen_file, conditions_of, headline
+from augment.turbo.condition import Condition, Row, conditions_of, headline
 from swiftwrf.choices import AUTO, fraction_key
 from tasks import labels
 from tasks.records import Records
@@ -76,9 +76,10 @@ class FractionRecords:
 
     @property
     def chosen_file(self) -> Path | None:
-        """File of the estimator that cross-validation chose. None if nothing was chosen, or what needs no file."""
+        """File of the estimator that held-out spectra chose. None if nothing was chosen, or what has no file."""
         choice = self.mix["estimator_choice"]
-        return chosen_file(self.run.folder, self.key, self.conditions.get(choice["name"]) if choice else None)
+        name = choice.get("file") if choice else None
+        return self.run.folder / name if name else None
 
     @property
     def percent(self) -> str:

@@ -60,7 +60,8 @@ def quality_table(fraction: FractionRecords) -> Table:
     caption = (
         "PSNR (10 log10(1 / MSE)): mean without the extreme tenths over held-out measured spectra, by which the field model "
         "is chosen, and median over the test spectra with its 95 % interval. Median SSIM (7 x 7 uniform window, data range "
-        "1) and mean L1 over the test spectra, which no field model was fitted to."
+        "1) and mean L1 over the test spectra, which no field model was fitted to. Shaded: the field model of the synthetic "
+        "spectra in the answer."
     )
     columns = ["field model", "held-out PSNR [dB]", "PSNR [dB]", "SSIM", "L1", "fit [s]"]
     chosen = frozenset(fraction.synthesizers([fraction.turbo_method])[:1])

@@ -99,6 +99,7 @@ def record(result: LocateComparison, folder: Path) -> Row:
         "overall": result.overall,
         "calibration": {str(level): fraction for level, fraction in result.coverage.items()},
         "weights": result.values[OWN]["weights"],
+        "held_out": result.values[OWN].get("held_out", {}),
     }
 
 

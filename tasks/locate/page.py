@@ -13,6 +13,7 @@ from pandas import DataFrame
 from scipy.stats import binomtest
 
 from swiftwrf.locate.baselines import LOCALIZERS
+from swiftwrf.metrics import LEVEL
 from swiftwrf.plotting import corners_of
 from tasks import labels
 from tasks.page import figures
@@ -27,6 +28,7 @@ from tasks.page.shared import (
     errors_section,
     limits,
     next_steps,
+    recommendation,
     suggestion_section,
 )
 from tasks.records import Records, notes
@@ -34,7 +36,6 @@ from tasks.terminal import Answer, Method, NextStep
 
 OWN = "posterior"  # the localizer that all others are compared with
 NEIGHBOURS = ("knn", "knn_difference")
-LEVEL = 0.8  # probability of the credible regions in the summary
 SUGGESTED = "suggested"  # name of the files with suggested positions
 TRUTH, ESTIMATE = "#cf4a4a", "#ffffff"
 COLUMNS = ["index", "place", "method", "position_error_m"]  # of the errors of methods
@@ -181,14 +182,16 @@ def posteriors(maps: Mapping[str, NDArray[Any]]) -> list[Figure]:
 
 def answer(run: Records) -> Answer:
     """Return the answer of a run."""
+    chosen, _ = recommendation(run, OWN, "m")
     errors, methods = by_method(run.table("errors")[COLUMNS]), []
     for name, entry in run.metrics["overall"].items():
         cells = {"median in plan [m]": number(entry["horizontal_error_m"]["median"])}
         cells |= {"floors right": f"{entry['floor_hit_rate']:.1%}"} if "floor_hit_rate" in entry else {}
         cells |= {f"{OWN} minus it [m]": difference(errors, OWN, name)}
         seconds = entry["seconds"]["fit"], entry["seconds"]["predict"]
-        methods.append(Method(name, entry["position_error_m"], name == "mean", seconds, cells))
-    return Answer("m", methods, OWN, conclusion(run), _steps(run), NEIGHBOURS)
+        is_reference = name == "mean" != chosen
+        methods.append(Method(name, entry["position_error_m"], is_reference, seconds, cells))
+    return Answer("m", methods, chosen, conclusion(run), _steps(run), NEIGHBOURS)
 
 
 def conclusion(run: Records) -> list[str]:
@@ -197,6 +200,7 @@ def conclusion(run: Records) -> list[str]:
     best = min((name for name in error if name != OWN), key=lambda name: error[name]["median"])
     own, receivers, n_test = error[OWN], run.metrics["n_receivers"], run.metrics["n_test"]
     return [
+        *recommendation(run, OWN, "m")[1],
         f"Positions are found within {own['median']:.2f} m (median error; 90 % within {own['p90']:.1f} m).",
         f"The median's 95 % interval is {own['low']:.2f} to {own['high']:.2f} m, and "
         f"{run.metrics['calibration'][str(LEVEL)]:.0%} of the true positions lie in the {LEVEL:.0%} region that comes with "

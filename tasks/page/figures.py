@@ -7,6 +7,7 @@ import re
 import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
+from warnings import catch_warnings, filterwarnings
 
 import matplotlib.style
 import numpy as np
@@ -76,7 +77,8 @@ def as_svg(figure: Figure, title: str | None = None) -> str:
     """Return the figure as SVG without date or random names, with a title for readers who do not see it."""
     stream = io.StringIO()
     canvas, dpi = FigureCanvasSVG(figure), figure.dpi
-    with matplotlib.style.context(STYLE):
+    with matplotlib.style.context(STYLE), catch_warnings():
+        filterwarnings("ignore", "Glyph .* missing")  # of names in scripts that the font lacks
         if (engine := figure.get_layout_engine()) is not None:  # savefig would draw the figure twice to place its parts
             engine.execute(figure)
             figure.set_layout_engine("none")

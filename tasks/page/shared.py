@@ -71,7 +71,10 @@ def errors_section(
         for one in answer.methods
     ]
     columns = ["method", f"median [{unit}]", f"90 % below [{unit}]", *further, "fit + apply [s]"]
-    caption = f"{quantity.capitalize()} on the test rows; medians with their 95 % intervals. {caption}".strip()
+    caption = (
+        f"{quantity.capitalize()} on the test rows; medians with their 95 % intervals. Shaded: {answer.chosen}, which is "
+        f"recommended. {caption}"
+    ).strip()
     values = {"error": [interval(one.error) for one in short]}
     names = [one.name for one in short]
     dots = figures.dots(names, values, {"error": MEASURED}, f"median {quantity} [{unit}]", log=True)
@@ -260,6 +263,18 @@ def comparison_sentence(errors: DataFrame, method: str, other: str, *, name: str
             "several on these rows, which favours it."
         )
     return f"On the same {rows} the errors of {name} and {other} do not differ significantly: {interval}."
+
+
+def recommendation(run: Records, model: str, unit: str) -> tuple[str, list[str]]:
+    """Return the model of a run, or `mean` with a sentence if that has the smaller mean error at held-out training rows."""
+    held_out: Mapping[str, float] = run.metrics["held_out"]
+    chosen = min(held_out, key=lambda name: held_out[name], default=model)
+    if chosen == model:
+        return model, []
+    return chosen, [
+        f"Recommended is {chosen} and not {model}: its mean error at held-out training rows is {held_out[chosen]:.2f} "
+        f"{unit}, that of {model} {held_out[model]:.2f} {unit}. These rows do not show how RSSI depends on the place."
+    ]
 
 
 def coverage_warning(name: str, coverage: float, nominal: float, n_places: int) -> str:

@@ -11,8 +11,8 @@ import torch
 
 from swiftwrf import InputError, Rssi, rssi_room
 from swiftwrf.data.files import sha256
-from swiftwrf.metrics import summary
-from swiftwrf.rssi import LEVEL, PairModel, RssiComparison, RssiModel, compare
+from swiftwrf.metrics import LEVEL, summary
+from swiftwrf.rssi import PairModel, RssiComparison, RssiModel, compare
 from swiftwrf.rssi.comparison import compared
 from swiftwrf.rssi.coverage import Coverage, reach
 from swiftwrf.rssi.maps import RssiMap
@@ -139,6 +139,7 @@ def record(result: RssiComparison, folder: Path, notes: Sequence[str] = ()) -> R
             for receiver in result.test.receiver_names
         },
         "model": result.model,
+        "held_out": result.values[result.model].get("held_out", {}),
         "seconds": seconds[result.model],
         "interval": {"nominal": LEVEL, "coverage": result.coverage},
         "coverage": coverage,
@@ -156,7 +157,7 @@ def _maps(model: RssiModel | PairModel, train: Rssi) -> tuple[dict[str, Any], li
     Without floors there is one map, at the median height of the measurements.
     """
     floors, limits = train.floors, (COVERED_DBM, CERTAINTY, 1)
-    heights = floors.height_m if floors else [None]
+    names, heights = (floors.names, floors.height_m) if floors else ([""], [None])
     charts = [RssiMap.predict(model, height=height) for height in heights]
     number = floors.number(train.transmitter_position) if floors else torch.zeros(len(train), dtype=torch.int64)
     detected = [RssiMap.predict(model, height=height, detected=True) for height in heights]
@@ -175,8 +176,8 @@ def _maps(model: RssiModel | PairModel, train: Rssi) -> tuple[dict[str, Any], li
         "measured": train.rssi_dbm.numpy(),
         "receiver": train.receiver_position.numpy(),
         "receiver_names": np.array(train.receiver_names),
-        "floor_names": np.array(floors.names if floors else [""]),
+        "floor_names": np.array(names),
         "floor_of_row": number.numpy(),
     }
     maps = maps if train.origin is None else maps | {"origin": np.array(train.origin)}
-    return maps, [found.values for found in coverage]
+    return maps, [{"floor": name} | found.values for name, found in zip(names, coverage, strict=True)]

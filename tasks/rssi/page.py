@@ -5,11 +5,12 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
+import torch
 from matplotlib.figure import Figure
 
 from swiftwrf.choices import RSSI_PREDICTORS
-from swiftwrf.metrics import paired_difference
-from swiftwrf.rssi import LEVEL
+from swiftwrf.data.splits import places
+from swiftwrf.metrics import LEVEL, paired_difference
 from tasks.labels import PREDICTORS, colour, meanings
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of
@@ -23,6 +24,7 @@ from tasks.page.shared import (
     errors_section,
     limits,
     next_steps,
+    recommendation,
 )
 from tasks.records import Records, notes
 from tasks.rssi.maps import CERTAINTY, COVERED_DBM, MIN_RATIO, WIDTH_PER_STD, Maps, coverage_sentence
@@ -107,14 +109,15 @@ def _errors(run: Records) -> Section:
 def answer(run: Records) -> Answer:
     """Return the answer of a run."""
     own, errors, methods = model_of(run), by_method(run.table("errors")[COLUMNS]), []
+    chosen = recommendation(run, own, "dB")[0]
     scored = any(entry.get("detection") for entry in run.metrics["overall"].values())
     for name, entry in run.metrics["overall"].items():
         detection = entry.get("detection")
         cells = {f"{own} minus it [dB]": difference(errors, own, name)}
         cells |= {"detection": number(None if detection is None else sum(detection) / 2)} if scored else {}
         seconds = entry["seconds"]["fit"], entry["seconds"]["predict"]
-        methods.append(Method(name, entry["abs_error_db"], name in REFERENCES and name != own, seconds, cells))
-    return Answer("dB", methods, own, conclusion(run), steps(run), (best_baseline(run),))
+        methods.append(Method(name, entry["abs_error_db"], name in REFERENCES and name != chosen, seconds, cells))
+    return Answer("dB", methods, chosen, conclusion(run), steps(run), (own, best_baseline(run)))
 
 
 def model_of(run: Records) -> str:
@@ -145,6 +148,7 @@ def conclusion(run: Records) -> list[str]:
     errors = by_method(run.table("errors")[COLUMNS])
     compared = comparison_sentence(errors, own, best, name=own, unit="dB", rows="pairs")
     return [
+        *recommendation(run, own, "dB")[1],
         f"{', '.join(covered)} {'has' if len(covered) == 1 else 'have'} {who} above {COVERED_DBM:g} dBm with "
         f"{CERTAINTY:.0%} certainty; predictions are within {error['median']:.1f} dB (median error).",
         *(coverage_sentence(maps.coverage, maps.place) for maps in floors),
@@ -178,14 +182,14 @@ def where_next(run: Records) -> str:
     if not any(maps.arrays["inside"].any() for maps in floors):
         return "Measure in a second dimension: the measured positions lie on a line."
     if varied := [maps for maps in floors if maps.varies]:
-        places = []
+        widest = []
         for maps in varied:
             x, y, width, typical = maps.widest
             at = f"x = {x:.1f} m, y = {y:.1f} m{f' on {maps.name}' if maps.suffix else ''}"
-            places.append(f"{at} ({width:.0f} dB instead of {typical:.0f} dB)")
+            widest.append(f"{at} ({width:.0f} dB instead of {typical:.0f} dB)")
         best = " of the best server" if len(floors[0].names) > 1 else ""
-        return f"Measure around {', '.join(places)}: the {LEVEL:.0%} interval{best} is widest there."
-    if (n := len(np.unique(run.arrays("maps")["measured_position"], axis=0))) < MIN_POSITIONS:
+        return f"Measure around {', '.join(widest)}: the {LEVEL:.0%} interval{best} is widest there."
+    if (n := int(places(torch.from_numpy(run.arrays("maps")["measured_position"])).max()) + 1) < MIN_POSITIONS:
         return f"Measure at more positions: {n} are too few to show how RSSI varies between them."
     typical, scatter = max(maps.widest[3] for maps in floors), scatter_of_repeats(run)
     reason = "and the model explains no more"
@@ -194,14 +198,16 @@ def where_next(run: Records) -> str:
     elif scatter is not None:
         reason += f", though repeated measurements at one place lie within {scatter:.0f} dB"
     return (
-        f"More positions between the scans are not worth it: the {LEVEL:.0%} interval is about {typical:.0f} dB wide, and "
-        f"less than {MIN_RATIO:g} times as wide in any place, {reason}."
+        f"More positions between the scans would hardly narrow the {LEVEL:.0%} interval: it is about {typical:.0f} dB wide, "
+        f"and less than {MIN_RATIO:g} times as wide in any place, {reason}."
     )
 
 
 def scatter_of_repeats(run: Records) -> float | None:
     """Return the width of the 80 % interval of repeated measurements at one place [dB], None if there are too few."""
-    same = run.table("predictions").groupby(["x", "y", "z", "receiver"])["measured"]
+    table = run.table("predictions")
+    place = places(torch.from_numpy(table[["x", "y", "z"]].to_numpy(dtype=float)))
+    same = table.groupby([place.numpy(), "receiver"])["measured"]
     repeats = same.count() - 1
     n = int(repeats.clip(lower=0).sum())
     return float(WIDTH_PER_STD * np.sqrt((same.var() * repeats).sum() / n)) if n >= MIN_REPEATS else None

@@ -22,8 +22,8 @@ from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.files import refusing_unreadable, table_of
 from swiftwrf.data.receivers import spelled_as
 from swiftwrf.errors import CONTENT_ERRORS
+from swiftwrf.metrics import LEVEL
 from swiftwrf.online import Step
-from swiftwrf.online.scores import LEVEL
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime.durable import strict
 from tasks.configs import OF_ROWS, TABLE_SUFFIX, UpdateConfig

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from swiftwrf import Prediction, Rssi, RssiModel
 from swiftwrf.data.coordinates import Floors
 from swiftwrf.locate.posterior import PlanMap
-from swiftwrf.rssi import LEVEL
+from swiftwrf.metrics import LEVEL
 from swiftwrf.rssi.coverage import Coverage, reach
 from swiftwrf.rssi.maps import RssiMap
 from tasks.page.maps import Corners, FloorPlan
@@ -151,7 +151,7 @@ class RssiView:
 
     def known(self, height: float, counted: bool = False) -> NDArray[np.bool_]:
         """Return the measured cells of a map, (rows, columns)."""
-        return self.coverage(MapSelection("coverage", 0, height), counted).measured
+        return self.coverage(MapSelection("coverage", 0, height), chart=self.map(height, counted)).measured
 
     def silent(self, selection: MapSelection) -> NDArray[np.bool_]:
         """Return where a packet is more likely lost than received, at the selected receiver or at all of them."""
@@ -225,8 +225,12 @@ class RssiView:
         return self.coverage(selection).probability >= selection.certainty
 
     def best(self, height: float) -> dict[int, float]:
-        """Return the fraction of the measured cells where each receiver has the highest prediction, the largest first."""
-        counts = np.bincount(self.map(height, counted=True).mean.argmax(axis=0)[self.known(height, counted=True)])
+        """Return the fraction of the measured cells where each receiver has the highest prediction, the largest first.
+
+        All cells count on a floor without scans.
+        """
+        best, known = self.map(height, counted=True).mean.argmax(axis=0), self.known(height, counted=True)
+        counts = np.bincount(best[known if known.any() else ...].ravel())
         order = [int(number) for number in np.argsort(-counts, kind="stable") if counts[number]]
         return {number: float(counts[number] / counts.sum()) for number in order}
 

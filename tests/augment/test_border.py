@@ -223,8 +223,11 @@ def test_turbo_learning_with_a_constant_synthesizer():
     ("words", "call"),
     [
         ("models is empty; name at least one", lambda: turbo_learning(ROOM, **OPTIONS, models=[])),
-        ("1000000000 synthetic positions do not fit", lambda: turbo_learning(ROOM, **OPTIONS | {"extra": 10**9})),
-        ("synthetic positions do not fit into memory; give at most", lambda: synthetic_positions(ROOM, 10**9, 0)),
+        (
+            "extra must be .* at most 1000000 or None, got 1000000000",
+            lambda: turbo_learning(ROOM, **OPTIONS | {"extra": 10**9}),
+        ),
+        ("n must be .* at most 1000000, got 1000000000", lambda: synthetic_positions(ROOM, 10**9, 0)),
         ("must begin with a letter and hold no slash, got '../x'", lambda: own(name="../x")),
         ("got ''", lambda: own(name="")),
         (

@@ -3,6 +3,7 @@
 import sys
 from dataclasses import replace
 
+import numpy as np
 import pandas as pd
 import pytest
 import quick
@@ -12,7 +13,7 @@ from augment.suggest import suggest, suggest_positions
 from swiftwrf import rssi_room
 from swiftwrf.gp import most_informative
 from swiftwrf.locate import RssiLocator
-from tasks.page.shared import write_suggestion
+from tasks.page.shared import suggestion_section, write_suggestion
 
 
 def test_suggestions_lie_in_the_region_and_lower_the_variance(room):
@@ -33,6 +34,21 @@ def test_suggested_positions_keep_the_digits_of_maps(room, tmp_path):
     write_suggestion(tmp_path / "suggested", measured.position, found.position, found.variance)
     table = pd.read_csv(tmp_path / "suggested.csv", float_precision="round_trip")
     assert table[["x_m", "y_m", "z_m"]].to_numpy().tolist() == found.position.tolist()
+    assert table["variance_left"].tolist() == found.variance[1:].tolist()
+
+
+@pytest.mark.parametrize(("left", "is_worth"), [((0.5, 0.48, 0.46), False), ((0.5, 0.46, 0.44), True)])
+def test_the_report_states_the_variance_before_and_after(left, is_worth):
+    arrays = {"measured": np.zeros((4, 3)), "suggested": np.arange(6.0).reshape(2, 3), "left": np.array(left)}
+    section = suggestion_section("", arrays, "table", "run", what="a", whole="b", how="c", label="d")
+    (text,), (plot,) = section.paragraphs, section.plots
+    assert (
+        f"at 2 more positions (table.csv, the most useful first) would reduce a from 50% to {left[2]:.0%} of b" in text
+    )
+    assert ("not worth it" not in text) == is_worth
+    percent = [100 * value for value in left]
+    assert plot.panels[1].axes[0].lines[0].get_xydata().tolist() == [list(pair) for pair in enumerate(percent)]
+    assert plot.data["variance_left"].tolist() == list(left[1:])
 
 
 @pytest.fixture(scope="module")

@@ -34,6 +34,7 @@ from scipy.io import savemat
 from small import FLOOR, PUBLISHED, PUBLISHED_RSSI
 
 from augment import Mixed
+from augment.estimators.baselines import NearestSpectrum
 from augment.estimators.kernel_regression import KernelRegression
 from fuzz import runs
 from fuzz.commands import config_file
@@ -172,6 +173,7 @@ MODELS: dict[str, Callable[[], Any]] = {
     "dcgan model": lambda: FIELD_MODELS["dcgan"](PUBLISHED["dcgan"]).fit(_room()),
     "rssi pair model": lambda: PairModel(new_places=False).fit(_floor()),
     "kernel regression": lambda: KernelRegression().fit(Mixed.measured(_room())),
+    "nearest spectrum": lambda: NearestSpectrum().fit(Mixed.measured(_room())),
     "RSSI locator": lambda: RssiLocator(n_cells=200).fit(rssi_room(n=40)),
     "matched-field locator": _matched_field,
 }
@@ -215,7 +217,7 @@ def predicted(model: Any) -> torch.Tensor:
 
 
 def estimated(estimator: Any) -> torch.Tensor:
-    assert isinstance(estimator, KernelRegression)
+    assert isinstance(estimator, KernelRegression | NearestSpectrum)
     return estimator.predict(_room().spectrum[:2].flip(2))
 
 
@@ -226,7 +228,10 @@ def located(locator: Any) -> torch.Tensor:
     return locator.locate(_room().spectrum[:1]).median
 
 
-ANSWERS = {"kernel regression": estimated, "RSSI locator": located, "matched-field locator": located}  # others predict
+ANSWERS = {  # others predict
+    **dict.fromkeys(("kernel regression", "nearest spectrum"), estimated),
+    **dict.fromkeys(("RSSI locator", "matched-field locator"), located),
+}
 
 
 @functools.cache

@@ -64,7 +64,6 @@ def forked(function, *arguments):
     receiver, sender = multiprocessing.Pipe(duplex=False)
 
     def call() -> None:
-        torch.set_num_threads(1)  # the threads of this process are not in the other
         try:
             found = function(*arguments)
         except BaseException as error:

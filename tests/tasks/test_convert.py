@@ -21,6 +21,7 @@ from swiftwrf.data.coordinates import Floors, GeodeticOrigin
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.data.rssi import SURVEY, Offsets
 from swiftwrf.data.writing import write_rssi, write_spectra
+from swiftwrf.metrics import angle_errors
 
 GRID = ("--grid", 24, 96)
 
@@ -237,15 +238,21 @@ def test_an_array_of_any_rows_and_columns(tmp_path, asked, array):
     assert torch.equal(load_spectra(tmp_path / "own").spectrum, expected.spectrum)
 
 
-def test_calibration_sees_the_training_part_alone(tmp_path):
+def test_calibration_sees_the_training_part_alone(tmp_path, capsys):
     data, *_ = spoilt(snapshots(n=150))
     folder = write_snapshots(tmp_path / "source", data=data)
     assert run(folder, tmp_path / "own", *GRID, "--calibrate", "--split", "block", "--seed", 1) == 0
     record = json.loads((tmp_path / "own" / "conversion.json").read_text())["calibration"]
     assert np.linalg.norm(record["turn_deg"]) == pytest.approx(20, abs=1.5)
+    (printed,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("calibrated on")]
+    degrees = max(record["phase_std_deg"]), np.linalg.norm(record["turn_deg"]), max(record["turn_std_deg"])
+    shares = (100 * record[f"line_of_sight_share_{name}"] for name in ("after", "before"))
+    expected = (record["clear_positions"], *(round(x, 1) for x in degrees), *map(round, shares))
+    assert tuple(map(float, re.findall(r"\d+(?:\.\d+)?", printed))) == expected
     mended = load_spectra(tmp_path / "own")
     usual = snapshots(n=150).spectra(AngularGrid.hemisphere(24, 96))
     assert float((mended.spectrum - usual.spectrum).abs().mean()) < 0.01
+    assert float(angle_errors(mended.label, usual.label)["great_circle"].rad2deg().max()) < 2
     assert {name: (len(a), len(b)) for name, (a, b) in mended.named_splits.items()} == {"block": (120, 30)}
     assert torch.equal(mended.split("block")[1].index, data.split("block", 1)[1].index)
 

@@ -12,14 +12,18 @@ import pytest
 import small
 import torch
 from fuzz.runs import follow
+from scipy.spatial.distance import cdist
+from scipy.stats import norm
 
 from swiftwrf import AngularGrid, Rssi, RssiModel, load, load_rssi, make_model, rssi_room, simulated_room
 from swiftwrf.data.writing import write_rssi
 from swiftwrf.models.geometry import GeometryModel, Plane
-from swiftwrf.online import Follower
+from swiftwrf.online import Follower, Step
+from swiftwrf.online.scores import Scores
 from swiftwrf.rssi import estimate_offsets
 from tasks.command import run_command
-from tasks.update.record import Record
+from tasks.update.lines import answer
+from tasks.update.record import Record, map_plot, page
 
 
 @cache
@@ -474,3 +478,48 @@ def test_a_record_comes_back_as_it_was_and_is_cut_to_what_the_model_has_learnt(t
         kept.write(tmp_path)
         assert [row["index"] for row in Record.read(tmp_path).rows] == [41, 42][:number]
         assert kept.table["error"].tolist() == pytest.approx(record.table["error"][:number].tolist(), nan_ok=True)
+
+
+def test_the_numbers_of_a_record_are_those_of_its_measurements(tmp_path):
+    draw, record = np.random.default_rng(0), Record("source", "dB")
+    position, error, covered = draw.random((40, 3)), draw.gamma(2, size=40), draw.random(40)
+    innovation = draw.normal(size=(40, 3))
+    innovation[20:, 1] = np.nan  # not detected
+    for k in range(40):
+        scores = Scores(*(torch.from_numpy(values[k : k + 1]) for values in (position, error, innovation, covered)))
+        record.add(k, Step(scores, ("hall weaker",) * (k == 7), None, ""))
+    root_mean_square = np.sqrt(np.nanmean(innovation**2, axis=1))
+    running = [error[max(0, k - 29) : k + 1].mean() for k in range(40)]
+    for column, values in (("error", error), ("running_error", running), ("innovation", root_mean_square)):
+        assert record.table[column].tolist() == pytest.approx(list(values))
+    shown = page(record, "name", tmp_path)
+    mean, last = f"{error.mean():.3g} dB", f"{running[-1]:.3g} dB"
+    assert [number.value for number in shown.summary.numbers] == ["40", mean, "1", f"{covered.mean():.0%}"]
+    first, second, third = record.sentences()
+    assert first == "1 change detected, 40 measurements learnt."
+    assert (mean in second, second.endswith(f"30: {last}."), "measurement 7" in third) == (True, True, True)
+    cells = shown.sections[0].tables[0].rows
+    assert [int(row[0]) for row in cells] == np.argsort(-root_mean_square)[:10].tolist()
+    worst = root_mean_square.argmax()
+    assert cells[0][1:] == [f"{x:.3g}" for x in (*position[worst], error[worst], root_mean_square[worst])]
+    near = np.argsort(cdist(position, position), axis=1)[:, :5]
+    assert map_plot(record).data["innovation"].tolist() == pytest.approx(root_mean_square[near].mean(axis=1).tolist())
+
+
+def test_an_answer_has_what_was_predicted_its_interval_and_what_was_observed():
+    model, new = rssi_model(), floor().subset(torch.tensor([41]))
+    found = json.loads(answer(41, new, model, Follower(model).step(new)))
+    predicted = model.predict(new.transmitter_position)
+    for name, away in (("predicted", 0), ("low", -1), ("high", 1)):
+        expected = (predicted.mean + away * norm.ppf(0.9) * predicted.std)[0].tolist()
+        assert found[name] == pytest.approx(dict(zip(model.receiver_names, expected, strict=True)), abs=0.00501)
+    observed = dict(zip(model.receiver_names, new.rssi_dbm[0].tolist(), strict=True))
+    known = {name: x for name, x in found["observed"].items() if x is not None}
+    assert known == pytest.approx({name: x for name, x in observed.items() if x == x}, abs=0.00501)
+    data = simulated_room(n=41, grid=AngularGrid.hemisphere(8, 32))
+    train, new = data.subset(torch.arange(40)), data.subset(torch.tensor([40]))
+    field = make_model("gp").fit(train)
+    found = json.loads(answer(40, new, field, Follower(field, train).step(new)))
+    for name, spectrum in (("predicted", field.synthesize(new.position)), ("observed", new.spectrum)):
+        peak = data.grid.peak_direction(spectrum)[0].rad2deg().tolist()
+        assert found[f"{name}_peak_deg"] == pytest.approx(peak, abs=0.0501)

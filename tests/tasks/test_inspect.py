@@ -1,14 +1,22 @@
 """tasks.inspect on valid measurements: findings and page. Wrong ones are in test_wrong_conventions.py."""
 
 import json
+import re
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import quick
 import torch
 from samples import WAVELENGTH, snapshots, write_snapshots, write_survey
+from scipy.spatial.distance import cdist
+from test_rssi_model import path_loss_only
 
-from swiftwrf import AngularGrid, simulated_room
+from swiftwrf import AngularGrid, rssi_room, simulated_room
 from swiftwrf.data.writing import write_spectra
+from swiftwrf.diagnostics.inspection import Findings, inspect
+from tasks.configs import InspectConfig
+from tasks.inspect import page
 
 
 def run(*arguments):
@@ -59,5 +67,69 @@ def test_positions_that_repeat(tmp_path, capsys):
     write_spectra(room.subset(torch.arange(15).repeat(2)), tmp_path / "source")
     assert run(tmp_path / "source", "--out", tmp_path / "page") == 0
     said = capsys.readouterr().out
-    assert "30 rows are at 15 different positions" in said
+    assert "30 rows are at 15 places" in said
     assert "other position is 0.000 m" not in said
+
+
+def test_the_page_of_spectra_has_the_numbers_of_the_data():
+    data = simulated_room(n=30, grid=AngularGrid.hemisphere(8, 32))
+    shown, position = page(Findings(data), "spectra", InspectConfig("a")), data.position.numpy()
+    plan, directions, neighbours = shown.plots
+    sides = [float(side) for side in re.findall(r"\d+\.\d+", shown.summary.numbers[-1].value)]
+    assert sides == pytest.approx(np.ptp(position, axis=0), abs=0.00501)
+    for panel, axes in zip(plan.panels, ([0, 1], [0, 2]), strict=True):
+        arrows = panel.axes[0].collections[0]
+        assert np.stack([arrows.U, arrows.V]) == pytest.approx(
+            0.25 * max(sides) * data.rotation.numpy()[axes], rel=0.01
+        )
+    (azimuth, elevation), (a, e) = data.grid.peak_direction(data.spectrum).T.numpy(), data.label.T.numpy()
+    cosine = np.sin(elevation) * np.sin(e) + np.cos(elevation) * np.cos(e) * np.cos(azimuth - a)
+    away = np.rad2deg(np.arccos(cosine))[data.line_of_sight.numpy()]
+    assert directions.data["peak_from_line_deg"].to_numpy() == pytest.approx(away, abs=1e-3)
+    nearest = np.sort(cdist(position, position), axis=1)[:, 1]
+    assert neighbours.data["nearest_m"].to_numpy() == pytest.approx(nearest)
+    assert neighbours.panels[0].axes[0].lines[0].get_xdata()[0] == pytest.approx(data.array.wavelength / 2)
+
+
+def test_the_page_of_a_survey_has_the_numbers_of_the_data():
+    data = rssi_room(n=30)
+    plan, path_loss = page(Findings(data), "RSSI", InspectConfig("a")).plots
+    assert plan.data["strongest_dbm"].tolist() == np.nanmax(data.rssi_dbm.numpy(), axis=1).tolist()
+    away = cdist(data.transmitter_position.numpy(), data.receiver_position.numpy())[data.detected.numpy()]
+    assert path_loss.data["distance_m"].to_numpy() == pytest.approx(away)
+
+
+def numbers(findings, words):
+    """Return the numbers of the only sentence with these words."""
+    (text,) = [text for _, text in findings.sentences if words in text]
+    return [float(found) for found in re.findall(r"(?<![\w.])-?\d+(?:\.\d+)?", text)]
+
+
+def ranges(position):
+    return [end for axis in position.T.tolist() for end in (min(axis), max(axis))]
+
+
+def test_findings_are_the_numbers_of_snapshots():
+    split = {"walk": (torch.arange(45), torch.arange(45, 60))}
+    time = torch.arange(60.0) ** 3 / 1000
+    data = replace(snapshots(n=60, count=2), line_of_sight=torch.arange(60) < 45, named_splits=split, time=time)
+    found, position = inspect(data, grid=(8, 32)), data.position.numpy()
+    nearest = np.median(np.sort(cdist(position, position), axis=1)[:, 1])
+    for words, expected in (
+        ("snapshots of", [60, 2, 16, 0.5, 2.4]),
+        ("Taken over", [205.4, np.median(np.diff(time))]),
+        ("positions, x", [60, *ranges(position)]),
+        ("nearest other", [nearest, nearest / WAVELENGTH]),
+        ("line of sight, or", [75]),
+        ("Split walk", [45, 15]),
+    ):
+        assert numbers(found, words) == pytest.approx(expected, abs=0.0501), words
+
+
+def test_findings_are_the_numbers_of_a_survey():
+    data = path_loss_only()
+    data.rssi_dbm[:9, 0] = torch.nan
+    found, detected = inspect(data), data.rssi_dbm[data.detected].numpy()
+    extremes = [pytest.approx(end, abs=0.001) for end in (detected.min(), detected.max())]
+    assert numbers(found, "rows of RSSI") == [60, 3, 95, *extremes]
+    assert numbers(found, "Path-loss models") == [100, -50, 1, 2.0]

@@ -24,13 +24,13 @@ def small_parts():
         yield
 
 
-def turbo():
+def turbo(*estimators):
     data = swiftwrf.simulated_room(n=40, grid=AngularGrid.hemisphere(10, 40))
-    return augment.turbo_learning(data, measured=0.5, models=["nearest"], estimators=["peak"], extra=0)
+    return augment.turbo_learning(data, measured=0.5, models=["nearest"], estimators=estimators, extra=0)
 
 
 RESULTS = {
-    "angles": turbo,
+    "angles": lambda: turbo("peak"),
     "RSSI": lambda: swiftwrf.rssi.compare(swiftwrf.rssi_room(n=60), receivers=["6"]),
     "positions": lambda: swiftwrf.locate.compare(swiftwrf.rssi_room(n=80), n_cells=300),
 }

@@ -209,6 +209,17 @@ def chart_of(x, y, cell, rssi, origin=None):
     return RssiMap(np.array(x), np.array(y), 1.0, cell, rssi, rssi, rssi, ("hall",), origin)
 
 
+def test_a_map_is_hatched_where_nothing_is_received_at_the_median_height(model, floor, monkeypatch):
+    hatched = []
+    monkeypatch.setattr("swiftwrf.rssi.maps.hatch", lambda ax, x, y, where: hatched.append(where))
+    chart = RssiMap.predict(model, cell=4.0)
+    detection = np.linspace(0, 1, chart.mean.size).reshape(chart.mean.shape)
+    replace(chart, detection=detection).plot()
+    assert np.array_equal(hatched[0], (detection < 0.5).all(axis=0))
+    assert chart.height == pytest.approx(np.median(floor.transmitter_position[:, 2]), abs=0.01)
+    assert RssiMap.predict(model, cell=2.0, region=[[1.0, 2.0], [9.0, 8.0]]).corners == (1, 9, 2, 8)
+
+
 def test_a_world_file_of_one_cell_has_its_size(tmp_path):
     write_world_file(tmp_path / "a.pgw", chart_of([3.0], [4.0], 2.0, [-50.0]))
     assert list(map(float, (tmp_path / "a.pgw").read_text().split())) == [2, 0, 0, -2, 3, 4]

@@ -199,3 +199,10 @@ def test_tasks_read_files_by_the_guarded_readers():
         named = {ast.unparse(call) for call in calls}
         wrong = {name for name in named if re.search(r"(^|\.)(open|read_text|read_bytes)$", name)} - {"Image.open"}
         assert file.name in allowed or not wrong - {"read_text"}, f"{file}: {wrong}"
+
+
+def test_names_in_scripts_that_the_font_lacks_give_no_warning(recwarn):
+    figure, axes = figures.panel(3, 2)
+    axes.set_title("\u90e8\u5c4b")
+    assert figures.as_svg(figure).endswith("</svg>\n")
+    assert not recwarn.list

@@ -15,7 +15,9 @@ from augment.estimators.aann import AANN
 from augment.estimators.aann_kernel import AANNKernel
 from swiftwrf import AngularGrid, InputError, Rssi, RssiModel, Spectra, load, make_model, rssi_room, simulated_room
 from swiftwrf.data.writing import write_spectra
+from swiftwrf.locate import Posterior
 from swiftwrf.metrics import angle_errors
+from swiftwrf.predicting import _located
 from swiftwrf.runtime.checkpoint import read, write
 from tasks.aoa.page import steps
 from tasks.aoa.records import FractionRecords
@@ -82,7 +84,7 @@ def test_a_damaged_network_is_refused(network, tmp_path, change):
 
 
 def test_a_run_keeps_the_estimator_that_saw_most(finished):
-    files = sorted(file.name for file in finished.glob("*.safetensors"))
+    files = sorted(file.name for file in finished.glob("kernel_regression*.safetensors"))
     # the network of these runs is a stand-in that cannot be saved
     assert files == ["kernel_regression-measured-mix0.5.safetensors", "kernel_regression-mix0.5.safetensors"]
     estimator = load(finished / "kernel_regression-mix0.5.safetensors")
@@ -93,15 +95,12 @@ def test_a_run_keeps_the_estimator_that_saw_most(finished):
     np.testing.assert_allclose(estimate, own[["estimate_azimuth_deg", "estimate_elevation_deg"]], atol=1e-3)
 
 
-def test_the_estimator_that_a_run_recommends_is_the_one_that_cross_validation_chose(finished):
+def test_the_report_and_predict_apply_the_file_of_the_choice(finished):
     fraction = FractionRecords.of(Records(finished))[0]
-    recommended = {}
-    for name in ("kernel_regression, measured", "kernel_regression, measured + synthetic + extra (nearest)"):
-        fraction.mix["estimator_choice"] = {"name": name, "held_out_deg": {name: 1.0}, "n_held_out": 9, "better": {}}
+    for training in ("-measured", ""):
+        fraction.mix["estimator_choice"]["file"] = f"kernel_regression{training}-mix0.5.safetensors"
         assert f"swiftwrf predict {finished} SOURCE" in [step.code for step in steps(fraction)]
-        recommended[name] = load(fraction.chosen_file)
-    alone, turbo = recommended.values()
-    assert len(alone.state()[0]["known"]) < len(turbo.state()[0]["known"])
+        assert fraction.chosen_file == finished / f"kernel_regression{training}-mix0.5.safetensors"
 
 
 def test_directions_of_measured_and_unknown_positions(finished, small, tmp_path, capsys, monkeypatch):
@@ -220,3 +219,25 @@ def test_the_directory_of_a_run_is_enough(finished, small, tmp_path, capsys):
     assert run("predict", finished, tmp_path / "new.npy", "--out", tmp_path / "other.csv") == 0
     assert f"applied: {file}" in capsys.readouterr().err.replace("\n", "")
     assert (tmp_path / "one.csv").read_bytes() == (tmp_path / "other.csv").read_bytes()
+
+
+def test_the_columns_of_positions_are_those_of_the_posteriors():
+    """Equal masses on a cross: 0.1 to 1 m along x either way, half as far along y, a tenth along z."""
+    step = torch.arange(-10, 11)[torch.arange(21) != 10] / 10.0
+    at = torch.cat([side * step[:, None] for side in torch.diag(torch.tensor([1, 0.5, 0.1]))]).double()
+    mass = torch.full((2, 60), 1 / 60, dtype=torch.float64).log()
+    found = _located([Posterior(at.expand(2, -1, -1), mass)], torch.arange(2), torch.tensor([[3.0, 0, 4], [0, 0, 1]]))
+    assert [float(found[f"std_{axis}_m"][0]) for axis in "xyz"] == pytest.approx(at.numpy().std(axis=0))
+    assert found["credible_radius_80_m"].tolist() == [0.5, 0.5]
+    assert found["position_error_m"].tolist() == pytest.approx([5, 1])
+
+
+def test_the_median_error_of_a_table(small, monkeypatch, tmp_path, capsys):
+    errors = pd.DataFrame({"great_circle_deg": [1.0, 2.0, 9.0], "position_error_m": [0.1, 0.2, 3.0], "x_m": 0.0})
+    (tmp_path / "a.safetensors").touch()
+    monkeypatch.setattr("tasks.predict.load", lambda file: AANN())
+    monkeypatch.setattr(AANN, "grid", GRID, raising=False)
+    monkeypatch.setattr("tasks.predict.observed_spectra", lambda *_: (small.store, small))
+    monkeypatch.setattr("tasks.predict.predict", lambda *_, **__: errors)
+    assert run("predict", tmp_path / "a.safetensors", tmp_path, "--out", tmp_path / "out.csv") == 0
+    assert "3 positions, median error 2 degrees and 0.2 m" in capsys.readouterr().out

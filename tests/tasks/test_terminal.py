@@ -2,16 +2,22 @@
 
 import io
 import json
+import os
 import re
+import subprocess
+import sys
 from html import unescape
+from types import SimpleNamespace
 
 import pytest
 import quick
 from rich.console import Console
+from samples import write_survey
 
 from swiftwrf.runtime.progress import progress
+from tasks.command import run_command
 from tasks.options import Output
-from tasks.terminal import Answer, Method, NextStep, Terminal, terminal
+from tasks.terminal import Answer, Method, NextStep, Terminal, _Line, terminal
 
 ERROR = {"median": 2.36, "p90": 7.0, "mean": 3.1, "low": 2.0, "high": 2.9, "n": 40}
 
@@ -26,11 +32,11 @@ def found():
     return Answer("deg", methods, "gp", ["It works.", "It helps."], [NextStep("Look", "swiftwrf view 'a b'")])
 
 
-def test_the_answer_is_a_sorted_table_next_steps_the_conclusion_and_the_report(tmp_path, capsys, found):
+def test_the_answer_is_the_conclusion_a_sorted_table_next_steps_and_the_report(tmp_path, capsys, found):
     Terminal().answer(found, tmp_path / "report.html")
     lines = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
-    head, *rows, none, step, empty, first, second, last = lines
-    assert " ".join(head.split()) == "what you can use median [deg] 95 % interval 90 % below [deg]"
+    first, second, empty, head, *rows, none, step, last = lines
+    assert " ".join(head.split()) == "what you can use (* recommended) median [deg] 95 % interval 90 % below [deg]"
     assert rows[0].split() == ["network,", "measured", "2.36", "2.00", "to", "2.90", "7.00"]
     assert [row.split()[0] for row in rows] == ["network,", "*", "references", "peak"]
     assert (none, step, empty) == ("", "Look: swiftwrf view 'a b'", "")
@@ -87,6 +93,11 @@ def test_one_display_has_the_fraction_of_all_steps():
     assert "inner" not in shown.console.file.getvalue()
 
 
+@pytest.mark.parametrize(("seconds", "words"), [(None, "fit"), (99, "fit, 99 s left"), (200, "fit, 3 min left")])
+def test_the_time_left_is_in_seconds_or_minutes(seconds, words):
+    assert str(_Line().render(SimpleNamespace(description="fit", time_remaining=seconds))) == words
+
+
 def test_into_a_file_steps_have_a_line_at_their_start_and_their_end():
     shown = Terminal()
     shown.console = Console(file=io.StringIO(), width=20)
@@ -113,11 +124,11 @@ def test_into_a_file_steps_have_a_line_at_their_start_and_their_end():
 def test_a_run_shows_results_and_its_answer(request, run, answered, unit):
     folder = request.getfixturevalue(run)
     out, err = ((folder.parent / name).read_text() for name in ("out.txt", "err.txt"))
-    assert out.startswith("what you can use")
-    *_, conclusion = out.split("\n\n")
-    first, *_, last = conclusion.splitlines()
+    conclusion, table, steps = out.split("\n\n")
+    first, *_ = conclusion.splitlines()
     assert answered in first
-    assert last == f"report: {folder / 'report.html'}"
+    assert table.startswith("what you can use (* recommended)")
+    assert steps.splitlines()[-1] == f"report: {folder / 'report.html'}"
     html = unescape(re.sub("<[^>]*>", "", (folder / "report.html").read_text()))
     assert first.removeprefix("50% measured: ").replace("`", "") in html
     assert len(re.findall(rf"^\[\d+/\d+\] .*: [\d.]+ {unit}, [\d.]+ s$", err, flags=re.MULTILINE)) >= 4
@@ -127,6 +138,33 @@ def test_a_run_shows_results_and_its_answer(request, run, answered, unit):
 def test_quiet_runs_show_the_answer_alone(tmp_path, capsys):
     assert quick.run("rssi", "--rx", "1", "--quiet", "--out", tmp_path / "run") == 0
     out, err = capsys.readouterr()
-    assert out.startswith("what you can use")
+    assert "above -75 dBm" in out.splitlines()[0]
     assert err == ""
     assert not terminal.console.quiet
+
+
+@pytest.mark.parametrize(
+    ("stream", "options"), [("", ""), ("", "--json"), (">&-", ""), (">&- 2>&-", "--json")], ids=str
+)
+def test_no_stream_and_no_setting_of_a_session_ends_a_command(tmp_path, stream, options):
+    """Neither an encoding without the characters of a file, nor a closed stream, nor a name of windows of matplotlib."""
+    write_survey(tmp_path, "caf\u00e9.csv")
+    environment = {"PYTHONIOENCODING": "ascii", "MPLBACKEND": "nope", "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = f"{sys.executable} -m tasks inspect caf\u00e9.csv --out out {options} {stream}"
+    done = subprocess.run(
+        command, cwd=tmp_path, env=os.environ | environment, shell=True, capture_output=True, check=False
+    )
+    assert (done.returncode, done.stderr.count(b"Traceback")) == (0, 0), done.stderr[-500:]
+    assert (tmp_path / "out" / "report.html").exists()
+    if stream == "":
+        out = done.stdout.decode("ascii")
+        assert json.loads(out)["source"] == "caf\u00e9.csv" if options else out.startswith("caf\\xe9.csv: RSSI")
+
+
+def test_a_library_that_cannot_be_loaded_is_one_sentence(monkeypatch, capsys):
+    def broken(*_):
+        raise ImportError("libtorch.so: failed to map segment from shared object")
+
+    monkeypatch.setattr("tasks.command.run_task", broken)
+    assert run_command("inspect", ["x", "--out", "y"], "swiftwrf inspect") == 2
+    assert capsys.readouterr().err.startswith("error: a library cannot be loaded (libtorch.so: failed to map")

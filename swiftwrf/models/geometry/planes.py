@@ -42,7 +42,7 @@ class Plane:
         gain: Reflection gain (amplitude) with its sign, of a dielectric that at normal incidence.
         std_mm: Standard deviation of the offset within its mode [mm], which is a quarter of a phase period to either side.
         probability: Probability of that mode, in (0, 1]. The rest is that of alternative offsets.
-        rival_m: Offset of the strongest alternative [m]. None if the alternatives have less than 1 % together.
+        rival_m: Offset of the strongest alternative [m]. None if no alternative has a probability of 1 %.
         dielectric: The gain depends on the angle of incidence by Fresnel's equations for vertically polarised antennas.
 
     Raises:

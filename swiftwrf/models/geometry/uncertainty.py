@@ -35,7 +35,7 @@ from swiftwrf.runtime.threads import parallel_map
 
 MIN_PROBABILITY = 1e-6  # of a plane
 MIN_RIVAL = 0.01  # of an alternative that is named
-SIGN_ODDS = 0.6  # prior odds of a plane whose gain has another sign than the planes of most rooms
+SIGN_ODDS = 0.6  # prior of a sign other than usual, by the study in docs/development/architecture.md
 MIN_SPREAD_RAD = 0.8  # of phase: positions with less spread in any direction count as flat
 CARRIER_SCALES = (0.95, 0.97, 0.98, 0.99, 1.01, 1.02, 1.03, 1.05)  # of alternative carriers
 MAX_PERIODS = 4  # to either side

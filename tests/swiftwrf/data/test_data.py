@@ -198,7 +198,7 @@ def test_paths_without_usable_numbers_are_refused(tmp_path, changes, says):
         load_spectra(write_paths(tmp_path / "p", **changes))
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32, np.uint64, ">i4"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32, np.uint64, ">i4", np.longdouble])
 def test_paths_in_other_precisions(tmp_path, dtype):
     usual = load_spectra(write_paths(tmp_path / "a"))
     single = np.tile([0.0, 0.0, 2.0], (N, 1)).astype(np.float32)

@@ -1,5 +1,6 @@
 """Array snapshots: what is read from npz and HDF5, and everything that is refused."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -319,3 +320,9 @@ def test_a_linear_array_receives_the_angle_to_its_axis(tmp_path):
     estimator = make_estimator("peak").fit(Mixed.measured(data))
     error = angle_errors(estimator.predict(data.spectrum), data.label)["great_circle"]
     torch.testing.assert_close(error, angular_distance(label, peak), atol=1e-6, rtol=0)
+
+
+def test_a_pickle_is_refused_without_advice_to_load_it(tmp_path):
+    (tmp_path / "snapshots.npz").write_bytes(pickle.dumps({"csi": 1}))
+    with pytest.raises(InputError, match=r"\(it is no zip archive\)$"):
+        read_arrays(tmp_path / "snapshots.npz", ["csi"])

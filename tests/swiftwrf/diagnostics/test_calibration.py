@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from samples import snapshots
@@ -153,6 +154,11 @@ def test_a_calibration_in_the_near_field_uses_distances():
 
 
 def test_plain_values_are_strict_json():
-    found = json.loads(json.dumps(calibrate(snapshots(n=100)).to_json(), allow_nan=False))
+    calibration = calibrate(snapshots(n=100))
+    found = json.loads(json.dumps(calibration.to_json(), allow_nan=False))
+    for name in ("phase", "phase_std", "turn", "turn_std"):
+        assert np.deg2rad(found[f"{name}_deg"]) == pytest.approx(getattr(calibration, name).numpy())
+    shares = [found[f"line_of_sight_share_{name}"] for name in ("before", "after")]
+    assert shares == [calibration.before, calibration.after]
     assert len(found["phase_deg"]) == 16
     assert 0 < found["turn_std_deg"][0] < 1

@@ -13,11 +13,12 @@ from rooms import mirror_room
 from swiftwrf import AngularGrid, InputError, Rssi, load, rssi_room, simulated_room
 from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.data.coordinates import Floors
+from swiftwrf.data.splits import folds
 from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.locate import MatchedField, Posterior, Region, RssiLocator, smoothed
 from swiftwrf.locate import posterior as module
 from swiftwrf.locate.features import PathWaves, SpectrumFeatures
-from swiftwrf.locate.posterior import normalised, pooled_weights
+from swiftwrf.locate.posterior import HeldOut, calibrated_pool, normalised, pooled_weights
 from swiftwrf.locate.region import Cells, best_cells, refined
 from swiftwrf.locate.rssi_likelihood import METRICS, DetectionLikelihood, Fingerprints, ValueLikelihood
 from swiftwrf.locate.spectrum_likelihood import BOUNDS, PhaseLikelihood, Student
@@ -26,9 +27,9 @@ from swiftwrf.models.geometry.path_gains import PathGains
 
 SMALL = {"n_best": 60, "n_background": 40, "n_split": 8, "spacing": 0.4, "n_calibration": 40}
 ROOM = [
-    Plane((-1.0, 0.0, 0.0), 0.0, -0.6, 0.1, True),
-    Plane((0.0, 1.0, 0.0), 5.0, -0.6, 0.1, True),
-    Plane((0.0, 0.0, -1.0), 0.0, -0.6, 0.1, True),
+    Plane((-1.0, 0.0, 0.0), 0.0, -0.6, 0.1),
+    Plane((0.0, 1.0, 0.0), 5.0, -0.6, 0.1),
+    Plane((0.0, 0.0, -1.0), 0.0, -0.6, 0.1),
 ]
 
 
@@ -47,6 +48,21 @@ def closed_form():
     exact = replace(spectra, store=type(spectra.store)(room.synthesize(spectra.position)))
     train, test = exact.split()
     return train, test, MatchedField(**SMALL, n_rounds=9).fit(train, room=GeometryModel.of_planes(train, ROOM))
+
+
+def test_errors_at_held_out_rows_are_those_of_the_posterior_and_of_the_mean_position():
+    """RSSI that does not depend on the position locates nothing, RSSI of a floor does."""
+    generator = np.random.default_rng(0)
+    position = np.column_stack([generator.uniform(0, 20, (60, 2)), np.ones(60)])
+    noise = Rssi(generator.normal(-60, 4, (60, 3)).round(), position)
+    fold = folds(noise.transmitter_position, "random", 0).numpy()
+    mean = np.stack([position[fold != own].mean(axis=0) for own in fold])
+    expected = np.linalg.norm(mean - position, axis=1).mean()
+    found = RssiLocator(n_cells=300).fit(noise).held_out_m
+    assert found["mean"] == pytest.approx(expected, abs=1e-3)
+    assert found["posterior"] > 0.8 * expected
+    found = RssiLocator(n_cells=300).fit(rssi_room(n=80)).held_out_m
+    assert found["posterior"] < 0.7 * found["mean"]
 
 
 def gaussian_on_a_line(centre, std, n=400):
@@ -138,6 +154,38 @@ def test_pooling_tempers_what_is_too_certain_and_drops_what_is_noise():
     weight = pooled_weights(at_truth, at_candidates, prior)
     assert weight[0] == pytest.approx(claimed**2, rel=0.25)
     assert weight[1] < 0.1
+
+
+def test_regions_hold_where_weights_fit_the_positions_that_choose_them():
+    """One likelihood is right and 60 are noise, too many for 20 positions."""
+    generator = torch.Generator().manual_seed(0)
+    line = torch.linspace(-4, 4, 41, dtype=torch.float64)
+    cells = torch.stack([line, 0 * line, 0 * line], dim=1)[None]
+
+    def observations(n: int) -> HeldOut:
+        cell = torch.randint(10, 31, (n,), generator=generator)
+        seen = line[cell] + torch.randn(n, generator=generator, dtype=torch.float64)
+        noise = torch.randn(60, n, len(line), generator=generator, dtype=torch.float64)
+        values = torch.cat([-(line - seen[:, None]).square()[None] / 2, noise])
+        return HeldOut(
+            cells[0, cell], values[:, torch.arange(n), cell], cells, values, torch.zeros(n, len(line)).double()
+        )
+
+    inside = []
+    for _ in range(5):
+        parts, new = [observations(4) for _ in range(5)], observations(100)
+        truth, volume = (torch.cat([getattr(part, name) for part in parts]) for name in ("truth", "log_volume"))
+        at_truth, values = (
+            torch.cat([getattr(part, name) for part in parts], dim=1) for name in ("at_truth", "at_candidates")
+        )
+        weight, factor = calibrated_pool(parts, 0.1)
+        of_the_same, too_small = calibrated_pool([HeldOut(truth, at_truth, cells, values, volume)], 0.1)
+        assert of_the_same.equal(weight)
+        found = Posterior(cells, normalised(torch.einsum("k,knm->nm", weight, new.at_candidates)), 0.1)
+        error = (found.median - new.truth).norm(dim=1) / found.credible_radius()
+        inside.append([float((error <= limit).double().mean()) for limit in (factor, too_small)])
+    assert np.mean(inside, axis=0)[0] > 0.8
+    assert np.mean(inside, axis=0)[1] < 0.75
 
 
 def test_true_positions_that_a_search_misses_do_not_sharpen_the_posterior():
@@ -371,9 +419,19 @@ def test_detections_are_learnt():
     generator = torch.Generator().manual_seed(0)
     mean = -100 + 60 * torch.rand(500, 4, generator=generator)
     detected = torch.rand(500, 4, generator=generator) < 0.9 * torch.sigmoid((mean + 85) / 3)
-    found = DetectionLikelihood.fit(mean, detected)
-    assert found.threshold == pytest.approx(-85, abs=2)
+    found = DetectionLikelihood.fit(mean, detected, torch.zeros(4))
+    assert found.threshold.tolist() == pytest.approx([-85] * 4, abs=2)
     assert found.loss == pytest.approx(0.1, abs=0.05)
+
+
+def test_detections_of_receivers_of_other_sensitivity(tmp_path):
+    """Half of the receivers detect nothing below -60 dBm; a saved locator knows them, too."""
+    room = rssi_room(n=120)
+    limit = torch.tensor([-90.0, -60.0]).repeat(6)
+    data = replace(room, rssi_dbm=room.rssi_dbm.where(room.rssi_dbm >= limit, torch.nan))
+    RssiLocator(n_cells=100, n_calibration=50).fit(data).save(tmp_path / "locator.safetensors")
+    threshold = load(tmp_path / "locator.safetensors").likelihoods.detections.threshold
+    assert float(threshold[1::2].mean() - threshold[::2].mean()) > 15
 
 
 def test_variances_of_phases_that_no_room_explains_stay_finite():

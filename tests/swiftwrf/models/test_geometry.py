@@ -339,6 +339,19 @@ def test_a_wall_has_the_probability_that_the_spectra_leave_it(monkeypatch, every
     assert plane.rival_m == (pytest.approx(float(other.offset)) if plane.probability < 0.99 else None)
 
 
+def test_a_search_takes_the_most_probable_room_and_a_known_room_stays():
+    """Half a phase period away a wall of the other sign explains the spectra nearly as well."""
+    data = mirror_room({(1, 0, 0): 4.6}, n=60, noise=0.1, low=(0.5, 0.5, 0.5), high=(4.3, 3.5, 2.2))
+    scene, _ = observe(data)
+    alias = refine(scene, GeometryModel.of_planes(data, [Plane((1, 0, 0), 4.69, 0.6)], 1).tensors())
+    ((moved,), (kept,)) = (assess(data, scene, alias, 0.0, searched).planes for searched in (True, False))
+    assert (moved.offset_m, moved.gain) == pytest.approx((4.6, -0.6), abs=0.02)
+    assert moved.certain
+    assert (kept.offset_m, kept.gain) == pytest.approx((4.69, 0.6), abs=0.05)
+    assert kept.probability < 0.1
+    assert kept.rival_m == pytest.approx(4.6, abs=0.01)
+
+
 def test_a_room_on_other_spectra_has_their_uncertainty_and_scores(room):
     """The new spectra are a fifth as many, with three times the noise."""
     other = mirror_room(SIX, n=20, noise=0.3, seed=3)

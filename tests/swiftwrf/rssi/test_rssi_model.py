@@ -12,6 +12,7 @@ from scipy.optimize import minimize
 from swiftwrf import InputError, PairModel, Rssi, RssiModel, fit_rssi, rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.data.coordinates import GeodeticOrigin
+from swiftwrf.data.splits import folds
 from swiftwrf.gp import Kernel
 from swiftwrf.rssi import RssiConfig, RssiPaperModel, compare
 from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
@@ -197,6 +198,23 @@ def test_shrinkage_keeps_the_first_of_equal_predictors():
 
 
 # --- the model -------------------------------------------------------------------------------------------------------
+
+
+def test_errors_at_held_out_rows_are_those_of_the_model_and_of_the_receivers_means():
+    """RSSI that no place explains: the penalty on the weights costs more than the field gains. On a floor it gains."""
+    generator = np.random.default_rng(2)
+    position = np.column_stack([generator.uniform(0, 10, (40, 2)), np.ones(40)])
+    noise = Rssi(
+        (-60 + generator.normal(0, 3, (40, 2))).round(), position, receiver_position=[[0.0, 0, 1], [10.0, 10, 1]]
+    )
+    fold = folds(noise.transmitter_position, "random", 0).numpy()
+    rssi = noise.rssi_dbm.numpy()
+    mean = np.stack([rssi[fold != own].mean(axis=0) for own in fold])
+    found = RssiModel().fit(noise).held_out_db
+    assert found["mean"] == pytest.approx(np.abs(mean - rssi).mean(), abs=1e-6)
+    assert found["swiftwrf"] > found["mean"]
+    found = RssiModel().fit(with_field()).held_out_db
+    assert found["swiftwrf"] < 0.7 * found["mean"]
 
 
 def test_primitives_are_for_a_field():

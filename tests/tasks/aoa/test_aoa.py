@@ -34,6 +34,7 @@ from swiftwrf.models.geometry import model as geometry
 from swiftwrf.runtime.steps import Memo
 from tasks.aoa import experiment
 from tasks.aoa.records import palette
+from tasks.aoa.room import cross_validation_sentences
 from tasks.labels import colour
 
 
@@ -91,6 +92,16 @@ def test_nearest_spectrum_distinguishes_spectra_that_differ_in_their_last_digits
     query = close[torch.randperm(30, generator=generator)] + 1e-8
     distance = (query.double()[:, None] - close.double()).square().sum(dim=(2, 3))
     assert torch.equal(NearestSpectrum().fit(train).predict(query), room.label[distance.argmin(dim=1)])
+
+
+def test_nearest_spectrum_comes_back_from_its_file_with_half_the_digits(room, tmp_path):
+    train, test = room.split("random", 0)
+    estimator = NearestSpectrum().fit(Mixed.measured(train))
+    estimator.save(tmp_path / "nearest.safetensors")
+    again = load(tmp_path / "nearest.safetensors")
+    assert torch.equal(again.predict(train.spectrum), train.label)
+    distance = (test.spectrum[:, None] - train.spectrum.half().float()).square().sum(dim=(2, 3))
+    assert torch.equal(again.predict(test.spectrum), train.label[distance.argmin(dim=1)])
 
 
 def test_kernel_regression_reads_only_the_spectra_that_it_keeps(room, monkeypatch):
@@ -305,15 +316,15 @@ def test_networks_are_seeded_and_leave_the_global_generator_alone(room, kind):
 def pretended(monkeypatch, room, errors, repeats=1):
     """Return the cross-validation for four folds with these errors by fold and number of synthetic positions.
 
-    So many consecutive spectra of a fold are at one place.
+    `repeats` consecutive spectra of a fold are at one place.
     """
-    monkeypatch.setattr(cross_validation, "held_out_errors", lambda fold, _, number, seed: errors(fold.number, number))
+    monkeypatch.setattr(cross_validation, "held_out_errors", lambda fold, number, seed: errors(fold.number, number))
     model, folds = make_model("idw").fit(room), []
     for fold in range(4):
         position = torch.full((len(errors(fold, 0)), 3), float(fold))
         position[:, 0] = torch.arange(len(position)) // repeats
         folds.append(SimpleNamespace(model=model, number=fold, test=SimpleNamespace(position=position)))
-    return cross_validation.cross_validate(folds, n_synthetic=3000, seed=0)[0]
+    return cross_validation.cross_validate(folds, n_synthetic=3000, seed=0)
 
 
 @pytest.mark.parametrize(
@@ -326,6 +337,41 @@ def test_further_positions_are_recommended_if_each_number_of_them_gains(monkeypa
     given = pretended(monkeypatch, room, lambda fold, number: factor[number] * np.linspace(1, 1.01, 20))
     assert given["recommended_n_synthetic"] == recommended
     assert given["helps"] == (recommended > 0)
+
+
+@pytest.mark.parametrize(("n_better", "helps"), [(19, True), (11, False)])
+def test_turbo_learning_helps_if_the_whole_interval_of_the_rule_is_below_zero(monkeypatch, room, n_better, helps):
+    """The median falls in both cases. Where 9 of 20 spectra lose, the interval reaches from a gain to a loss."""
+    generator = np.random.default_rng(0)
+    alone = [generator.uniform(1, 1.1, 20) for _ in range(4)]
+    factor = np.where(np.arange(20) < n_better, 0.6, 1.5)
+    given = pretended(monkeypatch, room, lambda fold, number: alone[fold] * (factor if number else 1))
+    before, after = np.concatenate(alone), np.concatenate([errors * factor for errors in alone])
+    rows = np.random.default_rng(9).integers(80, size=(4000, 80))
+    change = np.median(after[rows], axis=1) / np.median(before[rows], axis=1) - 1
+    low, high = np.quantile(change, (0.025, 0.975))
+    assert low < 0
+    assert (high < 0) == helps
+    assert given["rule"]["low"] == pytest.approx(low, abs=0.05)
+    assert given["rule"]["high"] == pytest.approx(high, abs=0.05)
+    assert given["helps"] == helps
+    assert given["recommended_n_synthetic"] > 0  # every number gains
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "said"),
+    [
+        (-0.4, -0.1, "Turbo learning helps here: use --extra 300"),
+        (-0.4, 0.1, "The change is not significant"),
+        (0.1, 0.4, "Turbo learning harms here"),
+    ],
+)
+def test_the_report_says_that_turbo_learning_helps_if_its_whole_interval_is_below_zero(low, high, said):
+    rule = {"median_deg": 2.0, "change": (low + high) / 2, "low": low, "high": high}
+    values = {"n_held_out": 9, "stand_in": "kernel_regression", "measured_only_deg": 3.0, "helps": high < 0}
+    values |= {"gains": [{"n_synthetic": 300, **rule}], "rule": rule, "recommended_n_synthetic": 300}
+    (sentence,) = cross_validation_sentences(SimpleNamespace(mix={"cross_validation": {"gp": values}}))
+    assert said in sentence
 
 
 def test_the_interval_of_cross_validation_is_that_of_the_rule(monkeypatch, room):
@@ -454,12 +500,12 @@ def test_a_new_field_model_is_in_help_and_colours(monkeypatch, capsys):
 
 
 def test_models_for_comparison_are_always_quick(small, monkeypatch):
-    """A field model asked for by name does not bring fits of the published size of others along."""
+    """A field model asked for by name brings no fits of the published size along, of others or of held-out spectra."""
     made, model_type = [], context.model_type
     monkeypatch.setattr(context, "model_type", lambda *given: made.append(given) or model_type(given[0]))
     monkeypatch.setattr(ESTIMATORS, "_registered", {"aann": Constant, "kernel_regression": KernelRegression})
     turbo_learning(small, measured=0.5, models=["idw"], preset="paper", extra=0)
-    assert sorted(made) == [("coarray", "quick"), ("gp", "quick"), ("idw", "paper")]
+    assert sorted(made) == [("coarray", "quick"), ("gp", "quick"), ("idw", "paper"), *[("idw", "quick")] * 2]
 
 
 def test_the_room_is_searched_once_for_all_models_with_one(room, floor_alone, short_fits, tmp_path, monkeypatch):

@@ -15,7 +15,6 @@ from quick import cheap, command, sketched
 from rooms import mirror_room
 from small import known_planes
 
-from augment import cross_validation
 from augment.cross_validation import LOCATOR
 from augment.turbo.condition import LOCATED
 from augment.turbo.stages import containing_level
@@ -112,8 +111,9 @@ def test_a_known_room_without_noise_is_located(finished):
     assert mix["locating"][LOCATED]["position_error_m"]["median"] < 0.1
     assert mix["estimator_choice"]["name"] == LOCATED  # whatever field models were asked for
     assert mix["estimator_choice"]["better"] == {}
-    alone = {name for name, method in mix["methods"].items() if method["training"] == "measured"}
-    assert set(mix["estimator_choice"]["held_out_deg"]) == alone - {"network, measured"}
+    usable = {name for name, method in mix["methods"].items() if method["training"] != "all measured"}
+    assert set(mix["estimator_choice"]["held_out_deg"]) == usable
+    assert "network, measured + synthetic (nearest)" in usable
 
 
 def test_the_report_shows_where_it_was(finished):
@@ -162,20 +162,6 @@ def test_without_array_or_planes_it_is_left_out_with_one_sentence(closed_form, t
     html = (tmp_path / "run" / "report.html").read_text()
     assert ("Where was it?" in html) == (missing == "planes")  # which states that none was found
     assert reason in html
-
-
-def test_the_estimator_is_chosen_by_held_out_errors_alone():
-    """Without a model that has a room, or with planes in one of two searches, it is not matched-field processing."""
-    turbo = "kernel_regression, measured + synthetic (idw)"
-    errors = {"kernel_regression": [np.full(4, 2.0)] * 4, turbo: [np.full(4, 1.0)] * 4}
-    for located in ({}, dict.fromkeys((0, 2)), {0: np.full(4, 0.1), 2: None}):
-        choice = cross_validation.choose_estimator(errors, located)
-        assert choice["name"] == turbo
-        assert choice["held_out_deg"] == {"kernel_regression": 2.0, turbo: 1.0}
-        assert choice["n_held_out"] == 16
-    for error, chosen in ((0.1, LOCATOR), (1.5, turbo)):
-        choice = cross_validation.choose_estimator(errors, dict.fromkeys((0, 2), np.full(4, error)))
-        assert (choice["name"], choice["n_held_out"]) == (chosen, 8)
 
 
 def test_the_benchmark_writes_every_draw_and_their_medians(closed_form, tmp_path, monkeypatch):

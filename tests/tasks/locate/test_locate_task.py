@@ -19,7 +19,9 @@ from swiftwrf.locate import MatchedField
 from swiftwrf.locate.baselines import LEVELS, LOCALIZERS
 from swiftwrf.locate.comparison import LocateSplit
 from swiftwrf.runtime.steps import LOCATOR as MODEL
+from tasks.locate.page import answer
 from tasks.predict import read_rssi
+from tasks.records import Records
 from tasks.source import aligned
 
 GRID = AngularGrid.hemisphere(8, 32)
@@ -115,6 +117,20 @@ def test_the_report_shows_errors_calibration_and_posteriors(locate_run):
     with np.load(locate_run / "maps.npz") as maps:
         assert maps["density"].shape == (6, len(maps["y"]), len(maps["x"]))
         assert np.nanmax(maps["density"], axis=(1, 2)) == pytest.approx(1)
+
+
+def test_the_mean_position_is_recommended_where_the_posterior_is_behind_it_on_held_out_rows(locate_run):
+    run = Records(locate_run)
+    assert answer(run).chosen == "posterior"
+    assert answer(run).conclusion[0].startswith("Positions are found within")
+    held_out = run.metrics["held_out"]
+    assert held_out["posterior"] < held_out["mean"]
+    run.metrics["held_out"] = {"posterior": 8.25, "mean": 7.5}
+    found = answer(run)
+    assert found.chosen == "mean"
+    assert "mean" in {one.name for one in found.short()[0]}
+    assert "8.25 m" in found.conclusion[0]
+    assert "7.50 m" in found.conclusion[0]
 
 
 def test_rows_that_no_receiver_detected_are_left_out(tmp_path, capsys):

@@ -24,7 +24,7 @@ NAMES = ("Ground floor", "1")
 
 @pytest.fixture(scope="module")
 def building(tmp_path_factory):
-    """A run on two floors, weak signals above, where every packet is detected: folder, and what the terminal says."""
+    """A run on two floors, weak signals above, where every packet is detected: folder and terminal."""
     folder = tmp_path_factory.mktemp("building")
     data = rssi_room(n=90).columns([0, 5, 11])
     position, rssi = data.transmitter_position.clone(), data.rssi_dbm.nan_to_num(-66.0) - 6.7
@@ -77,6 +77,7 @@ def test_one_number_everywhere(building, floor):
         "scans_above": (maps["measured"][rows].max(axis=1) > -75).mean(),
     }
     assert {name: metrics["coverage"][floor][name] for name in expected} == pytest.approx(expected)
+    assert metrics["coverage"][floor]["floor"] == NAMES[floor]
     shares = {name: f"{share:.0%}" for name, share in expected.items()}
     assert 0.1 < expected[("covered", "not_covered")[floor]] < 0.9
     place = f"the measured area of {('Ground floor', 'floor 1')[floor]}"

@@ -29,10 +29,11 @@ from swiftwrf.rssi import RssiPredictor, compare
 from swiftwrf.rssi.baselines import NEIGHBOUR_COUNTS
 from swiftwrf.rssi.comparison import make_predictor, pool_of
 from swiftwrf.runtime import registry
+from tasks.records import Records
 from tasks.report import merge
 from tasks.rssi import experiment
 from tasks.rssi.maps import Maps, coverage_sentence
-from tasks.rssi.page import where_next
+from tasks.rssi.page import answer, where_next
 
 
 @pytest.mark.parametrize("name", [n for n in RSSI_PREDICTORS if n.startswith(("mri", "gp"))])
@@ -244,7 +245,9 @@ def test_an_interval_of_one_width_sends_nobody_to_measure(tmp_path):
     assert where_next(run).startswith("Measure at more positions: 4 are too few")
     position = np.concatenate([run.maps["measured_position"], np.linspace([0, 0, 1], [4, 3, 1], 30)])
     run.maps |= {"measured_position": position, "measured": position[:, :1], "floor_of_row": np.zeros(34, int)}
-    assert "not worth it: the 80% interval is about 7 dB wide, and less than 1.2 times as wide" in where_next(run)
+    assert "would hardly narrow the 80% interval: it is about 7 dB wide, and less than 1.2 times as wide" in where_next(
+        run
+    )
     assert "the model explains no more" in where_next(run)
     for spread, reason in ((2.7, "which is the scatter of repeated"), (0.5, "lie within 1 dB")):
         measured = [-60.0 - spread, -60 + spread] * 20
@@ -268,7 +271,7 @@ def test_where_the_best_server_is_uncertain_is_where_to_measure(tmp_path):
     assert where_next(run).startswith(sentence)
     assert [ax.get_title() for panel in Maps(run).summary().panels for ax in panel.axes[:1]] == ["best server"] * 2
     run.maps["inside"] = run.maps["inside"] & (np.arange(5) < 3)  # x = 3 is outside now
-    assert "not worth it" in where_next(run) or "too few" in where_next(run)
+    assert "4 are too few" in where_next(run)
     assert "about 9 dB in the whole measured area" in Maps(run).summary().caption
 
 
@@ -289,6 +292,22 @@ def test_cells_that_are_not_measured_are_hatched(tmp_path, monkeypatch):
         assert plot.data["measured"].tolist() == known.ravel().tolist()
     run.metrics["coverage"][0]["reach_m"] = None
     assert "Hatched like /: not measured, outside the scans; like" in Maps(run).summary().caption
+
+
+def test_the_mean_is_recommended_where_the_model_is_behind_it_on_held_out_rows(rssi_run):
+    run = Records(rssi_run)
+    held_out = run.metrics["held_out"]
+    assert set(held_out) == {"swiftwrf", "mean"}
+    assert answer(run).chosen == min(held_out, key=held_out.get)
+    run.metrics["held_out"] = {"swiftwrf": 3.25, "mean": 3.5}
+    assert answer(run).chosen == "swiftwrf"
+    assert "above -75 dBm" in answer(run).conclusion[0]
+    run.metrics["held_out"] = {"swiftwrf": 3.75, "mean": 3.5}
+    found = answer(run)
+    assert found.chosen == "mean"
+    assert {"swiftwrf", "mean"} <= {one.name for one in found.short()[0]}
+    assert "3.50 dB" in found.conclusion[0]
+    assert "3.75 dB" in found.conclusion[0]
 
 
 def test_each_floor_has_its_maps_its_rows_and_its_widest_place(tmp_path):

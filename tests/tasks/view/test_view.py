@@ -297,6 +297,10 @@ def test_floors_and_what_was_not_received_are_shown_apart():
     assert view.on_floor(above.height).tolist() == upper.tolist()
     assert view.silent(above).mean() > 0.9 > 0.1 > view.silent(lower).mean()
     assert ("Hatched" in view.coloured(above).sentence, "Hatched" in view.coloured(lower).sentence) == (True, False)
+    floor = RssiView("one floor measured", view.model, data.subset(~upper))
+    assert (floor.known(above.height).any(), floor.known(lower.height).any()) == (False, True)
+    assert sum(floor.best(above.height).values()) == pytest.approx(1)
+    assert "No cell" in floor.coloured(replace(above, kind="coverage")).sentence
     assert np.nanmean(charts.stripes(view.silent(above))) == 1
 
 
