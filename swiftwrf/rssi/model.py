@@ -329,7 +329,7 @@ class RssiModel(SavedRssiPredictor):
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
         model = cls._of_header(header)
         model.kernel, model.detection_field = Kernel(**header["kernel"]), None
-        model.row_digests = tensors.get("row_digests", cls.row_digests)  # earlier files have none
+        model._take_digests(tensors)
         detections, anchor = any("detection_field." in name for name in tensors), tensors["posterior.anchor"]
         shapes = _shapes(len(model.receiver_names), len(anchor), detections)
         expect(tensors, shapes)
