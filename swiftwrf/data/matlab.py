@@ -57,7 +57,7 @@ def _of_version_4(file: Path, name: str) -> NDArray[Any]:
 
 
 def _content(file: Path, start: int, size: int, is_compressed: bool, most: int) -> bytes:
-    """Return the elements of a variable from its bytes in the file, at most so many bytes."""
+    """Return the elements of a variable from its bytes in the file, at most `most` bytes."""
     with file.open("rb") as stream:
         stream.seek(start)
         if not is_compressed:

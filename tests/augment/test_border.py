@@ -1,4 +1,4 @@
-"""What models and estimators of one's own return is used if it is what they promise, and refused in a sentence otherwise."""
+"""Models and estimators of a user: valid spectra and directions count in every form, others are refused with the class."""
 
 import math
 from functools import cache
