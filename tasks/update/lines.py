@@ -22,6 +22,7 @@ from swiftwrf.online import Step
 from swiftwrf.online.scores import LEVEL
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime.durable import strict
+from swiftwrf.runtime.plain import read_json
 from tasks.configs import OF_ROWS, TABLE_SUFFIX, UpdateConfig
 from tasks.source import reading
 
@@ -133,7 +134,7 @@ def measurement(line: Line, config: UpdateConfig, model: FieldModel | RssiModel)
         if line.header:
             assert isinstance(model, RssiModel)
             return _of_row(text, config, model)
-        content = json.loads(text)
+        content = read_json(text)
         position, value = [list(map(_number, content["position"]))], content[needed]
         if isinstance(model, RssiModel):
             return _of_receivers(position, value, model)
