@@ -115,7 +115,7 @@ def test_measured_splits_are_skipped_on_resume(results, monkeypatch):
 
 def test_primitives_in_phase_are_the_identity():
     latent = torch.linspace(-60, 60, 25)[:, None].double()
-    table = HeadTable(rssi.in_phase([Head("a", 50, 0).requires_grad_(False)]))
+    table = HeadTable(rssi.in_phase([Head(50, 0).requires_grad_(False)]))
     value, _ = table(latent)
     torch.testing.assert_close(value - table(0 * latent)[0], latent, atol=1e-3, rtol=0)
-    assert not rssi.in_phase([Head("a", 0, 0)]).any()
+    assert not rssi.in_phase([Head(0, 0)]).any()
