@@ -147,7 +147,7 @@ def learn_receivers(
     def descend(rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return predictions in all bins (R, n) by the fit to some bins, the normal numbers (R, n), and the heads."""
         generator = torch.Generator().manual_seed(config.seed)
-        heads = [Head(name, config.n_primitives, config.seed).to(device) for name in names]
+        heads = [Head(config.n_primitives, config.seed).to(device) for _ in names]
         white = nn.Parameter(torch.zeros_like(measured))
         n_detected = (~measured[rows.to(device)].isnan()).sum(dim=0).clamp_min(1)
         optimiser = torch.optim.Adam([*(p for head in heads for p in head.parameters()), white], lr=config.rate)

@@ -118,11 +118,11 @@ def prepare(pool: Rssi, own: Tensor, config: RssiConfig, shift: Tensor, curve: D
     n_primitives = config.n_primitives if helps else 0
     loss = everything.columns(own)
     field_db, noise_db = prior_std(loss.variance, kernel if n_primitives else None)
-    heads = [Head(name, n_primitives, config.seed).requires_grad_(False) for name in bins.receiver_names]
+    head = render([Head(n_primitives, config.seed).requires_grad_(False)])
     return RssiTraining(
         **vars(bins),
         kernel=kernel,
-        rendered=render(heads),
+        rendered=head.expand(len(own), *head.shape[1:]),
         path_loss=loss,
         shift=shift[:, own],
         limit=_limits(rssi, loss, distance, shift[:, own]),
