@@ -176,8 +176,10 @@ def of_aoa():
         value = {"estimate": (test.label - off).tolist(), "seconds": TIMES, "history": [], "counts": {}}
         more = {"located": located} if "matched" in name else {}
         found.add(Condition(*known, measured_fraction=0.5), value | more)
-    scores = {"psnr_db": OWN / 4, "ssim": OWN / 100, "l1": OWN / 100}
-    found.add_synthesis(MeasuredSubset(0.5), "gp", True, {"scores": scores, "seconds": TIMES, "history": []})
+    for name, trains in (("idw", False), ("gp", True)):
+        scores = {"psnr_db": OWN / (4 if trains else 5), "ssim": OWN / 100, "l1": OWN / 100}
+        value = {"scores": scores, "seconds": TIMES, "history": []}
+        found.add_synthesis(MeasuredSubset(0.5), name, trains, value)
     validation = VALIDATION | {"helps": True, "recommended_n_synthetic": 300}
     found.compared = {"cross_validation": {"gp": validation}}
     return found
@@ -347,7 +349,9 @@ def test_directions(said):
     assert calibration.get_ydata() == pytest.approx([(level > N / 120).mean() for level in np.linspace(0, 1, 21)])
     assert said_of(row[1]) == median_of(OWN / 10, 0.05)
     assert [float(cell.rstrip("%")) for cell in row[2:]] == [round(np.quantile(OWN / 10, 0.9), 1), 96, 7]
-    (row,) = synthesis.quality_table(fraction).rows
+    assert fraction.mix["seconds"] == {"fit": 1, "synthesize": 7, "train": 2}  # of gp, and of two networks
+    row, other = synthesis.quality_table(fraction).rows
+    assert (row[0], other[0]) == ("gp", "idw")  # the best first
     assert said_of(row[2]) == median_of(OWN / 4, 0.05)
     expected = [np.median(OWN) / 100, OWN.mean() / 100, 1.0]
     assert [float(cell) for cell in row[3:]] == [pytest.approx(each, abs=0.000501) for each in expected]
