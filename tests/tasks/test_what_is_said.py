@@ -8,6 +8,7 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
@@ -22,7 +23,7 @@ from scipy.stats import binomtest, norm
 from test_calibration import spoilt
 
 from augment.positions import sample_positions
-from augment.turbo.artifacts import save_examples
+from augment.turbo.artifacts import save_examples, save_located
 from augment.turbo.condition import Condition, MeasuredSubset
 from augment.turbo.experiment import Experiment
 from augment.turbo.results import TurboResult
@@ -45,7 +46,7 @@ from tasks.aoa.records import FractionRecords
 from tasks.locate import experiment as locate
 from tasks.locate import page as locate_page
 from tasks.page.shared import compared, comparison_sentence, coverage_warning
-from tasks.records import CONFIG, Records
+from tasks.records import CONFIG, Records, read_npz
 from tasks.rssi import experiment as rssi
 from tasks.rssi import page as rssi_page
 from tasks.source import split_notes
@@ -176,8 +177,10 @@ def of_aoa():
         value = {"estimate": (test.label - off).tolist(), "seconds": TIMES, "history": [], "counts": {}}
         more = {"located": located} if "matched" in name else {}
         found.add(Condition(*known, measured_fraction=0.5), value | more)
-    scores = {"psnr_db": OWN / 4, "ssim": OWN / 100, "l1": OWN / 100}
-    found.add_synthesis(MeasuredSubset(0.5), "gp", True, {"scores": scores, "seconds": TIMES, "history": []})
+    for name, trains in (("idw", False), ("gp", True)):
+        scores = {"psnr_db": OWN / (4 if trains else 5), "ssim": OWN / 100, "l1": OWN / 100}
+        value = {"scores": scores, "seconds": TIMES, "history": []}
+        found.add_synthesis(MeasuredSubset(0.5), name, trains, value)
     validation = VALIDATION | {"helps": True, "recommended_n_synthetic": 300}
     found.compared = {"cross_validation": {"gp": validation}}
     return found
@@ -347,7 +350,12 @@ def test_directions(said):
     assert calibration.get_ydata() == pytest.approx([(level > N / 120).mean() for level in np.linspace(0, 1, 21)])
     assert said_of(row[1]) == median_of(OWN / 10, 0.05)
     assert [float(cell.rstrip("%")) for cell in row[2:]] == [round(np.quantile(OWN / 10, 0.9), 1), 96, 7]
-    (row,) = synthesis.quality_table(fraction).rows
+    assert result.positions["credible_radius_80_m"].tolist() == N.tolist()
+    free = result.experiment.test.line_of_sight.numpy().mean()
+    assert fraction.run.metrics["line_of_sight_share"] == pytest.approx(free)
+    assert fraction.mix["seconds"] == {"fit": 1, "synthesize": 7, "train": 2}  # of gp, and of two networks
+    row, other = synthesis.quality_table(fraction).rows
+    assert (row[0], other[0]) == ("gp", "idw")  # the best first
     assert said_of(row[2]) == median_of(OWN / 4, 0.05)
     expected = [np.median(OWN) / 100, OWN.mean() / 100, 1.0]
     assert [float(cell) for cell in row[3:]] == [pytest.approx(each, abs=0.000501) for each in expected]
@@ -432,6 +440,18 @@ def test_whether_synthetic_spectra_help(said):
         assert words in text
     plot = aoa_room._gain(fraction, "gp", VALIDATION)
     assert plot.panels[0].axes[0].lines[0].get_xydata().tolist() == [[0, 0], [300, -25], [1000, -25]]
+
+
+def test_examples_of_positions_are_from_the_smallest_error_to_the_largest(said, tmp_path):
+    (_, result), locator = said["aoa"], Rings()
+    wall = SimpleNamespace(normal=(1.0, 0.0, 0.0), offset_m=2.0, certain=True)
+    locator.room = SimpleNamespace(planes=[wall], fixed_position=torch.zeros(3))
+    test = result.experiment.test
+    save_located(tmp_path / "a.npz", locator, test, test, test.position + torch.from_numpy(OWN[:, None]) * ALONG)
+    found, rows = read_npz(tmp_path / "a.npz"), [0, 20, 40, 59, 79, 99]
+    assert found["index"].tolist() == test.index[rows].tolist()
+    assert found["truth"] == pytest.approx(test.position[rows].numpy())
+    assert (found["radius"].tolist(), found["offset"].tolist()) == ([4.0] * 6, [2.0])
 
 
 @pytest.mark.parametrize(
