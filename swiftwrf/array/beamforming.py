@@ -85,9 +85,7 @@ def capon(channel: Tensor, responses: Responses) -> Tensor:
 
 def of_unit_power(channel: Tensor) -> Tensor:
     """Return the covariance (n, K, K) of channels (n, S, K), scaled to a mean diagonal of 1."""
-    found = covariance(channel)
-    power = found.diagonal(dim1=1, dim2=2).real.mean(dim=1).clamp_min(1e-300)
-    return found / power[:, None, None]
+    return covariance(unit_power(channel.to(torch.complex128)))
 
 
 BEAMFORMERS = {PHASE: phase, "bartlett": bartlett, "capon": capon}

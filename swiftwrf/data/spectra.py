@@ -276,16 +276,13 @@ def snapshot_frequencies(frequency_hz: Numbers | None, channel: Tensor, array: P
     if frequency_hz is None:
         return None
     found = to_tensor("frequency_hz", frequency_hz, torch.float64, (channel.shape[1],))
-    if len(found) and not CARRIERS_HZ[0] <= float(found.min()) <= float(found.max()) <= 2 * float(found.min()):
+    low, high = CARRIERS_HZ
+    if array is not None:
+        low, high = array.frequency_hz / MAX_BAND_RATIO, array.frequency_hz * MAX_BAND_RATIO
+    if len(found) and not low <= float(found.max()) <= 2 * float(found.min()) <= 2 * high:
         raise InputError(
-            f"frequency_hz must be frequencies of one carrier's snapshots in Hz, got {float(found.min()):.6g} to "
-            f"{float(found.max()):.6g}; give e.g. 2.412e9"
-        )
-    carrier = math.nan if array is None else array.frequency_hz
-    if len(found) and (carrier < found.min() / MAX_BAND_RATIO or carrier > MAX_BAND_RATIO * found.max()):
-        raise InputError(
-            f"frequency_hz is about {float(found.mean()):.4g}, but the array has a carrier of {carrier:.4g} Hz; "
-            "give both of one band"
+            f"frequency_hz must be frequencies of one carrier's snapshots, {low:.4g} to {high:.4g} Hz, got "
+            f"{float(found.min()):.6g} to {float(found.max()):.6g}; give Hz of the array's band"
         )
     return found
 

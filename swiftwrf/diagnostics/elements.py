@@ -30,6 +30,7 @@ def other_readings(data: Snapshots, away: Tensor) -> Iterator[tuple[str, float, 
 
     Direct paths begin at points `away` (n, 3) [m] in array coordinates.
     """
+    data = replace(data, frequency_hz=None)  # those of another carrier
     channel, array = data.channel, data.array
     for name, order in _element_orders(array).items():
         yield f"the elements are given {name}", 0, replace(data, channel=channel[..., order])
@@ -43,10 +44,7 @@ def other_readings(data: Snapshots, away: Tensor) -> Iterator[tuple[str, float, 
     meaning = f"the phases are those of the way there and back, as of RFID and backscatter (--round-trip); {apart}"
     yield meaning, 0, replace(data, array=halved)
     scales = torch.logspace(math.log10(0.38), math.log10(3.5), 50, dtype=torch.float64).tolist()
-    scaled = {
-        scale: replace(data, array=PlanarArray(array.element, array.wavelength / scale), frequency_hz=None)
-        for scale in scales
-    }
+    scaled = {scale: replace(data, array=PlanarArray(array.element, array.wavelength / scale)) for scale in scales}
     scale = max(scaled, key=lambda scale: float(evidence(scaled[scale], away).mean()))
     if min(abs(math.log(scale)), abs(math.log(scale / 2))) > MIN_SCALE:
         carrier = f"the carrier is about {scaled[scale].array.frequency_hz / 1e9:.2g} GHz"

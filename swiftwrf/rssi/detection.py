@@ -10,7 +10,7 @@ regression with misclassification: J. Tobin, Econometrica 26, 1958; J. A. Hausma
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -31,9 +31,8 @@ MISSES = torch.tensor([MISSED, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3], dtype=torch.flo
 WIDTHS_DB = 0.5, 1.0, 2.0, 3.0, 5.0, 8.0
 LIMIT_STD_DB = 20.0  # prior of a receiver's limit about that of all; `benchmarks/not_detected.py --insensitive-dbm -70`
 OFFSETS_DB = torch.arange(-40.0, 41.0, dtype=torch.float64)  # of a receiver's limit that are compared
-SAME_LIMIT_DB = 3.0  # difference of limits that is not worth a sentence
 MAX_ROUNDS = 5  # of the limits of all receivers and of each
-MAX_ROWS, MAX_CELLS, MAX_OWN_CELLS = 1500, 1000, 50_000  # that determine the curve, and the limits of the receivers
+MAX_ROWS, MAX_CELLS, MAX_OWN_CELLS = 1500, 4000, 50_000  # that determine the curve, and the limits of the receivers
 Cells = tuple[Tensor, Tensor, float]  # values [dB], their receivers, and the number of cells that each stands for
 
 
@@ -93,19 +92,21 @@ class Detection:
             return cls(own + lowest, 0.5, missed, is_limit)
         spread = 1.25 * float((rssi - level)[usable & seen].abs().mean())
 
-        def cells(value: Tensor, where: Tensor) -> Cells:
-            every = where.nonzero()
-            (some,) = subsample(every, rows=MAX_OWN_CELLS)
-            return value[tuple(some.T)], some[:, 1], max(1.0, len(every) / MAX_OWN_CELLS)
+        def cells(fewest: int, rows: int) -> Iterator[Cells]:
+            for value, kind in ((rssi, seen), (level, ~seen)):
+                every = (kind & (n_near >= fewest)).nonzero()
+                row, receiver = subsample(every, rows=rows)[0].T
+                yield value[row, receiver], receiver, max(1.0, len(every) / rows)
 
-        shared, each = (
-            (cells(rssi, seen & (n_near >= least)), cells(level, ~seen & (n_near >= least)))
-            for least in (FEWEST, OWN_FEWEST)
-        )
+        shared, each = list(cells(FEWEST, MAX_CELLS)), list(cells(OWN_FEWEST, MAX_OWN_CELLS))
         for _ in range(MAX_ROUNDS):
-            limit, width, misses = _shared_curve([(db - own[r], w) for db, r, w in shared], spread)
-            kept, lost = ((db - limit, r, w) for db, r, w in each)
-            score = _log_likelihoods(kept, lost, OFFSETS_DB, (width, math.hypot(spread, width)), len(own))
+            kept, lost = ((db - own[receiver], receiver, weight) for db, receiver, weight in shared)
+            limits = torch.linspace(float(kept[0].min()) - 0.5, float(kept[0].median()), 30, dtype=torch.float64)
+            likely = torch.stack([_log_likelihoods(kept, lost, limits, w, spread, len(own)).sum(-1) for w in WIDTHS_DB])
+            best = np.unravel_index(int(likely.argmax()), likely.shape)
+            width, misses, limit = WIDTHS_DB[best[0]], MISSES[best[1]], limits[best[2]]
+            kept, lost = ((db - limit, receiver, weight) for db, receiver, weight in each)
+            score = _log_likelihoods(kept, lost, OFFSETS_DB, width, spread, len(own))
             score += MISSES_WORTH * (misses * MISSES.log() + (1 - misses) * (-MISSES).log1p())[:, None, None]
             score -= (OFFSETS_DB / LIMIT_STD_DB).square()[:, None] / 2
             previous, own = own, OFFSETS_DB[score.amax(dim=0).argmax(dim=0)]
@@ -122,9 +123,8 @@ class Detection:
         missed = float(self.missed[self.is_limit].mean()) if weak else 0.0
         said = []
         if weak:
-            low, high = (float(x) for x in self.limit[self.is_limit].aminmax())
-            limit = f"{low:.0f} to {high:.0f} dBm, by receiver" if high - low > SAME_LIMIT_DB else f"{high:.0f} dBm"
-            said.append(f"an empty cell means that the signal was below about {limit}")
+            limits = dict.fromkeys(f"{limit:.0f}" for limit in self.limit[self.is_limit].aminmax())
+            said.append(f"an empty cell means that the signal was below about {' to '.join(limits)} dBm")
             if missed > 0.03:
                 said.append(f"{missed:.0%} of all packets are missed at any power")
         if others:
@@ -146,29 +146,13 @@ class Detection:
         return given[0].where(self.is_limit, mean), given[1].where(self.is_limit, std)
 
 
-def _shared_curve(cells: Sequence[tuple[Tensor, float]], spread: float) -> tuple[float, float, float]:
-    """Return limit [dBm], width [dB] and share of misses that fit detected values and the levels beside empty cells best.
+def _log_likelihoods(kept: Cells, lost: Cells, limit: Tensor, width: float, spread: float, n_receivers: int) -> Tensor:
+    """Return log-likelihoods (7, L, R) of values and of levels beside empty cells, for shares of misses and limits (L,).
 
-    Both have the number of cells that each stands for; `spread` is the standard deviation of values about levels [dB].
+    `spread` is the standard deviation of a value about its level [dB].
     """
-    some = [subsample(db.sort().values, rows=MAX_CELLS)[0] for db, _ in cells]
-    weight = [stands_for * len(db) / len(few) for (db, stands_for), few in zip(cells, some, strict=True)]
-    kept, lost = ((few, torch.zeros(len(few), dtype=torch.int64), w) for few, w in zip(some, weight, strict=True))
-    limit = torch.linspace(float(some[0][0]) - 0.5, float(some[0].median()), 30, dtype=torch.float64)
-    scores = torch.stack(
-        [_log_likelihoods(kept, lost, limit, (width, math.hypot(spread, width)), 1)[..., 0] for width in WIDTHS_DB]
-    )
-    best = np.unravel_index(int(scores.argmax()), scores.shape)
-    return float(limit[best[2]]), WIDTHS_DB[best[0]], float(MISSES[best[1]])
-
-
-def _log_likelihoods(kept: Cells, lost: Cells, limit: Tensor, width: tuple[float, float], n_receivers: int) -> Tensor:
-    """Return log-likelihoods (7, L, R) of cells for all shares of misses and limits (L,), which both kinds of cells count.
-
-    The widths are those of the curve over values and over levels [dB].
-    """
-    above = torch.special.log_ndtr((kept[0] - limit[:, None]) / width[0])
-    below = torch.special.ndtr((limit[:, None] - lost[0]) / width[1])
+    above = torch.special.log_ndtr((kept[0] - limit[:, None]) / width)
+    below = torch.special.ndtr((limit[:, None] - lost[0]) / math.hypot(spread, width))
 
     def summed(logarithm: Tensor, cells: Cells) -> Tensor:
         none = torch.zeros(len(limit), n_receivers, dtype=torch.float64)

@@ -88,7 +88,7 @@ def test_receivers_of_other_sensitivity_have_limits_of_their_own(not_detected):
     assert float(torch.cat(errors).mean()) < 2
     assert 0.65 < float(torch.cat(inside).double().mean()) < 0.9
     curve = Detection(limit.double(), 1.0, torch.zeros(4), torch.ones(4, dtype=torch.bool))
-    assert curve.note(list("abcd")) == "an empty cell means that the signal was below about -95 to -72 dBm, by receiver"
+    assert curve.note(list("abcd")) == "an empty cell means that the signal was below about -95 to -72 dBm"
 
 
 def test_empty_cells_that_are_weak_are_no_random_misses_however_many_there_are():
