@@ -13,7 +13,7 @@ from scipy.spatial import Delaunay
 from torch import Tensor
 
 from swiftwrf import InputError, Spectra
-from swiftwrf.data.splits import centres, places
+from swiftwrf.locate.region import Region
 from swiftwrf.positions import nearest
 from swiftwrf.runtime.validation import checked
 
@@ -97,11 +97,7 @@ def sample_positions(known: Tensor, n: int, seed: int) -> Tensor:
     _, extent, axes = torch.linalg.svd(known - centre, full_matrices=False)
     axes = axes[extent > MIN_RELATIVE_EXTENT * extent[0].clamp_min(1e-12)]
     projected = ((known - centre) @ axes.T).numpy()
-    spots = centres(known, places(known))
-    # each is its own nearest, and the next may be the step along a path
-    distance, _ = nearest(spots, spots, min(9, len(spots)))
-    spacing = float(distance[:, -1].quantile(0.95))
-    samples, tried = torch.empty(0, 3, dtype=torch.float64), 0
+    spacing, samples, tried = Region(known).scale_m, torch.empty(0, 3, dtype=torch.float64), 0
     while len(samples) < n:
         inside = torch.from_numpy(_sample_hull(projected, 2 * n, generator)) @ axes + centre
         accepted = nearest(inside, known, 1)[0][:, 0] <= spacing

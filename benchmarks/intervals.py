@@ -2,11 +2,9 @@
 
 python benchmarks/intervals.py --data DATA
 
-floor: intervals of `RssiModel` and regions of `RssiLocator` on simulated floors.
-room: intervals of field models in the simulated room.
+floor, rssi: intervals of `RssiModel` and regions of `RssiLocator`, on simulated floors and on public data sets.
+room, spectra: intervals of field models, in the simulated room and on public data sets.
 matched: regions of `MatchedField` in the simulated room.
-rssi: intervals and regions as on the floors, on public data sets.
-spectra: intervals of field models on public data sets.
 
 Test rows of simulated data are at new positions in the region (random), or in a region of their own (block). The rules of
 intervals were chosen on seeds from 100. Rows that were measured before and not again stay in the result.
@@ -15,25 +13,16 @@ intervals were chosen on seeds from 100. Rows that were measured before and not 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 import torch
 from record import kept, options, write_result
 
-from swiftwrf import (
-    AngularGrid,
-    MatchedField,
-    Rssi,
-    RssiModel,
-    Spectra,
-    load_rssi,
-    load_spectra,
-    make_model,
-    rssi_room,
-    simulated_room,
-)
+import swiftwrf
+from swiftwrf import Rssi, Spectra
 from swiftwrf.locate.baselines import LEVELS
 from swiftwrf.locate.comparison import LocateSplit
 from swiftwrf.metrics import LEVEL, covered
@@ -41,22 +30,18 @@ from swiftwrf.metrics import LEVEL, covered
 RESULT = "intervals"
 Study = Literal["floor", "room", "matched", "rssi", "spectra"]
 SEEDED = ("random", "block")
-N_TEST = 400  # random test rows of simulated measurements
-N_BLOCKS = 5  # of a block split, one for each seed
+N_TRAIN, N_SPECTRA, N_TEST = 200, 80, 400  # training positions; those of regions by spectra; random test rows
+N_CELLS = 2000  # candidate positions of regions by RSSI
 FIELDS = ("swiftwrf", "gp", "coarray")
-RSSI = {
-    "tetam-tracks": ("random", "block", "spatial"),
-    "tetam-fingerprints": ("random", "spatial"),
-    "kolak": ("random", "block", "spatial"),
-    "lora-campus": ("random", "foot"),
-    **dict.fromkeys(("wifi-rooms/office", "wifi-rooms/lecture-theatre", "wifi-rooms/corridor", "gsm-recife"), SEEDED),
-    **dict.fromkeys(("dae-2025", "ts-dsi1", "ts-tut2", "ts-tut5", "ts-ujib1"), ("published",)),
-}
-SPECTRA = {
-    **dict.fromkeys(("s23-200", "newrf-bedroom", "newrf-conference", "newrf-office"), SEEDED),
-    **{f"wsr-{sight}-a-tx{number}": ("place",) for sight in ("los", "nlos") for number in (2, 3, 4)},
-}
-Part = tuple[str, str, int, Rssi | Spectra, Rssi | Spectra]  # data set, split, seed, training and test rows
+N_BLOCKS = 5  # of a block split, one for each seed
+RSSI = {"tetam-tracks": (*SEEDED, "spatial"), "tetam-fingerprints": ("random", "spatial")}
+RSSI |= {"kolak": (*SEEDED, "spatial"), "lora-campus": ("random", "foot"), "gsm-recife": SEEDED}
+RSSI |= {f"wifi-rooms/{name}": SEEDED for name in ("office", "lecture-theatre", "corridor")}
+RSSI |= dict.fromkeys(("dae-2025", "ts-dsi1", "ts-tut2", "ts-tut5", "ts-ujib1"), ("published",))
+SPECTRA = dict.fromkeys(("s23-200", "newrf-bedroom", "newrf-conference", "newrf-office"), SEEDED)
+SPECTRA |= {f"wsr-{sight}-a-tx{number}": ("place",) for sight in ("los", "nlos") for number in (2, 3, 4)}
+Data = Rssi | Spectra
+Part = tuple[str, str, int, Data, Data]  # data set, split, seed, training and test rows
 Row = tuple[str, int, float]  # what is measured, seed, covered fraction
 
 
@@ -69,14 +54,8 @@ class Config:
     """first seed of simulated measurements"""
     seeds: int = 40
     """number of seeds"""
-    positions: int = 200
-    """training positions of simulated measurements"""
-    spectra: int = 80
-    """training spectra of regions by spectra"""
     rows: int = 1000
     """training rows of a public data set at most, random ones"""
-    cells: int = 2000
-    """candidate positions of regions by RSSI"""
 
 
 def main(config: Config) -> None:
@@ -91,16 +70,18 @@ def main(config: Config) -> None:
             write_result(RESULT, {"level": LEVEL, "rows": found}, rows=[row])
 
 
-def simulated(config: Config, make: Callable[[int], Rssi | Spectra], splits: Sequence[str] = SEEDED) -> Iterator[Part]:
-    """Yield parts of simulated measurements."""
+def simulated(
+    config: Config, make: Callable[..., Data], n: int = N_TRAIN, splits: Sequence[str] = SEEDED
+) -> Iterator[Part]:
+    """Yield parts of simulated measurements at n training positions."""
     for seed in range(config.first, config.first + config.seeds):
-        data, some = make(seed), torch.arange(config.positions)
+        data = make(n=n + N_TEST, seed=seed)
+        first, others = (data.subset(rows) for rows in torch.arange(n + N_TEST).split([n, N_TEST]))
         for split in splits:
-            new = data.subset(some), data.subset(torch.arange(config.positions, len(data)))
-            yield data.name, split, seed, *(new if split == "random" else data.subset(some).split(split, seed))
+            yield data.name, split, seed, *((first, others) if split == "random" else first.split(split, seed))
 
 
-def public(config: Config, read: Callable[[Path], Rssi | Spectra], sets: dict[str, Sequence[str]]) -> Iterator[Part]:
+def public(config: Config, read: Callable[[Path], Data], sets: dict[str, Sequence[str]]) -> Iterator[Part]:
     """Yield parts of public data sets, of all seeds of splits that do not come with them."""
     for name, splits in sets.items():
         data = read(config.data / name)
@@ -111,58 +92,44 @@ def public(config: Config, read: Callable[[Path], Rssi | Spectra], sets: dict[st
                 yield name, split, seed, train.subset(some.sort().values), test
 
 
-def of_rssi(config: Config, parts: Iterator[Part]) -> Iterator[Row]:
+def of_rssi(parts: Iterator[Part]) -> Iterator[Row]:
     """Yield the covered fractions of detected values and of positions."""
     for name, split, seed, *rows in parts:
         train, test = (part.subset(part.detected.any(dim=1)) for part in rows)
-        model = RssiModel(validation=train.validation_for(split, test), seed=seed).fit(train)
+        model = swiftwrf.RssiModel(validation=train.validation_for(split, test), seed=seed).fit(train)
         low, high = model.predict_detected(test).interval(LEVEL)
         inside = (test.rssi_dbm >= low) & (test.rssi_dbm <= high)
         yield f"{name} {split}, RSSI", seed, float(inside[test.detected].double().mean())
-        values = LocateSplit(train, test, split, config.cells, seed, 0).fit(None, "posterior")
-        error, radius = (values["estimate"] - values["truth"]).norm(dim=1), values["radius"][:, LEVELS.index(LEVEL)]
+        found = LocateSplit(train, test, split, N_CELLS, seed, 0).fit(None, "posterior")
+        error, radius = (found["estimate"] - found["truth"]).norm(dim=1), found["radius"][:, LEVELS.index(LEVEL)]
         yield f"{name} {split}, regions", seed, float((error <= radius).double().mean())
 
 
 def of_spectra(parts: Iterator[Part]) -> Iterator[Row]:
     """Yield the covered fractions of pixels by each field model."""
     for name, split, seed, train, test in parts:
+        validation = "block" if split == "block" else "random"
         for field in FIELDS[: 2 + (train.array is not None)]:  # the last one needs an array
-            model = make_model(field, validation="block" if split == "block" else "random", seed=seed).fit(train)
-            prediction = model.predict(test.position)
-            fraction = covered(prediction.mean, prediction.std, test.spectrum).mean()
-            yield f"{name} {split}, {field}", seed, float(fraction)
+            found = swiftwrf.make_model(field, validation=validation, seed=seed).fit(train).predict(test.position)
+            yield f"{name} {split}, {field}", seed, float(covered(found.mean, found.std, test.spectrum).mean())
 
 
 def of_positions(parts: Iterator[Part]) -> Iterator[Row]:
     """Yield the covered fractions of positions by a room of six planes."""
     for name, split, seed, train, test in parts:
-        room = make_model("geometry", beam_width=1, max_extra_planes=0, max_order=1).fit(train)
-        found = MatchedField(spacing=0.3, seed=seed).fit(train, room=room).locate(test)
+        room = swiftwrf.make_model("geometry", beam_width=1, max_extra_planes=0, max_order=1).fit(train)
+        found = swiftwrf.MatchedField(spacing=0.3, seed=seed).fit(train, room=room).locate(test)
         inside = (found.median - test.position).norm(dim=1) <= found.credible_radius(LEVEL)
         yield f"{name} {split}, regions", seed, float(inside.double().mean())
 
 
-def floor(config: Config) -> Iterator[Row]:
-    return of_rssi(config, simulated(config, lambda seed: rssi_room(config.positions + N_TEST, seed)))
-
-
-def room(config: Config) -> Iterator[Row]:
-    return of_spectra(simulated(config, lambda seed: simulated_room(n=config.positions + N_TEST, seed=seed)))
-
-
-def matched(config: Config) -> Iterator[Row]:
-    config, grid = replace(config, positions=config.spectra), AngularGrid.hemisphere(10, 40)
-    rooms = simulated(config, lambda seed: simulated_room(n=config.spectra + N_TEST, seed=seed, grid=grid), SEEDED[:1])
-    return of_positions(rooms)
-
-
+coarse_room = partial(swiftwrf.simulated_room, grid=swiftwrf.AngularGrid.hemisphere(10, 40))
 STUDIES: dict[Study, Callable[[Config], Iterator[Row]]] = {
-    "floor": floor,
-    "room": room,
-    "matched": matched,
-    "rssi": lambda config: of_rssi(config, public(config, load_rssi, RSSI)),
-    "spectra": lambda config: of_spectra(public(config, load_spectra, SPECTRA)),
+    "floor": lambda config: of_rssi(simulated(config, swiftwrf.rssi_room)),
+    "room": lambda config: of_spectra(simulated(config, swiftwrf.simulated_room)),
+    "matched": lambda config: of_positions(simulated(config, coarse_room, N_SPECTRA, SEEDED[:1])),
+    "rssi": lambda config: of_rssi(public(config, lambda folder: swiftwrf.load_rssi(folder).receivers(["all"]), RSSI)),
+    "spectra": lambda config: of_spectra(public(config, swiftwrf.load_spectra, SPECTRA)),
 }
 
 

@@ -121,22 +121,17 @@ def covered(mean: Tensor, std: Tensor, measured: Tensor) -> Tensor:
     return ((mean - measured).abs() <= HALF_WIDTH * std).float().mean(dim=(-2, -1))
 
 
-def interval_factor(score: Tensor, place: Tensor, level: float = LEVEL) -> float:
-    """Return the factor of intervals or regions with which they contain a value at a new place with probability `level`.
+def interval_factor(score: Tensor, place: Tensor) -> float:
+    """Return the factor of 80 % intervals or regions with which they contain 80 % of the values at new places.
 
-    Places are exchangeable, rows of one place are not. So all places have equal weight, and one more place, the new one, has
+    Places are exchangeable, rows of one place are not. So all places have equal weight, and one more, the new one, has
     scores above all others (hierarchical conformal prediction: Y. Lee, R. F. Barber and R. Willett, arXiv:2306.06342, 2023).
-    With one row a place the factor is number ceil((n + 1) level) of n ascending scores. The new place must have as many and
-    as accurate measurements as those that were held out.
+    With one row a place the factor is number ceil(0.8 (n + 1)) of n ascending scores, or the last one if there are fewer.
 
     Args:
         score: Errors of held-out rows relative to the half-widths of their intervals, or to the radii of their regions,
             (n, ...). Those that are not finite have no part.
         place: Number of the place of each row, int64 (n,).
-        level: Probability.
-
-    Returns:
-        The factor; the largest score if there are too few places for the level.
 
     Example:
         >>> interval_factor(torch.arange(1.0, 10.0), torch.arange(9))
@@ -147,7 +142,7 @@ def interval_factor(score: Tensor, place: Tensor, level: float = LEVEL) -> float
     count = place.bincount(usable.sum(dim=1).double())
     value, order = score[usable].sort()
     weight = (1 / count[place])[:, None].expand_as(score)[usable][order]
-    needed = level * (int((count > 0).sum()) + 1) - 1e-9
+    needed = LEVEL * (int((count > 0).sum()) + 1) - 1e-9
     return float(value[(weight.cumsum(dim=0) < needed).sum().clamp_max(len(value) - 1)])
 
 

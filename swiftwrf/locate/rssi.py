@@ -205,8 +205,8 @@ class RssiLocator(Configured, Saved):
         at = self.cells.position
         values = self.likelihoods(at, self._maps, rssi)
         log_mass = torch.einsum("k,knm->nm", self.weight, values) + self.cells.log_volume
-        floors = self.region.floors
-        return Posterior(at[None], normalised(log_mass), self.cells.edge_m, self.inflation, floors=floors)
+        edge_m, floors = self.cells.edge_m, self.region.floors
+        return Posterior(at[None], normalised(log_mass), edge_m, self.inflation, floors=floors)
 
     @torch.no_grad()
     @checked

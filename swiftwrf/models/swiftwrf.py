@@ -196,9 +196,7 @@ class SwiftWRF(ProcessModel):
         component = self.weight[1:] @ kernel
         dual = torch.linalg.pinv(component.double() @ component.double().T, hermitian=True) @ component.double()
         basis = Basis(kernel, self.weight[0] @ kernel, dual.float())
-        if (
-            kernel.numel() <= MAX_CACHED_VALUES
-        ):  # of two grids; a new dictionary, because other threads read the old one
+        if kernel.numel() <= MAX_CACHED_VALUES:  # a new dictionary, because other threads read the old one
             self._bases = dict([*self._bases.items()][-1:]) | {grid: basis}
         return basis
 

@@ -140,13 +140,9 @@ class PairPredictor(RssiPredictor):
         pair = torch.cat([train.transmitter_position[row], train.receiver_position[column]], dim=1)
         session = None if train.session is None else train.session[row]
         fold = folds(pair[:, :3], self.config.validation, self.config.seed, session=session)
-        if self._has_new_places(pair):
+        if self.config.new_places and len(pair[:, 3:].unique(dim=0)) > 1:
             fold = folds(pair[:, 3:], "random", self.config.seed)
         self._fit_pairs(pair, train.rssi_dbm[row, column], fold)
-
-    def _has_new_places(self, pair: Tensor) -> bool:
-        """Return whether receivers of pairs (m, 6), at more than one place, are held out, and not the transmitter."""
-        return self.config.new_places and bool(places(pair[:, 3:]).any())
 
     def _predict(self, position: Tensor) -> tuple[Tensor, Tensor | None]:
         n, r = len(position), len(self.receiver_position)
@@ -245,8 +241,8 @@ class PairModel(PairPredictor, SavedRssiPredictor):
         choices = [choice for ratio in RATIOS for choice in self._judged(ratio, fold, sample, held_out)]
         _, self.ratio, self.kernel, score = min(choices, key=lambda choice: choice[0])
         rows = torch.cat([sample[fold[sample] == number] for number in held_out])
-        end = pair[rows, 3:] if self._has_new_places(pair) else pair[rows, :3]
-        scale = interval_factor(score / HALF_WIDTH, places(end))
+        place = places(pair[rows, 3:] if self.config.new_places else pair[rows, :3], 2)  # of the end that is held out
+        scale = interval_factor(score / HALF_WIDTH, place)
         self.scale_db = score.new_tensor([max(scale, rounding_std(rssi) / self.kernel.noise**0.5)])
         self._precompute()
 
