@@ -13,6 +13,7 @@ from scipy.spatial import Delaunay
 from torch import Tensor
 
 from swiftwrf import InputError, Spectra
+from swiftwrf.data.splits import centres, places
 from swiftwrf.positions import nearest
 from swiftwrf.runtime.validation import checked
 
@@ -96,9 +97,9 @@ def sample_positions(known: Tensor, n: int, seed: int) -> Tensor:
     _, extent, axes = torch.linalg.svd(known - centre, full_matrices=False)
     axes = axes[extent > MIN_RELATIVE_EXTENT * extent[0].clamp_min(1e-12)]
     projected = ((known - centre) @ axes.T).numpy()
-    places = known.unique(dim=0)
+    spots = centres(known, places(known))
     # each is its own nearest, and the next may be the step along a path
-    distance, _ = nearest(places, places, min(9, len(places)))
+    distance, _ = nearest(spots, spots, min(9, len(spots)))
     spacing = float(distance[:, -1].quantile(0.95))
     samples, tried = torch.empty(0, 3, dtype=torch.float64), 0
     while len(samples) < n:

@@ -33,7 +33,6 @@ from record import RESULTS, options, write_result
 
 from augment import Mixed, withhold
 from augment.estimators import ESTIMATORS, make_estimator
-from augment.turbo.artifacts import LEVEL
 from augment.turbo.experiment import ROOM_MODEL
 from augment.turbo.stages import located
 from swiftwrf import (
@@ -52,7 +51,7 @@ from swiftwrf.data.raytraced import FurnishedRoom, Material, Scene, Tracing, tra
 from swiftwrf.data.spectra import array_spectra
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import GaussianProcess, choose_kernel
-from swiftwrf.metrics import angle_errors, summary
+from swiftwrf.metrics import LEVEL, angle_errors, summary
 from swiftwrf.models.geometry.channels import coherence, field, waves
 
 KERNEL = "kernel_regression"

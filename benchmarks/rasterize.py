@@ -165,7 +165,7 @@ def model_of(n: int, grid: AngularGrid, device: torch.device) -> SwiftWRF:
     model, (mean, cholesky, _) = SwiftWRF(n_primitives=n), scene(n, 1, torch.device("cpu"))
     known, value = positions(200).double(), torch.randn(200, RANK, generator=generator, dtype=torch.float64)
     model.grid, model.bounds = grid, torch.tensor([[0.0] * 3, [1.0] * 3], dtype=torch.float64)
-    model.mean, model.cholesky, model.calibration = mean[0], cholesky, 1.0
+    model.mean, model.cholesky, model.spread = mean[0], cholesky, torch.ones(grid.shape)
     model.weight = torch.randn(1 + RANK, n, generator=generator)
     model.process = GaussianProcess(Kernel(), known, value)
     model._move(device)

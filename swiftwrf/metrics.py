@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from functools import lru_cache
+from statistics import NormalDist
 from typing import TypedDict
 
 import numpy as np
@@ -26,7 +27,8 @@ MIN_GROUPS = 10  # of test rows, for an interval of differences
 N_BOOTSTRAP = 1000  # resamplings of an interval
 N_CHANGE = 2000  # of a change, whose distribution has long tails
 SMALLEST_ERROR_DEG = 1e-9  # a change is relative to at least this median
-NORMAL_80 = 1.2816  # standard deviations about the mean that hold 80 % of a normal variable
+LEVEL = 0.8  # probability of every interval and region that held-out places calibrate
+HALF_WIDTH = NormalDist().inv_cdf((1 + LEVEL) / 2)  # of the interval of a normal variable, in standard deviations
 
 
 @lru_cache(maxsize=16)
@@ -116,21 +118,37 @@ def covered(mean: Tensor, std: Tensor, measured: Tensor) -> Tensor:
         >>> round(float(covered(torch.zeros(100, 100), torch.ones(100, 100), measured)), 1)
         0.8
     """
-    return ((mean - measured).abs() <= NORMAL_80 * std).float().mean(dim=(-2, -1))
+    return ((mean - measured).abs() <= HALF_WIDTH * std).float().mean(dim=(-2, -1))
 
 
-def std_factor(score: Tensor) -> float:
-    """Return the factor of standard deviations with which 80 % intervals contain 80 % of the values.
+def interval_factor(score: Tensor, place: Tensor, level: float = LEVEL) -> float:
+    """Return the factor of intervals or regions with which they contain a value at a new place with probability `level`.
+
+    Places are exchangeable, rows of one place are not. So all places have equal weight, and one more place, the new one, has
+    scores above all others (hierarchical conformal prediction: Y. Lee, R. F. Barber and R. Willett, arXiv:2306.06342, 2023).
+    With one row a place the factor is number ceil((n + 1) level) of n ascending scores. The new place must have as many and
+    as accurate measurements as those that were held out.
 
     Args:
-        score: Absolute errors in standard deviations, of any shape.
+        score: Errors of held-out rows relative to the half-widths of their intervals, or to the radii of their regions,
+            (n, ...). Those that are not finite have no part.
+        place: Number of the place of each row, int64 (n,).
+        level: Probability.
+
+    Returns:
+        The factor; the largest score if there are too few places for the level.
 
     Example:
-        >>> errors = torch.randn(100, 100, generator=torch.Generator().manual_seed(0)).abs()
-        >>> round(std_factor(errors / 0.5), 1)  # standard deviations of 0.5 are half as large as they should be
-        2.0
+        >>> interval_factor(torch.arange(1.0, 10.0), torch.arange(9))
+        8.0
     """
-    return float(np.quantile(score.numpy(), 0.8)) / NORMAL_80
+    score = score.reshape(len(score), -1)
+    usable = score.isfinite()
+    count = place.bincount(usable.sum(dim=1).double())
+    value, order = score[usable].sort()
+    weight = (1 / count[place])[:, None].expand_as(score)[usable][order]
+    needed = level * (int((count > 0).sum()) + 1) - 1e-9
+    return float(value[(weight.cumsum(dim=0) < needed).sum().clamp_max(len(value) - 1)])
 
 
 def angle_errors(estimate: Tensor | NDArray[np.floating], truth: Tensor | NDArray[np.floating]) -> dict[str, Tensor]:

@@ -174,7 +174,7 @@ def _located(
 ) -> Columns:
     """Return the columns of a table with the positions of observations, batch by batch."""
     parts = (
-        (each.median, each.std, each.credible_radius(0.8), each.ambiguous, each.floor_probability.amax(dim=1))
+        (each.median, each.std, each.credible_radius(), each.ambiguous, each.floor_probability.amax(dim=1))
         for each in posteriors
     )
     if not len(index):

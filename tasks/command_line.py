@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import inspect
-import json
 import os
 import sys
 from argparse import ArgumentError, ArgumentParser
@@ -19,6 +18,7 @@ import yaml
 from tyro.constructors import ConstructorRegistry, PrimitiveTypeInfo
 
 from swiftwrf.errors import FitError, InputError, one_line
+from swiftwrf.runtime.plain import TypedLoader, read_json
 from tasks.options import Answered, Options
 from tasks.terminal import terminal
 
@@ -193,7 +193,7 @@ def file_options(file: Path) -> dict[str, Any]:
         if not file.is_file() or file.stat().st_size > MAX_CONFIG_BYTES:
             raise OSError(f"expected a file of at most {MAX_CONFIG_BYTES} bytes")
         text = file.read_text(encoding="utf-8-sig")
-        content = json.loads(text) if file.suffix == ".json" else yaml.safe_load(text)
+        content = read_json(text) if file.suffix == ".json" else yaml.load(text, Loader=TypedLoader)
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
         raise InputError(f"--config {file} cannot be read ({error})") from None
     if isinstance(content, dict) and isinstance(content.get("config"), dict):

@@ -19,7 +19,7 @@ from swiftwrf.data.files import TABLES, read_table
 from swiftwrf.data.formats import RSSI_FORMATS, ReadOptions, read, read_spectra
 from swiftwrf.data.receivers import spelled_as
 from swiftwrf.data.rssi import Offsets
-from swiftwrf.data.splits import MAX_REPEATED, repeated_fraction
+from swiftwrf.data.splits import MAX_REPEATED, places, repeated_fraction
 from swiftwrf.data.store import Store
 from swiftwrf.datasets import DATA_SETS, fetch
 from swiftwrf.errors import listed
@@ -109,11 +109,11 @@ def split_notes(train: Rssi, test: Rssi, split: str) -> list[str]:
         )
     repeated = repeated_fraction(train.transmitter_position, test.transmitter_position)
     position = torch.cat([train.transmitter_position, test.transmitter_position])
-    n_places = len(position.unique(dim=0))
+    n_places = int(places(position).max()) + 1
     if repeated > MAX_REPEATED:
-        notes.append(f"this split tests look-up: {repeated:.0%} of the test rows are at positions of training rows")
+        notes.append(f"this split tests look-up: {repeated:.0%} of the test rows are at places of training rows")
     elif n_places < len(position) and not repeated:
-        notes.append(f"{len(position)} rows are at {n_places} positions, each of which is in one part of the split")
+        notes.append(f"{len(position)} rows are at {n_places} places, each of which is in one part of the split")
     return notes
 
 

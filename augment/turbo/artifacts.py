@@ -12,14 +12,13 @@ from torch import Tensor
 from swiftwrf import Spectra
 from swiftwrf.data.store import Store
 from swiftwrf.locate import MatchedField
-from swiftwrf.metrics import covered
+from swiftwrf.metrics import LEVEL, covered
 from swiftwrf.models import FieldModel
 from swiftwrf.models.neighbours import MemoryModel
 from swiftwrf.runtime.durable import write_json, write_npz
 
 # of the PSNR at the test positions, and of the position error: from the best spectrum to the worst
 SPECTRA_QUANTILES, LOCATED_QUANTILES = (1.0, 0.5, 0.0), (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
-LEVEL = 0.8  # of the credible regions
 MAX_CANDIDATES = 300  # candidate positions of largest mass that are stored of an example
 N_LAYERS = 3  # of heights between which furniture is shown
 

@@ -13,7 +13,7 @@ from pandas import DataFrame, concat
 
 from augment.cross_validation import LOCATOR, choose_estimator
 from augment.estimators import Estimator
-from augment.turbo.artifacts import LEVEL, model_file
+from augment.turbo.artifacts import model_file
 from augment.turbo.condition import (
     LOCATED,
     Condition,
@@ -29,7 +29,7 @@ from swiftwrf import load
 from swiftwrf.choices import fraction_key
 from swiftwrf.data.splits import places
 from swiftwrf.locate import MatchedField
-from swiftwrf.metrics import ChangeMetrics, ErrorSummary, angle_errors, paired_change, summary
+from swiftwrf.metrics import LEVEL, ChangeMetrics, ErrorSummary, angle_errors, paired_change, summary
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.runtime.registry import write_report
 

@@ -17,13 +17,13 @@ from augment.estimators import SavedEstimator
 from augment.estimators.base import estimated
 from augment.mix import Mixed, mix
 from augment.positions import SyntheticPositions, synthetic_positions
-from augment.turbo.artifacts import LEVEL, as_bytes, model_file, save_examples, save_located, save_model
+from augment.turbo.artifacts import as_bytes, model_file, save_examples, save_located, save_model
 from augment.turbo.condition import Condition, MeasuredSubset, Row
 from augment.turbo.experiment import ROOM_MODEL, Experiment
 from swiftwrf import FitError, GeometryModel, InputError, Spectra, load
 from swiftwrf.data.store import Store
 from swiftwrf.locate import MatchedField, MatchedFieldConfig, Posterior
-from swiftwrf.metrics import l1, psnr, ssim
+from swiftwrf.metrics import LEVEL, l1, psnr, ssim
 from swiftwrf.models.base import synthesized
 from swiftwrf.runtime.checkpoint import read, write
 from swiftwrf.runtime.steps import STEPS

@@ -41,6 +41,18 @@ def unit(channel: Tensor) -> Tensor:
     return channel / channel.abs().clamp_min(1e-300)
 
 
+def unit_power(channel: Tensor) -> Tensor:
+    """Return channels (n, S, K) of any scale with a mean power of 1 at each position. Zeros stay zeros.
+
+    Example:
+        >>> unit_power(torch.full((1, 1, 2), 3e-30j))
+        tensor([[[0.+1.j, 0.+1.j]]])
+    """
+    wide = channel.to(torch.complex128)  # the square of a small single-precision number is 0
+    power = wide.abs().square().mean(dim=(1, 2), keepdim=True)
+    return (wide / power.sqrt().clamp_min(1e-300)).to(channel.dtype)
+
+
 def unit_phasor(phase: Tensor) -> Tensor:
     """Return exp(j phase) for phases [rad] of any shape."""
     return torch.polar(torch.ones_like(phase), phase)

@@ -22,7 +22,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from swiftwrf.array.beamforming import covariance
+from swiftwrf.array.beamforming import covariance, of_unit_power
 from swiftwrf.array.planar import PlanarArray, differences, pairs
 from swiftwrf.errors import InputError
 
@@ -176,7 +176,7 @@ def _directions(method: Method, array: PlanarArray, channel: Tensor) -> Tensor:
     """Return the directions that a method finds; see `music`."""
     found = torch.empty(len(channel), 3, dtype=torch.float64)
     for rows in torch.arange(len(channel)).split(BATCH_ROWS):
-        cosine = method(array, covariance(channel[rows]))
+        cosine = method(array, of_unit_power(channel[rows]))
         z = (1 - cosine.square().sum(-1, keepdim=True)).clamp_min(0).sqrt()
         found[rows] = torch.cat([cosine @ _axes(array).T, z], dim=-1)
     return found

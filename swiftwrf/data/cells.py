@@ -46,6 +46,8 @@ DIGITS_OF_DATE = re.compile(
     r"(?:19|20)\d\d(?:0[1-9]|1[0-2])(?:0[1-9]|[12]\d|3[01])(?:[01]\d|2[0-3])[0-5]\d[0-5]\d(?:\d{3})?"
 )
 DAY_FIRST = re.compile(r"\s*(?:\d{1,2}\.\d{1,2}\.|(?:1[3-9]|2\d|3[01])/\d{1,2}/)\d{2,4}\b.*")
+DAY_S = 86400.0
+DECIMAL_COMMA = re.compile(r"^(\s*[+-]?\d+),(\d+\s*)$")
 CLOCK_ONLY = re.compile(r"\s*\d{1,2}:\d\d(?::\d\d(?:[.,]\d+)?)?\s*(?:[ap]\.?m\.?)?\s*", re.IGNORECASE)
 
 
@@ -133,16 +135,17 @@ def column_of_numbers(label: object, table: pd.DataFrame, name: str) -> Floats:
 def seconds(column: pd.Series, date: pd.Series | None = None) -> tuple[Floats, list[str]]:
     """Return times [s] since the first cell, nan where a cell is no time, and a note on their unit.
 
-    Cells are dates or numbers [s]. A unit in the name of the column counts. Otherwise, numbers as large as milliseconds,
-    microseconds or nanoseconds since 1970 are these, and 14 or 17 digits may be a date (20240131120000).
+    Cells are dates, durations, times of the day or numbers [s]. A unit in the name of the column counts. Otherwise, numbers
+    as large as milliseconds, microseconds or nanoseconds since 1970 are these, and 14 or 17 digits may be a date
+    (20240131120000).
 
     Args:
         column: Dates, numbers, or times of the day.
         date: Dates, if the cells are times of the day.
 
     Example:
-        >>> seconds(pd.Series(["2024-01-01 10:00:00", "2024-01-01 10:01:00", "noon"]))
-        (array([ 0., 60., nan]), [])
+        >>> seconds(pd.Series(["2024-01-01 10:00:00", "2024-01-01 10:01:00", "noon"], name="time"))
+        (array([ 0., 60., nan]), ["cells of column time that hold no time are unknown: 1 of 3, e.g. 'noon'"])
         >>> seconds(pd.Series([1_700_000_000_000, 1_700_000_000_500], name="time"))
         (array([0. , 0.5]), ['column time counts milliseconds since 1970, which are converted to seconds'])
         >>> seconds(pd.Series(["20240131235959", "20240201000000"], name="t"))
@@ -151,7 +154,11 @@ def seconds(column: pd.Series, date: pd.Series | None = None) -> tuple[Floats, l
     notes = []
     text = text_of(column).str.removesuffix(".0")
     filled = text[text != ""]
+    if column.dtype.kind == "O":  # text, maybe with a decimal comma, which is no date
+        column = text.str.replace(DECIMAL_COMMA, r"\1.\2", regex=True).rename(column.name)
     values = np.full(len(column), np.nan) if column.dtype.kind == "M" else parsed(column)[0]
+    if column.dtype.kind == "m":
+        values = column.dt.total_seconds().to_numpy(np.float64)
     if len(filled) and filled.str.fullmatch(DIGITS_OF_DATE).all():
         notes.append(f"column {column.name} holds dates as digits (yyyymmddhhmmss)")
         whole = pd.to_datetime(text.str[:14], errors="coerce", utc=True, format="%Y%m%d%H%M%S")
@@ -163,6 +170,10 @@ def seconds(column: pd.Series, date: pd.Series | None = None) -> tuple[Floats, l
         day_first = bool(text_of(column).str.fullmatch(DAY_FIRST).any())
         when = pd.to_datetime(column, errors="coerce", utc=True, format="mixed", dayfirst=day_first)
         values = (when - when.min()).dt.total_seconds().to_numpy(np.float64)
+        back = np.flatnonzero(np.diff(values) < -DAY_S / 2)
+        if len(back) == 1 and text_of(column).str.fullmatch(CLOCK_ONLY).all():
+            values = values + DAY_S * (np.arange(len(values)) > back[0])
+            notes.append(f"times of the day in column {column.name} pass midnight")
     else:
         size = np.nanmedian(values) if np.isfinite(values).any() else 0.0
         unit = unit_of(column)
@@ -173,4 +184,8 @@ def seconds(column: pd.Series, date: pd.Series | None = None) -> tuple[Floats, l
         if UNITS.get(unit, 1.0) != 1:
             values = values / UNITS[unit]
             notes.append(f"column {column.name} is in {unit}, which is converted to seconds")
+    unknown = text[np.isnan(values) & ~text.str.fullmatch(NO_VALUE).to_numpy(bool)]
+    if len(unknown):
+        count = f"{len(unknown)} of {len(column)}, e.g. {unknown.iloc[0]!r}"
+        notes.append(f"cells of column {column.name} that hold no time are unknown: {count}")
     return values - values[0] if len(values) and np.isfinite(values[0]) else values, notes

@@ -27,7 +27,7 @@ MAX_EXTENT_DEG = 2.0  # of positions that are recognised as degrees
 NO_FIX = (0.0, -1.0, 999.0, -999.0, 9999.0, -9999.0)
 MIN_EXTENT_M, MAX_EXTENT_MINUTES = 2.0, 30.0  # of walks in metres, and in ddmm.mmmm
 STOREY_M = 4.0  # height of a floor where heights are missing or count from the floor
-MIN_STOREY_M = 1.5  # difference of the heights of two floors
+MIN_STOREY_M, SAME_HEIGHT_M = 1.5, 0.5  # differences of the heights of two floors, and of one floor
 BELOW_GROUND = re.compile(r"(?:b|ug|u\.g\.?|basement|cellar|keller|sub|lower)[ ._-]*(?:level|floor)?[ ._-]*(\d*)")
 VALUE, PX, METRE = r"(\d+(?:[.,]\d+)?)", "(?:px|pixels?)", "m(?:et(?:er|re)s?)?"
 SCALES = [  # of a plan in lines above a table: pixels in a metre, and metres in a pixel, whose power is -1
@@ -204,7 +204,8 @@ def degrees_in(
 ) -> tuple[Floats | None, list[str]]:
     """Return latitudes and longitudes (n, 2) [deg], None if the coordinates are metres, and a note on their unit.
 
-    Coordinates that are named after degrees may count 1e-7 degrees, or degrees and minutes (ddmm.mmmm).
+    Coordinates that are named after degrees may count 1e-7 degrees, or degrees and minutes (ddmm.mmmm). They are metres only
+    if none of them can be degrees. Longitudes may count from 0 to 360 degrees.
 
     Args:
         label: Name of the table, for messages.
@@ -214,7 +215,7 @@ def degrees_in(
         asked: What the user states.
 
     Raises:
-        InputError: Values that are no degrees though the user states it, or that may be either, or may be ddmm.mmmm.
+        InputError: Values that are no degrees though the user or their names state it, or that may be either.
 
     Example:
         >>> degrees_in("walk.csv", ("x", "y"), np.array([[11.0, 48.0], [11.0, 48.001]]), False, None)[0][1].tolist()
@@ -242,12 +243,18 @@ def degrees_in(
             notes.append(f"{columns} count degrees and minutes (ddmm.mmmm), which are converted to degrees")
     swapped = not named and bool((np.abs(xy[:, 1]) > 90).any())
     degrees = xy if swapped else xy[:, ::-1]
+    stated = named or asked == "degrees"
+    if stated and 180 < degrees[:, 1].max() <= 360 and degrees[:, 1].min() >= 0:
+        degrees = np.stack([degrees[:, 0], (degrees[:, 1] + 180) % 360 - 180], axis=1)
+        notes.append(f"longitudes in {columns} count from 0 to 360 degrees")
     if not (np.abs(degrees) <= (90, 180)).all():
-        if asked == "degrees" or (named and (np.abs(degrees) <= 180).all()):
-            raise InputError(
-                f"{label}: {columns} hold latitudes beyond 90 degrees; are they swapped? Name them with columns "
-                "latitude=NAME longitude=NAME"
-            )
+        if asked is None and (size > (360, 90)).all():
+            return None, [f"{columns} count as metres, because none of their values can be degrees"] * named
+        if stated:
+            fault = "latitudes beyond 90 degrees; are they swapped? Name them with columns latitude=NAME longitude=NAME"
+            if not (np.abs(degrees) <= 180).all():
+                fault = "values beyond 180 degrees; if they are metres, give --coordinates metres"
+            raise InputError(f"{label}: {columns} hold {fault}")
         return None, notes
     east = (degrees[:, 1] - degrees[0, 1] + 180) % 360  # on either side of the antimeridian
     extent, distance = float(max(np.ptp(degrees[:, 0]), np.ptp(east))), float(np.abs(xy).max())
@@ -289,25 +296,43 @@ class Floors:
         return [self.names[number] for number in self.number(position).tolist()]
 
 
-def floors_of(floor: list[str], z: Floats) -> Floors | None:
-    """Return the floors by the name of each row's floor and its height z (n,) [m]; None if there is one only.
+def floors_of(label: object, floor: list[str], position: Floats) -> Floors | None:
+    """Return the floors by the name of each row's floor and its position (n, 3) [m]; None if there is one only.
 
-    Names of one height, e.g. in two buildings, are one floor.
+    Names of one height at different places, e.g. in two buildings, are one floor.
+
+    Raises:
+        InputError: Floors of one height at the same places; the label names the table.
 
     Example:
-        >>> floors_of(["1", "0", "1"], np.array([5.0, 1.0, 5.2]))
+        >>> position = np.array([[0, 0, 5.0], [0, 0, 1.0], [0, 0, 5.2]])
+        >>> floors_of("walk.csv", ["1", "0", "1"], position)
         Floors(names=('0', '1'), height_m=(1.0, 5.1))
     """
-    label = np.array(floor, dtype=object)
-    height = {name: float(np.median(z[label == name])) for name in set(floor) - {""}}
+    of_row = np.array(floor, dtype=object)
+    rows = {name: position[of_row == name] for name in set(floor) - {""}}
+    height = {name: float(np.median(own[:, 2])) for name, own in rows.items()}
     levels: list[list[str]] = []
     for name in sorted(height, key=lambda name: (height[name], name)):
         if levels and height[name] - height[levels[-1][0]] < MIN_STOREY_M:
+            if above := [other for other in levels[-1] if _overlap(rows[name], rows[other])]:
+                raise InputError(
+                    f"{label}: floors {above[0]!r} and {name!r} have heights of {height[above[0]]:.3g} and "
+                    f"{height[name]:.3g} m at the same places; give heights above one ground, or numbers of the floors "
+                    "without heights"
+                )
             levels[-1].append(name)
         else:
             levels.append([name])
     heights = (float(np.mean([height[name] for name in level])) for level in levels)
     return Floors(tuple(", ".join(level) for level in levels), tuple(heights)) if len(levels) > 1 else None
+
+
+def _overlap(a: Floats, b: Floats) -> bool:
+    """Return True if more than half of the positions of one floor are in the box of the other, or nearly so in height."""
+    margin = np.array([0.0, 0.0, SAME_HEIGHT_M])
+    boxes = ((p >= q.min(axis=0) - margin) & (p <= q.max(axis=0) + margin) for p, q in ((a, b), (b, a)))
+    return any(float(inside.all(axis=1).mean()) > 0.5 for inside in boxes)
 
 
 def floor_numbers(names: Sequence[str]) -> Floats:

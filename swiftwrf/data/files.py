@@ -7,7 +7,6 @@ import hashlib
 import io
 import itertools
 import math
-import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,9 +19,10 @@ from numpy.typing import NDArray
 
 from swiftwrf.choices import CARRIERS_HZ
 from swiftwrf.data.archives import MAX_UNPACKED_BYTES, refusing_broken
-from swiftwrf.data.cells import NO_VALUE, column_of_numbers
+from swiftwrf.data.cells import DECIMAL_COMMA, NO_VALUE, column_of_numbers
 from swiftwrf.data.documents import DOCUMENTS, table_in_document
 from swiftwrf.errors import InputError, optional_module
+from swiftwrf.runtime.plain import TextLoader
 
 SUFFIXES = (".csv", ".parquet")  # of tables in a folder
 TABLES = (*SUFFIXES, *DOCUMENTS)  # of tables that are named
@@ -30,7 +30,6 @@ SEPARATORS = ",;\t"
 MAX_TEXT_BYTES = 2**28  # a million rows of positions take a tenth of it
 MAX_PREAMBLE_LINES = 20  # before the header of a table
 MAX_MISSING_CELLS = 3  # at the end of all rows
-DECIMAL_COMMA = re.compile(r"^(\s*[+-]?\d+),(\d+\s*)$")
 
 
 def sha256(file: Path) -> str:
@@ -105,21 +104,10 @@ def read_yaml(file: Path) -> dict[str, Any]:
         InputError: No such file, not YAML, not a mapping, or a name twice.
     """
     with refusing_broken(file, "valid YAML"):
-        content = yaml.load(read_text(file), Loader=_PlainLoader)
+        content = yaml.load(read_text(file), Loader=TextLoader)
     if not isinstance(content, dict):
         raise InputError(f"{file} must hold names and values, got {type(content).__name__}")
     return content
-
-
-class _PlainLoader(yaml.BaseLoader):
-    """Loader of texts, lists and mappings that refuses a name given twice, of which YAML would keep the last."""
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
-        names = [key.value for key, _ in node.value]
-        if len(set(names)) < len(names):
-            twice = next(name for name in names if names.count(name) > 1)
-            raise ValueError(f"it names {twice!r} twice; each needs a name of its own")
-        return super().construct_mapping(node, deep)
 
 
 def numbers(value: Any, count: int) -> tuple[float, ...] | None:

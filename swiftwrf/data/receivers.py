@@ -166,12 +166,14 @@ def _positions(file: Path, table: pd.DataFrame, origin: GeodeticOrigin | None, f
     known = ~np.isnan(position[:, :2]).all(axis=1)
     xy = position[known, :2]
     if origin is None:
-        if column_of(table, "longitude", {}) in both and (np.abs(xy) <= (180, 90)).all():
+        if column_of(table, "longitude", {}) in both and (np.abs(xy) <= (360, 90)).all():
             raise InputError(
                 f"{file} holds longitudes and latitudes, but the measurements are in metres; give one unit"
             )
         return frame_of(file, table, both, frame)[0].to_world(position)
-    if not (np.abs(xy - (origin.longitude, origin.latitude)) <= MAX_FROM_ORIGIN_DEG).all():
+    away = xy - (origin.longitude, origin.latitude)
+    away[:, 0] = (away[:, 0] + 180) % 360 - 180
+    if not (np.abs(away) <= MAX_FROM_ORIGIN_DEG).all():
         raise InputError(
             f"{file}: positions must be in degrees as the measurements are, within {MAX_FROM_ORIGIN_DEG:g} degrees of "
             f"{origin}"

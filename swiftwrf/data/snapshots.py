@@ -94,7 +94,7 @@ class Snapshots(PositionedData):
             rotation=to_rotation(rotation),
             line_of_sight=to_tensor("line_of_sight", free, torch.bool, (None,)),
             time=None if time is None else to_tensor("time", time, torch.float64, (None,)),
-            frequency_hz=snapshot_frequencies(frequency_hz, channel),
+            frequency_hz=snapshot_frequencies(frequency_hz, channel, array),
         )
 
     @property

@@ -29,6 +29,7 @@ from swiftwrf.runtime.validation import check_value, checked
 GRID = AngularGrid.hemisphere(90, 360)  # of spectra that are computed
 OF_SPECTRA = ("line_of_sight", "label", "channel", "frequency_hz")  # arrays beside the spectra in spectrum.npz
 DIRECTION = ("elevation", "azimuth")  # names of the dimensions of a spectrum
+MAX_BAND_RATIO = 2.05  # of the frequencies of channels and of the array; 2 is the way there and back
 MAX_LABEL = torch.tensor([math.tau, math.pi / 2], dtype=torch.float64) + 1e-6  # azimuth and elevation [rad], rounded
 
 
@@ -144,7 +145,7 @@ class Spectra(PositionedData):
             fixed_position=fixed_position,
             rotation=rotation,
             channel=channel,
-            frequency_hz=None if channel is None else snapshot_frequencies(frequency_hz, channel),
+            frequency_hz=None if channel is None else snapshot_frequencies(frequency_hz, channel, array),
         )
 
     @property
@@ -266,11 +267,11 @@ def to_directions(name: str, value: Any, n: int | None = None, missing: bool = F
     return found
 
 
-def snapshot_frequencies(frequency_hz: Numbers | None, channel: Tensor) -> Tensor | None:
+def snapshot_frequencies(frequency_hz: Numbers | None, channel: Tensor, array: PlanarArray | None) -> Tensor | None:
     """Return the frequency of each snapshot of channels (n, S, K), float64 (S,) [Hz], checked; None if none are given.
 
     Raises:
-        InputError: Another number of frequencies than snapshots, or one that no carrier has.
+        InputError: Another number of frequencies than snapshots, one that no carrier has, or one far from the array's.
     """
     if frequency_hz is None:
         return None
@@ -279,6 +280,12 @@ def snapshot_frequencies(frequency_hz: Numbers | None, channel: Tensor) -> Tenso
         raise InputError(
             f"frequency_hz must be frequencies of one carrier's snapshots in Hz, got {float(found.min()):.6g} to "
             f"{float(found.max()):.6g}; give e.g. 2.412e9"
+        )
+    carrier = math.nan if array is None else array.frequency_hz
+    if len(found) and (carrier < found.min() / MAX_BAND_RATIO or carrier > MAX_BAND_RATIO * found.max()):
+        raise InputError(
+            f"frequency_hz is about {float(found.mean()):.4g}, but the array has a carrier of {carrier:.4g} Hz; "
+            "give both of one band"
         )
     return found
 

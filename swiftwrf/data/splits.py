@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Literal
 
-import pandas as pd
+import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from scipy.stats import wasserstein_distance
 from torch import Tensor
 
@@ -20,6 +20,7 @@ TEST_SHARE = 0.2
 MIN_TRAINING = 10  # measurements
 MAX_REPEATED = 0.1  # fraction of test rows at training positions, beyond which a split tests look-up
 FOLDS = 5
+PLACE_RADIUS = 0.05  # of a place, relative to the mean spacing of places; repeats by motion capture lie within 3 %
 
 Validation = Literal["random", "block", "session"]
 
@@ -86,24 +87,51 @@ def kept_splits(splits: dict[str, tuple[Tensor, Tensor]], kept: Tensor, n: int) 
     return {name: (train[train >= 0], test[test >= 0]) for name, (train, test) in parts.items()}
 
 
-def places(position: Tensor, n_parts: int) -> Tensor:
-    """Return the number of the place of each row (n, 3), in the order in which the places first occur, int64 (n,).
+def places(position: Tensor, n_parts: int = 1) -> Tensor:
+    """Return the number of the place of each row (n, 3), int64 (n,).
 
-    Rows at one position share a place. Each row is a place of its own if there are fewer places than parts.
+    Robots, motion capture and satellite receivers report other coordinates each time they return to a place. So a place is
+    a ball with a radius of 5 % of the mean spacing of places: sqrt(area / places), or length / places along a line. Its
+    centre is the position with most others within the radius, outside all balls before. The order of the rows has no
+    effect. Each row is a place of its own if there are fewer places than parts.
+
+    Example:
+        >>> places(torch.tensor([[5.0, 0, 0], [0.0, 0, 0], [5.001, 0, 0]]))
+        tensor([0, 1, 0])
     """
-    spot = position.unique(dim=0, return_inverse=True)[1]
-    place, spots = pd.factorize(spot.numpy())
-    return torch.from_numpy(place) if len(spots) >= n_parts else torch.arange(len(position))
+    spots, spot = position.double().unique(dim=0, return_inverse=True)
+    length, width, _ = (spots.amax(dim=0) - spots.amin(dim=0)).sort(descending=True).values.tolist()
+    tree, number, last = cKDTree(spots.numpy()), torch.arange(len(spots)), len(spots) + 1
+    while (count := int(number.max()) + 1) < last:  # fewer places are farther apart
+        number, last = _balls(tree, PLACE_RADIUS * max((length * width / count) ** 0.5, length / count)), count
+    return number[spot] if count >= n_parts else torch.arange(len(position))
+
+
+def _balls(tree: cKDTree, radius: float) -> Tensor:
+    """Return the number of the ball that contains each point of a tree: around the points with most others nearby first."""
+    number, count, size = np.full(tree.n, -1), 0, tree.query_ball_point(tree.data, radius, return_length=True)
+    for row in np.argsort(-size, kind="stable"):
+        if number[row] < 0:
+            own = np.array([row] if size[row] == 1 else tree.query_ball_point(tree.data[row], radius))
+            number[own[number[own] < 0]] = count
+            count += 1
+    return torch.from_numpy(number)
+
+
+def centres(position: Tensor, place: Tensor) -> Tensor:
+    """Return the mean position of each place, float64 (P, 3), given the place of each position (n, 3)."""
+    total = torch.zeros(int(place.max()) + 1, 3, dtype=torch.float64).index_add(0, place, position.double())
+    return total / place.bincount()[:, None]
 
 
 def random_rows(position: Tensor, n: int, seed: int) -> Tensor:
-    """Return at most n random rows, ascending, that share no position with the others. Exactly n if no position repeats.
+    """Return at most n random rows, ascending, that share no place with the others. Exactly n if no place repeats.
 
-    If every position has more than n rows, those of one with the fewest are returned.
+    If every place has more than n rows, those of one with the fewest are returned.
     """
     place = places(position, 2)
-    size = place.bincount()
-    order = torch.randperm(len(size), generator=torch.Generator().manual_seed(seed))
+    size, rank = place.bincount(), torch.randperm(len(place), generator=torch.Generator().manual_seed(seed)).argsort()
+    order = rank[np.unique(place.numpy(), return_index=True)[1]].argsort()  # of places, by the rank of their first row
     chosen = torch.zeros(len(size), dtype=torch.bool)
     left = n
     for number, rows in zip(order.tolist(), size[order].tolist(), strict=True):
@@ -120,7 +148,7 @@ def some_rows(n: int, most: int) -> Tensor:
 
 
 def random_split(position: Tensor, seed: int) -> tuple[Tensor, Tensor]:
-    """Return training rows and a random fifth as test rows, both ascending. Rows at one position are in one part.
+    """Return training rows and a random fifth as test rows, both ascending. Rows at one place are in one part.
 
     Suits positions drawn independently.
     """
@@ -130,10 +158,7 @@ def random_split(position: Tensor, seed: int) -> tuple[Tensor, Tensor]:
 
 
 def repeated_fraction(train: Tensor, test: Tensor) -> float:
-    """Return the fraction of test positions (n, 3) that are training positions (m, 3), too.
-
-    Positions measured again differ by the error of positioning. Those closer than 2 % of the mean spacing of the training
-    positions, sqrt(area / m), count as one.
+    """Return the fraction of test positions (n, 3) at a place of the training positions (m, 3).
 
     Example:
         >>> repeated_fraction(torch.zeros(1, 3), torch.tensor([[0.0, 0, 0], [1, 0, 0]]))
@@ -141,25 +166,25 @@ def repeated_fraction(train: Tensor, test: Tensor) -> float:
     """
     if not len(test):
         return 0.0
-    sides = (train.amax(dim=0) - train.amin(dim=0)).sort(descending=True).values
-    spacing = math.sqrt(float(sides[0] * sides[1]) / len(train))
-    return float((nearest(test, train, 1)[0] <= 0.02 * spacing).double().mean())
+    known, asked = places(torch.cat([train, test])).split([len(train), len(test)])
+    return float(torch.isin(asked, known).double().mean())
 
 
 def slabs(position: Tensor, n_slabs: int) -> Tensor:
     """Return the slab of each position (n, 3), 0 to n_slabs - 1, across the direction of the largest extent.
 
-    Slabs hold equal numbers of positions. Neighbours and repeated measurements at one position share a slab, so holding out
-    a slab holds out a region.
+    Slabs hold equal numbers of positions. Neighbours and repeated measurements at one place share a slab, so holding out a
+    slab holds out a region. The order of the rows has no effect.
     """
-    centred = position.double() - position.double().mean(dim=0)
-    direction = torch.linalg.svd(centred, full_matrices=False).Vh[0]
-    rank = (centred @ direction).argsort(stable=True).argsort()
-    _, spot, times = position.unique(dim=0, return_inverse=True, return_counts=True)
-    middle = torch.zeros_like(times).index_add_(0, spot, rank) // times
-    slab: Tensor = middle[spot] * n_slabs // len(position)
-    if len(slab.unique()) < n_slabs:  # few distinct positions cannot be held out whole
-        slab = rank * n_slabs // len(position)
+    place = places(position)
+    at, size = centres(position, place), place.bincount()
+    centred = at - (size[:, None] * at).sum(dim=0) / len(position)
+    direction = torch.linalg.svd(size.sqrt()[:, None] * centred, full_matrices=False).Vh[0]
+    order = (centred @ direction).argsort(stable=True)
+    middle = size[order].cumsum(dim=0) - (size[order] + 1) // 2  # rank of the middle row of each place
+    slab: Tensor = middle[order.argsort()][place] * n_slabs // len(position)
+    if len(slab.unique()) < n_slabs:  # few places cannot be held out whole
+        slab = order.argsort()[place].argsort(stable=True).argsort() * n_slabs // len(position)
     return slab
 
 
@@ -174,7 +199,9 @@ def block_split(position: Tensor, seed: int) -> tuple[Tensor, Tensor]:
 def folds(
     position: Tensor, validation: Validation, seed: int, number: PositiveInt = FOLDS, session: Tensor | None = None
 ) -> Tensor:
-    """Return the fold of each training position, counted from 0. Rows at one position, or of one session, share a fold.
+    """Return the fold of each training position, counted from 0. Rows at one place, or of one session, share a fold.
+
+    The order of the rows has no effect.
 
     Args:
         position: Training positions, (n, 3) [m].

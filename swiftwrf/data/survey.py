@@ -146,7 +146,7 @@ def read_survey(
     elif time is not None:
         notes += _split_packets(rssi, time)
     floor = survey.text("floor")
-    floors = None if floor is None else floors_of(floor.iloc[origins].tolist(), position[:, 2])
+    floors = None if floor is None else floors_of(label, floor.iloc[origins].tolist(), position)
     if survey.end:
         names, rssi, position, places, found = _as_receivers(label, rssi, position)
         notes += found
@@ -210,6 +210,8 @@ class _Survey:
         elif options.transmitter or not {"x", "y"} & asked.keys():
             self.end = _columns_of_end(label, table, options.transmitter)
         self.roles = find_roles(label, table, asked, self.end.values())
+        if (floor := self.text("floor")) is not None and not floor.any():
+            self.notes.append(f"column {self.roles.pop('floor')} is empty, so there are no floors")
         used = {options.offset_by, options.pool_by, *self.end.values()}
         left_out, found = ([], []) if "receiver" in self.roles else self._find_receivers(asked, used)
         taken = [f"{role} = {name}" for role, name in self.roles.items()]
@@ -302,7 +304,7 @@ class _Survey:
         position = frame.to_world(np.stack([x, y, z], axis=1))
         if "z" in roles and "floor" in roles and not unknown:
             heights = pd.Series(position[:, 2]).groupby(floor).median().dropna()  # in the order of floors
-            if len(heights) > 1 and heights.diff().max() < MIN_STOREY_M:
+            if len(heights) > 1 and heights.diff().abs().max() < MIN_STOREY_M:
                 position[:, 2] += STOREY_M * floor
                 notes.append(
                     f"heights count from the floor, so each floor of column {roles['floor']} adds {STOREY_M:g} m"

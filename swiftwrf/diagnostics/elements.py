@@ -43,7 +43,10 @@ def other_readings(data: Snapshots, away: Tensor) -> Iterator[tuple[str, float, 
     meaning = f"the phases are those of the way there and back, as of RFID and backscatter (--round-trip); {apart}"
     yield meaning, 0, replace(data, array=halved)
     scales = torch.logspace(math.log10(0.38), math.log10(3.5), 50, dtype=torch.float64).tolist()
-    scaled = {scale: replace(data, array=PlanarArray(array.element, array.wavelength / scale)) for scale in scales}
+    scaled = {
+        scale: replace(data, array=PlanarArray(array.element, array.wavelength / scale), frequency_hz=None)
+        for scale in scales
+    }
     scale = max(scaled, key=lambda scale: float(evidence(scaled[scale], away).mean()))
     if min(abs(math.log(scale)), abs(math.log(scale / 2))) > MIN_SCALE:
         carrier = f"the carrier is about {scaled[scale].array.frequency_hz / 1e9:.2g} GHz"

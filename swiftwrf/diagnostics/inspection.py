@@ -13,7 +13,7 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.data import Rssi, Snapshots, Spectra
 from swiftwrf.data.powers import has_frequent_edge
-from swiftwrf.data.splits import MAX_REPEATED, MIN_TRAINING, repeated_fraction
+from swiftwrf.data.splits import MAX_REPEATED, MIN_TRAINING, centres, places, repeated_fraction
 from swiftwrf.diagnostics.calibration import calibrate
 from swiftwrf.diagnostics.elements import in_noise, noisy_elements
 from swiftwrf.diagnostics.frames import Frame, check_frames
@@ -119,14 +119,12 @@ def _check_positions(position: Tensor, findings: Findings, wavelength: float | N
     flat = [axis for axis, size in zip("xyz", extent, strict=True) if size < 1e-9]
     if {"x", "y"} & set(flat):
         findings.warn(f"All positions have one {' and one '.join(flat)}; directions and planes are not identifiable.")
-    places = position.unique(dim=0)
-    if len(places) < len(position):
-        findings.add(
-            f"{len(position)} rows are at {len(places)} different positions; the split random keeps each in one part."
-        )
-    if len(places) < 2:
+    spots = centres(position, places(position))
+    if len(spots) < len(position):
+        findings.add(f"{len(position)} rows are at {len(spots)} places; the split random keeps each in one part.")
+    if len(spots) < 2:
         return
-    middle = float(nearest(places, places, 2)[0][:, 1].median())
+    middle = float(nearest(spots, spots, 2)[0][:, 1].median())
     findings.numbers["nearest_m"] = middle
     if wavelength is None:
         findings.add(f"The nearest other position is {middle:.3f} m away (median).")

@@ -88,7 +88,10 @@ class LocateSplit:
         return cls(train, test, split, n_cells, seed, int((~kept).sum()))
 
     def fit(self, folder: Path | None, name: str) -> Values:
-        """Fit a localizer and locate the test rows. Return values for `LocateComparison`. A folder gets the locator."""
+        """Fit a localizer and locate the test rows. Return values for `LocateComparison`. A folder gets the locator.
+
+        Folds resemble the test rows in their distances to the training positions, all that is used of the test positions.
+        """
         train, test = self.train, self.test
         validation = train.validation_for(self.split, test)
         if validation == "block" and self.split != "block":

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
+from swiftwrf.array.beamforming import unit_power
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.gp import GaussianProcess
 from swiftwrf.models.geometry.channels import field, sources, waves
@@ -35,7 +36,7 @@ class SpectrumFeatures:
         coarray: Real and imaginary parts of the co-array numbers, float32 (n, F), of channels with amplitudes.
         phases: Element phasors of unit modulus of spectra and their indistinguishable aliases, complex64 (n, T, K). T is 2
             if there are aliases.
-        channel: Measured channels, complex64 (n, F, K).
+        channel: Measured channels, scaled to unit power, complex64 (n, F, K).
     """
 
     coarray: Tensor
@@ -54,7 +55,7 @@ class SpectrumFeatures:
     @classmethod
     def of_channels(cls, channel: Tensor, array: PlanarArray) -> SpectrumFeatures:
         """Compute the features of channels (n, S, K)."""
-        kept = channel[:, kept_snapshots(channel.shape[1])]
+        kept = unit_power(channel[:, kept_snapshots(channel.shape[1])])
         return cls(channel_numbers(kept, array), channel=kept)
 
     def subset(self, rows: Tensor) -> SpectrumFeatures:

@@ -14,12 +14,12 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid, to_angles, to_direction
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.spectra import Spectra, check_training, direction_of_link
-from swiftwrf.data.splits import places
+from swiftwrf.data.splits import FOLDS, folds
 from swiftwrf.errors import InputError, with_article
 from swiftwrf.gp import subsample
 from swiftwrf.locate.features import SpectrumFeatures
 from swiftwrf.locate.likelihoods import ChannelLikelihoods, Likelihoods, SpectrumLikelihoods
-from swiftwrf.locate.posterior import Posterior, inflation, normalised, pooled_weights, read_pool
+from swiftwrf.locate.posterior import HeldOut, Posterior, calibrated_pool, normalised, read_pool
 from swiftwrf.locate.region import Cells, Region, best_cells, outside_mass, refined
 from swiftwrf.locate.spectrum_likelihood import Screen
 from swiftwrf.models.base import FieldModel
@@ -27,7 +27,6 @@ from swiftwrf.models.geometry import GeometryModel
 from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.validation import Configured, NonNegativeInt, PositiveInt, all_or_nothing, checked, configuration
 
-FOLDS = 5
 MIN_SPECTRA = 15
 
 
@@ -63,9 +62,9 @@ class MatchedField(Configured, Saved):
 
     Three likelihoods of spectra are pooled: co-array numbers predicted by constant path gains, by position-dependent path
     gains, and element phases under uncertain path gains. Those of channels are: channels under uncertain and under constant
-    path gains, and co-array numbers predicted by constant path gains and measured channels nearby. The covariances come
-    from held-out positions, and so do the weights, which maximise the posterior density there. This also calibrates the
-    posterior.
+    path gains, and co-array numbers predicted by constant path gains and measured channels nearby. Covariances, weights and
+    the radii of credible regions come from held-out positions. Weights maximise the posterior density there. For each fold
+    the room is refined, not searched, without it.
 
     Args:
         config: Options as one object. Defaults to `MatchedFieldConfig()`.
@@ -131,7 +130,7 @@ class MatchedField(Configured, Saved):
         seed, position = self.config.seed, train.position
         own = GeometryModel(seed=seed).fit(train, like=room, progress=progress)
         train = own.link.aligned(train)
-        fold = places(position, FOLDS) % FOLDS
+        fold = folds(position, "random", seed)
         kind = SpectrumLikelihoods if train.channel is None else ChannelLikelihoods
         features, (*parts, self.likelihoods) = kind.fit(train, own, fold, seed)
         held_out = [position[fold == number] for number in range(FOLDS)]
@@ -156,20 +155,15 @@ class MatchedField(Configured, Saved):
     ) -> None:
         """Choose the weights of the likelihoods and the inflation of credible radii by held-out positions."""
         (some,) = subsample(torch.arange(len(position)), rows=self.config.n_calibration)
-        rows_of = {number: some[fold[some] == number] for number in fold[some].unique().tolist()}
-        at_truth, values, volumes, candidates = [], [], [], []
-        for number, rows in rows_of.items():
+        held_out = []
+        for number in fold[some].unique().tolist():
+            rows = some[fold[some] == number]
             likelihoods, observed = parts[number], features.subset(rows)
-            at_truth.append(likelihoods(position[rows][:, None], observed, self.weight)[..., 0])
-            for cells, value in self._searched(observed, likelihoods):
-                values.append(value)
-                volumes.append(cells.log_volume)
-                candidates.append(cells.position)
-        value, volume, at = torch.cat(values, dim=1).double(), torch.cat(volumes), torch.cat(candidates)
-        self.weight = pooled_weights(torch.cat(at_truth, dim=1), value, volume)
-        log_mass = torch.einsum("k,knm->nm", self.weight, value) + volume
-        held_out = Posterior(at, normalised(log_mass), self._resolution_m)
-        self.inflation = inflation(held_out, position[torch.cat(list(rows_of.values()))])
+            at_truth = likelihoods(position[rows][:, None], observed, self.weight)[..., 0]
+            cells, values = zip(*self._searched(observed, likelihoods), strict=True)
+            at, volume = (torch.cat([getattr(part, name) for part in cells]) for name in ("position", "log_volume"))
+            held_out.append(HeldOut(position[rows], at_truth, at, torch.cat(values, dim=1).double(), volume))
+        self.weight, self.inflation, _ = calibrated_pool(held_out, self._resolution_m)
 
     def _searched(self, observed: SpectrumFeatures, likelihoods: Likelihoods) -> Iterator[tuple[Cells, Tensor]]:
         """Yield cells (b, m) and log-likelihoods (k, b, m) of some observations at a time."""

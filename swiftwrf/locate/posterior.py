@@ -15,7 +15,9 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from swiftwrf.data.coordinates import Floors
+from swiftwrf.data.splits import places
 from swiftwrf.errors import InputError
+from swiftwrf.metrics import LEVEL, interval_factor
 from swiftwrf.plotting import MARK, Axes, Displayed, corners_of, plan
 from swiftwrf.positions import nearest
 from swiftwrf.runtime.checkpoint import Header, expect
@@ -228,7 +230,7 @@ class Posterior(Displayed):
         return variance.sqrt()
 
     @checked
-    def credible_radius(self, level: Annotated[float, Gt(0), Lt(1)] = 0.8) -> Tensor:
+    def credible_radius(self, level: Annotated[float, Gt(0), Lt(1)] = LEVEL) -> Tensor:
         """Return the radius [m] around the median within which the position lies with probability `level`, (n,).
 
         Raises:
@@ -330,17 +332,54 @@ def pooled_weights(at_truth: Tensor, at_candidates: Tensor, log_volume: Tensor) 
     return torch.from_numpy(found.x)
 
 
-def inflation(posterior: Posterior, truth: Tensor, level: float = 0.8, margin: float = 0.0) -> float:
-    """Return the factor of credible radii for which regions of `level` contain that fraction of held-out positions.
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Observations of a held-out fold at n known positions, and their log-likelihoods by the other folds.
 
-    The weights of largest posterior density leave regions too small if the likelihoods are wrong in ways that no weight
-    corrects (split conformal calibration: V. Vovk, A. Gammerman and G. Shafer, "Algorithmic Learning in a Random World",
-    2005).
-
-    True positions are (n, 3) [m]; `margin` is added to the fraction.
+    Args:
+        truth: True positions, float64 (n, 3) [m].
+        at_truth: Log-likelihoods at the true positions, (k, n).
+        position: Candidate positions, float64 (n, m, 3) [m], or (1, m, 3) if all observations share them.
+        at_candidates: Log-likelihoods at the candidates, float64 (k, n, m).
+        log_volume: Logarithms of the candidates' prior masses, (n, m).
     """
-    ratio = (posterior.median - truth).norm(dim=1) / posterior.credible_radius(level).clamp_min(1e-9)
-    return float(ratio.quantile(min(level + margin, 1.0)))
+
+    truth: Tensor
+    at_truth: Tensor
+    position: Tensor
+    at_candidates: Tensor
+    log_volume: Tensor
+
+
+def calibrated_pool(
+    held_out: Sequence[HeldOut], resolution_m: float, floors: Floors | None = None
+) -> tuple[Tensor, float, Tensor]:
+    """Return the weights (k,) of a log-linear pool, the factor of its credible radii, and held-out errors (n,) [m].
+
+    The likelihoods may be wrong in ways that no weight corrects, so errors calibrate the radii; see `interval_factor`.
+    Weights fit the positions that choose them better than new ones, so the radii of each fold are those of a pool whose
+    weights the other folds choose.
+
+    Args:
+        held_out: Folds.
+        resolution_m: Edge of the largest cell around a candidate [m].
+        floors: Floors that the candidates are on.
+    """
+
+    def weights(parts: Sequence[HeldOut]) -> Tensor:
+        names = (("at_truth", 1), ("at_candidates", 1), ("log_volume", 0))
+        return pooled_weights(*(torch.cat([getattr(part, name) for part in parts], dim=dim) for name, dim in names))
+
+    held_out = [part for part in held_out if len(part.truth)]
+    score, errors = [], []
+    for part in held_out:
+        weight = weights([other for other in held_out if other is not part] or held_out)
+        log_mass = torch.einsum("k,knm->nm", weight, part.at_candidates) + part.log_volume
+        found = Posterior(part.position, normalised(log_mass), resolution_m, floors=floors)
+        errors.append((found.median - part.truth).norm(dim=1))
+        score.append(errors[-1] / found.credible_radius(LEVEL).clamp_min(1e-9))
+    place = places(torch.cat([part.truth for part in held_out]))
+    return weights(held_out), interval_factor(torch.cat(score), place), torch.cat(errors)
 
 
 def read_pool(tensors: dict[str, Tensor], header: Header) -> tuple[Tensor, float]:

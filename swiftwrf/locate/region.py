@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.data.coordinates import Floors
+from swiftwrf.data.splits import centres, places
 from swiftwrf.errors import InputError
 from swiftwrf.positions import check_positions, nearest
 from swiftwrf.runtime.validation import from_plain
@@ -106,7 +107,7 @@ class Region:
     @cached_property
     def scale_m(self) -> float:
         """Distance [m] from the known positions that their neighbourhood covers."""
-        spots = self._apart(self.known).unique(dim=0)
+        spots = self._apart(centres(self.known, places(self.known)))
         apart, _ = nearest(spots, spots, min(9, len(spots)))  # the nearest one is the position itself
         return float(apart[:, -1].quantile(0.95))
 

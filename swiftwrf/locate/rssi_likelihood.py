@@ -18,7 +18,7 @@ from torch import Tensor
 from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.splits import places
+from swiftwrf.data.splits import centres, places
 from swiftwrf.errors import InputError
 from swiftwrf.locate.spectrum_likelihood import DEGREES
 from swiftwrf.rssi import RssiModel
@@ -208,7 +208,7 @@ class Fingerprints:
         held_out = torch.zeros(len(train), dtype=torch.bool).index_fill(0, order[:MAX_HELD_OUT], value=True)
         parts = [((fold == number) & held_out, fold != number) for number in fold.unique()]
         errors: dict[tuple[str, int], Tensor] = {}
-        fewest = min(len(train.transmitter_position[kept].unique(dim=0)) for _, kept in parts)
+        fewest = min(int(places(train.transmitter_position[kept]).max()) + 1 for _, kept in parts)
         counts = [k for k in NEIGHBOUR_COUNTS if k <= fewest]
         for metric in METRICS:
             error = []
@@ -228,9 +228,9 @@ class Fingerprints:
 
     @cached_property
     def _places(self) -> tuple[Tensor, Tensor]:
-        """Positions of the places (P, 3) [m] in the order of the rows, which decides ties, and the place of each row."""
-        row = places(self.position, 1)
-        return self.position[torch.zeros(int(row.max()) + 1).long().scatter_(0, row, torch.arange(len(row)))], row
+        """Positions of the places (P, 3) [m], whose order decides ties, and the place of each row."""
+        place = places(self.position)
+        return centres(self.position, place), place
 
     @cached_property
     def _known(self) -> tuple[Tensor, Tensor]:

@@ -229,9 +229,8 @@ class PathLikelihood(PhaseLikelihood):
 
     def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
         assert observed.channel is not None
-        channel = observed.channel / observed.channel.abs().square().mean((1, 2), keepdim=True).sqrt().clamp_min(1e-30)
-        count = channel.shape[1]  # snapshots at one frequency have the same waves
-        x, mean = channel @ self._basis, waves.channel.expand(-1, count, -1) @ self._basis
+        count = observed.channel.shape[1]  # snapshots at one frequency have the same waves
+        x, mean = observed.channel @ self._basis, waves.channel.expand(-1, count, -1) @ self._basis
         wave = waves.wave.expand(-1, -1, count, -1) @ self._basis
         power = torch.view_as_real(wave).square().sum((2, 3, 4)) / wave[0, 0].numel()  # which no rotation changes
         paths = wave, power

@@ -76,6 +76,10 @@ class Updatable:
             warnings.warn(f"{new.name}: {n_known} of {len(new)} rows {ALREADY_LEARNT}", stacklevel=4)
         return new.subset(~known) if n_known else new
 
+    def _take_digests(self, tensors: dict[str, Tensor]) -> None:
+        """Take the digests from the tensors of a file; earlier files have none."""
+        self.row_digests = to_tensor("row_digests", tensors.get("row_digests", self.row_digests), torch.int64, (None,))
+
     def _digests_without(self, rows: Tensor, n: int) -> Tensor:
         """Return the digests without those of some rows by their numbers among n, of which the last have a digest."""
         return self.row_digests[~torch.isin(torch.arange(-len(self.row_digests), 0), rows - n)]
@@ -419,7 +423,7 @@ class FieldModel(Updatable, Configured, Saved, Displayed):
         model = cls(from_plain(cls.config_type, header.get("options", {})))
         model.grid = AngularGrid(**header["grid"])
         model.bounds = bounding_box(torch.tensor(header["bounds"], dtype=torch.float64))
-        model.row_digests = tensors.get("row_digests", cls.row_digests)  # earlier files have none
+        model._take_digests(tensors)
         model.link = Link.from_json(header["link"])
         if lacking := cls.lacking(model.link):
             raise InputError(f"it lacks the {' and the '.join(lacking)}")

@@ -131,7 +131,7 @@ class CoarrayModel(Linked, ProcessModel):
     def _state(self) -> tuple[dict[str, Tensor], Header]:
         tensors, header = self.process.state()
         own = {"offset": self.offset, "form": self.form, "component": self.component}
-        return tensors | own | self._spread_state(), header
+        return tensors | own | {"spread": self.spread}, header
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         self.process = GaussianProcess.from_state(tensors, header, torch.float64)

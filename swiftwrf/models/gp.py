@@ -81,7 +81,7 @@ class GPModel(ProcessModel, MemoryModel):
     def _state(self) -> tuple[dict[str, Tensor], Header]:
         tensors, header = self.process.state()
         kept = {name: tensors[name] for name in tensors if name == "correlation"}
-        return super()._state()[0] | kept | self._spread_state(), header
+        return super()._state()[0] | kept | {"spread": self.spread}, header
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         super()._restore(tensors, header)

@@ -16,6 +16,7 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.dataset import Arrays, Labelled, position_coordinates
 from swiftwrf.data.spectra import DIRECTION, direction_coordinates
 from swiftwrf.errors import InputError
+from swiftwrf.metrics import LEVEL
 from swiftwrf.plotting import Axes, Displayed, plan, polar_spectrum
 from swiftwrf.runtime.validation import check_value, checked
 
@@ -86,7 +87,7 @@ class Prediction(Labelled, Displayed):
         return {"shape": f"{tuple(self.mean.shape)}", "mean": span(self.mean), "std": span(self.std)}
 
     @checked
-    def interval(self, level: Annotated[float, Gt(0), Lt(1)] = 0.8) -> tuple[Tensor, Tensor]:
+    def interval(self, level: Annotated[float, Gt(0), Lt(1)] = LEVEL) -> tuple[Tensor, Tensor]:
         """Return the lower and upper end of the central interval that contains a measurement with probability `level`.
 
         Intervals of spectra are clipped to [0, 1], the range of magnitudes.

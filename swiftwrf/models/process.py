@@ -19,11 +19,11 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.data.splits import folds
+from swiftwrf.data.splits import folds, places
 from swiftwrf.data.store import Store
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel, leave_folds_out, subsample
-from swiftwrf.metrics import std_factor
+from swiftwrf.metrics import HALF_WIDTH, interval_factor
 from swiftwrf.models.base import FieldModel
 from swiftwrf.runtime.checkpoint import expect
 
@@ -42,8 +42,8 @@ class ProcessModel(FieldModel):
 
     process: GaussianProcess
     """process of the values"""
-    spread: Tensor | None = None
-    """standard deviation of a measurement far from all training positions, float32 (H, W); None for `SwiftWRF`"""
+    spread: Tensor
+    """standard deviation of a measurement far from all training positions, float32 (H, W)"""
 
     def expected_error(self, position: Tensor) -> Tensor:
         """Return the expected error at positions (n, 3) [m] relative to that far from all training positions, (n,)."""
@@ -84,13 +84,8 @@ class ProcessModel(FieldModel):
             torch.cat([variance for *_, variance in leave_folds_out(kernel, position, fold, rows)]).mean().sqrt()
             for kernel in (before, model.process.kernel)
         )
-        model._scale_std(float(old / new))  # of noisy values at held-out positions
+        model.spread = self.spread * float(old / new)  # of noisy values at held-out positions
         return model
-
-    def _scale_std(self, factor: float) -> None:
-        """Multiply all standard deviations by a factor."""
-        if self.spread is not None:
-            self.spread = self.spread * factor
 
     def _set_spread(
         self,
@@ -108,29 +103,26 @@ class ProcessModel(FieldModel):
             spectrum: Returns spectra (b, H, W) at rows (b,) from held-out values (b, K).
         """
         (rows,) = subsample(torch.arange(len(train)), rows=MAX_HELD_OUT)
-        scores = []
+        scores, order = [], []
         for own, others, weight, variance in leave_folds_out(self.process.kernel, train.position, fold, rows):
             predicted = spectrum(weight.float() @ value(others).float(), own).clamp(0, 1)
             scores.append((predicted - train.store[own]).abs() / variance.sqrt().float()[:, None, None])
+            order.append(own)
         score = torch.cat(scores)
         square = score.square()
         total = square.sum(dim=0) + SHRINKAGE_SPECTRA * square.mean()
         spread = (total / (len(score) + SHRINKAGE_SPECTRA)).sqrt().clamp_min(1e-6)
-        self.spread = spread * std_factor(score / spread)
+        place = places(train.position)[torch.cat(order)]
+        self.spread = spread * interval_factor(score / (HALF_WIDTH * spread), place)
 
     def _std(self, position: Tensor, grid: AngularGrid) -> Tensor:
         """Return the standard deviation (b, H, W) of measurements at positions (b, 3) [m]."""
-        assert self.spread is not None
         spread = self.spread
         if grid != self.grid:  # that of the nearest direction
             row = ((grid.elevation - self.grid.elevation_start) / self.grid.elevation_step).round().long()
             column = ((grid.azimuth - self.grid.azimuth_start) / self.grid.azimuth_step).round().long()
             spread = spread[row.clamp(0, self.grid.n_elevation - 1)][:, column % self.grid.n_azimuth]
         return self.expected_error(position).float()[:, None, None] * spread
-
-    def _spread_state(self) -> dict[str, Tensor]:
-        assert self.spread is not None
-        return {"spread": self.spread}
 
     def _restore_spread(self, tensors: dict[str, Tensor]) -> None:
         expect(tensors, {"spread": self.grid.shape})

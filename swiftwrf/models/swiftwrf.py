@@ -18,8 +18,7 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.data.splits import folds
-from swiftwrf.errors import InputError
+from swiftwrf.data.splits import folds, places
 from swiftwrf.gp import (
     GaussianProcess,
     Kernel,
@@ -29,7 +28,7 @@ from swiftwrf.gp import (
     principal_components,
     subsample,
 )
-from swiftwrf.metrics import spectrum_loss, std_factor
+from swiftwrf.metrics import spectrum_loss
 from swiftwrf.models.base import CPU, FieldConfig, FieldModel
 from swiftwrf.models.primitives import constrained, min_width
 from swiftwrf.models.process import ProcessModel
@@ -93,8 +92,6 @@ class SwiftWRF(ProcessModel):
     """Cholesky factors l1, l2, l3 of each primitive, float32 (N, 3) [rad]"""
     weight: Tensor
     """weights of the primitives in the mean spectrum, then in each component, float32 (1 + K, N)"""
-    calibration: float
-    """factor of the standard deviations with which held-out spectra lie in their intervals"""
     process: GaussianProcess
     """process of the K component scores"""
 
@@ -112,10 +109,10 @@ class SwiftWRF(ProcessModel):
         fold = folds(work.position, config.validation, config.seed)
         kernel = choose_kernel(work.position, work.store, fold)
         if config.validation == "random":
-            fold = torch.arange(len(work))  # leave-one-out costs a regression no more than five folds
+            fold = places(work.position, 2)  # leaving one place out costs a regression no more than five folds
         rank = choose_rank(work.position, work.store, fold, kernel)
         (rows,) = subsample(torch.arange(len(work)), rows=MAX_ROWS)
-        some, fold = work.subset(rows).in_memory(), fold[rows]
+        some, own = work.subset(rows).in_memory(), fold[rows]
         small = some.at_most(90).in_memory()  # the beams of an array are far wider
         n, record = config.n_primitives, on_record or (lambda record: None)
         if n == "auto" and isinstance(like, SwiftWRF):
@@ -127,32 +124,36 @@ class SwiftWRF(ProcessModel):
             def loss(n: int) -> float:
                 bar.update(task, description=f"swiftwrf, {n} primitives")
                 function = kernels(*_shapes(target, n, small.grid, 8), small.grid, CUTOFF)  # few steps rank alike
-                found = float(spectrum_loss(_held_out(small, function, kernel, fold)[0], small.spectrum))
+                found = float(spectrum_loss(_held_out(small, function, kernel, own), small.spectrum))
                 record({"stage": "search", "n_primitives": n, "validation": found})
                 return found
 
             if n == "auto":
                 n = smallest(loss, SIZES)
             self.mean, self.cholesky = _shapes(target, n, small.grid, 60)
-            self._regress(work, some, kernel, rank, fold)
+            self._regress(work, some, kernel, rank)
+            function = kernels(self.mean, self.cholesky, self.grid, CUTOFF)
+
+            def spectrum(score: Tensor, _: Tensor) -> Tensor:
+                return _render(self.weight[0] + score @ self.weight[1:], function)
+
+            self._set_spread(train, fold, lambda rows: self.process.value[rows], spectrum)
         record({"stage": "final", "n_primitives": n})
         self._move(device)
 
-    def _regress(self, train: Spectra, some: Spectra, kernel: Kernel, rank: int, fold: Tensor) -> None:
-        """Fit weights and calibration to some of the training spectra, with their folds, and the process to all of them."""
+    def _regress(self, train: Spectra, some: Spectra, kernel: Kernel, rank: int) -> None:
+        """Fit weights to some of the training spectra, and the process to all of them."""
         function = kernels(self.mean, self.cholesky, train.grid, CUTOFF)
         mean, component = _components(some, rank)
         self.weight = _weights(function, torch.cat([mean, component]))
         flat = component.flatten(1)
         score = torch.cat([(part - mean).flatten(1) @ flat.T for part in train.store.batches()])
         self.process = GaussianProcess(kernel, train.position, (score / flat.square().sum(dim=1)).double())
-        predicted, variance = _held_out(some, function, kernel, fold)
-        prior = _render(self.weight[1:], function).square().sum(dim=0).clamp_min(1e-12)
-        self.calibration = std_factor((predicted - some.spectrum).abs() / (variance[:, None, None] * prior).sqrt())
 
     def _move(self, device: torch.device) -> None:
         """Move the fitted tensors to a device, and start an empty cache."""
         self.mean, self.cholesky, self.weight = (x.to(device) for x in self.parameters())
+        self.spread = self.spread.to(device)
         if device.type != "cpu":
             known, value = self.process.known.to(device), self.process.value.to(device)
             self.process = GaussianProcess(self.process.kernel, known, value)
@@ -183,13 +184,7 @@ class SwiftWRF(ProcessModel):
             spectrum = rasterize_magnitude(mean, cholesky, weight, grid, cutoff=CUTOFF)
         else:
             spectrum = (weight[..., 0] @ self._basis(grid).kernel).abs().reshape(-1, *grid.shape)
-        if not with_std:
-            return spectrum, None
-        std = self.calibration * self.expected_error(position).float()
-        return spectrum, std[:, None, None] * self._basis(grid).prior
-
-    def _scale_std(self, factor: float) -> None:
-        self.calibration *= factor
+        return spectrum, self._std(position, grid) if with_std else None
 
     @torch.inference_mode(False)  # a cached tensor must also serve calls with gradients
     @torch.no_grad()
@@ -200,8 +195,7 @@ class SwiftWRF(ProcessModel):
         kernel = kernels(self.mean, self.cholesky, grid, CUTOFF).flatten(1)
         component = self.weight[1:] @ kernel
         dual = torch.linalg.pinv(component.double() @ component.double().T, hermitian=True) @ component.double()
-        prior = component.square().sum(dim=0).sqrt().reshape(grid.shape)
-        basis = Basis(kernel, self.weight[0] @ kernel, dual.float(), prior)
+        basis = Basis(kernel, self.weight[0] @ kernel, dual.float())
         if (
             kernel.numel() <= MAX_CACHED_VALUES
         ):  # of two grids; a new dictionary, because other threads read the old one
@@ -220,16 +214,14 @@ class SwiftWRF(ProcessModel):
     def _state(self) -> tuple[dict[str, Tensor], Header]:
         tensors, header = self.process.state()
         own = {"mean": self.mean, "cholesky": self.cholesky, "weight": self.weight}
-        return tensors | own, header | {"calibration": self.calibration}
+        return tensors | own | {"spread": self.spread}, header
 
     def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
         self.process = GaussianProcess.from_state(tensors, header, torch.float64)
         n, k = len(tensors["mean"]), tensors["value"].shape[1]
         expect(tensors, {"mean": (n, 2), "cholesky": (n, 3), "weight": (1 + k, n)})
         self.mean, self.cholesky, self.weight = (tensors[name] for name in ("mean", "cholesky", "weight"))
-        self.calibration = float(header["calibration"])
-        if not 0 <= self.calibration < math.inf:
-            raise InputError(f"calibration is {self.calibration}, expected a finite number, 0 or more")
+        self._restore_spread(tensors)
         self._move(torch.device("cpu"))
 
 
@@ -239,7 +231,6 @@ class Basis(NamedTuple):
     kernel: Tensor  # of each primitive, (N, pixels)
     mean: Tensor  # spectrum, (pixels,)
     dual: Tensor  # projections of a change of the spectrum onto the scores, (K, pixels)
-    prior: Tensor  # standard deviation of the spectra that the process gives without training data, (H, W)
 
 
 def fit(train: Spectra, *, device: torch.device | str = "cpu", progress: bool = False, **options: Any) -> SwiftWRF:
@@ -294,8 +285,8 @@ def _components(spectra: Spectra, rank: int) -> tuple[Tensor, Tensor]:
     return whole[:1], whole[1:]
 
 
-def _held_out(spectra: Spectra, function: Tensor, kernel: Kernel, fold: Tensor) -> tuple[Tensor, Tensor]:
-    """Return held-out predictions (n, H, W) of spectra, and their variances relative to the prior, (n,).
+def _held_out(spectra: Spectra, function: Tensor, kernel: Kernel, fold: Tensor) -> Tensor:
+    """Return held-out predictions (n, H, W) of spectra.
 
     Args:
         spectra: Spectra.
@@ -305,10 +296,10 @@ def _held_out(spectra: Spectra, function: Tensor, kernel: Kernel, fold: Tensor) 
     """
     weight = _weights(function, spectra.spectrum)
     mean, predicted = weight.mean(dim=0), torch.empty_like(weight)
-    change, variance = (weight - mean).double(), weight.new_empty(len(weight))
-    for out, kept, share, of_errors in leave_folds_out(kernel, spectra.position, fold):
-        predicted[out], variance[out] = (share @ change[kept]).to(weight), of_errors.to(weight)
-    return _render(mean + predicted, function).clamp(0, 1), variance
+    change = (weight - mean).double()
+    for out, kept, share, _ in leave_folds_out(kernel, spectra.position, fold):
+        predicted[out] = (share @ change[kept]).to(weight)
+    return _render(mean + predicted, function).clamp(0, 1)
 
 
 def _shapes(target: Tensor, n: int, grid: AngularGrid, steps: int) -> tuple[Tensor, Tensor]:

@@ -16,12 +16,12 @@ from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.spectra import Spectra
+from swiftwrf.metrics import LEVEL
 from swiftwrf.models.base import FieldModel
 from swiftwrf.models.process import ProcessModel
 from swiftwrf.rssi.base import RssiPredictor
 from swiftwrf.runtime.validation import PositiveInt, checked
 
-LEVEL = 0.8  # nominal coverage of the intervals
 # standard deviations per measurement that a series may exceed its mean; detects changes of twice as much
 ALLOWANCE = 0.5
 Model = TypeVar("Model", bound=FieldModel | RssiPredictor)

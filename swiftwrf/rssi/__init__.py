@@ -7,8 +7,7 @@ from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation, 
 from swiftwrf.rssi.pairs import PairModel
 from swiftwrf.rssi.paper import RssiPaperModel
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, log_distance
-from swiftwrf.rssi.training import LEVEL
 
-__all__ = ["LEVEL", "FloorAttenuation", "Map", "PairModel", "PathLoss", "RssiComparison", "RssiConfig"]
+__all__ = ["FloorAttenuation", "Map", "PairModel", "PathLoss", "RssiComparison", "RssiConfig"]
 __all__ += ["RssiModel", "RssiPaperModel", "RssiPredictor", "compare", "estimate_floor_attenuation"]
 __all__ += ["estimate_offsets", "fit_path_loss", "fit_rssi", "log_distance"]

@@ -21,7 +21,7 @@ from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.rssi import PLACE
 from swiftwrf.data.splits import MIN_TRAINING, Validation, places
 from swiftwrf.errors import InputError
-from swiftwrf.metrics import method_summary
+from swiftwrf.metrics import LEVEL, method_summary
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import distance, nearest
 from swiftwrf.rssi.base import RssiPredictor
@@ -29,7 +29,6 @@ from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.offsets import estimate_offsets
 from swiftwrf.rssi.pairs import PairModel
 from swiftwrf.rssi.paper import RssiPaperModel
-from swiftwrf.rssi.training import LEVEL
 from swiftwrf.runtime.checkpoint import Saved, load
 from swiftwrf.runtime.registry import write_report
 from swiftwrf.runtime.steps import MODEL, Memo, Steps, refusing_executor

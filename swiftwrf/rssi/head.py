@@ -9,7 +9,6 @@ fixed, A and B are rendered once, and m is one convex function of one number.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable
 
 import torch
@@ -27,18 +26,16 @@ TABLE_RANGE_DB, TABLE_STEP_DB = 64.0, 0.125  # 64 dB are 10 standard deviations 
 
 
 class Head(nn.Module):
-    """The primitives of one receiver.
+    """The primitives of one receiver, which are alike at all receivers until they are trained.
 
     Args:
-        receiver_name: Name of the receiver. Its primitives depend on the name and the seed only.
         n_primitives: Number of primitives. With 0 the head is 0 everywhere.
         seed: Seed of the primitives' means and responses.
     """
 
-    def __init__(self, receiver_name: str, n_primitives: int, seed: int) -> None:
+    def __init__(self, n_primitives: int, seed: int) -> None:
         super().__init__()
-        digest = hashlib.sha256(f"{seed} {receiver_name}".encode()).digest()
-        generator = torch.Generator().manual_seed(int.from_bytes(digest[:7], "big"))
+        generator = torch.Generator().manual_seed(seed)
         self.primitives = Primitives(n_primitives, HEAD_GRID, generator=generator)
         # independent responses overfit, since only their sum is measured
         self.basis = nn.Parameter(1 + 0.3 * torch.randn(n_primitives, generator=generator))

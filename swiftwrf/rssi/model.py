@@ -19,7 +19,9 @@ from torch import Tensor
 
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Rssi
+from swiftwrf.data.splits import places
 from swiftwrf.gp import GaussianProcess, Kernel, subsample
+from swiftwrf.metrics import HALF_WIDTH, interval_factor
 from swiftwrf.models.base import CPU
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Axes
@@ -33,7 +35,6 @@ from swiftwrf.rssi.regression import RssiPosterior, fit_receiver, held_out_std, 
 from swiftwrf.rssi.training import (
     MAX_KERNEL_RECEIVERS,
     check_comparable,
-    interval_scale,
     mixing_weights,
     prepare,
     rounding_std,
@@ -43,6 +44,7 @@ from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import parallel_map, single_thread
 from swiftwrf.runtime.validation import checked
 
+MIN_PLACES = 30  # of a receiver; with fewer, held-out rows of all receivers calibrate its intervals
 RECEIVERS_AT_ONCE = 64  # between two steps of the progress bar; starting threads costs milliseconds
 
 
@@ -151,7 +153,7 @@ class RssiModel(SavedRssiPredictor):
         predicted = torch.einsum("k,knr->nr", weight[weight > 0], predictors[weight > 0])
         means = ((self.name, predicted), ("mean", predictors[-1]))
         self.held_out_db = {name: float((mean - train.rssi_dbm).abs().nanmean()) for name, mean in means}
-        scale = self._calibrate(train.rssi_dbm, predicted, std[:, mine], found["field_db"], found["noise_db"])
+        scale = self._calibrate(train, predicted, std[:, mine], found["field_db"], found["noise_db"])
         # only two predictors have the receiver's path loss
         self.covariance = (weight[:2].sum() * scale).square()[:, None, None] * found.pop("covariance")
         self.mixing_weight, self.kernel, self.centre = weight, training.kernel, training.centre
@@ -164,14 +166,18 @@ class RssiModel(SavedRssiPredictor):
             self.detection_field = DetectionField.fit(training.kernel, *bins, self.detection.limit)
         self._take(found | {"anchor": training.position})
 
-    def _calibrate(self, rssi: Tensor, predicted: Tensor, std: Tensor, field_db: Tensor, noise_db: Tensor) -> Tensor:
+    def _calibrate(self, train: Rssi, predicted: Tensor, std: Tensor, field_db: Tensor, noise_db: Tensor) -> Tensor:
         """Calibrate the standard deviations by held-out predictions of the training rows, and return their factors (R,).
 
-        `rssi`, `predicted` [dBm] and `std` [dB] are (n, R), the prior deviations of latent field and noise are (R,) [dB].
+        `predicted` [dBm] and `std` [dB] are (n, R), the prior deviations of latent field and noise are (R,) [dB].
         """
-        scale = interval_scale(predicted, std, rssi)
+        score, place = (train.rssi_dbm - predicted).abs() / (HALF_WIDTH * std), places(train.transmitter_position)
+        count = torch.zeros(int(place.max()) + 1, score.shape[1]).index_add(0, place, score.isfinite().float())
+        scale = torch.full_like(field_db, interval_factor(score, place))
+        for r in ((count > 0).sum(dim=0) >= MIN_PLACES).nonzero()[:, 0].tolist():
+            scale[r] = interval_factor(score[:, r], place)
         self.field_db = (scale * field_db).float()
-        self.noise_db = (scale * noise_db).clamp_min(rounding_std(rssi)).float()
+        self.noise_db = (scale * noise_db).clamp_min(rounding_std(train.rssi_dbm)).float()
         return scale
 
     def _take(self, state: dict[str, Any]) -> None:
@@ -323,7 +329,7 @@ class RssiModel(SavedRssiPredictor):
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
         model = cls._of_header(header)
         model.kernel, model.detection_field = Kernel(**header["kernel"]), None
-        model.row_digests = tensors.get("row_digests", cls.row_digests)  # earlier files have none
+        model._take_digests(tensors)
         detections, anchor = any("detection_field." in name for name in tensors), tensors["posterior.anchor"]
         shapes = _shapes(len(model.receiver_names), len(anchor), detections)
         expect(tensors, shapes)

@@ -12,23 +12,23 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from dataclasses import asdict, dataclass
-from statistics import NormalDist
 from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.splits import folds
+from swiftwrf.data.splits import folds, places
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, candidates
 from swiftwrf.gp.process import N_NEIGHBOURS, local_weights
+from swiftwrf.metrics import HALF_WIDTH, interval_factor
 from swiftwrf.models.base import FieldConfig
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import Neighbours, check_positions, distance, nearest
 from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiPredictor, SavedRssiPredictor, in_batches
 from swiftwrf.rssi.path_loss import MIN_DISTANCE_M, fit_path_loss
-from swiftwrf.rssi.training import LEVEL, rounding_std
+from swiftwrf.rssi.training import rounding_std
 from swiftwrf.runtime import checkpoint as files
 from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.threads import single_thread
@@ -140,9 +140,13 @@ class PairPredictor(RssiPredictor):
         pair = torch.cat([train.transmitter_position[row], train.receiver_position[column]], dim=1)
         session = None if train.session is None else train.session[row]
         fold = folds(pair[:, :3], self.config.validation, self.config.seed, session=session)
-        if self.config.new_places and len(pair[:, 3:].unique(dim=0)) > 1:
+        if self._has_new_places(pair):
             fold = folds(pair[:, 3:], "random", self.config.seed)
         self._fit_pairs(pair, train.rssi_dbm[row, column], fold)
+
+    def _has_new_places(self, pair: Tensor) -> bool:
+        """Return whether receivers of pairs (m, 6), at more than one place, are held out, and not the transmitter."""
+        return self.config.new_places and bool(places(pair[:, 3:]).any())
 
     def _predict(self, position: Tensor) -> tuple[Tensor, Tensor | None]:
         n, r = len(position), len(self.receiver_position)
@@ -240,8 +244,10 @@ class PairModel(PairPredictor, SavedRssiPredictor):
         held_out = {number: rssi - path_loss(fold != number)(pair) for number in fold[sample].unique().tolist()}
         choices = [choice for ratio in RATIOS for choice in self._judged(ratio, fold, sample, held_out)]
         _, self.ratio, self.kernel, score = min(choices, key=lambda choice: choice[0])
-        scale = score.quantile(LEVEL)[None] / NormalDist().inv_cdf((1 + LEVEL) / 2)
-        self.scale_db = scale.clamp_min(rounding_std(rssi) / self.kernel.noise**0.5)
+        rows = torch.cat([sample[fold[sample] == number] for number in held_out])
+        end = pair[rows, 3:] if self._has_new_places(pair) else pair[rows, :3]
+        scale = interval_factor(score / HALF_WIDTH, places(end))
+        self.scale_db = score.new_tensor([max(scale, rounding_std(rssi) / self.kernel.noise**0.5)])
         self._precompute()
 
     def _judged(

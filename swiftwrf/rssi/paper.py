@@ -97,7 +97,7 @@ class RssiPaperModel(RssiModel):
         predicted = held_out.T.double().where(out, torch.nan)[bins.bin_of_row]
         check_comparable(predicted[None], train.rssi_dbm)
         std = held_out_std(bins, self.kernel, prior_db, covariance)[bins.bin_of_row]
-        self._calibrate(train.rssi_dbm, predicted, std, *prior_db)
+        self._calibrate(train, predicted, std, *prior_db)
         self.mixing_weight, self.baseline = torch.eye(4).double()[0], torch.zeros(n_receivers, 2).double()
         self.centre, self.rendered, self.covariance, self.detection_field = bins.centre, rendered, covariance, None
         dual = torch.linalg.solve_triangular(root.T, white.T.double() * prior_db[0], upper=True).T
@@ -147,7 +147,7 @@ def learn_receivers(
     def descend(rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return predictions in all bins (R, n) by the fit to some bins, the normal numbers (R, n), and the heads."""
         generator = torch.Generator().manual_seed(config.seed)
-        heads = [Head(name, config.n_primitives, config.seed).to(device) for name in names]
+        heads = [Head(config.n_primitives, config.seed).to(device) for _ in names]
         white = nn.Parameter(torch.zeros_like(measured))
         n_detected = (~measured[rows.to(device)].isnan()).sum(dim=0).clamp_min(1)
         optimiser = torch.optim.Adam([*(p for head in heads for p in head.parameters()), white], lr=config.rate)

@@ -1,13 +1,12 @@
 """Shared by all receivers in a fit: location bins, path-loss models, limits, the kernel, and weights of predictors.
 
-Weights follow by stacking (L. Breiman, Machine Learning 24, 1996), intervals by cross-conformal prediction.
+Weights follow by stacking (L. Breiman, Machine Learning 24, 1996).
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from statistics import NormalDist
 
 import numpy as np
 import torch
@@ -25,7 +24,6 @@ from swiftwrf.rssi.head import Head, render
 from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_losses, log_distance
 from swiftwrf.runtime.threads import single_thread
 
-LEVEL = 0.8  # nominal coverage of the interval that the standard deviation is calibrated for
 MAX_PAIRS = 20_000  # measurements that determine the mixing weights
 # variance of a packet relative to the variance of the field: fading is as large as shadowing
 RELATIVE_NOISE_VARIANCES = (0.3, 1.0, 2.0, 3.0)
@@ -120,11 +118,11 @@ def prepare(pool: Rssi, own: Tensor, config: RssiConfig, shift: Tensor, curve: D
     n_primitives = config.n_primitives if helps else 0
     loss = everything.columns(own)
     field_db, noise_db = prior_std(loss.variance, kernel if n_primitives else None)
-    heads = [Head(name, n_primitives, config.seed).requires_grad_(False) for name in bins.receiver_names]
+    head = render([Head(n_primitives, config.seed).requires_grad_(False)])
     return RssiTraining(
         **vars(bins),
         kernel=kernel,
-        rendered=render(heads),
+        rendered=head.expand(len(own), *head.shape[1:]),
         path_loss=loss,
         shift=shift[:, own],
         limit=_limits(rssi, loss, distance, shift[:, own]),
@@ -295,26 +293,6 @@ def mixing_weights(held_out: Tensor, measured: Tensor, shrinkage: float = 0.05) 
         # absolute errors below 0.5 dB count as squares, so that the solution is unique
         importance = 1 / np.maximum(np.abs(error @ weight), 0.5)
     return torch.from_numpy(weight)
-
-
-def interval_scale(predicted: Tensor, std: Tensor, measured: Tensor) -> Tensor:
-    """Return the factors (R,) of the standard deviations with which the 80 % intervals hold 80 % of the held-out rows.
-
-    The interval is cross-conformal (V. Vovk, Annals of Mathematics and Artificial Intelligence 74, 2015): the error of each
-    row is divided by the standard deviation that a model without the row's fold predicts.
-
-    Args:
-        predicted: Held-out predictions of the rows (n, R) [dBm], nan where there is none.
-        std: Their standard deviations (n, R) [dB].
-        measured: Measurements of the rows, (n, R) [dBm].
-    """
-    score = ((measured - predicted) / std).abs()
-    finite = score.where(score.isfinite(), torch.nan)
-    quantile = finite.nanquantile(LEVEL, dim=0)
-    few = (~finite.isnan()).sum(dim=0) < 30  # scores of all receivers count
-    if few.any():
-        quantile = quantile.where(~few, score[score.isfinite()].quantile(LEVEL))
-    return quantile / NormalDist().inv_cdf((1 + LEVEL) / 2)
 
 
 def rounding_std(rssi: Tensor) -> float:

@@ -13,6 +13,7 @@ from pandas import DataFrame
 from scipy.stats import binomtest
 
 from swiftwrf.locate.baselines import LOCALIZERS
+from swiftwrf.metrics import LEVEL
 from swiftwrf.plotting import corners_of
 from tasks import labels
 from tasks.page import figures
@@ -35,7 +36,6 @@ from tasks.terminal import Answer, Method, NextStep
 
 OWN = "posterior"  # the localizer that all others are compared with
 NEIGHBOURS = ("knn", "knn_difference")
-LEVEL = 0.8  # probability of the credible regions in the summary
 SUGGESTED = "suggested"  # name of the files with suggested positions
 TRUTH, ESTIMATE = "#cf4a4a", "#ffffff"
 COLUMNS = ["index", "place", "method", "position_error_m"]  # of the errors of methods

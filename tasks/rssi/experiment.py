@@ -11,8 +11,8 @@ import torch
 
 from swiftwrf import InputError, Rssi, rssi_room
 from swiftwrf.data.files import sha256
-from swiftwrf.metrics import summary
-from swiftwrf.rssi import LEVEL, PairModel, RssiComparison, RssiModel, compare
+from swiftwrf.metrics import LEVEL, summary
+from swiftwrf.rssi import PairModel, RssiComparison, RssiModel, compare
 from swiftwrf.rssi.comparison import compared
 from swiftwrf.rssi.coverage import Coverage, reach
 from swiftwrf.rssi.maps import RssiMap

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from statistics import NormalDist
 from typing import Any, Literal
 
 import numpy as np
@@ -13,8 +12,8 @@ from numpy.typing import NDArray
 from pandas import DataFrame
 
 from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
+from swiftwrf.metrics import HALF_WIDTH, LEVEL
 from swiftwrf.plotting import corners_of, hatch
-from swiftwrf.rssi import LEVEL
 from tasks.page import figures, maps
 from tasks.page.page import Plot
 from tasks.records import Records, Row
@@ -25,7 +24,7 @@ MAX_RATIO = 12.0  # of the sides of a map that is to scale; one of a corridor wo
 MIN_RATIO = 1.2  # of the widest interval inside to the median one, for which the widths are drawn
 COVERED_DBM, CERTAINTY = -75.0, 0.9  # coverage of the summary
 RECEIVER = "#cf4a4a"
-WIDTH_PER_STD = 2 * NormalDist().inv_cdf((1 + LEVEL) / 2)  # of the interval of a normal variable
+WIDTH_PER_STD = 2 * HALF_WIDTH  # of the interval of a normal variable
 
 
 def coverage_sentence(found: Row, where: str = "the measured area") -> str:

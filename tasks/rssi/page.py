@@ -5,11 +5,12 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
+import torch
 from matplotlib.figure import Figure
 
 from swiftwrf.choices import RSSI_PREDICTORS
-from swiftwrf.metrics import paired_difference
-from swiftwrf.rssi import LEVEL
+from swiftwrf.data.splits import places
+from swiftwrf.metrics import LEVEL, paired_difference
 from tasks.labels import PREDICTORS, colour, meanings
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of
@@ -181,14 +182,14 @@ def where_next(run: Records) -> str:
     if not any(maps.arrays["inside"].any() for maps in floors):
         return "Measure in a second dimension: the measured positions lie on a line."
     if varied := [maps for maps in floors if maps.varies]:
-        places = []
+        widest = []
         for maps in varied:
             x, y, width, typical = maps.widest
             at = f"x = {x:.1f} m, y = {y:.1f} m{f' on {maps.name}' if maps.suffix else ''}"
-            places.append(f"{at} ({width:.0f} dB instead of {typical:.0f} dB)")
+            widest.append(f"{at} ({width:.0f} dB instead of {typical:.0f} dB)")
         best = " of the best server" if len(floors[0].names) > 1 else ""
-        return f"Measure around {', '.join(places)}: the {LEVEL:.0%} interval{best} is widest there."
-    if (n := len(np.unique(run.arrays("maps")["measured_position"], axis=0))) < MIN_POSITIONS:
+        return f"Measure around {', '.join(widest)}: the {LEVEL:.0%} interval{best} is widest there."
+    if (n := int(places(torch.from_numpy(run.arrays("maps")["measured_position"])).max()) + 1) < MIN_POSITIONS:
         return f"Measure at more positions: {n} are too few to show how RSSI varies between them."
     typical, scatter = max(maps.widest[3] for maps in floors), scatter_of_repeats(run)
     reason = "and the model explains no more"
@@ -204,7 +205,9 @@ def where_next(run: Records) -> str:
 
 def scatter_of_repeats(run: Records) -> float | None:
     """Return the width of the 80 % interval of repeated measurements at one place [dB], None if there are too few."""
-    same = run.table("predictions").groupby(["x", "y", "z", "receiver"])["measured"]
+    table = run.table("predictions")
+    place = places(torch.from_numpy(table[["x", "y", "z"]].to_numpy(dtype=float)))
+    same = table.groupby([place.numpy(), "receiver"])["measured"]
     repeats = same.count() - 1
     n = int(repeats.clip(lower=0).sum())
     return float(WIDTH_PER_STD * np.sqrt((same.var() * repeats).sum() / n)) if n >= MIN_REPEATS else None

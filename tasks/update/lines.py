@@ -22,10 +22,11 @@ from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.files import refusing_unreadable, table_of
 from swiftwrf.data.receivers import spelled_as
 from swiftwrf.errors import CONTENT_ERRORS
+from swiftwrf.metrics import LEVEL
 from swiftwrf.online import Step
-from swiftwrf.online.scores import LEVEL
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime.durable import strict
+from swiftwrf.runtime.plain import read_json
 from tasks.configs import OF_ROWS, TABLE_SUFFIX, UpdateConfig
 from tasks.source import reading
 
@@ -140,7 +141,7 @@ def measurement(line: Line, config: UpdateConfig, model: FieldModel | RssiModel,
         if line.header:
             assert isinstance(model, RssiModel)
             return _of_row(text, config, model, left_out).derived(index=index)
-        content = json.loads(text)
+        content = read_json(text)
         position, value = [list(map(_number, content["position"]))], content[needed]
         if isinstance(model, RssiModel):
             return _of_receivers(position, value, model, left_out).derived(index=index)

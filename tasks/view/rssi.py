@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from swiftwrf import Prediction, Rssi, RssiModel
 from swiftwrf.data.coordinates import Floors
 from swiftwrf.locate.posterior import PlanMap
-from swiftwrf.rssi import LEVEL
+from swiftwrf.metrics import LEVEL
 from swiftwrf.rssi.coverage import Coverage, reach
 from swiftwrf.rssi.maps import RssiMap
 from tasks.page.maps import Corners, FloorPlan

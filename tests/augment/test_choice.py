@@ -36,7 +36,7 @@ def test_the_median_decides_and_not_the_mean():
 
 @pytest.mark.parametrize(("far_off", "chosen"), [(36.0, "network"), (0.0, "peak")])
 def test_among_medians_that_are_equal_up_to_chance_large_errors_decide(far_off, chosen):
-    """As on a circular array: the peak is ahead by a hair, and far off for a sixth of the spectra."""
+    """The peak of a circular array is ahead by a hair, and far off for a sixth of the spectra."""
     generator = np.random.default_rng(0)
     network = generator.gamma(4, 3, 40)
     peak = network * generator.uniform(0.6, 1.25, 40)
@@ -60,7 +60,7 @@ def test_a_significantly_smaller_median_outweighs_large_errors():
 
 
 def test_spectra_of_one_place_are_no_independent_evidence():
-    """Of 24 spectra 18 favour `first`, but they are of three places; of 24 places they are evidence."""
+    """18 of 24 spectra favour `first`, which is evidence from 24 places and none from four."""
     first = np.repeat([1.0, 1.0, 1.0, 5.0], 6)
     second = np.repeat([1.5, 1.5, 1.5, 0.1], 6)
     assert second.mean() < first.mean()
@@ -97,7 +97,8 @@ class Recorded(KernelRegression):
 
 
 @pytest.mark.parametrize("measured", [0.25, 0.7])  # two folds, two pairs of folds
-def test_all_methods_are_compared_on_the_same_spectra_which_trained_none(tmp_path, measured):
+def test_all_methods_are_compared_on_the_same_spectra_which_trained_none(tmp_path, measured, monkeypatch):
+    monkeypatch.setattr("augment.turbo.stages.MAX_HELD_OUT_EXTRA", 6)
     data = simulated_room(n=60, grid=AngularGrid.hemisphere(8, 32))
     CALLS.clear()
     options = {"models": ["idw", "nearest"], "estimators": ["peak", Recorded()], "extra": 9, "keep": Memo(tmp_path)}
@@ -111,7 +112,7 @@ def test_all_methods_are_compared_on_the_same_spectra_which_trained_none(tmp_pat
         """Return the rows of the data with these spectra."""
         return set((spectra[:, None] == data.spectrum).flatten(2).all(dim=2).nonzero()[:, 1].tolist())
 
-    held_out, errors = set(), []
+    held_out, errors, n_synthetic = set(), [], []
     for training, asked in zip(CALLS[::2], CALLS[1::2], strict=True):
         own, rows = set(training.index[~training.synthetic].tolist()), rows_of(asked)
         assert rows.isdisjoint(training.index.tolist())
@@ -119,10 +120,13 @@ def test_all_methods_are_compared_on_the_same_spectra_which_trained_none(tmp_pat
             assert own < set(known.index.tolist())
             assert rows <= set(known.index.tolist())
             held_out |= rows
+            n_synthetic.append(int(training.synthetic.sum()))
             if not bool(training.synthetic.any()):
                 peak = data.grid.peak_direction(asked)
                 errors.append(angle_errors(peak, data.subset(torch.tensor(sorted(rows))).label)["great_circle"])
     assert len(held_out) >= (0.7 if len(known) >= 25 else 0.15) * len(known)
+    n = len(train) - len(known)
+    assert sorted(n_synthetic) == sorted(2 * [0, n, n, n + 6, n + 6])  # in two parts, with spectra of two field models
     assert result.choice["n_held_out"] == len(held_out)
     assert result.choice["held_out_deg"]["peak"] == pytest.approx(float(torch.cat(errors).rad2deg().quantile(0.5)))
 

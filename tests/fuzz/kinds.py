@@ -54,6 +54,7 @@ from swiftwrf import (
     rssi_room,
     simulated_room,
 )
+from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.comparison import NeRF2Rssi
 from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.rssi import Offsets
@@ -89,7 +90,7 @@ def rssi_nerf2(folder: Path) -> None:
 
 def spectra_as_written(folder: Path) -> None:
     data = SNAPSHOTS.spectra(GRID)
-    label, frequency = data.label.flip(0), 915e6 + 1e6 * torch.arange(2).double()
+    label, frequency = data.label.flip(0), LIGHT_SPEED / data.array.wavelength + 1e6 * torch.arange(2).double()
     write_spectra(replace(data, label=label, frequency_hz=frequency), folder)
 
 

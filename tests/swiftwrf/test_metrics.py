@@ -1,3 +1,8 @@
+import inspect
+import math
+import re
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -6,9 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
+import swiftwrf
+from swiftwrf.locate import Posterior
 from swiftwrf.metrics import (
+    LEVEL,
     angle_errors,
     covered,
+    interval_factor,
     median_interval,
     method_summary,
     ssim,
@@ -59,6 +68,52 @@ def test_four_fifths_of_a_normal_variable_are_covered():
     share = covered(torch.zeros_like(noise), 2 * torch.ones_like(noise), 2 * noise)
     assert share.tolist() == pytest.approx([0.8] * 3, abs=0.01)
     assert covered(noise, torch.zeros_like(noise), noise).tolist() == [1, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("n", "level"), [(1, 0.8), (3, 0.8), (4, 0.8), (9, 0.8), (57, 0.8), (400, 0.8), (40, 0.5), (19, 0.95)]
+)
+def test_the_factor_of_one_row_a_place_is_an_ascending_score(n, level):
+    """Number ceil((n + 1) level) of n, or the largest if there are fewer."""
+    score = np.random.default_rng(n).exponential(size=n)
+    wanted = np.sort(score)[min(math.ceil((n + 1) * level - 1e-9), n) - 1]
+    assert interval_factor(torch.from_numpy(score), torch.randperm(n), level) == wanted
+
+
+def test_places_count_alike_in_a_factor(generator):
+    """The smallest score below which the mean fraction of a place's scores is 0.8 (P + 1) / P."""
+    place = torch.randint(12, (300,), generator=generator) ** 2 // 11  # places of 10 to 70 rows
+    score = torch.rand(300, 5, generator=generator) * (1 + place[:, None])
+    score[::7, 2], score[3, 1] = torch.nan, torch.inf
+    parts = [score[place == number].numpy().ravel() for number in place.unique()]
+    parts = [part[np.isfinite(part)] for part in parts]
+    needed = 0.8 * (len(parts) + 1) / len(parts)
+    ascending = np.sort(np.concatenate(parts))
+    wanted = next(value for value in ascending if np.mean([(part <= value).mean() for part in parts]) >= needed - 1e-9)
+    assert interval_factor(score, place) == wanted
+    again = torch.cat([score, score[place == 2].repeat(9, 1)]), torch.cat([place, place[place == 2].repeat(9)])
+    assert interval_factor(*again) == wanted
+
+
+@pytest.mark.parametrize("n_places", [9, 24, 100])
+def test_intervals_hold_at_a_new_place(n_places):
+    """With places of 1 to 30 rows, whose errors have a common scale."""
+    draw, inside = np.random.default_rng(n_places), []
+    for _ in range(400):
+        rows = draw.integers(1, 31, n_places)
+        place, scale = np.arange(n_places).repeat(rows), draw.gamma(2.0, size=n_places).repeat(rows)
+        score = scale * np.abs(draw.normal(size=len(place)))
+        factor = interval_factor(torch.from_numpy(score), torch.from_numpy(place))
+        inside.append((draw.gamma(2.0) * np.abs(draw.normal(size=30)) <= factor).mean())
+    assert LEVEL - 0.015 < np.mean(inside) < LEVEL + 0.015 + 1 / (n_places + 1)
+
+
+def test_all_intervals_and_regions_have_one_level():
+    root = Path(swiftwrf.__file__).parent.parent
+    files = [file for package in ("swiftwrf", "augment", "tasks") for file in (root / package).rglob("*.py")]
+    assert [file.stem for file in files if re.search(r"^LEVEL\b.* = ", file.read_text(), re.MULTILINE)] == ["metrics"]
+    for method in (swiftwrf.Prediction.interval, Posterior.credible_radius):
+        assert inspect.signature(method).parameters["level"].default == LEVEL == 0.8
 
 
 @pytest.mark.parametrize(("n_pairs", "mean", "has_interval"), [(0, np.nan, False), (9, 1.0, False), (10, 1.0, True)])

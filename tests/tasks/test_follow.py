@@ -251,6 +251,8 @@ def test_an_update_by_the_rows_that_trained_the_model_learns_the_others(model, t
         line(41, rssi_dbm={"receiver01": 10**400}),
         line(41, rssi_dbm={"nowhere\r\n": -60}),
         b"[" * 5000 + b"\n",
+        b'{"position": [1, 2, 1], "rssi_dbm": {"receiver01": -60, "receiver01": -90}}\n',
+        b'{"position": [1, 2, 1], "position": [9, 9, 1], "rssi_dbm": {"receiver01": -60}}\n',
     ],
     ids=lambda bad: str(bad[:40]),
 )

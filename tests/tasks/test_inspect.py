@@ -67,7 +67,7 @@ def test_positions_that_repeat(tmp_path, capsys):
     write_spectra(room.subset(torch.arange(15).repeat(2)), tmp_path / "source")
     assert run(tmp_path / "source", "--out", tmp_path / "page") == 0
     said = capsys.readouterr().out
-    assert "30 rows are at 15 different positions" in said
+    assert "30 rows are at 15 places" in said
     assert "other position is 0.000 m" not in said
 
 

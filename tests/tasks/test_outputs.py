@@ -214,7 +214,9 @@ def test_a_map_is_hatched_where_nothing_is_received_at_the_median_height(model, 
     monkeypatch.setattr("swiftwrf.rssi.maps.hatch", lambda ax, x, y, where: hatched.append(where))
     chart = RssiMap.predict(model, cell=4.0)
     detection = np.linspace(0, 1, chart.mean.size).reshape(chart.mean.shape)
-    replace(chart, detection=detection).plot()
+    image = replace(chart, detection=detection).plot().images[0]
+    assert (image.origin, tuple(image.get_extent())) == ("lower", chart.corners)
+    assert np.array_equal(image.get_array(), chart.mean.max(axis=0))
     assert np.array_equal(hatched[0], (detection < 0.5).all(axis=0))
     assert chart.height == pytest.approx(np.median(floor.transmitter_position[:, 2]), abs=0.01)
     assert RssiMap.predict(model, cell=2.0, region=[[1.0, 2.0], [9.0, 8.0]]).corners == (1, 9, 2, 8)

@@ -145,6 +145,13 @@ def test_general_options_are_refused_in_a_sentence(tmp_path, monkeypatch, argume
         executed(RssiTaskConfig, "--rx", 1, *arguments)
 
 
+@pytest.mark.parametrize(("name", "text"), [("a.yml", "seed: 1\nseed: 2\n"), ("a.json", '{"seed": 1, "seed": 2}')])
+def test_an_option_given_twice_in_a_file_is_refused(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match="it names 'seed' twice; each needs a name of its own"):
+        executed(RssiTaskConfig, "--rx", 1, "--config", tmp_path / name)
+
+
 @pytest.mark.parametrize("given", [("--seed", "7"), ("--data", "x"), ("--processes", "2")])
 def test_resume_changes_no_result(tmp_path, given, capsys):
     folder = tmp_path / "x.partial"

@@ -50,6 +50,7 @@ from tasks.rssi import experiment as rssi
 from tasks.rssi import page as rssi_page
 from tasks.source import split_notes
 from tasks.terminal import _table
+from tasks.view import charts
 from tasks.view.locating import Located
 
 N = np.arange(100)
@@ -314,7 +315,8 @@ def test_credible_circles(said):
     posterior = Rings().locate([0])
     shown = Located.of(posterior, torch.tensor([3.0, 4.0, 0.0]))
     assert said_of(shown.describe())[3:] == [50, 2.5, 80, 4.0, 5.0]
-    assert np.hypot(*posterior.plot().get_lines()[-1].get_xydata().T) == pytest.approx(4.0, abs=0.01)
+    for path in (posterior.plot().get_lines()[-1].get_xydata(), charts.circle((3.0, 4.0, 0.0), 4.0) - [3, 4]):
+        assert np.hypot(*path.T) == pytest.approx(4.0, abs=0.01)
     assert posterior.std[0].tolist() == pytest.approx([np.arange(-50, 51).std() / 10, 0, 0])
     wide = replace(posterior, inflation=1.5, resolution_m=0.8)
     assert wide.credible_radius(0.5).tolist() == pytest.approx([1.5 * (2.5 + 0.2)])

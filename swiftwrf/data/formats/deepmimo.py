@@ -15,7 +15,6 @@ phase -2 pi f delay of the propagation is added here. The line-of-sight paths, w
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from pathlib import Path
@@ -34,6 +33,7 @@ from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.errors import InputError
 from swiftwrf.positions import check_positions
+from swiftwrf.runtime.plain import read_json
 
 Floats = NDArray[np.float64]
 KEYS = ("power", "phase", "delay", "aoa_az", "aoa_el")
@@ -62,7 +62,7 @@ class DeepMimo(Format[Spectra]):
         pair = pairs[station(f"{path} holds {len(pairs)} pairs of transmitter and receivers", pairs, options.station)]
         params = path / "params.json"
         with refusing_broken(params, "JSON with rt_params, and in it frequency, the carrier in Hz"):
-            given = json.loads(read_text(params))["rt_params"]
+            given = read_json(read_text(params))["rt_params"]
             frequency, tracer = float(given["frequency"]), str(given.get("raytracer_name", ""))
         check_carrier(params, frequency)
         table = _table(path, pair)

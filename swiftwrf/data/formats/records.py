@@ -26,7 +26,6 @@ A checksum is the CRC-32C, rotated right by 15 bits, plus 0xa282ead8.
 
 from __future__ import annotations
 
-import json
 import math
 import struct
 from collections.abc import Iterator
@@ -44,6 +43,7 @@ from swiftwrf.data.formats.snapshots import snapshots_of
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.errors import InputError, optional_module
 from swiftwrf.positions import MAX_COORDINATE_M, check_positions
+from swiftwrf.runtime.plain import read_json
 from swiftwrf.runtime.validation import PositiveFloat, check_value
 
 SUFFIX = ".tfrecords"
@@ -143,7 +143,7 @@ def _of_dichasus(csi: NDArray[Any], offsets: NDArray[Any] | None) -> NDArray[Any
 def _read_offsets(file: Path) -> NDArray[Any]:
     """Return carrier phase [rad] and sampling time [samples] to add to each antenna, (antennas, 2)."""
     with refusing_broken(file, "JSON with lists cpo and sto, a number for each antenna"):
-        content = json.loads(read_text(file))
+        content = read_json(read_text(file))
         values = np.array([content["cpo"], content["sto"]], dtype=np.float64).T
         if values.ndim != 2 or not np.isfinite(values).all():
             raise ValueError(f"got {values.shape[::-1]} numbers, or some that are not finite")
@@ -161,7 +161,7 @@ def _description(path: Path) -> tuple[Path, dict[str, Any]] | None:
     folder = path if path.is_dir() else path.parent
     for file in sorted(folder.glob("*.json")):
         try:
-            content = json.loads(read_text(file))
+            content = read_json(read_text(file))
         except (ValueError, RecursionError):  # InputError is such
             continue
         antennas = content.get("antennas") if isinstance(content, dict) else None

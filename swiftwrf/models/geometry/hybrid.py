@@ -176,7 +176,7 @@ class HybridModel(ProcessModel):
         parts = [self.room._state(), self.process.state()]
         if self.path_gains is not None:
             parts.append(self.path_gains.state())
-        tensors, own = {"component": self.component} | self._spread_state(), {"mixing_weight": self.mixing_weight}
+        tensors, own = {"component": self.component} | {"spread": self.spread}, {"mixing_weight": self.mixing_weight}
         for some, header in parts:
             tensors |= some
             own |= header

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
+from swiftwrf.array.beamforming import unit_power
 from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.spectra import Spectra, fingerprint
@@ -130,7 +131,7 @@ class GeometryModel(Linked, FieldModel):
         return model
 
     def channels(self, data: Spectra) -> Channels:
-        """Return the channels of spectra as the room predicts them, of at most 8 snapshots.
+        """Return the channels of spectra as the room predicts them, of at most 8 snapshots and of unit power.
 
         Raises:
             InputError: Spectra without channels, or of another link.
@@ -141,7 +142,7 @@ class GeometryModel(Linked, FieldModel):
         rows = kept_snapshots(data.channel.shape[1])
         carrier = LIGHT_SPEED / self.array.wavelength
         frequency = torch.ones(len(rows)).double() if data.frequency_hz is None else data.frequency_hz[rows] / carrier
-        return Channels(self.scene(data.position), data.channel[:, rows], frequency)
+        return Channels(self.scene(data.position), unit_power(data.channel[:, rows]), frequency)
 
     def _update(self, new: Spectra) -> None:
         if self.planes:

@@ -18,7 +18,7 @@ from swiftwrf import InputError, Rssi, RssiModel, load, load_rssi
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.rssi import Offsets
-from swiftwrf.data.splits import folds, random_split, repeated_fraction
+from swiftwrf.data.splits import folds, places, random_split, repeated_fraction, slabs
 from swiftwrf.data.writing import write_rssi
 from swiftwrf.locate import RssiLocator
 from swiftwrf.rssi import estimate_offsets
@@ -298,14 +298,52 @@ def test_a_place_measured_again_is_in_one_part_of_every_random_split(floor):
     assert len(train) + len(test) == len(frequent)
 
 
-def test_positions_measured_again_differ_by_the_error_of_positioning():
+@pytest.mark.parametrize(
+    ("n_places", "extent", "error"),
+    [
+        (30, (12, 12, 12), 0.01),
+        (10, (2, 1, 0), 0.005),  # motion capture of a robot that returns to ten places
+        (8, (9, 0, 0), 0.004),  # a corridor
+        (40, (300, 200, 0), 0.7),  # a satellite receiver
+    ],
+)
+def test_positions_measured_again_differ_by_the_error_of_positioning(n_places, extent, error):
     draw = np.random.default_rng(0)
-    place = draw.uniform(0, 12, (30, 3)).repeat(8, axis=0)
-    position = torch.from_numpy(place + draw.normal(0, 0.001, place.shape))
+    grid = np.linspace(0.05, 0.95, n_places)
+    place = np.stack([grid, grid * 7 % 1, grid * 3 % 1], axis=1) * extent
+    position = torch.from_numpy(place.repeat(8, axis=0) + draw.uniform(-error, error, (8 * n_places, 3)))
+    number = torch.arange(n_places).repeat_interleave(8)
+    found = places(position)
+    assert len(found.unique()) == n_places == len(torch.stack([found, number]).unique(dim=1).T)
+    for held_out in (folds(position, "random", 0), folds(position, "block", 0)):
+        assert len(torch.stack([held_out, number]).unique(dim=1).T) == n_places
+        assert len(held_out.unique()) == 5
     train, test = random_split(position, seed=0)
-    assert repeated_fraction(position[train], position[test]) > 0.9
+    assert repeated_fraction(position[train], position[test]) == 0
+    assert repeated_fraction(position[::2], position[1::2]) == 1
     spread = torch.from_numpy(draw.uniform(0, 12, (240, 3)))
-    assert repeated_fraction(spread[train], spread[test]) < 0.05
+    assert repeated_fraction(spread[:200], spread[200:]) < 0.05
+
+
+def test_a_dense_path_is_not_one_place():
+    along = torch.linspace(0, 8, 4000, dtype=torch.float64)
+    path = torch.stack([along, along.sin(), torch.zeros_like(along)], dim=1)
+    assert len(places(path).unique()) > 100
+    one = places(torch.ones(7, 3)), places(torch.ones(7, 3), 2)
+    assert [found.tolist() for found in one] == [[0] * 7, [*range(7)]]
+
+
+@pytest.mark.parametrize("validation", ["random", "block"])
+@pytest.mark.parametrize("kind", ["random", "grid", "repeated"])
+def test_the_order_of_rows_changes_no_fold(validation, kind, generator):
+    position = 9 * torch.rand(83, 3, generator=generator, dtype=torch.float64)
+    if kind == "grid":
+        position = torch.cartesian_prod(torch.arange(12.0), torch.arange(7.0), torch.ones(1)).double()
+    elif kind == "repeated":
+        position = torch.cat([position, position[:40] + 1e-3, position[:9]])
+    order = torch.randperm(len(position), generator=generator)
+    for held_out in (lambda at: folds(at, validation, 3), lambda at: slabs(at, 5), places):
+        assert held_out(position[order]).tolist() == held_out(position)[order].tolist()
 
 
 @pytest.mark.parametrize(("task", "options"), [("rssi", ()), ("locate", FEW_CELLS)])

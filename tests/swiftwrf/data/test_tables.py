@@ -262,6 +262,47 @@ def test_degrees_in_other_units(table, unit, at):
     assert noted(data, "longitude longitude and latitude latitude are projected")
 
 
+@pytest.mark.parametrize("longitude", [-74.1, 179.9999, -179.9999])
+@pytest.mark.parametrize("named", [True, False])
+def test_longitudes_from_0_to_360_degrees(table, longitude, named):
+    degrees = GeodeticOrigin(40.7, longitude).to_degrees(table[["x", "y"]].to_numpy())
+    names = ["longitude", "latitude"] if named else ["x", "y"]
+    changed = table.drop(columns=["x", "y"]).assign(**{names[0]: degrees[:, 1] % 360, names[1]: degrees[:, 0]})
+    data = Rssi.from_frame(changed, coordinates=None if named else "degrees")
+    is_read_as(data, table, atol=1e-3)
+    assert noted(data, "count from 0 to 360 degrees")
+
+
+def test_receivers_with_longitudes_from_0_to_360_degrees(table, tmp_path):
+    origin = GeodeticOrigin(40.7, -74.1)
+    degrees = origin.to_degrees(table[["x", "y"]].to_numpy())
+    table.assign(longitude=degrees[:, 1], latitude=degrees[:, 0]).drop(columns=["x", "y"]).to_csv(
+        tmp_path / "walk.csv", index=False
+    )
+    (tmp_path / "receivers.csv").write_text(f"receiver,longitude,latitude\na,{degrees[3, 1] % 360},{degrees[3, 0]}\n")
+    data = load_rssi(tmp_path / "walk.csv")
+    np.testing.assert_allclose(data.receiver_position[0, :2], data.transmitter_position[3, :2], atol=1e-3)
+    table.to_csv(tmp_path / "walk.csv", index=False)
+    with pytest.raises(InputError, match="holds longitudes and latitudes, but the measurements are in metres"):
+        load_rssi(tmp_path / "walk.csv")
+
+
+def test_columns_named_as_degrees_are_metres_only_if_none_can_be_degrees(table):
+    named = table.rename(columns={"x": "longitude", "y": "latitude"})
+    with pytest.raises(InputError, match="may be degrees or metres"):
+        Rssi.from_frame(named.assign(longitude=np.where(np.arange(N) % 3, named.longitude, -170.0)))
+    beyond = named.assign(longitude=named.longitude + 361.1)
+    for asked in (None, "degrees"):
+        with pytest.raises(
+            InputError, match="values beyond 180 degrees; if they are metres, give --coordinates metres"
+        ):
+            Rssi.from_frame(beyond, coordinates=asked)
+    is_read_as(Rssi.from_frame(beyond, coordinates="metres"), table)
+    projected = named.assign(longitude=named.longitude + 691_000, latitude=named.latitude + 5_300_000)
+    is_read_as(Rssi.from_frame(projected), table)
+    assert noted(Rssi.from_frame(projected), "count as metres, because none of their values can be degrees")
+
+
 def test_one_row_of_a_stream_keeps_its_receivers(table):
     row = table.iloc[:1].assign(a=-11.5, noise=-95)
     assert Rssi.from_frame(row).receiver_names == ("a", "b", "c", "d")
@@ -292,6 +333,24 @@ def test_times_in_other_units(table, kind):
     assert noted(data, kind) == (kind in ("milliseconds", "microseconds", "nanoseconds"))
     first = seconds[0] if "start" in kind or kind == "epoch" else 0
     np.testing.assert_allclose(data.time, seconds - first, atol=1e-3)
+
+
+def test_times_that_are_read_otherwise_have_a_note(table):
+    odd = table.assign(time=["noon" if n % 10 == 3 else f"{n}" for n in range(N)])
+    data = Rssi.from_frame(odd)
+    assert data.time.isnan().nonzero()[:, 0].tolist() == list(range(3, N, 10))
+    assert noted(data, "cells of column time that hold no time are unknown: 6 of 60, e.g. 'noon'")
+    clock = [f"{pd.Timestamp('2024-01-01 23:59:30') + pd.Timedelta(seconds=n):%H:%M:%S}" for n in range(N)]
+    night = Rssi.from_frame(table.assign(time=clock))
+    np.testing.assert_array_equal(night.time, np.arange(N))
+    assert noted(night, "pass midnight")
+
+
+@pytest.mark.parametrize("kind", ["decimal comma", "durations"])
+def test_times_with_a_decimal_comma_or_as_durations(table, kind):
+    half = np.arange(N) / 2
+    time = pd.to_timedelta(half, unit="s") if kind == "durations" else [f"{t:.1f}".replace(".", ",") for t in half]
+    np.testing.assert_allclose(Rssi.from_frame(table.assign(time=time)).time, half, atol=1e-9)
 
 
 def test_date_and_time_in_two_columns(table):

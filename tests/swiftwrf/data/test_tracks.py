@@ -58,6 +58,46 @@ def test_records_in_json(tmp_path, record, wrapped):
     assert wrapped is list or "rows are the records in floorplans > survey_paths > scan_events" in "".join(data.notes)
 
 
+def survey(tmp_path, records):
+    (tmp_path / "survey.json").write_text(json.dumps(records))
+    return load_rssi(tmp_path / "survey.json")
+
+
+@pytest.mark.parametrize("n", [2, 3, 4])
+def test_a_list_of_rssi_is_no_position(tmp_path, n):
+    lists = [[-50 - place - 10 * number for number in range(n)] for place in range(12)]
+    places = [{"x": x, "y": y} for x, y in PLACES]
+    data = survey(tmp_path, [place | {"rssi": values} for place, values in zip(places, lists, strict=True)])
+    assert data.receiver_names == tuple(f"rssi_{number}" for number in range(1, n + 1))
+    assert data.rssi_dbm.tolist() == lists
+    assert data.transmitter_position.tolist() == [[x, y, 0] for x, y in PLACES]
+    records = [place | {"B": values[0], "A": values} for place, values in zip(places, lists, strict=True)]
+    other = survey(tmp_path, records)
+    assert other.receiver_names == ("B",)
+    assert other.transmitter_position.tolist() == [[x, y, 0] for x, y in PLACES]
+    assert "lists that hold no records, position or RSSI are left out: A" in other.notes
+
+
+@pytest.mark.parametrize("name", ["position", "pos", "Location", "coordinates", "tx_position", "xyz"])
+def test_a_list_of_a_place_is_a_position(tmp_path, name):
+    metres = {"coordinates": 1e-5}.get(name, 1.0)
+    data = survey(tmp_path, [{name: [8 + metres * x, metres * y, 2], "a": -60} for x, y in PLACES])
+    assert bool((data.transmitter_position[:, 2] == 2).all())
+    assert float(data.transmitter_position[:, 0].diff().mean()) == pytest.approx(1.1132 if metres < 1 else 1, rel=1e-3)
+
+
+@pytest.mark.parametrize("empty", [[], {}, None, "absent"])
+@pytest.mark.parametrize("by_receiver", [True, False])
+def test_a_place_where_nothing_was_detected_is_a_row(tmp_path, empty, by_receiver):
+    records = []
+    for n, (x, y) in enumerate(PLACES):
+        scan = {"hall": {"rssi": -50 - n}} if by_receiver else [{"bssid": "hall", "rssi": -50 - n}]
+        records.append({"x": x, "y": y} | ({"scan": scan if n % 2 else empty} if n % 2 or empty != "absent" else {}))
+    data = survey(tmp_path, {"site": "a", "points": records})
+    assert data.transmitter_position[:, :2].tolist() == [list(place) for place in PLACES]
+    assert data.rssi_dbm.nan_to_num(0)[:, 0].tolist() == [-50 - n if n % 2 else 0 for n in range(12)]
+
+
 def test_survey_points_of_a_heatmap_tool(tmp_path):
     def point(n):
         wifi = {"ssid": "net", "bssid": "0c11", "rssi": -40 - n, "signalStrength": 90 - n, "channel": 36}
@@ -115,6 +155,8 @@ BOMB = '<!DOCTYPE b [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;">]><gpx
         ("a.json", '{"points": [{"x": 1', "is not a complete JSON document"),
         ("a.json", "[" * 100_000, "is not a complete JSON document"),
         ("a.json", "[[1, 2, -60], [2, 3, -61]]", "holds no records with names"),
+        ("a.json", '[{"x": 1, "y": 2, "a": -50, "a": -90}]', "it names 'a' twice"),
+        ("a.json", '[{"x": 1, "y": 2, "scan": [{"x": 5, "x": 6, "rssi": -50}]}]', "it names 'x' twice"),
         ("a.json", '[{"ap": "a", "rssi": -60}]', "has no column for x"),
         ("a.json", '[{"x": 1, "y": 2, "note": "quiet"}]', "has no column of RSSI"),
         ("a.json", json.dumps([{"x": x, "y": x, "rssi": -60} for x in (0, 1, 2, 3, 1e999)]), "must be finite"),

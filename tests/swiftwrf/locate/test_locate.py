@@ -18,7 +18,7 @@ from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.locate import MatchedField, Posterior, Region, RssiLocator, smoothed
 from swiftwrf.locate import posterior as module
 from swiftwrf.locate.features import PathWaves, SpectrumFeatures
-from swiftwrf.locate.posterior import normalised, pooled_weights
+from swiftwrf.locate.posterior import HeldOut, calibrated_pool, normalised, pooled_weights
 from swiftwrf.locate.region import Cells, best_cells, refined
 from swiftwrf.locate.rssi_likelihood import METRICS, DetectionLikelihood, Fingerprints, ValueLikelihood
 from swiftwrf.locate.spectrum_likelihood import BOUNDS, PhaseLikelihood, Student
@@ -154,6 +154,38 @@ def test_pooling_tempers_what_is_too_certain_and_drops_what_is_noise():
     weight = pooled_weights(at_truth, at_candidates, prior)
     assert weight[0] == pytest.approx(claimed**2, rel=0.25)
     assert weight[1] < 0.1
+
+
+def test_regions_hold_where_weights_fit_the_positions_that_choose_them():
+    """One likelihood is right and 60 are noise, too many for 20 positions."""
+    generator = torch.Generator().manual_seed(0)
+    line = torch.linspace(-4, 4, 41, dtype=torch.float64)
+    cells = torch.stack([line, 0 * line, 0 * line], dim=1)[None]
+
+    def observations(n: int) -> HeldOut:
+        cell = torch.randint(10, 31, (n,), generator=generator)
+        seen = line[cell] + torch.randn(n, generator=generator, dtype=torch.float64)
+        noise = torch.randn(60, n, len(line), generator=generator, dtype=torch.float64)
+        values = torch.cat([-(line - seen[:, None]).square()[None] / 2, noise])
+        return HeldOut(
+            cells[0, cell], values[:, torch.arange(n), cell], cells, values, torch.zeros(n, len(line)).double()
+        )
+
+    inside = []
+    for _ in range(5):
+        parts, new = [observations(4) for _ in range(5)], observations(100)
+        truth, volume = (torch.cat([getattr(part, name) for part in parts]) for name in ("truth", "log_volume"))
+        at_truth, values = (
+            torch.cat([getattr(part, name) for part in parts], dim=1) for name in ("at_truth", "at_candidates")
+        )
+        weight, factor = calibrated_pool(parts, 0.1)
+        of_the_same, too_small = calibrated_pool([HeldOut(truth, at_truth, cells, values, volume)], 0.1)
+        assert of_the_same.equal(weight)
+        found = Posterior(cells, normalised(torch.einsum("k,knm->nm", weight, new.at_candidates)), 0.1)
+        error = (found.median - new.truth).norm(dim=1) / found.credible_radius()
+        inside.append([float((error <= limit).double().mean()) for limit in (factor, too_small)])
+    assert np.mean(inside, axis=0)[0] > 0.8
+    assert np.mean(inside, axis=0)[1] < 0.75
 
 
 def test_true_positions_that_a_search_misses_do_not_sharpen_the_posterior():

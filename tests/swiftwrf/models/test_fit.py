@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from swiftwrf import AngularGrid, SwiftWRF, fit, make_model
+from swiftwrf import AngularGrid, SwiftWRF, fit, make_model, simulated_room
 from swiftwrf.data.splits import folds
 from swiftwrf.data.store import Store
 from swiftwrf.gp import GaussianProcess, choose_kernel
@@ -78,6 +78,16 @@ def test_standard_deviations_are_calibrated(built_in_room, floor_alone, name):
     assert 0.75 < covered(found.mean, found.std, test.spectrum).mean() < 0.85
     near, far = (model.predict(position).std for position in (train.position, test.position + 100))
     assert near.mean() < found.std.mean() < far.mean()
+
+
+def test_standard_deviations_hold_where_positions_repeat():
+    """The other measurements of its place predict one almost exactly, so a place is held out as a whole."""
+    grid = AngularGrid.hemisphere(8, 32)
+    position = simulated_room(n=50, seed=1, grid=grid).position.repeat(4, 1)
+    train = simulated_room(n=len(position), seed=2, grid=grid, position=position, phase_noise=0.3)
+    test = simulated_room(n=150, seed=9, grid=grid, phase_noise=0.3)
+    found = SwiftWRF(n_primitives=32).fit(train).predict(test.position)
+    assert 0.72 < covered(found.mean, found.std, test.spectrum).mean() < 0.88
 
 
 @pytest.mark.parametrize("name", ["swiftwrf", "gp", "coarray"])

@@ -68,6 +68,36 @@ def test_floors_by_name_without_heights():
         rssi(table.assign(floor=np.where(names == "First", "Annex", names)))
 
 
+def test_floors_without_an_order_are_not_merged():
+    """Heights from each floor make one place of all floors, and error of the fit is 4.9 dB for 1.0."""
+    table = building()
+    names = np.array(["red", "green", "blue"])[table["floor"]]
+    with pytest.raises(InputError, match=r"floors 'blue' and 'green' have heights of 1 and 1 m at the same places"):
+        rssi(table.assign(z=1.0, floor=names))
+    with pytest.raises(InputError, match=r"floors '0' and '1' have heights of 1 and 1.2 m at the same places"):
+        rssi(table.assign(z=np.array([1.0, 1.2, 4.5])[table["floor"]]))
+    assert rssi(table.assign(floor=names)).floors.names == ("red", "green", "blue")
+    assert rssi(table.assign(z=np.array([0.0, 1.0, 4.5])[table["floor"]])).floors.names == (
+        "0, 1",
+        "2",
+    )  # levels of one
+
+
+def test_heights_that_fall_with_the_number_of_the_floor_stand():
+    table = building()
+    data = rssi(table.assign(z=-3.0 * table["floor"]))
+    assert data.floors == Floors(("2", "1", "0"), (-6.0, -3.0, 0.0))
+
+
+@pytest.mark.parametrize("with_heights", [True, False])
+def test_an_empty_column_of_floors_is_none(with_heights):
+    table = building()[["x", "y", *(["z"] if with_heights else []), *RECEIVERS]].assign(floor="")
+    data = rssi(table)
+    assert data.floors is None
+    assert len(data) == len(table)
+    assert "column floor is empty, so there are no floors" in data.notes
+
+
 def test_floors_by_name():
     table = building()
     table["floor"] = np.array(["UG", "EG", "OG"])[table["floor"]]

@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.optimize import minimize
 
-from swiftwrf import InputError, PairModel, Rssi, RssiModel, fit_rssi, rssi_room
+from swiftwrf import InputError, PairModel, Rssi, RssiLocator, RssiModel, fit_rssi, rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.splits import folds
@@ -80,7 +80,7 @@ def training_of(data, n_primitives=50):
         rssi=data.rssi_dbm,
         count=torch.ones(n, r, dtype=torch.float64),
         kernel=KERNEL,
-        rendered=render([Head(name, n_primitives, 0).requires_grad_(False) for name in data.receiver_names]),
+        rendered=render([Head(n_primitives, 0).requires_grad_(False) for _ in data.receiver_names]),
         path_loss=PathLosses(
             own=path_loss,
             shared=path_loss,
@@ -165,7 +165,7 @@ def test_held_out_is_a_fit_without_the_fold():
 
 
 def test_table_is_the_head():
-    rendered = render([Head(name, 50, 0).requires_grad_(False) for name in "ab"])
+    rendered = render([Head(50, seed).requires_grad_(False) for seed in (0, 1)])
     latent = torch.linspace(-30, 30, 200)[:, None].expand(-1, 2).contiguous()
     value, slope = HeadTable(rendered)(latent)
     change = mean_magnitude(rendered, latent) - mean_magnitude(rendered, torch.zeros(1, 2))
@@ -300,6 +300,25 @@ def test_a_receiver_does_not_depend_on_the_others(make):
     for names in (["5", "6"], ["1", "2", "3", "4", "6"]):
         among = make().fit(pool.receivers(names), pool=pool).predict(position)
         torch.testing.assert_close(both(among)[:, :, -1:], both(alone), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("name", [name for name in RSSI_PREDICTORS if name != "nerf2"])
+def test_names_of_receivers_change_nothing(name):
+    """Their alphabetical order is another, too."""
+    room = rssi_room(n=60)
+    renamed = replace(room, receiver_names=tuple(f"z{99 - number} é" for number in range(12)))
+    found = [RSSI_PREDICTORS[name]().fit(data).predict(room.transmitter_position + 0.3) for data in (room, renamed)]
+    torch.testing.assert_close(found[1].mean, found[0].mean)
+    assert found[0].std is None or torch.equal(found[1].std, found[0].std)
+
+
+def test_names_of_receivers_change_nothing_in_training_and_locating():
+    room = rssi_room(n=60).receivers(["1", "2", "3"])
+    renamed = replace(room, receiver_names=("c", "a", "b"))
+    learnt = [RssiPaperModel(steps=3).fit(data).predict(room.transmitter_position).mean for data in (room, renamed)]
+    torch.testing.assert_close(learnt[1], learnt[0])
+    located = [RssiLocator(n_cells=100).fit(data).locate(room.rssi_dbm[:5]).median for data in (room, renamed)]
+    torch.testing.assert_close(located[1], located[0])
 
 
 def test_gradients_are_those_of_finite_differences_in_metres():

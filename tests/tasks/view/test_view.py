@@ -340,7 +340,9 @@ def test_posterior_of_a_row_is_that_of_the_locator(locating, located_floor):
     assert found.error_m == pytest.approx(float((posterior.median[0] - data.transmitter_position[7]).norm()))
     assert np.nanmax(found.density.values) == 1
     assert found.density.at(*posterior.most_likely[0, :2].tolist()) == pytest.approx(1)
-    assert f"row 7: median at {found.median[0]:.2f}" in locating.describe(row)
+    part = "training" if in_training[7] else "test"
+    assert f"{part} row 7: median at {found.median[0]:.2f}" in locating.describe(row)
+    assert spectra.angle_between((30.0, 20.0), (210.0, 80.0)) == pytest.approx(80)
 
 
 def test_rows_are_simulated_from_the_distributions_of_the_locator(located_floor, generator):
@@ -357,6 +359,8 @@ def test_rows_are_simulated_from_the_distributions_of_the_locator(located_floor,
 
 def test_expected_error_is_that_of_the_test_rows(locating, located_floor):
     locator, data, in_training = located_floor
+    values = locating.expected_error.values[np.isfinite(locating.expected_error.values)]
+    assert f"{values.mean():.1f} m on average, 90 % below {np.quantile(values, 0.9):.1f} m" in locating.summary
     test = data.subset(~in_training)
     error = (locator.locate(test.rssi_dbm).median - test.transmitter_position).norm(dim=1).mean()
     expected = locating.expected_error
