@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from copy import copy, deepcopy
 from dataclasses import dataclass, replace
@@ -65,6 +66,8 @@ class Experiment:
         if not self.models:
             raise InputError("models is empty; name at least one, or give 'auto'")
         for name in self.named:
+            if not re.fullmatch(r"\w[\w .+-]*", name):  # files have it in their names
+                raise InputError(f"a field model needs a name that begins with a letter, without slashes, got {name!r}")
             if missing := self.model_type(name).lacking(data):
                 hint = "give it with --array" if "array" in missing else "the data must contain its position"
                 raise InputError(

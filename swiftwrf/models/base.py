@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Iterable
@@ -139,8 +138,6 @@ class FieldModel(Updatable, Configured, Saved, Displayed):
 
     def __init_subclass__(cls, **options: Any) -> None:
         cls.name, cls.kind = (vars(cls).get(attribute, cls.__name__) for attribute in ("name", "kind"))
-        if not re.fullmatch(r"\w[\w .+-]*", cls.name):  # files have it in their names
-            raise InputError(f"name of {cls.__name__} must begin with a letter and hold no slash, got {cls.name!r}")
         super().__init_subclass__(**options)
 
     @classmethod

@@ -14,7 +14,7 @@ from swiftwrf import FieldModel, InputError, Rssi, Spectra, load
 from swiftwrf.data import ReadOptions, Snapshots
 from swiftwrf.data.files import sha256
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
-from swiftwrf.errors import with_article
+from swiftwrf.errors import one_line, with_article
 from swiftwrf.models.base import ALREADY_LEARNT
 from swiftwrf.online import Follower
 from swiftwrf.rssi import RssiModel
@@ -97,7 +97,7 @@ def follow(config: UpdateConfig) -> None:
             if left_out and not is_noted:
                 is_noted = True
                 note = f"note: receivers that the model does not have are left out, e.g. {min(left_out)}"
-                console.print(note, markup=False, soft_wrap=True)
+                console.print(one_line(note), markup=False, soft_wrap=True)
             index = follower.count - 1
             record.append(folder, record.add(index, step))
             _save(follower, file, line.end, line.sha256)

@@ -228,8 +228,11 @@ def test_turbo_learning_with_a_constant_synthesizer():
             lambda: turbo_learning(ROOM, **OPTIONS | {"extra": 10**9}),
         ),
         ("n must be .* at most 1000000, got 1000000000", lambda: synthetic_positions(ROOM, 10**9, 0)),
-        ("must begin with a letter and hold no slash, got '../x'", lambda: own(name="../x")),
-        ("got ''", lambda: own(name="")),
+        (
+            r"begins with a letter, without slashes, got '\.\./x'",
+            lambda: turbo_learning(ROOM, models=[own(name="../x")]),
+        ),
+        ("begins with a letter, without slashes, got ''", lambda: turbo_learning(ROOM, models=[own(name="")])),
         (
             r"turbo_learning\(\) got an unexpected keyword argument 'modells'; it takes data, measured",
             lambda: turbo_learning(ROOM, modells=["idw"]),

@@ -177,6 +177,7 @@ def followed(model: FieldModel | RssiModel, content: bytes, folder: Path, source
     ):
         code, learnt, messages = follow(file, source if source == "-" else folder / source, content)
     errors = [line for line in messages.splitlines() if not line.startswith("note: ")]
+    assert all(len(line) <= MAX_LENGTH + len(ERROR) for line in messages.splitlines())
     assert all(line.startswith(ERROR) and len(line) <= MAX_LENGTH + len(ERROR) for line in errors), errors
     if code == 2 and len(errors) == 1 and not learnt:
         raise InputError(errors[0])
