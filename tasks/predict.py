@@ -96,7 +96,8 @@ def saved_file(model: Path) -> Path:
     fractions = FractionRecords.of(records) if "mixes" in records.metrics else []
     chosen = max(fractions, key=lambda fraction: float(fraction.key)).chosen_file if fractions else None
     if chosen is None:
-        raise InputError(f"{model} is a run whose choice has no file; name one of its models, {model}/....safetensors")
+        models = ", ".join(sorted(file.name for file in model.glob("*.safetensors"))) or "none"
+        raise InputError(f"{model} is a run whose choice has no file; name one of its saved models: {models}")
     console.print(f"applied: {chosen}")
     return chosen
 

@@ -167,7 +167,7 @@ def answer(fraction: FractionRecords) -> Answer:
         cells = {
             "azimuth [deg]": number(found["azimuth_deg"]["median"]),
             "elevation [deg]": number(found["elevation_deg"]["median"]),
-            "held out [deg]": ", ".join(number(errors[name]) for errors in held_out if name in errors),
+            "held out, median and mean [deg]": ", ".join(number(errors[name]) for errors in held_out if name in errors),
             "by synthetic spectra": change_text(change) if change else "",
         }
         seconds = found["seconds"]["train"], found["seconds"]["estimate"]

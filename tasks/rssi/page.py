@@ -206,7 +206,7 @@ def where_next(run: Records) -> str:
 def scatter_of_repeats(run: Records) -> float | None:
     """Return the width of the 80 % interval of repeated measurements at one place [dB], None if there are too few."""
     table = run.table("predictions")
-    place = places(torch.from_numpy(table[["x", "y", "z"]].to_numpy(dtype=float)))
+    place = places(torch.tensor(table[["x", "y", "z"]].to_numpy(dtype=float)))
     same = table.groupby([place.numpy(), "receiver"])["measured"]
     repeats = same.count() - 1
     n = int(repeats.clip(lower=0).sum())

@@ -79,6 +79,10 @@ def test_predictions_become_tables(field, model, room):
     position = room.position[:3]
     table, found = model.predict(position).to_frame(), model.predict(position)
     assert list(table) == ["x_m", "y_m", "z_m", "receiver", "predicted_dbm", "std_db"]
+    cells = RssiMap.predict(model, cell=4.0)
+    frame = cells.to_frame().query("receiver == @model.receiver_names[1]").pivot(index="y_m", columns="x_m")
+    assert (frame.index.tolist(), frame["std_db"].columns.tolist()) == (cells.y.tolist(), cells.x.tolist())
+    np.testing.assert_array_equal(frame["std_db"], cells.std[1])
     second = table[table["receiver"] == model.receiver_names[1]]
     np.testing.assert_array_equal(second["predicted_dbm"], found.mean[:, 1].numpy())
     np.testing.assert_array_equal(second[["x_m", "y_m", "z_m"]], position.numpy())

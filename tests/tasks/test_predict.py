@@ -1,6 +1,7 @@
 """Models are kept, come back as they were, and are applied to new spectra, rows and positions."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -212,11 +213,18 @@ def test_positions_on_floors_have_the_heights_of_the_measurements(tmp_path, caps
 
 
 def test_the_directory_of_a_run_is_enough(finished, small, tmp_path, capsys):
+    """Of a run that recommends an estimator with a file; the choice of the toy, the strongest peak, has none."""
     np.save(tmp_path / "new.npy", small.spectrum.numpy()[:7])
-    file = FractionRecords.of(Records(finished))[0].chosen_file
+    assert run("predict", finished, tmp_path / "new.npy", "--out", tmp_path / "none.csv") == 2
+    assert "saved models: kernel_regression-measured-mix0.5.safetensors, kernel" in capsys.readouterr().err
+    of_run, file = tmp_path / "run", tmp_path / "run" / "kernel_regression-mix0.5.safetensors"
+    shutil.copytree(finished, of_run)
+    metrics = json.loads((of_run / "metrics.json").read_text())
+    metrics["mixes"]["0.5"]["estimator_choice"]["file"] = file.name
+    (of_run / "metrics.json").write_text(json.dumps(metrics))
     assert run("predict", file, tmp_path / "new.npy", "--out", tmp_path / "one.csv", "--json") == 0
     assert json.loads(capsys.readouterr().out) == {"n": 7, "table": str(tmp_path / "one.csv")}
-    assert run("predict", finished, tmp_path / "new.npy", "--out", tmp_path / "other.csv") == 0
+    assert run("predict", of_run, tmp_path / "new.npy", "--out", tmp_path / "other.csv") == 0
     assert f"applied: {file}" in capsys.readouterr().err.replace("\n", "")
     assert (tmp_path / "one.csv").read_bytes() == (tmp_path / "other.csv").read_bytes()
 

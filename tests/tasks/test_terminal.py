@@ -9,6 +9,7 @@ import sys
 from html import unescape
 from types import SimpleNamespace
 
+import pandas as pd
 import pytest
 import quick
 from rich.console import Console
@@ -19,6 +20,7 @@ from tasks.command import run_command
 from tasks.options import Output
 from tasks.terminal import Answer, Method, NextStep, Terminal, _Line, terminal
 
+COLUMNS = {"dB": "abs_error_db", "m": "position_error_m"}
 ERROR = {"median": 2.36, "p90": 7.0, "mean": 3.1, "low": 2.0, "high": 2.9, "n": 40}
 
 
@@ -131,7 +133,11 @@ def test_a_run_shows_results_and_its_answer(request, run, answered, unit):
     assert steps.splitlines()[-1] == f"report: {folder / 'report.html'}"
     html = unescape(re.sub("<[^>]*>", "", (folder / "report.html").read_text()))
     assert first.removeprefix("50% measured: ").replace("`", "") in html
-    assert len(re.findall(rf"^\[\d+/\d+\] .*: [\d.]+ {unit}, [\d.]+ s$", err, flags=re.MULTILINE)) >= 4
+    shown = re.findall(rf"^\[\d+/\d+\] (.*): ([\d.]+) {unit}, [\d.]+ s$", err, flags=re.MULTILINE)
+    found = pd.read_csv(folder / "errors.csv").groupby("method")
+    assert len(shown) >= 4
+    for name, text in shown if unit != "degrees" else ():
+        assert float(text) == pytest.approx(found[COLUMNS[unit]].median()[name], abs=0.00501)
     assert not {*json.loads((folder / "config.json").read_text())["config"]} & {"open", "quiet", "json"}
 
 
