@@ -213,7 +213,7 @@ def test_positions_on_floors_have_the_heights_of_the_measurements(tmp_path, caps
 
 
 def test_the_directory_of_a_run_is_enough(finished, small, tmp_path, capsys):
-    """Of a run that recommends an estimator with a file; the choice of the toy, the strongest peak, has none."""
+    """The choice of the toy, the strongest peak, has no file, so a copy of the run has another choice."""
     np.save(tmp_path / "new.npy", small.spectrum.numpy()[:7])
     assert run("predict", finished, tmp_path / "new.npy", "--out", tmp_path / "none.csv") == 2
     assert "saved models: kernel_regression-measured-mix0.5.safetensors, kernel" in capsys.readouterr().err

@@ -178,8 +178,9 @@ def test_regions_hold_where_weights_fit_the_positions_that_choose_them():
         at_truth, values = (
             torch.cat([getattr(part, name) for part in parts], dim=1) for name in ("at_truth", "at_candidates")
         )
-        weight, factor = calibrated_pool(parts, 0.1)
-        of_the_same, too_small = calibrated_pool([HeldOut(truth, at_truth, cells, values, volume)], 0.1)
+        weight, factor, errors = calibrated_pool(parts, 0.1)
+        assert errors.shape == (20,)
+        of_the_same, too_small, _ = calibrated_pool([HeldOut(truth, at_truth, cells, values, volume)], 0.1)
         assert of_the_same.equal(weight)
         found = Posterior(cells, normalised(torch.einsum("k,knm->nm", weight, new.at_candidates)), 0.1)
         error = (found.median - new.truth).norm(dim=1) / found.credible_radius()

@@ -167,7 +167,7 @@ def test_unknown_positions_of_receivers_leave_the_coverage_as_it_is():
 def test_held_out_scans_pass_as_predicted():
     """At thresholds that half to nine tenths of the scans pass, on floors that the correlation was not chosen by."""
     predicted, passed = [], []
-    for seed in (100, 101):
+    for seed in range(100, 104):
         train, test = rssi_room(n=400, seed=seed).split()
         model = RssiModel().fit(train)
         strongest = test.rssi_dbm.nan_to_num(-torch.inf).amax(dim=1)
@@ -178,5 +178,6 @@ def test_held_out_scans_pass_as_predicted():
             predicted.append(at_least(1, *fields, detection, threshold).numpy())
             passed.append((strongest > threshold).numpy())
     predicted, passed = np.stack(predicted), np.stack(passed)
-    np.testing.assert_allclose(predicted.mean(axis=1), passed.mean(axis=1), atol=0.1)
+    expected = passed.mean(axis=1).reshape(-1, 3).mean(axis=0)  # of all floors
+    np.testing.assert_allclose(predicted.mean(axis=1).reshape(-1, 3).mean(axis=0), expected, atol=0.05)
     assert passed[predicted > 0.9].mean() >= 0.85

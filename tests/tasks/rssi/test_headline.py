@@ -24,13 +24,15 @@ NAMES = ("Ground floor", "1")
 
 @pytest.fixture(scope="module")
 def building(tmp_path_factory):
-    """A run on two floors, weak signals above, where every packet is detected: folder and terminal."""
+    """A run around the middle of two floors, weak signals above, every packet detected: folder and terminal."""
     folder = tmp_path_factory.mktemp("building")
-    data = rssi_room(n=90).columns([0, 5, 11])
-    position, rssi = data.transmitter_position.clone(), data.rssi_dbm.nan_to_num(-66.0) - 6.7
-    upper = torch.arange(90) % 3 == 0
+    data = rssi_room(n=200).columns([0, 5, 11])
+    at = data.transmitter_position
+    data = data.subset(((at - at.mean(dim=0)).norm(dim=1) > 8.0).nonzero()[:, 0])
+    position, rssi = data.transmitter_position.clone(), data.rssi_dbm.nan_to_num(-66.0) - 5.7
+    upper = torch.arange(len(data)) % 3 == 0
     position[upper, 2] += 4.0
-    rssi[upper] -= 13.0
+    rssi[upper] -= 16.0
     table = pd.DataFrame(torch.cat([position, rssi], dim=1).numpy(), columns=["x", "y", "z", "a", "b", "c"])
     table.insert(3, "floor", np.where(upper, NAMES[1], NAMES[0]))
     table.to_csv(folder / "walk.csv", index=False)
