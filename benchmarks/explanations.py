@@ -12,8 +12,8 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "swiftwrf" / "di
 import test_diagnosis as diagnosis
 from record import options, write_result
 
+from swiftwrf.contrib.diagnostics.frames import check_frames
 from swiftwrf.data import Snapshots
-from swiftwrf.diagnostics.frames import check_frames
 
 
 @dataclass(frozen=True)

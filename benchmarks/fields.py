@@ -35,7 +35,7 @@ from swiftwrf import AngularGrid, FieldModel, FitError, InputError, Spectra, Swi
 from swiftwrf import load_spectra as read
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.choices import Moving
-from swiftwrf.data.raytraced import ROOMS
+from swiftwrf.contrib.raytraced import ROOMS
 from swiftwrf.data.splits import places
 from swiftwrf.gp import subsample
 from swiftwrf.metrics import covered, l1, psnr, ssim, summary

@@ -23,8 +23,8 @@ from record import kept, options, write_result
 
 import swiftwrf
 from swiftwrf import Rssi, Spectra
-from swiftwrf.locate.baselines import LEVELS
-from swiftwrf.locate.comparison import LocateSplit
+from swiftwrf.contrib.comparison.localizers import LEVELS
+from swiftwrf.contrib.comparison.locating import LocateSplit
 from swiftwrf.metrics import LEVEL, covered
 
 RESULT = "intervals"

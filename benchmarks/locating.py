@@ -14,9 +14,9 @@ import tyro
 from record import kept, options, write_result
 
 from swiftwrf import Rssi, load_rssi, rssi_room
-from swiftwrf.datasets import DATA_SETS, fetch
-from swiftwrf.locate.baselines import LOCALIZERS
-from swiftwrf.locate.comparison import LocateComparison, LocateSplit
+from swiftwrf.contrib.comparison.localizers import LOCALIZERS
+from swiftwrf.contrib.comparison.locating import LocateComparison, LocateSplit
+from swiftwrf.contrib.datasets import DATA_SETS, fetch
 
 RESULT = "locating_rssi"
 BUILT_IN = "floor"

@@ -47,7 +47,7 @@ from swiftwrf import (
     simulated_room,
 )
 from swiftwrf.choices import Moving, fraction_key
-from swiftwrf.data.raytraced import FurnishedRoom, Material, Scene, Tracing, trace
+from swiftwrf.contrib.raytraced import FurnishedRoom, Material, Scene, Tracing, trace
 from swiftwrf.data.spectra import array_spectra
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import GaussianProcess, choose_kernel

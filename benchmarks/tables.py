@@ -16,9 +16,9 @@ from record import ROOT, age, load, loaded, markdown
 
 from augment.turbo.condition import LOCATED
 from swiftwrf.choices import ROOMS, RSSI_PREDICTORS
+from swiftwrf.contrib.comparison.localizers import LOCALIZERS
+from swiftwrf.contrib.datasets import catalogue
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
-from swiftwrf.datasets import catalogue
-from swiftwrf.locate.baselines import LOCALIZERS
 from tasks import configs, labels
 from tasks.command import COMMANDS
 from tasks.options import OffsetSource, SpectraSource

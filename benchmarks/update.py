@@ -13,9 +13,9 @@ from rooms import room_with_box
 
 import swiftwrf
 from swiftwrf import AngularGrid, Rssi, RssiModel, Spectra, rssi_room, simulated_room
+from swiftwrf.contrib.online import Follower, Scores, adapted, prequential, score
 from swiftwrf.data import load_rssi
 from swiftwrf.metrics import psnr
-from swiftwrf.online import Follower, Scores, adapted, prequential, score
 
 Part = Literal["spectra", "rssi", "change", "unchanged", "tracks"]
 PLACES = ((1.6, 2.4), (4.8, 2.0), (3.2, 0.9))  # centres of boxes [m]

@@ -17,12 +17,14 @@ from swiftwrf.runtime.lazy import import_lazily
 __version__ = version("swiftwrf-tasks")
 
 if TYPE_CHECKING:
-    from swiftwrf import datasets as datasets
     from swiftwrf import locate as locate
     from swiftwrf import metrics as metrics
     from swiftwrf import rssi as rssi
     from swiftwrf.array.angles import AngularGrid as AngularGrid
     from swiftwrf.array.angles import ArrayPose as ArrayPose
+    from swiftwrf.contrib import datasets as datasets
+    from swiftwrf.contrib.diagnostics.calibration import calibrate as calibrate
+    from swiftwrf.contrib.diagnostics.inspection import inspect as inspect
     from swiftwrf.data import Rssi as Rssi
     from swiftwrf.data import Snapshots as Snapshots
     from swiftwrf.data import Spectra as Spectra
@@ -31,8 +33,6 @@ if TYPE_CHECKING:
     from swiftwrf.data import load_spectra as load_spectra
     from swiftwrf.data.simulated import rssi_room as rssi_room
     from swiftwrf.data.simulated import simulated_room as simulated_room
-    from swiftwrf.diagnostics.calibration import calibrate as calibrate
-    from swiftwrf.diagnostics.inspection import inspect as inspect
     from swiftwrf.errors import FitError as FitError
     from swiftwrf.errors import InputError as InputError
     from swiftwrf.locate import MatchedField as MatchedField

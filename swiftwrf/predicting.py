@@ -18,7 +18,7 @@ from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.store import Store
 from swiftwrf.errors import InputError, with_article
 from swiftwrf.locate import MatchedField, Posterior, RssiLocator, smoothed
-from swiftwrf.locate.baselines import BATCH_ROWS
+from swiftwrf.locate.rssi import BATCH_ROWS
 from swiftwrf.metrics import angle_errors
 from swiftwrf.models.base import FieldModel
 from swiftwrf.models.prediction import Prediction

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.array.beamforming import PHASE
+from swiftwrf.contrib.diagnostics.inspection import Findings, inspect, propose_offsets
 from swiftwrf.data import Rssi, Snapshots, Spectra
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
-from swiftwrf.diagnostics.inspection import Findings, inspect, propose_offsets
 from swiftwrf.errors import InputError
 from swiftwrf.positions import nearest
 from swiftwrf.rssi import fit_path_loss, log_distance

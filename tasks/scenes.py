@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from swiftwrf import InputError
+from swiftwrf.contrib.raytraced import ROOMS, FurnishedRoom, Tracing, open_scene, trace
 from swiftwrf.data.files import sha256
-from swiftwrf.data.raytraced import ROOMS, FurnishedRoom, Tracing, open_scene, trace
 from swiftwrf.data.writing import write_paths
 from swiftwrf.runtime.durable import write_json
 from tasks.configs import ScenesConfig

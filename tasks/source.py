@@ -14,6 +14,7 @@ from torch.nn import functional
 
 from swiftwrf import AngularGrid, InputError, Rssi, RssiModel, Spectra
 from swiftwrf.array.planar import PlanarArray
+from swiftwrf.contrib.datasets import DATA_SETS, fetch
 from swiftwrf.data.archives import array_header, read_rows
 from swiftwrf.data.files import TABLES, read_table
 from swiftwrf.data.formats import RSSI_FORMATS, ReadOptions, read, read_spectra
@@ -21,7 +22,6 @@ from swiftwrf.data.receivers import spelled_as
 from swiftwrf.data.rssi import Offsets
 from swiftwrf.data.splits import MAX_REPEATED, places, repeated_fraction
 from swiftwrf.data.store import Store
-from swiftwrf.datasets import DATA_SETS, fetch
 from swiftwrf.errors import listed
 from tasks.options import OffsetSource, SpectraSource, TableSource, by_name, pairs
 from tasks.terminal import console

@@ -14,7 +14,7 @@ from filelock import FileLock
 from PIL import Image
 
 from swiftwrf import AngularGrid, InputError, Spectra, make_model, simulated_room
-from swiftwrf.data.raytraced import sionna
+from swiftwrf.contrib.raytraced import sionna
 from swiftwrf.data.writing import write_spectra
 
 collect_ignore = ["cuda_shim"]  # programs of tests, which have no examples

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from swiftwrf import rssi_room
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
+from swiftwrf.contrib.formats.records import checksum
 from swiftwrf.data import Snapshots
-from swiftwrf.data.formats.records import checksum
 from swiftwrf.data.simulated import ShoeboxRoom
 
 FREQUENCY = 2.4e9

@@ -10,11 +10,11 @@ from unittest import mock
 from torch import Tensor
 
 from swiftwrf import Spectra
-from swiftwrf.comparison import NeRF2Rssi
-from swiftwrf.comparison.base import Config
-from swiftwrf.comparison.generative import DcganConfig, VaeConfig
-from swiftwrf.comparison.nerf2 import NeRF2Config, NeRF2RssiConfig
-from swiftwrf.comparison.wrfgs import WrfGsConfig
+from swiftwrf.contrib.published import NeRF2Rssi
+from swiftwrf.contrib.published.base import Config
+from swiftwrf.contrib.published.generative import DcganConfig, VaeConfig
+from swiftwrf.contrib.published.nerf2 import NeRF2Config, NeRF2RssiConfig
+from swiftwrf.contrib.published.wrfgs import WrfGsConfig
 from swiftwrf.gp import Kernel, candidates
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import GeometryConfig, GeometryModel, search, uncertainty

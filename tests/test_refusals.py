@@ -42,7 +42,9 @@ from swiftwrf import (
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.array.subspace import esprit
 from swiftwrf.choices import RSSI_PREDICTORS
-from swiftwrf.data.raytraced import Tracing
+from swiftwrf.contrib.comparison.rssi import compared, make_predictor
+from swiftwrf.contrib.online import Follower, prequential
+from swiftwrf.contrib.raytraced import Tracing
 from swiftwrf.data.simulated import ShoeboxRoom
 from swiftwrf.data.splits import folds
 from swiftwrf.data.store import Store
@@ -51,9 +53,7 @@ from swiftwrf.locate import Posterior, smoothed
 from swiftwrf.metrics import ssim
 from swiftwrf.models.geometry import Plane
 from swiftwrf.models.swiftwrf_paper import SwiftWRFPaperConfig
-from swiftwrf.online import Follower, prequential
 from swiftwrf.rssi import RssiPaperModel, compare, estimate_floor_attenuation, estimate_offsets
-from swiftwrf.rssi.comparison import compared, make_predictor
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.runtime.registry import write_report
 

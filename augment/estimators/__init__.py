@@ -2,6 +2,6 @@
 
 from augment.estimators.base import ESTIMATORS, Estimator, EstimatorConfig, SavedEstimator, make_estimator
 
-ESTIMATORS.discover(__name__, __path__)
+ESTIMATORS.discover(__name__)
 
 __all__ = ["ESTIMATORS", "Estimator", "EstimatorConfig", "SavedEstimator", "make_estimator"]

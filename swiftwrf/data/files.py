@@ -20,11 +20,18 @@ from numpy.typing import NDArray
 from swiftwrf.choices import CARRIERS_HZ
 from swiftwrf.data.archives import MAX_UNPACKED_BYTES, refusing_broken
 from swiftwrf.data.cells import DECIMAL_COMMA, NO_VALUE, column_of_numbers
-from swiftwrf.data.documents import DOCUMENTS, table_in_document
 from swiftwrf.errors import InputError, optional_module
 from swiftwrf.runtime.plain import TextLoader
+from swiftwrf.runtime.registry import Registry
 
 SUFFIXES = (".csv", ".parquet")  # of tables in a folder
+# functions that return the table in a document, from its name, its text and its suffix
+DOCUMENTS: Registry[pd.DataFrame] = Registry(
+    "document",
+    declared=dict.fromkeys(
+        (".json", ".geojson", ".gpx", ".kml"), "swiftwrf.contrib.formats.documents:table_in_document"
+    ),
+)
 TABLES = (*SUFFIXES, *DOCUMENTS)  # of tables that are named
 SEPARATORS = ",;\t"
 MAX_TEXT_BYTES = 2**28  # a million rows of positions take a tenth of it
@@ -142,9 +149,9 @@ def read_table(file: Path, header: bool = True) -> pd.DataFrame:
     """Return the table in a CSV, Parquet, JSON, GPX or KML file. Cells are text, except those of Parquet.
 
     Args:
-        file: A document as in `swiftwrf.data.documents`, Parquet, or one row a line with commas, semicolons or tabs between
-            values; the most frequent one in the header counts. Numbers may have a decimal comma if it is not the comma.
-            Lines before the header are skipped.
+        file: A document as in `swiftwrf.contrib.formats.documents`, Parquet, or one row a line with commas, semicolons or
+            tabs between values; the most frequent one in the header counts. Numbers may have a decimal comma if it is not
+            the comma. Lines before the header are skipped.
         header: The first line contains the names of the columns. Otherwise, they are named 1, 2, ...
 
     Returns:
@@ -154,7 +161,8 @@ def read_table(file: Path, header: bool = True) -> pd.DataFrame:
         InputError: No such file, one that is broken, a column without name or a name twice, rows of unequal length, no rows.
     """
     if file.suffix.lower() in DOCUMENTS:
-        return table_in_document(file, read_text(file), file.suffix.lower())
+        table: pd.DataFrame = DOCUMENTS[file.suffix.lower()](file, read_text(file), file.suffix.lower())
+        return table
     if file.suffix.lower() != ".parquet":
         text = read_text(file)
         skipped = _lines_before_header(text) if header else 0

@@ -9,7 +9,7 @@ from swiftwrf.locate.rssi import RssiLocator
 from swiftwrf.runtime.lazy import import_lazily
 
 if TYPE_CHECKING:
-    from swiftwrf.locate.comparison import LocateComparison, compare
+    from swiftwrf.contrib.comparison.locating import LocateComparison, compare
 
 import_lazily(__name__)  # the comparison imports scikit-learn
 

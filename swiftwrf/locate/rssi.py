@@ -38,6 +38,7 @@ from swiftwrf.runtime.validation import Configured, NonNegativeInt, PositiveInt,
 
 UNDETECTED_DBM = -1000.0  # stands for what is not detected in a file, which holds finite values only
 MAX_HELD_OUT = 2000  # rows that determine the distributions
+BATCH_ROWS = 128  # rows whose posteriors are in memory together
 
 
 @configuration

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.errors import InputError
-from swiftwrf.rasterize import cuda, operators, reference
+from swiftwrf.rasterize import operators, reference
 from swiftwrf.runtime.validation import check_value
 
 Backend = Literal["auto", "reference", "cpu", "cuda"]
@@ -125,8 +125,8 @@ def prepare(device: torch.device | str) -> None:
 @cache
 def _cuda_compiles(device: torch.device) -> bool:
     try:
-        cuda.kernels(device)
-    except cuda.CudaUnavailable as error:
+        operators.backend_module("cuda").kernels(device)
+    except InputError as error:
         warnings.warn(f"rendering with the slow backend 'reference': {error}", stacklevel=2)
         return False
     return True

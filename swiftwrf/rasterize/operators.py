@@ -15,7 +15,7 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.errors import InputError
 
 # Modules with the functions `field` and `field_gradients`, "cuda" also `magnitude`, imported at the first call.
-BACKENDS = {"cpu": "swiftwrf.rasterize.cpu", "cuda": "swiftwrf.rasterize.cuda"}
+BACKENDS = {"cpu": "swiftwrf.contrib.rasterize.cpu", "cuda": "swiftwrf.contrib.rasterize.cuda"}
 
 
 def backend_module(device: str) -> ModuleType:

@@ -168,7 +168,8 @@ def load(path: str | Path) -> Saved:
 
 def _import_kinds() -> None:
     """Import all packages that define saved kinds; those of others that cannot be imported define none."""
-    for package in ("swiftwrf.models", "swiftwrf.comparison", "swiftwrf.rssi", "swiftwrf.locate"):
+    contrib = ("swiftwrf.contrib.published", "swiftwrf.contrib.raytraced.model")
+    for package in ("swiftwrf.models", "swiftwrf.rssi", "swiftwrf.locate", *contrib):
         import_module(package)
     for point in (point for group in ("swiftwrf.models", "swiftwrf.estimators") for point in entry_points(group=group)):
         with suppress(Exception):  # code of another package may raise anything

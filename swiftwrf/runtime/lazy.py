@@ -8,7 +8,7 @@ from __future__ import annotations
 import ast
 import inspect
 import sys
-from importlib import import_module
+from pkgutil import resolve_name
 from types import ModuleType
 from typing import Any
 
@@ -21,8 +21,7 @@ class _LazyPackage(ModuleType):
     def __getattr__(self, name: str) -> Any:
         if name not in self.lazy:
             raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
-        module = self.lazy[name]
-        value = import_module(f"{module}.{name}") if module == self.__name__ else getattr(import_module(module), name)
+        value = resolve_name(f"{self.lazy[name]}.{name}")
         self.__dict__[name] = value
         return value
 
@@ -38,7 +37,7 @@ class _LazyPackage(ModuleType):
 def import_lazily(package: str) -> None:
     """Postpone the imports in a package's block `if TYPE_CHECKING` until a name is read from it.
 
-    `__all__` are the names that are no submodules.
+    `__all__` are the names that are no submodules of the package or of its `contrib`.
 
     Args:
         package: `__name__` of the package.
@@ -47,5 +46,6 @@ def import_lazily(package: str) -> None:
     block = next(part for part in ast.parse(inspect.getsource(module)).body if isinstance(part, ast.If))
     imports = [part for part in block.body if isinstance(part, ast.ImportFrom)]
     lazy = {name.name: str(part.module) for part in imports for name in part.names}
-    module.__dict__.update(lazy=lazy, __all__=sorted(name for name, source in lazy.items() if source != package))
+    own = (package, f"{package}.contrib")
+    module.__dict__.update(lazy=lazy, __all__=sorted(name for name, source in lazy.items() if source not in own))
     module.__class__ = _LazyPackage

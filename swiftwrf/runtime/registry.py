@@ -44,7 +44,7 @@ class Registry(Mapping[str, type[Made]]):
     def __init__(self, kind: str, group: str | None = None, declared: Mapping[str, str] = MappingProxyType({})) -> None:
         self.kind, self.group = kind, group
         self._registered: dict[str, Any] = dict(declared)  # implementations, and references before their first use
-        self._package: str | None = None  # whose modules register themselves
+        self._packages: tuple[str, ...] = ()  # whose modules register themselves
 
     def register(self, name: str) -> Callable[[Registered], Registered]:
         """Return a decorator that registers a class or function under a name.
@@ -60,10 +60,12 @@ class Registry(Mapping[str, type[Made]]):
 
         return decorate
 
-    def discover(self, package: str, path: list[str]) -> None:
-        """Import every module of a package in the order of names, so that each registers itself."""
-        self._package = package
-        for module in sorted(module.name for module in pkgutil.iter_modules(path)):
+    def discover(self, *packages: str) -> None:
+        """Import every module of the packages in the order of their names, so that each registers itself."""
+        self._packages = packages
+        paths = {package: importlib.import_module(package).__path__ for package in packages}
+        modules = [(one.name, package) for package, path in paths.items() for one in pkgutil.iter_modules(path)]
+        for module, package in sorted(modules):
             importlib.import_module(f"{package}.{module}")
 
     def check(self, name: str) -> None:
@@ -82,7 +84,7 @@ class Registry(Mapping[str, type[Made]]):
     def _external(self) -> dict[str, Any]:
         found = _entry_points(self.group, tuple(sys.path)) if self.group else ()
         # the installed metadata may be older than the package and name modules that it no longer has
-        others = (point for point in found if not point.module.startswith(f"{self._package}."))
+        others = (point for point in found if point.module.rpartition(".")[0] not in self._packages)
         return {point.name: point for point in others if point.name not in self._registered}
 
     def __getitem__(self, name: str) -> Any:

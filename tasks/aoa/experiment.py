@@ -13,9 +13,9 @@ from augment.turbo.learning import learn
 from augment.turbo.results import TurboResult
 from swiftwrf import Spectra, make_model, simulated_room
 from swiftwrf.choices import RAYTRACE, fraction_key
+from swiftwrf.contrib.raytraced import sionna
 from swiftwrf.data.files import sha256
 from swiftwrf.data.formats import read_spectra
-from swiftwrf.data.raytraced import sionna
 from swiftwrf.metrics import angle_errors
 from swiftwrf.models import FieldModel
 from tasks.aoa.page import answer_of, page

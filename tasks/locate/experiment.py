@@ -9,8 +9,8 @@ import numpy as np
 
 from augment.suggest import suggest_positions
 from swiftwrf import Rssi, rssi_room
+from swiftwrf.contrib.comparison.locating import LocateComparison, compare
 from swiftwrf.data.coordinates import degree_columns
-from swiftwrf.locate.comparison import LocateComparison, compare
 from swiftwrf.runtime.durable import write_npz
 from tasks.configs import LocateConfig
 from tasks.directory import Run

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pandas import DataFrame
 from scipy.stats import binomtest
 
-from swiftwrf.locate.baselines import LOCALIZERS
+from swiftwrf.contrib.comparison.localizers import LOCALIZERS
 from swiftwrf.metrics import LEVEL
 from swiftwrf.plotting import corners_of
 from tasks import labels

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 
 from swiftwrf import InputError, Rssi, rssi_room
+from swiftwrf.contrib.comparison.rssi import compared
 from swiftwrf.data.files import sha256
 from swiftwrf.metrics import LEVEL, summary
 from swiftwrf.rssi import PairModel, RssiComparison, RssiModel, compare
-from swiftwrf.rssi.comparison import compared
 from swiftwrf.rssi.coverage import Coverage, reach
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.runtime.durable import write_npz

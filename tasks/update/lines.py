@@ -16,6 +16,7 @@ from typing import Any, BinaryIO, NamedTuple
 import torch
 
 from swiftwrf import FieldModel, InputError, Rssi, Spectra
+from swiftwrf.contrib.online import Step
 from swiftwrf.data.cells import text_of
 from swiftwrf.data.columns import column_of
 from swiftwrf.data.coordinates import Floors
@@ -23,7 +24,6 @@ from swiftwrf.data.files import refusing_unreadable, table_of
 from swiftwrf.data.receivers import spelled_as
 from swiftwrf.errors import CONTENT_ERRORS
 from swiftwrf.metrics import LEVEL
-from swiftwrf.online import Step
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime.durable import strict
 from swiftwrf.runtime.plain import read_json

@@ -10,9 +10,9 @@ from pathlib import Path
 import torch
 from pandas import DataFrame
 
+from swiftwrf.contrib.online import Step
 from swiftwrf.data.files import read_bytes
 from swiftwrf.errors import InputError
-from swiftwrf.online import Step
 from swiftwrf.positions import nearest
 from swiftwrf.runtime.checkpoint import refusing
 from swiftwrf.runtime.durable import write_json, write_text

@@ -11,12 +11,12 @@ from typing import Any
 import torch
 
 from swiftwrf import FieldModel, InputError, Rssi, Spectra, load
+from swiftwrf.contrib.online import Follower
 from swiftwrf.data import ReadOptions, Snapshots
 from swiftwrf.data.files import sha256
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
 from swiftwrf.errors import one_line, with_article
 from swiftwrf.models.base import ALREADY_LEARNT
-from swiftwrf.online import Follower
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime import checkpoint
 from swiftwrf.runtime.durable import write_json

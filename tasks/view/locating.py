@@ -12,8 +12,8 @@ from torch import Tensor
 
 from swiftwrf import Rssi
 from swiftwrf.locate import Posterior, RssiLocator
-from swiftwrf.locate.baselines import BATCH_ROWS
 from swiftwrf.locate.posterior import PlanMap
+from swiftwrf.locate.rssi import BATCH_ROWS
 from swiftwrf.positions import nearest
 
 LEVELS = (0.5, 0.8)  # probabilities of the credible regions that are shown

@@ -17,7 +17,8 @@ from hard_cases import (
 )
 
 from swiftwrf import AngularGrid
-from swiftwrf.rasterize import cuda, operators
+from swiftwrf.contrib.rasterize import cuda
+from swiftwrf.rasterize import operators
 
 torch.cuda.get_device_capability = lambda device: (9, 0)
 torch.cuda.device = lambda device: contextlib.nullcontext()

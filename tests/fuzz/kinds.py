@@ -55,7 +55,7 @@ from swiftwrf import (
     simulated_room,
 )
 from swiftwrf.array.planar import LIGHT_SPEED
-from swiftwrf.comparison import NeRF2Rssi
+from swiftwrf.contrib.published import NeRF2Rssi
 from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.rssi import Offsets
 from swiftwrf.data.writing import write_rssi, write_spectra

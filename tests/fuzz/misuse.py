@@ -36,9 +36,9 @@ from swiftwrf import (
     simulated_room,
 )
 from swiftwrf.array.planar import PlanarArray
+from swiftwrf.contrib.online import Follower
 from swiftwrf.locate import Posterior
 from swiftwrf.models.geometry import Plane
-from swiftwrf.online import Follower
 from swiftwrf.positions import MAX_COORDINATE_M
 from swiftwrf.rssi.base import RssiPredictor
 

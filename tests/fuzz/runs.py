@@ -30,9 +30,9 @@ from swiftwrf import (
     rssi_room,
     simulated_room,
 )
+from swiftwrf.contrib.online import Follower
 from swiftwrf.errors import MAX_LENGTH
 from swiftwrf.models.geometry import Plane
-from swiftwrf.online import Follower
 from swiftwrf.runtime.durable import write_json
 from tasks.aoa.room import in_plan
 from tasks.command import run_command

@@ -39,8 +39,8 @@ from swiftwrf import (
     rssi,
 )
 from swiftwrf.array.planar import LIGHT_SPEED
+from swiftwrf.contrib.online import Follower, Monitor, adapted, prequential, score
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin
-from swiftwrf.online import Follower, Monitor, adapted, prequential, score
 from swiftwrf.rssi import FloorAttenuation, comparison, estimate_floor_attenuation, estimate_offsets
 from swiftwrf.rssi.base import RssiPredictor
 from swiftwrf.rssi.coverage import Coverage
@@ -396,7 +396,14 @@ def takes_data(function):
 
 def public_functions():
     """Return functions, classes and methods of docs/api.md and of packages' __all__ that take data."""
-    packages = ("swiftwrf", "swiftwrf.rssi", "swiftwrf.locate", "swiftwrf.online", "augment", "augment.estimators")
+    packages = (
+        "swiftwrf",
+        "swiftwrf.rssi",
+        "swiftwrf.locate",
+        "swiftwrf.contrib.online",
+        "augment",
+        "augment.estimators",
+    )
     names = re.findall(r"^::: (\S+)", (Path(__file__).parents[2] / "docs" / "api.md").read_text(), re.MULTILINE)
     names += [f"{package}.{name}" for package in packages for name in importlib.import_module(package).__all__]
     values = [pkgutil.resolve_name(name) for name in names]

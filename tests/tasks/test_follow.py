@@ -16,10 +16,10 @@ from scipy.spatial.distance import cdist
 from scipy.stats import norm
 
 from swiftwrf import AngularGrid, Rssi, RssiModel, load, load_rssi, make_model, rssi_room, simulated_room
+from swiftwrf.contrib.online import Follower, Step
+from swiftwrf.contrib.online.scores import Scores
 from swiftwrf.data.writing import write_rssi
 from swiftwrf.models.geometry import GeometryModel, Plane
-from swiftwrf.online import Follower, Step
-from swiftwrf.online.scores import Scores
 from swiftwrf.rssi import estimate_offsets
 from tasks.command import run_command
 from tasks.update.lines import answer
@@ -373,7 +373,7 @@ def test_names_of_receivers_are_any_text(tmp_path, monkeypatch):
     names = ("caf\u00e9 hall", *data.receiver_names[1:])
     data = Rssi(data.rssi_dbm, data.transmitter_position, receiver_names=names)
     RssiModel().fit(data.subset(torch.arange(40))).save(tmp_path / "model.safetensors")
-    monkeypatch.setattr("swiftwrf.online.follower.alarm_threshold", lambda *_: 1e-9)
+    monkeypatch.setattr("swiftwrf.contrib.online.follower.alarm_threshold", lambda *_: 1e-9)
     content = line(40, rssi_dbm={names[0]: -20.0}) + line(41, rssi_dbm={names[0]: -20.0})
     code, answers, _ = follow(tmp_path / "model.safetensors", content=content)
     assert code == 0

@@ -13,8 +13,8 @@ from scipy.spatial.distance import cdist
 from test_rssi_model import path_loss_only
 
 from swiftwrf import AngularGrid, rssi_room, simulated_room
+from swiftwrf.contrib.diagnostics.inspection import Findings, inspect
 from swiftwrf.data.writing import write_spectra
-from swiftwrf.diagnostics.inspection import Findings, inspect
 from tasks.configs import InspectConfig
 from tasks.inspect import page
 

@@ -11,7 +11,7 @@ import torch
 from pandas import DataFrame
 
 from swiftwrf import AngularGrid, Rssi, Spectra, plotting
-from swiftwrf.diagnostics.inspection import Findings
+from swiftwrf.contrib.diagnostics.inspection import Findings
 from swiftwrf.positions import inside
 from tasks import labels
 from tasks.aoa.records import CHOSEN, LOWER_REFERENCE, UPPER_REFERENCE

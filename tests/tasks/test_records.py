@@ -9,7 +9,7 @@ from samples import record_source, tensor_message, write_dichasus, write_espargo
 
 from swiftwrf import AngularGrid, InputError, load_snapshots, load_spectra
 from swiftwrf.array.angles import angular_distance, to_direction
-from swiftwrf.data.formats.records import records, tensor
+from swiftwrf.contrib.formats.records import records, tensor
 
 GRID = AngularGrid.hemisphere(45, 180)
 

@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from swiftwrf import AngularGrid, InputError, RssiModel, load, make_model
+from swiftwrf.contrib.online import Follower
 from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.simulated import rssi_room, simulated_room
 from swiftwrf.gp import GaussianProcess, Kernel
-from swiftwrf.online import Follower
 from swiftwrf.rssi import FloorAttenuation
 from swiftwrf.runtime import checkpoint
 

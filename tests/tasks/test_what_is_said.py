@@ -28,15 +28,15 @@ from augment.turbo.condition import Condition, MeasuredSubset
 from augment.turbo.experiment import Experiment
 from augment.turbo.results import TurboResult
 from swiftwrf import AngularGrid, Rssi, RssiModel, calibrate, make_model, rssi_room, simulated_room
+from swiftwrf.contrib.comparison.localizers import PosteriorLocalizer
+from swiftwrf.contrib.comparison.locating import LocateComparison, LocateSplit
+from swiftwrf.contrib.online import score
 from swiftwrf.data.cells import seconds
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin
 from swiftwrf.data.rssi import Offsets
 from swiftwrf.locate import Posterior
-from swiftwrf.locate.baselines import PosteriorLocalizer
-from swiftwrf.locate.comparison import LocateComparison, LocateSplit
 from swiftwrf.metrics import summary
 from swiftwrf.models.prediction import Prediction
-from swiftwrf.online import score
 from swiftwrf.rssi import RssiComparison, RssiPredictor, estimate_offsets, log_distance
 from swiftwrf.runtime.durable import write_json
 from tasks.aoa import experiment as aoa

@@ -1,4 +1,4 @@
-"""Readers, one a file of this package, found by what a folder or file holds."""
+"""Readers, one a file of this package and of `swiftwrf.contrib.formats`, found by what a folder or file holds."""
 
 from swiftwrf.data.formats.base import (
     RSSI_FORMATS,
@@ -10,6 +10,6 @@ from swiftwrf.data.formats.base import (
     read_spectra,
 )
 
-SPECTRA_FORMATS.discover(__name__, __path__)  # and with them all other formats of this package
+SPECTRA_FORMATS.discover(__name__, "swiftwrf.contrib.formats")  # and with them the formats of all kinds
 
 __all__ = ["RSSI_FORMATS", "SNAPSHOT_FORMATS", "SPECTRA_FORMATS", "Format", "ReadOptions", "read", "read_spectra"]

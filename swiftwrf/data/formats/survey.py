@@ -13,8 +13,7 @@ import torch
 
 from swiftwrf.data.columns import is_coordinate, is_rssi
 from swiftwrf.data.files import SUFFIXES, TABLES, digests, has_header, read_table
-from swiftwrf.data.formats.base import RSSI_FORMATS, Format, ReadOptions
-from swiftwrf.data.formats.captures import holds_captures
+from swiftwrf.data.formats.base import RSSI_FORMATS, SNAPSHOT_FORMATS, Format, ReadOptions
 from swiftwrf.data.formats.nerf2 import FILES as NERF2_FILES
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
@@ -57,7 +56,7 @@ class SurveyTable(Format[Rssi]):
 
 
 def _tables(path: Path) -> list[Path]:
-    if holds_captures(path):
+    if SNAPSHOT_FORMATS["captures"]().recognises(path):
         return []
     if path.is_file():
         return [path] if path.suffix.lower() in TABLES else []

@@ -7,7 +7,7 @@ import tracemalloc
 import pytest
 
 from swiftwrf import InputError
-from swiftwrf.data.documents import table_in_document
+from swiftwrf.contrib.formats.documents import table_in_document
 
 
 def around(n):

@@ -60,7 +60,7 @@ def test_an_installation_without_a_place_for_caches():
         "import numba.core.caching as c\n"
         "c._Cache._impl_class = None\n"
         "for l in c.CacheImpl._locator_classes: l.from_function = classmethod(lambda *a: None)\n"
-        "import swiftwrf.rasterize.cpu\nprint('imported')"
+        "import swiftwrf.contrib.rasterize.cpu\nprint('imported')"
     )
     environment = os.environ | {"PYTHONPATH": os.getcwd()}
     child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)

@@ -25,8 +25,8 @@ from swiftwrf import (
     rssi_room,
 )
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
+from swiftwrf.contrib.online import Follower, score
 from swiftwrf.models.geometry import HybridModel
-from swiftwrf.online import Follower, score
 
 FLOOR = rssi_room(n=100)
 QUARTER = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)

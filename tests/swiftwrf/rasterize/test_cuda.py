@@ -26,7 +26,8 @@ from hard_cases import (
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from swiftwrf import AngularGrid, InputError, rasterize
-from swiftwrf.rasterize import cuda, operators
+from swiftwrf.contrib.rasterize import cuda
+from swiftwrf.rasterize import operators
 
 SHIM = Path(__file__).parents[2] / "cuda_shim"
 rasterize_package = sys.modules[rasterize.__module__]

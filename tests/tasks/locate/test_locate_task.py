@@ -13,11 +13,11 @@ from quick import said
 from small import FLOOR, known_planes
 
 from swiftwrf import AngularGrid, InputError, load, rssi_room, simulated_room
+from swiftwrf.contrib.comparison.localizers import LEVELS, LOCALIZERS
+from swiftwrf.contrib.comparison.locating import LocateSplit
 from swiftwrf.data import ReadOptions
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.locate import MatchedField
-from swiftwrf.locate.baselines import LEVELS, LOCALIZERS
-from swiftwrf.locate.comparison import LocateSplit
 from swiftwrf.runtime.steps import LOCATOR as MODEL
 from tasks.locate.page import answer
 from tasks.predict import read_rssi

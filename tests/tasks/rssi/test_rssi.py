@@ -22,12 +22,12 @@ from test_rssi_model import path_loss_only
 
 from swiftwrf import InputError, rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
-from swiftwrf.comparison import NeRF2Rssi
-from swiftwrf.comparison.nerf2 import NeRF2RssiConfig
+from swiftwrf.contrib.comparison.rssi import make_predictor, pool_of
+from swiftwrf.contrib.comparison.rssi_baselines import NEIGHBOUR_COUNTS
+from swiftwrf.contrib.published import NeRF2Rssi
+from swiftwrf.contrib.published.nerf2 import NeRF2RssiConfig
 from swiftwrf.data.splits import folds
 from swiftwrf.rssi import RssiPredictor, compare
-from swiftwrf.rssi.baselines import NEIGHBOUR_COUNTS
-from swiftwrf.rssi.comparison import make_predictor, pool_of
 from swiftwrf.runtime import registry
 from tasks.records import Records
 from tasks.report import merge

@@ -27,9 +27,9 @@ from scipy.spatial.distance import cdist
 from scipy.stats import norm
 
 from swiftwrf import AngularGrid, InputError, PairModel, Rssi, RssiModel, load, load_rssi, rssi_room
+from swiftwrf.contrib.online import Follower
 from swiftwrf.locate import MatchedField, RssiLocator
 from swiftwrf.models.geometry import Plane
-from swiftwrf.online import Follower
 from swiftwrf.rssi.coverage import reach
 from swiftwrf.rssi.maps import RssiMap
 from tasks.configs import LocateConfig

@@ -23,9 +23,9 @@ import quick
 import torch
 
 from swiftwrf import GeometryModel, RssiModel, rssi_room, simulated_room
+from swiftwrf.contrib.online import Follower
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.models.geometry import Plane
-from swiftwrf.online import Follower
 from tasks.report import merge
 from tasks.update.record import Record
 

@@ -1,0 +1,1 @@
+"""Comparisons of all methods on held-out rows, and the baselines that they compare."""

@@ -1,0 +1,256 @@
+"""Comparison of localizers: each is fitted to the training rows of a split and locates the test rows."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+from pandas import DataFrame, concat
+
+from swiftwrf.contrib.comparison.localizers import LEVELS, LOCALIZERS, PosteriorLocalizer
+from swiftwrf.data import Rssi
+from swiftwrf.data.coordinates import degree_columns
+from swiftwrf.data.rssi import PLACE
+from swiftwrf.data.splits import matching_validation, places
+from swiftwrf.errors import InputError
+from swiftwrf.locate.rssi import RssiLocator
+from swiftwrf.metrics import method_summary, summary
+from swiftwrf.rssi import estimate_offsets
+from swiftwrf.runtime.checkpoint import load
+from swiftwrf.runtime.registry import write_report
+from swiftwrf.runtime.steps import LOCATOR, Memo, Steps
+from swiftwrf.runtime.validation import checked
+
+MIN_ROWS = 20  # training rows that a receiver detected: five folds, of which four hold at least 10 rows
+Values = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class LocateSplit:
+    """Training and test rows that localizers are compared on.
+
+    Args:
+        train: Training rows, without offsets between groups.
+        test: Test rows that a receiver detected, without offsets between groups.
+        split: Name of the split, which determines how training rows are held out.
+        n_cells: Number of candidate positions of the posterior.
+        seed: Seed of everything random.
+        n_undetected: Number of test rows that no receiver detected, which are left out.
+    """
+
+    train: Rssi
+    test: Rssi
+    split: str
+    n_cells: int
+    seed: int
+    n_undetected: int
+
+    @classmethod
+    def of(cls, data: Rssi, split: str, n_cells: int, seed: int, reference: str | None = None) -> LocateSplit:
+        """Return a split of RSSI; the arguments are those of `compare`.
+
+        Offsets between groups, if there are any, are estimated from training rows and removed.
+
+        Raises:
+            InputError: Receivers that move, no such split, one of other receivers in the test rows, or too few rows in which
+                a receiver detected the transmitter.
+        """
+        if data.receiver_moves:
+            raise InputError(
+                f"both ends of {data.name} move; positions are found by receivers that stay where they are"
+            )
+        if split == PLACE and split not in data.named_splits:
+            raise InputError(
+                f"split {split!r} tests other receivers than it trains; choose random or block to locate by"
+            )
+        train, test = data.split(split, seed)
+        detected = int(train.detected.any(dim=1).sum())
+        if detected < MIN_ROWS:
+            raise InputError(
+                f"split {split!r} of {data.name} has {detected} training rows that a receiver detected; at least {MIN_ROWS} "
+                "are needed to locate by"
+            )
+        kept = test.detected.any(dim=1)
+        if not bool(kept.any()):
+            raise InputError(f"split {split!r} of {data.name} has no test rows that a receiver detected")
+        test = test.subset(kept)
+        if train.groups is not None:
+            offsets = estimate_offsets(train, reference)
+            train, test = offsets.removed(train), offsets.removed(test)
+        return cls(train, test, split, n_cells, seed, int((~kept).sum()))
+
+    def fit(self, folder: Path | None, name: str) -> Values:
+        """Fit a localizer and locate the test rows. Return values for `LocateComparison`. A folder gets the locator.
+
+        Folds resemble the test rows in their distances to the training positions, all that is used of the test positions.
+        """
+        train, test = self.train, self.test
+        validation = train.validation_for(self.split, test)
+        if validation == "block" and self.split != "block":
+            validation = matching_validation(train.transmitter_position, test.transmitter_position)
+        options = {"validation": validation, "n_cells": self.n_cells, "seed": self.seed}
+        localizer = LOCALIZERS[name](**options)
+        began = time.perf_counter()
+        localizer.fit(train)
+        fitted = time.perf_counter()
+        located = localizer.locate(test.rssi_dbm)
+        error = (located.position - test.transmitter_position).norm(dim=1)
+        values: Values = {
+            "seconds": {"fit": fitted - began, "predict": time.perf_counter() - fitted},
+            "index": test.index,
+            "truth": test.transmitter_position,
+            "estimate": located.position,
+            "median_m": summary(error)["median"],
+        }
+        optional = {name: getattr(located, name) for name in ("radius", "ambiguous", "floor_probability")}
+        values |= {name: value for name, value in optional.items() if value is not None}
+        if isinstance(localizer, PosteriorLocalizer):
+            weight = localizer.locator.weight.tolist()
+            values["weights"] = dict(zip(("values", "detections", "fingerprints"), weight, strict=True))
+            values["held_out"] = localizer.locator.held_out_m
+            if folder is not None:
+                localizer.locator.save(folder / LOCATOR)
+        return values
+
+
+@dataclass(frozen=True, eq=False)
+class LocateComparison:
+    """Result of `compare`.
+
+    Args:
+        split: Training and test rows.
+        values: What `LocateSplit.fit` gave, by localizer.
+        locator: Locator of all training rows.
+
+    Example:
+        >>> import swiftwrf
+        >>> split = LocateSplit.of(swiftwrf.rssi_room(n=60), "random", 100, 0)
+        >>> len(LocateComparison(split, {"mean": split.fit(None, "mean")}).errors)
+        12
+    """
+
+    split: LocateSplit
+    values: Mapping[str, Values]
+    locator: RssiLocator | None = None
+
+    @cached_property
+    def errors(self) -> DataFrame:
+        """Position errors, a row for each method and test row."""
+        return concat(map(self._table, self.values), ignore_index=True)
+
+    def summary(self) -> DataFrame:
+        """Return a row for each method: errors [m], and their mean difference to the posterior; see `method_summary`."""
+        return method_summary(self.errors, "position_error_m", "posterior")
+
+    def report(self, file: str | Path) -> None:
+        """Write the report of `swiftwrf locate` on this result into an HTML file, which opens offline.
+
+        Raises:
+            InputError: The file exists already.
+        """
+        write_report("locate", self, file)
+
+    @property
+    def coverage(self) -> dict[float, float]:
+        """Fraction of the test positions in the credible regions of the posterior, by their probability."""
+        own = self.errors[self.errors["method"] == "posterior"]
+        return {p: float((own["position_error_m"] <= own[_radius(p)]).mean()) for p in LEVELS}
+
+    @property
+    def overall(self) -> dict[str, Any]:
+        """Position errors in space and in plan [m] of each localizer, its seconds, and its floor hit rate.
+
+        The floor of an estimate is the one of the nearest height. Data without floors have no floor hit rate.
+        """
+        found: dict[str, Any] = {}
+        for name, table in self.errors.groupby("method", sort=False):
+            found[name] = {
+                "position_error_m": summary(table["position_error_m"], table["place"]),
+                "horizontal_error_m": summary(table["horizontal_error_m"], table["place"]),
+                "seconds": self.values[name]["seconds"],
+            }
+            if "floor" in table:
+                found[name]["floor_hit_rate"] = float((table["floor"] == table["truth_floor"]).mean())
+        return found
+
+    def _table(self, name: str) -> DataFrame:
+        values = self.values[name]
+        truth, estimate = (torch.as_tensor(values[name], dtype=torch.float64) for name in ("truth", "estimate"))
+        away = estimate - truth
+        columns: Values = {"index": values["index"], "place": places(truth, 2)}
+        columns |= {"position_error_m": away.norm(dim=1), "horizontal_error_m": away[:, :2].norm(dim=1)}
+        columns |= dict(zip(("x_m", "y_m", "z_m"), estimate.T, strict=True))
+        columns |= dict(zip(("truth_x_m", "truth_y_m", "truth_z_m"), truth.T, strict=True))
+        columns |= degree_columns(self.split.train.origin, estimate.numpy())
+        if (floors := self.split.train.floors) is not None:
+            columns["floor"], columns["truth_floor"] = (floors.named(at) for at in (estimate, truth))
+        if "floor_probability" in values:
+            columns["floor_probability"] = values["floor_probability"]
+        if "radius" in values:
+            radius = torch.as_tensor(values["radius"], dtype=torch.float64)
+            columns |= {_radius(p): r for p, r in zip(LEVELS, radius.T, strict=True)}
+            columns["ambiguous"] = values["ambiguous"]
+        table = DataFrame({name: np.asarray(column) for name, column in columns.items()})
+        table.insert(0, "method", name)
+        return table
+
+
+def _radius(level: float) -> str:
+    return f"credible_radius_{100 * level:.0f}_m"
+
+
+@checked
+def compare(
+    data: Rssi,
+    *,
+    receivers: Sequence[str] = ("all",),
+    split: str = "random",
+    seed: int = 0,
+    n_cells: int = 4000,
+    reference: str | None = None,
+    keep: Memo | None = None,
+    executor: Executor | None = None,
+) -> LocateComparison:
+    """Fit every localizer to the training rows of a split, and locate the test rows.
+
+    Args:
+        data: RSSI at receivers that stay where they are. Offsets between its groups, if it has any, are removed.
+        receivers: Names of receivers, numbers counted from 1, or "all".
+        split: Split that comes with the data, or a seeded one: random or block.
+        seed: Seed of everything random.
+        n_cells: Number of candidate positions of the posterior.
+        reference: Group whose offset is 0. Defaults to the most frequent one.
+        keep: Results by the names of steps, in a folder. A call with equal data, options, code and versions continues
+            after them, others are refused.
+        executor: Processes that compute steps side by side, e.g. a `ProcessPoolExecutor`.
+
+    Raises:
+        InputError: Receivers that move, unknown receivers or split, too few rows that a receiver detected, or `keep` of
+            another call.
+
+    Example:
+        >>> import swiftwrf
+        >>> result = compare(swiftwrf.rssi_room(n=80), n_cells=300)
+        >>> bool(result.summary().loc["posterior", "median"] < result.summary().loc["mean", "median"])
+        True
+    """
+    given = locals().copy()
+    measured = LocateSplit.of(data.receivers(receivers), split, n_cells, seed, reference)
+    if keep is not None:
+        keep.of(given | {"localizers": [LOCALIZERS[name] for name in LOCALIZERS]})
+    with TemporaryDirectory(prefix="swiftwrf-") as folder:
+        memo = keep or Memo(Path(folder))
+        steps = Steps(measured, memo, executor)
+        started = [steps.start(name, name, LocateSplit.fit, name) for name in LOCALIZERS]
+        values = {name: steps[name] for name in started}
+        locator = load(memo.folder / LOCATOR)
+        assert isinstance(locator, RssiLocator)
+        return LocateComparison(measured, values, locator)

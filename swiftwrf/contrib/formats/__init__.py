@@ -1,0 +1,1 @@
+"""Readers of rare formats, which register themselves."""

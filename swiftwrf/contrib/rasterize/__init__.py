@@ -1,0 +1,1 @@
+"""Fast backends of the rasterizer, named in `swiftwrf.rasterize.operators`."""

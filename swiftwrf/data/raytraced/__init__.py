@@ -1,7 +1,0 @@
-"""Ray-traced scenes: furnished rooms of boxes, or scene files, traced by Sionna RT (extra `raytrace`)."""
-
-from swiftwrf.data.raytraced.rooms import ROOMS, FurnishedRoom, Material, Surface
-from swiftwrf.data.raytraced.trace import Scene, Tracing, open_scene, sionna, trace
-
-__all__ = ["ROOMS", "FurnishedRoom", "Material", "Scene", "Surface", "Tracing"]
-__all__ += ["open_scene", "sionna", "trace"]

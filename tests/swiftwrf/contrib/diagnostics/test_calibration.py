@@ -1,0 +1,164 @@
+"""Element phases and orientation: recovered if the data determine them, refused otherwise."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from samples import snapshots
+from scipy.spatial.transform import Rotation
+
+from swiftwrf import InputError, calibrate
+from swiftwrf.array.angles import wrap
+from swiftwrf.array.planar import PlanarArray
+from swiftwrf.contrib.diagnostics.inspection import inspect
+from swiftwrf.data import Snapshots
+
+
+def spoilt(data, degrees=20.0, seed=0):
+    """The snapshots with phases of 0 to 2 pi and an orientation that is wrong by so much; the phases and the turn back."""
+    generator = torch.Generator().manual_seed(seed)
+    phase = 2 * math.pi * torch.rand(len(data.array.element), generator=generator, dtype=torch.float64)
+    axis = torch.randn(3, generator=generator, dtype=torch.float64)
+    turn = math.radians(degrees) * axis / axis.norm()
+    wrong = torch.from_numpy(Rotation.from_rotvec((-turn).numpy()).as_matrix())
+    channel = (data.channel * torch.polar(torch.ones_like(phase), phase)).to(torch.complex64)
+    return replace(data, channel=channel, rotation=data.rotation @ wrong), phase, turn
+
+
+def errors(found, phase, turn):
+    """Return the errors of the rotation and of the worst phase [deg], up to a common phase."""
+    left = Rotation.from_rotvec(found.turn.numpy()).inv() * Rotation.from_rotvec(turn.numpy())
+    beside = torch.polar(torch.ones_like(phase), found.phase - phase)
+    return math.degrees(left.magnitude()), float((beside * beside.sum().conj()).angle().abs().max().rad2deg())
+
+
+@pytest.mark.parametrize(("seed", "echo"), [(0, 0.0), (1, 0.1), (2, 0.1), (3, 0.0)])
+def test_phases_and_a_turn_of_20_degrees_are_recovered(seed, echo):
+    data, phase, turn = spoilt(snapshots(n=300, noise=0.2, echo=echo), seed=seed)
+    found = calibrate(data)
+    by_turn, by_phase = errors(found, phase, turn)
+    assert by_turn < 1
+    assert by_phase < 5
+    assert found.before < 0.3
+    assert found.after > 0.9
+    assert found.clear == 300
+
+
+def test_deviations_are_those_of_the_estimates():
+    """Over draws of the noise, errors in units of their deviation have a deviation of one."""
+    score = []
+    for seed in range(4):
+        data, phase, turn = spoilt(snapshots(n=120, count=1, noise=0.3, seed=seed))
+        found = calibrate(data)
+        turn_error = Rotation.from_rotvec(found.turn.numpy()).inv() * Rotation.from_rotvec(turn.numpy())
+        phase_error = wrap(found.phase - (phase - phase[0]))[1:]
+        score += (turn_error.as_rotvec() / found.turn_std.numpy()).tolist()
+        score += (phase_error / found.phase_std[1:]).tolist()
+    assert 0.5 < float(torch.tensor(score).square().mean().sqrt()) < 1.5
+
+
+def test_positions_without_line_of_sight_do_not_count():
+    data, phase, turn = spoilt(snapshots(n=200))
+    generator = torch.Generator().manual_seed(0)
+    hidden = torch.rand(200, generator=generator) < 0.4
+    noise = torch.randn(data.channel.shape, dtype=torch.complex64, generator=generator)
+    channel = torch.where(hidden[:, None, None], noise, data.channel)
+    unknown = calibrate(replace(data, channel=channel))
+    known = calibrate(replace(data, channel=channel, line_of_sight=~hidden))
+    for found in (unknown, known):
+        assert errors(found, phase, turn)[0] < 1
+    assert unknown.clear < 140
+    assert known.clear == int((~hidden).sum())
+
+
+QUARTER_TURN = Rotation.from_euler("z", 90, degrees=True)
+
+
+def narrow(data):
+    """Only positions straight in front of the array."""
+    return data.subset((data.direction[:, 2] > 0.97).nonzero()[:, 0])
+
+
+def changed(**changes):
+    """Return a function that makes snapshots, some parts of which are computed from the usual ones."""
+    return lambda: replace(data := snapshots(), **{name: change(data) for name, change in changes.items()})
+
+
+REFUSED = {
+    "few": (lambda: snapshots(n=12), "needs at least 20"),
+    "no line of sight": (changed(line_of_sight=lambda data: torch.zeros(120).bool()), "has 0 training positions"),
+    "noise": (lambda: snapshots(n=200, noise=30.0), "positions where a direct path stands out"),
+    "a cone": (lambda: narrow(snapshots(n=900, noise=0.5)), "measure positions in more directions"),
+    "a line": (
+        changed(channel=lambda data: data.channel[..., :4], array=lambda data: data.array.subset(torch.arange(4))),
+        "the elements of made lie on a line",
+    ),
+    "constant phases": (
+        changed(channel=lambda data: data.channel[..., :1].expand_as(data.channel)),
+        "hardly depend on the position",
+    ),
+    "a quarter turn": (
+        lambda: replace((data := snapshots()), rotation=data.rotation @ torch.from_numpy(QUARTER_TURN.as_matrix())),
+        "an error of frames, not of mounting|a direct path stands out|does not determine",
+    ),
+    "positions of others": (
+        changed(position=lambda data: data.position.flip(0)),
+        "a direct path stands out|does not determine|does harm",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_refuses_what_cannot_be_told(name):
+    make, says = REFUSED[name]
+    with pytest.raises(InputError, match=says):
+        calibrate(make())
+
+
+@pytest.mark.parametrize("noise", [[5], [1, 6, 12]])
+def test_elements_that_hold_noise_are_named(noise):
+    data = snapshots(n=120, count=2)
+    channel = data.channel.clone()
+    draw = torch.Generator().manual_seed(0)
+    channel[..., noise] = torch.randn(120, 2, len(noise), dtype=channel.dtype, generator=draw)
+    found = inspect(replace(data, channel=channel), grid=(24, 96))
+    assert found.numbers["noisy_elements"] == noise
+    assert "--drop-elements " + " ".join(map(str, noise)) in " ".join(found.warnings)
+
+
+def test_no_element_of_a_sound_array_holds_noise():
+    assert "noisy_elements" not in inspect(snapshots(n=120, count=2), grid=(24, 96)).numbers
+
+
+def near_field(seed=0):
+    """Spherical waves at a large array from places 0.3 to 1.2 m away."""
+    array = PlanarArray.square(6, 5.24e9, 0.04)
+    away = torch.tensor([-0.8, -0.8, 0.3]) + torch.tensor([1.6, 1.6, 0.7]) * torch.rand(
+        100, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)
+    )
+    channel = torch.polar(torch.ones(100, 36, dtype=torch.float64), array.phase_at(away))
+    return Snapshots(channel, away, array=array, fixed_position=torch.zeros(3), rotation=torch.eye(3))
+
+
+def test_a_calibration_in_the_near_field_uses_distances():
+    findings = inspect(near_field(), grid=(24, 96))
+    assert findings.numbers["near_field_share"] == 1
+    assert "needs no calibration" in str(findings)
+    data, phase, turn = spoilt(near_field(), degrees=10)
+    by_turn, by_phase = errors(calibrate(data), phase, turn)
+    assert by_turn < 1
+    assert by_phase < 5
+
+
+def test_plain_values_are_strict_json():
+    calibration = calibrate(snapshots(n=100))
+    found = json.loads(json.dumps(calibration.to_json(), allow_nan=False))
+    for name in ("phase", "phase_std", "turn", "turn_std"):
+        assert np.deg2rad(found[f"{name}_deg"]) == pytest.approx(getattr(calibration, name).numpy())
+    shares = [found[f"line_of_sight_share_{name}"] for name in ("before", "after")]
+    assert shares == [calibration.before, calibration.after]
+    assert len(found["phase_deg"]) == 16
+    assert 0 < found["turn_std_deg"][0] < 1
