@@ -1,7 +1,10 @@
 """A field model of another package."""
 
+from typing import Annotated
+
+from torch import Tensor
+
 from swiftwrf.models.base import FieldModel
-from swiftwrf.runtime.checkpoint import expect
 
 
 class Mean(FieldModel):
@@ -9,16 +12,11 @@ class Mean(FieldModel):
 
     name = "outside_mean"
     kind = "outside mean"
+    saved = "mean"
+    mean: Annotated[Tensor, "float32 grid.n_elevation grid.n_azimuth"]
 
     def _fit(self, train, **_):
         self.mean = train.spectrum.mean(dim=0)
 
     def _predict(self, position, grid, with_std):
         return self.mean.expand(len(position), -1, -1), None
-
-    def _state(self):
-        return {"mean": self.mean}, {}
-
-    def _restore(self, tensors, header):
-        expect(tensors, {"mean": self.grid.shape})
-        self.mean = tensors["mean"]

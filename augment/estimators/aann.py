@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Any, Self
+from collections.abc import Mapping
+from typing import Annotated, Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -21,7 +22,7 @@ from augment.estimators.base import ESTIMATORS, EstimatorConfig, SavedEstimator
 from augment.estimators.resnet import backbone
 from swiftwrf.array.angles import to_angles, to_direction
 from swiftwrf.data.spectra import coarsening
-from swiftwrf.runtime.checkpoint import Header, expect
+from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.progress import progress
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, PositiveInt, Preset, configuration
 
@@ -76,6 +77,10 @@ class AANN(SavedEstimator):
 
     kind = "angular neural network"
     config_type = AANNConfig
+    saved = "_network _offset"
+    _network: nn.Module
+    _offset: Annotated[Tensor, "float32 4"]
+    """mean training direction and spread of the labels"""
 
     def _build(self, device: torch.device) -> None:
         with torch.random.fork_rng(devices=[]):  # torchvision uses the global generator
@@ -164,25 +169,16 @@ class AANN(SavedEstimator):
         # if all spectra are equal, batch norms amplify rounding errors
         return torch.nan_to_num(torch.cat(outputs), posinf=0, neginf=0)
 
-    def _state(self) -> tuple[dict[str, Tensor], Header]:
-        return self._weights() | {"offset": self._offset}, {}
+    def state(self) -> tuple[dict[str, Tensor], Header]:
+        tensors, header = super().state()
+        return {name: halved(x) if name.startswith("_network.") else x for name, x in tensors.items()}, header
 
-    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
-        self._restore_network(tensors, {"offset": (4,)})
-        self._offset = tensors["offset"]
+    def blank(self, saved: Mapping[str, Tensor]) -> nn.Module:
+        return backbone(products=True)
 
-    def _weights(self) -> dict[str, Tensor]:
-        return {f"network.{name}": halved(value) for name, value in self._network.state_dict().items()}
-
-    def _restore_network(self, tensors: dict[str, Tensor], others: dict[str, tuple[int, ...]]) -> None:
-        """Take the network over from a file, checking the shapes of its tensors and of others first."""
-        self._build(torch.device("cpu"))
-        weights = self._network.state_dict()
-        expect(tensors, {f"network.{name}": tuple(value.shape) for name, value in weights.items()} | others)
-        self._network.load_state_dict(
-            {name: tensors[f"network.{name}"].to(value.dtype) for name, value in weights.items()}
-        )
-        self._network.eval()
+    def _restored(self) -> None:
+        self._device = torch.device("cpu")
+        self._network.to(memory_format=torch.channels_last)
 
 
 def _batches(rows: int, size: int, steps: int, generator: torch.Generator) -> Tensor:

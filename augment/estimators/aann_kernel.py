@@ -8,9 +8,11 @@ training spectra.
 from __future__ import annotations
 
 import math
-from typing import Any, Self
+from dataclasses import replace
+from typing import Annotated, Any, Self
 
 import torch
+from annotated_types import Gt
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
@@ -19,9 +21,7 @@ from augment.estimators.aann import AANN, AANNConfig, halved
 from augment.estimators.base import ESTIMATORS
 from augment.estimators.kernel_regression import NadarayaWatson, coarse_pixels, kept_rows
 from augment.estimators.resnet import FEATURES
-from swiftwrf import InputError
 from swiftwrf.array.angles import to_angles
-from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.validation import PositiveInt, configuration
 
 MAX_FEATURE = 1e4  # larger features are clipped; typical ones are a thousandth of that
@@ -54,6 +54,10 @@ class AANNKernel(AANN):
 
     kind = "kernel regression on the features of an angular neural network"
     config_type = AANNKernelConfig
+    saved = "_scale _direction"
+    _scale: Annotated[Tensor, "float32 2", Gt(0)]
+    """root mean square distances of features and of pixels from their means"""
+    _direction: NadarayaWatson
 
     def _fit(self, train: Mixed, device: torch.device) -> None:
         prepared, direction = self._fit_network(train, device)
@@ -62,7 +66,8 @@ class AANNKernel(AANN):
         self._scale = torch.stack([_scale_of(part) for part in embedded])
         self._scale[0] *= math.sqrt(1 + HALF_TRUST_SPECTRA / len(train))
         target = direction[rows].double().cpu().numpy()
-        self._direction = NadarayaWatson.fit(self._scaled(embedded), target, self.config.seed)
+        fitted = NadarayaWatson.fit(self._scaled(embedded), target, self.config.seed)
+        self._direction = replace(fitted, known=halved(fitted.known))
 
     def _embedded(self, prepared: Tensor) -> tuple[Tensor, Tensor]:
         """Return the network's features (n, 2048) of prepared spectra, and their coarse pixels (n, p), on the CPU."""
@@ -80,18 +85,10 @@ class AANNKernel(AANN):
         direction = torch.from_numpy(self._direction(self._scaled(self._embedded(self._prepare(spectra)))))
         return torch.stack(to_angles(direction), dim=-1)
 
-    def _state(self) -> tuple[dict[str, Tensor], Header]:
-        regression, header = self._direction.state()
-        known = halved(regression.pop("known"))
-        return self._weights() | regression | {"known": known, "scale": self._scale}, header
-
-    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
-        self._restore_network(tensors, {"scale": (2,)})
-        self._scale = tensors["scale"]
-        if not bool((self._scale > 0).all()):
-            raise InputError(f"scales must be positive, got {self._scale.tolist()}")
+    def _restored(self) -> None:
+        super()._restored()
         pixels = coarse_pixels(self._prepare(torch.zeros(1, *self.grid.shape))[:, 0]).shape[1]
-        self._direction = NadarayaWatson.from_state(tensors, header, FEATURES + pixels, 3)
+        self._direction.check(FEATURES + pixels, 3)
 
 
 def _scale_of(rows: Tensor) -> Tensor:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import asdict
 from typing import Any, ClassVar, Self
 
 import torch
@@ -12,7 +11,7 @@ from torch import Tensor
 from augment import Mixed
 from swiftwrf import AngularGrid, Spectra
 from swiftwrf.data.spectra import to_directions
-from swiftwrf.runtime.checkpoint import Header, Saved
+from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.registry import Registry
 from swiftwrf.runtime.validation import Configured, NonNegativeInt, Preset, configuration
 
@@ -104,38 +103,14 @@ def estimated(estimator: Estimator, data: Spectra) -> Tensor:
 class SavedEstimator(Estimator, Saved):
     """Base class of estimators that `save` writes to a file and `swiftwrf.load` reads, on the CPU.
 
-    A subclass sets `kind`, and implements `_state` and `_restore`.
+    A subclass sets `kind` and, as in every `Saved` model, `saved`.
 
     Example:
         >>> isinstance(make_estimator("kernel_regression"), SavedEstimator)
         True
     """
 
-    def state(self) -> tuple[dict[str, Tensor], Header]:
-        """Return the fitted tensors by name, and plain values.
-
-        Raises:
-            InputError: An estimator that is not fitted.
-        """
-        self.check_fitted()
-        tensors, header = self._state()
-        return tensors, header | {"config": asdict(self.config), "grid": asdict(self.grid)}
-
-    @classmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
-        """Return the estimator that `state` describes."""
-        estimator = cls(cls.config_type(**header.get("config", {})))
-        estimator.grid = AngularGrid(**header["grid"])
-        estimator._restore(tensors, header)
-        return estimator
-
-    @abstractmethod
-    def _state(self) -> tuple[dict[str, Tensor], Header]:
-        """Return the fitted tensors by name, and plain values beside options and grid."""
-
-    @abstractmethod
-    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
-        """Take the fitted state over from `_state`, checking every shape first."""
+    saved = "grid"
 
 
 ESTIMATORS: Registry[Estimator] = Registry("estimator", "swiftwrf.estimators")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import torch
 from torch import Tensor
 
@@ -9,8 +11,8 @@ from augment import Mixed
 from augment.estimators.base import ESTIMATORS, Estimator, SavedEstimator
 from swiftwrf.array.angles import to_angles, to_direction
 from swiftwrf.array.planar import folded_angles
+from swiftwrf.data.spectra import to_directions
 from swiftwrf.data.store import Store
-from swiftwrf.runtime.checkpoint import Header, expect
 
 SHORTLIST = 8  # candidates found by inner products, whose differences are then computed
 
@@ -72,28 +74,34 @@ class NearestSpectrum(SavedEstimator):
     """
 
     kind = "nearest spectrum"
+    saved = "spectrum label"
+    label: Annotated[Tensor, "float64 n 2"]
 
     def _fit(self, train: Mixed, device: torch.device) -> None:
-        self._train = train
+        self.label, self._batches = train.label, train.batches
 
     def predict(self, spectra: Tensor) -> Tensor:
         queries, start = spectra.flatten(1).double(), 0
         least = torch.full((len(queries),), torch.inf, dtype=torch.float64)
-        label = self._train.label.new_empty(len(queries), 2)
-        for batch in self._train.batches():
+        label = self.label.new_empty(len(queries), 2)
+        for batch in self._batches():
             known = batch.flatten(1).double()
             shortlist = torch.cdist(queries, known).topk(min(SHORTLIST, len(known)), largest=False).indices
             for number in shortlist.T:
                 distance = (queries - known[number]).square().sum(dim=1)
                 nearer = distance < least
-                least, label[nearer] = torch.minimum(distance, least), self._train.label[start + number[nearer]]
+                least, label[nearer] = torch.minimum(distance, least), self.label[start + number[nearer]]
             start += len(batch)
         return label
 
-    def _state(self) -> tuple[dict[str, Tensor], Header]:
-        return {"spectrum": self._train.spectrum.half(), "label": self._train.label}, {}
+    @property
+    def spectrum(self) -> Annotated[Tensor, "float16 n grid.n_elevation grid.n_azimuth"]:
+        """Training spectra with the precision of a file."""
+        return torch.cat(list(self._batches())).half()
 
-    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
-        expect(tensors, {"spectrum": (n := len(tensors["label"]), *self.grid.shape), "label": (n, 2)})
-        index, synthetic = torch.full((n,), -1), torch.zeros(n, dtype=torch.bool)
-        self._train = Mixed((Store(tensors["spectrum"].float()),), tensors["label"], index, synthetic, self.grid)
+    @spectrum.setter
+    def spectrum(self, values: Tensor) -> None:
+        self._batches = Store(values.float()).batches
+
+    def _restored(self) -> None:
+        self.label = to_directions("label", self.label, len(self.label))

@@ -13,10 +13,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from annotated_types import Gt, Lt
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import softmax
@@ -31,7 +33,6 @@ from augment.estimators.base import ESTIMATORS, SavedEstimator
 from swiftwrf import InputError
 from swiftwrf.array.angles import to_angles, to_direction
 from swiftwrf.data.spectra import coarsening
-from swiftwrf.runtime.checkpoint import Header, expect
 
 WIDTH_CANDIDATES = (10.0, 20.0, 40.0, 80.0)  # gamma times the median squared distance
 PENALTY_CANDIDATES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
@@ -62,9 +63,9 @@ class NadarayaWatson:
         True
     """
 
-    known: NDArray[Any]  # features of the training rows, (n, p)
-    dual: NDArray[Any]  # dual coefficients of the training rows, (n, k)
-    gamma: float  # inverse squared width of the kernel exp(-gamma |a - b|^2)
+    known: Annotated[Tensor, "float n p"]  # features of the training rows
+    dual: Annotated[Tensor, "float32 n k"]  # dual coefficients of the training rows
+    gamma: Annotated[float, Gt(0), Lt(math.inf)]  # inverse squared width of the kernel exp(-gamma |a - b|^2)
 
     @classmethod
     def fit(cls, feature: NDArray[Any], target: NDArray[Any], seed: int) -> NadarayaWatson:
@@ -79,38 +80,28 @@ class NadarayaWatson:
         distance = euclidean_distances(feature - feature.mean(axis=0), squared=True)
         some = slice(MAX_CHOICE_ROWS)
         gamma, alpha = choose(distance[some, some], target[some], seed)
-        return cls(feature, _dual_coefficients(np.exp(-gamma * distance), target, alpha), gamma)
+        dual = _dual_coefficients(np.exp(-gamma * distance), target, alpha)
+        return cls(torch.from_numpy(feature).float(), torch.from_numpy(dual).float(), gamma)
 
     def __call__(self, feature: NDArray[Any]) -> NDArray[Any]:
         """Return the predicted values (m, k) of features (m, p)."""
-        distance = euclidean_distances(feature, self.known, squared=True)
-        values: NDArray[Any] = _normalised_kernel(distance, self.gamma) @ self.dual
+        known, dual = self._arrays
+        distance = euclidean_distances(feature, known, squared=True)
+        values: NDArray[Any] = _normalised_kernel(distance, self.gamma) @ dual
         return values
 
-    def state(self) -> tuple[dict[str, Tensor], Header]:
-        """Return tensors in single precision, and plain values."""
-        arrays = {"known": self.known, "dual": self.dual}
-        tensors = {name: torch.from_numpy(array.astype(np.float32)) for name, array in arrays.items()}
-        return tensors, {"gamma": self.gamma}
+    @cached_property
+    def _arrays(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        return self.known.double().numpy(), self.dual.double().numpy()
 
-    @classmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header, features: int, values: int) -> NadarayaWatson:
-        """Return the regression that `state` describes.
-
-        Args:
-            tensors: Tensors by name; other names are ignored.
-            header: Plain values.
-            features: Number p of features.
-            values: Number k of values.
+    def check(self, n_features: int, n_values: int) -> None:
+        """Refuse a regression from a file that has other numbers of features or values.
 
         Raises:
-            InputError: Shapes or values that do not fit together.
+            InputError: It has.
         """
-        expect(tensors, {"known": (n := len(tensors["known"]), features), "dual": (n, values)})
-        gamma = float(header["gamma"])
-        if not (gamma > 0 and math.isfinite(gamma)):
-            raise InputError(f"gamma must be positive and finite, got {gamma}")
-        return cls(tensors["known"].double().numpy(), tensors["dual"].double().numpy(), gamma)
+        if (found := (self.known.shape[1], self.dual.shape[1])) != (n_features, n_values):
+            raise InputError(f"a regression of {n_features} features and {n_values} values has {found}")
 
 
 def choose(distance: NDArray[Any], target: NDArray[Any], seed: int) -> tuple[float, float]:
@@ -171,6 +162,8 @@ class KernelRegression(SavedEstimator):
     """
 
     kind = "kernel regression"
+    saved = "_direction"
+    _direction: NadarayaWatson
 
     def _fit(self, train: Mixed, device: torch.device) -> None:
         rows = torch.from_numpy(kept_rows(len(train), self.config.seed))
@@ -181,12 +174,8 @@ class KernelRegression(SavedEstimator):
     def predict(self, spectra: Tensor) -> Tensor:
         return torch.stack(to_angles(torch.from_numpy(self._direction(_features(spectra)))), dim=-1)
 
-    def _state(self) -> tuple[dict[str, Tensor], Header]:
-        return self._direction.state()
-
-    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
-        pixels = _features(torch.zeros(1, *self.grid.shape)).shape[1]
-        self._direction = NadarayaWatson.from_state(tensors, header, pixels, 3)
+    def _restored(self) -> None:
+        self._direction.check(_features(torch.zeros(1, *self.grid.shape)).shape[1], 3)
 
 
 def _features(spectra: Tensor) -> NDArray[Any]:

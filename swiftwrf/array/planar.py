@@ -41,7 +41,7 @@ class PlanarArray:
         <PlanarArray: 16 elements at 2.4 GHz>
     """
 
-    element: Tensor
+    element: Annotated[Tensor, "float64 k 2"]
     wavelength: float
 
     def __post_init__(self) -> None:

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -283,8 +283,8 @@ class Floors:
         tensor([0, 1])
     """
 
-    names: tuple[str, ...]
-    height_m: tuple[float, ...]
+    names: Annotated[tuple[str, ...], "n"]
+    height_m: Annotated[tuple[float, ...], "n"]
 
     def number(self, position: Tensor) -> Tensor:
         """Return the number of the floor whose height is nearest to each position (n, 3), int64 (n,)."""

@@ -5,19 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from copy import copy
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated
 
 import torch
-from annotated_types import Ge, Gt, Lt
+from annotated_types import Ge, Gt, Le, Lt
 from scipy.optimize import brentq
 from torch import Tensor
 from torch.nn import functional
 
-from swiftwrf.errors import InputError
 from swiftwrf.positions import Neighbours, distance
-from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.validation import Fraction, configuration
 
 MIN_NOISE = 1e-8  # variance of the noise, relative to that of the field
@@ -128,10 +126,10 @@ class GaussianProcess:
     """
 
     kernel: Kernel
-    known: Tensor
-    value: Tensor = None  # type: ignore[assignment]
+    known: Annotated[Tensor, "float64 n 3"]
+    value: Annotated[Tensor, "float n k"] = None  # type: ignore[assignment]
     exact: bool | None = None
-    correlation: Tensor = None  # type: ignore[assignment]
+    correlation: Annotated[Tensor, "float64 n", Gt(0), Le(1)] = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         known = self.known.double()
@@ -226,31 +224,6 @@ class GaussianProcess:
         root = torch.linalg.solve_triangular(self._factor, self._cross(position).T, upper=False)
         variance: Tensor = 1 - root.square().sum(dim=0)
         return variance.clamp(0, 1)
-
-    def state(self, prefix: str = "") -> tuple[dict[str, Tensor], Header]:
-        """Return positions and values, and the kernel as plain numbers, with names that begin with `prefix`."""
-        tensors = {f"{prefix}position": self.known, f"{prefix}value": self.value}
-        if bool((self.correlation < 1).any()):
-            tensors[f"{prefix}correlation"] = self.correlation
-        return tensors, {f"{prefix}kernel": asdict(self.kernel)}
-
-    @classmethod
-    def from_state(
-        cls, tensors: dict[str, Tensor], header: Header, dtype: torch.dtype, exact: bool | None = None, prefix: str = ""
-    ) -> GaussianProcess:
-        """Return the process of a state, with values of the given type.
-
-        Raises:
-            InputError: Tensors of other sizes, or a kernel outside its range.
-        """
-        known, value = tensors[f"{prefix}position"], tensors[f"{prefix}value"]
-        n = len(known)
-        expect(tensors, {f"{prefix}position": (n, 3), f"{prefix}value": (n, *value.shape[1:2])})
-        correlation = tensors.get(f"{prefix}correlation", known.new_ones(n))
-        expect({"correlation": correlation}, {"correlation": (n,)})
-        if not bool(((correlation > 0) & (correlation <= 1)).all()):
-            raise InputError("correlation in time must be above 0 and at most 1")
-        return cls(Kernel(**header[f"{prefix}kernel"]), known, value.to(dtype), exact, correlation)
 
     def _cross(self, position: Tensor) -> Tensor:
         """Return the covariances of the present field at positions (m, 3) with the values, float64 (m, n)."""

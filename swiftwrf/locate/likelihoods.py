@@ -5,13 +5,13 @@ Both kinds are fitted without each fold and to all data, screen the cells of a r
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from functools import cached_property
+from typing import Annotated, ClassVar, Self
 
 import torch
+from annotated_types import Ge, Gt, Le
 from torch import Tensor
 
 from swiftwrf.array.planar import LIGHT_SPEED, differences
@@ -45,8 +45,8 @@ from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.model import kept_snapshots
 from swiftwrf.models.geometry.path_gains import PRIORS, PathGains, choose_prior, fit_path_gains, kernel_of
 from swiftwrf.positions import to_tensor
-from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.threads import parallel_map
+from swiftwrf.runtime.validation import PositiveInt
 
 CHANNEL_CELLS = 8  # times as many first cells for channels, which are not computed at each of them
 CHANNEL_PARTS = 4  # along each edge of a cell with paths of its own
@@ -56,7 +56,6 @@ BATCH_CANDIDATES = 2048  # whose waves are computed together: as many as a proce
 BATCH_CELLS = 256  # the same with parts
 MAX_KEPT_NUMBERS = 2**25  # co-array numbers of channels at all cells: 134 MB
 MAX_LOG_VARIANCE = 30.0
-NEARBY, DEGREES = "nearby.", "degrees"  # prefix and name in a file
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,10 +65,12 @@ class Likelihoods(ABC):
     Args:
         room: Room whose paths they share.
         frequency: Frequencies of the snapshots relative to the carrier, float64 (F,), one if all are at the carrier.
+        log_variance: Logarithms of the variances of path gains, see `PhaseLikelihood`.
     """
 
     room: GeometryModel
-    frequency: Tensor
+    frequency: Annotated[Tensor, "float64 f", Gt(0)]
+    log_variance: Annotated[Tensor, "float32 v", Ge(-MAX_LOG_VARIANCE), Le(MAX_LOG_VARIANCE)]
 
     start: ClassVar[tuple[float, ...]]
     """weights by which the calibration searches"""
@@ -96,14 +97,22 @@ class Likelihoods(ABC):
     def screens(self, region: Region, count: int, most: int) -> tuple[Cells, list[Screen]]:
         """Return about `count` cells of a region, or `most` of them, and likelihoods at all of them that choose some."""
 
+    @property
     @abstractmethod
-    def state(self) -> tuple[dict[str, Tensor], Header]:
-        """Return the fitted tensors by name, and plain values, without those of the room."""
+    def students(self) -> tuple[Student, ...]:
+        """Distributions of the errors of co-array numbers."""
 
-    @classmethod
-    @abstractmethod
-    def from_state(cls, room: GeometryModel, tensors: dict[str, Tensor], header: Header) -> Self:
-        """Return the likelihoods of a room that `state` describes."""
+    def check(self) -> None:
+        """Refuse likelihoods from a file that do not fit their room.
+
+        Raises:
+            InputError: Another number of variances, or scales that are those of no distribution.
+        """
+        size, count = 2 * len(differences(self.room.array)), 4 + self.room.reflectors.gain.shape[1]
+        if any(len(own.scale) != size or torch.linalg.cholesky_ex(own.scale).info.any() for own in self.students):
+            raise InputError("scales are those of no distribution of co-array numbers")
+        if len(self.log_variance) != count:
+            raise InputError(f"a room with {count - 4} planes has {count} variances, got {len(self.log_variance)}")
 
     def __call__(self, position: Tensor, observed: SpectrumFeatures, weight: Tensor) -> Tensor:
         """Return log-likelihoods (k, n, m) of n observations at candidates (n, m, 3) [m], 0 for those of weight 0."""
@@ -130,19 +139,21 @@ class SpectrumLikelihoods(Likelihoods):
     Args:
         gains: Position-dependent path gains.
         coarray: Distributions of the errors of both predictions of co-array numbers.
-        phases: Likelihood of the element phases.
     """
 
     gains: PathGains
     coarray: tuple[Student, Student]
-    phases: PhaseLikelihood
 
     start = (0.05, 0.05, 0.3)
 
     @property
     def parts(self) -> tuple[Likelihood, ...]:
         predictions = gain_features(self.room.array, self.gains)
-        return *map(CoarrayLikelihood, predictions, self.coarray), self.phases
+        return *map(CoarrayLikelihood, predictions, self.coarray), self._phases
+
+    @cached_property
+    def _phases(self) -> PhaseLikelihood:
+        return PhaseLikelihood(self.room, self.log_variance)
 
     @classmethod
     def fit(cls, train: Spectra, room: GeometryModel, fold: Tensor, seed: int) -> tuple[SpectrumFeatures, list[Self]]:
@@ -172,7 +183,7 @@ class SpectrumLikelihoods(Likelihoods):
         found = []
         for known, (own, gains, phases) in zip(kept, fits, strict=True):
             constant, varying = (Student.fit(part[known], floor) for part in residual)
-            found.append(cls(own, CARRIER, gains, (constant, varying), phases))
+            found.append(cls(own, CARRIER, phases.log_variance, gains, (constant, varying)))
         return features, found
 
     def features(self, data: Numbers | Spectra, seed: int) -> SpectrumFeatures:
@@ -194,16 +205,14 @@ class SpectrumLikelihoods(Likelihoods):
         ones = torch.ones(len(cells.position))
         return cells, [own.screen(torch.cat(part), ones) for own, part in zip(likelihoods, parts, strict=True)]
 
-    def state(self) -> tuple[dict[str, Tensor], Header]:
-        tensors, header = self.gains.state()
-        distributions, degrees = _state_of(self.coarray)
-        return tensors | {"statistics": self.phases.log_variance} | distributions, header | degrees
+    @property
+    def students(self) -> tuple[Student, ...]:
+        return self.coarray
 
-    @classmethod
-    def from_state(cls, room: GeometryModel, tensors: dict[str, Tensor], header: Header) -> Self:
-        constant, varying = _distributions(room, tensors, header, 2)
-        phases = PhaseLikelihood(room, _log_variance(room, tensors))
-        return cls(room, CARRIER, PathGains.from_state(tensors, header, room), (constant, varying), phases)
+    def check(self) -> None:
+        super().check()
+        if len(self.frequency) != 1 or self.gains.n_paths != 1 + len(self.room.reflectors.sequence):
+            raise InputError("frequencies or path gains are those of another room")
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,23 +224,25 @@ class ChannelLikelihoods(Likelihoods):
 
     Args:
         n_snapshots: Number of snapshots of each measurement.
-        paths: Likelihood under uncertain path gains.
         process: Process of the differences of measured co-array numbers from those of the room.
         nearby: Distribution of the errors of the co-array numbers by room and process.
         fields: Likelihood by constant path gains.
     """
 
-    n_snapshots: int
-    paths: PathLikelihood
+    n_snapshots: PositiveInt
     process: GaussianProcess
-    nearby: Student
+    nearby: Annotated[Student, "f=process.k"]
     fields: ChannelLikelihood
 
     start = (0.5, 0.05, 0.05)
 
     @property
     def parts(self) -> tuple[Likelihood, ...]:
-        return self.paths, self._coarray, self.fields
+        return self._paths, self._coarray, self.fields
+
+    @cached_property
+    def _paths(self) -> PathLikelihood:
+        return PathLikelihood(self.room, self.log_variance)
 
     @property
     def _coarray(self) -> CoarrayLikelihood:
@@ -284,8 +295,8 @@ class ChannelLikelihoods(Likelihoods):
             cls(
                 own,
                 frequency,
+                variance,
                 n_snapshots,
-                PathLikelihood(own, variance),
                 nearby,
                 Student.fit(residual[rows], floor),
                 fields,
@@ -326,49 +337,16 @@ class ChannelLikelihoods(Likelihoods):
             screens.append(self._coarray.screen(torch.cat(numbers), torch.cat(std)))
         return cells, screens
 
-    def state(self) -> tuple[dict[str, Tensor], Header]:
-        tensors, header = self.process.state(NEARBY)
-        distributions, degrees = _state_of([self.nearby])
-        own = {"statistics": self.paths.log_variance, "frequency": self.frequency}
-        plain = {"n_snapshots": self.n_snapshots, "floor": self.fields.floor}
-        return tensors | own | distributions, header | degrees | plain
+    @property
+    def students(self) -> tuple[Student, ...]:
+        return (self.nearby,)
 
-    @classmethod
-    def from_state(cls, room: GeometryModel, tensors: dict[str, Tensor], header: Header) -> Self:
-        (nearby,) = _distributions(room, tensors, header, 1)
-        process = GaussianProcess.from_state(tensors, header, torch.float32, prefix=NEARBY)
-        expect(tensors, {f"{NEARBY}value": (len(process.known), len(nearby.scale))})
-        n_snapshots, floor = int(header["n_snapshots"]), float(header["floor"])
-        frequency = tensors["frequency"].double()
-        counts = {1, len(kept_snapshots(n_snapshots))}
-        if not floor > 0 or frequency.dim() != 1 or len(frequency) not in counts or bool((frequency <= 0).any()):
-            raise InputError("frequencies and missing coherence are not those of a fitted locator")
-        paths = PathLikelihood(room, _log_variance(room, tensors))
-        return cls(room, frequency, n_snapshots, paths, process, nearby, ChannelLikelihood(floor))
+    def check(self) -> None:
+        super().check()
+        if len(self.frequency) not in {1, len(kept_snapshots(self.n_snapshots))}:
+            raise InputError(f"{self.n_snapshots} snapshots have {len(self.frequency)} frequencies")
 
 
 def _without_folds(fold: Tensor) -> list[Tensor]:
     """Return the rows of all but each fold, bool (n,), and last all rows."""
     return [*(fold != number for number in range(int(fold.max()) + 1)), torch.ones_like(fold, dtype=torch.bool)]
-
-
-def _state_of(distributions: Sequence[Student]) -> tuple[dict[str, Tensor], Header]:
-    degrees = [None if math.isinf(own.degrees) else own.degrees for own in distributions]
-    return {"scale": torch.stack([own.scale for own in distributions])}, {DEGREES: degrees}
-
-
-def _distributions(room: GeometryModel, tensors: dict[str, Tensor], header: Header, count: int) -> list[Student]:
-    size = 2 * len(differences(room.array))
-    expect(tensors, {"scale": (count, size, size)})
-    degrees = [math.inf if value is None else float(value) for value in header[DEGREES]]
-    scales = tensors["scale"].double()
-    if len(degrees) != count or not min(degrees) > 0 or bool(torch.linalg.cholesky_ex(scales).info.any()):
-        raise InputError("scales or degrees of freedom are those of no distribution")
-    return [Student(scale, own) for scale, own in zip(scales, degrees, strict=True)]
-
-
-def _log_variance(room: GeometryModel, tensors: dict[str, Tensor]) -> Tensor:
-    expect(tensors, {"statistics": (4 + room.reflectors.gain.shape[1],)})
-    if bool((tensors["statistics"].abs() > MAX_LOG_VARIANCE).any()):
-        raise InputError("variances are not those of a fitted locator")
-    return tensors["statistics"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from typing import Annotated, ClassVar, Self
 
 import torch
@@ -19,13 +18,13 @@ from swiftwrf.errors import InputError, with_article
 from swiftwrf.gp import subsample
 from swiftwrf.locate.features import SpectrumFeatures
 from swiftwrf.locate.likelihoods import ChannelLikelihoods, Likelihoods, SpectrumLikelihoods
-from swiftwrf.locate.posterior import HeldOut, Posterior, calibrated_pool, normalised, read_pool
+from swiftwrf.locate.posterior import HeldOut, Inflation, PoolWeights, Posterior, calibrated_pool, normalised
 from swiftwrf.locate.region import Cells, Region, best_cells, outside_mass, refined
 from swiftwrf.locate.spectrum_likelihood import Screen
 from swiftwrf.models.base import FieldModel
 from swiftwrf.models.geometry import GeometryModel
-from swiftwrf.runtime.checkpoint import Header, Saved
-from swiftwrf.runtime.validation import Configured, NonNegativeInt, PositiveInt, all_or_nothing, checked, configuration
+from swiftwrf.runtime.checkpoint import Saved
+from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, all_or_nothing, checked, configuration
 
 MIN_SPECTRA = 15
 
@@ -57,7 +56,7 @@ class MatchedFieldConfig:
     """seed of everything random"""
 
 
-class MatchedField(Configured, Saved):
+class MatchedField(Saved):
     """Posterior over the position of the moving end, given a spectrum.
 
     Three likelihoods of spectra are pooled: co-array numbers predicted by constant path gains, by position-dependent path
@@ -88,10 +87,15 @@ class MatchedField(Configured, Saved):
     fitted_attribute = "likelihoods"
     config: MatchedFieldConfig
 
-    likelihoods: Likelihoods
+    saved = "likelihoods weight inflation region"
+    likelihoods: SpectrumLikelihoods | ChannelLikelihoods
     """likelihoods that are pooled, set by `fit`"""
-    weight: Tensor
-    """their weights, float64 (k,)"""
+    weight: PoolWeights
+    """their weights, float64 (3,)"""
+    inflation: Inflation
+    """factor of the credible radii"""
+    region: Region
+    """prior over positions"""
 
     @property
     def room(self) -> GeometryModel:
@@ -235,22 +239,6 @@ class MatchedField(Configured, Saved):
             return f"{type(self).__name__}(not fitted)"
         return f"{type(self).__name__}(fitted, {len(self.room.planes)} planes, {len(self.cells.position):,} cells)"
 
-    def state(self) -> tuple[dict[str, Tensor], Header]:
-        """Return the fitted tensors by name, and plain values."""
-        parts = [self.room.state(), self.likelihoods.state(), self.region.state()]
-        tensors, header = {"weight": self.weight}, {"locator": asdict(self.config), "inflation": self.inflation}
-        for own, values in parts:
-            tensors, header = tensors | own, header | values
-        return tensors, header
-
-    @classmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
-        """Return the locator that `state` describes."""
-        locator = cls(MatchedFieldConfig(**header["locator"]))
-        room = GeometryModel.from_state(tensors, header)
-        kind = ChannelLikelihoods if "n_snapshots" in header else SpectrumLikelihoods
-        locator.likelihoods = kind.from_state(room, tensors, header)
-        locator.weight, locator.inflation = read_pool(tensors, header)
-        locator.region = Region.from_state(tensors, header)
-        locator._prepare()
-        return locator
+    def _restored(self) -> None:
+        self.likelihoods.check()
+        self._prepare()

@@ -9,7 +9,7 @@ from typing import Annotated, Self
 
 import numpy as np
 import torch
-from annotated_types import Gt, Lt
+from annotated_types import Ge, Gt, Le, Lt
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor
@@ -20,7 +20,6 @@ from swiftwrf.errors import InputError
 from swiftwrf.metrics import LEVEL, interval_factor
 from swiftwrf.plotting import MARK, Axes, Displayed, corners_of, plan
 from swiftwrf.positions import nearest
-from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.validation import checked
 
 PLAN_PIXELS = 80  # of a posterior in plan, along its longer side
@@ -28,8 +27,9 @@ JUMP = 1e-3  # prior probability of a displacement that does not depend on the d
 CHUNK = 2**22  # pairs of candidates whose distances are computed together
 MAX_KEPT_PAIRS = 4096**2  # pairs of shared candidates whose distances are kept from step to step
 MAX_PAIRS = 20_000**2  # pairs of candidates of two consecutive observations
-MAX_WEIGHT = 1e3  # of a likelihood in a file
 RIDGE = 1e-3  # of the weights: keeps those that the data do not determine near their start
+PoolWeights = Annotated[Tensor, "float64 3", Ge(0), Le(1e3)]
+Inflation = Annotated[float, Ge(0), Lt(math.inf)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -380,21 +380,6 @@ def calibrated_pool(
         score.append(errors[-1] / found.credible_radius(LEVEL).clamp_min(1e-9))
     place = places(torch.cat([part.truth for part in held_out]))
     return weights(held_out), interval_factor(torch.cat(score), place), torch.cat(errors)
-
-
-def read_pool(tensors: dict[str, Tensor], header: Header) -> tuple[Tensor, float]:
-    """Return the three weights and the inflation of a saved locator.
-
-    Raises:
-        InputError: Weights outside [0, 1000], or an inflation that is not a number at least 0.
-    """
-    expect(tensors, {"weight": (3,)})
-    weight, factor = tensors["weight"], header["inflation"]
-    if not 0 <= float(weight.min()) <= float(weight.max()) <= MAX_WEIGHT:
-        raise InputError(f"weight must be 0 to {MAX_WEIGHT:g}, got {weight.tolist()}")
-    if not (isinstance(factor, int | float) and 0 <= factor < math.inf):
-        raise InputError(f"inflation must be a number at least 0, got {factor!r}")
-    return weight, float(factor)
 
 
 def smoothed(posterior: Posterior, time: Tensor | None, speed_m_s: float) -> Posterior:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -16,7 +16,6 @@ from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.splits import centres, places
 from swiftwrf.errors import InputError
 from swiftwrf.positions import check_positions, nearest
-from swiftwrf.runtime.validation import from_plain
 
 FLOOR_DISTANCE_M = 1e5  # of two floors, in the search for known positions near a cell
 MAX_CELLS = 200_000  # among which those near known positions are found
@@ -81,7 +80,7 @@ class Region:
         1.0
     """
 
-    known: Tensor
+    known: Annotated[Tensor, "float64 n 3"]
     margin: float = 0.03
     outside: float = 0.05
     floors: Floors | None = None
@@ -92,17 +91,6 @@ class Region:
             raise InputError(f"a region needs at least 2 known positions, got {len(self.known)}")
         if not self.margin >= 0 or not 0 < self.outside <= 1:
             raise InputError(f"a margin is at least 0 and a mass above 0, got {self.margin} and {self.outside}")
-
-    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Return the known positions by name, and the plain values."""
-        floors = self.floors and asdict(self.floors)
-        return {"region": self.known}, {"margin": self.margin, "outside": self.outside, "floors": floors}
-
-    @classmethod
-    def from_state(cls, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> Region:
-        """Return the region that `state` describes."""
-        floors = from_plain(Floors, header["floors"]) if header.get("floors") else None
-        return cls(tensors["region"], float(header["margin"]), float(header["outside"]), floors)
 
     @cached_property
     def scale_m(self) -> float:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Self
 
 import numpy as np
@@ -15,11 +14,10 @@ from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.powers import MAX_RSSI_DBM, MIN_RSSI_DBM, check_powers
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import FOLDS, Validation, folds
-from swiftwrf.errors import InputError, listed
-from swiftwrf.locate.posterior import HeldOut, Posterior, calibrated_pool, normalised, read_pool
+from swiftwrf.errors import InputError
+from swiftwrf.locate.posterior import HeldOut, Inflation, PoolWeights, Posterior, calibrated_pool, normalised
 from swiftwrf.locate.region import Region, outside_mass
 from swiftwrf.locate.rssi_likelihood import (
-    METRICS,
     DetectionLikelihood,
     FingerprintLikelihood,
     Fingerprints,
@@ -32,11 +30,10 @@ from swiftwrf.locate.rssi_likelihood import (
 from swiftwrf.positions import to_tensor
 from swiftwrf.rssi import RssiModel
 from swiftwrf.rssi.detection import Detection
-from swiftwrf.runtime.checkpoint import Header, Saved, expect
+from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.progress import progress as tracked
-from swiftwrf.runtime.validation import Configured, NonNegativeInt, PositiveInt, all_or_nothing, checked, configuration
+from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, all_or_nothing, checked, configuration
 
-UNDETECTED_DBM = -1000.0  # stands for what is not detected in a file, which holds finite values only
 MAX_HELD_OUT = 2000  # rows that determine the distributions
 BATCH_ROWS = 128  # rows whose posteriors are in memory together
 
@@ -68,7 +65,7 @@ class _Part:
     votes: Votes
 
 
-class RssiLocator(Configured, Saved):
+class RssiLocator(Saved):
     """Posterior over the position of the transmitter, given its RSSI at the receivers.
 
     Three likelihoods are pooled: the values under the radio maps with their uncertainty and a common offset of a row, which
@@ -93,8 +90,17 @@ class RssiLocator(Configured, Saved):
     fitted_attribute = "_maps"
     config: RssiLocatorConfig
 
+    saved = "model likelihoods region weight inflation"
     model: RssiModel
     """radio maps of the receivers, set by `fit`"""
+    likelihoods: Annotated[RssiLikelihoods, "r=model.r"]
+    """likelihoods that are pooled, set by `fit`"""
+    region: Region
+    """prior over positions, set by `fit`"""
+    weight: PoolWeights
+    """weights of the likelihoods, float64 (3,), set by `fit`"""
+    inflation: Inflation
+    """factor of the credible radii, set by `fit`"""
     receiver_names: tuple[str, ...]
     """names of the receivers, set by `fit`"""
     held_out_m: dict[str, float]
@@ -236,58 +242,7 @@ class RssiLocator(Configured, Saved):
             return f"{type(self).__name__}(not fitted)"
         return f"{type(self).__name__}(fitted, {len(self.receiver_names)} receivers, {len(self.cells.position)} cells)"
 
-    def state(self) -> tuple[dict[str, Tensor], Header]:
-        """Return the fitted tensors by name, and plain values."""
-        tensors, header = self.model.state()
-        values, likelihood = self.likelihoods.values, self.likelihoods.fingerprints
-        detections = self.likelihoods.detections
-        known = likelihood.fingerprints
-        own = {
-            "known": known.position,
-            "fingerprint": known.rssi.nan_to_num(UNDETECTED_DBM),
-            "scale_m": likelihood.scale_m,
-            "weight": self.weight,
-        }
-        plain = {
-            "locator": asdict(self.config),
-            "metric": known.metric,
-            "k": known.k,
-            "miss": likelihood.miss,
-            "values": [values.common_db, values.scale, None if math.isinf(values.degrees) else values.degrees],
-            "detections": vars(detections) | {"threshold": detections.threshold.tolist()},
-            "inflation": self.inflation,
-        }
-        at, prior = self.region.state()
-        return tensors | own | at, header | plain | prior
-
-    @classmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
-        """Return the locator that `state` describes."""
-        locator = cls(RssiLocatorConfig(**header["locator"]))
-        locator.model = RssiModel.from_state(tensors, header)
-        locator.receiver_names = locator.model.receiver_names
-        n, r = len(tensors["known"]), len(locator.receiver_names)
-        expect(tensors, {"known": (n, 3), "fingerprint": (n, r), "scale_m": (3,)})
-        (common_db, scale, degrees), k, metric = header["values"], int(header["k"]), str(header["metric"])
-        values = ValueLikelihood(float(common_db), float(scale), math.inf if degrees is None else float(degrees))
-        if not 1 <= k <= n or metric not in METRICS:
-            raise InputError(f"k must be 1 to the number of rows, the metric {listed(METRICS)}; got {k} and {metric!r}")
-        saved = header["detections"]
-        threshold = to_tensor("threshold", saved["threshold"], torch.float64, (r,))
-        detections = DetectionLikelihood(threshold, float(saved["width"]), float(saved["loss"]))
-        positive = values.common_db >= 0 and min(values.scale, values.degrees, detections.width) > 0
-        fractions = 0 < float(header["miss"]) < 1 and 0 <= detections.loss < 1
-        if not (positive and fractions and bool((tensors["scale_m"] > 0).all())):
-            raise InputError("scales, degrees of freedom or a probability are those of no distribution")
-        locator.region = Region.from_state(tensors, header)
-        rssi = tensors["fingerprint"].where(tensors["fingerprint"] > UNDETECTED_DBM, torch.nan)
-        known = Fingerprints(tensors["known"], rssi, locator.region.floors, metric, k)
-        locator.likelihoods = RssiLikelihoods(
-            values,
-            detections,
-            FingerprintLikelihood(known, tensors["scale_m"], float(header["miss"])),
-        )
-        locator.cells = locator.region.cells(locator.config.n_cells)
-        locator.weight, locator.inflation = read_pool(tensors, header)
-        locator._maps = maps_at(locator.model, locator.cells.position)
-        return locator
+    def _restored(self) -> None:
+        self.receiver_names = self.model.receiver_names
+        self.cells = self.region.cells(self.config.n_cells)
+        self._maps = maps_at(self.model, self.cells.position)

@@ -6,10 +6,11 @@ import itertools
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import Annotated, Literal, Self, get_args
 
 import numpy as np
 import torch
+from annotated_types import Ge, Gt, Lt
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit
@@ -22,13 +23,15 @@ from swiftwrf.data.splits import centres, places
 from swiftwrf.errors import InputError
 from swiftwrf.locate.spectrum_likelihood import DEGREES
 from swiftwrf.rssi import RssiModel
+from swiftwrf.runtime.validation import PositiveFloat, PositiveInt
 
 COMMON_DB = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
 SCALES = (0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
 MAX_DETECTIONS = 200_000  # that determine the likelihood of detections
 MISSES = (0.003, 0.01, 0.03, 0.1, 0.2, 0.4)
 NEIGHBOUR_COUNTS = (1, 2, 3, 4, 5, 7, 9, 12, 16, 20)
-METRICS = ("sorensen", "manhattan", "euclidean")  # the first one unless another has a significantly lower error
+Metric = Literal["sorensen", "manhattan", "euclidean"]
+METRICS: tuple[Metric, ...] = get_args(Metric)  # the first one unless another has a significantly lower error
 MAX_HELD_OUT = 1000  # rows that choose the settings
 SMALLEST_DISTANCE = 1e-3  # of fingerprints, whose inverse is a weight
 Votes = tuple[Tensor, Tensor, Tensor]  # each floor's part of the weights, its mean position, and the estimate
@@ -52,9 +55,9 @@ class ValueLikelihood:
         degrees: Degrees of freedom; infinite for a Gaussian.
     """
 
-    common_db: float
-    scale: float
-    degrees: float
+    common_db: Annotated[float, Ge(0), Lt(math.inf)]
+    scale: Annotated[float, Gt(0), Lt(math.inf)]
+    degrees: PositiveFloat
 
     @classmethod
     def fit(cls, maps: Maps, rssi: Tensor) -> ValueLikelihood:
@@ -120,9 +123,9 @@ class DetectionLikelihood:
         loss: Probability that a strong packet is lost.
     """
 
-    threshold: Tensor
-    width: float
-    loss: float
+    threshold: Annotated[Tensor, "float64 r"]
+    width: PositiveFloat
+    loss: Annotated[float, Ge(0), Lt(1)]
 
     @classmethod
     def fit(cls, mean: Tensor, detected: Tensor, limit: Tensor) -> DetectionLikelihood:
@@ -178,14 +181,14 @@ class Fingerprints:
         torch.Size([12, 3])
     """
 
-    position: Tensor
-    rssi: Tensor
+    position: Annotated[Tensor, "float64 n 3"]
+    rssi: Annotated[Tensor, "float32 n r nan"]
     floors: Floors | None = None
-    metric: str = METRICS[0]
-    k: int = 1
+    metric: Metric = METRICS[0]
+    k: PositiveInt = 1
 
     @classmethod
-    def of(cls, train: Rssi, metric: str = METRICS[0], k: int = 1) -> Self:
+    def of(cls, train: Rssi, metric: Metric = METRICS[0], k: int = 1) -> Self:
         """Return the detected rows of the training data as fingerprints."""
         train = train.subset(train.detected.any(dim=1))
         return cls(train.transmitter_position, train.rssi_dbm.float(), train.floors, metric, k)
@@ -207,7 +210,7 @@ class Fingerprints:
         order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))
         held_out = torch.zeros(len(train), dtype=torch.bool).index_fill(0, order[:MAX_HELD_OUT], value=True)
         parts = [((fold == number) & held_out, fold != number) for number in fold.unique()]
-        errors: dict[tuple[str, int], Tensor] = {}
+        errors: dict[tuple[Metric, int], Tensor] = {}
         fewest = min(int(places(train.transmitter_position[kept]).max()) + 1 for _, kept in parts)
         counts = [k for k in NEIGHBOUR_COUNTS if k <= fewest]
         for metric in METRICS:
@@ -307,10 +310,10 @@ class FingerprintLikelihood:
         degrees: Degrees of freedom.
     """
 
-    fingerprints: Fingerprints
-    scale_m: Tensor
-    miss: float = 0.1
-    degrees: float = 4.0
+    fingerprints: Annotated[Fingerprints, "r"]
+    scale_m: Annotated[Tensor, "float64 3", Gt(0)]
+    miss: Annotated[float, Gt(0), Lt(1)] = 0.1
+    degrees: PositiveFloat = 4.0
 
     @classmethod
     def fit(cls, fingerprints: Fingerprints, votes: Votes, truth: Tensor, smallest_m: float) -> FingerprintLikelihood:
@@ -355,8 +358,8 @@ class RssiLikelihoods:
     """
 
     values: ValueLikelihood
-    detections: DetectionLikelihood
-    fingerprints: FingerprintLikelihood
+    detections: Annotated[DetectionLikelihood, "r"]
+    fingerprints: Annotated[FingerprintLikelihood, "r"]
 
     def __call__(self, position: Tensor, maps: Maps, rssi: Tensor) -> Tensor:
         """Return log-likelihoods, float64 (3, n, m), of RSSI (n, R) at candidates (m, 3) with radio maps (m, R)."""

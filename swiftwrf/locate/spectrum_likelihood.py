@@ -12,10 +12,11 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import Annotated, Self
 
 import numpy as np
 import torch
+from annotated_types import Gt, Lt
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor
@@ -24,6 +25,7 @@ from swiftwrf.locate.features import Features, PathWaves, SpectrumFeatures
 from swiftwrf.models.geometry.channels import coherence, ends, sources
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.runtime.threads import parallel_map
+from swiftwrf.runtime.validation import PositiveFloat
 
 DEGREES = (3.0, 5.0, 10.0, 30.0, math.inf)  # degrees of freedom of Student distributions that are compared
 SHRINKAGES = (0.05, 0.1, 0.2, 0.4, 0.7)  # of scale matrices to multiples of the identity, that are compared
@@ -46,8 +48,8 @@ class Student:
         degrees: Degrees of freedom; infinite for a Gaussian.
     """
 
-    scale: Tensor
-    degrees: float
+    scale: Annotated[Tensor, "float64 f f"]
+    degrees: PositiveFloat
 
     @classmethod
     def fit(cls, residual: Tensor, floor: float) -> Self:
@@ -337,7 +339,7 @@ class ChannelLikelihood:
         floor: Missing coherence at true positions.
     """
 
-    floor: float
+    floor: Annotated[float, Gt(0), Lt(math.inf)]
 
     def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
         """Return log-likelihoods (m,) of m observations at m candidates, up to a constant of each observation."""

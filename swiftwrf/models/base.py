@@ -6,7 +6,6 @@ import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Iterable
 from copy import copy
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
@@ -29,13 +28,11 @@ from swiftwrf.runtime.checkpoint import Header, Saved, check_folder
 from swiftwrf.runtime.descent import Record
 from swiftwrf.runtime.threads import single_thread, to_device
 from swiftwrf.runtime.validation import (
-    Configured,
     NonNegativeInt,
     Preset,
     all_or_nothing,
     checked,
     configuration,
-    from_plain,
 )
 
 ARRAY, FIXED_END = "array", "fixed end"  # requirements that a model can declare
@@ -63,7 +60,7 @@ class Updatable:
 
     updates: ClassVar[bool] = False
     """whether `update` is available; other models must be fitted again"""
-    row_digests: Tensor = torch.zeros(0, dtype=torch.int64)
+    row_digests: Annotated[Tensor, "int64 rows"] = torch.zeros(0, dtype=torch.int64)
     """digests of the rows that the model has learnt, in their order, set by `fit` and `update`"""
 
     def is_learnt(self, new: PositionedData) -> Tensor:
@@ -76,22 +73,19 @@ class Updatable:
             warnings.warn(f"{new.name}: {n_known} of {len(new)} rows {ALREADY_LEARNT}", stacklevel=4)
         return new.subset(~known) if n_known else new
 
-    def _take_digests(self, tensors: dict[str, Tensor]) -> None:
-        """Take the digests from the tensors of a file; earlier files have none."""
-        self.row_digests = to_tensor("row_digests", tensors.get("row_digests", self.row_digests), torch.int64, (None,))
-
     def _digests_without(self, rows: Tensor, n: int) -> Tensor:
         """Return the digests without those of some rows by their numbers among n, of which the last have a digest."""
         return self.row_digests[~torch.isin(torch.arange(-len(self.row_digests), 0), rows - n)]
 
 
-class FieldModel(Updatable, Configured, Saved, Displayed):
+class FieldModel(Updatable, Saved, Displayed):
     """Base class of all field models.
 
-    A subclass implements `_fit` and `_predict`, and for `save` and `load` also `_state` and `_restore`. Its `name` and its
-    `kind` in files default to the name of the class. `config_type` declares the options, which are keyword arguments of the
-    constructor. `augment.choose_model` takes the class or an object of it. The decorator `FIELD_MODELS.register("name")` of
-    `swiftwrf.models` makes the name known to `make_model` and to the tasks of this process.
+    A subclass implements `_fit` and `_predict`. For `save` and `load` it names what `_fit` sets in `saved` and annotates it;
+    see `Saved`. Its `name` and its `kind` in files default to the name of the class. `config_type` declares the options,
+    which are keyword arguments of the constructor. `augment.choose_model` takes the class or an object of it. The decorator
+    `FIELD_MODELS.register("name")` of `swiftwrf.models` makes the name known to `make_model` and to the tasks of this
+    process.
 
     Args:
         config: Options as one object. Defaults to those of the preset.
@@ -129,9 +123,10 @@ class FieldModel(Updatable, Configured, Saved, Displayed):
     batch: ClassVar[int] = 64
     """positions evaluated at a time, which bounds the memory"""
 
+    saved = "grid bounds link row_digests"
     grid: AngularGrid
     """grid of the training spectra, set by `fit`"""
-    bounds: Tensor
+    bounds: Annotated[Tensor, "float64 2 3"]
     """corners of the box around the training positions, float64 (2, 3) [m], set by `fit`"""
     link: Link
     """link of the training spectra, set by `fit`"""
@@ -403,36 +398,13 @@ class FieldModel(Updatable, Configured, Saved, Displayed):
         return grid or self.grid
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
-        """Return the fitted tensors by name, and plain values.
+        if self.saved == FieldModel.saved:
+            raise InputError(f"{self.name} cannot be saved; its class must name what `_fit` sets in `saved`")
+        return super().state()
 
-        Raises:
-            InputError: The model is not fitted.
-        """
-        grid = self._checked_grid(None)
-        tensors, header = self._state()
-        described = {"grid": asdict(grid), "bounds": self.bounds.tolist(), "link": self.link.to_json()}
-        learnt = {"row_digests": self.row_digests} if self.updates else {}
-        return tensors | learnt, {"options": asdict(self.config)} | described | header
-
-    def _state(self) -> tuple[dict[str, Tensor], Header]:
-        """Return the fitted tensors by name, and plain values beside options, grid and link."""
-        raise InputError(f"{self.name} cannot be saved; its class needs _state and _restore")
-
-    @classmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
-        model = cls(from_plain(cls.config_type, header.get("options", {})))
-        model.grid = AngularGrid(**header["grid"])
-        model.bounds = bounding_box(torch.tensor(header["bounds"], dtype=torch.float64))
-        model._take_digests(tensors)
-        model.link = Link.from_json(header["link"])
-        if lacking := cls.lacking(model.link):
+    def _restored(self) -> None:
+        if lacking := self.lacking(self.link):
             raise InputError(f"it lacks the {' and the '.join(lacking)}")
-        model._restore(tensors, header)
-        return model
-
-    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
-        """Take the fitted state over from `_state`, checking every shape first."""
-        raise InputError(f"{self.name} cannot be loaded; its class needs _state and _restore")
 
     def plot(self, position: Numbers, ax: Axes | None = None) -> Axes:
         """Draw the predicted spectrum at one position, seen along the normal of the array.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import lru_cache
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
@@ -20,11 +20,11 @@ from swiftwrf.array.planar import PlanarArray, basis, differences
 from swiftwrf.data.spectra import Spectra, coarsening
 from swiftwrf.data.splits import folds
 from swiftwrf.data.store import Store
+from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, choose_kernel, principal_components
 from swiftwrf.models.base import ARRAY
 from swiftwrf.models.link import Linked
 from swiftwrf.models.process import ProcessModel
-from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.threads import single_thread
 
 MAX_COMPONENTS = 64  # principal components of the training magnitudes
@@ -71,12 +71,13 @@ class CoarrayModel(Linked, ProcessModel):
 
     process: GaussianProcess
     """process of the K component scores and the offset"""
-    offset: Tensor
-    """mean offset that stretching removed from a spectrum, float32 (1,)"""
-    form: Tensor
-    """quadratic form from scores, after a 1, to coefficients, float32 (1 + 2 P, K + 1, K + 1)"""
-    component: Tensor
-    """mean magnitude and its components, averaged to few pixels, float32 (1 + K, h, w)"""
+    saved = "offset form component"
+    offset: Annotated[Tensor, "float32 1"]
+    """mean offset that stretching removed from a spectrum"""
+    form: Annotated[Tensor, "float32 c process.k process.k"]
+    """quadratic form from K scores, after a 1, to coefficients, (1 + 2 P, K + 1, K + 1)"""
+    component: Annotated[Tensor, "float32 process.k h w"]
+    """mean magnitude and its components, averaged to few pixels, (1 + K, h, w)"""
 
     @single_thread()
     def _fit(self, train: Spectra, **_: Any) -> None:
@@ -128,19 +129,11 @@ class CoarrayModel(Linked, ProcessModel):
         mean = self._spectra(self.process.mean(position).float(), grid)
         return mean, self._std(position, grid) if with_std else None
 
-    def _state(self) -> tuple[dict[str, Tensor], Header]:
-        tensors, header = self.process.state()
-        own = {"offset": self.offset, "form": self.form, "component": self.component}
-        return tensors | own | {"spread": self.spread}, header
-
-    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
-        self.process = GaussianProcess.from_state(tensors, header, torch.float64)
-        n_scores = tensors["value"].shape[-1]
-        form = (1 + 2 * len(differences(self.array)), n_scores, n_scores)
-        coarse = _coarse(Store(torch.zeros(1, *self.grid.shape))).shape[1:]
-        expect(tensors, {"offset": (1,), "form": form, "component": (n_scores, *coarse)})
-        self.offset, self.form, self.component = (tensors[name].float() for name in ("offset", "form", "component"))
-        self._restore_spread(tensors)
+    def _restored(self) -> None:
+        super()._restored()
+        shape = 1 + 2 * len(differences(self.array)), *_coarse(Store(torch.zeros(1, *self.grid.shape))).shape[1:]
+        if (len(self.form), *self.component.shape[1:]) != shape:
+            raise InputError(f"the array and grid have {shape[0]} coefficients and components of {shape[1:]} pixels")
 
 
 def _coarse(spectra: Store) -> Tensor:

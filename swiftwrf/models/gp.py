@@ -11,10 +11,10 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import folds
 from swiftwrf.data.store import Store
+from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, choose_kernel
 from swiftwrf.models.neighbours import MemoryModel
 from swiftwrf.models.process import ProcessModel
-from swiftwrf.runtime.checkpoint import Header
 
 
 class GPModel(ProcessModel, MemoryModel):
@@ -78,13 +78,8 @@ class GPModel(ProcessModel, MemoryModel):
             mean = self._mean + (weight @ self._change).reshape(-1, *grid.shape)
         return mean, self._std(position, grid) if with_std else None
 
-    def _state(self) -> tuple[dict[str, Tensor], Header]:
-        tensors, header = self.process.state()
-        kept = {name: tensors[name] for name in tensors if name == "correlation"}
-        return super()._state()[0] | kept | {"spread": self.spread}, header
-
-    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
-        super()._restore(tensors, header)
-        none = {"value": torch.zeros(len(self.position), 0)}
-        self._set_process(GaussianProcess.from_state(tensors | none, header, torch.float64))
-        self._restore_spread(tensors)
+    def _restored(self) -> None:
+        super()._restored()
+        if len(self.store) != len(self.process.known):
+            raise InputError(f"{len(self.process.known)} positions have {len(self.store)} spectra")
+        self._set_process(self.process)

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated
 
-from torch import Tensor, float64, tensor
+from torch import Tensor
 
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.choices import Moving
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.errors import InputError
-from swiftwrf.positions import to_tensor
-from swiftwrf.runtime.validation import check_value
 
 ROTATION_TOLERANCE = 1e-4  # between the matrices of one orientation
 FREQUENCY_TOLERANCE = 1e-6  # between frequencies, relative to them
-SHAPES = {"fixed_position": (3,), "rotation": (3, 3), "frequency_hz": (None,)}  # of tensors in a file
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,32 +38,15 @@ class Link:
     """
 
     moving: Moving
-    fixed_position: Tensor | None
-    rotation: Tensor | None
+    fixed_position: Annotated[Tensor, "float64 3"] | None
+    rotation: Annotated[Tensor, "float64 3 3"] | None
     array: PlanarArray | None
-    frequency_hz: Tensor | None = None
+    frequency_hz: Annotated[Tensor, "float64 s"] | None = None
 
     @classmethod
     def from_spectra(cls, data: Spectra) -> Link:
         """Return the link that spectra describe."""
         return cls(data.moving, data.fixed_position, data.rotation, data.array, data.frequency_hz)
-
-    @classmethod
-    def from_json(cls, plain: dict[str, Any]) -> Link:
-        """Return the link that `to_json` describes."""
-        check_value("moving", plain["moving"], Moving)
-        array = plain["array"] and PlanarArray(
-            tensor(plain["array"]["element"], dtype=float64), plain["array"]["wavelength"]
-        )
-        known = {name: (plain.get(name), shape) for name, shape in SHAPES.items()}  # earlier files have no frequencies
-        values = {name: x and to_tensor(name, x, float64, shape) for name, (x, shape) in known.items()}
-        return cls(moving=plain["moving"], array=array, **values)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the link as plain values."""
-        array = self.array and {"element": self.array.element.tolist(), "wavelength": self.array.wavelength}
-        known = {name: None if getattr(self, name) is None else getattr(self, name).tolist() for name in SHAPES}
-        return {"moving": self.moving, "array": array} | known
 
     def aligned(self, data: Spectra) -> Spectra:
         """Return spectra of this link with their snapshots in its order of frequencies, and refuse those of another link.

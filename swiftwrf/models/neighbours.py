@@ -5,7 +5,7 @@ D. Shepard, "A two-dimensional interpolation function for irregularly-spaced dat
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from swiftwrf.data.store import Store
 from swiftwrf.gp import dense_weights, inner_products, subsample
 from swiftwrf.models.base import FieldModel
 from swiftwrf.positions import distance, nearest
-from swiftwrf.runtime.checkpoint import Header, expect
+from swiftwrf.runtime.validation import PositiveInt
 
 MIN_DISTANCE_M = 1e-9
 MAX_CHOICE_SPECTRA = 2000  # that choose the number of neighbours
@@ -27,8 +27,9 @@ MAX_CHOICE_SPECTRA = 2000  # that choose the number of neighbours
 class MemoryModel(FieldModel):
     """Base class of models that keep the measured spectra."""
 
-    position: Tensor
-    """training positions, float64 (n, 3) [m]"""
+    saved = "position spectrum"
+    position: Annotated[Tensor, "float64 n 3"]
+    """training positions [m]"""
     store: Store
     """training spectra (n, H, W)"""
 
@@ -41,16 +42,15 @@ class MemoryModel(FieldModel):
     def region(self) -> Tensor:
         return self.position
 
-    def _state(self) -> tuple[dict[str, Tensor], Header]:
-        return {
-            "position": self.position,
-            "spectrum": self.store.values if self.store.rows is None else self.store[:],
-        }, {}
+    @property
+    def spectrum(self) -> Annotated[Tensor, "uint8|float n grid.n_elevation grid.n_azimuth"]:
+        """Training spectra in the type of their source."""
+        is_whole = self.store.rows is None and self.store.factor == 1
+        return self.store.values if is_whole else self.store[:]
 
-    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
-        n = len(tensors["position"])
-        expect(tensors, {"position": (n, 3), "spectrum": (n, *self.grid.shape)})
-        self.position, self.store = tensors["position"].double(), Store(tensors["spectrum"])
+    @spectrum.setter
+    def spectrum(self, values: Tensor) -> None:
+        self.store = Store(values)
 
 
 class NearestModel(MemoryModel):
@@ -83,8 +83,9 @@ class IDWModel(MemoryModel):
     name = "idw"
     kind = "inverse-distance model"
 
-    k: int
-    """number of neighbours"""
+    saved = "k"
+    k: PositiveInt
+    """number of neighbours, at most that of the training positions"""
 
     def _fit(self, train: Spectra, **_: Any) -> None:
         super()._fit(train)
@@ -98,12 +99,9 @@ class IDWModel(MemoryModel):
         rows, weight = dense_weights(*weights(position, self.position, self.k))
         return torch.tensordot(weight, self.store[rows], dims=1), None
 
-    def _state(self) -> tuple[dict[str, Tensor], Header]:
-        return super()._state()[0], {"k": self.k}
-
-    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
-        super()._restore(tensors, header)
-        self.k = min(max(int(header["k"]), 1), len(self.position))
+    def _restored(self) -> None:
+        super()._restored()
+        self.k = min(self.k, len(self.position))
 
 
 def _held_out_loss(k: int, position: Tensor, gram: Tensor, fold: Tensor) -> float:

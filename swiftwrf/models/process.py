@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Self
+from typing import Annotated, Self
 
 import torch
 from torch import Tensor
@@ -25,7 +25,6 @@ from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel, leave_folds_out, subsample
 from swiftwrf.metrics import HALF_WIDTH, interval_factor
 from swiftwrf.models.base import FieldModel
-from swiftwrf.runtime.checkpoint import expect
 
 MAX_HELD_OUT = 100  # training spectra that determine the spread
 SHRINKAGE_SPECTRA = 5.0  # weight of the mean over directions in the spread of each one, in spectra
@@ -40,10 +39,11 @@ class ProcessModel(FieldModel):
 
     updates = True
 
+    saved = "process spread"
     process: GaussianProcess
     """process of the values"""
-    spread: Tensor
-    """standard deviation of a measurement far from all training positions, float32 (H, W)"""
+    spread: Annotated[Tensor, "float32 grid.n_elevation grid.n_azimuth"]
+    """standard deviation of a measurement far from all training positions"""
 
     def expected_error(self, position: Tensor) -> Tensor:
         """Return the expected error at positions (n, 3) [m] relative to that far from all training positions, (n,)."""
@@ -123,10 +123,6 @@ class ProcessModel(FieldModel):
             column = ((grid.azimuth - self.grid.azimuth_start) / self.grid.azimuth_step).round().long()
             spread = spread[row.clamp(0, self.grid.n_elevation - 1)][:, column % self.grid.n_azimuth]
         return self.expected_error(position).float()[:, None, None] * spread
-
-    def _restore_spread(self, tensors: dict[str, Tensor]) -> None:
-        expect(tensors, {"spread": self.grid.shape})
-        self.spread = tensors["spread"].float()
 
     def _set_process(self, process: GaussianProcess) -> None:
         self.process = process

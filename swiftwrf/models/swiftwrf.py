@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -34,7 +34,6 @@ from swiftwrf.models.primitives import constrained, min_width
 from swiftwrf.models.process import ProcessModel
 from swiftwrf.rasterize import rasterize_magnitude
 from swiftwrf.rasterize.reference import kernels
-from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.descent import Record
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import single_thread
@@ -86,12 +85,13 @@ class SwiftWRF(ProcessModel):
     searches = True
     any_grid = True
 
-    mean: Tensor
-    """azimuth and elevation of each primitive, float32 (N, 2) [rad]"""
-    cholesky: Tensor
-    """Cholesky factors l1, l2, l3 of each primitive, float32 (N, 3) [rad]"""
-    weight: Tensor
-    """weights of the primitives in the mean spectrum, then in each component, float32 (1 + K, N)"""
+    saved = "mean cholesky weight"
+    mean: Annotated[Tensor, "float32 n 2"]
+    """azimuth and elevation of each primitive [rad]"""
+    cholesky: Annotated[Tensor, "float32 n 3"]
+    """Cholesky factors l1, l2, l3 of each primitive [rad]"""
+    weight: Annotated[Tensor, "float32 1+process.k n"]
+    """weights of the primitives in the mean spectrum, then in each component"""
     process: GaussianProcess
     """process of the K component scores"""
 
@@ -209,17 +209,8 @@ class SwiftWRF(ProcessModel):
         weighted: Tensor = self.process.value / self._basis(self.grid).dual.norm(dim=1)  # of orthogonal components
         return weighted.cpu()
 
-    def _state(self) -> tuple[dict[str, Tensor], Header]:
-        tensors, header = self.process.state()
-        own = {"mean": self.mean, "cholesky": self.cholesky, "weight": self.weight}
-        return tensors | own | {"spread": self.spread}, header
-
-    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
-        self.process = GaussianProcess.from_state(tensors, header, torch.float64)
-        n, k = len(tensors["mean"]), tensors["value"].shape[1]
-        expect(tensors, {"mean": (n, 2), "cholesky": (n, 3), "weight": (1 + k, n)})
-        self.mean, self.cholesky, self.weight = (tensors[name] for name in ("mean", "cholesky", "weight"))
-        self._restore_spread(tensors)
+    def _restored(self) -> None:
+        super()._restored()
         self._move(torch.device("cpu"))
 
 

@@ -9,7 +9,7 @@ fine: the first steps fit the primitives alone, the others the network, with the
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
 from typing import Any, cast
 
@@ -25,7 +25,6 @@ from swiftwrf.models.mlp import SkipMLP, encode
 from swiftwrf.models.primitives import Primitives
 from swiftwrf.positions import frame, normalise
 from swiftwrf.rasterize import prepare, rasterize_magnitude
-from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.descent import Descent, Record, warm_cosine
 from swiftwrf.runtime.validation import (
     Fraction,
@@ -105,6 +104,7 @@ class SwiftWRFPaper(FieldModel):
     slow = True
     any_grid = True
 
+    saved = "field"
     field: DeformableGaussians
     """fitted Gaussians and network; the gradients of their parameters are off after a fit"""
 
@@ -124,18 +124,14 @@ class SwiftWRFPaper(FieldModel):
         found: tuple[Tensor, Tensor, Tensor] = self.field(self.field.normalise(position.to(self.device)))
         return found
 
-    def _state(self) -> tuple[dict[str, Tensor], Header]:
-        return self.field.state_dict(), {}
+    def blank(self, saved: Mapping[str, Tensor]) -> DeformableGaussians:
+        n, centre, scale = len(saved["primitives.mean"]), torch.zeros(3).double(), torch.ones(()).double()
+        return DeformableGaussians(n, self.grid, centre, scale, generator=torch.Generator())
 
-    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
-        n = len(tensors["primitives.mean"])
-        shapes = {"mean": (n, 2), "cholesky": (n, 3), "attenuation": (n,), "response": (n, 2), "floor": (2,)}
-        expect(tensors, {"centre": (3,), "scale": ()} | {f"primitives.{name}": s for name, s in shapes.items()})
-        if not float(tensors["scale"]) > 0:
-            raise InputError(f"scale is {float(tensors['scale'])}, expected metres above 0")
-        field = DeformableGaussians(n, self.grid, tensors["centre"], tensors["scale"], generator=torch.Generator())
-        field.load_state_dict(tensors)
-        self.field = field.eval().requires_grad_(False)
+    def _restored(self) -> None:
+        super()._restored()
+        if not float(self.field.scale) > 0:
+            raise InputError(f"scale is {float(self.field.scale)}, expected metres above 0")
 
 
 class DeformableGaussians(nn.Module):

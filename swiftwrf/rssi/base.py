@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Self
 
 import torch
@@ -22,10 +21,10 @@ from swiftwrf.errors import InputError, listed
 from swiftwrf.models.base import FieldConfig, Updatable
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Displayed
-from swiftwrf.positions import check_near, check_positions, to_tensor
+from swiftwrf.positions import check_near, check_positions
 from swiftwrf.rssi.detection import Detection
 from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation
-from swiftwrf.runtime.checkpoint import Header, Saved
+from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.threads import to_device
 from swiftwrf.runtime.validation import (
     Configured,
@@ -34,7 +33,6 @@ from swiftwrf.runtime.validation import (
     all_or_nothing,
     checked,
     configuration,
-    from_plain,
 )
 
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
@@ -91,17 +89,17 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
     """positions evaluated at a time, few enough to stay in the processor's cache"""
 
     fitted_attribute = "receiver_names"
-    receiver_names: tuple[str, ...]
+    receiver_names: Annotated[tuple[str, ...], "r"]
     """names of the receivers, set by `fit`"""
-    receiver_position: Tensor
+    receiver_position: Annotated[Tensor, "float64 r 3 nan"]
     """positions of the receivers, float64 (R, 3) [m], nan where unknown, set by `fit`"""
     origin: GeodeticOrigin | None
     """latitude and longitude of x = y = 0, if the positions were projected from degrees, set by `fit`"""
-    detection: Detection | None
+    detection: Annotated[Detection, "r"] | None
     """curve of detection of the training rows; None if every cell has a value; set by `fit`"""
     offsets: Offsets | None
     """offsets that were removed from the training rows, set by `fit`; predictions are of their reference"""
-    attenuation: FloorAttenuation | None = None
+    attenuation: Annotated[FloorAttenuation, "r"] | None = None
     """attenuation of the floors between transmitter and receiver, set by `fit` if the data have floors"""
 
     @classmethod
@@ -345,38 +343,7 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
 class SavedRssiPredictor(RssiPredictor, Saved):
     """Base class of predictors that one file stores."""
 
-    def _header(self) -> Header:
-        """Return the plain values that files of all these predictors contain."""
-        return {
-            "options": asdict(self.config),
-            "origin": self.origin,
-            "offsets": self.offsets and asdict(self.offsets),
-            "attenuation": self.attenuation and asdict(self.attenuation),
-            "detection": self.detection
-            and {name: torch.as_tensor(x).tolist() for name, x in vars(self.detection).items()},
-            "receiver_names": self.receiver_names,
-            "receiver_position": [None if math.isnan(at[0]) else at for at in self.receiver_position.tolist()],
-        }
-
-    @classmethod
-    def _of_header(cls, header: Header) -> Self:
-        """Return a predictor with these values, without its tensors."""
-        predictor = cls(from_plain(cls.config_type, header["options"]))
-        predictor.receiver_names = tuple(map(str, header["receiver_names"]))
-        known = header["receiver_position"]
-        shape, located = (len(predictor.receiver_names), 3), torch.tensor([at is not None for at in known])
-        position = to_tensor("receiver_position", [at or [0.0] * 3 for at in known], torch.float64, shape)
-        predictor.receiver_position = position.where(located[:, None], torch.nan)
-        predictor.origin = GeodeticOrigin(*map(float, header["origin"])) if header.get("origin") else None
-        attenuation = header.get("attenuation")
-        predictor.attenuation = from_plain(FloorAttenuation, attenuation) if attenuation else None
-        predictor.offsets = Offsets(**header["offsets"]) if header.get("offsets") else None
-        predictor.detection = None
-        if curve := header.get("detection"):
-            types = {"limit": torch.float64, "missed": torch.float64, "is_limit": torch.bool}
-            of_receivers = {n: to_tensor(n, curve[n], dtype, (len(known),)) for n, dtype in types.items()}
-            predictor.detection = Detection(width=float(curve["width"]), **of_receivers)
-        return predictor
+    saved = "receiver_position receiver_names origin offsets attenuation detection row_digests"
 
 
 def in_batches(

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Annotated, Self
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from torch import Tensor
 from swiftwrf.errors import listed
 from swiftwrf.gp import GaussianProcess, Kernel, leave_folds_out, subsample
 from swiftwrf.positions import Neighbours
+from swiftwrf.runtime.validation import PositiveFloat
 
 NEIGHBOURS, FEWEST = 6, 3  # rows beside a cell, and values among them, that determine its level
 OWN_FEWEST = 2  # of these values for the limit of one receiver, which has fewer cells
@@ -52,10 +53,10 @@ class Detection:
         tensor([-80., -88.])
     """
 
-    limit: Tensor
-    width: float
-    missed: Tensor
-    is_limit: Tensor
+    limit: Annotated[Tensor, "float64 r"]
+    width: PositiveFloat
+    missed: Annotated[Tensor, "float64 r"]
+    is_limit: Annotated[Tensor, "bool r"]
 
     @classmethod
     def estimate(cls, position: Tensor, rssi: Tensor) -> Self | None:
@@ -174,10 +175,10 @@ class DetectionField:
         weight: Constant, weight of the power [per 10 dB], and weight of the share, float64 (3,).
     """
 
-    process: GaussianProcess
-    mean: Tensor
-    limit: Tensor
-    weight: Tensor
+    process: Annotated[GaussianProcess, "k=r"]
+    mean: Annotated[Tensor, "float64 r"]
+    limit: Annotated[Tensor, "float64 r"]
+    weight: Annotated[Tensor, "float64 3"]
 
     @classmethod
     def fit(

@@ -9,10 +9,9 @@ directivity_r a few harmonics of the direction from the receiver, and w_r the mi
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, replace
+from dataclasses import fields, replace
 from functools import partial
-from operator import attrgetter
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -20,7 +19,7 @@ from torch import Tensor
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import places
-from swiftwrf.gp import GaussianProcess, Kernel, subsample
+from swiftwrf.gp import Kernel, subsample
 from swiftwrf.metrics import HALF_WIDTH, interval_factor
 from swiftwrf.models.base import CPU
 from swiftwrf.models.prediction import Prediction
@@ -31,7 +30,7 @@ from swiftwrf.rssi.detection import Detection, DetectionField
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.path_loss import harmonics, log_distance
-from swiftwrf.rssi.regression import RssiPosterior, fit_receiver, held_out_std, uncertainty
+from swiftwrf.rssi.regression import FittedRows, RssiPosterior, fit_receiver, held_out_std, uncertainty
 from swiftwrf.rssi.training import (
     MAX_KERNEL_RECEIVERS,
     check_comparable,
@@ -39,7 +38,6 @@ from swiftwrf.rssi.training import (
     prepare,
     rounding_std,
 )
-from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import parallel_map, single_thread
 from swiftwrf.runtime.validation import checked
@@ -75,19 +73,20 @@ class RssiModel(SavedRssiPredictor):
     config_type = RssiConfig
     updates = True
 
+    saved = "kernel mixing_weight centre covariance detection_field rendered field_db noise_db baseline _rows"
     kernel: Kernel
     """kernel of the latent field, lengths in [m]"""
-    mixing_weight: Tensor
+    mixing_weight: Annotated[Tensor, "float64 4"]
     """weights (4,) of the field and the three simpler predictors at all receivers, contained in the tensors below"""
-    centre: Tensor
+    centre: Annotated[Tensor, "float64 3"]
     """centre of the measured positions, float64 (3,) [m]"""
     level: Tensor
     """RSSI at 1 m, float64 (R,) [dBm]"""
     slope: Tensor
     """float64 (R,) [dB a decade]"""
-    covariance: Tensor
+    covariance: Annotated[Tensor, "float64 r 2 2"]
     """calibrated covariance of level and slope, float64 (R, 2, 2)"""
-    detection_field: DetectionField | None
+    detection_field: Annotated[DetectionField, "r"] | None
     """probability of a detection; None if every cell has a value, or if empty cells are ignored"""
     directivity: Tensor
     """coefficients of the harmonics, (R, 8) [dB]"""
@@ -95,13 +94,13 @@ class RssiModel(SavedRssiPredictor):
     """positions of the location bins less the centre, (n, 3) [m]"""
     coefficient: Tensor
     """coefficients of the kernel to the anchors, (n, R) [dB]"""
-    rendered: Tensor
+    rendered: Annotated[Tensor, f"float32 r 2 2 {N_DIRECTIONS}"]
     """fields of the heads, (R, 2, 2, directions)"""
-    field_db: Tensor
+    field_db: Annotated[Tensor, "float32 r"]
     """calibrated standard deviation of the field far from all measurements, (R,) [dB]"""
-    noise_db: Tensor
+    noise_db: Annotated[Tensor, "float32 r"]
     """calibrated standard deviation of a measurement about the field, (R,) [dB]"""
-    baseline: Tensor
+    baseline: Annotated[Tensor, "float64 r 2"]
     """RSSI at 1 m [dBm] and slope [dB a decade] of the simpler predictors by their mixing weights, float64 (R, 2)"""
     posterior: RssiPosterior
     """least squares of the fit, which `update` continues"""
@@ -181,9 +180,11 @@ class RssiModel(SavedRssiPredictor):
         return scale
 
     def _take(self, state: dict[str, Any]) -> None:
-        """Take the state of a posterior over; see `RssiPosterior`."""
+        """Take the rows of a posterior over; see `FittedRows`."""
         self._table, receiver = HeadTable(self.rendered), self.receiver_position - self.centre
-        self._set_posterior(RssiPosterior(receiver, self.kernel, self._table, self.config.huber, **state))
+        self._set_posterior(
+            RssiPosterior(receiver=receiver, kernel=self.kernel, table=self._table, huber=self.config.huber, **state)
+        )
 
     def _set_posterior(self, posterior: RssiPosterior) -> None:
         """Mix a posterior with the simpler predictors, and compute what all predictions share."""
@@ -319,29 +320,13 @@ class RssiModel(SavedRssiPredictor):
         self.check_fitted()
         return RssiMap.predict(self, height=height_m).plot(receiver, ax)
 
-    def state(self) -> tuple[dict[str, Tensor], Header]:
-        self.check_fitted()
-        names = _shapes(0, 0, self.detection_field is not None)
-        tensors = {name: attrgetter(name)(self) for name in (*names, "row_digests")}
-        return tensors, self._header() | {"kernel": asdict(self.kernel)}
+    @property
+    def _rows(self) -> Annotated[FittedRows, "r"]:
+        return FittedRows(**{field.name: getattr(self.posterior, field.name) for field in fields(FittedRows)})
 
-    @classmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
-        model = cls._of_header(header)
-        model.kernel, model.detection_field = Kernel(**header["kernel"]), None
-        model._take_digests(tensors)
-        detections, anchor = any("detection_field." in name for name in tensors), tensors["posterior.anchor"]
-        shapes = _shapes(len(model.receiver_names), len(anchor), detections)
-        expect(tensors, shapes)
-        vars(model).update({name: tensors[name] for name in shapes if "." not in name})
-        if model.detection is not None and detections:
-            of_field = ("process.value", "mean", "weight")
-            value, mean, weight = (tensors[f"detection_field.{name}"].double() for name in of_field)
-            process = GaussianProcess(model.kernel, anchor, value)
-            model.detection_field = DetectionField(process, mean, model.detection.limit, weight)
-        of_fit = (name for name in shapes if name.startswith("posterior."))
-        model._take({name.removeprefix("posterior."): tensors[name].double() for name in of_fit})
-        return model
+    @_rows.setter
+    def _rows(self, rows: FittedRows) -> None:
+        self._take(vars(rows))
 
 
 def fit_rssi(train: Rssi, config: RssiConfig | None = None, **options: Any) -> RssiModel:
@@ -360,25 +345,3 @@ def _in_threads(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterabl
     waiting = list(items)
     for start in range(0, len(waiting), RECEIVERS_AT_ONCE):
         yield from parallel_map(function, waiting[start : start + RECEIVERS_AT_ONCE])
-
-
-def _shapes(n_receivers: int, n_rows: int, detections: bool) -> dict[str, tuple[int, ...]]:
-    """Return the shape of every saved tensor by the name of its attribute."""
-    in_rows = ("posterior.dual", "posterior.tangent", "posterior.variance", "posterior.measured")
-    field = {"mean": (n_receivers,), "weight": (3,), "process.value": (n_rows, n_receivers)} if detections else {}
-    return {
-        "mixing_weight": (4,),
-        "baseline": (n_receivers, 2),
-        "covariance": (n_receivers, 2, 2),
-        "centre": (3,),
-        "rendered": (n_receivers, 2, 2, N_DIRECTIONS),
-        "field_db": (n_receivers,),
-        "noise_db": (n_receivers,),
-        "posterior.anchor": (n_rows, 3),
-        **dict.fromkeys(in_rows, (n_receivers, n_rows)),
-        "posterior.prior": (n_receivers, 2),
-        "posterior.root": (n_receivers, 2, 2),
-        "posterior.field_db": (n_receivers,),
-        "posterior.noise_db": (n_receivers,),
-        **{f"detection_field.{name}": shape for name, shape in field.items()},
-    }

@@ -9,6 +9,7 @@ linear in the number of floors. Groups are devices, channels or any other betwee
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -41,7 +42,7 @@ class FloorAttenuation:
     """
 
     floors: Floors
-    receiver_floor: tuple[int, ...]
+    receiver_floor: Annotated[tuple[int, ...], "r"]
     db: float
 
     def of(self, position: Tensor) -> Tensor:

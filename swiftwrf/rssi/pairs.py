@@ -11,10 +11,11 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from dataclasses import asdict, dataclass
-from typing import Any, ClassVar, Self
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Self
 
 import torch
+from annotated_types import Gt, Lt
 from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
@@ -29,8 +30,6 @@ from swiftwrf.positions import Neighbours, check_positions, distance, nearest
 from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiPredictor, SavedRssiPredictor, in_batches
 from swiftwrf.rssi.path_loss import MIN_DISTANCE_M, fit_path_loss
 from swiftwrf.rssi.training import rounding_std
-from swiftwrf.runtime import checkpoint as files
-from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import configuration
 
@@ -64,9 +63,9 @@ class PairPathLoss:
         tensor([-40., -60.], dtype=torch.float64)
     """
 
-    shared: Tensor
-    place: Tensor
-    correction: Tensor
+    shared: Annotated[Tensor, "float64 2"]
+    place: Annotated[Tensor, "float64 p 3"]
+    correction: Annotated[Tensor, "float64 p 2"]
 
     @classmethod
     def fit(cls, pair: Tensor, rssi: Tensor, by_place: bool) -> Self:
@@ -212,18 +211,19 @@ class PairModel(PairPredictor, SavedRssiPredictor):
     name = "pairs"
     max_map_predictions = 60_000  # each needs a system of 64 equations
 
+    saved = "kernel ratio path_loss pair residual scale_db"
     kernel: Kernel
     """kernel of the field, lengths in [m]"""
-    ratio: float
+    ratio: Annotated[float, Gt(0), Lt(math.inf)]
     """factor of the receiver's coordinates, by which distances of both ends count"""
     path_loss: PairPathLoss
     """path-loss model, of all receivers or of each place"""
-    pair: Tensor
-    """measured pairs, float64 (m, 6) [m]"""
-    residual: Tensor
-    """residuals of the path-loss model, float64 (m,) [dB]"""
-    scale_db: Tensor
-    """calibrated standard deviation of the field far from all measurements, float64 (1,) [dB]"""
+    pair: Annotated[Tensor, "float64 m 6"]
+    """measured pairs [m]"""
+    residual: Annotated[Tensor, "float64 m"]
+    """residuals of the path-loss model [dB]"""
+    scale_db: Annotated[Tensor, "float64 1"]
+    """calibrated standard deviation of the field far from all measurements [dB]"""
 
     @single_thread()
     def _fit_pairs(self, pair: Tensor, rssi: Tensor, fold: Tensor) -> None:
@@ -283,24 +283,8 @@ class PairModel(PairPredictor, SavedRssiPredictor):
         field, variance = self._process.condition(scaled(pair, self.ratio))
         return self.path_loss(pair) + field[:, 0], self.scale_db * (variance + self.kernel.noise).sqrt()
 
-    def state(self) -> tuple[dict[str, Tensor], Header]:
-        self.check_fitted()
-        own = {"pair": self.pair, "residual": self.residual, "scale_db": self.scale_db}
-        loss = self.path_loss
-        tensors = own | {"path_loss": loss.shared, "place": loss.place, "correction": loss.correction}
-        return tensors, self._header() | {"kernel": asdict(self.kernel), "ratio": self.ratio}
-
-    @classmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
-        model = cls._of_header(header)
-        model.kernel, model.ratio = Kernel(**header["kernel"]), float(header["ratio"])
-        if not (0 < model.ratio < math.inf and model.receiver_position.isfinite().all()):
-            raise InputError("its ratio or a position of its receivers is not finite")
-        n_pairs, n_places = len(tensors["pair"]), len(tensors["place"])
-        shapes = {"pair": (n_pairs, 6), "residual": (n_pairs,), "scale_db": (1,)}
-        files.expect(tensors, shapes | {"path_loss": (2,), "place": (n_places, 3), "correction": (n_places, 2)})
-        for name in shapes:
-            setattr(model, name, tensors[name])
-        model.path_loss = PairPathLoss(tensors["path_loss"], tensors["place"], tensors["correction"])
-        model._precompute()
-        return model
+    def _restored(self) -> None:
+        super()._restored()
+        if not bool(self.receiver_position.isfinite().all()):
+            raise InputError("a position of its receivers is not finite")
+        self._precompute()

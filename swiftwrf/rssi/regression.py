@@ -20,7 +20,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -211,15 +211,11 @@ def _site(mean: Tensor, variance: Tensor, limit: Tensor, noise: Tensor, censored
 
 
 @dataclass(frozen=True, eq=False)
-class RssiPosterior:
-    """Gaussian processes of R receivers, given n rows.
+class FittedRows:
+    """Regressions of R receivers on n rows, which a file contains.
 
     Args:
-        receiver: Positions of the receivers less the centre, (R, 3) [m], nan where unknown.
-        kernel: Kernel of the latent field.
-        table: Heads of the receivers.
-        huber: See `RssiConfig`.
-        anchor: Positions of the rows less the centre, float64 (n, 3) [m].
+        anchor: Positions of the rows less the centre, (n, 3) [m].
         dual: Dual coefficients (R, n); 0 in rows that have no part in the fit.
         tangent: Slope of each head at the latent field, times the prior standard deviation of the field, (R, n) [dB].
         variance: Variance of the noise over the weight, (R, n) [dB^2]; 0 in rows that have no part in the fit.
@@ -228,6 +224,28 @@ class RssiPosterior:
         root: A factor of their prior covariance, root @ root^T, (R, 2, 2).
         field_db: Prior standard deviation of the latent field, (R,) [dB].
         noise_db: Standard deviation of one measurement, (R,) [dB].
+    """
+
+    anchor: Annotated[Tensor, "float64 n 3"]
+    dual: Annotated[Tensor, "float64 r n"]
+    tangent: Annotated[Tensor, "float64 r n"]
+    variance: Annotated[Tensor, "float64 r n"]
+    measured: Annotated[Tensor, "float64 r n"]
+    prior: Annotated[Tensor, "float64 r 2"]
+    root: Annotated[Tensor, "float64 r 2 2"]
+    field_db: Annotated[Tensor, "float64 r"]
+    noise_db: Annotated[Tensor, "float64 r"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RssiPosterior(FittedRows):
+    """Gaussian processes of R receivers, given n rows.
+
+    Args:
+        receiver: Positions of the receivers less the centre, (R, 3) [m], nan where unknown.
+        kernel: Kernel of the latent field.
+        table: Heads of the receivers.
+        huber: See `RssiConfig`.
         fit: Posterior of the first n - m rows, whose weights are fixed. Defaults to all rows.
         later: Of the m rows after those: the effect of their dual coefficients on those of the fit, float32 (R, m, n - m),
             the errors of the fit, (R, m) [dB], and the covariance of these errors without noise, (R, m, m).
@@ -237,15 +255,6 @@ class RssiPosterior:
     kernel: Kernel
     table: HeadTable
     huber: float
-    anchor: Tensor
-    dual: Tensor
-    tangent: Tensor
-    variance: Tensor
-    measured: Tensor
-    prior: Tensor
-    root: Tensor
-    field_db: Tensor
-    noise_db: Tensor
     fit: RssiPosterior | None = None
     later: tuple[Tensor, Tensor, Tensor] | None = None
 

@@ -1,30 +1,35 @@
 """Model files: tensors and plain values in one safetensors file, written atomically; opening one never runs its code.
 
-Every fitted model derives from `Saved`, and `load` opens any of them.
+Every fitted model derives from `Saved`, and `load` opens any of them. A file contains a tree: models and dataclasses, lists
+and tuples of these, networks, tensors and plain values. `pack` turns a tree into tensors by their dotted names and a header
+of plain values. `unpack` builds the tree of an annotation from them and checks each value against its annotation.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from abc import ABC
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import fields, is_dataclass
 from importlib import import_module
 from importlib.metadata import entry_points
+from inspect import isclass
 from pathlib import Path
-from typing import Any, ClassVar
+from types import NoneType, UnionType
+from typing import Annotated, Any, ClassVar, Self, Union, get_args, get_origin
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
-from torch import Tensor
+from torch import Tensor, nn
 
 from swiftwrf.errors import CONTENT_ERRORS, InputError
 from swiftwrf.runtime.durable import write_bytes
-from swiftwrf.runtime.validation import checked
+from swiftwrf.runtime.validation import RANGES, Configured, check_value, checked, hints_of
 
-FORMAT = 1
+FORMAT = 2
 Header = dict[str, Any]  # values that JSON can store
 
 
@@ -72,8 +77,7 @@ def read(path: str | Path, *kinds: str) -> tuple[str, dict[str, Tensor], Header]
                 )
             header = json.loads(metadata.get("header", ""))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
-            # files of 0.3.0 have no digest
-            if (known := metadata.pop("sha256", None)) is not None and known != _digest(tensors, metadata):
+            if metadata.pop("sha256", None) != _digest(tensors, metadata):
                 raise InputError(f"{path} is damaged: its content is not what was written; create the file again")
             for name, tensor in tensors.items():
                 if not bool(torch.isfinite(tensor).all()):
@@ -87,44 +91,56 @@ def read(path: str | Path, *kinds: str) -> tuple[str, dict[str, Tensor], Header]
     return kind, tensors, header
 
 
-def expect(tensors: dict[str, Tensor], shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Refuse tensors that are missing or have other shapes than the header implies.
+class Saved(Configured, ABC):
+    """Base class of fitted models that one file stores. A subclass with a `kind` is registered for `load`.
 
-    Call it before memory is allocated for sizes from the header: a damaged header may claim gigabytes.
-
-    Raises:
-        InputError: The first such tensor.
+    A subclass names in `saved` what `fit` sets, and annotates it. For example, `saved = "mean"` with
+    `mean: Annotated[Tensor, "float64 n 3"]`; see `unpack` for annotations. A name may also be that of a property with a
+    setter, whose result is annotated.
     """
-    for name, shape in shapes.items():
-        if name not in tensors:
-            raise InputError(f"{name} is missing")
-        if tuple(tensors[name].shape) != shape:
-            raise InputError(f"{name} has shape {tuple(tensors[name].shape)}, but the configuration calls for {shape}")
-
-
-class Saved(ABC):
-    """Base class of fitted models that one file stores. A subclass with a `kind` is registered for `load`."""
 
     kind: ClassVar[str]
     kinds: ClassVar[dict[str, type[Saved]]] = {}
+    saved: ClassVar[str] = ""
+    """attributes that a file contains besides the options and those of the base classes, in the order of reading"""
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         if "kind" in cls.__dict__:
             Saved.kinds[cls.kind] = cls
 
-    @abstractmethod
     def state(self) -> tuple[dict[str, Tensor], Header]:
-        """Return tensors by name, and plain values."""
+        """Return the tensors by name, and plain values.
+
+        Raises:
+            InputError: The model is not fitted, or its class does not annotate an attribute that it names in `saved`.
+        """
+        self.check_fitted()
+        for name in _names(type(self)):
+            _annotation(type(self), name)
+        tensors, header = pack(self)
+        return tensors, header
 
     @classmethod
-    @abstractmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Saved:
+    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
         """Return the model that `state` describes.
 
         Raises:
             InputError: Tensors and header do not match. No memory is allocated for sizes that only the header claims.
         """
+        model: Self = unpack(cls, tensors, header)
+        return model
+
+    def _restored(self) -> None:
+        """Compute what follows from the attributes of a file, and refuse those that do not fit together."""
+
+    def blank(self, saved: Mapping[str, Tensor]) -> nn.Module:
+        """Return a network like the one in the file, without memory for its weights.
+
+        Args:
+            saved: Tensors that the network takes over, if their number depends on the training.
+        """
+        raise NotImplementedError(f"{type(self).__name__} needs a method `blank` that returns its network")
 
     @checked
     def save(self, path: str | Path, provenance: dict[str, str] | None = None) -> None:
@@ -140,6 +156,188 @@ class Saved(ABC):
         check_folder(path, self.kind)
         tensors, header = self.state()
         write(path, self.kind, tensors, header | {"provenance": provenance or {}})
+
+
+def pack(value: Any, name: str = "") -> tuple[dict[str, Tensor], Any]:
+    """Return the tensors of a tree by their dotted names, and the rest as values that JSON can store.
+
+    In a tensor, the largest number of its type stands for nan, because a file contains finite values only.
+
+    Example:
+        >>> from swiftwrf.gp import GaussianProcess, Kernel
+        >>> tensors, header = pack(GaussianProcess(Kernel(), torch.zeros(2, 3)))
+        >>> sorted(tensors), header["kernel"]["noise"]
+        (['correlation', 'known', 'value'], 0.01)
+        >>> unpack(GaussianProcess, tensors, header).kernel == Kernel()
+        True
+    """
+    if isinstance(value, Tensor):
+        if value.is_floating_point():
+            value = value.where(~value.isnan(), torch.finfo(value.dtype).max)
+        return {name: value}, {}
+    if isinstance(value, nn.Module):
+        return {_joined(name, of): tensor for of, tensor in value.state_dict().items()}, {}
+    if isinstance(value, list | tuple) and not hasattr(value, "_fields"):
+        parts = {str(number): pack(part, _joined(name, str(number))) for number, part in enumerate(value)}
+        header: Any = [plain for _, plain in parts.values()]
+    elif isinstance(value, Saved | tuple) or is_dataclass(value):
+        parts = {part: pack(getattr(value, part), _joined(name, part)) for part in _names(type(value))}
+        header = {part: plain for part, (_, plain) in parts.items()}
+    else:
+        return {}, value
+    return {of: tensor for own, _ in parts.values() for of, tensor in own.items()}, header
+
+
+def unpack(
+    kind: Any, tensors: Mapping[str, Tensor], header: Any, name: str = "", sizes: dict[str, int] | None = None
+) -> Any:
+    """Return the tree of an annotation from what `pack` returned.
+
+    The annotation of a tensor contains its type and sizes, and bounds of its values, e.g.
+    `Annotated[Tensor, "float64 n 3", Gt(0)]`. The type is one or several, separated by a bar. `float` is any floating-point
+    type. A size is a number or a name, or a sum such as `1+n`. Equal names in one model or dataclass are equal sizes. A name
+    may be that of a whole number read before. `part.n` is the n of a part read before, e.g. `grid.n_azimuth`. The last word
+    `nan` allows nan.
+
+    Such a text also gives the length of a list or tuple. For a dataclass, `Annotated[Part, "k=n"]` states that the k of the
+    part is the n of the whole, and `"n"` that both have one n. Of several
+    dataclasses the names decide. Other annotations are those of `check_value`.
+
+    Args:
+        kind: Annotation.
+        tensors: Tensors by name; other names are ignored.
+        header: Plain values.
+        name: Dotted name of the tree in the file.
+        sizes: Sizes by their dotted names, filled while the file is read.
+
+    Raises:
+        InputError: A value is missing, or its annotation does not allow it.
+    """
+    sizes = {} if sizes is None else sizes
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Annotated and arguments[0] is Tensor:
+        return _tensor(arguments[1:], tensors, name, sizes)
+    if origin is Annotated and isinstance(arguments[1], str):
+        kind, words, whole = arguments[0], arguments[1].split(), name.rpartition(".")[0]
+        if is_dataclass(kind):
+            pairs = (word.split("=") for word in words)
+            sizes |= {_joined(name, pair[0]): sizes[_joined(whole, pair[-1])] for pair in pairs}
+            return unpack(kind, tensors, header, name, sizes)
+        value = unpack(kind, tensors, header, name, sizes)
+        _check_shape(name, (len(value),), words, sizes)
+        return value
+    if origin in (Union, UnionType):
+        kinds = [of for of in arguments if of is not NoneType]
+        if header is None and len(kinds) < len(arguments):
+            return None
+        if len(kinds) > 1 and isinstance(header, dict):
+            kinds = [of for of in kinds if header.keys() <= {*_names(of)}]
+        if len(kinds) == 1:
+            return unpack(kinds[0], tensors, header, name, sizes)
+    if origin in (list, tuple):
+        kinds = [arguments[0]] * len(header) if origin is list or arguments[-1] is ... else [*arguments]
+        parts = zip(kinds, header, strict=True)
+        return origin(unpack(of, tensors, x, _joined(name, str(n)), sizes) for n, (of, x) in enumerate(parts))
+    if isclass(kind) and (issubclass(kind, Saved | tuple) or is_dataclass(kind)):
+        return _unpacked(kind, tensors, header, name, sizes)
+    check_value(name, header, kind)
+    if isinstance(header, int):
+        sizes[name] = header
+    return header
+
+
+def _unpacked(kind: Any, tensors: Mapping[str, Tensor], header: Header, name: str, sizes: dict[str, int]) -> Any:
+    """Return a named tuple, a dataclass, or a model whose attributes are read in their order."""
+
+    def read_part(part: str) -> Any:
+        return unpack(_annotation(kind, part), tensors, header[part], _joined(name, part), sizes)
+
+    names = _names(kind)
+    if not isinstance(header, dict):
+        raise InputError(f"{name or 'the header'} must be a dictionary, got {header!r}")
+    for part in {*names, "provenance"} ^ {*header, "provenance"}:
+        raise InputError(f"{_joined(name, part)} is {'missing' if part in names else 'unknown'}")
+    if not issubclass(kind, Saved):
+        return kind(**{part: read_part(part) for part in names})
+    model = kind(read_part(names[0]))
+    for part in names[1:]:
+        of = _annotation(kind, part)
+        is_network = isclass(of) and issubclass(of, nn.Module)
+        setattr(model, part, _network(model.blank, tensors, _joined(name, part)) if is_network else read_part(part))
+    model._restored()
+    return model
+
+
+def _names(kind: type[Any]) -> list[str]:
+    """Return the names of what a file contains of a named tuple, dataclass or model."""
+    if not issubclass(kind, Saved):
+        return [*kind._fields] if hasattr(kind, "_fields") else [field.name for field in fields(kind) if field.init]
+    return ["config", *(name for base in reversed(kind.__mro__) for name in vars(base).get("saved", "").split())]
+
+
+def _annotation(kind: Any, name: str) -> Any:
+    if issubclass(kind, Saved) and name == "config":
+        return kind.config_type
+    known = getattr(kind, name, None)
+    hints = {name: hints_of(known.fget)["return"]} if isinstance(known, property) else hints_of(kind)
+    if name not in hints:
+        raise InputError(f"{kind.__name__} cannot be saved; annotate its attribute {name}, which it names in `saved`")
+    return hints[name]
+
+
+def _joined(*names: str) -> str:
+    return ".".join(filter(None, names))
+
+
+def _tensor(annotation: tuple[Any, ...], tensors: Mapping[str, Tensor], name: str, sizes: dict[str, int]) -> Tensor:
+    if name not in tensors:
+        raise InputError(f"{name} is missing")
+    (text, *bounds), tensor = annotation, tensors[name]
+    kinds, *words = text.split()
+    found = str(tensor.dtype).removeprefix("torch.")
+    if not found.startswith(tuple(kinds.split("|"))):
+        raise InputError(f"{name} has numbers of type {found}, expected {kinds}")
+    if words[-1:] == ["nan"]:
+        words.pop()
+        tensor = tensor.masked_fill(tensor == torch.finfo(tensor.dtype).max, torch.nan)
+    _check_shape(name, tuple(tensor.shape), words, sizes)
+    for bound in bounds:
+        described, attribute, holds = RANGES[type(bound)]
+        if not bool(torch.as_tensor(holds(tensor, getattr(bound, attribute))).all()):
+            raise InputError(f"{name} must be {described} {getattr(bound, attribute)}")
+    return tensor
+
+
+def _check_shape(name: str, shape: tuple[int, ...], words: list[str], sizes: dict[str, int]) -> None:
+    """Refuse a shape that the words of an annotation do not allow. New names become those of the sizes found."""
+    wanted: list[int | str] = []
+    for axis, word in enumerate(words):
+        *added, last = word.split("+")
+        constant = sum(map(int, added))
+        if last.isdecimal():
+            wanted.append(constant + int(last))
+        elif axis < len(shape):
+            wanted.append(
+                constant + sizes.setdefault(_joined(name.rpartition(".")[0], last), max(0, shape[axis] - constant))
+            )
+        else:
+            wanted.append(word)
+    if list(shape) != wanted:
+        raise InputError(f"{name} has shape {shape}, but the configuration calls for ({', '.join(map(str, wanted))})")
+
+
+def _network(blank: Callable[[Mapping[str, Tensor]], nn.Module], tensors: Mapping[str, Tensor], name: str) -> nn.Module:
+    """Return the network of a file, without gradients. No memory is allocated before its shapes are checked."""
+    known = {of.removeprefix(f"{name}."): tensor for of, tensor in tensors.items() if of.startswith(f"{name}.")}
+    with torch.device("meta"):
+        network = blank(known)
+    state = network.state_dict()
+    for of, empty in state.items():
+        if of not in known:
+            raise InputError(f"{name}.{of} is missing")
+        _check_shape(f"{name}.{of}", tuple(known[of].shape), [*map(str, empty.shape)], {})
+    network.load_state_dict({of: known[of].to(empty.dtype) for of, empty in state.items()}, assign=True)
+    return network.eval().requires_grad_(False)
 
 
 def load(path: str | Path) -> Saved:

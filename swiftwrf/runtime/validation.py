@@ -14,7 +14,7 @@ import sys
 import types
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, replace
 from numbers import Integral, Real
 from typing import (
     TYPE_CHECKING,
@@ -149,7 +149,7 @@ def configuration(cls: type[Class]) -> type[Class]:
     """
 
     def check_fields(self: Any) -> None:
-        hints = _hints(cls)  # type: ignore[arg-type]
+        hints = hints_of(cls)  # type: ignore[arg-type]
         for field in fields(self):
             value = getattr(self, field.name)
             check_value(field.name, value, hints[field.name])
@@ -165,7 +165,8 @@ def configuration(cls: type[Class]) -> type[Class]:
 
 
 @functools.cache
-def _hints(annotated: Any) -> dict[str, Any]:
+def hints_of(annotated: Any) -> dict[str, Any]:
+    """Return the annotations of a class or function, resolved and with their ranges."""
     return get_type_hints(annotated, include_extras=True)
 
 
@@ -187,7 +188,7 @@ def checked(function: Function) -> Function:
 
     @functools.wraps(function)
     def wrapped(*arguments: Any, **options: Any) -> Any:
-        hints = _hints(function)
+        hints = hints_of(function)
         try:
             bound = signature.bind(*arguments, **options)
         except TypeError as error:
@@ -276,15 +277,3 @@ def all_or_nothing(fit: Function) -> Function:
         return self
 
     return fit_copy  # type: ignore[return-value]
-
-
-def from_plain(config_type: type[Any], options: Mapping[str, Any]) -> Any:
-    """Return a configuration from values that JSON has stored: nested configurations as objects, tuples as lists."""
-    hints = get_type_hints(config_type)
-
-    def restored(name: str, value: Any) -> Any:
-        if is_dataclass(hints.get(name)):
-            return from_plain(hints[name], value)
-        return tuple(value) if isinstance(value, list) else value
-
-    return config_type(**{name: restored(name, value) for name, value in options.items()})

@@ -33,18 +33,13 @@ class Recorder(FieldModel):
 
     name = "recorder"
     kind = "recorder"
+    saved = ""
 
     def _fit(self, train, like=None, **_):
         self.train = train
 
     def _predict(self, position, grid, with_std):
         return torch.full((len(position), *grid.shape), 2.0), None
-
-    def _state(self):
-        return {}, {}
-
-    def _restore(self, tensors, header):
-        pass
 
 
 @settings(max_examples=6, deadline=None)
@@ -253,7 +248,7 @@ def test_a_model_of_two_methods_is_registered_fitted_and_refuses_to_be_saved(tmp
         FIELD_MODELS.register("mine")(Mean)
         model = make_model("mine").fit(TRAIN)
     assert "Mean" in model._repr_html_()
-    with pytest.raises(InputError, match="Mean cannot be saved; its class needs _state and _restore"):
+    with pytest.raises(InputError, match="Mean cannot be saved; its class must name what `_fit` sets in `saved`"):
         model.save(tmp_path / "model")
     with pytest.raises(InputError, match="Mean: cannot be updated"):
         model.update(TEST)

@@ -187,12 +187,6 @@ class Mean(FieldModel):
     def _predict(self, position, grid, with_std):
         return self.mean.expand(len(position), *grid.shape), None
 
-    def _state(self):
-        return {"mean": self.mean}, {}
-
-    def _restore(self, tensors, header):
-        self.mean = tensors["mean"]
-
 
 @pytest.mark.parametrize("name", ["kernel_regression", "aann_kernel"])  # which solve with a Gram matrix
 @pytest.mark.parametrize("noise", [0.0, 1e-7])

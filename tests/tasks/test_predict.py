@@ -66,15 +66,15 @@ def test_a_damaged_network_is_refused(network, tmp_path, change):
         pytest.skip("the network has no kernel regression")
     match change:
         case "missing":
-            del tensors["offset" if kind == AANN.kind else "dual"]
+            del tensors["_offset" if kind == AANN.kind else "_direction.dual"]
         case "shape":
-            tensors["network.fc.0.weight"] = torch.zeros(3, 3)
+            tensors["_network.fc.0.weight"] = torch.zeros(3, 3)
         case "features":
-            tensors["known"] = tensors["known"][:, :100]
+            tensors["_direction.known"] = tensors["_direction.known"][:, :100]
         case "scale":
-            tensors["scale"] = torch.zeros(2)
+            tensors["_scale"] = torch.zeros(2)
         case "width":
-            header["gamma"] = -1.0
+            header["_direction"]["gamma"] = -1.0
         case "config":
             header["config"]["layers"] = 3
         case "grid":

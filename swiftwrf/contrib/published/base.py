@@ -18,7 +18,6 @@ from swiftwrf.data.spectra import Spectra, fingerprint
 from swiftwrf.models.base import CPU, FieldModel
 from swiftwrf.models.link import Linked
 from swiftwrf.positions import frame, normalise
-from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.descent import Descent, Model, warm_cosine
 from swiftwrf.runtime.validation import Fraction, NonNegativeInt, PositiveFloat, PositiveInt, configuration
 
@@ -111,6 +110,7 @@ class TrainedModel(Linked, FieldModel):
 
     slow = True
 
+    saved = "network"
     network: nn.Module
     """trained network; the gradients of its parameters are off"""
 
@@ -150,26 +150,6 @@ class TrainedModel(Linked, FieldModel):
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         return self.render(self.network, position, grid), None
-
-    def _state(self) -> tuple[dict[str, Tensor], Header]:
-        return self.network.state_dict(), {}
-
-    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
-        self.network = restored(lambda: self.blank(tensors), tensors)
-
-
-def restored(make: Callable[[], Model], tensors: dict[str, Tensor]) -> Model:
-    """Return the module that `make` returns, with saved tensors and without gradients.
-
-    Raises:
-        InputError: Tensors are missing or have other shapes. No memory is allocated before this check.
-    """
-    with torch.device("meta"):
-        blank = make()
-    expect(tensors, {name: tuple(tensor.shape) for name, tensor in blank.state_dict().items()})
-    model = make()
-    model.load_state_dict(tensors)
-    return model.eval().requires_grad_(False)
 
 
 def draw_parameters(model: nn.Module, generator: torch.Generator) -> None:

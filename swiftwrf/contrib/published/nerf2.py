@@ -32,21 +32,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.contrib.published.base import Config, Count, Depth, TrainedModel, Training, draw_parameters, restored
+from swiftwrf.contrib.published.base import Config, Count, Depth, TrainedModel, Training, draw_parameters
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.models.base import CPU, FIXED_END, check_predicted
 from swiftwrf.models.mlp import SkipMLP, encode
 from swiftwrf.positions import frame, normalise
 from swiftwrf.rssi.base import SavedRssiPredictor
-from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
 
 MAX_SAMPLES = {
@@ -271,14 +270,15 @@ class NeRF2Rssi(SavedRssiPredictor):
     requires_receiver_position = True
     slow = True
 
+    saved = "field centre"
     field: Field
-    centre: Tensor
-    """centre of the box around the training positions, (3,) [m]"""
+    centre: Annotated[Tensor, "float64 3"]
+    """centre of the box around the training positions [m]"""
 
     def _fit(self, train: Rssi, *, device: torch.device = CPU, progress: bool = False, **_: Any) -> None:
         """Descend the squared error of amplitudes where RSSI was detected."""
         self.centre = frame(train.transmitter_position)[0]
-        config, field = self.config, self._blank()
+        config, field = self.config, self.blank()
         draw_parameters(field, torch.Generator().manual_seed(config.seed))
         detected = (~train.rssi_dbm.isnan()).any(dim=1)
         position = train.transmitter_position[detected]
@@ -293,7 +293,7 @@ class NeRF2Rssi(SavedRssiPredictor):
         training = Training(config, field.to(device), loss, betas=(0.9, 0.999), weight_decay=config.weight_decay)
         self.field = training.run("", progress=progress).cpu()
 
-    def _blank(self) -> Field:
+    def blank(self, saved: Mapping[str, Tensor] | None = None) -> Field:
         return Field(self.config.width, self.config.depth, self.config.bands)
 
     def _amplitude(self, field: Field, position: Tensor) -> Tensor:
@@ -310,15 +310,3 @@ class NeRF2Rssi(SavedRssiPredictor):
         some = position.split(max(1, MAX_SAMPLES["cpu"] // n_samples))
         amplitude = torch.cat([self._amplitude(self.field, part) for part in some])
         return check_predicted(self, 100 * (amplitude.double() - 1), amplitude.shape), None
-
-    def state(self) -> tuple[dict[str, Tensor], Header]:
-        self.check_fitted()
-        return self.field.state_dict() | {"centre": self.centre}, self._header()
-
-    @classmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
-        model = cls._of_header(header)
-        expect(tensors, {"centre": (3,)})
-        model.centre = tensors.pop("centre").double()
-        model.field = restored(model._blank, tensors)
-        return model

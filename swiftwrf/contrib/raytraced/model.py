@@ -12,10 +12,10 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.contrib.raytraced import Material, Scene, Surface, Tracing, open_scene, sionna, trace
 from swiftwrf.contrib.raytraced.rooms import rectangle
 from swiftwrf.data.spectra import Spectra
+from swiftwrf.errors import InputError
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel
 from swiftwrf.models.geometry import GeometryConfig, GeometryModel
 from swiftwrf.models.link import Linked
-from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.validation import configuration
 
 MAX_DISTANCE_M = 1e4  # from the fixed end; beyond, single precision loses the phase
@@ -45,6 +45,8 @@ class RaytraceModel(Linked, FieldModel):
     slow = True
     any_grid = True
 
+    saved = "_room"
+    _room: GeometryModel | None
     progress: bool = False
     """whether `predict` shows a progress bar on a terminal"""
 
@@ -96,11 +98,10 @@ class RaytraceModel(Linked, FieldModel):
         spectrum[near[reached]] = self.array.spectrum(channel[reached], grid)
         return spectrum, None
 
-    def _state(self) -> tuple[dict[str, Tensor], Header]:
-        return ({}, {}) if self._room is None else self._room._state()
-
-    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
-        self._room = GeometryModel.within(self, tensors, header) if self.config.scene is None else None
+    def _restored(self) -> None:
+        super()._restored()
+        if (self._room is None) == (self.config.scene is None):
+            raise InputError("ray tracing needs a scene or a room")
         self._build()
 
 

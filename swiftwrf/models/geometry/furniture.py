@@ -16,12 +16,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from annotated_types import Ge, Gt, Lt
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from torch import Tensor
@@ -33,14 +34,12 @@ from swiftwrf.models.geometry.images import MAX_COSINE, PhaseObservations, Plane
 from swiftwrf.models.geometry.planes import Plane, log_advantage, log_explained, plane_set, robust_advantage
 from swiftwrf.models.geometry.surfaces import find_surfaces
 from swiftwrf.plotting import Axes, corners_of, hatch, plan_map
-from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.threads import parallel_map, single_thread
 
 Floats = NDArray[np.float64]
 MAX_VOXELS = 50_000
 MIN_SHOWN_DB = 1.0  # absorption [dB/m] of a voxel in JSON: less differs little from empty space
 N_STEPS = 150  # of Adam
-TENSORS = ("low", "absorption", "reflectivity", "crossed_m")
 # edge of a voxel [wavelengths] and weight of the penalty
 SETTINGS = ((2.0, 1e-3), (1.0, 1e-3), (2.0, 3e-3), (2.0, 3e-4))
 SIGNIFICANCE = 2.5  # standard errors by which furniture must explain held-out channels better
@@ -64,11 +63,11 @@ class Furniture:
         surfaces: Reflecting surfaces besides the planes of the room, after which their rows of `reflectivity` come.
     """
 
-    low: Tensor
-    voxel_m: float
-    absorption: Tensor
-    reflectivity: Tensor
-    crossed_m: Tensor
+    low: Annotated[Tensor, "float64 3"]
+    voxel_m: Annotated[float, Gt(0), Lt(math.inf)]
+    absorption: Annotated[Tensor, "float32 x y z", Ge(0)]
+    reflectivity: Annotated[Tensor, "float32 s c"]
+    crossed_m: Annotated[Tensor, "float32 x y z"]
     penalty: float
     surfaces: tuple[Plane, ...] = ()
 
@@ -91,27 +90,18 @@ class Furniture:
         reflectivity[plane] = value
         return replace(self, reflectivity=reflectivity)
 
-    def state(self) -> tuple[dict[str, Tensor], Header]:
-        """Return the tensors by name, and plain values."""
-        return {name: getattr(self, name) for name in TENSORS}, {
-            "voxel_m": self.voxel_m,
-            "penalty": self.penalty,
-            "surfaces": [asdict(plane) for plane in self.surfaces],
-        }
+    def check(self, n_planes: int) -> None:
+        """Refuse other cells than those of the voxels on the planes of a room and on the surfaces.
 
-    @classmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header, n_planes: int) -> Furniture:
-        """Return the furniture of a room of planes that `state` describes."""
-        shape = tuple(tensors["absorption"].shape)
-        n_cells = math.prod(shape) // max(1, min(shape, default=1))
-        surfaces = tuple(Plane(**{**plane, "normal": tuple(plane["normal"])}) for plane in header["surfaces"])
-        cells = n_planes + len(surfaces), n_cells
-        expect(tensors, {"low": (3,), "absorption": shape, "crossed_m": shape, "reflectivity": cells})
-        values = {name: tensors[name] for name in TENSORS}
-        found = cls(**values, voxel_m=header["voxel_m"], penalty=header["penalty"], surfaces=surfaces)
-        if len(shape) != 3 or not (found.voxel_m > 0 and float(found.absorption.min()) >= 0):
-            raise InputError("voxels of furniture need three dimensions, an edge above 0 and no negative absorption")
-        return found
+        Raises:
+            InputError: The reflectivity has another shape.
+        """
+        voxels = self.absorption.shape
+        shape = n_planes + len(self.surfaces), math.prod(voxels) // max(1, min(voxels))
+        if self.reflectivity.shape != shape:
+            raise InputError(
+                f"reflectivity has shape {tuple(self.reflectivity.shape)}, but planes and voxels need {shape}"
+            )
 
     def to_json(self) -> dict[str, Any]:
         """Return what stands in the room as plain values.

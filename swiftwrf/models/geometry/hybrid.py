@@ -9,7 +9,8 @@ alone.
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor, nn
@@ -26,9 +27,8 @@ from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.path_gains import PathGains, choose_prior, fit_path_gains, kernel_of
 from swiftwrf.models.geometry.planes import advantage
 from swiftwrf.models.process import ProcessModel
-from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.threads import single_thread
-from swiftwrf.runtime.validation import Fraction, check_value
+from swiftwrf.runtime.validation import Fraction
 
 MAX_COMPONENTS = 64  # principal components of the residual spectra
 MAX_PIXELS = 4000  # of a spectrum, to choose kernel and mixing weight
@@ -55,14 +55,16 @@ class HybridModel(ProcessModel):
     searches = True
     batch = 256
 
+    saved = "_room path_gains mixing_weight component"
     path_gains: PathGains | None
     """gains of the paths; None if they are constant"""
-    mixing_weight: float
+    mixing_weight: Fraction
     """weight of the geometric part, 0 to 1"""
     process: GaussianProcess
     """process of the k component scores of the residual"""
-    component: Tensor
-    """mean residual spectrum, then its components, float32 (1 + k, pixels)"""
+    component: Annotated[Tensor, "float32 1+process.k pixels"]
+    """mean residual spectrum, then its components"""
+    _room: GeometryModel
 
     @classmethod
     def accepts_like(cls, model: FieldModel) -> bool:
@@ -172,30 +174,14 @@ class HybridModel(ProcessModel):
             mean = mean + self.mixing_weight * self._paths(position)
         return mean, self._std(position, grid) if with_std else None
 
-    def _state(self) -> tuple[dict[str, Tensor], Header]:
-        parts = [self.room._state(), self.process.state()]
-        if self.path_gains is not None:
-            parts.append(self.path_gains.state())
-        tensors, own = {"component": self.component} | {"spread": self.spread}, {"mixing_weight": self.mixing_weight}
-        for some, header in parts:
-            tensors |= some
-            own |= header
-        return tensors, own
-
-    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
-        self._room = GeometryModel.within(self, tensors, header)
-        self.process = GaussianProcess.from_state(tensors, header, torch.float32, exact=True)
-        n_scores, pixels = tensors["value"].shape[-1], self.grid.shape[0] * self.grid.shape[1]
-        expect(tensors, {"component": (1 + n_scores, pixels)})
-        self._restore_spread(tensors)
-        check_value("mixing_weight", header["mixing_weight"], Fraction)
-        self.mixing_weight, self.component, self.path_gains = (
-            header["mixing_weight"],
-            tensors["component"].float(),
-            None,
-        )
-        if "path_gains.kernel" in header:
-            self.path_gains = PathGains.from_state(tensors, header, self.room)
+    def _restored(self) -> None:
+        super()._restored()
+        sizes = math.prod(self.grid.shape), 1 + len(self.room.reflectors.sequence)
+        found = self.component.shape[1], sizes[1] if self.path_gains is None else self.path_gains.n_paths
+        if self.room.grid != self.grid or found != sizes:
+            raise InputError(
+                f"grid and room have {sizes[0]} pixels and {sizes[1]} paths, the components and gains {found}"
+            )
 
 
 def _mixing_weight(position: Tensor, seen: Tensor, known: Tensor, fold: Tensor, kernel: Kernel) -> tuple[float, bool]:

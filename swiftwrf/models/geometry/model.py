@@ -26,7 +26,6 @@ from swiftwrf.models.geometry.images import PhaseObservations, PlaneSet, Sequenc
 from swiftwrf.models.geometry.planes import Plane, RoomEstimate, plane_set, refine
 from swiftwrf.models.link import Link, Linked
 from swiftwrf.positions import check_positions
-from swiftwrf.runtime.checkpoint import Header, expect
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import checked
 
@@ -58,6 +57,7 @@ class GeometryModel(Linked, FieldModel):
     any_grid = True
     batch = 256
 
+    saved = "estimate fingerprint furniture"
     estimate: RoomEstimate
     """planes with their uncertainty"""
     fingerprint: str
@@ -94,14 +94,6 @@ class GeometryModel(Linked, FieldModel):
         model.grid, model.bounds, model.link = link.grid, bounding_box(link.position), Link.from_spectra(link)
         model.estimate, model.fingerprint = estimate, ""
         return model
-
-    @classmethod
-    def within(cls, model: FieldModel, tensors: dict[str, Tensor], header: Header) -> Self:
-        """Return the room that a saved model of another kind contains."""
-        room = cls()
-        room.grid, room.bounds, room.link = model.grid, model.bounds, model.link
-        room._restore(tensors, header)
-        return room
 
     def _fit(self, train: Spectra, *, like: FieldModel | None = None, progress: bool = False, **_: Any) -> None:
         owner, known = fingerprint(train), like.room if like else None
@@ -294,26 +286,10 @@ class GeometryModel(Linked, FieldModel):
             (high if plane.normal[axis] > 0 else low)[axis] = at
         return torch.stack([(low + high) / 2, low, high])
 
-    def _state(self) -> tuple[dict[str, Tensor], Header]:
-        header = self.estimate.to_json() | {"conclusion": self.conclusion, "fingerprint": self.fingerprint}
-        if self.furniture is None:
-            return {"covariance": self.estimate.covariance}, header
-        tensors, own = self.furniture.state()
-        return {"covariance": self.estimate.covariance} | tensors, header | own
-
-    def _restore(self, tensors: dict[str, Tensor], header: Header) -> None:
-        planes, order = header["planes"], header["order"]
-        expect(tensors, {"covariance": (len(planes), len(planes))})
-        self.fingerprint = str(header["fingerprint"])
-        self.furniture = Furniture.from_state(tensors, header, len(planes)) if "voxel_m" in header else None
-        self.estimate = RoomEstimate(
-            planes=[Plane.from_json(plane) for plane in planes],
-            order=order,
-            score_held_out=float(header["score_held_out"]),
-            unexplained=float(header["unexplained"]),
-            conclusion=str(header["conclusion"]),
-            covariance=tensors["covariance"].double(),
-        )
+    def _restored(self) -> None:
+        super()._restored()
+        if self.furniture is not None:
+            self.furniture.check(len(self.planes))
 
 
 def _points(scene: PhaseObservations, room: PlaneSet, sequence: Sequence) -> Tensor | None:

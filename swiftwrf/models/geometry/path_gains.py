@@ -28,15 +28,12 @@ from swiftwrf.models.geometry.images import PhaseObservations
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation
 from swiftwrf.models.geometry.planes import advantage
-from swiftwrf.runtime.checkpoint import Header
 from swiftwrf.runtime.threads import parallel_map, single_thread
-from swiftwrf.runtime.validation import check_value
+from swiftwrf.runtime.validation import PositiveInt
 
 MAX_CHOICE = 200  # spectra that choose the prior
 MIN_ERROR = 1e-6  # of squared co-array numbers, by rounding
 HIGHEST_ORDER, MAX_PATHS = 3, 100  # of the image sources that may be added to those of the room
-
-PREFIX = "path_gains."  # of the names in a file
 
 PriorName = Literal["loose", "tight"]
 
@@ -66,6 +63,7 @@ PRIORS: dict[PriorName, GainPrior] = {
 }
 
 
+@dataclass(frozen=True, eq=False)
 class PathGains:
     """Gains of the direct path and of each image as functions of position, in F equally plausible fields.
 
@@ -79,23 +77,15 @@ class PathGains:
         InputError: Coefficients that do not fit the number of paths.
     """
 
-    def __init__(self, process: GaussianProcess, n_paths: int, prior: PriorName = "loose") -> None:
-        self.process, self.n_paths, self.prior = process, n_paths, prior
-        if (size := process.value.shape[1]) == 0 or size % (2 * n_paths):
-            raise InputError(f"path gains of {n_paths} paths need multiples of {2 * n_paths} coefficients, got {size}")
+    process: GaussianProcess
+    n_paths: PositiveInt
+    prior: PriorName = "loose"
 
-    def state(self) -> tuple[dict[str, Tensor], Header]:
-        """Return the tensors by name, and plain values."""
-        tensors, header = self.process.state(PREFIX)
-        return tensors, header | {f"{PREFIX}prior": self.prior}
-
-    @classmethod
-    def from_state(cls, tensors: dict[str, Tensor], header: Header, geometry: GeometryModel) -> PathGains:
-        """Return the path gains of a room that `state` describes."""
-        prior = header[f"{PREFIX}prior"]
-        check_value(f"{PREFIX}prior", prior, PriorName)
-        process = GaussianProcess.from_state(tensors, header, torch.float32, exact=True, prefix=PREFIX)
-        return cls(process, 1 + len(geometry.reflectors.sequence), prior)
+    def __post_init__(self) -> None:
+        if (size := self.process.value.shape[1]) == 0 or size % (2 * self.n_paths):
+            raise InputError(
+                f"path gains of {self.n_paths} paths need multiples of {2 * self.n_paths} coefficients, got {size}"
+            )
 
     def averaged(self) -> PathGains:
         """Return the mean of the fields, as one field."""

@@ -100,12 +100,12 @@ class RoomEstimate:
         InputError: More than 64 planes, or an order outside 0 to 4.
     """
 
-    planes: list[Plane]
+    planes: Annotated[list[Plane], "p"]
     order: int
     score_held_out: float
     unexplained: float
     conclusion: str
-    covariance: Tensor
+    covariance: Annotated[Tensor, "float64 p p"]
 
     def __post_init__(self) -> None:
         check_value("order", self.order, Annotated[int, Ge(0), Le(MAX_ORDER)])

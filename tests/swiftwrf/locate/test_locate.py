@@ -314,10 +314,10 @@ def test_spectra_at_one_position_are_held_out_together():
 @pytest.mark.parametrize(
     ("name", "value", "says"),
     [
-        ("weight", -1.0, "weight must be 0 to 1000"),
-        ("weight", 1e30, "weight must be 0 to 1000"),
-        ("path_gains.value", 3.4e38, "no candidate position has a finite likelihood"),
-        ("scale", -1.0, "of no distribution"),
+        ("weight", -1.0, "weight must be at least 0"),
+        ("weight", 1e30, "weight must be at most 1000"),
+        ("likelihoods.gains.process.value", 3.4e38, "no candidate position has a finite likelihood"),
+        ("likelihoods.coarray.0.scale", -1.0, "of no distribution"),
     ],
 )
 def test_a_locator_whose_numbers_overflow_is_refused(closed_form, name, value, says):

@@ -256,7 +256,7 @@ def test_predictions_of_each_device_are_drawn_tabulated_and_stored(fitted, posit
 def test_numbers_of_numpy_are_numbers():
     room = swiftwrf.simulated_room(n=np.int64(12), grid=AngularGrid.hemisphere(9, np.int32(36)))
     model = make_model("gp", seed=np.int64(3)).fit(room)
-    assert json.dumps(model.state()[1]["options"]) == json.dumps(make_model("gp", seed=3).config.__dict__)
+    assert json.dumps(model.state()[1]["config"]) == json.dumps(make_model("gp", seed=3).config.__dict__)
     assert len(model.predict(room.position).interval(np.float32(0.5))) == 2
 
 

@@ -579,7 +579,7 @@ def test_priors_of_path_gains_are_checked(hybrid):
     tensors, header = with_path_gains(hybrid, gains).state()
     assert HybridModel.from_state(tensors, header).path_gains.prior == "tight"
     with pytest.raises(InputError, match=r"path_gains\.prior"):
-        HybridModel.from_state(tensors, header | {"path_gains.prior": "narrow"})
+        HybridModel.from_state(tensors, header | {"path_gains": header["path_gains"] | {"prior": "narrow"}})
 
 
 def test_path_gains_stay_constant_where_nothing_is_hidden():

@@ -94,11 +94,11 @@ def test_load_refuses_other_files(tmp_path):
     with pytest.raises(InputError, match="not a readable"):
         load(tmp_path / "text")
     for header in ("", "[]", "{", "[" * 100_000, "3"):
-        save_file({}, tmp_path / "m", {"kind": "swiftwrf model", "format": "1", "header": header})
+        save_file({}, tmp_path / "m", {"kind": "swiftwrf model", "format": str(checkpoint.FORMAT), "header": header})
         with pytest.raises(InputError):
             load(tmp_path / "m")
     checkpoint.write(tmp_path / "other", "fit state", {"a": torch.zeros(1)}, {})
-    with pytest.raises(InputError, match="holds 'fit state' in format 1; expected '"):
+    with pytest.raises(InputError, match="holds 'fit state' in format 2; expected '"):
         load(tmp_path / "other")
 
 

@@ -104,7 +104,8 @@ def posterior(training, found):
     variances = {"field_db": training.field_db, "noise_db": training.noise_db}
     measured, table = (~training.rssi.isnan()).T.double(), HeadTable(training.rendered)
     rest = {"anchor": training.position, "measured": measured, **variances}
-    return RssiPosterior(training.receiver, training.kernel, table, huber=1.345, **tensors, **rest)
+    heads = {"receiver": training.receiver, "kernel": training.kernel, "table": table, "huber": 1.345}
+    return RssiPosterior(**heads, **tensors, **rest)
 
 
 # --- the regression -------------------------------------------------------------------------------------------------

@@ -58,7 +58,8 @@ def test_other_numbers_are_refused_although_they_are_finite(file):
         checkpoint.read(file, "kind")
 
 
-def test_files_of_before_the_digest_are_read(file):
-    metadata = {"kind": "kind", "format": "1", "header": json.dumps(HEADER)}
+def test_a_file_without_a_digest_is_refused(file):
+    metadata = {"kind": "kind", "format": str(checkpoint.FORMAT), "header": json.dumps(HEADER)}
     file.write_bytes(save(TENSORS, metadata))
-    assert is_as_written(file)
+    with pytest.raises(InputError, match="is damaged"):
+        checkpoint.read(file, "kind")
