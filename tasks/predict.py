@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pandas import DataFrame
 
-from augment.estimators import SavedEstimator
+from augment.estimators import Estimator
 from swiftwrf import FieldModel, InputError, Prediction, Rssi, load, predict
 from swiftwrf.data import ReadOptions
 from swiftwrf.data.coordinates import PlanFrame
@@ -64,7 +64,7 @@ def run(config: PredictConfig) -> None:
         if silent := int((~data.detected.any(dim=1)).sum()):
             console.print(f"{data.name}: rows that no receiver detected are left out: {silent}")
         table = predict(model, data, track=config.track, truth=is_known)
-    elif isinstance(model, MatchedField | SavedEstimator):
+    elif isinstance(model, MatchedField | Estimator):
         kind = "locator" if isinstance(model, MatchedField) else "estimator"
         store, known = observed_spectra(config.source, reading(config.spectra, config.table), model.grid, kind)
         table = predict(model, store if known is None else known, track=config.track)

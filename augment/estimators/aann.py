@@ -18,11 +18,11 @@ from torch.nn import functional
 from torch.optim.swa_utils import update_bn
 
 from augment import Mixed
-from augment.estimators.base import ESTIMATORS, EstimatorConfig, SavedEstimator
+from augment.estimators.base import ESTIMATORS, Estimator, EstimatorConfig
 from augment.estimators.resnet import backbone
 from swiftwrf.array.angles import to_angles, to_direction
 from swiftwrf.data.spectra import coarsening
-from swiftwrf.runtime.checkpoint import Header
+from swiftwrf.runtime.checkpoint import Header, Saved
 from swiftwrf.runtime.progress import progress
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, PositiveInt, Preset, configuration
 
@@ -65,7 +65,7 @@ class AANNConfig(EstimatorConfig):
 
 
 @ESTIMATORS.register("aann")
-class AANN(SavedEstimator):
+class AANN(Estimator, Saved):
     """ResNet-50 and a multilayer perceptron, the network of the paper, from a seeded start without downloads.
 
     Example:

@@ -11,7 +11,6 @@ from torch import Tensor
 from augment import Mixed
 from swiftwrf import AngularGrid, Spectra
 from swiftwrf.data.spectra import to_directions
-from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.registry import Registry
 from swiftwrf.runtime.validation import Configured, NonNegativeInt, Preset, configuration
 
@@ -41,6 +40,8 @@ class EstimatorConfig:
 class Estimator(Configured, ABC):
     """Base class of all estimators: fit to labelled spectra, then predict the direction behind a spectrum.
 
+    One that also derives from `Saved` has a file, which `swiftwrf.load` opens on the CPU.
+
     Args:
         config: Options as one object. Defaults to `config_type()`.
         options: Single options, which replace those of `config`.
@@ -58,6 +59,8 @@ class Estimator(Configured, ABC):
     trainable: ClassVar[bool] = True
     """whether more labelled spectra can reduce the error"""
     fitted_attribute = "grid"
+    saved: ClassVar[str] = "grid"
+    """what the file of an estimator contains that is `Saved`, too"""
 
     grid: AngularGrid
     """grid of the training spectra, set by `fit`"""
@@ -98,19 +101,6 @@ class Estimator(Configured, ABC):
 def estimated(estimator: Estimator, data: Spectra) -> Tensor:
     """Return the directions of measurements by an estimator of any class, checked, float64 (n, 2) [rad]."""
     return to_directions(f"directions of {type(estimator).__name__}", estimator.estimate(data), len(data))
-
-
-class SavedEstimator(Estimator, Saved):
-    """Base class of estimators that `save` writes to a file and `swiftwrf.load` reads, on the CPU.
-
-    A subclass sets `kind` and, as in every `Saved` model, `saved`.
-
-    Example:
-        >>> isinstance(make_estimator("kernel_regression"), SavedEstimator)
-        True
-    """
-
-    saved = "grid"
 
 
 ESTIMATORS: Registry[Estimator] = Registry("estimator", "swiftwrf.estimators")

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from augment import Mixed
-from augment.estimators.base import ESTIMATORS, Estimator, SavedEstimator
+from augment.estimators.base import ESTIMATORS, Estimator
 from swiftwrf.array.angles import to_angles, to_direction
 from swiftwrf.array.planar import folded_angles
-from swiftwrf.data.spectra import to_directions
 from swiftwrf.data.store import Store
+from swiftwrf.runtime.checkpoint import Saved
 
 SHORTLIST = 8  # candidates found by inner products, whose differences are then computed
 
@@ -59,7 +59,7 @@ class Constant(Estimator):
 
 
 @ESTIMATORS.register("nearest_spectrum")
-class NearestSpectrum(SavedEstimator):
+class NearestSpectrum(Estimator, Saved):
     """The label of the training spectrum with the least squared difference, hard to beat on a dense path.
 
     Inner products find candidates fast, but lose the digits in which similar spectra differ. Among the candidates, the
@@ -102,6 +102,3 @@ class NearestSpectrum(SavedEstimator):
     @spectrum.setter
     def spectrum(self, values: Tensor) -> None:
         self._batches = Store(values.float()).batches
-
-    def _restored(self) -> None:
-        self.label = to_directions("label", self.label, len(self.label))

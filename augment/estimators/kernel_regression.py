@@ -29,10 +29,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from augment import Mixed
-from augment.estimators.base import ESTIMATORS, SavedEstimator
+from augment.estimators.base import ESTIMATORS, Estimator
 from swiftwrf import InputError
 from swiftwrf.array.angles import to_angles, to_direction
 from swiftwrf.data.spectra import coarsening
+from swiftwrf.runtime.checkpoint import Saved
 
 WIDTH_CANDIDATES = (10.0, 20.0, 40.0, 80.0)  # gamma times the median squared distance
 PENALTY_CANDIDATES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
@@ -151,7 +152,7 @@ def _dual_coefficients(kernel: NDArray[Any], target: NDArray[Any], alpha: float)
 
 
 @ESTIMATORS.register("kernel_regression")
-class KernelRegression(SavedEstimator):
+class KernelRegression(Estimator, Saved):
     """Kernel regression from coarse spectra to directions, accurate for few training spectra.
 
     Example:

@@ -14,7 +14,7 @@ import torch
 
 from augment.choose import candidates
 from augment.cross_validation import LOCATOR, STAND_IN
-from augment.estimators import Estimator, SavedEstimator
+from augment.estimators import Estimator
 from augment.positions import Count
 from augment.turbo.condition import CHOSEN, LOCATED, NETWORKS, Condition, MeasuredSubset, Training
 from augment.turbo.experiment import ROOM_MODEL, Experiment
@@ -23,6 +23,7 @@ from augment.turbo.stages import compare, evaluate, find_room, hold_out, locate,
 from swiftwrf.choices import AUTO
 from swiftwrf.data import Spectra
 from swiftwrf.models import FieldModel
+from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.steps import Memo, Steps
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, Preset, checked
 
@@ -105,7 +106,7 @@ def learn(experiment: Experiment, keep: Memo, executor: Executor | None = None) 
     for result in results.values():
         if result.chosen is None or (condition := result.chosen[0]).method in result.files:
             continue
-        if isinstance(experiment.make_estimator(condition.estimator, 0), SavedEstimator):
+        if isinstance(experiment.make_estimator(condition.estimator, 0), Saved):
             title = f"{condition.method}, which is recommended"
             steps[steps.start(f"chosen-{condition.result_name}", title, evaluate, condition, CHOSEN)]
             result.files[condition.method] = CHOSEN

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from augment.choose import choose_model
 from augment.cross_validation import LOCATOR, cross_validate, degrees
-from augment.estimators import SavedEstimator
 from augment.estimators.base import estimated
 from augment.mix import Mixed, mix
 from augment.positions import SyntheticPositions, synthetic_positions
@@ -25,7 +24,7 @@ from swiftwrf.data.store import Store
 from swiftwrf.locate import MatchedField, MatchedFieldConfig, Posterior
 from swiftwrf.metrics import LEVEL, l1, psnr, ssim
 from swiftwrf.models.base import synthesized
-from swiftwrf.runtime.checkpoint import read, write
+from swiftwrf.runtime.checkpoint import Saved, read, write
 from swiftwrf.runtime.steps import STEPS
 
 KIND = "synthetic spectra"
@@ -245,7 +244,7 @@ def evaluate(experiment: Experiment, folder: Path, condition: Condition, saved_a
     estimator.fit(train, device=experiment.device)
     fitted = time.perf_counter()
     estimate = estimated(estimator, experiment.test)
-    if isinstance(estimator, SavedEstimator) and saved_as is not None:
+    if isinstance(estimator, Saved) and saved_as is not None:
         estimator.save(model_file(folder, saved_as, condition.subset.key))
     seconds = {"train": fitted - began, "estimate": time.perf_counter() - fitted}
     return {"estimate": estimate, "seconds": seconds, "history": estimator.history, "counts": train.counts}

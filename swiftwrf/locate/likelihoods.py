@@ -97,11 +97,6 @@ class Likelihoods(ABC):
     def screens(self, region: Region, count: int, most: int) -> tuple[Cells, list[Screen]]:
         """Return about `count` cells of a region, or `most` of them, and likelihoods at all of them that choose some."""
 
-    @property
-    @abstractmethod
-    def students(self) -> tuple[Student, ...]:
-        """Distributions of the errors of co-array numbers."""
-
     def check(self) -> None:
         """Refuse likelihoods from a file that do not fit their room.
 
@@ -109,10 +104,11 @@ class Likelihoods(ABC):
             InputError: Another number of variances, or scales that are those of no distribution.
         """
         size, count = 2 * len(differences(self.room.array)), 4 + self.room.reflectors.gain.shape[1]
-        if any(len(own.scale) != size or torch.linalg.cholesky_ex(own.scale).info.any() for own in self.students):
-            raise InputError("scales are those of no distribution of co-array numbers")
         if len(self.log_variance) != count:
             raise InputError(f"a room with {count - 4} planes has {count} variances, got {len(self.log_variance)}")
+        for scale in (part.distribution.scale for part in self.parts if isinstance(part, CoarrayLikelihood)):
+            if len(scale) != size or bool(torch.linalg.cholesky_ex(scale).info.any()):
+                raise InputError("scales are those of no distribution of co-array numbers")
 
     def __call__(self, position: Tensor, observed: SpectrumFeatures, weight: Tensor) -> Tensor:
         """Return log-likelihoods (k, n, m) of n observations at candidates (n, m, 3) [m], 0 for those of weight 0."""
@@ -204,10 +200,6 @@ class SpectrumLikelihoods(Likelihoods):
         parts = zip(*parallel_map(whitened, cells.position.split(BATCH_CANDIDATES)), strict=True)
         ones = torch.ones(len(cells.position))
         return cells, [own.screen(torch.cat(part), ones) for own, part in zip(likelihoods, parts, strict=True)]
-
-    @property
-    def students(self) -> tuple[Student, ...]:
-        return self.coarray
 
     def check(self) -> None:
         super().check()
@@ -336,10 +328,6 @@ class ChannelLikelihoods(Likelihoods):
             numbers, std = zip(*parallel_map(corrected, zip(some, positions, strict=True)), strict=True)
             screens.append(self._coarray.screen(torch.cat(numbers), torch.cat(std)))
         return cells, screens
-
-    @property
-    def students(self) -> tuple[Student, ...]:
-        return (self.nearby,)
 
     def check(self) -> None:
         super().check()

@@ -24,7 +24,6 @@ from swiftwrf.plotting import Displayed
 from swiftwrf.positions import check_near, check_positions
 from swiftwrf.rssi.detection import Detection
 from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation
-from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.threads import to_device
 from swiftwrf.runtime.validation import (
     Configured,
@@ -89,6 +88,8 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
     """positions evaluated at a time, few enough to stay in the processor's cache"""
 
     fitted_attribute = "receiver_names"
+    saved: ClassVar[str] = "receiver_position receiver_names origin offsets attenuation detection row_digests"
+    """what the file of a predictor contains that is `Saved`, too"""
     receiver_names: Annotated[tuple[str, ...], "r"]
     """names of the receivers, set by `fit`"""
     receiver_position: Annotated[Tensor, "float64 r 3 nan"]
@@ -338,12 +339,6 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
             return f"{type(self).__name__}(not fitted)"
         n = len(self.receiver_names)
         return f"{type(self).__name__}(fitted, {n} {'receiver' if n == 1 else 'receivers'})"
-
-
-class SavedRssiPredictor(RssiPredictor, Saved):
-    """Base class of predictors that one file stores."""
-
-    saved = "receiver_position receiver_names origin offsets attenuation detection row_digests"
 
 
 def in_batches(

@@ -25,7 +25,7 @@ from swiftwrf.models.base import CPU
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Axes
 from swiftwrf.positions import check_positions
-from swiftwrf.rssi.base import Map, RssiConfig, SavedRssiPredictor, columns_of, often_detected
+from swiftwrf.rssi.base import Map, RssiConfig, RssiPredictor, columns_of, often_detected
 from swiftwrf.rssi.detection import Detection, DetectionField
 from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
 from swiftwrf.rssi.maps import RssiMap
@@ -38,6 +38,7 @@ from swiftwrf.rssi.training import (
     prepare,
     rounding_std,
 )
+from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import parallel_map, single_thread
 from swiftwrf.runtime.validation import checked
@@ -46,7 +47,7 @@ MIN_PLACES = 30  # of a receiver; with fewer, held-out rows of all receivers cal
 RECEIVERS_AT_ONCE = 64  # between two steps of the progress bar; starting threads costs milliseconds
 
 
-class RssiModel(SavedRssiPredictor):
+class RssiModel(RssiPredictor, Saved):
     """50 primitives a receiver on a log-distance path-loss model, mixed with simpler predictors by cross-validation.
 
     It predicts RSSI at fixed receivers for any position of the transmitter, differentiable in the position.

@@ -27,9 +27,10 @@ from swiftwrf.metrics import HALF_WIDTH, interval_factor
 from swiftwrf.models.base import FieldConfig
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import Neighbours, check_positions, distance, nearest
-from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiPredictor, SavedRssiPredictor, in_batches
+from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiPredictor, in_batches
 from swiftwrf.rssi.path_loss import MIN_DISTANCE_M, fit_path_loss
 from swiftwrf.rssi.training import rounding_std
+from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import configuration
 
@@ -194,7 +195,7 @@ def scaled(pair: Tensor, ratio: float) -> Tensor:
     return pair * pair.new_tensor([1.0] * 3 + [ratio] * 3)
 
 
-class PairModel(PairPredictor, SavedRssiPredictor):
+class PairModel(PairPredictor, Saved):
     """A path-loss model in the distance of both ends, and a Gaussian process over both positions.
 
     A prediction conditions on the nearest 64 pairs (local Gaussian process). Lengths, noise and the ratio of the ends'

@@ -96,7 +96,8 @@ class Saved(Configured, ABC):
 
     A subclass names in `saved` what `fit` sets, and annotates it. For example, `saved = "mean"` with
     `mean: Annotated[Tensor, "float64 n 3"]`; see `unpack` for annotations. A name may also be that of a property with a
-    setter, whose result is annotated.
+    setter, whose result is annotated. A class with a network has a method `blank`. It takes the tensors of the network by
+    name and returns a network of the same shapes, whose weights take no memory.
     """
 
     kind: ClassVar[str]
@@ -118,8 +119,7 @@ class Saved(Configured, ABC):
         self.check_fitted()
         for name in _names(type(self)):
             _annotation(type(self), name)
-        tensors, header = pack(self)
-        return tensors, header
+        return pack(self)
 
     @classmethod
     def from_state(cls, tensors: dict[str, Tensor], header: Header) -> Self:
@@ -133,14 +133,6 @@ class Saved(Configured, ABC):
 
     def _restored(self) -> None:
         """Compute what follows from the attributes of a file, and refuse those that do not fit together."""
-
-    def blank(self, saved: Mapping[str, Tensor]) -> nn.Module:
-        """Return a network like the one in the file, without memory for its weights.
-
-        Args:
-            saved: Tensors that the network takes over, if their number depends on the training.
-        """
-        raise NotImplementedError(f"{type(self).__name__} needs a method `blank` that returns its network")
 
     @checked
     def save(self, path: str | Path, provenance: dict[str, str] | None = None) -> None:
@@ -200,8 +192,8 @@ def unpack(
     `nan` allows nan.
 
     Such a text also gives the length of a list or tuple. For a dataclass, `Annotated[Part, "k=n"]` states that the k of the
-    part is the n of the whole, and `"n"` that both have one n. Of several
-    dataclasses the names decide. Other annotations are those of `check_value`.
+    part is the n of the whole, and `"n"` that both have one n. Of several dataclasses the names decide. Other annotations
+    are those of `check_value`.
 
     Args:
         kind: Annotation.
@@ -293,37 +285,34 @@ def _tensor(annotation: tuple[Any, ...], tensors: Mapping[str, Tensor], name: st
     if name not in tensors:
         raise InputError(f"{name} is missing")
     (text, *bounds), tensor = annotation, tensors[name]
-    kinds, *words = text.split()
+    kinds, *words = text.removesuffix(" nan").split()
     found = str(tensor.dtype).removeprefix("torch.")
     if not found.startswith(tuple(kinds.split("|"))):
         raise InputError(f"{name} has numbers of type {found}, expected {kinds}")
-    if words[-1:] == ["nan"]:
-        words.pop()
-        tensor = tensor.masked_fill(tensor == torch.finfo(tensor.dtype).max, torch.nan)
     _check_shape(name, tuple(tensor.shape), words, sizes)
     for bound in bounds:
         described, attribute, holds = RANGES[type(bound)]
-        if not bool(torch.as_tensor(holds(tensor, getattr(bound, attribute))).all()):
+        if not bool(holds(tensor, getattr(bound, attribute)).all()):  # type: ignore[attr-defined]
             raise InputError(f"{name} must be {described} {getattr(bound, attribute)}")
+    if tensor.is_floating_point() and bool((gap := tensor == torch.finfo(tensor.dtype).max).any()):
+        if not text.endswith(" nan"):
+            raise InputError(f"{name} holds a value that is not finite")
+        return tensor.masked_fill(gap, torch.nan)
     return tensor
 
 
 def _check_shape(name: str, shape: tuple[int, ...], words: list[str], sizes: dict[str, int]) -> None:
     """Refuse a shape that the words of an annotation do not allow. New names become those of the sizes found."""
-    wanted: list[int | str] = []
-    for axis, word in enumerate(words):
+
+    def size(word: str, found: int) -> int:
         *added, last = word.split("+")
-        constant = sum(map(int, added))
-        if last.isdecimal():
-            wanted.append(constant + int(last))
-        elif axis < len(shape):
-            wanted.append(
-                constant + sizes.setdefault(_joined(name.rpartition(".")[0], last), max(0, shape[axis] - constant))
-            )
-        else:
-            wanted.append(word)
-    if list(shape) != wanted:
-        raise InputError(f"{name} has shape {shape}, but the configuration calls for ({', '.join(map(str, wanted))})")
+        constant, name_of_size = sum(map(int, added)), _joined(name.rpartition(".")[0], last)
+        return constant + (int(last) if last.isdecimal() else sizes.setdefault(name_of_size, found - constant))
+
+    wanted = [size(word, found) for word, found in zip(words, shape, strict=False)]
+    if [*shape] != wanted or len(words) > len(shape):
+        known = ", ".join(map(str, [*wanted, *words[len(wanted) :]]))
+        raise InputError(f"{name} has shape {shape}, but the configuration calls for ({known})")
 
 
 def _network(blank: Callable[[Mapping[str, Tensor]], nn.Module], tensors: Mapping[str, Tensor], name: str) -> nn.Module:
@@ -331,12 +320,11 @@ def _network(blank: Callable[[Mapping[str, Tensor]], nn.Module], tensors: Mappin
     known = {of.removeprefix(f"{name}."): tensor for of, tensor in tensors.items() if of.startswith(f"{name}.")}
     with torch.device("meta"):
         network = blank(known)
-    state = network.state_dict()
-    for of, empty in state.items():
-        if of not in known:
-            raise InputError(f"{name}.{of} is missing")
-        _check_shape(f"{name}.{of}", tuple(known[of].shape), [*map(str, empty.shape)], {})
-    network.load_state_dict({of: known[of].to(empty.dtype) for of, empty in state.items()}, assign=True)
+    state = {}
+    for of, empty in network.state_dict().items():
+        text = " ".join(["int|float|bool", *map(str, empty.shape)])
+        state[of] = _tensor((text,), tensors, _joined(name, of), {}).to(empty.dtype)
+    network.load_state_dict(state, assign=True)
     return network.eval().requires_grad_(False)
 
 

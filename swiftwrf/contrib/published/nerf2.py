@@ -45,7 +45,8 @@ from swiftwrf.data.spectra import Spectra
 from swiftwrf.models.base import CPU, FIXED_END, check_predicted
 from swiftwrf.models.mlp import SkipMLP, encode
 from swiftwrf.positions import frame, normalise
-from swiftwrf.rssi.base import SavedRssiPredictor
+from swiftwrf.rssi.base import RssiPredictor
+from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
 
 MAX_SAMPLES = {
@@ -254,7 +255,7 @@ class NeRF2(TrainedModel):
         return (grid.direction.flatten(0, 1).to(device, torch.float64) @ self.rotation.T.to(device)).float()
 
 
-class NeRF2Rssi(SavedRssiPredictor):
+class NeRF2Rssi(RssiPredictor, Saved):
     """A neural field for all receivers, its rays averaged; predictions are differentiable in the position.
 
     Example:
