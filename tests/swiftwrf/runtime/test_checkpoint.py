@@ -1,13 +1,18 @@
 """Saved models are opened as they were written, or refused."""
 
 import json
+from dataclasses import dataclass
+from typing import Annotated, Literal, NamedTuple
 
 import pytest
 import torch
+from annotated_types import Gt
 from safetensors.torch import load, save
+from torch import Tensor
 
 from swiftwrf import InputError
 from swiftwrf.runtime import checkpoint
+from swiftwrf.runtime.checkpoint import pack, unpack
 
 TENSORS = {
     "float": torch.tensor([[1.5, -2.0, 0.0], [4.0, 1e-30, 3e38]]),
@@ -63,3 +68,89 @@ def test_a_file_without_a_digest_is_refused(file):
     file.write_bytes(save(TENSORS, metadata))
     with pytest.raises(InputError, match="is damaged"):
         checkpoint.read(file, "kind")
+
+
+class Origin(NamedTuple):
+    latitude: float
+    longitude: float
+
+
+@dataclass
+class Rows:
+    position: Annotated[Tensor, "float64 n 3"]
+    value: Annotated[Tensor, "float n r nan"]
+
+
+@dataclass
+class Choice:
+    names: Annotated[tuple[str, ...], "r"]
+    rows: Annotated[Rows, "r"]
+    parts: list[Rows]
+    component: Annotated[Tensor, "float32 1+rows.n k", Gt(0)]
+    k: int
+    mode: Literal["one", "two"]
+    origin: Origin | None
+    mask: Annotated[Tensor, "bool k"] | None
+    other: Rows | Origin
+
+
+def tree(**changes):
+    generator = torch.Generator().manual_seed(0)
+
+    def rows(n):
+        return Rows(torch.rand(n, 3, generator=generator, dtype=torch.float64), torch.rand(n, 2, generator=generator))
+
+    known = {"names": ("a", "b"), "rows": rows(4), "parts": [rows(1), rows(2)], "k": 7, "mode": "two", "mask": None}
+    known |= {"component": torch.rand(5, 7) + 1, "origin": Origin(48.0, 11.0), "other": rows(3)}
+    return Choice(**known | changes)
+
+
+@pytest.mark.parametrize("changes", [{}, {"mask": torch.ones(7).bool(), "origin": None}, {"other": Origin(0.0, 1.0)}])
+def test_a_tree_is_unpacked_as_it_was_packed(changes, tmp_path):
+    before = tree(**changes)
+    before.rows.value[1, 0] = torch.nan
+    tensors, header = pack(before)
+    checkpoint.write(tmp_path / "tree", "tree", tensors, header)
+    after = unpack(Choice, *checkpoint.read(tmp_path / "tree", "tree")[1:])
+    torch.testing.assert_close(after.rows.value, before.rows.value, rtol=0, atol=0, equal_nan=True)
+    again = pack(after)
+    assert again[1] == header
+    assert all(torch.equal(again[0][name], tensor) for name, tensor in tensors.items())
+    assert (after.names, after.k, after.origin, after.mask is None) == (
+        before.names,
+        7,
+        before.origin,
+        before.mask is None,
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"names": ("a", "b", "c")}, r"rows.value has shape \(4, 2\), but the configuration calls for \(4, 3\)"),
+        ({"component": torch.ones(4, 7)}, r"component has shape \(4, 7\), .* \(5, 7\)"),
+        ({"component": torch.ones(5)}, r"component has shape \(5,\), .* \(5, k\)"),
+        ({"component": torch.ones(5, 7).double()}, "component has numbers of type float64, expected float32"),
+        ({"component": torch.zeros(5, 7)}, "component must be above 0"),
+        ({"component": torch.ones(5, 7) * torch.nan}, "component holds a value that is not finite"),
+        ({"mask": torch.ones(6).bool(), "k": 7}, r"mask has shape \(6,\)"),
+        ({"k": 7.5}, "k must be a whole number, got 7.5"),
+        ({"mode": "three"}, "mode must be 'one' or 'two', got 'three'"),
+        ({"origin": Origin(1.0, "x")}, "origin.longitude must be a number, got 'x'"),
+        ({"rows": None}, "rows must be a dictionary, got None"),
+        ({"parts": [Origin(0.0, 0.0)]}, r"parts\.0\.\w+ is (unknown|missing)"),
+    ],
+)
+def test_values_that_an_annotation_does_not_allow_are_refused(changes, says):
+    with pytest.raises(InputError, match=says):
+        unpack(Choice, *pack(tree(**changes)))
+
+
+def test_missing_and_unknown_names_are_refused():
+    tensors, header = pack(tree(mask=torch.ones(7).bool()))
+    with pytest.raises(InputError, match="mask is missing"):
+        unpack(Choice, {name: tensor for name, tensor in tensors.items() if name != "mask"}, header)
+    with pytest.raises(InputError, match="k is missing"):
+        unpack(Choice, tensors, {name: value for name, value in header.items() if name != "k"})
+    with pytest.raises(InputError, match="more is unknown"):
+        unpack(Choice, tensors, header | {"more": 1})
