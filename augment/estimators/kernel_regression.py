@@ -12,7 +12,7 @@ factor.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated, Any
 
@@ -65,7 +65,7 @@ class NadarayaWatson:
     """
 
     known: Annotated[Tensor, "float n p"]  # features of the training rows
-    dual: Annotated[Tensor, "float32 n k"]  # dual coefficients of the training rows
+    dual: Annotated[Tensor, "float64 n k"]  # dual coefficients of the training rows
     gamma: Annotated[float, Gt(0), Lt(math.inf)]  # inverse squared width of the kernel exp(-gamma |a - b|^2)
 
     @classmethod
@@ -82,7 +82,7 @@ class NadarayaWatson:
         some = slice(MAX_CHOICE_ROWS)
         gamma, alpha = choose(distance[some, some], target[some], seed)
         dual = _dual_coefficients(np.exp(-gamma * distance), target, alpha)
-        return cls(torch.from_numpy(feature).float(), torch.from_numpy(dual).float(), gamma)
+        return cls(torch.from_numpy(feature), torch.from_numpy(dual), gamma)
 
     def __call__(self, feature: NDArray[Any]) -> NDArray[Any]:
         """Return the predicted values (m, k) of features (m, p)."""
@@ -93,7 +93,7 @@ class NadarayaWatson:
 
     @cached_property
     def _arrays(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        return self.known.double().numpy(), self.dual.double().numpy()
+        return self.known.double().numpy(), self.dual.numpy()
 
     def check(self, n_features: int, n_values: int) -> None:
         """Refuse a regression from a file that has other numbers of features or values.
@@ -170,7 +170,8 @@ class KernelRegression(Estimator, Saved):
         rows = torch.from_numpy(kept_rows(len(train), self.config.seed))
         features = np.concatenate([_features(train.select(some)) for some in rows.split(BATCH_SPECTRA)])
         direction = to_direction(*train.label[rows].unbind(-1)).numpy()
-        self._direction = NadarayaWatson.fit(features, direction, self.config.seed)
+        fitted = NadarayaWatson.fit(features, direction, self.config.seed)
+        self._direction = replace(fitted, known=fitted.known.float())  # as the spectra are
 
     def predict(self, spectra: Tensor) -> Tensor:
         return torch.stack(to_angles(torch.from_numpy(self._direction(_features(spectra)))), dim=-1)

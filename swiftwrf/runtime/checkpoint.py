@@ -35,7 +35,12 @@ Header = dict[str, Any]  # values that JSON can store
 
 def write(path: str | Path, kind: str, tensors: dict[str, Tensor], header: Header) -> None:
     """Write a file atomically: an interrupted write leaves the old file. `read` refuses another kind of content."""
-    plain = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
+    plain, storages = dict[str, Tensor](), set[int]()
+    for name, tensor in tensors.items():
+        value = tensor.detach().cpu().contiguous()
+        is_shared = value.untyped_storage().data_ptr() in storages  # one tensor with two names, which is stored twice
+        plain[name] = value.clone() if is_shared else value
+        storages.add(value.untyped_storage().data_ptr())
     metadata = {"kind": kind, "format": str(FORMAT), "header": json.dumps(header)}
     write_bytes(Path(path), save(plain, metadata | {"sha256": _digest(plain, metadata)}))
 
@@ -164,8 +169,8 @@ def pack(value: Any, name: str = "") -> tuple[dict[str, Tensor], Any]:
         True
     """
     if isinstance(value, Tensor):
-        if value.is_floating_point():
-            value = value.where(~value.isnan(), torch.finfo(value.dtype).max)
+        if value.is_floating_point() and bool((gap := value.isnan()).any()):
+            value = value.masked_fill(gap, torch.finfo(value.dtype).max)
         return {name: value}, {}
     if isinstance(value, nn.Module):
         return {_joined(name, of): tensor for of, tensor in value.state_dict().items()}, {}

@@ -2,6 +2,7 @@
 
 import math
 from functools import cache
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
@@ -180,6 +181,9 @@ def test_an_estimator_that_changes_its_training_set_changes_no_other():
 
 class Mean(FieldModel):
     """Synthesizes one spectrum everywhere, as `constant_synthesizer` of the issue."""
+
+    saved = "mean"
+    mean: Annotated[torch.Tensor, "float32 grid.n_elevation grid.n_azimuth"]
 
     def _fit(self, train, **_):
         self.mean = train.spectrum.mean(0)

@@ -63,6 +63,13 @@ def test_other_numbers_are_refused_although_they_are_finite(file):
         checkpoint.read(file, "kind")
 
 
+def test_one_tensor_with_two_names_is_stored_twice(tmp_path):
+    checkpoint.write(tmp_path / "model", "kind", {"a": TENSORS["double"], "b": TENSORS["double"][:3]}, {})
+    _, tensors, _ = checkpoint.read(tmp_path / "model", "kind")
+    assert torch.equal(tensors["a"], TENSORS["double"])
+    assert torch.equal(tensors["b"], TENSORS["double"][:3])
+
+
 def test_a_file_without_a_digest_is_refused(file):
     metadata = {"kind": "kind", "format": str(checkpoint.FORMAT), "header": json.dumps(HEADER)}
     file.write_bytes(save(TENSORS, metadata))
