@@ -209,9 +209,12 @@ def write_geotiff(file: Path, data: RssiMap) -> None:
     """
     rasterio = optional_module("rasterio", f"{file.name} is a GeoTIFF, which rasterio writes", "formats")
     west, _, _, north = data.corners
-    place = (
-        f"+proj=aeqd +lat_0={data.origin.latitude} +lon_0={data.origin.longitude} +datum=WGS84" if data.origin else None
-    )
+    place = 'LOCAL_CS["local metres",UNIT["metre",1]]'
+    if data.origin is not None:
+        from pyproj.crs import ProjectedCRS  # takes a moment, and most data are in metres
+        from pyproj.crs.coordinate_operation import AzimuthalEquidistantConversion
+
+        place = ProjectedCRS(AzimuthalEquidistantConversion(*data.origin), geodetic_crs="EPSG:4326").to_wkt()
     options = {
         "driver": "GTiff",
         "count": len(data.mean),
@@ -219,7 +222,7 @@ def write_geotiff(file: Path, data: RssiMap) -> None:
         "width": len(data.x),
         "dtype": "float32",
         "nodata": math.nan,
-        "crs": place or 'LOCAL_CS["local metres",UNIT["metre",1]]',
+        "crs": place,
         "transform": rasterio.Affine(data.cell, 0, west, 0, -data.cell, north),
         "compress": "deflate",
     }
