@@ -51,7 +51,7 @@ def coverage_headline() -> str:
         sure = [row for row in every if row["n_certain"]]
         n_sure = sum(row["n_certain"] for row in sure)
         passed = sum(row["n_certain"] * row["certain_above"] for row in sure) / n_sure if sure else None
-        cells = [str(len(own)), str(n), f"{predicted:.0%}", f"{above:.0%}", f"{worst:+.1f}"]
+        cells = [str(len(own)), str(n), f"{predicted:.0%}", f"{above:.0%}", f"{round(worst, 1) + 0.0:+.1f}"]
         rows.append([name, *cells, "" if passed is None else f"{passed:.1%} of {n_sure}"])
     columns = ["data, split", "floors", "scans", "predicted", "counted", "largest difference of a floor [points]"]
     return markdown([*columns, "pass where P is 0.9 or more, all thresholds"], rows)
