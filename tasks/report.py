@@ -3,26 +3,21 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any
 
 from swiftwrf import InputError
+from swiftwrf.contrib.comparison.base import Result
 from swiftwrf.runtime.checkpoint import refusing
-from swiftwrf.runtime.durable import strict, write_json
-from tasks.aoa.experiment import record as aoa_record
+from swiftwrf.runtime.durable import write_text
 from tasks.aoa.page import page as aoa
 from tasks.configs import ReportConfig
 from tasks.directory import check_new_file, new_directory
 from tasks.environment import choose_device, environment, stamp
-from tasks.locate.experiment import record as locate_record
 from tasks.locate.page import page as locate
-from tasks.page.page import REPORT, Page, write_page
-from tasks.records import CONFIG, ENVIRONMENT, Records
-from tasks.rssi.experiment import record as rssi_record
+from tasks.page.page import REPORT, Page, as_html, drawn, write_page
+from tasks.records import Records
 from tasks.rssi.page import page as rssi
 from tasks.terminal import terminal
 
@@ -38,32 +33,22 @@ def run(config: ReportConfig) -> None:
     terminal.page({"runs": list(config.runs)}, "", page)
 
 
-def write(task: str, result: Any, file: Path) -> None:
+def write(task: str, result: Result, file: Path) -> None:
     """Write the report of a result of the library into an HTML file, without a directory of a run.
 
     Args:
         task: Name of the task.
-        result: `TurboResult`, `RssiComparison` or `LocateComparison`.
+        result: Result of the library.
         file: New file.
 
     Raises:
         InputError: The file is no .html, exists already, or its folder does not.
     """
     check_new_file(file, (".html", ".htm"))
-    with TemporaryDirectory() as name:
-        folder = Path(name)
-        match task:
-            case "aoa":
-                shutil.copytree(result.folder, folder, dirs_exist_ok=True)  # what the steps left for the report
-                metrics, source = aoa_record([result], folder), result.experiment.train.source
-            case "rssi":
-                metrics, source = rssi_record(result, folder), result.train.source
-            case _:
-                metrics, source = locate_record(result, folder), result.split.train.source
-        write_json(folder / CONFIG, {"command": CALLS[task]})
-        write_json(folder / ENVIRONMENT, environment(choose_device("cpu"), source))
-        write_page(folder, replace(PAGES[task]([Records(folder, strict(metrics))]), alone=True))
-        shutil.copyfile(folder / REPORT, file)
+    here = environment(choose_device("cpu"), result.source)
+    run = Records.of(result, result.folder or file, {"command": CALLS[task]}, here)
+    page = replace(PAGES[task]([run]), alone=True)
+    write_text(file, as_html(page, drawn(page)))
 
 
 def merge(folders: list[Path], out: Path) -> None:

@@ -27,11 +27,11 @@ from augment.turbo.experiment import ROOM_MODEL, Experiment
 from augment.turbo.stages import training_set
 from swiftwrf import load
 from swiftwrf.choices import fraction_key
+from swiftwrf.contrib.comparison.base import Result
 from swiftwrf.data.splits import places
 from swiftwrf.locate import MatchedField
 from swiftwrf.metrics import LEVEL, ChangeMetrics, ErrorSummary, angle_errors, paired_change, summary
 from swiftwrf.models import FIELD_MODELS
-from swiftwrf.runtime.registry import write_report
 
 ANGLES = ("azimuth_deg", "elevation_deg", "great_circle_deg")
 
@@ -263,7 +263,7 @@ class TurboResult:
         Raises:
             InputError: The file exists already.
         """
-        write_report("aoa", self, file)
+        TurboResults([self]).report(file)
 
     def __repr__(self) -> str:
         error = self.summary()["median"]
@@ -345,6 +345,63 @@ class TurboResult:
             }
             for method, entry in summaries(self.positions, "method", ("error_m",)).items()
         }
+
+
+class TurboResults(Result):
+    """Results of one experiment, for each measured fraction.
+
+    Args:
+        results: Results of `turbo_learning` on the same split.
+
+    Example:
+        >>> import augment, swiftwrf
+        >>> data = swiftwrf.simulated_room(n=40, grid=swiftwrf.AngularGrid.hemisphere(10, 40))
+        >>> result = augment.turbo_learning(data, measured=0.5, models=["nearest"], estimators=["peak"], extra=0)
+        >>> list(TurboResults([result]).metrics["mixes"])
+        ['0.5']
+    """
+
+    task = "aoa"
+
+    def __init__(self, results: Sequence[TurboResult]) -> None:
+        self.results, self.folder = results, results[0].folder
+
+    @property
+    def source(self) -> dict[str, str]:
+        return self.results[0].experiment.train.source
+
+    @property
+    def metrics(self) -> Row:
+        experiment = self.results[0].experiment
+        train, test = experiment.train, experiment.test
+        return {
+            "task": self.task,
+            "data": train.name,
+            "split": experiment.split,
+            "preset": experiment.preset,
+            "seed": experiment.seed,
+            "repeats": experiment.repeats,
+            "moving": train.moving,
+            "notes": list(train.notes),
+            "extra": experiment.n_synthetic,
+            "n_train": len(train),
+            "n_test": len(test),
+            "grid": train.grid.shape,
+            "line_of_sight_share": float(test.line_of_sight.float().mean()),
+            "mixes": {fraction_key(result.fraction): result.metrics for result in self.results},
+        }
+
+    @property
+    def tables(self) -> dict[str, DataFrame]:
+        names = ("errors", "synthesis", "positions")
+        tables = {name: concat([getattr(one, name) for one in self.results]) for name in names}
+        # the columns of rows differ, and integers stay integers
+        tables["history"] = DataFrame([row for one in self.results for row in one.history], dtype=object)
+        return {name: table for name, table in tables.items() if len(table) or name != "positions"}
+
+    @property
+    def arrays(self) -> dict[str, dict[str, NDArray[np.float64]]]:
+        return {}
 
 
 def summaries(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dict[str, ErrorSummary]]:

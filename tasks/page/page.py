@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,12 @@ from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 from pandas import DataFrame
 
+from swiftwrf.contrib.comparison.base import Result
 from swiftwrf.runtime.durable import write_text
 from tasks.directory import Run
 from tasks.page.figures import as_svg, for_page
 from tasks.preload import served_map
-from tasks.records import Records, write_table
+from tasks.records import Records, write_result, write_table
 from tasks.terminal import Answer, NextStep, terminal
 
 HALF = 92  # letters of a table that fit into half of the page
@@ -151,10 +152,8 @@ def rich(text: str) -> Markup:
     return Markup(re.sub("`([^`]*)`", code, str(escape(text))))  # of escaped text
 
 
-def write_page(folder: Path, page: Page) -> None:
-    """Write the panels of each plot and its numbers into `figures/`, and `report.html` with the same panels inlined."""
-    figures = folder / "figures"
-    figures.mkdir(parents=True, exist_ok=True)
+def drawn(page: Page) -> dict[str, str]:
+    """Return the SVG of each panel of each plot, by the name of its file without suffix."""
     panels: dict[str, Figure] = {}
     for plot in page.plots:
         for file, panel in zip(plot.files, plot.panels, strict=True):
@@ -162,24 +161,40 @@ def write_page(folder: Path, page: Page) -> None:
                 raise ValueError(f"two figures are called {file}; one would be shown in the other's place")
             panels[file] = panel
     captions = [plot.caption for plot in page.plots for _ in plot.panels]
-    inlined: dict[str, Markup] = {}
-    for file, svg in zip(panels, served_map(as_svg, panels.values(), captions), strict=True):
-        write_text(figures / f"{file}.svg", svg)
-        inlined[file] = Markup(for_page(svg, file))  # our own drawing; its texts are escaped in it
-    for plot in page.plots:
-        write_table(figures / f"{plot.name}.csv", plot.data.to_dict("records"))
+    return dict(zip(panels, served_map(as_svg, panels.values(), captions), strict=True))
+
+
+def as_html(page: Page, svg: Mapping[str, str]) -> str:
+    """Return the page with the panels of `drawn` inlined."""
     environment = Environment(
         loader=PackageLoader("tasks.page", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters["rich"] = rich
-    html = environment.get_template("template.html").render(page=page, svg=inlined)
-    write_text(folder / REPORT, html)
+    inlined = {file: Markup(for_page(text, file)) for file, text in svg.items()}  # our own drawings; texts are escaped
+    return environment.get_template("template.html").render(page=page, svg=inlined)
+
+
+def write_page(folder: Path, page: Page) -> None:
+    """Write the panels of each plot and its numbers into `figures/`, and `report.html` with the same panels inlined."""
+    figures, svg = folder / "figures", drawn(page)
+    figures.mkdir(parents=True, exist_ok=True)
+    for file, text in svg.items():
+        write_text(figures / f"{file}.svg", text)
+    for plot in page.plots:
+        write_table(figures / f"{plot.name}.csv", plot.data.to_dict("records"))
+    write_text(folder / REPORT, as_html(page, svg))
 
 
 def finish(
-    run: Run, metrics: dict[str, Any], page: Callable[[list[Records]], Page], answer: Callable[[Records], Answer]
+    run: Run,
+    result: Result,
+    page: Callable[[list[Records]], Page],
+    answer: Callable[[Records], Answer],
+    notes: Sequence[str] = (),
 ) -> None:
-    """Finish a run with its metrics and its report, and show its answer."""
+    """Finish a run with its result, further notes on its data, and its report, and show its answer."""
+    metrics = write_result(result, run.folder)
+    metrics["notes"] = [*notes, *metrics["notes"]]
     final = run.finish(metrics, lambda folder, values: write_page(folder, page([Records(folder, values)])))
     terminal.answer(answer(Records(final)), final / REPORT)
 

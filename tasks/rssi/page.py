@@ -9,6 +9,7 @@ import torch
 from matplotlib.figure import Figure
 
 from swiftwrf.choices import RSSI_PREDICTORS
+from swiftwrf.contrib.comparison.rssi import CERTAINTY, COVERED_DBM
 from swiftwrf.data.splits import places
 from swiftwrf.metrics import LEVEL, paired_difference
 from tasks.labels import PREDICTORS, colour, meanings
@@ -27,7 +28,7 @@ from tasks.page.shared import (
     recommendation,
 )
 from tasks.records import Records, notes
-from tasks.rssi.maps import CERTAINTY, COVERED_DBM, MIN_RATIO, WIDTH_PER_STD, Maps, coverage_sentence
+from tasks.rssi.maps import MIN_RATIO, WIDTH_PER_STD, Maps, coverage_sentence
 from tasks.terminal import Answer, Method, NextStep
 
 COLUMNS = ["index", "place", "receiver", "method", "abs_error_db"]  # of the errors of methods

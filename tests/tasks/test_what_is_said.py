@@ -26,10 +26,11 @@ from augment.positions import sample_positions
 from augment.turbo.artifacts import save_examples, save_located
 from augment.turbo.condition import Condition, MeasuredSubset
 from augment.turbo.experiment import Experiment
-from augment.turbo.results import TurboResult
+from augment.turbo.results import TurboResult, TurboResults
 from swiftwrf import AngularGrid, Rssi, RssiModel, calibrate, make_model, rssi_room, simulated_room
+from swiftwrf.contrib.comparison.base import split_notes
 from swiftwrf.contrib.comparison.localizers import PosteriorLocalizer
-from swiftwrf.contrib.comparison.locating import LocateComparison, LocateSplit
+from swiftwrf.contrib.comparison.locating import LocateComparison
 from swiftwrf.contrib.online import score
 from swiftwrf.data.cells import seconds
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin
@@ -39,19 +40,15 @@ from swiftwrf.metrics import summary
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.rssi import RssiComparison, RssiPredictor, estimate_offsets, log_distance
 from swiftwrf.runtime.durable import write_json
-from tasks.aoa import experiment as aoa
 from tasks.aoa import page as aoa_page
 from tasks.aoa import room as aoa_room
 from tasks.aoa import synthesis
 from tasks.aoa.records import FractionRecords
-from tasks.locate import experiment as locate
 from tasks.locate import page as locate_page
 from tasks.page.page import number
 from tasks.page.shared import compared, comparison_sentence, coverage_warning
-from tasks.records import CONFIG, Records, read_npz
-from tasks.rssi import experiment as rssi
+from tasks.records import CONFIG, Records, read_npz, write_result
 from tasks.rssi import page as rssi_page
-from tasks.source import split_notes
 from tasks.terminal import _table
 from tasks.view import charts
 from tasks.view.locating import Located
@@ -128,14 +125,14 @@ def of_rssi():
 
     def value(error):
         without_offset = -60 + SIGN * error + 8 * (N // 2 % 2)
-        return TIMES | {"predicted": without_offset, "std": None, "detection": None, "n_primitives": 0}
+        return {"seconds": TIMES, "predicted": without_offset, "std": None, "detection": None, "n_primitives": 0}
 
     values = {name: value(error) for name, error in ERRORS["rssi"].items()}
     values["swiftwrf"] |= {"std": STD, "detection": (0.9, 0.6)}
     by_rows = pd.DataFrame({"swiftwrf": [3.0, 2.0], "knn": [4.0, 3.5]}, index=[10, 30])
     options = {"split": "random", "preset": "quick", "seed": 0}
     models = {"swiftwrf": RssiModel(n_primitives=0).fit(train)}
-    return RssiComparison(train, test, values, {}, models, by_rows, options)
+    return RssiComparison(train, test, values, options, {}, models, by_rows)
 
 
 class Rings:
@@ -160,7 +157,8 @@ def of_locate():
         values[name] = {"seconds": TIMES, "index": test.index, "truth": at, "estimate": estimate}
     radius = torch.tensor([[1.05, 3.05, 9.05]]).expand(100, 3)
     values["posterior"] |= {"radius": radius, "ambiguous": torch.arange(100) < 10, "weights": {"values": 0.5}}
-    return LocateComparison(LocateSplit(test.subset(torch.arange(40)), test, "random", 300, 0, 3), values, Rings())
+    options = {"split": "random", "n_cells": 300, "seed": 0}
+    return LocateComparison(test.subset(torch.arange(40)), test, values, options, 3, Rings())
 
 
 @pytest.fixture(scope="module")
@@ -194,14 +192,11 @@ def of_aoa():
 def said(of_rssi, of_locate, of_aoa, tmp_path_factory):
     """Return the records of each result, and the result."""
     found = {}
-    for name, result, record in (
-        ("rssi", of_rssi, rssi.record),
-        ("locate", of_locate, locate.record),
-        ("aoa", of_aoa, lambda result, folder: aoa.record([result], folder)),
-    ):
+    for name, result in (("rssi", of_rssi), ("locate", of_locate), ("aoa", of_aoa)):
         folder = tmp_path_factory.mktemp(name)
         with mock.patch("swiftwrf.rssi.maps.CELLS", 6):
-            metrics = json.loads(json.dumps(record(result, folder)))
+            metrics = write_result(TurboResults([result]) if name == "aoa" else result, folder)
+        metrics = json.loads(json.dumps(metrics))
         (folder / CONFIG).write_text(json.dumps({"command": "swiftwrf"}))
         run = Records(folder, metrics)
         found[name] = (FractionRecords.of(run)[0] if name == "aoa" else run), result
@@ -321,7 +316,7 @@ def test_credible_circles(said):
     assert maps["index"].tolist() == [99, 79, 59, 40, 20, 0]  # from the smallest error to the largest
     drawn = [panel.axes[0] for panel in locate_page.posteriors(maps | {"estimate": maps["estimate"] + 1})]
     assert [(ax.patches[0].get_radius(), tuple(ax.patches[0].center)) for ax in drawn] == [(4.0, (1, 1))] * 6
-    away = np.linalg.norm(result.split.test.transmitter_position.numpy()[maps["index"]] - 1, axis=1)
+    away = np.linalg.norm(result.test.transmitter_position.numpy()[maps["index"]] - 1, axis=1)
     assert [said_of(ax.get_title())[1] for ax in drawn] == pytest.approx(away, abs=0.00501)
     posterior = Rings().locate([0])
     shown = Located.of(posterior, torch.tensor([3.0, 4.0, 0.0]))

@@ -1,0 +1,173 @@
+"""What all comparisons of methods have: errors on test rows, their summaries, and what a run writes into its directory."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pandas import DataFrame, concat
+
+from swiftwrf.data import Rssi
+from swiftwrf.data.splits import MAX_REPEATED, places, repeated_fraction
+from swiftwrf.metrics import method_summary, summary
+from swiftwrf.runtime.registry import write_report
+
+Values = dict[str, Any]
+
+
+class Result(ABC):
+    """Errors of methods on test rows, with the content of the files of a run."""
+
+    task: ClassVar[str]
+    """command with the same result"""
+    folder: Path | None = None
+    """folder of further files that the report shows, if there are any"""
+
+    @property
+    @abstractmethod
+    def source(self) -> dict[str, str]:
+        """SHA-256 of the input by name."""
+
+    @property
+    @abstractmethod
+    def metrics(self) -> Values:
+        """Content of metrics.json."""
+
+    @property
+    @abstractmethod
+    def tables(self) -> Mapping[str, DataFrame]:
+        """Tables by the names of their files without suffix."""
+
+    @property
+    @abstractmethod
+    def arrays(self) -> Mapping[str, Mapping[str, NDArray[Any]]]:
+        """Arrays by the names of their files without suffix, and by their names in the file."""
+
+    def report(self, file: str | Path) -> None:
+        """Write the report of the command with the same result into an HTML file, which opens offline.
+
+        Raises:
+            InputError: The file exists already.
+        """
+        write_report(self.task, self, file)
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison(Result):
+    """Methods that were fitted to the training rows of a split, and their errors on its test rows.
+
+    Args:
+        train: Training rows, without offsets between groups.
+        test: Test rows.
+        values: What each method gave, by name. `seconds` are those to `fit` and to `predict`, and `median` is the median
+            error.
+        options: The split, the seed, and what else determines the result.
+    """
+
+    column: ClassVar[str]
+    """error of the methods in `errors`"""
+    further: ClassVar[tuple[str, ...]] = ()
+    """further errors in `errors`"""
+
+    train: Rssi
+    test: Rssi
+    values: Mapping[str, Values]
+    options: Values
+
+    @property
+    @abstractmethod
+    def model(self) -> str:
+        """Name of the model of this package that all others are compared with."""
+
+    @abstractmethod
+    def _columns(self, name: str) -> Mapping[str, Any]:
+        """Return the columns of the errors of one method."""
+
+    @abstractmethod
+    def _further(self, name: str, errors: DataFrame) -> Values:
+        """Return what is known of a method beside its errors, for `overall`."""
+
+    @abstractmethod
+    def _further_metrics(self) -> Values:
+        """Return the entries of `metrics` that this comparison alone has."""
+
+    @cached_property
+    def errors(self) -> DataFrame:
+        """Errors, a row for each method and test row, or pair of test row and receiver, with the number of its place."""
+        tables = []
+        for name in self.values:
+            columns = {column: np.asarray(values) for column, values in self._columns(name).items()}
+            tables.append(DataFrame({"method": name, **columns}))
+        return concat(tables, ignore_index=True)
+
+    def summary(self) -> DataFrame:
+        """Return a row for each method: errors, and their mean difference to those of `model`; see `method_summary`."""
+        return method_summary(self.errors, self.column, self.model)
+
+    @property
+    def overall(self) -> dict[str, Values]:
+        """Summaries of the errors of each method over test places, its seconds, and what else is known of it."""
+        return {
+            name: {column: summary(own[column], own["place"]) for column in (self.column, *self.further)}
+            | {"seconds": self.values[name]["seconds"]}
+            | self._further(name, own)
+            for name, own in self.errors.groupby("method", sort=False)
+        }
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences on the split, the data and the offsets between groups."""
+        offsets = [] if self.train.offsets is None else [self.train.offsets.note()]
+        return [*split_notes(self.train, self.test, self.options["split"]), *self.train.notes, *offsets]
+
+    @property
+    def source(self) -> dict[str, str]:
+        return self.train.source
+
+    @property
+    def metrics(self) -> Values:
+        return {
+            "task": self.task,
+            "data": self.train.name,
+            "notes": self.notes,
+            **self.options,
+            "n_train": len(self.train),
+            "n_test": len(self.test),
+            "overall": self.overall,
+            "held_out": self.values[self.model].get("held_out", {}),
+            **self._further_metrics(),
+        }
+
+    @property
+    def tables(self) -> Mapping[str, DataFrame]:
+        return {"errors": self.errors}
+
+
+def split_notes(train: Rssi, test: Rssi, split: str) -> list[str]:
+    """Return notes on sessions and on rows that share positions.
+
+    Example:
+        >>> import swiftwrf
+        >>> split_notes(*swiftwrf.rssi_room(n=60).split(), "random")
+        []
+    """
+    notes = []
+    if train.validation_for(split, test) == "session":
+        notes.append(
+            "the test rows are of other sessions than the training rows, so cross-validation holds out sessions"
+        )
+    repeated = repeated_fraction(train.transmitter_position, test.transmitter_position)
+    position = torch.cat([train.transmitter_position, test.transmitter_position])
+    n_places = int(places(position).max()) + 1
+    if repeated > MAX_REPEATED:
+        notes.append(f"this split tests look-up: {repeated:.0%} of the test rows are at places of training rows")
+    elif n_places < len(position) and not repeated:
+        notes.append(f"{len(position)} rows are at {n_places} places, each of which is in one part of the split")
+    return notes
