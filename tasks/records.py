@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import NDArray
 
-    from swiftwrf.contrib.comparison.base import Result
+    from swiftwrf.contrib.comparison.base import Recorded
 
 Row = dict[str, Any]
 CONFIG, ENVIRONMENT, METRICS = "config.json", "environment.json", "metrics.json"  # files of a run
@@ -159,13 +159,13 @@ def read_npz(file: Path) -> dict[str, NDArray[Any]]:
     return read_arrays(file, sorted(array_names(file)), kinds=f"{NUMBERS}U")
 
 
-def write_result(result: Result, folder: Path) -> Row:
+def write_result(result: Recorded, folder: Path) -> Row:
     """Write the tables and arrays of a result into a folder, and return the content of metrics.json."""
     for name, table in result.tables.items():
         write_table(folder / f"{name}.csv", table.to_dict("records"))
     for name, arrays in result.arrays.items():
         write_npz(folder / f"{name}.npz", arrays)
-    return result.metrics
+    return dict(result.metrics)
 
 
 def notes(run: Records) -> list[str]:
@@ -197,11 +197,11 @@ class Records:
         self._arrays: dict[str, dict[str, NDArray[Any]]] = {}
 
     @classmethod
-    def of(cls, result: Result, folder: Path, config: Row, environment: Row) -> Records:
+    def of(cls, result: Recorded, folder: Path, config: Row, environment: Row) -> Records:
         """Return the records that a run with this result would have.
 
         Args:
-            result: Result of the library.
+            result: Content of its files.
             folder: Folder of what is not in memory, which need not exist.
             config: Command and configuration.
             environment: Environment: machine, versions, commit.

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from swiftwrf import InputError
-from swiftwrf.contrib.comparison.base import Result
+from swiftwrf.contrib.comparison.base import Recorded
 from swiftwrf.runtime.checkpoint import refusing
 from swiftwrf.runtime.durable import write_text
 from tasks.aoa.page import page as aoa
@@ -33,19 +33,19 @@ def run(config: ReportConfig) -> None:
     terminal.page({"runs": list(config.runs)}, "", page)
 
 
-def write(task: str, result: Result, file: Path) -> None:
+def write(task: str, result: Recorded, file: Path) -> None:
     """Write the report of a result of the library into an HTML file, without a directory of a run.
 
     Args:
         task: Name of the task.
-        result: Result of the library.
+        result: Content of the files of a run with it.
         file: New file.
 
     Raises:
         InputError: The file is no .html, exists already, or its folder does not.
     """
     check_new_file(file, (".html", ".htm"))
-    here = environment(choose_device("cpu"), result.source)
+    here = environment(choose_device("cpu"), dict(result.source))
     run = Records.of(result, result.folder or file, {"command": CALLS[task]}, here)
     page = replace(PAGES[task]([run]), alone=True)
     write_text(file, as_html(page, drawn(page)))

@@ -27,11 +27,12 @@ from augment.turbo.experiment import ROOM_MODEL, Experiment
 from augment.turbo.stages import training_set
 from swiftwrf import load
 from swiftwrf.choices import fraction_key
-from swiftwrf.contrib.comparison.base import Result
+from swiftwrf.contrib.comparison.base import Recorded
 from swiftwrf.data.splits import places
 from swiftwrf.locate import MatchedField
 from swiftwrf.metrics import LEVEL, ChangeMetrics, ErrorSummary, angle_errors, paired_change, summary
 from swiftwrf.models import FIELD_MODELS
+from swiftwrf.runtime.steps import Memo
 
 ANGLES = ("azimuth_deg", "elevation_deg", "great_circle_deg")
 
@@ -57,8 +58,8 @@ class TurboResult:
         (True, True)
     """
 
-    def __init__(self, experiment: Experiment, fraction: float, folder: Path) -> None:
-        self.experiment, self.fraction, self.folder = experiment, fraction, folder
+    def __init__(self, experiment: Experiment, fraction: float, keep: Memo) -> None:
+        self.experiment, self.fraction, self._keep = experiment, fraction, keep
         self.compared: Row = {}  # comparison of the field models in the first repeat
         # in the first repeat: errors [deg] of its methods on held-out spectra, and names of the files of its methods
         self.held_out: dict[str, list[float]] = {}
@@ -76,6 +77,11 @@ class TurboResult:
         if missing := FIELD_MODELS[ROOM_MODEL].lacking(experiment.test):
             reason = f"it needs the {missing[0]}, which {experiment.test.name} does not describe"
             self.leave_out(LOCATED, f"{LOCATOR} is left out: {reason}", reason)
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the files that the steps wrote."""
+        return self._keep.folder
 
     def leave_out(self, method: str, sentence: str, reason: str) -> None:
         """Record why a method is missing, and a sentence about it."""
@@ -263,7 +269,7 @@ class TurboResult:
         Raises:
             InputError: The file exists already.
         """
-        TurboResults([self]).report(file)
+        recorded([self]).report(file)
 
     def __repr__(self) -> str:
         error = self.summary()["median"]
@@ -347,61 +353,40 @@ class TurboResult:
         }
 
 
-class TurboResults(Result):
-    """Results of one experiment, for each measured fraction.
-
-    Args:
-        results: Results of `turbo_learning` on the same split.
+def recorded(results: Sequence[TurboResult]) -> Recorded:
+    """Return the content of the files of a run with these results, one for each measured fraction of an experiment.
 
     Example:
         >>> import augment, swiftwrf
         >>> data = swiftwrf.simulated_room(n=40, grid=swiftwrf.AngularGrid.hemisphere(10, 40))
         >>> result = augment.turbo_learning(data, measured=0.5, models=["nearest"], estimators=["peak"], extra=0)
-        >>> list(TurboResults([result]).metrics["mixes"])
+        >>> list(recorded([result]).metrics["mixes"])
         ['0.5']
     """
-
-    task = "aoa"
-
-    def __init__(self, results: Sequence[TurboResult]) -> None:
-        self.results, self.folder = results, results[0].folder
-
-    @property
-    def source(self) -> dict[str, str]:
-        return self.results[0].experiment.train.source
-
-    @property
-    def metrics(self) -> Row:
-        experiment = self.results[0].experiment
-        train, test = experiment.train, experiment.test
-        return {
-            "task": self.task,
-            "data": train.name,
-            "split": experiment.split,
-            "preset": experiment.preset,
-            "seed": experiment.seed,
-            "repeats": experiment.repeats,
-            "moving": train.moving,
-            "notes": list(train.notes),
-            "extra": experiment.n_synthetic,
-            "n_train": len(train),
-            "n_test": len(test),
-            "grid": train.grid.shape,
-            "line_of_sight_share": float(test.line_of_sight.float().mean()),
-            "mixes": {fraction_key(result.fraction): result.metrics for result in self.results},
-        }
-
-    @property
-    def tables(self) -> dict[str, DataFrame]:
-        names = ("errors", "synthesis", "positions")
-        tables = {name: concat([getattr(one, name) for one in self.results]) for name in names}
-        # the columns of rows differ, and integers stay integers
-        tables["history"] = DataFrame([row for one in self.results for row in one.history], dtype=object)
-        return {name: table for name, table in tables.items() if len(table) or name != "positions"}
-
-    @property
-    def arrays(self) -> dict[str, dict[str, NDArray[np.float64]]]:
-        return {}
+    experiment = results[0].experiment
+    train, test = experiment.train, experiment.test
+    metrics = {
+        "task": "aoa",
+        "data": train.name,
+        "split": experiment.split,
+        "preset": experiment.preset,
+        "seed": experiment.seed,
+        "repeats": experiment.repeats,
+        "moving": train.moving,
+        "notes": list(train.notes),
+        "extra": experiment.n_synthetic,
+        "n_train": len(train),
+        "n_test": len(test),
+        "grid": train.grid.shape,
+        "line_of_sight_share": float(test.line_of_sight.float().mean()),
+        "mixes": {fraction_key(result.fraction): result.metrics for result in results},
+    }
+    names = ("errors", "synthesis", "positions")
+    tables = {name: concat([getattr(result, name) for result in results]) for name in names}
+    # the columns of rows differ, and integers stay integers
+    tables["history"] = DataFrame([row for result in results for row in result.history], dtype=object)
+    tables = {name: table for name, table in tables.items() if len(table) or name != "positions"}
+    return Recorded(metrics, tables, {}, train.source, results[0].folder)
 
 
 def summaries(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dict[str, ErrorSummary]]:

@@ -9,7 +9,7 @@ import torch
 from augment import suggest
 from augment.turbo.experiment import Experiment
 from augment.turbo.learning import learn
-from augment.turbo.results import TurboResults
+from augment.turbo.results import recorded
 from swiftwrf import Spectra, make_model, simulated_room
 from swiftwrf.choices import RAYTRACE, fraction_key
 from swiftwrf.contrib.raytraced import sionna
@@ -83,7 +83,7 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
             measured, _ = experiment.withhold(subset)
             found = suggest(measured, config.suggest, config.seed)
             write_suggestion(run.path(f"suggested-mix{subset.key}"), measured.position, found.position, found.variance)
-        finish(run, TurboResults(results), page, answer_of)
+        finish(run, recorded(results), page, answer_of)
 
 
 def measurements(config: AoaConfig) -> Spectra:

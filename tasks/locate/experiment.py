@@ -55,7 +55,7 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
             degrees = degree_columns(train.origin, found.position.numpy())
             measured = train.transmitter_position
             write_suggestion(directory.path(SUGGESTED), measured, found.position, found.variance, degrees)
-        finish(directory, result, page, answer)
+        finish(directory, result.recorded(), page, answer)
 
 
 def measurements(config: LocateConfig) -> Rssi:

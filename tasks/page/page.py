@@ -13,7 +13,7 @@ from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 from pandas import DataFrame
 
-from swiftwrf.contrib.comparison.base import Result
+from swiftwrf.contrib.comparison.base import Recorded
 from swiftwrf.runtime.durable import write_text
 from tasks.directory import Run
 from tasks.page.figures import as_svg, for_page
@@ -187,7 +187,7 @@ def write_page(folder: Path, page: Page) -> None:
 
 def finish(
     run: Run,
-    result: Result,
+    result: Recorded,
     page: Callable[[list[Records]], Page],
     answer: Callable[[Records], Answer],
     notes: Sequence[str] = (),

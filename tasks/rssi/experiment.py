@@ -69,7 +69,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
             console.print(f"{data.name}: {detection.note(data.receiver_names)}")
         if plan is not None:
             plan.save(directory.folder)
-        finish(directory, result, page, answer, offset_notes(data, config.table))
+        finish(directory, result.recorded(), page, answer, offset_notes(data, config.table))
 
 
 def _read_floor_plan(config: RssiTaskConfig, data: Rssi) -> FloorPlan | None:

@@ -7,7 +7,6 @@ import json
 import math
 import re
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
 
@@ -26,7 +25,7 @@ from augment.positions import sample_positions
 from augment.turbo.artifacts import save_examples, save_located
 from augment.turbo.condition import Condition, MeasuredSubset
 from augment.turbo.experiment import Experiment
-from augment.turbo.results import TurboResult, TurboResults
+from augment.turbo.results import TurboResult, recorded
 from swiftwrf import AngularGrid, Rssi, RssiModel, calibrate, make_model, rssi_room, simulated_room
 from swiftwrf.contrib.comparison.base import split_notes
 from swiftwrf.contrib.comparison.localizers import PosteriorLocalizer
@@ -40,6 +39,7 @@ from swiftwrf.metrics import summary
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.rssi import RssiComparison, RssiPredictor, estimate_offsets, log_distance
 from swiftwrf.runtime.durable import write_json
+from swiftwrf.runtime.steps import Memo
 from tasks.aoa import page as aoa_page
 from tasks.aoa import room as aoa_room
 from tasks.aoa import synthesis
@@ -167,7 +167,7 @@ def of_aoa():
     grid = AngularGrid.hemisphere(8, 32)
     room, train = simulated_room(n=25, grid=grid), simulated_room(n=60, seed=1, grid=grid)
     test = room.subset(torch.arange(25).repeat_interleave(4)).derived(index=torch.arange(100) * 37 % 100)
-    found = TurboResult(Experiment(train, test, (0.4,), ["gp"], estimators=[]), 0.4, Path())
+    found = TurboResult(Experiment(train, test, (0.4,), ["gp"], estimators=[]), 0.4, Memo())
     place = test.position + torch.from_numpy(OWN[:, None] / 1000) * ALONG
     located = {"position": place.tolist(), "radius": N, "level": N / 120, "ambiguous": N < 7, "weights": {}}
     located["seconds"] = TIMES
@@ -195,7 +195,7 @@ def said(of_rssi, of_locate, of_aoa, tmp_path_factory):
     for name, result in (("rssi", of_rssi), ("locate", of_locate), ("aoa", of_aoa)):
         folder = tmp_path_factory.mktemp(name)
         with mock.patch("swiftwrf.rssi.maps.CELLS", 6):
-            metrics = write_result(TurboResults([result]) if name == "aoa" else result, folder)
+            metrics = write_result(recorded([result]) if name == "aoa" else result.recorded(), folder)
         metrics = json.loads(json.dumps(metrics))
         (folder / CONFIG).write_text(json.dumps({"command": "swiftwrf"}))
         run = Records(folder, metrics)

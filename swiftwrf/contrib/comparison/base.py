@@ -22,45 +22,35 @@ from swiftwrf.runtime.registry import write_report
 Values = dict[str, Any]
 
 
-class Result(ABC):
-    """Errors of methods on test rows, with the content of the files of a run."""
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """Content of the files of a run: a result as a report, a table or another program reads it.
 
-    task: ClassVar[str]
-    """command with the same result"""
+    Args:
+        metrics: Content of metrics.json; `task` is the command of the run.
+        tables: Tables by the names of their files without suffix.
+        arrays: Arrays by the names of their files without suffix, and by their names in the file.
+        source: SHA-256 of the input by name.
+        folder: Folder of further files that the report shows, if there are any.
+    """
+
+    metrics: Values
+    tables: Mapping[str, DataFrame]
+    arrays: Mapping[str, Mapping[str, NDArray[Any]]]
+    source: Mapping[str, str]
     folder: Path | None = None
-    """folder of further files that the report shows, if there are any"""
-
-    @property
-    @abstractmethod
-    def source(self) -> dict[str, str]:
-        """SHA-256 of the input by name."""
-
-    @property
-    @abstractmethod
-    def metrics(self) -> Values:
-        """Content of metrics.json."""
-
-    @property
-    @abstractmethod
-    def tables(self) -> Mapping[str, DataFrame]:
-        """Tables by the names of their files without suffix."""
-
-    @property
-    @abstractmethod
-    def arrays(self) -> Mapping[str, Mapping[str, NDArray[Any]]]:
-        """Arrays by the names of their files without suffix, and by their names in the file."""
 
     def report(self, file: str | Path) -> None:
-        """Write the report of the command with the same result into an HTML file, which opens offline.
+        """Write the report of the command into an HTML file, which opens offline.
 
         Raises:
             InputError: The file exists already.
         """
-        write_report(self.task, self, file)
+        write_report(self.metrics["task"], self, file)
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison(Result):
+class Comparison(ABC):
     """Methods that were fitted to the training rows of a split, and their errors on its test rows.
 
     Args:
@@ -71,6 +61,8 @@ class Comparison(Result):
         options: The split, the seed, and what else determines the result.
     """
 
+    task: ClassVar[str]
+    """command with the same result"""
     column: ClassVar[str]
     """error of the methods in `errors`"""
     further: ClassVar[tuple[str, ...]] = ()
@@ -90,14 +82,6 @@ class Comparison(Result):
     def _columns(self, name: str) -> Mapping[str, Any]:
         """Return the columns of the errors of one method."""
 
-    @abstractmethod
-    def _further(self, name: str, errors: DataFrame) -> Values:
-        """Return what is known of a method beside its errors, for `overall`."""
-
-    @abstractmethod
-    def _further_metrics(self) -> Values:
-        """Return the entries of `metrics` that this comparison alone has."""
-
     @cached_property
     def errors(self) -> DataFrame:
         """Errors, a row for each method and test row, or pair of test row and receiver, with the number of its place."""
@@ -113,11 +97,10 @@ class Comparison(Result):
 
     @property
     def overall(self) -> dict[str, Values]:
-        """Summaries of the errors of each method over test places, its seconds, and what else is known of it."""
+        """Summaries of the errors of each method over test places, and its seconds."""
         return {
             name: {column: summary(own[column], own["place"]) for column in (self.column, *self.further)}
             | {"seconds": self.values[name]["seconds"]}
-            | self._further(name, own)
             for name, own in self.errors.groupby("method", sort=False)
         }
 
@@ -127,13 +110,9 @@ class Comparison(Result):
         offsets = [] if self.train.offsets is None else [self.train.offsets.note()]
         return [*split_notes(self.train, self.test, self.options["split"]), *self.train.notes, *offsets]
 
-    @property
-    def source(self) -> dict[str, str]:
-        return self.train.source
-
-    @property
-    def metrics(self) -> Values:
-        return {
+    def recorded(self) -> Recorded:
+        """Return the content of the files of a run with this result."""
+        metrics = {
             "task": self.task,
             "data": self.train.name,
             "notes": self.notes,
@@ -142,12 +121,16 @@ class Comparison(Result):
             "n_test": len(self.test),
             "overall": self.overall,
             "held_out": self.values[self.model].get("held_out", {}),
-            **self._further_metrics(),
         }
+        return Recorded(metrics, {"errors": self.errors}, {}, self.train.source)
 
-    @property
-    def tables(self) -> Mapping[str, DataFrame]:
-        return {"errors": self.errors}
+    def report(self, file: str | Path) -> None:
+        """Write the report of the command with the same result into an HTML file, which opens offline.
+
+        Raises:
+            InputError: The file exists already.
+        """
+        self.recorded().report(file)
 
 
 def split_notes(train: Rssi, test: Rssi, split: str) -> list[str]:

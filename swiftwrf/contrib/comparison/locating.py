@@ -6,17 +6,14 @@ import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pandas import DataFrame
 
-from swiftwrf.contrib.comparison.base import Comparison, Values
+from swiftwrf.contrib.comparison.base import Comparison, Recorded, Values
 from swiftwrf.contrib.comparison.localizers import LEVELS, LOCALIZERS, PosteriorLocalizer
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
@@ -136,12 +133,29 @@ class LocateComparison(Comparison):
         return {p: float((own[self.column] <= own[_radius(p)]).mean()) for p in LEVELS}
 
     @property
-    def arrays(self) -> Mapping[str, Mapping[str, NDArray[Any]]]:
-        return {"maps": self._maps}
+    def overall(self) -> dict[str, Values]:
+        """Position errors in space and in plan [m] of each localizer, its seconds, and its floor hit rate.
 
-    @cached_property
-    def _maps(self) -> Mapping[str, NDArray[Any]]:
-        """Posteriors in plan of at most six test rows, from the smallest error to the largest."""
+        The floor of an estimate is the one of the nearest height. Data without floors have no floor hit rate.
+        """
+        found = super().overall
+        if self.train.floors is not None:
+            for name, own in self.errors.groupby("method"):
+                found[name]["floor_hit_rate"] = float((own["floor"] == own["truth_floor"]).mean())
+        return found
+
+    def recorded(self) -> Recorded:
+        found = super().recorded()
+        metrics = {
+            "n_receivers": len(self.train.receiver_names),
+            "n_undetected": self.n_undetected,
+            "calibration": {str(level): fraction for level, fraction in self.coverage.items()},
+            "weights": self.values[self.model]["weights"],
+        }
+        return replace(found, metrics=found.metrics | metrics, arrays={"maps": self._maps()})
+
+    def _maps(self) -> dict[str, NDArray[Any]]:
+        """Return posteriors in plan of at most six test rows, from the smallest error to the largest."""
         assert self.locator is not None
         order = self.errors.loc[self.errors["method"] == self.model, self.column].to_numpy().argsort()
         shown = order[np.linspace(0, len(order) - 1, min(N_MAPS, len(order))).round().astype(int)]
@@ -176,18 +190,6 @@ class LocateComparison(Comparison):
             columns |= {_radius(p): r for p, r in zip(LEVELS, radius.T, strict=True)}
             columns["ambiguous"] = values["ambiguous"]
         return columns
-
-    def _further(self, name: str, errors: DataFrame) -> Values:
-        # the floor of an estimate is the one of the nearest height
-        return {"floor_hit_rate": float((errors["floor"] == errors["truth_floor"]).mean())} if "floor" in errors else {}
-
-    def _further_metrics(self) -> Values:
-        return {
-            "n_receivers": len(self.train.receiver_names),
-            "n_undetected": self.n_undetected,
-            "calibration": {str(level): fraction for level, fraction in self.coverage.items()},
-            "weights": self.values[self.model]["weights"],
-        }
 
 
 def _radius(level: float) -> str:
@@ -233,11 +235,10 @@ def compare(
     begun = LocateComparison.of(data.receivers(receivers), split, n_cells, seed, reference)
     if keep is not None:
         keep.of(given | {"localizers": [LOCALIZERS[name] for name in LOCALIZERS]})
-    with TemporaryDirectory(prefix="swiftwrf-") as folder:
-        memo = keep or Memo(Path(folder))
-        steps = Steps(begun, memo, executor)
-        started = [steps.start(name, name, LocateComparison.fit, name) for name in LOCALIZERS]
-        values = {name: steps[name] for name in started}
-        locator = load(memo.folder / LOCATOR)
-        assert isinstance(locator, RssiLocator)
-        return replace(begun, values=values, locator=locator)
+    memo = keep or Memo()
+    steps = Steps(begun, memo, executor)
+    started = [steps.start(name, name, LocateComparison.fit, name) for name in LOCALIZERS]
+    values = {name: steps[name] for name in started}
+    locator = load(memo.folder / LOCATOR)
+    assert isinstance(locator, RssiLocator)
+    return replace(begun, values=values, locator=locator)

@@ -8,7 +8,6 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import numpy as np
@@ -18,7 +17,7 @@ from pandas import DataFrame
 from torch import Tensor
 
 from swiftwrf.choices import RSSI_PREDICTORS, NotDetected
-from swiftwrf.contrib.comparison.base import Comparison, Values
+from swiftwrf.contrib.comparison.base import Comparison, Recorded, Values
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.rssi import PLACE
@@ -155,47 +154,6 @@ class RssiComparison(Comparison):
             notes.append(f"each of the {len(floors.names)} floors takes {model.attenuation.db:.1f} dB")
         return notes if model.detection is None else [*notes, model.detection.note(self.train.receiver_names)]
 
-    @property
-    def tables(self) -> Mapping[str, DataFrame]:
-        return {"errors": self.errors, "predictions": self.predictions}
-
-    @property
-    def arrays(self) -> Mapping[str, Mapping[str, NDArray[Any]]]:
-        return {"maps": self._maps[0]}
-
-    @cached_property
-    def _maps(self) -> tuple[Mapping[str, NDArray[Any]], list[Values]]:
-        """Maps of each floor, (floors, R, H, W) or (floors, H, W), and the coverage of each floor.
-
-        Without floors there is one map, at the median height of the measurements.
-        """
-        train, model, limits = self.train, self._fitted, (COVERED_DBM, CERTAINTY, 1)
-        floors = train.floors
-        names, heights = (floors.names, floors.height_m) if floors else ([""], [None])
-        charts = [RssiMap.predict(model, height=height) for height in heights]
-        number = floors.number(train.transmitter_position) if floors else torch.zeros(len(train), dtype=torch.int64)
-        detected = [RssiMap.predict(model, height=height, detected=True) for height in heights]
-        coverage = [Coverage.of(each, train[number == n], limits, reach(model)) for n, each in enumerate(detected)]
-        lower, upper = zip(*(chart.prediction.interval(LEVEL) for chart in charts), strict=True)
-        maps: dict[str, NDArray[Any]] = {
-            "x": charts[0].x,
-            "y": charts[0].y,
-            "predicted": np.stack([chart.mean for chart in charts]),
-            "width": (torch.stack(upper) - torch.stack(lower)).numpy(),
-            "detection": np.stack([chart.detection for chart in charts]),
-            "above": np.stack([found.probability for found in coverage]),
-            "inside": np.stack([found.inside for found in coverage]),
-            "known": np.stack([found.measured for found in coverage]),
-            "measured_position": train.transmitter_position.numpy(),
-            "measured": train.rssi_dbm.numpy(),
-            "receiver": train.receiver_position.numpy(),
-            "receiver_names": np.array(train.receiver_names),
-            "floor_names": np.array(names),
-            "floor_of_row": number.numpy(),
-        }
-        maps = maps if train.origin is None else maps | {"origin": np.array(train.origin)}
-        return maps, [{"floor": name} | found.values for name, found in zip(names, coverage, strict=True)]
-
     def _columns(self, name: str) -> Mapping[str, Any]:
         test, (row, column) = self.test, self._pairs
         measured, predicted = test.rssi_dbm[row, column], self._prediction(name).mean
@@ -210,14 +168,16 @@ class RssiComparison(Comparison):
             "from_training_m": self._from_training[row],
         }
 
-    def _further(self, name: str, errors: DataFrame) -> Values:
-        return {"detection": self.values[name]["detection"]}
+    @property
+    def overall(self) -> dict[str, Values]:
+        return {name: entry | {"detection": self.values[name]["detection"]} for name, entry in super().overall.items()}
 
-    def _further_metrics(self) -> Values:
+    def recorded(self) -> Recorded:
+        found, attenuation = super().recorded(), self._fitted.attenuation
+        maps, coverage = _maps(self._fitted, self.train)
         groups = self.errors.groupby(["receiver", "method"])
         at_receiver = {key: summary(own[self.column], own["place"]) for key, own in groups}
-        attenuation = self._fitted.attenuation
-        return {
+        metrics = {
             "left_out": self.left_out,
             "receivers": {
                 receiver: {name: {self.column: at_receiver.get((receiver, name), summary([]))} for name in self.values}
@@ -226,13 +186,15 @@ class RssiComparison(Comparison):
             "model": self.model,
             "seconds": self.values[self.model]["seconds"],
             "interval": {"nominal": LEVEL, "coverage": self.coverage},
-            "coverage": self._maps[1],
+            "coverage": coverage,
             "by_rows": {str(n): {str(name): mean for name, mean in row.items()} for n, row in self.by_rows.iterrows()},
             "chosen": {
                 "n_primitives": max(value["n_primitives"] for value in self.values.values()),
                 "floor_attenuation_db": None if attenuation is None else attenuation.db,
             },
         }
+        tables = {"errors": self.errors, "predictions": self.predictions}
+        return replace(found, metrics=found.metrics | metrics, tables=tables, arrays={"maps": maps})
 
     @property
     def _fitted(self) -> RssiModel | PairModel:
@@ -263,6 +225,38 @@ class RssiComparison(Comparison):
             mean = mean + offsets.of(self.test)[self._pairs[0]]
         std = None if values["std"] is None else torch.as_tensor(values["std"], dtype=torch.float64)
         return Prediction(mean, std)
+
+
+def _maps(model: RssiModel | PairModel, train: Rssi) -> tuple[dict[str, NDArray[Any]], list[Values]]:
+    """Return maps of each floor, (floors, R, H, W) or (floors, H, W), and the coverage of each floor.
+
+    Without floors there is one map, at the median height of the measurements.
+    """
+    floors, limits = train.floors, (COVERED_DBM, CERTAINTY, 1)
+    names, heights = (floors.names, floors.height_m) if floors else ([""], [None])
+    charts = [RssiMap.predict(model, height=height) for height in heights]
+    number = floors.number(train.transmitter_position) if floors else torch.zeros(len(train), dtype=torch.int64)
+    detected = [RssiMap.predict(model, height=height, detected=True) for height in heights]
+    coverage = [Coverage.of(each, train[number == n], limits, reach(model)) for n, each in enumerate(detected)]
+    lower, upper = zip(*(chart.prediction.interval(LEVEL) for chart in charts), strict=True)
+    maps: dict[str, NDArray[Any]] = {
+        "x": charts[0].x,
+        "y": charts[0].y,
+        "predicted": np.stack([chart.mean for chart in charts]),
+        "width": (torch.stack(upper) - torch.stack(lower)).numpy(),
+        "detection": np.stack([chart.detection for chart in charts]),
+        "above": np.stack([found.probability for found in coverage]),
+        "inside": np.stack([found.inside for found in coverage]),
+        "known": np.stack([found.measured for found in coverage]),
+        "measured_position": train.transmitter_position.numpy(),
+        "measured": train.rssi_dbm.numpy(),
+        "receiver": train.receiver_position.numpy(),
+        "receiver_names": np.array(train.receiver_names),
+        "floor_names": np.array(names),
+        "floor_of_row": number.numpy(),
+    }
+    maps = maps if train.origin is None else maps | {"origin": np.array(train.origin)}
+    return maps, [{"floor": name} | found.values for name, found in zip(names, coverage, strict=True)]
 
 
 def model_of(data: Rssi) -> str:
@@ -373,8 +367,8 @@ def compare(
         less = {str(len(rows)): {name: compute(_, folder, name, rows)["mean"] for name in studied} for rows in parts}
         return less | {str(len(train)): {name: values[name]["mean"] for name in studied}}
 
-    with TemporaryDirectory(prefix="swiftwrf-") as temporary, refusing_executor(executor):
-        memo = keep or Memo(Path(temporary))
+    memo = keep or Memo()
+    with refusing_executor(executor):
         steps = Steps(None, memo)
         started = [steps.start(name, name, compute, name) for name in names]
         if fewer:

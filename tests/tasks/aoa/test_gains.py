@@ -1,7 +1,6 @@
 """Gains by synthetic spectra: their reference, their interval, in reports, and over repeats that chose differently."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from augment.turbo.results import TurboResult, summaries
 from swiftwrf import simulated_room
 from swiftwrf.metrics import median_interval, paired_change
 from swiftwrf.metrics import summary as error_summary
+from swiftwrf.runtime.steps import Memo
 from tasks.aoa.page import answer, conclusion, first_screen
 from tasks.aoa.records import FractionRecords
 from tasks.configs import AoaConfig
@@ -71,7 +71,7 @@ def test_one_repeat_has_the_interval_of_independent_values():
 def results_of(errors):
     """Return the results of conditions with these elevation errors [deg] at the test positions."""
     room = simulated_room(n=20)
-    found = TurboResult(Experiment(simulated_room(n=40), room, estimators=()), 0.3, Path())
+    found = TurboResult(Experiment(simulated_room(n=40), room, estimators=()), 0.3, Memo())
     for condition, error in errors.items():
         off = torch.stack([torch.zeros(20), torch.as_tensor(error)], dim=1).double().deg2rad()
         seconds = {"train": 1.0, "estimate": 1.0}
@@ -265,7 +265,7 @@ def test_the_time_of_all_networks_counts():
     room = simulated_room(n=20)
     trained = of_repeats((GP,), (IDW, IDW_EXTRA))
     for synthesizer in (("auto",), ("gp", "idw")):
-        found = TurboResult(Experiment(simulated_room(n=40), room, (0.3,), synthesizer, estimators=()), 0.3, Path())
+        found = TurboResult(Experiment(simulated_room(n=40), room, (0.3,), synthesizer, estimators=()), 0.3, Memo())
         for condition, _ in trained:
             seconds = {"train": 10.0, "estimate": 1.0}
             value = {"estimate": room.label.tolist(), "seconds": seconds, "history": [], "counts": {}}
