@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 from collections.abc import Iterable, Sequence
 from functools import cached_property
@@ -197,16 +198,9 @@ class Records:
         self._arrays: dict[str, dict[str, NDArray[Any]]] = {}
 
     @classmethod
-    def of(cls, result: Recorded, folder: Path, config: Row, environment: Row) -> Records:
-        """Return the records that a run with this result would have.
-
-        Args:
-            result: Content of its files.
-            folder: Folder of what is not in memory, which need not exist.
-            config: Command and configuration.
-            environment: Environment: machine, versions, commit.
-        """
-        run = cls(folder, strict(result.metrics))
+    def of(cls, result: Recorded, config: Row, environment: Row) -> Records:
+        """Return the records that a run with this result, `CONFIG` and `ENVIRONMENT` would have."""
+        run = cls(result.folder or Path(os.devnull), strict(result.metrics))
         run.config, run.environment = config, environment
         run._tables, run._arrays = dict(result.tables), {name: dict(part) for name, part in result.arrays.items()}
         return run

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,13 +15,13 @@ from tasks.configs import ReportConfig
 from tasks.directory import check_new_file, new_directory
 from tasks.environment import choose_device, environment, stamp
 from tasks.locate.page import page as locate
-from tasks.page.page import REPORT, Page, as_html, drawn, write_page
+from tasks.page.page import REPORT, rendered, write_page
 from tasks.records import Records
 from tasks.rssi.page import page as rssi
-from tasks.terminal import terminal
+from tasks.terminal import Answer, terminal
 
 CALLS = {"aoa": "augment.turbo_learning", "rssi": "swiftwrf.rssi.compare", "locate": "swiftwrf.locate.compare"}
-PAGES: dict[str, Callable[[list[Records]], Page]] = {"aoa": aoa, "rssi": rssi, "locate": locate}
+PAGES = {"aoa": aoa, "rssi": rssi, "locate": locate}
 
 
 def run(config: ReportConfig) -> None:
@@ -33,22 +32,23 @@ def run(config: ReportConfig) -> None:
     terminal.page({"runs": list(config.runs)}, "", page)
 
 
-def write(task: str, result: Recorded, file: Path) -> None:
-    """Write the report of a result of the library into an HTML file, without a directory of a run.
+def write(result: Recorded, file: Path | None) -> Answer | None:
+    """Return the answer of a result of the library, and write its report into an HTML file, without a directory of a run.
 
     Args:
-        task: Name of the task.
         result: Content of the files of a run with it.
-        file: New file.
+        file: New file. None for the answer alone.
 
     Raises:
         InputError: The file is no .html, exists already, or its folder does not.
     """
-    check_new_file(file, (".html", ".htm"))
-    here = environment(choose_device("cpu"), dict(result.source))
-    run = Records.of(result, result.folder or file, {"command": CALLS[task]}, here)
-    page = replace(PAGES[task]([run]), alone=True)
-    write_text(file, as_html(page, drawn(page)))
+    if file is not None:
+        check_new_file(file, (".html", ".htm"))
+    task, here = result.metrics["task"], environment(choose_device("cpu"), dict(result.source))
+    page = PAGES[task]([Records.of(result, {"command": CALLS[task]}, here)])
+    if file is not None:
+        write_text(file, rendered(replace(page, alone=True))[0])
+    return page.answer
 
 
 def merge(folders: list[Path], out: Path) -> None:

@@ -27,7 +27,7 @@ from augment.turbo.experiment import ROOM_MODEL, Experiment
 from augment.turbo.stages import training_set
 from swiftwrf import load
 from swiftwrf.choices import fraction_key
-from swiftwrf.contrib.comparison.base import Recorded
+from swiftwrf.contrib.comparison.base import Recorded, Result
 from swiftwrf.data.splits import places
 from swiftwrf.locate import MatchedField
 from swiftwrf.metrics import LEVEL, ChangeMetrics, ErrorSummary, angle_errors, paired_change, summary
@@ -37,7 +37,7 @@ from swiftwrf.runtime.steps import Memo
 ANGLES = ("azimuth_deg", "elevation_deg", "great_circle_deg")
 
 
-class TurboResult:
+class TurboResult(Result):
     """Errors of estimators trained on measured, synthetic and all spectra, and the one that cross-validation chose.
 
     Attributes:
@@ -263,13 +263,32 @@ class TurboResult:
             rows.append(row)
         return DataFrame(rows, index=list(self.metrics["methods"])).sort_values("median")
 
-    def report(self, file: str | Path) -> None:
-        """Write the report of `swiftwrf aoa` on this result into an HTML file, which opens offline.
-
-        Raises:
-            InputError: The file exists already.
-        """
-        recorded([self]).report(file)
+    def recorded(self, *others: TurboResult) -> Recorded:
+        """Return the content of the files of a run with this result, and with those of other measured fractions."""
+        experiment, results = self.experiment, (self, *others)
+        train, test = experiment.train, experiment.test
+        metrics = {
+            "task": "aoa",
+            "data": train.name,
+            "split": experiment.split,
+            "preset": experiment.preset,
+            "seed": experiment.seed,
+            "repeats": experiment.repeats,
+            "moving": train.moving,
+            "notes": list(train.notes),
+            "extra": experiment.n_synthetic,
+            "n_train": len(train),
+            "n_test": len(test),
+            "grid": train.grid.shape,
+            "line_of_sight_share": float(test.line_of_sight.float().mean()),
+            "mixes": {fraction_key(result.fraction): result.metrics for result in results},
+        }
+        names = ("errors", "synthesis", "positions")
+        tables = {name: concat([getattr(result, name) for result in results]) for name in names}
+        # the columns of rows differ, and integers stay integers
+        tables["history"] = DataFrame([row for result in results for row in result.history], dtype=object)
+        tables = {name: table for name, table in tables.items() if len(table) or name != "positions"}
+        return Recorded(metrics, tables, {}, train.source, self.folder)
 
     def __repr__(self) -> str:
         error = self.summary()["median"]
@@ -351,42 +370,6 @@ class TurboResult:
             }
             for method, entry in summaries(self.positions, "method", ("error_m",)).items()
         }
-
-
-def recorded(results: Sequence[TurboResult]) -> Recorded:
-    """Return the content of the files of a run with these results, one for each measured fraction of an experiment.
-
-    Example:
-        >>> import augment, swiftwrf
-        >>> data = swiftwrf.simulated_room(n=40, grid=swiftwrf.AngularGrid.hemisphere(10, 40))
-        >>> result = augment.turbo_learning(data, measured=0.5, models=["nearest"], estimators=["peak"], extra=0)
-        >>> list(recorded([result]).metrics["mixes"])
-        ['0.5']
-    """
-    experiment = results[0].experiment
-    train, test = experiment.train, experiment.test
-    metrics = {
-        "task": "aoa",
-        "data": train.name,
-        "split": experiment.split,
-        "preset": experiment.preset,
-        "seed": experiment.seed,
-        "repeats": experiment.repeats,
-        "moving": train.moving,
-        "notes": list(train.notes),
-        "extra": experiment.n_synthetic,
-        "n_train": len(train),
-        "n_test": len(test),
-        "grid": train.grid.shape,
-        "line_of_sight_share": float(test.line_of_sight.float().mean()),
-        "mixes": {fraction_key(result.fraction): result.metrics for result in results},
-    }
-    names = ("errors", "synthesis", "positions")
-    tables = {name: concat([getattr(result, name) for result in results]) for name in names}
-    # the columns of rows differ, and integers stay integers
-    tables["history"] = DataFrame([row for result in results for row in result.history], dtype=object)
-    tables = {name: table for name, table in tables.items() if len(table) or name != "positions"}
-    return Recorded(metrics, tables, {}, train.source, results[0].folder)
 
 
 def summaries(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dict[str, ErrorSummary]]:

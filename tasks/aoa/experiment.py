@@ -9,7 +9,6 @@ import torch
 from augment import suggest
 from augment.turbo.experiment import Experiment
 from augment.turbo.learning import learn
-from augment.turbo.results import recorded
 from swiftwrf import Spectra, make_model, simulated_room
 from swiftwrf.choices import RAYTRACE, fraction_key
 from swiftwrf.contrib.raytraced import sionna
@@ -17,7 +16,7 @@ from swiftwrf.data.files import sha256
 from swiftwrf.data.formats import read_spectra
 from swiftwrf.metrics import angle_errors
 from swiftwrf.models import FieldModel
-from tasks.aoa.page import answer_of, page
+from tasks.aoa.page import page
 from tasks.configs import AoaConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
@@ -83,7 +82,7 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
             measured, _ = experiment.withhold(subset)
             found = suggest(measured, config.suggest, config.seed)
             write_suggestion(run.path(f"suggested-mix{subset.key}"), measured.position, found.position, found.variance)
-        finish(run, recorded(results), page, answer_of)
+        finish(run, results[0].recorded(*results[1:]), page)
 
 
 def measurements(config: AoaConfig) -> Spectra:

@@ -11,7 +11,7 @@ from swiftwrf.data.coordinates import degree_columns
 from tasks.configs import LocateConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
-from tasks.locate.page import SUGGESTED, answer, page
+from tasks.locate.page import SUGGESTED, page
 from tasks.page.page import finish
 from tasks.page.shared import write_suggestion
 from tasks.source import measured_rssi
@@ -55,7 +55,7 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
             degrees = degree_columns(train.origin, found.position.numpy())
             measured = train.transmitter_position
             write_suggestion(directory.path(SUGGESTED), measured, found.position, found.variance, degrees)
-        finish(directory, result.recorded(), page, answer)
+        finish(directory, result.recorded(), page)
 
 
 def measurements(config: LocateConfig) -> Rssi:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -118,7 +118,8 @@ class Summary:
 class Page:
     """A report: first screen, at most `MAX_SECTIONS` sections in the navigation, and folded sections as details.
 
-    A page that stands `alone`, outside of the directory of a run, has neither commands on it nor links to its files.
+    It states the answer of its first run. A page that stands `alone`, without the directory of a run, has neither commands
+    on it nor links to its files.
     """
 
     title: str
@@ -126,6 +127,7 @@ class Page:
     sections: list[Section]
     details: list[Section] = field(default_factory=list)
     alone: bool = False
+    answer: Answer | None = None
 
     def __post_init__(self) -> None:
         if len(self.sections) > MAX_SECTIONS:
@@ -152,8 +154,8 @@ def rich(text: str) -> Markup:
     return Markup(re.sub("`([^`]*)`", code, str(escape(text))))  # of escaped text
 
 
-def drawn(page: Page) -> dict[str, str]:
-    """Return the SVG of each panel of each plot, by the name of its file without suffix."""
+def rendered(page: Page) -> tuple[str, dict[str, str]]:
+    """Return the page as HTML, and the SVG of each panel in it by the name of its file without suffix."""
     panels: dict[str, Figure] = {}
     for plot in page.plots:
         for file, panel in zip(plot.files, plot.panels, strict=True):
@@ -161,42 +163,34 @@ def drawn(page: Page) -> dict[str, str]:
                 raise ValueError(f"two figures are called {file}; one would be shown in the other's place")
             panels[file] = panel
     captions = [plot.caption for plot in page.plots for _ in plot.panels]
-    return dict(zip(panels, served_map(as_svg, panels.values(), captions), strict=True))
-
-
-def as_html(page: Page, svg: Mapping[str, str]) -> str:
-    """Return the page with the panels of `drawn` inlined."""
+    svg = dict(zip(panels, served_map(as_svg, panels.values(), captions), strict=True))
+    inlined = {file: Markup(for_page(text, file)) for file, text in svg.items()}  # our own drawings; texts are escaped
     environment = Environment(
         loader=PackageLoader("tasks.page", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters["rich"] = rich
-    inlined = {file: Markup(for_page(text, file)) for file, text in svg.items()}  # our own drawings; texts are escaped
-    return environment.get_template("template.html").render(page=page, svg=inlined)
+    return environment.get_template("template.html").render(page=page, svg=inlined), svg
 
 
-def write_page(folder: Path, page: Page) -> None:
+def write_page(folder: Path, page: Page) -> Page:
     """Write the panels of each plot and its numbers into `figures/`, and `report.html` with the same panels inlined."""
-    figures, svg = folder / "figures", drawn(page)
+    figures, (html, svg) = folder / "figures", rendered(page)
     figures.mkdir(parents=True, exist_ok=True)
     for file, text in svg.items():
         write_text(figures / f"{file}.svg", text)
     for plot in page.plots:
         write_table(figures / f"{plot.name}.csv", plot.data.to_dict("records"))
-    write_text(folder / REPORT, as_html(page, svg))
+    write_text(folder / REPORT, html)
+    return page
 
 
-def finish(
-    run: Run,
-    result: Recorded,
-    page: Callable[[list[Records]], Page],
-    answer: Callable[[Records], Answer],
-    notes: Sequence[str] = (),
-) -> None:
+def finish(run: Run, result: Recorded, page: Callable[[list[Records]], Page], notes: Sequence[str] = ()) -> None:
     """Finish a run with its result, further notes on its data, and its report, and show its answer."""
     metrics = write_result(result, run.folder)
     metrics["notes"] = [*notes, *metrics["notes"]]
-    final = run.finish(metrics, lambda folder, values: write_page(folder, page([Records(folder, values)])))
-    terminal.answer(answer(Records(final)), final / REPORT)
+    shown = run.finish(metrics, lambda folder, values: write_page(folder, page([Records(folder, values)])))
+    assert shown.answer is not None
+    terminal.answer(shown.answer, run.final / REPORT)
 
 
 def sections_of(

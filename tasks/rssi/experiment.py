@@ -13,7 +13,7 @@ from tasks.environment import choose_device
 from tasks.page.maps import FloorPlan, read_pixels
 from tasks.page.page import finish
 from tasks.records import Row
-from tasks.rssi.page import answer, page
+from tasks.rssi.page import page
 from tasks.source import measured_rssi, offset_notes
 from tasks.terminal import console, terminal
 from tasks.workers import connected, workers_of
@@ -69,7 +69,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
             console.print(f"{data.name}: {detection.note(data.receiver_names)}")
         if plan is not None:
             plan.save(directory.folder)
-        finish(directory, result.recorded(), page, answer, offset_notes(data, config.table))
+        finish(directory, result.recorded(), page, offset_notes(data, config.table))
 
 
 def _read_floor_plan(config: RssiTaskConfig, data: Rssi) -> FloorPlan | None:

@@ -25,7 +25,7 @@ from augment.positions import sample_positions
 from augment.turbo.artifacts import save_examples, save_located
 from augment.turbo.condition import Condition, MeasuredSubset
 from augment.turbo.experiment import Experiment
-from augment.turbo.results import TurboResult, recorded
+from augment.turbo.results import TurboResult
 from swiftwrf import AngularGrid, Rssi, RssiModel, calibrate, make_model, rssi_room, simulated_room
 from swiftwrf.contrib.comparison.base import split_notes
 from swiftwrf.contrib.comparison.localizers import PosteriorLocalizer
@@ -195,7 +195,7 @@ def said(of_rssi, of_locate, of_aoa, tmp_path_factory):
     for name, result in (("rssi", of_rssi), ("locate", of_locate), ("aoa", of_aoa)):
         folder = tmp_path_factory.mktemp(name)
         with mock.patch("swiftwrf.rssi.maps.CELLS", 6):
-            metrics = write_result(recorded([result]) if name == "aoa" else result.recorded(), folder)
+            metrics = write_result(result.recorded(), folder)
         metrics = json.loads(json.dumps(metrics))
         (folder / CONFIG).write_text(json.dumps({"command": "swiftwrf"}))
         run = Records(folder, metrics)
@@ -206,7 +206,8 @@ def said(of_rssi, of_locate, of_aoa, tmp_path_factory):
 @pytest.mark.parametrize("task", PAGES)
 def test_every_table_has_medians_90_percent_and_intervals_over_places(said, task):
     (run, result), errors, page = said[task], ERRORS[task], PAGES[task]
-    answer, section, library = page.answer(run), page._errors(run), result.summary()
+    answer, library = page.answer(run), result.summary()
+    section = page._errors(run, answer)
     terminal = zip(*(column.cells for column in _table(answer).columns), strict=True)
     terminal = {name: [said_of(cell) for cell in cells] for name, *cells in terminal}
     assert [name for name in terminal if name.startswith("*")] == [f"* {answer.chosen}"]
@@ -244,7 +245,7 @@ def test_rssi(said):
     expected = {name: [difference_of(OWN, ERRORS["rssi"][name]), []] for name in ("knn", "gp")}
     assert cells == expected | {"swiftwrf": [[], [0.75]]}
     assert [80, 100 * inside.mean()] in [said_of(step.text) for step in answer.next_steps]
-    shown = [number.value for number in rssi_page._summary(run).numbers][-3:]
+    shown = [number.value for number in rssi_page._summary(run, answer).numbers][-3:]
     assert shown == [f"{np.median(OWN):.2f} dB", f"{np.median(OTHER):.2f} dB", f"{inside.mean():.0%}"]
     assert (run.metrics["n_train"], run.metrics["n_test"]) == (30, 50)
     assert any("b -8.0 dB" in note for note in run.metrics["notes"])
@@ -295,7 +296,7 @@ def test_locating(said):
         assert plan == [pytest.approx(0.6 * np.median(error), abs=0.00501)]
         assert floor == [pytest.approx(100 * (0.8 * error < 2.05).mean())]
         assert difference == (difference_of(OWN / 10, error) if one.name != "posterior" else [])
-    shown = [number.value for number in locate_page._summary(run).numbers]
+    shown = [number.value for number in locate_page._summary(run, answer).numbers]
     assert shown == [f"{np.median(OWN) / 10:.2f} m", f"{np.median(OTHER) / 10:.2f} m", f"{shares[1]}%"]
     lines, truth = locate_page._overview(run, "all").panels[0].axes[0].collections[0], run.table("errors")
     truth = truth[truth["method"] == "posterior"][["truth_x_m", "truth_y_m"]].to_numpy()
@@ -405,7 +406,9 @@ def test_examples_of_spectra(said):
     for mark, (azimuth, elevation) in ((drawn[0], peak.tolist()), (drawn[-1], truth)):
         turn, tilt = mark.get_xydata()[0]
         assert (np.rad2deg(turn), 90 - tilt) == pytest.approx((azimuth, elevation))
-    assert aoa_page.first_screen(fraction).numbers[-1].value == f"{np.median(OWN) / 4:.1f} dB"
+    assert (
+        aoa_page.first_screen(fraction, aoa_page.answer(fraction)).numbers[-1].value == f"{np.median(OWN) / 4:.1f} dB"
+    )
 
 
 def test_the_room_and_posteriors_in_plan(said):

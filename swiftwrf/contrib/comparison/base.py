@@ -17,7 +17,8 @@ from pandas import DataFrame, concat
 from swiftwrf.data import Rssi
 from swiftwrf.data.splits import MAX_REPEATED, places, repeated_fraction
 from swiftwrf.metrics import method_summary, summary
-from swiftwrf.runtime.registry import write_report
+from swiftwrf.runtime.registry import reporter
+from swiftwrf.runtime.validation import checked
 
 Values = dict[str, Any]
 
@@ -40,26 +41,34 @@ class Recorded:
     source: Mapping[str, str]
     folder: Path | None = None
 
+
+class Result(ABC):
+    """Errors of methods on test rows, as the command with the same result states and reports them."""
+
+    @abstractmethod
+    def recorded(self) -> Recorded:
+        """Return the content of the files of a run with this result."""
+
+    def answer(self) -> Any:
+        """Return the answer of the command: the errors of all methods, the one to take, and the conclusion in words.
+
+        Printed, it is the conclusion. `methods`, `chosen` and `conclusion` are its parts, `values()` are those of `--json`.
+        """
+        return reporter()(self.recorded(), None)
+
+    @checked
     def report(self, file: str | Path) -> None:
         """Write the report of the command into an HTML file, which opens offline.
 
         Raises:
             InputError: The file exists already.
         """
-        write_report(self.metrics["task"], self, file)
+        reporter()(self.recorded(), Path(file))
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison(ABC):
-    """Methods that were fitted to the training rows of a split, and their errors on its test rows.
-
-    Args:
-        train: Training rows, without offsets between groups.
-        test: Test rows.
-        values: What each method gave, by name. `seconds` are those to `fit` and to `predict`, and `median` is the median
-            error.
-        options: The split, the seed, and what else determines the result.
-    """
+class Comparison(Result):
+    """Methods that were fitted to the training rows of a split, and their errors on its test rows; see its subclasses."""
 
     task: ClassVar[str]
     """command with the same result"""
@@ -111,7 +120,6 @@ class Comparison(ABC):
         return [*split_notes(self.train, self.test, self.options["split"]), *self.train.notes, *offsets]
 
     def recorded(self) -> Recorded:
-        """Return the content of the files of a run with this result."""
         metrics = {
             "task": self.task,
             "data": self.train.name,
@@ -123,14 +131,6 @@ class Comparison(ABC):
             "held_out": self.values[self.model].get("held_out", {}),
         }
         return Recorded(metrics, {"errors": self.errors}, {}, self.train.source)
-
-    def report(self, file: str | Path) -> None:
-        """Write the report of the command with the same result into an HTML file, which opens offline.
-
-        Raises:
-            InputError: The file exists already.
-        """
-        self.recorded().report(file)
 
 
 def split_notes(train: Rssi, test: Rssi, split: str) -> list[str]:

@@ -157,6 +157,7 @@ class RssiComparison(Comparison):
     def _columns(self, name: str) -> Mapping[str, Any]:
         test, (row, column) = self.test, self._pairs
         measured, predicted = test.rssi_dbm[row, column], self._prediction(name).mean
+        from_training = nearest(test.transmitter_position, self.train.transmitter_position, 1)[0]
         return {
             "receiver": self._receiver,
             "index": test.index[row],
@@ -165,7 +166,7 @@ class RssiComparison(Comparison):
             "predicted_dbm": predicted,
             "abs_error_db": (predicted - measured).abs(),
             "from_receiver_m": distance(test.transmitter_position, test.receiver_position)[row, column],
-            "from_training_m": self._from_training[row],
+            "from_training_m": from_training[row, 0],
         }
 
     @property
@@ -211,11 +212,6 @@ class RssiComparison(Comparison):
     @property
     def _receiver(self) -> list[str]:
         return [self.test.receiver_names[number] for number in self._pairs[1].tolist()]
-
-    @cached_property
-    def _from_training(self) -> Tensor:
-        """Distance of each test row from the nearest training position (n,) [m]."""
-        return nearest(self.test.transmitter_position, self.train.transmitter_position, 1)[0][:, 0]
 
     def _prediction(self, name: str) -> Prediction:
         """Return the prediction of the detected test pairs (n,), with the offsets of their groups."""

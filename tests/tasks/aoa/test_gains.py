@@ -183,7 +183,7 @@ def test_the_summary_begins_with_the_estimator_that_cross_validation_chose(aoa_r
         "n_held_out": 9,
         "better": {},
     }
-    first = first_screen(fraction)
+    first = first_screen(fraction, answer(fraction))
     assert first.conclusion[0].startswith(f"Directions are found within {fraction.medians['peak']:.2f} degrees")
     assert first.numbers[0].value == f"{fraction.medians['peak']:.2f}\N{DEGREE SIGN}"
     assert "peak" in first.numbers[0].meaning
