@@ -30,7 +30,7 @@ from swiftwrf.choices import fraction_key
 from swiftwrf.contrib.comparison.base import Recorded, Result
 from swiftwrf.data.splits import places
 from swiftwrf.locate import MatchedField
-from swiftwrf.metrics import LEVEL, ChangeMetrics, ErrorSummary, angle_errors, paired_change, summary
+from swiftwrf.metrics import LEVEL, ChangeMetrics, angle_errors, paired_change, summaries
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.runtime.steps import Memo
 
@@ -370,20 +370,6 @@ class TurboResult(Result):
             }
             for method, entry in summaries(self.positions, "method", ("error_m",)).items()
         }
-
-
-def summaries(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dict[str, ErrorSummary]]:
-    """Return a summary of columns of errors for each value of `by`, with the number of test rows that have one.
-
-    It is over all test rows (`index`) and repeats. Errors of one `place` are not independent.
-    """
-    return {
-        str(name): {
-            column: {**summary(part[column], part["place"]), "n": part.dropna(subset=column)["index"].nunique()}
-            for column in columns
-        }
-        for name, part in table.groupby(by, sort=False)
-    }
 
 
 def by_repeat(table: DataFrame, column: str) -> NDArray[np.float64]:

@@ -9,14 +9,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from pandas import DataFrame, concat
 
 from swiftwrf.data import Rssi
 from swiftwrf.data.splits import MAX_REPEATED, places, repeated_fraction
-from swiftwrf.metrics import method_summary, summary
+from swiftwrf.metrics import method_summary, summaries
 from swiftwrf.runtime.registry import reporter
 from swiftwrf.runtime.validation import checked
 
@@ -53,6 +52,11 @@ class Result(ABC):
         """Return the answer of the command: the errors of all methods, the one to take, and the conclusion in words.
 
         Printed, it is the conclusion. `methods`, `chosen` and `conclusion` are its parts, `values()` are those of `--json`.
+
+        Example:
+            >>> import swiftwrf
+            >>> swiftwrf.locate.compare(swiftwrf.rssi_room(n=80), n_cells=300).answer().chosen
+            'posterior'
         """
         return reporter()(self.recorded(), None)
 
@@ -94,11 +98,7 @@ class Comparison(Result):
     @cached_property
     def errors(self) -> DataFrame:
         """Errors, a row for each method and test row, or pair of test row and receiver, with the number of its place."""
-        tables = []
-        for name in self.values:
-            columns = {column: np.asarray(values) for column, values in self._columns(name).items()}
-            tables.append(DataFrame({"method": name, **columns}))
-        return concat(tables, ignore_index=True)
+        return concat((DataFrame({"method": name, **self._columns(name)}) for name in self.values), ignore_index=True)
 
     def summary(self) -> DataFrame:
         """Return a row for each method: errors, and their mean difference to those of `model`; see `method_summary`."""
@@ -107,11 +107,8 @@ class Comparison(Result):
     @property
     def overall(self) -> dict[str, Values]:
         """Summaries of the errors of each method over test places, and its seconds."""
-        return {
-            name: {column: summary(own[column], own["place"]) for column in (self.column, *self.further)}
-            | {"seconds": self.values[name]["seconds"]}
-            for name, own in self.errors.groupby("method", sort=False)
-        }
+        found = summaries(self.errors, "method", (self.column, *self.further))
+        return {name: {**found[name], "seconds": self.values[name]["seconds"]} for name in self.values}
 
     @property
     def notes(self) -> list[str]:

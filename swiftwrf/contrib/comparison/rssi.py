@@ -23,7 +23,7 @@ from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.rssi import PLACE
 from swiftwrf.data.splits import MIN_TRAINING, Validation, places
 from swiftwrf.errors import InputError
-from swiftwrf.metrics import LEVEL, summary
+from swiftwrf.metrics import LEVEL, summaries, summary
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import distance, nearest
 from swiftwrf.rssi.base import RssiPredictor
@@ -176,12 +176,11 @@ class RssiComparison(Comparison):
     def recorded(self) -> Recorded:
         found, attenuation = super().recorded(), self._fitted.attenuation
         maps, coverage = _maps(self._fitted, self.train)
-        groups = self.errors.groupby(["receiver", "method"])
-        at_receiver = {key: summary(own[self.column], own["place"]) for key, own in groups}
+        at_receiver, none = summaries(self.errors, ["receiver", "method"], [self.column]), {self.column: summary([])}
         metrics = {
             "left_out": self.left_out,
             "receivers": {
-                receiver: {name: {self.column: at_receiver.get((receiver, name), summary([]))} for name in self.values}
+                receiver: {name: at_receiver.get((receiver, name), none) for name in self.values}
                 for receiver in self.test.receiver_names
             },
             "model": self.model,

@@ -10,9 +10,9 @@ from pandas import DataFrame
 from augment.cross_validation import LOCATOR
 from augment.turbo.condition import Condition, MeasuredSubset, pooled
 from augment.turbo.experiment import Experiment
-from augment.turbo.results import TurboResult, summaries
+from augment.turbo.results import TurboResult
 from swiftwrf import simulated_room
-from swiftwrf.metrics import median_interval, paired_change
+from swiftwrf.metrics import median_interval, paired_change, summaries
 from swiftwrf.metrics import summary as error_summary
 from swiftwrf.runtime.steps import Memo
 from tasks.aoa.page import answer, conclusion, first_screen
