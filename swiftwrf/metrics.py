@@ -323,8 +323,8 @@ def summaries(errors: DataFrame, by: str | list[str], columns: Sequence[str]) ->
     """Return a summary of columns of errors for each value of a column, or for each combination of values of columns.
 
     Args:
-        errors: Errors, with the test row `index` and its `place`, and `receiver` where a row has several errors. Repeats of
-            a test row count once in `n`.
+        errors: Errors, with the test row `index`, `receiver` where a row has several errors, and `place` of the row if it is
+            known. Repeats of a test row count once in `n`.
         by: Column, e.g. "method", or columns.
         columns: Columns of errors.
 
@@ -336,7 +336,7 @@ def summaries(errors: DataFrame, by: str | list[str], columns: Sequence[str]) ->
     keys = [name for name in ("index", "receiver") if name in errors]
 
     def of(part: DataFrame, column: str) -> ErrorSummary:
-        found = summary(part[column], part["place"])
+        found = summary(part[column], part.get("place", part["index"]))
         return {**found, "n": len(part.dropna(subset=column).drop_duplicates(keys))}
 
     return {name: {column: of(part, column) for column in columns} for name, part in errors.groupby(by, sort=False)}
@@ -356,14 +356,13 @@ def method_summary(errors: DataFrame, column: str, reference: str) -> DataFrame:
         `difference_high`.
     """
     keys = [name for name in ("index", "receiver", "place") if name in errors]
-    pairs = errors.groupby([*keys, "method"])[column].mean().unstack("method")
-    rows = {}
-    for name, own in errors.groupby("method", sort=False):
-        mean, low, high = paired_difference(pairs, name, reference)
-        rows[name] = {
-            **summary(own[column], own.get("place", own["index"])),
-            "difference": mean,
-            "difference_low": low,
-            "difference_high": high,
+    pairs, ends = errors.groupby([*keys, "method"])[column].mean().unstack("method"), ("", "_low", "_high")
+    rows = {
+        name: found[column]
+        | {
+            f"difference{end}": value
+            for end, value in zip(ends, paired_difference(pairs, name, reference), strict=True)
         }
+        for name, found in summaries(errors, "method", [column]).items()
+    }
     return DataFrame.from_dict(rows, orient="index").rename_axis("method")

@@ -298,7 +298,8 @@ class TurboResult(Result):
     @cached_property
     def _error(self) -> dict[str, NDArray[np.float64]]:
         """Angular errors [deg] of each method, (n, repeats)."""
-        return {method: by_repeat(part, "great_circle_deg") for method, part in self.errors.groupby("method")}
+        columns = {"index": "index", "columns": "repeat", "values": "great_circle_deg"}
+        return {method: part.pivot(**columns).to_numpy(float) for method, part in self.errors.groupby("method")}
 
     def _change(self, before: str, after: str) -> ChangeMetrics:
         """Return the change of the angular error between two methods, paired over the places of the test spectra."""
@@ -370,12 +371,6 @@ class TurboResult(Result):
             }
             for method, entry in summaries(self.positions, "method", ("error_m",)).items()
         }
-
-
-def by_repeat(table: DataFrame, column: str) -> NDArray[np.float64]:
-    """Return a column with a row for each test row and a column for each repeat, (n, repeats)."""
-    values: NDArray[np.float64] = table.pivot(index="index", columns="repeat", values=column).to_numpy(np.float64)
-    return values
 
 
 def averaged(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dict[str, float]]:

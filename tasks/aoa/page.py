@@ -129,11 +129,9 @@ def _parts(*parts: Section | None) -> Section | None:
 
 
 def _suggestion_section(fraction: FractionRecords) -> Section | None:
-    if not (arrays := fraction.arrays("suggested")):
-        return None
     return suggestion_section(
         "Where to measure next",
-        arrays,
+        fraction.arrays("suggested"),
         f"suggested-mix{fraction.key}",
         fraction.file_name,
         what="the predictive variance over the region",

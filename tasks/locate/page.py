@@ -94,11 +94,9 @@ def _errors(run: Records, found: Answer) -> Section:
 
 
 def _suggestion(run: Records) -> Section | None:
-    if not (arrays := run.arrays(SUGGESTED)):
-        return None
     return suggestion_section(
         "",
-        arrays,
+        run.arrays(SUGGESTED),
         SUGGESTED,
         run.file_name,
         what="the variance of the radio maps",

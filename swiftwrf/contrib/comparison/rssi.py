@@ -116,7 +116,7 @@ class RssiComparison(Comparison):
 
     @property
     def model(self) -> str:
-        return model_of(self.train)
+        return PairModel.name if self.train.receiver_moves else RssiModel.name
 
     @cached_property
     def predictions(self) -> DataFrame:
@@ -254,11 +254,6 @@ def _maps(model: RssiModel | PairModel, train: Rssi) -> tuple[dict[str, NDArray[
     return maps, [{"floor": name} | found.values for name, found in zip(names, coverage, strict=True)]
 
 
-def model_of(data: Rssi) -> str:
-    """Return the name of the model of this package for these data."""
-    return PairModel.name if data.receiver_moves else RssiModel.name
-
-
 @checked
 def compare(
     data: Rssi,
@@ -321,7 +316,8 @@ def compare(
     names, left_out = compared(chosen, also)
     if keep is not None:
         keep.of(given | {"predictors": [RSSI_PREDICTORS[name] for name in names]})
-    own, predictors = model_of(train), dict[str, RssiPredictor]()
+    begun = RssiComparison(train, test, {}, {"split": split, "preset": preset, "seed": seed}, left_out)
+    own, predictors = begun.model, dict[str, RssiPredictor]()
     parallel = None if executor is None else executor.map
 
     def compute(_: None, folder: Path, name: str, rows: Tensor | None = None) -> Values:
@@ -375,8 +371,7 @@ def compare(
             assert isinstance(model, RssiModel | PairModel)
             predictors[own] = model
     by_rows = by_rows.set_index(by_rows.index.astype(int)).rename_axis("n_train")
-    used = {"split": split, "preset": preset, "seed": seed}
-    return RssiComparison(train, test, values, used, left_out, predictors, by_rows)
+    return replace(begun, values=values, predictors=predictors, by_rows=by_rows)
 
 
 def pool_of(whole: Rssi, train: Rssi, test: Rssi, split: str, seed: int) -> Rssi:
