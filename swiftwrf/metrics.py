@@ -356,13 +356,10 @@ def method_summary(errors: DataFrame, column: str, reference: str) -> DataFrame:
         `difference_high`.
     """
     keys = [name for name in ("index", "receiver", "place") if name in errors]
-    pairs, ends = errors.groupby([*keys, "method"])[column].mean().unstack("method"), ("", "_low", "_high")
+    pairs = errors.groupby([*keys, "method"])[column].mean().unstack("method")
+    columns = ("difference", "difference_low", "difference_high")
     rows = {
-        name: found[column]
-        | {
-            f"difference{end}": value
-            for end, value in zip(ends, paired_difference(pairs, name, reference), strict=True)
-        }
+        name: {**found[column], **dict(zip(columns, paired_difference(pairs, name, reference), strict=True))}
         for name, found in summaries(errors, "method", [column]).items()
     }
     return DataFrame.from_dict(rows, orient="index").rename_axis("method")

@@ -179,9 +179,9 @@ def answer(fraction: FractionRecords) -> Answer:
 
 def joined(of_fractions: Mapping[FractionRecords, Answer]) -> Answer:
     """Return the answer of a run, whose methods of several measured fractions have the fraction in their names."""
+    if len(of_fractions) == 1:
+        return next(iter(of_fractions.values()))
     fractions, answers = list(of_fractions), {one.percent: found for one, found in of_fractions.items()}
-    if len(answers) == 1:
-        return of_fractions[fractions[0]]
     named = [replace(one, name=f"{one.name}, {share} measured") for share, of in answers.items() for one in of.methods]
     chosen = [f"{of.chosen}, {share} measured" for share, of in answers.items()]
     sentences = [f"{share} measured: {of.conclusion[0]}" for share, of in answers.items()]
