@@ -24,7 +24,7 @@ from record import kept, options, write_result
 import swiftwrf
 from swiftwrf import Rssi, Spectra
 from swiftwrf.contrib.comparison.localizers import LEVELS
-from swiftwrf.contrib.comparison.locating import LocateSplit
+from swiftwrf.contrib.comparison.locating import LocateComparison
 from swiftwrf.metrics import LEVEL, covered
 
 RESULT = "intervals"
@@ -100,7 +100,8 @@ def of_rssi(parts: Iterator[Part]) -> Iterator[Row]:
         low, high = model.predict_detected(test).interval(LEVEL)
         inside = (test.rssi_dbm >= low) & (test.rssi_dbm <= high)
         yield f"{name} {split}, RSSI", seed, float(inside[test.detected].double().mean())
-        found = LocateSplit(train, test, split, N_CELLS, seed, 0).fit(None, "posterior")
+        options = {"split": split, "n_cells": N_CELLS, "seed": seed}
+        found = LocateComparison(train, test, {}, options).fit(None, "posterior")
         error, radius = (found["estimate"] - found["truth"]).norm(dim=1), found["radius"][:, LEVELS.index(LEVEL)]
         yield f"{name} {split}, regions", seed, float((error <= radius).double().mean())
 

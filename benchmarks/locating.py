@@ -5,7 +5,7 @@ python benchmarks/locating.py tetam-tracks:spatial ts-tut5:published floor
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,7 +15,7 @@ from record import kept, options, write_result
 
 from swiftwrf import Rssi, load_rssi, rssi_room
 from swiftwrf.contrib.comparison.localizers import LOCALIZERS
-from swiftwrf.contrib.comparison.locating import LocateComparison, LocateSplit
+from swiftwrf.contrib.comparison.locating import LocateComparison
 from swiftwrf.contrib.datasets import DATA_SETS, fetch
 
 RESULT = "locating_rssi"
@@ -60,10 +60,10 @@ def measure(data: Rssi, split: str, config: Config) -> dict[str, Any]:
 
     The benchmark's nearest neighbour has all receivers, the others those that detected at least 10 rows.
     """
-    measured = LocateSplit.of(data.receivers(["all"]), split, config.cells, config.seed)
-    whole = LocateSplit.of(data, split, config.cells, config.seed)
+    measured = LocateComparison.of(data.receivers(["all"]), split, config.cells, config.seed)
+    whole = LocateComparison.of(data, split, config.cells, config.seed)
     values = {name: (whole if name == "nearest" else measured).fit(None, name) for name in config.localizers}
-    result = LocateComparison(measured, values)
+    result = replace(measured, values=values)
     return {
         "n_train": len(measured.train),
         "n_test": len(measured.test),

@@ -117,7 +117,7 @@ def measure(data: Rssi, split: str, also: tuple[str, ...] = ()) -> Row:
             others.keep(name, result.values[name], 0.0)
         identity = compare(data, split=split, also=also, keep=others)
     result = replace(result, values={**result.values, IDENTITY: identity.values[RssiModel.name]})
-    median = {name: values["median_db"] for name, values in result.values.items()}
+    median = {name: values["median"] for name, values in result.values.items()}
     best = min((name for name in median if name not in OWN), key=lambda name: median[name])
     table = method_summary(result.errors, "abs_error_db", best)
     methods: dict[str, Row] = {}
@@ -127,9 +127,8 @@ def measure(data: Rssi, split: str, also: tuple[str, ...] = ()) -> Row:
         ends = {end: float(change[f"difference_{end}"]) for end in ("low", "high")}
         ends = {end: value for end, value in ends.items() if math.isfinite(value)}
         difference = {"median": median[name] - median[best], "mean": float(change["difference"]), **ends}
-        seconds = {part: values[part] for part in ("fit", "predict")}
         error = summary(own["abs_error_db"], own["place"])
-        methods[name] = {"abs_error_db": error, "seconds": seconds, "difference_db": difference}
+        methods[name] = {"abs_error_db": error, "seconds": values["seconds"], "difference_db": difference}
         if values["std"] is not None:
             away, std = torch.tensor(own["abs_error_db"].to_numpy()), torch.as_tensor(values["std"]).double()
             _, half_width = Prediction(torch.zeros_like(std), std).interval(LEVEL)

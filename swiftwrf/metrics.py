@@ -7,10 +7,10 @@ SSIM is scikit-image's default (7 x 7 uniform window, sample covariance, borders
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from statistics import NormalDist
-from typing import TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
 import torch
@@ -319,6 +319,29 @@ def paired_difference(errors: DataFrame, method: str, other: str) -> tuple[float
     return float(found.mean()), low, high
 
 
+def summaries(errors: DataFrame, by: str | list[str], columns: Sequence[str]) -> dict[Any, dict[str, ErrorSummary]]:
+    """Return a summary of columns of errors for each value of a column, or for each combination of values of columns.
+
+    Args:
+        errors: Errors, with the test row `index`, `receiver` where a row has several errors, and `place` of the row if it is
+            known. Repeats of a test row count once in `n`.
+        by: Column, e.g. "method", or columns.
+        columns: Columns of errors.
+
+    Example:
+        >>> errors = DataFrame({"method": ["a", "a", "b"], "index": [0, 1, 0], "place": [0, 1, 0], "m": [1.0, 3.0, 5.0]})
+        >>> {name: found["m"]["median"] for name, found in summaries(errors, "method", ["m"]).items()}
+        {'a': 2.0, 'b': 5.0}
+    """
+    keys = [name for name in ("index", "receiver") if name in errors]
+
+    def of(part: DataFrame, column: str) -> ErrorSummary:
+        found = summary(part[column], part.get("place", part["index"]))
+        return {**found, "n": len(part.dropna(subset=column).drop_duplicates(keys))}
+
+    return {name: {column: of(part, column) for column in columns} for name, part in errors.groupby(by, sort=False)}
+
+
 def method_summary(errors: DataFrame, column: str, reference: str) -> DataFrame:
     """Return a summary of the errors of each method, and their mean difference to those of a reference.
 
@@ -334,13 +357,9 @@ def method_summary(errors: DataFrame, column: str, reference: str) -> DataFrame:
     """
     keys = [name for name in ("index", "receiver", "place") if name in errors]
     pairs = errors.groupby([*keys, "method"])[column].mean().unstack("method")
-    rows = {}
-    for name, own in errors.groupby("method", sort=False):
-        mean, low, high = paired_difference(pairs, name, reference)
-        rows[name] = {
-            **summary(own[column], own.get("place", own["index"])),
-            "difference": mean,
-            "difference_low": low,
-            "difference_high": high,
-        }
+    columns = ("difference", "difference_low", "difference_high")
+    rows = {
+        name: {**found[column], **dict(zip(columns, paired_difference(pairs, name, reference), strict=True))}
+        for name, found in summaries(errors, "method", [column]).items()
+    }
     return DataFrame.from_dict(rows, orient="index").rename_axis("method")

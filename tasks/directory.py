@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from os.path import isfile  # unlike Path.is_file, it is False for names that are too long
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from filelock import FileLock, Timeout
@@ -30,6 +30,7 @@ from tasks.terminal import terminal
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # errors of file systems without locks
 LOCK = "lock"
+Reported = TypeVar("Reported")
 MAX_LABEL = 60  # characters of the label in the name of a directory under runs/
 
 
@@ -271,21 +272,21 @@ class Run(Memo):
         """Return a file in the run's directory."""
         return self.folder / name
 
-    def finish(self, metrics: Mapping[str, Any], report: Callable[[Path, Row], None]) -> Path:
-        """Write environment, report and metrics, give the run its name, and return its directory.
+    def finish(self, metrics: Mapping[str, Any], report: Callable[[Path, Row], Reported]) -> Reported:
+        """Write environment, report and metrics, give the run its name, and return what `report` does.
 
         Files that only a resumed run needs are removed last, so that a run stopped in between can be resumed.
         """
         self._environment["end"] = now()
         self.write_json(ENVIRONMENT, self._environment)
         as_read: Row = strict(metrics)
-        report(self.folder, as_read)
+        reported = report(self.folder, as_read)
         self.write_json(METRICS, as_read)
         rename(self.folder, self.final)
         self._claim.release()
         shutil.rmtree(self.final / STEPS, ignore_errors=True)
         (self.final / LOCK).unlink(missing_ok=True)
-        return self.final
+        return reported
 
     def __enter__(self) -> Run:
         return self

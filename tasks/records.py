@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 from collections.abc import Iterable, Sequence
 from functools import cached_property
@@ -15,11 +16,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from swiftwrf.errors import InputError
-from swiftwrf.runtime.durable import write_text
+from swiftwrf.runtime.durable import strict, write_npz, write_text
 
 if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import NDArray
+
+    from swiftwrf.contrib.comparison.base import Recorded
 
 Row = dict[str, Any]
 CONFIG, ENVIRONMENT, METRICS = "config.json", "environment.json", "metrics.json"  # files of a run
@@ -157,13 +160,22 @@ def read_npz(file: Path) -> dict[str, NDArray[Any]]:
     return read_arrays(file, sorted(array_names(file)), kinds=f"{NUMBERS}U")
 
 
+def write_result(result: Recorded, folder: Path) -> Row:
+    """Write the tables and arrays of a result into a folder, and return the content of metrics.json."""
+    for name, table in result.tables.items():
+        write_table(folder / f"{name}.csv", table.to_dict("records"))
+    for name, arrays in result.arrays.items():
+        write_npz(folder / f"{name}.npz", arrays)
+    return dict(result.metrics)
+
+
 def notes(run: Records) -> list[str]:
     """Return what the reader of the data found, in sentences; nothing for a run that did not keep it."""
     return [f"{note[0].upper()}{note[1:]}." for note in run.metrics.get("notes", [])]
 
 
 class Records:
-    """The files of one run.
+    """The files of one run, or a result in memory.
 
     Args:
         folder: Directory of the run.
@@ -184,6 +196,14 @@ class Records:
         self.metrics = metrics
         self._tables: dict[str, pd.DataFrame] = {}
         self._arrays: dict[str, dict[str, NDArray[Any]]] = {}
+
+    @classmethod
+    def of(cls, result: Recorded, config: Row, environment: Row) -> Records:
+        """Return the records that a run with this result, `CONFIG` and `ENVIRONMENT` would have."""
+        run = cls(result.folder or Path(os.devnull), strict(result.metrics))
+        run.config, run.environment = config, environment
+        run._tables, run._arrays = dict(result.tables), {name: dict(part) for name, part in result.arrays.items()}
+        return run
 
     @property
     def place(self) -> str:

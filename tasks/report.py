@@ -3,31 +3,25 @@
 from __future__ import annotations
 
 import os
-import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any
 
 from swiftwrf import InputError
+from swiftwrf.contrib.comparison.base import Recorded
 from swiftwrf.runtime.checkpoint import refusing
-from swiftwrf.runtime.durable import strict, write_json
-from tasks.aoa.experiment import record as aoa_record
+from swiftwrf.runtime.durable import write_text
 from tasks.aoa.page import page as aoa
 from tasks.configs import ReportConfig
 from tasks.directory import check_new_file, new_directory
 from tasks.environment import choose_device, environment, stamp
-from tasks.locate.experiment import record as locate_record
 from tasks.locate.page import page as locate
-from tasks.page.page import REPORT, Page, write_page
-from tasks.records import CONFIG, ENVIRONMENT, Records
-from tasks.rssi.experiment import record as rssi_record
+from tasks.page.page import REPORT, rendered, write_page
+from tasks.records import Records
 from tasks.rssi.page import page as rssi
-from tasks.terminal import terminal
+from tasks.terminal import Answer, terminal
 
 CALLS = {"aoa": "augment.turbo_learning", "rssi": "swiftwrf.rssi.compare", "locate": "swiftwrf.locate.compare"}
-PAGES: dict[str, Callable[[list[Records]], Page]] = {"aoa": aoa, "rssi": rssi, "locate": locate}
+PAGES = {"aoa": aoa, "rssi": rssi, "locate": locate}
 
 
 def run(config: ReportConfig) -> None:
@@ -38,32 +32,23 @@ def run(config: ReportConfig) -> None:
     terminal.page({"runs": list(config.runs)}, "", page)
 
 
-def write(task: str, result: Any, file: Path) -> None:
-    """Write the report of a result of the library into an HTML file, without a directory of a run.
+def write(result: Recorded, file: Path | None) -> Answer | None:
+    """Return the answer of a result of the library, and write its report into an HTML file, without a directory of a run.
 
     Args:
-        task: Name of the task.
-        result: `TurboResult`, `RssiComparison` or `LocateComparison`.
-        file: New file.
+        result: Content of the files of a run with it.
+        file: New file. None for the answer alone.
 
     Raises:
         InputError: The file is no .html, exists already, or its folder does not.
     """
-    check_new_file(file, (".html", ".htm"))
-    with TemporaryDirectory() as name:
-        folder = Path(name)
-        match task:
-            case "aoa":
-                shutil.copytree(result.folder, folder, dirs_exist_ok=True)  # what the steps left for the report
-                metrics, source = aoa_record([result], folder), result.experiment.train.source
-            case "rssi":
-                metrics, source = rssi_record(result, folder), result.train.source
-            case _:
-                metrics, source = locate_record(result, folder), result.split.train.source
-        write_json(folder / CONFIG, {"command": CALLS[task]})
-        write_json(folder / ENVIRONMENT, environment(choose_device("cpu"), source))
-        write_page(folder, replace(PAGES[task]([Records(folder, strict(metrics))]), alone=True))
-        shutil.copyfile(folder / REPORT, file)
+    if file is not None:
+        check_new_file(file, (".html", ".htm"))
+    task, here = result.metrics["task"], environment(choose_device("cpu"), dict(result.source))
+    page = PAGES[task]([Records.of(result, {"command": CALLS[task]}, here)])
+    if file is not None:
+        write_text(file, rendered(replace(page, alone=True))[0])
+    return page.answer
 
 
 def merge(folders: list[Path], out: Path) -> None:

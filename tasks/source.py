@@ -20,7 +20,6 @@ from swiftwrf.data.files import TABLES, read_table
 from swiftwrf.data.formats import RSSI_FORMATS, ReadOptions, read, read_spectra
 from swiftwrf.data.receivers import spelled_as
 from swiftwrf.data.rssi import Offsets
-from swiftwrf.data.splits import MAX_REPEATED, places, repeated_fraction
 from swiftwrf.data.store import Store
 from swiftwrf.errors import listed
 from tasks.options import OffsetSource, SpectraSource, TableSource, by_name, pairs
@@ -98,23 +97,6 @@ def offset_notes(data: Rssi, table: OffsetSource) -> list[str]:
     return [
         f"rows differ in {listed(data.labels)}; if swiftwrf inspect finds offsets between them, give --offset-by COLUMN"
     ]
-
-
-def split_notes(train: Rssi, test: Rssi, split: str) -> list[str]:
-    """Return notes on sessions and on rows that share positions."""
-    notes = []
-    if train.validation_for(split, test) == "session":
-        notes.append(
-            "the test rows are of other sessions than the training rows, so cross-validation holds out sessions"
-        )
-    repeated = repeated_fraction(train.transmitter_position, test.transmitter_position)
-    position = torch.cat([train.transmitter_position, test.transmitter_position])
-    n_places = int(places(position).max()) + 1
-    if repeated > MAX_REPEATED:
-        notes.append(f"this split tests look-up: {repeated:.0%} of the test rows are at places of training rows")
-    elif n_places < len(position) and not repeated:
-        notes.append(f"{len(position)} rows are at {n_places} places, each of which is in one part of the split")
-    return notes
 
 
 def observed_spectra(source: str, options: ReadOptions, grid: AngularGrid, model: str) -> tuple[Store, Spectra | None]:

@@ -74,6 +74,9 @@ class Answer:
         ordered = sorted(self.methods, key=lambda one: (not one.error["n"], one.error["median"]))
         object.__setattr__(self, "methods", ordered)
 
+    def __str__(self) -> str:
+        return "\n".join(self.conclusion)
+
     def short(self) -> tuple[list[Method], list[Method]]:
         """Return the methods that a user can take and the references of the short table, each sorted."""
         wanted = [self.chosen, *self.shown]

@@ -53,9 +53,8 @@ from swiftwrf.locate import Posterior, smoothed
 from swiftwrf.metrics import ssim
 from swiftwrf.models.geometry import Plane
 from swiftwrf.models.swiftwrf_paper import SwiftWRFPaperConfig
-from swiftwrf.rssi import RssiPaperModel, compare, estimate_floor_attenuation, estimate_offsets
+from swiftwrf.rssi import RssiComparison, RssiPaperModel, compare, estimate_floor_attenuation, estimate_offsets
 from swiftwrf.rssi.maps import RssiMap
-from swiftwrf.runtime.registry import write_report
 
 ROOM = simulated_room(n=24, grid=AngularGrid.hemisphere(9, 36))
 NAN_POSITION = ROOM.position.where(torch.arange(24)[:, None] != 3, torch.nan)
@@ -423,7 +422,10 @@ EMPTY = [
     ("number must be .* below 3, got 'a'", lambda: rssi_model().predict(rssi().transmitter_position).plot("a")),
     ("row must be .* below 24, got 99", lambda: ROOM.plot(99)),
     ("row must be .* below 0, got 0", lambda: ROOM.subset(NONE).plot()),
-    ("file must be a text or an instance of Path, got None", lambda: write_report("aoa", None, None)),
+    (
+        "file must be a text or an instance of Path, got None",
+        lambda: RssiComparison(rssi(), rssi(), {}, {}).report(None),
+    ),
 ]
 
 

@@ -42,7 +42,7 @@ def finished(tmp_path_factory):
 def stopped_once(tmp_path_factory):
     folder = tmp_path_factory.mktemp("stopped")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rssi, "record", _interrupt)
+        patch.setattr(rssi, "finish", _interrupt)
         assert run("rssi", "--rx", "1", "--out", folder / "run") == 130
     return folder / "run.partial"
 
@@ -141,7 +141,7 @@ def test_resume_refuses_changed_data(tmp_path, monkeypatch, capsys):
     plan = tmp_path / "plan.png"
     Image.new("RGB", (4, 4)).save(plan)
     with monkeypatch.context() as patch:
-        patch.setattr(rssi, "record", _interrupt)
+        patch.setattr(rssi, "finish", _interrupt)
         floor = ("--floor-plan", plan, "--floor-extent", 0, 1, 0, 1)
         assert run("rssi", "--rx", "1", *floor, "--out", tmp_path / "run") == 130
     Image.new("RGB", (5, 4)).save(plan)

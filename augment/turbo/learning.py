@@ -6,9 +6,6 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from itertools import zip_longest
-from pathlib import Path
-from tempfile import TemporaryDirectory
-from weakref import finalize
 
 import torch
 
@@ -89,17 +86,13 @@ def turbo_learning(
     if keep is not None:
         named = [experiment.model_type(name) for name in (*experiment.named, *experiment.candidates)]
         keep.of(given | {"field models": named, "evaluated": experiment.evaluated})
-        return learn(experiment, keep, executor)[0]
-    folder = TemporaryDirectory(prefix="swiftwrf-")
-    (result,) = learn(experiment, Memo(Path(folder.name)), executor)
-    finalize(result, folder.cleanup)  # the result reads its files
-    return result
+    return learn(experiment, keep or Memo(), executor)[0]
 
 
 def learn(experiment: Experiment, keep: Memo, executor: Executor | None = None) -> list[TurboResult]:
     """Return the result of each measured fraction. Measured subsets are computed side by side."""
     steps = Steps(experiment, keep, executor)
-    results = {fraction: TurboResult(experiment, fraction, keep.folder) for fraction in experiment.fractions}
+    results = {fraction: TurboResult(experiment, fraction, keep) for fraction in experiment.fractions}
     subsets = [_learn(experiment, one, steps, results[one.measured_fraction]) for one in experiment.subsets]
     for _ in zip_longest(*subsets):
         pass

@@ -27,16 +27,17 @@ from augment.turbo.experiment import ROOM_MODEL, Experiment
 from augment.turbo.stages import training_set
 from swiftwrf import load
 from swiftwrf.choices import fraction_key
+from swiftwrf.contrib.comparison.base import Recorded, Result
 from swiftwrf.data.splits import places
 from swiftwrf.locate import MatchedField
-from swiftwrf.metrics import LEVEL, ChangeMetrics, ErrorSummary, angle_errors, paired_change, summary
+from swiftwrf.metrics import LEVEL, ChangeMetrics, angle_errors, paired_change, summaries
 from swiftwrf.models import FIELD_MODELS
-from swiftwrf.runtime.registry import write_report
+from swiftwrf.runtime.steps import Memo
 
 ANGLES = ("azimuth_deg", "elevation_deg", "great_circle_deg")
 
 
-class TurboResult:
+class TurboResult(Result):
     """Errors of estimators trained on measured, synthetic and all spectra, and the one that cross-validation chose.
 
     Attributes:
@@ -57,8 +58,8 @@ class TurboResult:
         (True, True)
     """
 
-    def __init__(self, experiment: Experiment, fraction: float, folder: Path) -> None:
-        self.experiment, self.fraction, self.folder = experiment, fraction, folder
+    def __init__(self, experiment: Experiment, fraction: float, keep: Memo) -> None:
+        self.experiment, self.fraction, self._keep = experiment, fraction, keep
         self.compared: Row = {}  # comparison of the field models in the first repeat
         # in the first repeat: errors [deg] of its methods on held-out spectra, and names of the files of its methods
         self.held_out: dict[str, list[float]] = {}
@@ -76,6 +77,11 @@ class TurboResult:
         if missing := FIELD_MODELS[ROOM_MODEL].lacking(experiment.test):
             reason = f"it needs the {missing[0]}, which {experiment.test.name} does not describe"
             self.leave_out(LOCATED, f"{LOCATOR} is left out: {reason}", reason)
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the files that the steps wrote."""
+        return self._keep.folder
 
     def leave_out(self, method: str, sentence: str, reason: str) -> None:
         """Record why a method is missing, and a sentence about it."""
@@ -257,13 +263,32 @@ class TurboResult:
             rows.append(row)
         return DataFrame(rows, index=list(self.metrics["methods"])).sort_values("median")
 
-    def report(self, file: str | Path) -> None:
-        """Write the report of `swiftwrf aoa` on this result into an HTML file, which opens offline.
-
-        Raises:
-            InputError: The file exists already.
-        """
-        write_report("aoa", self, file)
+    def recorded(self, *others: TurboResult) -> Recorded:
+        """Return the content of the files of a run with this result, and with those of other measured fractions."""
+        experiment, results = self.experiment, (self, *others)
+        train, test = experiment.train, experiment.test
+        metrics = {
+            "task": "aoa",
+            "data": train.name,
+            "split": experiment.split,
+            "preset": experiment.preset,
+            "seed": experiment.seed,
+            "repeats": experiment.repeats,
+            "moving": train.moving,
+            "notes": list(train.notes),
+            "extra": experiment.n_synthetic,
+            "n_train": len(train),
+            "n_test": len(test),
+            "grid": train.grid.shape,
+            "line_of_sight_share": float(test.line_of_sight.float().mean()),
+            "mixes": {fraction_key(result.fraction): result.metrics for result in results},
+        }
+        names = ("errors", "synthesis", "positions")
+        tables = {name: concat([getattr(result, name) for result in results]) for name in names}
+        # the columns of rows differ, and integers stay integers
+        tables["history"] = DataFrame([row for result in results for row in result.history], dtype=object)
+        tables = {name: table for name, table in tables.items() if len(table) or name != "positions"}
+        return Recorded(metrics, tables, {}, train.source, self.folder)
 
     def __repr__(self) -> str:
         error = self.summary()["median"]
@@ -273,7 +298,8 @@ class TurboResult:
     @cached_property
     def _error(self) -> dict[str, NDArray[np.float64]]:
         """Angular errors [deg] of each method, (n, repeats)."""
-        return {method: by_repeat(part, "great_circle_deg") for method, part in self.errors.groupby("method")}
+        columns = {"index": "index", "columns": "repeat", "values": "great_circle_deg"}
+        return {method: part.pivot(**columns).to_numpy(float) for method, part in self.errors.groupby("method")}
 
     def _change(self, before: str, after: str) -> ChangeMetrics:
         """Return the change of the angular error between two methods, paired over the places of the test spectra."""
@@ -345,26 +371,6 @@ class TurboResult:
             }
             for method, entry in summaries(self.positions, "method", ("error_m",)).items()
         }
-
-
-def summaries(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dict[str, ErrorSummary]]:
-    """Return a summary of columns of errors for each value of `by`, with the number of test rows that have one.
-
-    It is over all test rows (`index`) and repeats. Errors of one `place` are not independent.
-    """
-    return {
-        str(name): {
-            column: {**summary(part[column], part["place"]), "n": part.dropna(subset=column)["index"].nunique()}
-            for column in columns
-        }
-        for name, part in table.groupby(by, sort=False)
-    }
-
-
-def by_repeat(table: DataFrame, column: str) -> NDArray[np.float64]:
-    """Return a column with a row for each test row and a column for each repeat, (n, repeats)."""
-    values: NDArray[np.float64] = table.pivot(index="index", columns="repeat", values=column).to_numpy(np.float64)
-    return values
 
 
 def averaged(table: DataFrame, by: str, columns: Sequence[str]) -> dict[str, dict[str, float]]:

@@ -18,7 +18,6 @@ from types import MappingProxyType
 from typing import Any, TypeVar
 
 from swiftwrf.errors import InputError
-from swiftwrf.runtime.validation import checked
 
 Made = TypeVar("Made")
 Registered = TypeVar("Registered", bound=Callable[..., Any])
@@ -123,9 +122,8 @@ def _entry_points(group: str, path: tuple[str, ...]) -> tuple[Any, ...]:
     return tuple(entry_points(group=group))
 
 
-@checked
-def write_report(task: str, result: Any, file: str | Path) -> None:
-    """Write the report of a task's result by the entry point of the group `swiftwrf.reports`.
+def reporter() -> Callable[[Any, Path | None], Any]:
+    """Return the function that writes the report of a result, by the entry point of the group `swiftwrf.reports`.
 
     Raises:
         InputError: The package is not installed, or was installed before it had this entry point.
@@ -133,4 +131,5 @@ def write_report(task: str, result: Any, file: str | Path) -> None:
     points = _entry_points("swiftwrf.reports", tuple(sys.path))
     if not points:
         raise InputError("nothing here writes reports; install this package again: pip install -e .")
-    points[0].load()(task, result, Path(file))
+    found: Callable[[Any, Path | None], Any] = points[0].load()
+    return found

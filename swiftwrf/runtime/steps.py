@@ -13,7 +13,10 @@ from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from pickle import PicklingError
+from shutil import rmtree
+from tempfile import mkdtemp
 from typing import Any, Generic, TypeVar
+from weakref import finalize
 
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.durable import strict, write_json
@@ -71,6 +74,9 @@ def check_unchanged(folder: Path, before: Any, now: Mapping[str, str]) -> None:
 class Memo:
     """Results of steps by name, kept in a folder. Steps write their files there, too.
 
+    Args:
+        folder: Folder of the results. Defaults to a temporary one, which is deleted with this object.
+
     Example:
         >>> from tempfile import TemporaryDirectory
         >>> with TemporaryDirectory() as folder:
@@ -80,7 +86,10 @@ class Memo:
         {'value': 3}
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path | None = None) -> None:
+        if folder is None:
+            folder = Path(mkdtemp(prefix="swiftwrf-"))
+            finalize(self, rmtree, folder, ignore_errors=True)
         self.folder = folder
         (folder / STEPS).mkdir(parents=True, exist_ok=True)
 

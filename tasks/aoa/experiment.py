@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -10,7 +9,6 @@ import torch
 from augment import suggest
 from augment.turbo.experiment import Experiment
 from augment.turbo.learning import learn
-from augment.turbo.results import TurboResult
 from swiftwrf import Spectra, make_model, simulated_room
 from swiftwrf.choices import RAYTRACE, fraction_key
 from swiftwrf.contrib.raytraced import sionna
@@ -18,14 +16,14 @@ from swiftwrf.data.files import sha256
 from swiftwrf.data.formats import read_spectra
 from swiftwrf.metrics import angle_errors
 from swiftwrf.models import FieldModel
-from tasks.aoa.page import answer_of, page
+from tasks.aoa.page import page
 from tasks.configs import AoaConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
 from tasks.options import TableSource
 from tasks.page.page import finish
 from tasks.page.shared import write_suggestion
-from tasks.records import Row, write_table
+from tasks.records import Row
 from tasks.source import located, reading
 from tasks.terminal import console, terminal
 from tasks.workers import connected, workers_of
@@ -84,34 +82,7 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
             measured, _ = experiment.withhold(subset)
             found = suggest(measured, config.suggest, config.seed)
             write_suggestion(run.path(f"suggested-mix{subset.key}"), measured.position, found.position, found.variance)
-        finish(run, record(results, run.folder), page, answer_of)
-
-
-def record(results: Sequence[TurboResult], folder: Path) -> Row:
-    """Write the tables of the results of one experiment into a folder, and return the content of metrics.json."""
-    write_table(folder / "history.csv", (row for result in results for row in result.history))
-    for name in ("errors", "synthesis", "positions"):
-        rows = [row for result in results for row in getattr(result, name).to_dict("records")]
-        if rows or name != "positions":
-            write_table(folder / f"{name}.csv", rows)
-    experiment = results[0].experiment
-    train, test = experiment.train, experiment.test
-    return {
-        "task": "aoa",
-        "data": train.name,
-        "split": experiment.split,
-        "preset": experiment.preset,
-        "seed": experiment.seed,
-        "repeats": experiment.repeats,
-        "moving": train.moving,
-        "notes": list(train.notes),
-        "extra": experiment.n_synthetic,
-        "n_train": len(train),
-        "n_test": len(test),
-        "grid": train.grid.shape,
-        "line_of_sight_share": float(test.line_of_sight.float().mean()),
-        "mixes": {fraction_key(result.fraction): result.metrics for result in results},
-    }
+        finish(run, results[0].recorded(*results[1:]), page)
 
 
 def measurements(config: AoaConfig) -> Spectra:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 from augment.cross_validation import LOCATOR
@@ -36,8 +37,10 @@ LOOK_UP = (
 def page(runs: list[Records]) -> Page:
     """Return the page of these runs."""
     fractions = [fraction for run in runs for fraction in FractionRecords.of(run)]
+    answers = {fraction: answer(fraction) for fraction in fractions}
+    of_first = joined({one: found for one, found in answers.items() if one.run is runs[0]})
     sections = [
-        sections_of("Errors", fractions, _errors, _terms()),
+        sections_of("Errors", fractions, lambda one: _errors(one, answers[one]), _terms()),
         sections_of("Where was it?", fractions, lambda one: _parts(locating_section(one), room_section(one))),
         sections_of("Spectra", fractions, lambda fraction: Section("", plots=[examples_plot(fraction)])),
         limits(runs[0], *LIMITS, *([LOOK_UP] if runs[0].metrics["split"] == "random" else [])),
@@ -52,19 +55,18 @@ def page(runs: list[Records]) -> Page:
     )
     names = ", ".join(dict.fromkeys(run.place for run in runs))
     if len(fractions) == 1:
-        first = first_screen(fractions[0])
+        first = first_screen(fractions[0], of_first)
     else:
-        answers = {fraction.scene: answer(fraction) for fraction in fractions}
+        named = {fraction.scene: found for fraction, found in answers.items()}
         colours = palette(condition for fraction in fractions for condition in fraction.conditions.values())
-        own_steps = answer_of(runs[0]).next_steps if len(runs) == 1 else ()
-        first = compared(answers, runs, colours, "angular error", own_steps)
-    return Page(f"Angle of arrival: {names}", first, sections, details)
+        first = compared(named, runs, colours, "angular error", of_first.next_steps if len(runs) == 1 else ())
+    return Page(f"Angle of arrival: {names}", first, sections, details, answer=of_first)
 
 
-def first_screen(fraction: FractionRecords) -> Summary:
+def first_screen(fraction: FractionRecords, found: Answer) -> Summary:
     """Return the first screen of one measured fraction."""
-    found, medians = answer(fraction), fraction.medians
-    turbo, baseline = fraction.turbo_method, "peak" if "peak" in medians else fraction.mix["reference"]
+    medians, turbo = fraction.medians, fraction.turbo_method
+    baseline = "peak" if "peak" in medians else fraction.mix["reference"]
     synthesizer = fraction.synthesizers([turbo])[0]
     quality = fraction.mix["synthesis"][synthesizer]["psnr_db"]["median"]
     numbers = [
@@ -94,7 +96,7 @@ def first_screen(fraction: FractionRecords) -> Summary:
     return Summary(numbers, [plot], found.conclusion, found.next_steps, notes=notes(fraction.run))
 
 
-def _errors(fraction: FractionRecords) -> Section:
+def _errors(fraction: FractionRecords, found: Answer) -> Section:
     caption = (
         "Near the zenith azimuth errors are large without meaning. Held out: median and mean error on measured spectra that "
         "decide the choice, all methods trained on the other measured spectra and on at most "
@@ -103,7 +105,7 @@ def _errors(fraction: FractionRecords) -> Section:
     )
     errors = fraction.table("errors")[["repeat", "index", "method", "great_circle_deg"]]
     return errors_section(
-        answer(fraction),
+        found,
         errors,
         fraction.palette,
         name=fraction.file_name,
@@ -127,11 +129,9 @@ def _parts(*parts: Section | None) -> Section | None:
 
 
 def _suggestion_section(fraction: FractionRecords) -> Section | None:
-    if not (arrays := fraction.arrays("suggested")):
-        return None
     return suggestion_section(
         "Where to measure next",
-        arrays,
+        fraction.arrays("suggested"),
         f"suggested-mix{fraction.key}",
         fraction.file_name,
         what="the predictive variance over the region",
@@ -177,13 +177,11 @@ def answer(fraction: FractionRecords) -> Answer:
     return Answer("deg", methods, chosen, conclusion(fraction), steps(fraction), shown)
 
 
-def answer_of(run: Records) -> Answer:
+def joined(of_fractions: Mapping[FractionRecords, Answer]) -> Answer:
     """Return the answer of a run, whose methods of several measured fractions have the fraction in their names."""
-    fractions = FractionRecords.of(run)
-    answers = {fraction.percent: answer(fraction) for fraction in fractions}
-    first = answers[fractions[0].percent]
-    if len(answers) == 1:
-        return first
+    if len(of_fractions) == 1:
+        return next(iter(of_fractions.values()))
+    fractions, answers = list(of_fractions), {one.percent: found for one, found in of_fractions.items()}
     named = [replace(one, name=f"{one.name}, {share} measured") for share, of in answers.items() for one in of.methods]
     chosen = [f"{of.chosen}, {share} measured" for share, of in answers.items()]
     sentences = [f"{share} measured: {of.conclusion[0]}" for share, of in answers.items()]

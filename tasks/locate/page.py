@@ -50,9 +50,10 @@ LIMITS = (
 
 def page(runs: list[Records]) -> Page:
     """Return the page of these runs."""
+    answers = {run: answer(run) for run in runs}
     sections = [
         sections_of("Where was it?", runs, lambda run: _posteriors(run, several=len(runs) > 1)),
-        sections_of("Errors", runs, _errors, labels.meanings(LOCALIZERS)),
+        sections_of("Errors", runs, lambda run: _errors(run, answers[run]), labels.meanings(LOCALIZERS)),
         sections_of("How sure is it?", runs, lambda run: Section("", plots=[_calibration(run)])),
         limits(runs[0], *LIMITS),
     ]
@@ -60,16 +61,16 @@ def page(runs: list[Records]) -> Page:
         sections.insert(3, sections_of("Where to measure next", runs, _suggestion))
     names = ", ".join(dict.fromkeys(run.place for run in runs))
     if len(runs) == 1:
-        first = _summary(runs[0])
+        first = _summary(runs[0], answers[runs[0]])
     else:
-        answers = {f"{run.number}: {run.place}": answer(run) for run in runs}
-        first = compared(answers, runs, COLOURS, "position error")
-    return Page(f"Localization: {names}", first, sections, [provenance(runs)])
+        named = {f"{run.number}: {run.place}": one for run, one in answers.items()}
+        first = compared(named, runs, COLOURS, "position error")
+    return Page(f"Localization: {names}", first, sections, [provenance(runs)], answer=answers[runs[0]])
 
 
-def _summary(run: Records) -> Summary:
+def _summary(run: Records, found: Answer) -> Summary:
     error = {name: entry["position_error_m"]["median"] for name, entry in run.metrics["overall"].items()}
-    nearest, found = min(NEIGHBOURS, key=lambda name: error[name]), answer(run)
+    nearest = min(NEIGHBOURS, key=lambda name: error[name])
     numbers = [
         Number(f"{error[OWN]:.2f} m", "median position error of the posterior"),
         Number(f"{error[nearest]:.2f} m", f"that of {nearest}, the best nearest-neighbour fingerprinting"),
@@ -78,10 +79,10 @@ def _summary(run: Records) -> Summary:
     return Summary(numbers, [_overview(run, "summary")], found.conclusion, found.next_steps, notes=notes(run))
 
 
-def _errors(run: Records) -> Section:
+def _errors(run: Records, found: Answer) -> Section:
     n_undetected = run.metrics["n_undetected"]
     return errors_section(
-        answer(run),
+        found,
         run.table("errors")[COLUMNS],
         COLOURS,
         name=run.file_name,
@@ -93,11 +94,9 @@ def _errors(run: Records) -> Section:
 
 
 def _suggestion(run: Records) -> Section | None:
-    if not (arrays := run.arrays(SUGGESTED)):
-        return None
     return suggestion_section(
         "",
-        arrays,
+        run.arrays(SUGGESTED),
         SUGGESTED,
         run.file_name,
         what="the variance of the radio maps",

@@ -13,11 +13,12 @@ from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 from pandas import DataFrame
 
+from swiftwrf.contrib.comparison.base import Recorded
 from swiftwrf.runtime.durable import write_text
 from tasks.directory import Run
 from tasks.page.figures import as_svg, for_page
 from tasks.preload import served_map
-from tasks.records import Records, write_table
+from tasks.records import Records, write_result, write_table
 from tasks.terminal import Answer, NextStep, terminal
 
 HALF = 92  # letters of a table that fit into half of the page
@@ -117,7 +118,8 @@ class Summary:
 class Page:
     """A report: first screen, at most `MAX_SECTIONS` sections in the navigation, and folded sections as details.
 
-    A page that stands `alone`, outside of the directory of a run, has neither commands on it nor links to its files.
+    It states the answer of its first run. A page that stands `alone`, without the directory of a run, has neither commands
+    on it nor links to its files.
     """
 
     title: str
@@ -125,6 +127,7 @@ class Page:
     sections: list[Section]
     details: list[Section] = field(default_factory=list)
     alone: bool = False
+    answer: Answer | None = None
 
     def __post_init__(self) -> None:
         if len(self.sections) > MAX_SECTIONS:
@@ -151,10 +154,8 @@ def rich(text: str) -> Markup:
     return Markup(re.sub("`([^`]*)`", code, str(escape(text))))  # of escaped text
 
 
-def write_page(folder: Path, page: Page) -> None:
-    """Write the panels of each plot and its numbers into `figures/`, and `report.html` with the same panels inlined."""
-    figures = folder / "figures"
-    figures.mkdir(parents=True, exist_ok=True)
+def rendered(page: Page) -> tuple[str, dict[str, str]]:
+    """Return the page as HTML, and the SVG of each panel in it by the name of its file without suffix."""
     panels: dict[str, Figure] = {}
     for plot in page.plots:
         for file, panel in zip(plot.files, plot.panels, strict=True):
@@ -162,26 +163,34 @@ def write_page(folder: Path, page: Page) -> None:
                 raise ValueError(f"two figures are called {file}; one would be shown in the other's place")
             panels[file] = panel
     captions = [plot.caption for plot in page.plots for _ in plot.panels]
-    inlined: dict[str, Markup] = {}
-    for file, svg in zip(panels, served_map(as_svg, panels.values(), captions), strict=True):
-        write_text(figures / f"{file}.svg", svg)
-        inlined[file] = Markup(for_page(svg, file))  # our own drawing; its texts are escaped in it
-    for plot in page.plots:
-        write_table(figures / f"{plot.name}.csv", plot.data.to_dict("records"))
+    svg = dict(zip(panels, served_map(as_svg, panels.values(), captions), strict=True))
+    inlined = {file: Markup(for_page(text, file)) for file, text in svg.items()}  # our own drawings; texts are escaped
     environment = Environment(
         loader=PackageLoader("tasks.page", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters["rich"] = rich
-    html = environment.get_template("template.html").render(page=page, svg=inlined)
+    return environment.get_template("template.html").render(page=page, svg=inlined), svg
+
+
+def write_page(folder: Path, page: Page) -> Page:
+    """Write the panels of each plot and its numbers into `figures/`, and `report.html` with the same panels inlined."""
+    figures, (html, svg) = folder / "figures", rendered(page)
+    figures.mkdir(parents=True, exist_ok=True)
+    for file, text in svg.items():
+        write_text(figures / f"{file}.svg", text)
+    for plot in page.plots:
+        write_table(figures / f"{plot.name}.csv", plot.data.to_dict("records"))
     write_text(folder / REPORT, html)
+    return page
 
 
-def finish(
-    run: Run, metrics: dict[str, Any], page: Callable[[list[Records]], Page], answer: Callable[[Records], Answer]
-) -> None:
-    """Finish a run with its metrics and its report, and show its answer."""
-    final = run.finish(metrics, lambda folder, values: write_page(folder, page([Records(folder, values)])))
-    terminal.answer(answer(Records(final)), final / REPORT)
+def finish(run: Run, result: Recorded, page: Callable[[list[Records]], Page], notes: Sequence[str] = ()) -> None:
+    """Finish a run with its result, further notes on its data, and its report, and show its answer."""
+    metrics = write_result(result, run.folder)
+    metrics["notes"] = [*notes, *metrics["notes"]]
+    shown = run.finish(metrics, lambda folder, values: write_page(folder, page([Records(folder, values)])))
+    assert shown.answer is not None
+    terminal.answer(shown.answer, run.final / REPORT)
 
 
 def sections_of(

@@ -204,12 +204,14 @@ def suggestion_section(
     whole: str,
     how: str,
     label: str,
-) -> Section:
+) -> Section | None:
     """Return a plan of suggested positions, from arrays of `write_suggestion`, and the variance after measuring there.
 
     The text names the table, what falls, the whole that it is a fraction of, and how it is estimated. The axis of the
     variance [%] has the label.
     """
+    if not arrays:
+        return None
     measured, suggested, left = (arrays[key] for key in ("measured", "suggested", "left"))
     first, plan = figures.panel(5, 4.2)
     plan.plot(*measured[:, :2].T, ".", color=MEASURED, markersize=3, label="measured")

@@ -22,7 +22,6 @@ MAX_MAPS = 24  # receivers with a map in the report; all are in the tables
 MAX_WIDTH_DB = 30.0  # end of the scale of interval widths of the page
 MAX_RATIO = 12.0  # of the sides of a map that is to scale; one of a corridor would be a line
 MIN_RATIO = 1.2  # of the widest interval inside to the median one, for which the widths are drawn
-COVERED_DBM, CERTAINTY = -75.0, 0.9  # coverage of the summary
 RECEIVER = "#cf4a4a"
 WIDTH_PER_STD = 2 * HALF_WIDTH  # of the interval of a normal variable
 

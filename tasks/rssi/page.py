@@ -9,6 +9,7 @@ import torch
 from matplotlib.figure import Figure
 
 from swiftwrf.choices import RSSI_PREDICTORS
+from swiftwrf.contrib.comparison.rssi import CERTAINTY, COVERED_DBM
 from swiftwrf.data.splits import places
 from swiftwrf.metrics import LEVEL, paired_difference
 from tasks.labels import PREDICTORS, colour, meanings
@@ -27,7 +28,7 @@ from tasks.page.shared import (
     recommendation,
 )
 from tasks.records import Records, notes
-from tasks.rssi.maps import CERTAINTY, COVERED_DBM, MIN_RATIO, WIDTH_PER_STD, Maps, coverage_sentence
+from tasks.rssi.maps import MIN_RATIO, WIDTH_PER_STD, Maps, coverage_sentence
 from tasks.terminal import Answer, Method, NextStep
 
 COLUMNS = ["index", "place", "receiver", "method", "abs_error_db"]  # of the errors of methods
@@ -48,8 +49,9 @@ LIMITS = (
 
 def page(runs: list[Records]) -> Page:
     """Return the page of these runs."""
+    answers = {run: answer(run) for run in runs}
     sections = [
-        sections_of("Errors", runs, _errors, meanings(RSSI_PREDICTORS)),
+        sections_of("Errors", runs, lambda run: _errors(run, answers[run]), meanings(RSSI_PREDICTORS)),
         sections_of("Where the errors are", runs, lambda run: Section("", plots=[_where(run)])),
         limits(runs[0], *LIMITS),
     ]
@@ -60,15 +62,15 @@ def page(runs: list[Records]) -> Page:
         details[:0] = [by_receiver, sections_of("Widths of the intervals", runs, partial(_maps, kind="width"))]
     names = ", ".join(dict.fromkeys(run.place for run in runs))
     if len(runs) == 1:
-        first = _summary(runs[0])
+        first = _summary(runs[0], answers[runs[0]])
     else:
-        answers = {f"{run.number}: {run.place}": answer(run) for run in runs}
-        first = compared(answers, runs, COLOURS, "absolute error")
-    return Page(f"RSSI: {names}", first, sections, details)
+        named = {f"{run.number}: {run.place}": one for run, one in answers.items()}
+        first = compared(named, runs, COLOURS, "absolute error")
+    return Page(f"RSSI: {names}", first, sections, details, answer=answers[runs[0]])
 
 
-def _summary(run: Records) -> Summary:
-    found, floors, interval = answer(run), Maps.of_floors(run), run.metrics["interval"]
+def _summary(run: Records, found: Answer) -> Summary:
+    floors, interval = Maps.of_floors(run), run.metrics["interval"]
     error = {name: entry["abs_error_db"] for name, entry in run.metrics["overall"].items()}
     best = best_baseline(run)
     numbers = [
@@ -88,14 +90,14 @@ def _maps(run: Records, kind: str) -> Section:
     return Section("", plots=[maps.by_receiver(kind) for maps in Maps.of_floors(run)])
 
 
-def _errors(run: Records) -> Section:
+def _errors(run: Records, found: Answer) -> Section:
     caption = (
         f"Column of {model_of(run)}: difference of the mean absolute errors on the same pairs, with its 95 % bootstrap "
         "interval over test places. Detection: mean of the fractions of detected and of empty test cells that are predicted "
         "as such; 0.5 is chance."
     )
     return errors_section(
-        answer(run),
+        found,
         run.table("errors")[COLUMNS],
         COLOURS,
         name=run.file_name,

@@ -365,6 +365,8 @@ OF_CHANNELS = {
 OF_NO_FRAME = {
     augment.choose.Fold,
     rssi.RssiComparison,
+    locate.LocateComparison,
+    locate.LocateComparison.of,
     FloorAttenuation.removed,
     augment.mix,
     augment.withhold,

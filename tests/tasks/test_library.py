@@ -1,8 +1,10 @@
 """Results of the library, which need no directory, process or terminal."""
 
 import json
+import re
 from contextlib import nullcontext
 from functools import partial
+from html import unescape
 from unittest import mock
 
 import pandas as pd
@@ -50,6 +52,10 @@ def test_a_result_writes_the_report_of_its_command_into_one_file(name, tmp_path)
     assert [entry.name for entry in tmp_path.iterdir()] == ["report.html"]
     with pytest.raises(InputError, match="exists already"):
         result.report(file)
+    answer, text = result.answer(), unescape(re.sub("<[^>]+>", "", html))
+    assert all(sentence.replace("`", "") in text for sentence in answer.conclusion)
+    assert str(answer).splitlines() == answer.conclusion
+    assert answer.chosen in result.summary().index
 
 
 def test_the_best_estimator_of_a_result_predicts_and_is_saved(tmp_path):

@@ -7,7 +7,6 @@ import json
 import math
 import re
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
 
@@ -28,8 +27,9 @@ from augment.turbo.condition import Condition, MeasuredSubset
 from augment.turbo.experiment import Experiment
 from augment.turbo.results import TurboResult
 from swiftwrf import AngularGrid, Rssi, RssiModel, calibrate, make_model, rssi_room, simulated_room
+from swiftwrf.contrib.comparison.base import split_notes
 from swiftwrf.contrib.comparison.localizers import PosteriorLocalizer
-from swiftwrf.contrib.comparison.locating import LocateComparison, LocateSplit
+from swiftwrf.contrib.comparison.locating import LocateComparison
 from swiftwrf.contrib.online import score
 from swiftwrf.data.cells import seconds
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin
@@ -39,19 +39,16 @@ from swiftwrf.metrics import summary
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.rssi import RssiComparison, RssiPredictor, estimate_offsets, log_distance
 from swiftwrf.runtime.durable import write_json
-from tasks.aoa import experiment as aoa
+from swiftwrf.runtime.steps import Memo
 from tasks.aoa import page as aoa_page
 from tasks.aoa import room as aoa_room
 from tasks.aoa import synthesis
 from tasks.aoa.records import FractionRecords
-from tasks.locate import experiment as locate
 from tasks.locate import page as locate_page
 from tasks.page.page import number
 from tasks.page.shared import compared, comparison_sentence, coverage_warning
-from tasks.records import CONFIG, Records, read_npz
-from tasks.rssi import experiment as rssi
+from tasks.records import CONFIG, Records, read_npz, write_result
 from tasks.rssi import page as rssi_page
-from tasks.source import split_notes
 from tasks.terminal import _table
 from tasks.view import charts
 from tasks.view.locating import Located
@@ -128,14 +125,14 @@ def of_rssi():
 
     def value(error):
         without_offset = -60 + SIGN * error + 8 * (N // 2 % 2)
-        return TIMES | {"predicted": without_offset, "std": None, "detection": None, "n_primitives": 0}
+        return {"seconds": TIMES, "predicted": without_offset, "std": None, "detection": None, "n_primitives": 0}
 
     values = {name: value(error) for name, error in ERRORS["rssi"].items()}
     values["swiftwrf"] |= {"std": STD, "detection": (0.9, 0.6)}
     by_rows = pd.DataFrame({"swiftwrf": [3.0, 2.0], "knn": [4.0, 3.5]}, index=[10, 30])
     options = {"split": "random", "preset": "quick", "seed": 0}
     models = {"swiftwrf": RssiModel(n_primitives=0).fit(train)}
-    return RssiComparison(train, test, values, {}, models, by_rows, options)
+    return RssiComparison(train, test, values, options, {}, models, by_rows)
 
 
 class Rings:
@@ -160,7 +157,8 @@ def of_locate():
         values[name] = {"seconds": TIMES, "index": test.index, "truth": at, "estimate": estimate}
     radius = torch.tensor([[1.05, 3.05, 9.05]]).expand(100, 3)
     values["posterior"] |= {"radius": radius, "ambiguous": torch.arange(100) < 10, "weights": {"values": 0.5}}
-    return LocateComparison(LocateSplit(test.subset(torch.arange(40)), test, "random", 300, 0, 3), values, Rings())
+    options = {"split": "random", "n_cells": 300, "seed": 0}
+    return LocateComparison(test.subset(torch.arange(40)), test, values, options, 3, Rings())
 
 
 @pytest.fixture(scope="module")
@@ -169,7 +167,7 @@ def of_aoa():
     grid = AngularGrid.hemisphere(8, 32)
     room, train = simulated_room(n=25, grid=grid), simulated_room(n=60, seed=1, grid=grid)
     test = room.subset(torch.arange(25).repeat_interleave(4)).derived(index=torch.arange(100) * 37 % 100)
-    found = TurboResult(Experiment(train, test, (0.4,), ["gp"], estimators=[]), 0.4, Path())
+    found = TurboResult(Experiment(train, test, (0.4,), ["gp"], estimators=[]), 0.4, Memo())
     place = test.position + torch.from_numpy(OWN[:, None] / 1000) * ALONG
     located = {"position": place.tolist(), "radius": N, "level": N / 120, "ambiguous": N < 7, "weights": {}}
     located["seconds"] = TIMES
@@ -194,14 +192,11 @@ def of_aoa():
 def said(of_rssi, of_locate, of_aoa, tmp_path_factory):
     """Return the records of each result, and the result."""
     found = {}
-    for name, result, record in (
-        ("rssi", of_rssi, rssi.record),
-        ("locate", of_locate, locate.record),
-        ("aoa", of_aoa, lambda result, folder: aoa.record([result], folder)),
-    ):
+    for name, result in (("rssi", of_rssi), ("locate", of_locate), ("aoa", of_aoa)):
         folder = tmp_path_factory.mktemp(name)
         with mock.patch("swiftwrf.rssi.maps.CELLS", 6):
-            metrics = json.loads(json.dumps(record(result, folder)))
+            metrics = write_result(result.recorded(), folder)
+        metrics = json.loads(json.dumps(metrics))
         (folder / CONFIG).write_text(json.dumps({"command": "swiftwrf"}))
         run = Records(folder, metrics)
         found[name] = (FractionRecords.of(run)[0] if name == "aoa" else run), result
@@ -211,7 +206,8 @@ def said(of_rssi, of_locate, of_aoa, tmp_path_factory):
 @pytest.mark.parametrize("task", PAGES)
 def test_every_table_has_medians_90_percent_and_intervals_over_places(said, task):
     (run, result), errors, page = said[task], ERRORS[task], PAGES[task]
-    answer, section, library = page.answer(run), page._errors(run), result.summary()
+    answer, library = page.answer(run), result.summary()
+    section = page._errors(run, answer)
     terminal = zip(*(column.cells for column in _table(answer).columns), strict=True)
     terminal = {name: [said_of(cell) for cell in cells] for name, *cells in terminal}
     assert [name for name in terminal if name.startswith("*")] == [f"* {answer.chosen}"]
@@ -249,7 +245,7 @@ def test_rssi(said):
     expected = {name: [difference_of(OWN, ERRORS["rssi"][name]), []] for name in ("knn", "gp")}
     assert cells == expected | {"swiftwrf": [[], [0.75]]}
     assert [80, 100 * inside.mean()] in [said_of(step.text) for step in answer.next_steps]
-    shown = [number.value for number in rssi_page._summary(run).numbers][-3:]
+    shown = [number.value for number in rssi_page._summary(run, answer).numbers][-3:]
     assert shown == [f"{np.median(OWN):.2f} dB", f"{np.median(OTHER):.2f} dB", f"{inside.mean():.0%}"]
     assert (run.metrics["n_train"], run.metrics["n_test"]) == (30, 50)
     assert any("b -8.0 dB" in note for note in run.metrics["notes"])
@@ -300,7 +296,7 @@ def test_locating(said):
         assert plan == [pytest.approx(0.6 * np.median(error), abs=0.00501)]
         assert floor == [pytest.approx(100 * (0.8 * error < 2.05).mean())]
         assert difference == (difference_of(OWN / 10, error) if one.name != "posterior" else [])
-    shown = [number.value for number in locate_page._summary(run).numbers]
+    shown = [number.value for number in locate_page._summary(run, answer).numbers]
     assert shown == [f"{np.median(OWN) / 10:.2f} m", f"{np.median(OTHER) / 10:.2f} m", f"{shares[1]}%"]
     lines, truth = locate_page._overview(run, "all").panels[0].axes[0].collections[0], run.table("errors")
     truth = truth[truth["method"] == "posterior"][["truth_x_m", "truth_y_m"]].to_numpy()
@@ -321,7 +317,7 @@ def test_credible_circles(said):
     assert maps["index"].tolist() == [99, 79, 59, 40, 20, 0]  # from the smallest error to the largest
     drawn = [panel.axes[0] for panel in locate_page.posteriors(maps | {"estimate": maps["estimate"] + 1})]
     assert [(ax.patches[0].get_radius(), tuple(ax.patches[0].center)) for ax in drawn] == [(4.0, (1, 1))] * 6
-    away = np.linalg.norm(result.split.test.transmitter_position.numpy()[maps["index"]] - 1, axis=1)
+    away = np.linalg.norm(result.test.transmitter_position.numpy()[maps["index"]] - 1, axis=1)
     assert [said_of(ax.get_title())[1] for ax in drawn] == pytest.approx(away, abs=0.00501)
     posterior = Rings().locate([0])
     shown = Located.of(posterior, torch.tensor([3.0, 4.0, 0.0]))
@@ -410,7 +406,9 @@ def test_examples_of_spectra(said):
     for mark, (azimuth, elevation) in ((drawn[0], peak.tolist()), (drawn[-1], truth)):
         turn, tilt = mark.get_xydata()[0]
         assert (np.rad2deg(turn), 90 - tilt) == pytest.approx((azimuth, elevation))
-    assert aoa_page.first_screen(fraction).numbers[-1].value == f"{np.median(OWN) / 4:.1f} dB"
+    assert (
+        aoa_page.first_screen(fraction, aoa_page.answer(fraction)).numbers[-1].value == f"{np.median(OWN) / 4:.1f} dB"
+    )
 
 
 def test_the_room_and_posteriors_in_plan(said):

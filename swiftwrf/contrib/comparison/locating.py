@@ -5,16 +5,15 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import torch
-from pandas import DataFrame, concat
+from numpy.typing import NDArray
 
+from swiftwrf.contrib.comparison.base import Comparison, Recorded, Values
 from swiftwrf.contrib.comparison.localizers import LEVELS, LOCALIZERS, PosteriorLocalizer
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
@@ -22,40 +21,46 @@ from swiftwrf.data.rssi import PLACE
 from swiftwrf.data.splits import matching_validation, places
 from swiftwrf.errors import InputError
 from swiftwrf.locate.rssi import RssiLocator
-from swiftwrf.metrics import method_summary, summary
+from swiftwrf.metrics import LEVEL, summary
 from swiftwrf.rssi import estimate_offsets
 from swiftwrf.runtime.checkpoint import load
-from swiftwrf.runtime.registry import write_report
 from swiftwrf.runtime.steps import LOCATOR, Memo, Steps
 from swiftwrf.runtime.validation import checked
 
 MIN_ROWS = 20  # training rows that a receiver detected: five folds, of which four hold at least 10 rows
-Values = dict[str, Any]
+N_MAPS = 6  # test rows whose posteriors are drawn
 
 
 @dataclass(frozen=True, eq=False)
-class LocateSplit:
-    """Training and test rows that localizers are compared on.
+class LocateComparison(Comparison):
+    """Result of `compare`.
 
     Args:
         train: Training rows, without offsets between groups.
         test: Test rows that a receiver detected, without offsets between groups.
-        split: Name of the split, which determines how training rows are held out.
-        n_cells: Number of candidate positions of the posterior.
-        seed: Seed of everything random.
+        values: What `fit` gave, by localizer.
+        options: The split, the number of candidate positions of the posterior `n_cells`, and the seed.
         n_undetected: Number of test rows that no receiver detected, which are left out.
+        locator: Locator of all training rows.
+
+    Example:
+        >>> import swiftwrf
+        >>> begun = LocateComparison.of(swiftwrf.rssi_room(n=60), "random", 100, 0)
+        >>> len(replace(begun, values={"mean": begun.fit(None, "mean")}).errors)
+        12
     """
 
-    train: Rssi
-    test: Rssi
-    split: str
-    n_cells: int
-    seed: int
-    n_undetected: int
+    task = "locate"
+    column = "position_error_m"
+    further = ("horizontal_error_m",)
+    model = "posterior"
+
+    n_undetected: int = 0
+    locator: RssiLocator | None = None
 
     @classmethod
-    def of(cls, data: Rssi, split: str, n_cells: int, seed: int, reference: str | None = None) -> LocateSplit:
-        """Return a split of RSSI; the arguments are those of `compare`.
+    def of(cls, data: Rssi, split: str, n_cells: int, seed: int, reference: str | None = None) -> LocateComparison:
+        """Return a split of RSSI without values; the arguments are those of `compare`.
 
         Offsets between groups, if there are any, are estimated from training rows and removed.
 
@@ -85,19 +90,20 @@ class LocateSplit:
         if train.groups is not None:
             offsets = estimate_offsets(train, reference)
             train, test = offsets.removed(train), offsets.removed(test)
-        return cls(train, test, split, n_cells, seed, int((~kept).sum()))
+        options = {"split": split, "n_cells": n_cells, "seed": seed}
+        return cls(train, test, {}, options, int((~kept).sum()))
 
     def fit(self, folder: Path | None, name: str) -> Values:
-        """Fit a localizer and locate the test rows. Return values for `LocateComparison`. A folder gets the locator.
+        """Fit a localizer and locate the test rows. Return its values. A folder gets the locator.
 
         Folds resemble the test rows in their distances to the training positions, all that is used of the test positions.
         """
-        train, test = self.train, self.test
-        validation = train.validation_for(self.split, test)
-        if validation == "block" and self.split != "block":
+        train, test, split = self.train, self.test, self.options["split"]
+        validation = train.validation_for(split, test)
+        if validation == "block" and split != "block":
             validation = matching_validation(train.transmitter_position, test.transmitter_position)
-        options = {"validation": validation, "n_cells": self.n_cells, "seed": self.seed}
-        localizer = LOCALIZERS[name](**options)
+        n_cells, seed = self.options["n_cells"], self.options["seed"]
+        localizer = LOCALIZERS[name](validation=validation, n_cells=n_cells, seed=seed)
         began = time.perf_counter()
         localizer.fit(train)
         fitted = time.perf_counter()
@@ -108,7 +114,7 @@ class LocateSplit:
             "index": test.index,
             "truth": test.transmitter_position,
             "estimate": located.position,
-            "median_m": summary(error)["median"],
+            "median": summary(error)["median"],
         }
         optional = {name: getattr(located, name) for name in ("radius", "ambiguous", "floor_probability")}
         values |= {name: value for name, value in optional.items() if value is not None}
@@ -120,68 +126,53 @@ class LocateSplit:
                 localizer.locator.save(folder / LOCATOR)
         return values
 
-
-@dataclass(frozen=True, eq=False)
-class LocateComparison:
-    """Result of `compare`.
-
-    Args:
-        split: Training and test rows.
-        values: What `LocateSplit.fit` gave, by localizer.
-        locator: Locator of all training rows.
-
-    Example:
-        >>> import swiftwrf
-        >>> split = LocateSplit.of(swiftwrf.rssi_room(n=60), "random", 100, 0)
-        >>> len(LocateComparison(split, {"mean": split.fit(None, "mean")}).errors)
-        12
-    """
-
-    split: LocateSplit
-    values: Mapping[str, Values]
-    locator: RssiLocator | None = None
-
-    @cached_property
-    def errors(self) -> DataFrame:
-        """Position errors, a row for each method and test row."""
-        return concat(map(self._table, self.values), ignore_index=True)
-
-    def summary(self) -> DataFrame:
-        """Return a row for each method: errors [m], and their mean difference to the posterior; see `method_summary`."""
-        return method_summary(self.errors, "position_error_m", "posterior")
-
-    def report(self, file: str | Path) -> None:
-        """Write the report of `swiftwrf locate` on this result into an HTML file, which opens offline.
-
-        Raises:
-            InputError: The file exists already.
-        """
-        write_report("locate", self, file)
-
     @property
     def coverage(self) -> dict[float, float]:
         """Fraction of the test positions in the credible regions of the posterior, by their probability."""
-        own = self.errors[self.errors["method"] == "posterior"]
-        return {p: float((own["position_error_m"] <= own[_radius(p)]).mean()) for p in LEVELS}
+        own = self.errors[self.errors["method"] == self.model]
+        return {p: float((own[self.column] <= own[_radius(p)]).mean()) for p in LEVELS}
 
     @property
-    def overall(self) -> dict[str, Any]:
+    def overall(self) -> dict[str, Values]:
         """Position errors in space and in plan [m] of each localizer, its seconds, and its floor hit rate.
 
         The floor of an estimate is the one of the nearest height. Data without floors have no floor hit rate.
         """
-        found: dict[str, Any] = {}
-        for name, table in self.errors.groupby("method", sort=False):
-            found[name] = {
-                "position_error_m": summary(table["position_error_m"], table["place"]),
-                "horizontal_error_m": summary(table["horizontal_error_m"], table["place"]),
-                "seconds": self.values[name]["seconds"],
-            }
-            if "floor" in table:
-                found[name]["floor_hit_rate"] = float((table["floor"] == table["truth_floor"]).mean())
+        found = super().overall
+        if self.train.floors is not None:
+            for name, own in self.errors.groupby("method"):
+                found[name]["floor_hit_rate"] = float((own["floor"] == own["truth_floor"]).mean())
         return found
 
-    def _table(self, name: str) -> DataFrame:
+    def recorded(self) -> Recorded:
+        found = super().recorded()
+        metrics = {
+            "n_receivers": len(self.train.receiver_names),
+            "n_undetected": self.n_undetected,
+            "calibration": {str(level): fraction for level, fraction in self.coverage.items()},
+            "weights": self.values[self.model]["weights"],
+        }
+        return replace(found, metrics=found.metrics | metrics, arrays={"maps": self._maps()})
+
+    def _maps(self) -> dict[str, NDArray[Any]]:
+        """Return posteriors in plan of at most six test rows, from the smallest error to the largest."""
+        assert self.locator is not None
+        order = self.errors.loc[self.errors["method"] == self.model, self.column].to_numpy().argsort()
+        shown = order[np.linspace(0, len(order) - 1, min(N_MAPS, len(order))).round().astype(int)]
+        posterior = self.locator.locate(self.test.rssi_dbm[shown])
+        plans = [posterior.in_plan(row) for row in range(len(posterior))]
+        return {
+            "x": plans[0].x,
+            "y": plans[0].y,
+            "density": np.stack([plan.values for plan in plans]).astype(np.float32),
+            "index": self.test.index[shown].numpy(),
+            "truth": self.test.transmitter_position[shown].numpy(),
+            "estimate": posterior.median.numpy(),
+            "radius_80_m": posterior.credible_radius(LEVEL).numpy(),
+            "training_position": self.train.transmitter_position.numpy(),
+        }
+
+    def _columns(self, name: str) -> Mapping[str, Any]:
         values = self.values[name]
         truth, estimate = (torch.as_tensor(values[name], dtype=torch.float64) for name in ("truth", "estimate"))
         away = estimate - truth
@@ -189,8 +180,8 @@ class LocateComparison:
         columns |= {"position_error_m": away.norm(dim=1), "horizontal_error_m": away[:, :2].norm(dim=1)}
         columns |= dict(zip(("x_m", "y_m", "z_m"), estimate.T, strict=True))
         columns |= dict(zip(("truth_x_m", "truth_y_m", "truth_z_m"), truth.T, strict=True))
-        columns |= degree_columns(self.split.train.origin, estimate.numpy())
-        if (floors := self.split.train.floors) is not None:
+        columns |= degree_columns(self.train.origin, estimate.numpy())
+        if (floors := self.train.floors) is not None:
             columns["floor"], columns["truth_floor"] = (floors.named(at) for at in (estimate, truth))
         if "floor_probability" in values:
             columns["floor_probability"] = values["floor_probability"]
@@ -198,9 +189,7 @@ class LocateComparison:
             radius = torch.as_tensor(values["radius"], dtype=torch.float64)
             columns |= {_radius(p): r for p, r in zip(LEVELS, radius.T, strict=True)}
             columns["ambiguous"] = values["ambiguous"]
-        table = DataFrame({name: np.asarray(column) for name, column in columns.items()})
-        table.insert(0, "method", name)
-        return table
+        return columns
 
 
 def _radius(level: float) -> str:
@@ -243,14 +232,13 @@ def compare(
         True
     """
     given = locals().copy()
-    measured = LocateSplit.of(data.receivers(receivers), split, n_cells, seed, reference)
+    begun = LocateComparison.of(data.receivers(receivers), split, n_cells, seed, reference)
     if keep is not None:
         keep.of(given | {"localizers": [LOCALIZERS[name] for name in LOCALIZERS]})
-    with TemporaryDirectory(prefix="swiftwrf-") as folder:
-        memo = keep or Memo(Path(folder))
-        steps = Steps(measured, memo, executor)
-        started = [steps.start(name, name, LocateSplit.fit, name) for name in LOCALIZERS]
-        values = {name: steps[name] for name in started}
-        locator = load(memo.folder / LOCATOR)
-        assert isinstance(locator, RssiLocator)
-        return LocateComparison(measured, values, locator)
+    memo = keep or Memo()
+    steps = Steps(begun, memo, executor)
+    started = [steps.start(name, name, LocateComparison.fit, name) for name in LOCALIZERS]
+    values = {name: steps[name] for name in started}
+    locator = load(memo.folder / LOCATOR)
+    assert isinstance(locator, RssiLocator)
+    return replace(begun, values=values, locator=locator)

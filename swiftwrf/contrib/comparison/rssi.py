@@ -8,33 +8,36 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
+import numpy as np
 import torch
-from pandas import DataFrame, concat
+from numpy.typing import NDArray
+from pandas import DataFrame
 from torch import Tensor
 
 from swiftwrf.choices import RSSI_PREDICTORS, NotDetected
+from swiftwrf.contrib.comparison.base import Comparison, Recorded, Values
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.rssi import PLACE
 from swiftwrf.data.splits import MIN_TRAINING, Validation, places
 from swiftwrf.errors import InputError
-from swiftwrf.metrics import LEVEL, method_summary
+from swiftwrf.metrics import LEVEL, summaries, summary
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import distance, nearest
 from swiftwrf.rssi.base import RssiPredictor
+from swiftwrf.rssi.coverage import Coverage, reach
+from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.offsets import estimate_offsets
 from swiftwrf.rssi.pairs import PairModel
 from swiftwrf.rssi.paper import RssiPaperModel
 from swiftwrf.runtime.checkpoint import Saved, load
-from swiftwrf.runtime.registry import write_report
 from swiftwrf.runtime.steps import MODEL, Memo, Steps, refusing_executor
 from swiftwrf.runtime.validation import Fraction, Preset, checked
 
-Values = dict[str, Any]
+COVERED_DBM, CERTAINTY = -75.0, 0.9  # coverage of the maps
 
 
 @checked
@@ -82,20 +85,20 @@ def compared(data: Rssi, also: Sequence[str] = ()) -> tuple[list[str], dict[str,
 
 
 @dataclass(frozen=True, eq=False)
-class RssiComparison:
+class RssiComparison(Comparison):
     """Result of `compare`.
 
     Args:
         train: Training rows, without offsets between groups.
         test: Test rows.
         values: What each predictor gave, by name: `predicted` at the detected test pairs (n,) [dBm], their standard
-            deviations `std` (n,) [dB] or None, median absolute error `median_db` [dB], seconds to `fit` and to `predict`.
+            deviations `std` (n,) [dB] or None, `median` absolute error [dB], `seconds` to `fit` and to `predict`.
             `detection` are the shares of detected and of empty test cells that are predicted as such, or None. Predictors
             without primitives have 0 `n_primitives`.
+        options: The split, the preset and the seed.
         left_out: Reason for each predictor that the data do not suffice for.
         predictors: Fitted predictors by name. Of those whose values `keep` had, the model alone.
         by_rows: Mean absolute errors [dB] of the model and of "knn" by the number of training rows, a column for each.
-        options: The split, the preset and the seed.
 
     Example:
         >>> import swiftwrf
@@ -104,43 +107,16 @@ class RssiComparison:
         'swiftwrf'
     """
 
-    train: Rssi
-    test: Rssi
-    values: Mapping[str, Values]
-    left_out: dict[str, str]
-    predictors: dict[str, RssiPredictor] = field(default_factory=dict)
+    task = "rssi"
+    column = "abs_error_db"
+
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    predictors: Mapping[str, RssiPredictor] = field(default_factory=dict)
     by_rows: DataFrame = field(default_factory=DataFrame)
-    options: Values = field(default_factory=dict)
 
     @property
     def model(self) -> str:
-        """Name of the model of this package that all others are compared with."""
-        return model_of(self.train)
-
-    @cached_property
-    def errors(self) -> DataFrame:
-        """Errors, a row for each method and detected pair of test row and receiver, with the number of the row's place."""
-        test, (row, column) = self.test, self._pairs
-        measured = test.rssi_dbm[row, column]
-        place = places(test.transmitter_position, 2)[row].numpy()
-        from_training = nearest(test.transmitter_position, self.train.transmitter_position, 1)[0][row, 0]
-        from_receiver = distance(test.transmitter_position, test.receiver_position)[row, column]
-        rows = []
-        for name in self.values:
-            predicted = self._prediction(name).mean
-            columns = {
-                "method": name,
-                "receiver": self._receiver,
-                "index": test.index[row].numpy(),
-                "place": place,
-                "measured_dbm": measured.numpy(),
-                "predicted_dbm": predicted.numpy(),
-                "abs_error_db": (predicted - measured).abs().numpy(),
-                "from_receiver_m": from_receiver.numpy(),
-                "from_training_m": from_training.numpy(),
-            }
-            rows.append(DataFrame(columns))
-        return concat(rows, ignore_index=True)
+        return PairModel.name if self.train.receiver_moves else RssiModel.name
 
     @cached_property
     def predictions(self) -> DataFrame:
@@ -167,17 +143,64 @@ class RssiComparison:
         `detection` is the balanced accuracy of predicting which test cells are empty, if there are empty ones: the mean of
         the shares of detected and of empty cells that are predicted as such.
         """
-        found = method_summary(self.errors, "abs_error_db", self.model)
+        found = super().summary()
         right = {name: sum(value["detection"]) / 2 for name, value in self.values.items() if value.get("detection")}
         return found.assign(detection=found.index.map(right)) if right else found
 
-    def report(self, file: str | Path) -> None:
-        """Write the report of `swiftwrf rssi` on this result into an HTML file, which opens offline.
+    @property
+    def notes(self) -> list[str]:
+        model, floors, notes = self._fitted, self.train.floors, super().notes
+        if model.attenuation is not None and model.attenuation.db is not None and floors is not None:
+            notes.append(f"each of the {len(floors.names)} floors takes {model.attenuation.db:.1f} dB")
+        return notes if model.detection is None else [*notes, model.detection.note(self.train.receiver_names)]
 
-        Raises:
-            InputError: The file exists already.
-        """
-        write_report("rssi", self, file)
+    def _columns(self, name: str) -> Mapping[str, Any]:
+        test, (row, column) = self.test, self._pairs
+        measured, predicted = test.rssi_dbm[row, column], self._prediction(name).mean
+        from_training = nearest(test.transmitter_position, self.train.transmitter_position, 1)[0]
+        return {
+            "receiver": self._receiver,
+            "index": test.index[row],
+            "place": places(test.transmitter_position, 2)[row],
+            "measured_dbm": measured,
+            "predicted_dbm": predicted,
+            "abs_error_db": (predicted - measured).abs(),
+            "from_receiver_m": distance(test.transmitter_position, test.receiver_position)[row, column],
+            "from_training_m": from_training[row, 0],
+        }
+
+    @property
+    def overall(self) -> dict[str, Values]:
+        return {name: entry | {"detection": self.values[name]["detection"]} for name, entry in super().overall.items()}
+
+    def recorded(self) -> Recorded:
+        found, attenuation = super().recorded(), self._fitted.attenuation
+        maps, coverage = _maps(self._fitted, self.train)
+        at_receiver, none = summaries(self.errors, ["receiver", "method"], [self.column]), {self.column: summary([])}
+        metrics = {
+            "left_out": self.left_out,
+            "receivers": {
+                receiver: {name: at_receiver.get((receiver, name), none) for name in self.values}
+                for receiver in self.test.receiver_names
+            },
+            "model": self.model,
+            "seconds": self.values[self.model]["seconds"],
+            "interval": {"nominal": LEVEL, "coverage": self.coverage},
+            "coverage": coverage,
+            "by_rows": {str(n): {str(name): mean for name, mean in row.items()} for n, row in self.by_rows.iterrows()},
+            "chosen": {
+                "n_primitives": max(value["n_primitives"] for value in self.values.values()),
+                "floor_attenuation_db": None if attenuation is None else attenuation.db,
+            },
+        }
+        tables = {"errors": self.errors, "predictions": self.predictions}
+        return replace(found, metrics=found.metrics | metrics, tables=tables, arrays={"maps": maps})
+
+    @property
+    def _fitted(self) -> RssiModel | PairModel:
+        model = self.predictors[self.model]
+        assert isinstance(model, RssiModel | PairModel)
+        return model
 
     @property
     def _pairs(self) -> tuple[Tensor, Tensor]:
@@ -199,9 +222,36 @@ class RssiComparison:
         return Prediction(mean, std)
 
 
-def model_of(data: Rssi) -> str:
-    """Return the name of the model of this package for these data."""
-    return PairModel.name if data.receiver_moves else RssiModel.name
+def _maps(model: RssiModel | PairModel, train: Rssi) -> tuple[dict[str, NDArray[Any]], list[Values]]:
+    """Return maps of each floor, (floors, R, H, W) or (floors, H, W), and the coverage of each floor.
+
+    Without floors there is one map, at the median height of the measurements.
+    """
+    floors, limits = train.floors, (COVERED_DBM, CERTAINTY, 1)
+    names, heights = (floors.names, floors.height_m) if floors else ([""], [None])
+    charts = [RssiMap.predict(model, height=height) for height in heights]
+    number = floors.number(train.transmitter_position) if floors else torch.zeros(len(train), dtype=torch.int64)
+    detected = [RssiMap.predict(model, height=height, detected=True) for height in heights]
+    coverage = [Coverage.of(each, train[number == n], limits, reach(model)) for n, each in enumerate(detected)]
+    lower, upper = zip(*(chart.prediction.interval(LEVEL) for chart in charts), strict=True)
+    maps: dict[str, NDArray[Any]] = {
+        "x": charts[0].x,
+        "y": charts[0].y,
+        "predicted": np.stack([chart.mean for chart in charts]),
+        "width": (torch.stack(upper) - torch.stack(lower)).numpy(),
+        "detection": np.stack([chart.detection for chart in charts]),
+        "above": np.stack([found.probability for found in coverage]),
+        "inside": np.stack([found.inside for found in coverage]),
+        "known": np.stack([found.measured for found in coverage]),
+        "measured_position": train.transmitter_position.numpy(),
+        "measured": train.rssi_dbm.numpy(),
+        "receiver": train.receiver_position.numpy(),
+        "receiver_names": np.array(train.receiver_names),
+        "floor_names": np.array(names),
+        "floor_of_row": number.numpy(),
+    }
+    maps = maps if train.origin is None else maps | {"origin": np.array(train.origin)}
+    return maps, [{"floor": name} | found.values for name, found in zip(names, coverage, strict=True)]
 
 
 @checked
@@ -266,7 +316,8 @@ def compare(
     names, left_out = compared(chosen, also)
     if keep is not None:
         keep.of(given | {"predictors": [RSSI_PREDICTORS[name] for name in names]})
-    own, predictors = model_of(train), dict[str, RssiPredictor]()
+    begun = RssiComparison(train, test, {}, {"split": split, "preset": preset, "seed": seed}, left_out)
+    own, predictors = begun.model, dict[str, RssiPredictor]()
     parallel = None if executor is None else executor.map
 
     def compute(_: None, folder: Path, name: str, rows: Tensor | None = None) -> Values:
@@ -287,9 +338,16 @@ def compare(
                 found = float(above[detected].double().mean()), float((~above)[~detected].double().mean())
         std = None if prediction.std is None else prediction.std[test.detected]
         error = (prediction.mean + offset - test.rssi_dbm)[test.detected].abs()
-        values: Values = {"predicted": prediction.mean[test.detected], "std": std, "mean_db": float(error.mean())}
-        values |= {"median_db": float(error.quantile(0.5)), "held_out": getattr(predictor, "held_out_db", {})}
-        return seconds | values | {"detection": found, "n_primitives": getattr(predictor, "n_primitives", 0)}
+        return {
+            "seconds": seconds,
+            "predicted": prediction.mean[test.detected],
+            "std": std,
+            "mean": float(error.mean()),
+            "median": float(error.quantile(0.5)),
+            "held_out": getattr(predictor, "held_out_db", {}),
+            "detection": found,
+            "n_primitives": getattr(predictor, "n_primitives", 0),
+        }
 
     order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))
     parts = [order[: round(fraction * len(train))].sort().values for fraction in fewer]
@@ -297,11 +355,11 @@ def compare(
     studied = [name for name in (own, "knn") if name in names]
 
     def study(_: None, folder: Path) -> Values:
-        less = {str(len(rows)): {name: compute(_, folder, name, rows)["mean_db"] for name in studied} for rows in parts}
-        return less | {str(len(train)): {name: values[name]["mean_db"] for name in studied}}
+        less = {str(len(rows)): {name: compute(_, folder, name, rows)["mean"] for name in studied} for rows in parts}
+        return less | {str(len(train)): {name: values[name]["mean"] for name in studied}}
 
-    with TemporaryDirectory(prefix="swiftwrf-") as temporary, refusing_executor(executor):
-        memo = keep or Memo(Path(temporary))
+    memo = keep or Memo()
+    with refusing_executor(executor):
         steps = Steps(None, memo)
         started = [steps.start(name, name, compute, name) for name in names]
         if fewer:
@@ -313,8 +371,7 @@ def compare(
             assert isinstance(model, RssiModel | PairModel)
             predictors[own] = model
     by_rows = by_rows.set_index(by_rows.index.astype(int)).rename_axis("n_train")
-    used = {"split": split, "preset": preset, "seed": seed}
-    return RssiComparison(train, test, values, left_out, predictors, by_rows, used)
+    return replace(begun, values=values, predictors=predictors, by_rows=by_rows)
 
 
 def pool_of(whole: Rssi, train: Rssi, test: Rssi, split: str, seed: int) -> Rssi:

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from swiftwrf import InputError, Rssi, RssiModel, load_rssi, rssi_room
+from swiftwrf.contrib.comparison.base import split_notes
 from swiftwrf.data.splits import folds
 from swiftwrf.data.writing import write_rssi
-from tasks.source import split_notes
 
 SIZES = (50, 30, 40, 20, 10, 10)
 

@@ -158,7 +158,7 @@ def test_detections_are_predicted_and_scored(fitted, monkeypatch):
     above = found.predictors["swiftwrf"].predict_detection(test.transmitter_position).numpy() > 0.5
     detected = test.detected.numpy()
     assert found.values["swiftwrf"]["detection"] == pytest.approx((above[detected].mean(), 1 - above[~detected].mean()))
-    assert found.values["mean"]["median_db"] == pytest.approx(errors.median()["mean"])
+    assert found.values["mean"]["median"] == pytest.approx(errors.median()["mean"])
     probability = model.predict_detection(data.transmitter_position)
     assert float(probability[data.detected].mean()) > 0.9 > 0.2 > float(probability[~data.detected].mean())
     full = replace(data, rssi_dbm=data.rssi_dbm.nan_to_num(-90.0))

@@ -1,7 +1,6 @@
 """Gains by synthetic spectra: their reference, their interval, in reports, and over repeats that chose differently."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,10 +10,11 @@ from pandas import DataFrame
 from augment.cross_validation import LOCATOR
 from augment.turbo.condition import Condition, MeasuredSubset, pooled
 from augment.turbo.experiment import Experiment
-from augment.turbo.results import TurboResult, summaries
+from augment.turbo.results import TurboResult
 from swiftwrf import simulated_room
-from swiftwrf.metrics import median_interval, paired_change
+from swiftwrf.metrics import median_interval, paired_change, summaries
 from swiftwrf.metrics import summary as error_summary
+from swiftwrf.runtime.steps import Memo
 from tasks.aoa.page import answer, conclusion, first_screen
 from tasks.aoa.records import FractionRecords
 from tasks.configs import AoaConfig
@@ -71,7 +71,7 @@ def test_one_repeat_has_the_interval_of_independent_values():
 def results_of(errors):
     """Return the results of conditions with these elevation errors [deg] at the test positions."""
     room = simulated_room(n=20)
-    found = TurboResult(Experiment(simulated_room(n=40), room, estimators=()), 0.3, Path())
+    found = TurboResult(Experiment(simulated_room(n=40), room, estimators=()), 0.3, Memo())
     for condition, error in errors.items():
         off = torch.stack([torch.zeros(20), torch.as_tensor(error)], dim=1).double().deg2rad()
         seconds = {"train": 1.0, "estimate": 1.0}
@@ -183,7 +183,7 @@ def test_the_summary_begins_with_the_estimator_that_cross_validation_chose(aoa_r
         "n_held_out": 9,
         "better": {},
     }
-    first = first_screen(fraction)
+    first = first_screen(fraction, answer(fraction))
     assert first.conclusion[0].startswith(f"Directions are found within {fraction.medians['peak']:.2f} degrees")
     assert first.numbers[0].value == f"{fraction.medians['peak']:.2f}\N{DEGREE SIGN}"
     assert "peak" in first.numbers[0].meaning
@@ -265,7 +265,7 @@ def test_the_time_of_all_networks_counts():
     room = simulated_room(n=20)
     trained = of_repeats((GP,), (IDW, IDW_EXTRA))
     for synthesizer in (("auto",), ("gp", "idw")):
-        found = TurboResult(Experiment(simulated_room(n=40), room, (0.3,), synthesizer, estimators=()), 0.3, Path())
+        found = TurboResult(Experiment(simulated_room(n=40), room, (0.3,), synthesizer, estimators=()), 0.3, Memo())
         for condition, _ in trained:
             seconds = {"train": 10.0, "estimate": 1.0}
             value = {"estimate": room.label.tolist(), "seconds": seconds, "history": [], "counts": {}}

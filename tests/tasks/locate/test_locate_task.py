@@ -14,7 +14,7 @@ from small import FLOOR, known_planes
 
 from swiftwrf import AngularGrid, InputError, load, rssi_room, simulated_room
 from swiftwrf.contrib.comparison.localizers import LEVELS, LOCALIZERS
-from swiftwrf.contrib.comparison.locating import LocateSplit
+from swiftwrf.contrib.comparison.locating import LocateComparison
 from swiftwrf.data import ReadOptions
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.locate import MatchedField
@@ -80,7 +80,7 @@ def test_differences_are_robust_to_the_offset_of_a_device():
 
 
 def test_test_rows_reach_no_fit():
-    given = LocateSplit.of(rssi_room(n=60), "random", 50, 0)
+    given = LocateComparison.of(rssi_room(n=60), "random", 50, 0)
     moved = replace(given, test=replace(given.test, transmitter_position=given.test.transmitter_position + 5))
     for name in ("knn", "knn_difference", "gp"):
         values = [one.fit(None, name) for one in (given, moved)]
@@ -145,9 +145,9 @@ def test_rows_that_no_receiver_detected_are_left_out(tmp_path, capsys):
     assert f"test rows that no receiver detected are left out: {metrics['n_undetected']}" in capsys.readouterr().err
     data.rssi_dbm[:70] = torch.nan
     with pytest.raises(InputError, match="at least 20 are needed"):
-        LocateSplit.of(data, "random", 100, 0)
+        LocateComparison.of(data, "random", 100, 0)
     with pytest.raises(InputError, match="split 'place' tests other receivers than it trains; choose random or block"):
-        LocateSplit.of(data, "place", 100, 0)
+        LocateComparison.of(data, "place", 100, 0)
 
 
 def test_positions_of_new_rows(locate_run, tmp_path, capsys):

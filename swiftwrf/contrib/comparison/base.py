@@ -1,0 +1,153 @@
+"""What all comparisons of methods have: errors on test rows, their summaries, and what a run writes into its directory."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from numpy.typing import NDArray
+from pandas import DataFrame, concat
+
+from swiftwrf.data import Rssi
+from swiftwrf.data.splits import MAX_REPEATED, places, repeated_fraction
+from swiftwrf.metrics import method_summary, summaries
+from swiftwrf.runtime.registry import reporter
+from swiftwrf.runtime.validation import checked
+
+Values = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """Content of the files of a run: a result as a report, a table or another program reads it.
+
+    Args:
+        metrics: Content of metrics.json; `task` is the command of the run.
+        tables: Tables by the names of their files without suffix.
+        arrays: Arrays by the names of their files without suffix, and by their names in the file.
+        source: SHA-256 of the input by name.
+        folder: Folder of further files that the report shows, if there are any.
+    """
+
+    metrics: Values
+    tables: Mapping[str, DataFrame]
+    arrays: Mapping[str, Mapping[str, NDArray[Any]]]
+    source: Mapping[str, str]
+    folder: Path | None = None
+
+
+class Result(ABC):
+    """Errors of methods on test rows, as the command with the same result states and reports them."""
+
+    @abstractmethod
+    def recorded(self) -> Recorded:
+        """Return the content of the files of a run with this result."""
+
+    def answer(self) -> Any:
+        """Return the answer of the command: the errors of all methods, the one to take, and the conclusion in words.
+
+        Printed, it is the conclusion. `methods`, `chosen` and `conclusion` are its parts, `values()` are those of `--json`.
+
+        Example:
+            >>> import swiftwrf
+            >>> swiftwrf.locate.compare(swiftwrf.rssi_room(n=80), n_cells=300).answer().chosen
+            'posterior'
+        """
+        return reporter()(self.recorded(), None)
+
+    @checked
+    def report(self, file: str | Path) -> None:
+        """Write the report of the command into an HTML file, which opens offline.
+
+        Raises:
+            InputError: The file exists already.
+        """
+        reporter()(self.recorded(), Path(file))
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison(Result):
+    """Methods that were fitted to the training rows of a split, and their errors on its test rows; see its subclasses."""
+
+    task: ClassVar[str]
+    """command with the same result"""
+    column: ClassVar[str]
+    """error of the methods in `errors`"""
+    further: ClassVar[tuple[str, ...]] = ()
+    """further errors in `errors`"""
+
+    train: Rssi
+    test: Rssi
+    values: Mapping[str, Values]
+    options: Values
+
+    @property
+    @abstractmethod
+    def model(self) -> str:
+        """Name of the model of this package that all others are compared with."""
+
+    @abstractmethod
+    def _columns(self, name: str) -> Mapping[str, Any]:
+        """Return the columns of the errors of one method."""
+
+    @cached_property
+    def errors(self) -> DataFrame:
+        """Errors, a row for each method and test row, or pair of test row and receiver, with the number of its place."""
+        return concat((DataFrame({"method": name, **self._columns(name)}) for name in self.values), ignore_index=True)
+
+    def summary(self) -> DataFrame:
+        """Return a row for each method: errors, and their mean difference to those of `model`; see `method_summary`."""
+        return method_summary(self.errors, self.column, self.model)
+
+    @property
+    def overall(self) -> dict[str, Values]:
+        """Summaries of the errors of each method over test places, and its seconds."""
+        found = summaries(self.errors, "method", (self.column, *self.further))
+        return {name: {**found[name], "seconds": self.values[name]["seconds"]} for name in self.values}
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences on the split, the data and the offsets between groups."""
+        offsets = [] if self.train.offsets is None else [self.train.offsets.note()]
+        return [*split_notes(self.train, self.test, self.options["split"]), *self.train.notes, *offsets]
+
+    def recorded(self) -> Recorded:
+        metrics = {
+            "task": self.task,
+            "data": self.train.name,
+            "notes": self.notes,
+            **self.options,
+            "n_train": len(self.train),
+            "n_test": len(self.test),
+            "overall": self.overall,
+            "held_out": self.values[self.model].get("held_out", {}),
+        }
+        return Recorded(metrics, {"errors": self.errors}, {}, self.train.source)
+
+
+def split_notes(train: Rssi, test: Rssi, split: str) -> list[str]:
+    """Return notes on sessions and on rows that share positions.
+
+    Example:
+        >>> import swiftwrf
+        >>> split_notes(*swiftwrf.rssi_room(n=60).split(), "random")
+        []
+    """
+    notes = []
+    if train.validation_for(split, test) == "session":
+        notes.append(
+            "the test rows are of other sessions than the training rows, so cross-validation holds out sessions"
+        )
+    repeated = repeated_fraction(train.transmitter_position, test.transmitter_position)
+    position = torch.cat([train.transmitter_position, test.transmitter_position])
+    n_places = int(places(position).max()) + 1
+    if repeated > MAX_REPEATED:
+        notes.append(f"this split tests look-up: {repeated:.0%} of the test rows are at places of training rows")
+    elif n_places < len(position) and not repeated:
+        notes.append(f"{len(position)} rows are at {n_places} places, each of which is in one part of the split")
+    return notes
