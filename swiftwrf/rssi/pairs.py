@@ -18,14 +18,14 @@ import torch
 from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.splits import folds, places
+from swiftwrf.data.splits import each_fold, folds, places
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, candidates
-from swiftwrf.gp.process import N_NEIGHBOURS, local_weights
+from swiftwrf.gp.process import leave_folds_out_locally
 from swiftwrf.metrics import HALF_WIDTH, interval_factor
 from swiftwrf.models.base import FieldConfig
 from swiftwrf.models.prediction import Prediction
-from swiftwrf.positions import Neighbours, check_positions, distance, nearest
+from swiftwrf.positions import check_positions, nearest
 from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiPredictor, SavedRssiPredictor, in_batches
 from swiftwrf.rssi.path_loss import MIN_DISTANCE_M, fit_path_loss
 from swiftwrf.rssi.training import rounding_std
@@ -230,44 +230,35 @@ class PairModel(PairPredictor, SavedRssiPredictor):
         def path_loss(rows: Tensor) -> PairPathLoss:
             return PairPathLoss.fit(pair[rows], rssi[rows], by_place=not self.config.new_places)
 
-        self.pair, self.path_loss = pair, path_loss(torch.ones_like(fold, dtype=torch.bool))
+        self.pair, self.path_loss = pair, path_loss(torch.arange(len(pair)))
         self.residual = rssi - self.path_loss(pair)
         order = torch.randperm(len(pair), generator=torch.Generator().manual_seed(self.config.seed))
-        sample = order[:MAX_HELD_OUT]
+        rows, (names, number) = order[:MAX_HELD_OUT], fold.unique(return_inverse=True)
         # one region only: none is left to predict it from
-        fold = fold if len(fold.unique()) > 1 else torch.arange(len(fold)) % 2
-        # residuals of the path-loss model fitted without each fold of the sample
-        held_out = {number: rssi - path_loss(fold != number)(pair) for number in fold[sample].unique().tolist()}
-        choices = [choice for ratio in RATIOS for choice in self._judged(ratio, fold, sample, held_out)]
+        fold = number if len(names) > 1 else torch.arange(len(fold)) % 2
+        # residuals (folds, pairs) of the path-loss model fitted without each fold
+        residual = torch.stack([rssi - path_loss(kept)(pair) for _, kept in each_fold(fold)])
+        choices = [choice for ratio in RATIOS for choice in self._judged(ratio, fold, rows, residual)]
         _, self.ratio, self.kernel, score = min(choices, key=lambda choice: choice[0])
-        rows = torch.cat([sample[fold[sample] == number] for number in held_out])
         place = places(pair[rows, 3:] if self.config.new_places else pair[rows, :3], 2)  # of the end that is held out
         scale = interval_factor(score / HALF_WIDTH, place)
         self.scale_db = score.new_tensor([max(scale, rounding_std(rssi) / self.kernel.noise**0.5)])
         self._precompute()
 
     def _judged(
-        self, ratio: float, fold: Tensor, sample: Tensor, held_out: dict[int, Tensor]
+        self, ratio: float, fold: Tensor, rows: Tensor, residual: Tensor
     ) -> list[tuple[float, float, Kernel, Tensor]]:
         """Return kernels with their mean absolute error at held-out pairs, and the errors by their relative deviations."""
-        n_near = min(N_NEIGHBOURS, int((fold[:, None] != fold.unique()).sum(dim=0).min()))
-        parts, coordinates = [], scaled(self.pair, ratio)
-        for number, own in held_out.items():
-            out, kept = sample[fold[sample] == number], (fold != number).nonzero()[:, 0]
-            near = kept[Neighbours(coordinates[kept])(coordinates[out], n_near)[1]]
-            known, query = coordinates[near], coordinates[out]
-            parts.append((distance(known, known), distance(query[:, None], known)[:, 0], own[near], own[out]))
-        r_between, r_across, values, truth = (torch.cat(part) for part in zip(*parts, strict=True))
+        coordinates = scaled(self.pair, ratio)
+        near, weights = leave_folds_out_locally(coordinates, fold, rows)
+        values, truth = residual[fold[rows, None], near], residual[fold[rows], rows]
         # rough fields only, as in the model of each receiver
         kernels = [k for k in candidates(coordinates, RELATIVE_NOISE_VARIANCES) if k.matern12_weight == 1]
         judged = []
-        for length in sorted({kernel.matern12_length for kernel in kernels}):
-            shape = Kernel(length, matern12_weight=1.0)
-            covariance, cross = shape.at(r_between), shape.at(r_across)
-            for kernel in (kernel for kernel in kernels if kernel.matern12_length == length):
-                weight, variance = local_weights(covariance, cross, kernel.noise)
-                error = (truth - (weight * values).sum(dim=1)).abs()
-                judged.append((float(error.mean()), ratio, kernel, error / (variance + kernel.noise).sqrt()))
+        for kernel in sorted(kernels, key=lambda kernel: kernel.matern12_length):
+            weight, variance = weights(kernel)
+            error = (truth - (weight * values).sum(dim=1)).abs()
+            judged.append((float(error.mean()), ratio, kernel, error / (variance + kernel.noise).sqrt()))
         return judged
 
     def region(self) -> Tensor:
