@@ -206,7 +206,7 @@ class GaussianProcess:
         if self.is_exact:
             mean: Tensor = self._cross(position).to(self.coefficient) @ self.coefficient
             return mean
-        return self.condition(position)[0]
+        return self.mean_and_variance(position)[0]
 
     def weights(self, position: Tensor) -> tuple[Tensor, Tensor]:
         """Return the posterior mean at positions (m, 3) as a linear function of the values.
@@ -271,8 +271,8 @@ class GaussianProcess:
     def _neighbours(self) -> Neighbours:
         return Neighbours(self.known)
 
-    def condition(self, position: Tensor) -> tuple[Tensor, Tensor]:
-        """Return posterior mean (m, K) and variance (m,) at positions (m, 3), as `mean` and `variance`, by one search."""
+    def mean_and_variance(self, position: Tensor) -> tuple[Tensor, Tensor]:
+        """Return posterior mean (m, K) and variance (m,) at positions (m, 3), by one search for neighbours."""
         if self.is_exact:
             return self.mean(position), self.variance(position)
         number, weight, variance = self._local(position)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Iterable
 from typing import Any
 
@@ -35,19 +34,9 @@ class Locator(Configured, Saved):
     """cells of the region"""
 
     @property
-    @abstractmethod
-    def _described(self) -> str:
-        """What the likelihoods use, in a few words."""
-
-    @property
     def _resolution_m(self) -> float:
         """Edge of the smallest cells [m]."""
         return self.cells.edge_m
-
-    @property
-    def _mode_width_m(self) -> float:
-        """Least distance of two modes [m]."""
-        return 0.0
 
     def _calibrate(self, held_out: Iterable[HeldOut]) -> Tensor:
         """Choose weights and inflation by held-out folds, and return the errors there, (n,) [m]."""
@@ -58,9 +47,4 @@ class Locator(Configured, Saved):
     def _posterior(self, position: Tensor, values: Tensor, log_volume: Tensor) -> Posterior:
         """Return the posterior on candidates with log-likelihoods (k, n, m); other arguments as of `HeldOut`."""
         log_mass = normalised(torch.einsum("k,knm->nm", self.weight, values.double()) + log_volume)
-        radii = self._resolution_m, self.inflation, self._mode_width_m
-        return Posterior(position, log_mass, *radii, self.region.floors)
-
-    def __repr__(self) -> str:
-        facts = f"fitted, {self._described}, {len(self.cells.position):,} cells" if self.is_fitted else "not fitted"
-        return f"{type(self).__name__}({facts})"
+        return Posterior(position, log_mass, self._resolution_m, self.inflation, floors=self.region.floors)

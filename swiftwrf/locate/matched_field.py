@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Annotated, ClassVar, Self
 
 import torch
@@ -195,16 +195,14 @@ class MatchedField(Locator):
         if isinstance(spectrum, Spectra):
             spectrum = self.room.link.aligned(spectrum)
         observed = self.likelihoods.features(spectrum, self.config.seed)
-        found = self._searched(observed, self.likelihoods)
-        return Posterior.cat([self._posterior(cells.position, values, cells.log_volume) for cells, values in found])
+        parts = self._searched(observed, self.likelihoods)
+        found = Posterior.cat([self._posterior(cells.position, values, cells.log_volume) for cells, values in parts])
+        # within half a wavelength the field changes too little for a second mode
+        return replace(found, mode_width_m=self.room.array.wavelength / 2)
 
     @property
     def _resolution_m(self) -> float:
         return float(self.cells.edge_m / 2**self.config.n_rounds)
-
-    @property
-    def _mode_width_m(self) -> float:
-        return self.room.array.wavelength / 2  # within it the field changes too little for a second mode
 
     def predict(self, spectrum: Numbers | Spectra) -> Tensor:
         """Return azimuth and elevation (n, 2) [rad] of the transmitter that minimise the expected angular error."""
@@ -217,9 +215,10 @@ class MatchedField(Locator):
         vectors = to_direction(*label.unbind(-1)).reshape(at.shape)
         return torch.stack(to_angles(posterior.direction(vectors)), dim=-1)
 
-    @property
-    def _described(self) -> str:
-        return f"{len(self.room.planes)} planes"
+    def __repr__(self) -> str:
+        if not self.is_fitted:
+            return f"{type(self).__name__}(not fitted)"
+        return f"{type(self).__name__}(fitted, {len(self.room.planes)} planes, {len(self.cells.position):,} cells)"
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         """Return the fitted tensors by name, and plain values."""

@@ -221,9 +221,10 @@ class RssiLocator(Locator):
         lost &= ~(strongest & lost.all(dim=2, keepdim=True))
         return rssi.masked_fill(lost, torch.nan)
 
-    @property
-    def _described(self) -> str:
-        return f"{len(self.receiver_names)} receivers"
+    def __repr__(self) -> str:
+        if not self.is_fitted:
+            return f"{type(self).__name__}(not fitted)"
+        return f"{type(self).__name__}(fitted, {len(self.receiver_names)} receivers, {len(self.cells.position)} cells)"
 
     def state(self) -> tuple[dict[str, Tensor], Header]:
         """Return the fitted tensors by name, and plain values."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar, Self
 
@@ -238,7 +239,7 @@ class PairModel(PairPredictor, SavedRssiPredictor):
         fold = number if len(names) > 1 else torch.arange(len(fold)) % 2
         # residuals (folds, pairs) of the path-loss model fitted without each fold
         residual = torch.stack([rssi - path_loss(kept)(pair) for _, kept in each_fold(fold)])
-        choices = [choice for ratio in RATIOS for choice in self._judged(ratio, fold, rows, residual)]
+        choices = (choice for ratio in RATIOS for choice in self._judged(ratio, fold, rows, residual))
         _, self.ratio, self.kernel, score = min(choices, key=lambda choice: choice[0])
         place = places(pair[rows, 3:] if self.config.new_places else pair[rows, :3], 2)  # of the end that is held out
         scale = interval_factor(score / HALF_WIDTH, place)
@@ -247,19 +248,17 @@ class PairModel(PairPredictor, SavedRssiPredictor):
 
     def _judged(
         self, ratio: float, fold: Tensor, rows: Tensor, residual: Tensor
-    ) -> list[tuple[float, float, Kernel, Tensor]]:
-        """Return kernels with their mean absolute error at held-out pairs, and the errors by their relative deviations."""
+    ) -> Iterator[tuple[float, float, Kernel, Tensor]]:
+        """Yield kernels with their mean absolute error at held-out pairs, and the errors by their relative deviations."""
         coordinates = scaled(self.pair, ratio)
         near, weights = leave_folds_out_locally(coordinates, fold, rows)
         values, truth = residual[fold[rows, None], near], residual[fold[rows], rows]
         # rough fields only, as in the model of each receiver
         kernels = [k for k in candidates(coordinates, RELATIVE_NOISE_VARIANCES) if k.matern12_weight == 1]
-        judged = []
         for kernel in sorted(kernels, key=lambda kernel: kernel.matern12_length):
             weight, variance = weights(kernel)
             error = (truth - (weight * values).sum(dim=1)).abs()
-            judged.append((float(error.mean()), ratio, kernel, error / (variance + kernel.noise).sqrt()))
-        return judged
+            yield float(error.mean()), ratio, kernel, error / (variance + kernel.noise).sqrt()
 
     def region(self) -> Tensor:
         """Return the training positions (n, 3) [m], one for each pair."""
@@ -271,7 +270,7 @@ class PairModel(PairPredictor, SavedRssiPredictor):
 
     @single_thread()
     def _at_pairs(self, pair: Tensor) -> tuple[Tensor, Tensor]:
-        field, variance = self._process.condition(scaled(pair, self.ratio))
+        field, variance = self._process.mean_and_variance(scaled(pair, self.ratio))
         return self.path_loss(pair) + field[:, 0], self.scale_db * (variance + self.kernel.noise).sqrt()
 
     def state(self) -> tuple[dict[str, Tensor], Header]:

@@ -389,7 +389,7 @@ def _trend(position: Tensor, receiver: Tensor) -> Tensor:
 def _variances(
     process: GaussianProcess, receiver: Tensor, covariance: Tensor, position: Tensor
 ) -> tuple[Tensor, Tensor]:
-    mean, of_field = process.condition(position)
+    mean, of_field = process.mean_and_variance(position)
     level, slope = (_trend(position, receiver) - mean).split([1, len(receiver)], dim=1)
     of_level, both, of_slope = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     trend = of_level * level.square() + 2 * both * level * slope + of_slope * slope.square()
