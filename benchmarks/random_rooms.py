@@ -106,7 +106,10 @@ def built_in_rooms(config: Config) -> Iterator[tuple[str, dict[str, Any]]]:
     for seed in range(config.seeds):
         train, _ = simulated_room(seed=seed).split("random", seed=seed)
         data, _ = withhold(train, 0.3, seed)
-        yield "transmitter", measure(data, walls("simulated-room"), seed=seed, validation="random")
+        yield (
+            f"simulated-room, {len(data)} spectra",
+            measure(data, walls("simulated-room"), seed=seed, validation="random"),
+        )
 
 
 def newrf_rooms(config: Config) -> Iterator[tuple[str, dict[str, Any]]]:

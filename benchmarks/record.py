@@ -89,9 +89,11 @@ def write_result(
 
 def load(name: str) -> dict[str, Any]:
     """Return one result, empty if it was not measured yet."""
-    loaded.append(name)
     file = RESULTS / f"{name}.json"
-    content: dict[str, Any] = json.loads(file.read_text()) if file.is_file() else {}
+    if not file.is_file():
+        return {}
+    loaded.append(name)
+    content: dict[str, Any] = json.loads(file.read_text())
     return content
 
 

@@ -7,6 +7,8 @@ from typing import Any
 
 from record import load, markdown
 
+Row = dict[str, Any]
+COVERED_DBM = -75.0  # threshold of the reports
 RELEVANT_DB = 0.02  # difference of medians below which predictors are level
 
 
@@ -32,6 +34,35 @@ def rssi_glance() -> str:
         )
     columns = ["data, split", "training / test rows", "best baseline", "model", "difference of medians"]
     return markdown([*columns, "mean difference [95 %]", "80 % interval covers"], rows)
+
+
+def coverage_headline() -> str:
+    """Return the predicted and the counted shares of test scans with a receiver above -75 dBm, and where it is certain."""
+    found: dict[str, list[Row]] = {}
+    for name, scene in load("coverage_headline").get("scenes", {}).items():
+        floors = "simulated floors random" if name.startswith("simulated-floor") else name
+        found.setdefault(floors, []).extend(scene["rows"])
+    rows = []
+    for name, every in found.items():
+        own = [row for row in every if row["threshold_dbm"] == COVERED_DBM]
+        n = sum(row["n"] for row in own)
+        predicted, above = (sum(row["n"] * row[key] for row in own) / n for key in ("predicted", "above"))
+        worst = max((100 * (row["predicted"] - row["above"]) for row in own), key=abs)
+        sure = [row for row in every if row["n_certain"]]
+        n_sure = sum(row["n_certain"] for row in sure)
+        passed = sum(row["n_certain"] * row["certain_above"] for row in sure) / n_sure if sure else None
+        cells = [str(len(own)), str(n), f"{predicted:.0%}", f"{above:.0%}", f"{round(worst, 1) + 0.0:+.1f}"]
+        rows.append([name, *cells, "" if passed is None else f"{passed:.1%} of {n_sure}"])
+    columns = ["data, split", "floors", "scans", "predicted", "counted", "largest difference of a floor [points]"]
+    return markdown([*columns, "pass where P is 0.9 or more, all thresholds"], rows)
+
+
+def intervals() -> str:
+    """Return the mean and the least coverage of the 80 % intervals and regions, of the runs of each study."""
+    rows = []
+    for name, found in load("intervals").get("rows", {}).items():
+        rows.append([name, str(len(found["coverage"])), f"{found['mean']:.0%}", f"{found['least']:.0%}"])
+    return markdown(["study: data, split, what", "runs", "mean coverage", "least"], rows)
 
 
 def not_detected() -> str:

@@ -27,8 +27,9 @@ from tasks.options import OffsetSource, SpectraSource
 def random_rooms() -> str:
     """Return how many of the random rooms are found, and how many planes are called certain."""
     rows = []
-    for case, rooms in load("random_rooms")["rooms"].items():
-        kind, noise = case.split(", ")
+    studies = ("random_rooms", "built_in_rooms", "newrf_rooms")
+    for case, rooms in (item for study in studies for item in load(study).get("rooms", {}).items()):
+        kind, _, noise = case.partition(", ")
         found, near = sum(room["near"] == 6 for room in rooms), sum(room["near"] for room in rooms)
         certain, wrong = (sum(room[key] for room in rooms) for key in ("certain", "certain_and_wrong"))
         seconds = statistics.mean(room["cpu_seconds"] for room in rooms)
@@ -41,7 +42,16 @@ def random_rooms() -> str:
         ]
         rows.append([kind, noise, *cells])
     return markdown(
-        ["gains", "phase noise", "rooms", "planes", "identifiable", "of them wrong", "processor time"], rows
+        [
+            "gains or scene",
+            "phase noise or spectra",
+            "rooms",
+            "planes",
+            "identifiable",
+            "of them wrong",
+            "processor time",
+        ],
+        rows,
     )
 
 

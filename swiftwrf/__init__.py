@@ -17,12 +17,12 @@ from swiftwrf.runtime.lazy import import_lazily
 __version__ = version("swiftwrf-tasks")
 
 if TYPE_CHECKING:
+    from swiftwrf import datasets as datasets
     from swiftwrf import locate as locate
     from swiftwrf import metrics as metrics
     from swiftwrf import rssi as rssi
     from swiftwrf.array.angles import AngularGrid as AngularGrid
     from swiftwrf.array.angles import ArrayPose as ArrayPose
-    from swiftwrf.contrib import datasets as datasets
     from swiftwrf.contrib.diagnostics.calibration import calibrate as calibrate
     from swiftwrf.contrib.diagnostics.inspection import inspect as inspect
     from swiftwrf.data import Rssi as Rssi

@@ -1,31 +1,26 @@
 """Maps of predicted RSSI on square cells, as tables, data sets and files of geographic information systems.
 
-The files need no further libraries. A GeoTIFF contains local metres and their azimuthal equidistant projection, so it is
-exact. GeoJSON and world files contain longitude and latitude (WGS84).
+A GeoTIFF contains local metres and their azimuthal equidistant projection, so it is exact. GeoJSON and
+world files contain longitude and latitude (WGS84).
 """
 
 from __future__ import annotations
 
-import io
 import json
 import math
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
-from xml.sax.saxutils import escape
 
 import numpy as np
 import pandas as pd
 import torch
 from numpy.typing import NDArray
-from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
 from swiftwrf.data.dataset import DEGREE_UNITS, Arrays, Labelled, Numbers
 from swiftwrf.data.rssi import Rssi, receiver_row
-from swiftwrf.errors import InputError, listed
+from swiftwrf.errors import InputError, listed, optional_module
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Axes, Displayed, corners_of, hatch, plan_map
 from swiftwrf.positions import to_tensor
@@ -35,8 +30,6 @@ from swiftwrf.runtime.durable import write_bytes, write_text
 CELLS = 120  # of a map, along its longer side
 MAX_CELLS = 2**22
 DEGREE_DECIMALS = 8  # of coordinates in GeoJSON: 1 mm
-SHORT, LONG, DOUBLE, ASCII = 3, 4, 12, 2  # types of TIFF values
-USER_DEFINED, WGS84, METRE, DEGREE, AZIMUTHAL_EQUIDISTANT = 32767, 4326, 9001, 9102, 12  # codes of GeoTIFF 1.1
 Values = NDArray[np.float64]
 
 
@@ -209,66 +202,35 @@ class RssiMap(Labelled, Displayed):
 
 
 def write_geotiff(file: Path, data: RssiMap) -> None:
-    """Write a map as a GeoTIFF of float32 with a band for each receiver; nan is no data."""
-    pixels = zlib.compress(np.moveaxis(data.mean[:, ::-1], 0, -1).astype("<f4").tobytes())
+    """Write a map as a GeoTIFF of float32 with a band for each receiver; nan is no data.
+
+    Raises:
+        InputError: rasterio (extra `formats`) is missing.
+    """
+    rasterio = optional_module("rasterio", f"{file.name} is a GeoTIFF, which rasterio writes", "formats")
     west, _, _, north = data.corners
-    names = "".join(  # GDAL escapes descriptions twice
-        f'<Item name="DESCRIPTION" sample="{number}" role="description">{escape(escape(name))}</Item>'
-        for number, name in enumerate(data.receiver_names)
-    )
-    keys, numbers = _geo_keys(data.origin)
-    n, rows, columns = data.mean.shape
-    tags: list[tuple[int, int, Any]] = [
-        (256, LONG, [columns]),  # width
-        (257, LONG, [rows]),  # length
-        (258, SHORT, [32] * n),  # bits of a sample
-        (259, SHORT, [8]),  # compression: deflate
-        (262, SHORT, [1]),  # photometric interpretation: black is zero
-        (273, LONG, [0]),  # offset of the only strip, after the directory
-        (277, SHORT, [n]),  # samples of a pixel
-        (278, LONG, [rows]),  # rows of a strip
-        (279, LONG, [len(pixels)]),  # bytes of the strip
-        (284, SHORT, [1]),  # planar configuration: the bands of a pixel follow each other
-        (338, SHORT, [0] * (n - 1)),  # extra samples
-        (339, SHORT, [3] * n),  # sample format: floating point
-        (33550, DOUBLE, [data.cell, data.cell, 0.0]),  # scale of a pixel
-        (33922, DOUBLE, [0.0, 0.0, 0.0, west, north, 0.0]),  # pixel 0, 0 and its place
-        (34735, SHORT, keys),
-        (34736, DOUBLE, numbers),
-        (42112, ASCII, f"<GDALMetadata>{names}</GDALMetadata>".encode()),
-        (42113, ASCII, "nan"),  # no data
-    ]
-    directory, stream = ImageFileDirectory_v2(), io.BytesIO()
-    for tag, kind, values in tags:
-        if len(values):
-            directory.tagtype[tag] = kind
-            directory[tag] = values
-    directory.save(stream)
-    write_bytes(file, stream.getvalue() + pixels)
+    place = 'LOCAL_CS["local metres",UNIT["metre",1]]'
+    if data.origin is not None:
+        from pyproj.crs import ProjectedCRS  # takes a moment, and most data are in metres
+        from pyproj.crs.coordinate_operation import AzimuthalEquidistantConversion
 
-
-def _geo_keys(origin: GeodeticOrigin | None) -> tuple[list[int], list[float]]:
-    """Return the directory of GeoTIFF keys and their doubles."""
-    keys = [(1024, 0, USER_DEFINED), (1025, 0, 1), (3076, 0, METRE)]  # kind of model, pixel is area, linear unit
-    numbers: list[float] = []
-    if origin is not None:
-        numbers = [origin.latitude, origin.longitude, 0.0, 0.0]
-        keys = [
-            (1024, 0, 1),  # projected
-            (1025, 0, 1),
-            (2048, 0, WGS84),
-            (2054, 0, DEGREE),
-            (3072, 0, USER_DEFINED),
-            (3074, 0, USER_DEFINED),
-            (3075, 0, AZIMUTHAL_EQUIDISTANT),
-            (3076, 0, METRE),
-            (3082, 34736, 2),  # false easting
-            (3083, 34736, 3),  # false northing
-            (3088, 34736, 1),  # longitude of the centre
-            (3089, 34736, 0),  # latitude of the centre
-        ]
-    entries = [(key, location, 1, value) for key, location, value in keys]
-    return [1, 1, 1, len(entries), *(number for entry in entries for number in entry)], numbers
+        place = ProjectedCRS(AzimuthalEquidistantConversion(*data.origin), geodetic_crs="EPSG:4326").to_wkt()
+    options = {
+        "driver": "GTiff",
+        "count": len(data.mean),
+        "height": len(data.y),
+        "width": len(data.x),
+        "dtype": "float32",
+        "nodata": math.nan,
+        "crs": place,
+        "transform": rasterio.Affine(data.cell, 0, west, 0, -data.cell, north),
+        "compress": "deflate",
+    }
+    with rasterio.MemoryFile() as memory:
+        with memory.open(**options) as image:
+            image.write(data.mean[:, ::-1].astype("float32"))
+            image.descriptions = data.receiver_names
+        write_bytes(file, memory.read())
 
 
 def write_geojson(file: Path, data: RssiMap) -> None:

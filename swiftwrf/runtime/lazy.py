@@ -37,7 +37,7 @@ class _LazyPackage(ModuleType):
 def import_lazily(package: str) -> None:
     """Postpone the imports in a package's block `if TYPE_CHECKING` until a name is read from it.
 
-    `__all__` are the names that are no submodules of the package or of its `contrib`.
+    `__all__` are the names that are no submodules.
 
     Args:
         package: `__name__` of the package.
@@ -46,6 +46,5 @@ def import_lazily(package: str) -> None:
     block = next(part for part in ast.parse(inspect.getsource(module)).body if isinstance(part, ast.If))
     imports = [part for part in block.body if isinstance(part, ast.ImportFrom)]
     lazy = {name.name: str(part.module) for part in imports for name in part.names}
-    own = (package, f"{package}.contrib")
-    module.__dict__.update(lazy=lazy, __all__=sorted(name for name, source in lazy.items() if source not in own))
+    module.__dict__.update(lazy=lazy, __all__=sorted(name for name, source in lazy.items() if source != package))
     module.__class__ = _LazyPackage

@@ -39,9 +39,10 @@ from swiftwrf import (
     rssi,
 )
 from swiftwrf.array.planar import LIGHT_SPEED
+from swiftwrf.contrib.comparison import rssi as comparison
 from swiftwrf.contrib.online import Follower, Monitor, adapted, prequential, score
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin
-from swiftwrf.rssi import FloorAttenuation, comparison, estimate_floor_attenuation, estimate_offsets
+from swiftwrf.rssi import FloorAttenuation, estimate_floor_attenuation, estimate_offsets
 from swiftwrf.rssi.base import RssiPredictor
 from swiftwrf.rssi.coverage import Coverage
 from swiftwrf.rssi.maps import RssiMap

@@ -19,6 +19,8 @@ from swiftwrf.data import Rssi, Spectra, load_rssi, load_spectra
 from swiftwrf.errors import InputError, optional_module
 from swiftwrf.runtime.durable import cache_folder, refusing_unwritable, rename, write_text
 
+__all__ = ["DATA_SETS", "catalogue", "fetch", "load"]
+
 FOLDER = "SWIFTWRF_DATA"  # environment variable with a folder of converted data sets
 
 

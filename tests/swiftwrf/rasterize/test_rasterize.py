@@ -142,7 +142,8 @@ def test_preparing_compiles_once_and_leaves_threads_and_torchs_compiler_alone():
     """
     code = """
 import sys, torch
-from swiftwrf.rasterize import cpu, prepare, rasterize
+from swiftwrf.contrib.rasterize import cpu
+from swiftwrf.rasterize import prepare, rasterize
 from hard_cases import GRID, random_scene
 
 prepare("cpu")
