@@ -359,8 +359,8 @@ def leave_folds_out_locally(
         rows: Numbers of the m rows.
 
     Returns:
-        Numbers (m, k) of the nearest rows: 64, or as many as there are without the largest fold. The function from a kernel
-        to their weights (m, k) and the posterior variance (m,). It is fast for kernels that differ from the last in noise.
+        Numbers (m, k) of the nearest rows, k = 64 or the number of rows outside of the largest fold, and the function from a
+        kernel to their weights (m, k) and the posterior variance (m,). Kernels that differ in noise share covariances.
 
     Example:
         >>> position, fold = torch.rand(20, 3, dtype=torch.float64), torch.arange(20) % 2
