@@ -85,7 +85,7 @@ def during_a_test(*contexts: Callable[[], AbstractContextManager[None]]) -> Call
 
 small_published = during_a_test(small.small_published)
 short_searches = during_a_test(small.short_searches)
-short_fits = during_a_test(small.few_kernels, small.few_folds, small.short_path_gains)
+short_fits = during_a_test(small.few_kernels, small.one_distribution, small.short_path_gains)
 floor_alone = during_a_test(partial(small.known_planes, small.FLOOR))  # the only plane that any search finds
 
 

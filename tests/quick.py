@@ -14,10 +14,10 @@ from unittest import mock
 
 from matplotlib.figure import Figure
 from small import (
-    few_folds,
     few_kernels,
     glances,
     known_planes,
+    one_distribution,
     short_path_gains,
     small_published,
     small_swiftwrf,
@@ -101,7 +101,7 @@ def cheap() -> Iterator[None]:
         mock.patch.object(MatchedField, "config_type", with_defaults(FEW_CELLS)),
         mock.patch("augment.turbo.stages.HELD_OUT_LOCATOR", FEW_CELLS),
         mock.patch.multiple(kernel_regression, MAX_ROWS=400, MAX_CHOICE_ROWS=150),
-        few_folds(),
+        one_distribution(),
         few_kernels(),
         short_path_gains(),
         mock.patch.multiple(furniture, SETTINGS=furniture.SETTINGS[:1], N_STEPS=10, MIN_HELD_OUT=20),

@@ -123,12 +123,9 @@ def few_kernels() -> Iterator[None]:
 
 
 @contextmanager
-def few_folds() -> Iterator[None]:
-    """Hold out thirds of the spectra for a locator, with one distribution of residuals."""
-    with (
-        mock.patch("swiftwrf.locate.matched_field.FOLDS", 3),
-        mock.patch("swiftwrf.locate.spectrum_likelihood.DEGREES", (5.0,)),
-    ):
+def one_distribution() -> Iterator[None]:
+    """Fit one distribution of the residuals of a locator."""
+    with mock.patch("swiftwrf.locate.spectrum_likelihood.DEGREES", (5.0,)):
         yield
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
@@ -235,6 +236,22 @@ def folds(
     return (order % number)[place]
 
 
+def each_fold(fold: Tensor, rows: Tensor | None = None) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yield the numbers of the rows that are held out with each fold, and of all rows in other folds, int64.
+
+    Args:
+        fold: Fold of each row, (n,).
+        rows: Numbers of the rows to hold out, in the order in which they are yielded. Defaults to all, ascending.
+
+    Example:
+        >>> [(out.tolist(), kept.tolist()) for out, kept in each_fold(torch.tensor([1, 0, 1]))]
+        [([1], [0, 2]), ([0, 2], [1])]
+    """
+    rows = torch.arange(len(fold)) if rows is None else rows
+    for number in fold[rows].unique():
+        yield rows[fold[rows] == number], (fold != number).nonzero()[:, 0]
+
+
 def matching_validation(train: Tensor, test: Tensor) -> Validation:
     """Return the kind of folds whose held-out distances resemble those of the test positions.
 
@@ -251,7 +268,7 @@ def matching_validation(train: Tensor, test: Tensor) -> Validation:
 
     def misfit(validation: Validation) -> float:
         fold = folds(train, validation, 0)
-        held_out = [distances(train[fold != number], train[fold == number]) for number in fold.unique()]
+        held_out = [distances(train[kept], train[out]) for out, kept in each_fold(fold)]
         return float(wasserstein_distance(torch.cat(held_out), distances(train, test)))
 
     kinds: tuple[Validation, Validation] = ("random", "block")

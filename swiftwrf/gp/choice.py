@@ -13,9 +13,10 @@ from collections.abc import Callable, Iterable
 import torch
 from torch import Tensor
 
+from swiftwrf.data.splits import each_fold
 from swiftwrf.data.store import Store
-from swiftwrf.gp.process import N_NEIGHBOURS, Kernel, candidates, held_out_errors, local_weights
-from swiftwrf.positions import Neighbours, distance
+from swiftwrf.gp.process import Kernel, candidates, held_out_errors, leave_folds_out_locally
+from swiftwrf.positions import distance
 from swiftwrf.runtime.threads import single_thread
 
 MIN_ERROR = 1e-12  # squared error, for logarithms
@@ -54,7 +55,7 @@ def choose_kernel(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> K
 def _held_out_errors(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> Callable[[Kernel], Tensor]:
     """Return the function from a kernel to the squared errors (n,) of all spectra, each predicted without its fold."""
     gram, apart = inner_products(spectrum[:]), distance(position.double(), position.double())
-    groups = [(fold == number).nonzero()[:, 0] for number in fold.unique()]
+    groups = [out for out, _ in each_fold(fold)]
 
     def evaluate(kernel: Kernel) -> Tensor:
         precision = torch.linalg.inv(kernel.at(apart) + kernel.noise * torch.eye(len(apart)))
@@ -69,20 +70,14 @@ def _local_errors(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> C
     """Return the function from a kernel to the squared errors of some spectra, each predicted from its neighbours."""
     position = position.double()
     (out,) = subsample(torch.arange(len(position)), rows=MAX_LOCAL_ROWS)
-    count = min(N_NEIGHBOURS, len(fold) - int(fold.bincount().max()))
-    near = torch.empty(len(out), count, dtype=torch.int64)
-    for number in fold[out].unique():
-        kept, mine = (fold != number).nonzero()[:, 0], fold[out] == number
-        near[mine] = kept[Neighbours(position[kept])(position[out[mine]], count)[1]]
+    near, weights = leave_folds_out_locally(position, fold, out)
     mean = subsample(spectrum)[0].flatten(1).mean(dim=0)
     rows = torch.cat([out[:, None], near], dim=1)
     flat = (spectrum[some].flatten(1) - mean for some in rows)
     gram = torch.stack([some @ some.T for some in flat]).double() / len(mean)
-    apart = distance(position[rows], position[rows])
 
     def evaluate(kernel: Kernel) -> Tensor:
-        covariance = kernel.at(apart)
-        weight, _ = local_weights(covariance[:, 1:, 1:], covariance[:, 0, 1:], kernel.noise)
+        weight, _ = weights(kernel)
         full = torch.cat([weight.new_full((len(weight), 1), -1.0), weight], dim=1)  # predicted minus held-out
         return torch.einsum("mi,mij,mj->m", full, gram, full)
 

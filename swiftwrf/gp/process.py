@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Annotated
 
 import torch
@@ -15,6 +15,7 @@ from scipy.optimize import brentq
 from torch import Tensor
 from torch.nn import functional
 
+from swiftwrf.data.splits import each_fold
 from swiftwrf.positions import Neighbours, distance
 from swiftwrf.runtime.validation import Fraction, configuration
 
@@ -203,7 +204,7 @@ class GaussianProcess:
         if self.is_exact:
             mean: Tensor = self._cross(position).to(self.coefficient) @ self.coefficient
             return mean
-        return self.condition(position)[0]
+        return self.mean_and_variance(position)[0]
 
     def weights(self, position: Tensor) -> tuple[Tensor, Tensor]:
         """Return the posterior mean at positions (m, 3) as a linear function of the values.
@@ -243,8 +244,8 @@ class GaussianProcess:
     def _neighbours(self) -> Neighbours:
         return Neighbours(self.known)
 
-    def condition(self, position: Tensor) -> tuple[Tensor, Tensor]:
-        """Return posterior mean (m, K) and variance (m,) at positions (m, 3), as `mean` and `variance`, by one search."""
+    def mean_and_variance(self, position: Tensor) -> tuple[Tensor, Tensor]:
+        """Return posterior mean (m, K) and variance (m,) at positions (m, 3), by one search for neighbours."""
         if self.is_exact:
             return self.mean(position), self.variance(position)
         number, weight, variance = self._local(position)
@@ -308,18 +309,53 @@ def leave_folds_out(
         [([0, 2], torch.Size([2, 10])), ([1, 3], torch.Size([2, 10]))]
     """
     if nearest_for is not None:
-        for number in fold[nearest_for].unique():
-            out, others = nearest_for[fold[nearest_for] == number], (fold != number).nonzero()[:, 0]
+        for out, others in each_fold(fold, nearest_for):
             near, weight, variance = GaussianProcess(kernel, position[others], exact=False)._local(position[out])
             used, dense = dense_weights(near, weight)
             yield out, others[used], dense, variance + kernel.noise
         return
     precision = torch.linalg.inv(kernel.covariance(position))
-    for number in fold.unique():
-        out, kept = ((fold == number) == held for held in (True, False))
+    for out, kept in each_fold(fold):
         covariance = torch.linalg.inv(precision[out][:, out])
         weight = -covariance @ precision[out][:, kept]
-        yield out.nonzero()[:, 0], kept.nonzero()[:, 0], weight, covariance.diagonal()
+        yield out, kept, weight, covariance.diagonal()
+
+
+def leave_folds_out_locally(
+    position: Tensor, fold: Tensor, rows: Tensor
+) -> tuple[Tensor, Callable[[Kernel], tuple[Tensor, Tensor]]]:
+    """Return how processes with mean 0 predict m rows, each from its nearest rows in other folds.
+
+    Args:
+        position: Positions (n, d).
+        fold: Number of the fold of each row, (n,).
+        rows: Numbers of the m rows.
+
+    Returns:
+        Numbers (m, k) of the nearest rows, k = 64 or the number of rows outside of the largest fold, and the function from a
+        kernel to their weights (m, k) and the posterior variance (m,). Kernels that differ in noise share covariances.
+
+    Example:
+        >>> position, fold = torch.rand(20, 3, dtype=torch.float64), torch.arange(20) % 2
+        >>> near, weights = leave_folds_out_locally(position, fold, torch.arange(4))
+        >>> near.shape, weights(Kernel(noise=0.01))[0].shape
+        (torch.Size([4, 10]), torch.Size([4, 10]))
+    """
+    count = min(N_NEIGHBOURS, len(fold) - int(fold.bincount().max()))
+    near = torch.empty(len(fold), count, dtype=torch.int64)
+    for out, kept in each_fold(fold, rows):
+        near[out] = kept[Neighbours(position[kept])(position[out], count)[1]]
+    known = position[near[rows]]
+    between, across = distance(known, known), distance(position[rows, None], known)[:, 0]
+
+    @lru_cache(maxsize=1)
+    def covariances(kernel: Kernel) -> tuple[Tensor, Tensor]:
+        return kernel.at(between), kernel.at(across)
+
+    def weights(kernel: Kernel) -> tuple[Tensor, Tensor]:
+        return local_weights(*covariances(replace(kernel, noise=1.0)), kernel.noise)
+
+    return near[rows], weights
 
 
 def held_out_errors(precision: Tensor, dual: Tensor, out: Tensor) -> Tensor:

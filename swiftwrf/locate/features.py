@@ -172,5 +172,5 @@ def nearby_numbers(
     Returns:
         Numbers, float32 (m, 2 P), and the relative standard deviations of their errors, (m,).
     """
-    mean, variance = process.condition(position)
+    mean, variance = process.mean_and_variance(position)
     return channel_numbers(channel, array) + mean.float(), (variance + process.kernel.noise).sqrt().float()

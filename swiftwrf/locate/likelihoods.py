@@ -17,6 +17,7 @@ from torch import Tensor
 from swiftwrf.array.planar import LIGHT_SPEED, differences
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.spectra import Spectra
+from swiftwrf.data.splits import each_fold
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, choose_kernel
 from swiftwrf.locate.features import (
@@ -161,16 +162,15 @@ class SpectrumLikelihoods(Likelihoods):
         kernel = kernel_of(scene.moving)
 
         def fitted(kept: Tensor) -> tuple[GeometryModel, PathGains, PhaseLikelihood]:
-            phases = scene.subset(kept[rows].nonzero()[:, 0])
+            phases = scene.subset(torch.isin(rows, kept).nonzero()[:, 0])
             own = room.refined_on(phases)
             likelihood = PhaseLikelihood.fit([(own, PathWaves.at(own, train.position[kept]), features.subset(kept))])
             return own, fit_path_gains(own, phases, kernel, prior), likelihood
 
-        kept = _without_folds(fold)
+        outs, kept = _held_out_and_kept(fold)
         fits = parallel_map(fitted, kept)
         residual = torch.empty(2, *features.coarray.shape)
-        for others, (own, gains, _) in zip(kept[:-1], fits[:-1], strict=True):
-            out = ~others
+        for out, (own, gains, _) in zip(outs, fits[:-1], strict=True):
             waves, observed = PathWaves.at(own, train.position[out]), features.coarray[out]
             residual[:, out] = torch.stack(
                 [predict(waves)[0] - observed for predict in gain_features(own.array, gains)]
@@ -251,11 +251,11 @@ class ChannelLikelihoods(Likelihoods):
             frequency = train.frequency_hz[kept_snapshots(n_snapshots)] * array.wavelength / LIGHT_SPEED
 
         def fitted(kept: Tensor) -> GeometryModel:
-            return room.refined_on(scene.subset(kept[rows].nonzero()[:, 0])).furnished_on(train.subset(kept))
+            phases = scene.subset(torch.isin(rows, kept).nonzero()[:, 0])
+            return room.refined_on(phases).furnished_on(train.subset(kept))
 
-        kept = _without_folds(fold)
+        outs, kept = _held_out_and_kept(fold)
         rooms = parallel_map(fitted, kept)
-        outs = [~others for others in kept[:-1]]
         # every channel, by the room without its fold
         held = [
             (own, PathWaves.at(own, position[out], frequency), features.subset(out))
@@ -335,6 +335,7 @@ class ChannelLikelihoods(Likelihoods):
             raise InputError(f"{self.n_snapshots} snapshots have {len(self.frequency)} frequencies")
 
 
-def _without_folds(fold: Tensor) -> list[Tensor]:
-    """Return the rows of all but each fold, bool (n,), and last all rows."""
-    return [*(fold != number for number in range(int(fold.max()) + 1)), torch.ones_like(fold, dtype=torch.bool)]
+def _held_out_and_kept(fold: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+    """Return the rows of each fold, and those of all but each fold with, last, all rows."""
+    outs, kept = zip(*each_fold(fold), strict=True)
+    return [*outs], [*kept, torch.arange(len(fold))]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Annotated, ClassVar, Self
 
 import torch
@@ -13,17 +14,17 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid, to_angles, to_direction
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.spectra import Spectra, check_training, direction_of_link
-from swiftwrf.data.splits import FOLDS, folds
+from swiftwrf.data.splits import each_fold, folds
 from swiftwrf.errors import InputError, with_article
 from swiftwrf.gp import subsample
 from swiftwrf.locate.features import SpectrumFeatures
 from swiftwrf.locate.likelihoods import ChannelLikelihoods, Likelihoods, SpectrumLikelihoods
-from swiftwrf.locate.posterior import HeldOut, Inflation, PoolWeights, Posterior, calibrated_pool, normalised
+from swiftwrf.locate.locator import Locator
+from swiftwrf.locate.posterior import HeldOut, Posterior
 from swiftwrf.locate.region import Cells, Region, best_cells, outside_mass, refined
 from swiftwrf.locate.spectrum_likelihood import Screen
 from swiftwrf.models.base import FieldModel
 from swiftwrf.models.geometry import GeometryModel
-from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, all_or_nothing, checked, configuration
 
 MIN_SPECTRA = 15
@@ -56,7 +57,7 @@ class MatchedFieldConfig:
     """seed of everything random"""
 
 
-class MatchedField(Saved):
+class MatchedField(Locator):
     """Posterior over the position of the moving end, given a spectrum.
 
     Three likelihoods of spectra are pooled: co-array numbers predicted by constant path gains, by position-dependent path
@@ -84,18 +85,10 @@ class MatchedField(Saved):
 
     kind: ClassVar[str] = "matched-field locator"
     config_type: ClassVar[type[MatchedFieldConfig]] = MatchedFieldConfig
-    fitted_attribute = "likelihoods"
     config: MatchedFieldConfig
 
     saved = "likelihoods weight inflation region"
     likelihoods: SpectrumLikelihoods | ChannelLikelihoods
-    """likelihoods that are pooled, set by `fit`"""
-    weight: PoolWeights
-    """their weights, float64 (3,)"""
-    inflation: Inflation
-    """factor of the credible radii"""
-    region: Region
-    """prior over positions"""
 
     @property
     def room(self) -> GeometryModel:
@@ -137,12 +130,11 @@ class MatchedField(Saved):
         fold = folds(position, "random", seed)
         kind = SpectrumLikelihoods if train.channel is None else ChannelLikelihoods
         features, (*parts, self.likelihoods) = kind.fit(train, own, fold, seed)
-        held_out = [position[fold == number] for number in range(FOLDS)]
-        others = [Region(position[fold != number]) for number in range(FOLDS)]
-        self.region = region or Region(position, outside=outside_mass(others, held_out))
-        self.weight, self.inflation = torch.tensor(kind.start, dtype=torch.float64), 1.0
+        held_out = ((Region(position[kept]), position[out]) for out, kept in each_fold(fold))
+        self.region = region or Region(position, outside=outside_mass(held_out))
         self._prepare()
-        self._calibrate(position, features, fold, parts)
+        self.weight, self.inflation = torch.tensor(kind.start, dtype=torch.float64), 1.0
+        self._calibrate(self._held_out(position, features, fold, parts))
         return self
 
     def _prepare(self) -> None:
@@ -151,23 +143,19 @@ class MatchedField(Saved):
         count = int(math.prod((self.region.extent / spacing).clamp_min(1).tolist()))
         self.cells, self._screens = self.likelihoods.screens(self.region, count, self.config.max_cells)
 
-    cells: Cells
     _screens: list[Screen]
 
-    def _calibrate(
+    def _held_out(
         self, position: Tensor, features: SpectrumFeatures, fold: Tensor, parts: Sequence[Likelihoods]
-    ) -> None:
-        """Choose the weights of the likelihoods and the inflation of credible radii by held-out positions."""
+    ) -> Iterator[HeldOut]:
+        """Yield some spectra of each fold with their likelihoods by the other folds."""
         (some,) = subsample(torch.arange(len(position)), rows=self.config.n_calibration)
-        held_out = []
-        for number in fold[some].unique().tolist():
-            rows = some[fold[some] == number]
-            likelihoods, observed = parts[number], features.subset(rows)
+        for rows, _ in each_fold(fold, some):
+            likelihoods, observed = parts[int(fold[rows[0]])], features.subset(rows)
             at_truth = likelihoods(position[rows][:, None], observed, self.weight)[..., 0]
             cells, values = zip(*self._searched(observed, likelihoods), strict=True)
             at, volume = (torch.cat([getattr(part, name) for part in cells]) for name in ("position", "log_volume"))
-            held_out.append(HeldOut(position[rows], at_truth, at, torch.cat(values, dim=1).double(), volume))
-        self.weight, self.inflation, _ = calibrated_pool(held_out, self._resolution_m)
+            yield HeldOut(position[rows], at_truth, at, torch.cat(values, dim=1).double(), volume)
 
     def _searched(self, observed: SpectrumFeatures, likelihoods: Likelihoods) -> Iterator[tuple[Cells, Tensor]]:
         """Yield cells (b, m) and log-likelihoods (k, b, m) of some observations at a time."""
@@ -185,12 +173,9 @@ class MatchedField(Saved):
             cells = best_cells(self.cells, total.neg_(), config.n_best, config.n_background, generator)
             values = evaluate(cells.position)
             for _ in range(config.n_rounds):
-                cells, values = refined(cells, self._log_mass(cells, values), values, evaluate, config.n_split)
+                log_mass = self._posterior(cells.position, values, cells.log_volume).log_weight
+                cells, values = refined(cells, log_mass, values, evaluate, config.n_split)
             yield cells, values
-
-    def _log_mass(self, cells: Cells, values: Tensor) -> Tensor:
-        """Return the logarithms of the posterior masses of cells (n, m) with log-likelihoods (k, n, m)."""
-        return normalised(torch.einsum("k,knm->nm", self.weight, values.double()) + cells.log_volume)
 
     @torch.no_grad()
     def locate(self, spectrum: Numbers | Spectra) -> Posterior:
@@ -211,16 +196,13 @@ class MatchedField(Saved):
         if isinstance(spectrum, Spectra):
             spectrum = self.room.link.aligned(spectrum)
         observed = self.likelihoods.features(spectrum, self.config.seed)
-        parts = list(self._searched(observed, self.likelihoods))
-        position = torch.cat([cells.position for cells, _ in parts])
-        log_weight = torch.cat([self._log_mass(cells, values) for cells, values in parts])
+        parts = self._searched(observed, self.likelihoods)
+        found = Posterior.cat([self._posterior(cells.position, values, cells.log_volume) for cells, values in parts])
         # within half a wavelength the field changes too little for a second mode
-        width = self.room.array.wavelength / 2
-        return Posterior(position, log_weight, self._resolution_m, self.inflation, width)
+        return replace(found, mode_width_m=self.room.array.wavelength / 2)
 
     @property
     def _resolution_m(self) -> float:
-        """Edge of the smallest cells [m]."""
         return float(self.cells.edge_m / 2**self.config.n_rounds)
 
     def predict(self, spectrum: Numbers | Spectra) -> Tensor:

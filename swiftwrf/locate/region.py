@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated
@@ -178,14 +178,13 @@ class Region:
         return (mass / mass.sum()).log()
 
 
-def outside_mass(regions: list[Region], positions: list[Tensor]) -> float:
+def outside_mass(held_out: Iterable[tuple[Region, Tensor]]) -> float:
     """Return the prior mass outside the neighbourhood of known positions.
 
-    It follows from the held-out positions (n, 3) [m] of each fold and the region of the other folds' positions.
+    It follows from the region of the other folds' positions and the held-out positions (n, 3) [m] of each fold.
     """
-    outside = sum(int((~region.is_near(at)).sum()) for region, at in zip(regions, positions, strict=True))
-    total = sum(len(at) for at in positions)
-    return (outside + 1) / (total + 2)
+    near = torch.cat([region.is_near(at) for region, at in held_out])
+    return (int((~near).sum()) + 1) / (len(near) + 2)
 
 
 def best_cells(cells: Cells, misfit: Tensor, most: int, others: int, generator: torch.Generator) -> Cells:

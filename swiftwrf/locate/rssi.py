@@ -13,9 +13,10 @@ from torch import Tensor
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.powers import MAX_RSSI_DBM, MIN_RSSI_DBM, check_powers
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.splits import FOLDS, Validation, folds
+from swiftwrf.data.splits import FOLDS, Validation, each_fold, folds
 from swiftwrf.errors import InputError
-from swiftwrf.locate.posterior import HeldOut, Inflation, PoolWeights, Posterior, calibrated_pool, normalised
+from swiftwrf.locate.locator import Locator
+from swiftwrf.locate.posterior import HeldOut, Posterior
 from swiftwrf.locate.region import Region, outside_mass
 from swiftwrf.locate.rssi_likelihood import (
     DetectionLikelihood,
@@ -30,7 +31,6 @@ from swiftwrf.locate.rssi_likelihood import (
 from swiftwrf.positions import to_tensor
 from swiftwrf.rssi import RssiModel
 from swiftwrf.rssi.detection import Detection
-from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.progress import progress as tracked
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, all_or_nothing, checked, configuration
 
@@ -65,7 +65,7 @@ class _Part:
     votes: Votes
 
 
-class RssiLocator(Saved):
+class RssiLocator(Locator):
     """Posterior over the position of the transmitter, given its RSSI at the receivers.
 
     Three likelihoods are pooled: the values under the radio maps with their uncertainty and a common offset of a row, which
@@ -87,7 +87,6 @@ class RssiLocator(Saved):
 
     kind: ClassVar[str] = "RSSI locator"
     config_type: ClassVar[type[RssiLocatorConfig]] = RssiLocatorConfig
-    fitted_attribute = "_maps"
     config: RssiLocatorConfig
 
     saved = "model likelihoods region weight inflation"
@@ -95,12 +94,6 @@ class RssiLocator(Saved):
     """radio maps of the receivers, set by `fit`"""
     likelihoods: Annotated[RssiLikelihoods, "r=model.r"]
     """likelihoods that are pooled, set by `fit`"""
-    region: Region
-    """prior over positions, set by `fit`"""
-    weight: PoolWeights
-    """weights of the likelihoods, float64 (3,), set by `fit`"""
-    inflation: Inflation
-    """factor of the credible radii, set by `fit`"""
     receiver_names: tuple[str, ...]
     """names of the receivers, set by `fit`"""
     held_out_m: dict[str, float]
@@ -131,12 +124,12 @@ class RssiLocator(Saved):
         known = train.transmitter_position
         fold = folds(known, config.validation, config.seed, session=train.session)
         fingerprints = Fingerprints.fit(train, fold, config.seed)
-        numbers = tracked(fold.unique().tolist(), "held-out folds", progress)
-        parts = [self._part(train, fold, number, fingerprints) for number in numbers]
+        splits = list(each_fold(fold, train.detected.any(dim=1).nonzero()[:, 0]))
+        parts = [self._part(train, *rows, fingerprints) for rows in tracked(splits, "held-out folds", progress)]
         prior = region or Region(
             known,
             0.25 if config.validation == "block" else 0.03,  # a block of a fifth may lie beyond the known positions
-            outside_mass([part.region for part in parts], [part.position for part in parts]),
+            outside_mass((part.region, part.position) for part in parts),
         )
         self.region = replace(prior, floors=train.floors)
         self.cells = self.region.cells(config.n_cells)
@@ -144,7 +137,10 @@ class RssiLocator(Saved):
         curve = Detection.estimate(train.transmitter_position, train.rssi_dbm)
         limit = torch.zeros(len(self.receiver_names)).double() if curve is None else curve.limit
         self.likelihoods = self._fitted(parts, fingerprints, limit)
-        self._calibrate(parts, limit)
+        held_out = [self._held_out(part, parts, limit) for part in parts]
+        error = self._calibrate(held_out)
+        away = [each.truth - part.region.known.mean(dim=0) for each, part in zip(held_out, parts, strict=True)]
+        self.held_out_m = {"posterior": float(error.mean()), "mean": float(torch.cat(away).norm(dim=1).mean())}
         return self
 
     def _fitted(self, parts: list[_Part], fingerprints: Fingerprints, limit: Tensor) -> RssiLikelihoods:
@@ -164,34 +160,24 @@ class RssiLocator(Saved):
         # which receivers detect the transmitter is a likelihood of its own
         return RssiModel(validation=self.config.validation, seed=self.config.seed, not_detected="unknown").fit(train)
 
-    def _part(self, train: Rssi, fold: Tensor, number: int, fingerprints: Fingerprints) -> _Part:
+    def _part(self, train: Rssi, out: Tensor, kept: Tensor, fingerprints: Fingerprints) -> _Part:
         generator = torch.Generator().manual_seed(self.config.seed)
-        out, kept = ((fold == number) & train.detected.any(dim=1)).nonzero()[:, 0], train.subset(fold != number)
         out = out[torch.randperm(len(out), generator=generator)[: MAX_HELD_OUT // FOLDS]]
-        rssi, position = train.rssi_dbm[out], train.transmitter_position[out]
-        model = self._radio_maps(kept)
-        found = Fingerprints.of(kept, fingerprints.metric, fingerprints.k)
-        region = Region(kept.transmitter_position, floors=train.floors)
+        rssi, position, known = train.rssi_dbm[out], train.transmitter_position[out], train.subset(kept)
+        model = self._radio_maps(known)
+        found = Fingerprints.of(known, fingerprints.metric, fingerprints.k)
+        region = Region(known.transmitter_position, floors=train.floors)
         return _Part(rssi, position, region, model, maps_at(model, position), found, found.votes(rssi))
 
-    def _calibrate(self, parts: list[_Part], limit: Tensor) -> None:
-        """Choose the weights of the likelihoods and the factor of credible radii by held-out positions.
-
-        The distributions for each fold are those of the other folds.
-        """
-        held_out, from_mean = [], []
-        for part in parts:
-            likelihoods = self._fitted([other for other in parts if other is not part], part.fingerprints, limit)
-            some = slice(-(-self.config.n_calibration // len(parts)))
-            rssi, at, (mean, std) = part.rssi[some], part.position[some], part.maps
-            values = likelihoods(self.cells.position, maps_at(part.model, self.cells.position), rssi)
-            at_truth = likelihoods(at, (mean[some], std[some]), rssi).diagonal(dim1=1, dim2=2)
-            prior = replace(part.region, margin=self.region.margin, outside=self.region.outside)
-            mass = prior.log_mass(self.cells.position).expand(len(rssi), -1)
-            held_out.append(HeldOut(at, at_truth, self.cells.position[None], values, mass))
-            from_mean.append((at - part.region.known.mean(dim=0)).norm(dim=1))
-        self.weight, self.inflation, error = calibrated_pool(held_out, self.cells.edge_m, self.region.floors)
-        self.held_out_m = {"posterior": float(error.mean()), "mean": float(torch.cat(from_mean).mean())}
+    def _held_out(self, part: _Part, parts: list[_Part], limit: Tensor) -> HeldOut:
+        """Return some rows of a part with their likelihoods, whose distributions are those of the other parts."""
+        likelihoods = self._fitted([other for other in parts if other is not part], part.fingerprints, limit)
+        some, cells = slice(-(-self.config.n_calibration // len(parts))), self.cells.position
+        rssi, at, (mean, std) = part.rssi[some], part.position[some], part.maps
+        values = likelihoods(cells, maps_at(part.model, cells), rssi)
+        at_truth = likelihoods(at, (mean[some], std[some]), rssi).diagonal(dim1=1, dim2=2)
+        prior = replace(part.region, margin=self.region.margin, outside=self.region.outside)
+        return HeldOut(at, at_truth, cells[None], values, prior.log_mass(cells).expand(len(rssi), -1))
 
     @torch.no_grad()
     def locate(self, rssi: Numbers) -> Posterior:
@@ -210,10 +196,7 @@ class RssiLocator(Saved):
         if len(silent):
             raise InputError(f"no receiver detected the transmitter in row {int(silent[0])}; leave such rows out")
         at = self.cells.position
-        values = self.likelihoods(at, self._maps, rssi)
-        log_mass = torch.einsum("k,knm->nm", self.weight, values) + self.cells.log_volume
-        edge_m, floors = self.cells.edge_m, self.region.floors
-        return Posterior(at[None], normalised(log_mass), edge_m, self.inflation, floors=floors)
+        return self._posterior(at[None], self.likelihoods(at, self._maps, rssi), self.cells.log_volume)
 
     @torch.no_grad()
     @checked

@@ -19,9 +19,9 @@ from torch import Tensor
 from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.splits import centres, places
+from swiftwrf.data.splits import centres, each_fold, places
 from swiftwrf.errors import InputError
-from swiftwrf.locate.spectrum_likelihood import DEGREES
+from swiftwrf.locate.spectrum_likelihood import DEGREES, student_log_density
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime.validation import PositiveFloat, PositiveInt
 
@@ -106,11 +106,7 @@ class ValueLikelihood:
         ratio = self.common_db**2 / variance
         distance = (second - first.square() * ratio / (1 + ratio * total)).clamp_min(0) / variance
         determinant = count * math.log(self.scale) + torch.log1p(ratio * total) / 2
-        if math.isinf(self.degrees):
-            return -distance / 2 - determinant
-        half = (self.degrees + count) / 2
-        constant = torch.lgamma(half) - math.lgamma(self.degrees / 2) - count / 2 * math.log(self.degrees / 2)
-        return constant - half * torch.log1p(distance / self.degrees) - determinant
+        return student_log_density(distance, self.degrees, count) - determinant
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,8 +204,7 @@ class Fingerprints:
                 'region or one session; measure elsewhere, too, or take validation="random"'
             )
         order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))
-        held_out = torch.zeros(len(train), dtype=torch.bool).index_fill(0, order[:MAX_HELD_OUT], value=True)
-        parts = [((fold == number) & held_out, fold != number) for number in fold.unique()]
+        parts = list(each_fold(fold, order[:MAX_HELD_OUT].sort().values))
         errors: dict[tuple[Metric, int], Tensor] = {}
         fewest = min(int(places(train.transmitter_position[kept]).max()) + 1 for _, kept in parts)
         counts = [k for k in NEIGHBOUR_COUNTS if k <= fewest]
@@ -338,7 +333,7 @@ class FingerprintLikelihood:
         if part.shape[1] > 1:
             away[..., 2] = 0.0
         floor = ((1 - self.miss) * part + self.miss / part.shape[1]).log()
-        return floor[:, number] - (self.degrees + 3) / 2 * torch.log1p(away.square().sum(dim=2) / self.degrees)
+        return floor[:, number] + student_log_density(away.square().sum(dim=2), self.degrees, 3)
 
 
 def _with_estimate(votes: Votes) -> Tensor:

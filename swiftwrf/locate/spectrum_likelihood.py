@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor
 
+from swiftwrf.data.splits import each_fold
 from swiftwrf.locate.features import Features, PathWaves, SpectrumFeatures
 from swiftwrf.models.geometry.channels import coherence, ends, sources
 from swiftwrf.models.geometry.model import GeometryModel
@@ -37,6 +38,20 @@ Likelihood = Callable[[PathWaves, SpectrumFeatures], Tensor]
 """from waves at m candidates and m observations to log-likelihoods (m,), up to a constant of each observation"""
 Screen = Callable[[SpectrumFeatures], Tensor]
 """from n observations to log-likelihoods (n, m) at m cells"""
+
+
+def student_log_density(distance: Tensor, degrees: float, size: Tensor | int) -> Tensor:
+    """Return the log-density of Student variables in `size` dimensions at squared whitened distances, without determinants.
+
+    With infinite degrees of freedom they are Gaussian.
+    """
+    size = torch.as_tensor(size, dtype=torch.float64)
+    if math.isinf(degrees):
+        return -distance / 2 - size / 2 * math.log(2 * math.pi)
+    half = (degrees + size) / 2
+    constant = torch.lgamma(half) - math.lgamma(degrees / 2) - size / 2 * math.log(degrees * math.pi)
+    # in place: a search has millions of distances
+    return (distance / degrees).log1p_().mul_(-half).add_(constant)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,10 +72,9 @@ class Student:
         residual, shrinkage = residual.double(), torch.tensor(SHRINKAGES, dtype=torch.float64)
         fold = torch.arange(len(residual)) % 5
         density = torch.zeros(len(DEGREES), len(shrinkage), dtype=torch.float64)
-        for (row, degrees), number in itertools.product(enumerate(DEGREES), range(5)):
-            out = residual[fold == number]
-            scales = covariance(residual[fold != number], shrinkage, degrees, floor)
-            held_out = [cls(scale, degrees).log_likelihood(out).sum() for scale in scales]
+        for (row, degrees), (out, kept) in itertools.product(enumerate(DEGREES), each_fold(fold)):
+            scales = covariance(residual[kept], shrinkage, degrees, floor)
+            held_out = [cls(scale, degrees).log_likelihood(residual[out]).sum() for scale in scales]
             density[row] += torch.stack(held_out)
         best, column = divmod(int(density.argmax()), len(shrinkage))
         return cls(covariance(residual, shrinkage[[column]], DEGREES[best], floor)[0], DEGREES[best])
@@ -73,15 +87,7 @@ class Student:
 
     def log_density(self, distance: Tensor) -> Tensor:
         """Return the log-density of squared whitened distances of any shape, without the determinants."""
-        f = len(self.scale)
-        if math.isinf(self.degrees):
-            normal: Tensor = -distance / 2 - f / 2 * math.log(2 * math.pi)
-            return normal
-        half = (self.degrees + f) / 2
-        constant = math.lgamma(half) - math.lgamma(self.degrees / 2) - f / 2 * math.log(self.degrees * math.pi)
-        # in place: a search has millions of distances
-        density: Tensor = (distance / self.degrees).log1p_().mul_(-half).add_(constant)
-        return density
+        return student_log_density(distance, self.degrees, len(self.scale))
 
     def log_likelihood(self, residual: Tensor) -> Tensor:
         """Return the log-likelihoods (n,) of residuals (n, F), float64."""

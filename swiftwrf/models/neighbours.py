@@ -13,7 +13,7 @@ from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.data.splits import folds
+from swiftwrf.data.splits import each_fold, folds
 from swiftwrf.data.store import Store
 from swiftwrf.gp import dense_weights, inner_products, subsample
 from swiftwrf.models.base import FieldModel
@@ -106,8 +106,7 @@ class IDWModel(MemoryModel):
 
 def _held_out_loss(k: int, position: Tensor, gram: Tensor, fold: Tensor) -> float:
     loss = 0.0
-    for number in fold.unique():
-        out, kept = fold == number, (fold != number).nonzero()[:, 0]
+    for out, kept in each_fold(fold):
         near, share = weights(position[out], position[kept], k)
         weight = -torch.eye(len(fold), dtype=gram.dtype)[out]  # predicted minus held-out spectra
         weight.scatter_(1, kept[near], share.to(gram.dtype))

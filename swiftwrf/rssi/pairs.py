@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Self
 
@@ -19,14 +20,14 @@ from annotated_types import Gt, Lt
 from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.splits import folds, places
+from swiftwrf.data.splits import each_fold, folds, places
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, candidates
-from swiftwrf.gp.process import N_NEIGHBOURS, local_weights
+from swiftwrf.gp.process import leave_folds_out_locally
 from swiftwrf.metrics import HALF_WIDTH, interval_factor
 from swiftwrf.models.base import FieldConfig
 from swiftwrf.models.prediction import Prediction
-from swiftwrf.positions import Neighbours, check_positions, distance, nearest
+from swiftwrf.positions import check_positions, nearest
 from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiPredictor, in_batches
 from swiftwrf.rssi.path_loss import MIN_DISTANCE_M, fit_path_loss
 from swiftwrf.rssi.training import rounding_std
@@ -231,45 +232,34 @@ class PairModel(PairPredictor, Saved):
         def path_loss(rows: Tensor) -> PairPathLoss:
             return PairPathLoss.fit(pair[rows], rssi[rows], by_place=not self.config.new_places)
 
-        self.pair, self.path_loss = pair, path_loss(torch.ones_like(fold, dtype=torch.bool))
+        self.pair, self.path_loss = pair, path_loss(torch.arange(len(pair)))
         self.residual = rssi - self.path_loss(pair)
         order = torch.randperm(len(pair), generator=torch.Generator().manual_seed(self.config.seed))
-        sample = order[:MAX_HELD_OUT]
+        rows, (names, number) = order[:MAX_HELD_OUT], fold.unique(return_inverse=True)
         # one region only: none is left to predict it from
-        fold = fold if len(fold.unique()) > 1 else torch.arange(len(fold)) % 2
-        # residuals of the path-loss model fitted without each fold of the sample
-        held_out = {number: rssi - path_loss(fold != number)(pair) for number in fold[sample].unique().tolist()}
-        choices = [choice for ratio in RATIOS for choice in self._judged(ratio, fold, sample, held_out)]
+        fold = number if len(names) > 1 else torch.arange(len(fold)) % 2
+        # residuals (folds, pairs) of the path-loss model fitted without each fold
+        residual = torch.stack([rssi - path_loss(kept)(pair) for _, kept in each_fold(fold)])
+        choices = (choice for ratio in RATIOS for choice in self._judged(ratio, fold, rows, residual))
         _, self.ratio, self.kernel, score = min(choices, key=lambda choice: choice[0])
-        rows = torch.cat([sample[fold[sample] == number] for number in held_out])
         place = places(pair[rows, 3:] if self.config.new_places else pair[rows, :3], 2)  # of the end that is held out
         scale = interval_factor(score / HALF_WIDTH, place)
         self.scale_db = score.new_tensor([max(scale, rounding_std(rssi) / self.kernel.noise**0.5)])
         self._precompute()
 
     def _judged(
-        self, ratio: float, fold: Tensor, sample: Tensor, held_out: dict[int, Tensor]
-    ) -> list[tuple[float, float, Kernel, Tensor]]:
-        """Return kernels with their mean absolute error at held-out pairs, and the errors by their relative deviations."""
-        n_near = min(N_NEIGHBOURS, int((fold[:, None] != fold.unique()).sum(dim=0).min()))
-        parts, coordinates = [], scaled(self.pair, ratio)
-        for number, own in held_out.items():
-            out, kept = sample[fold[sample] == number], (fold != number).nonzero()[:, 0]
-            near = kept[Neighbours(coordinates[kept])(coordinates[out], n_near)[1]]
-            known, query = coordinates[near], coordinates[out]
-            parts.append((distance(known, known), distance(query[:, None], known)[:, 0], own[near], own[out]))
-        r_between, r_across, values, truth = (torch.cat(part) for part in zip(*parts, strict=True))
+        self, ratio: float, fold: Tensor, rows: Tensor, residual: Tensor
+    ) -> Iterator[tuple[float, float, Kernel, Tensor]]:
+        """Yield kernels with their mean absolute error at held-out pairs, and the errors by their relative deviations."""
+        coordinates = scaled(self.pair, ratio)
+        near, weights = leave_folds_out_locally(coordinates, fold, rows)
+        values, truth = residual[fold[rows, None], near], residual[fold[rows], rows]
         # rough fields only, as in the model of each receiver
         kernels = [k for k in candidates(coordinates, RELATIVE_NOISE_VARIANCES) if k.matern12_weight == 1]
-        judged = []
-        for length in sorted({kernel.matern12_length for kernel in kernels}):
-            shape = Kernel(length, matern12_weight=1.0)
-            covariance, cross = shape.at(r_between), shape.at(r_across)
-            for kernel in (kernel for kernel in kernels if kernel.matern12_length == length):
-                weight, variance = local_weights(covariance, cross, kernel.noise)
-                error = (truth - (weight * values).sum(dim=1)).abs()
-                judged.append((float(error.mean()), ratio, kernel, error / (variance + kernel.noise).sqrt()))
-        return judged
+        for kernel in sorted(kernels, key=lambda kernel: kernel.matern12_length):
+            weight, variance = weights(kernel)
+            error = (truth - (weight * values).sum(dim=1)).abs()
+            yield float(error.mean()), ratio, kernel, error / (variance + kernel.noise).sqrt()
 
     def region(self) -> Tensor:
         """Return the training positions (n, 3) [m], one for each pair."""
@@ -281,7 +271,7 @@ class PairModel(PairPredictor, Saved):
 
     @single_thread()
     def _at_pairs(self, pair: Tensor) -> tuple[Tensor, Tensor]:
-        field, variance = self._process.condition(scaled(pair, self.ratio))
+        field, variance = self._process.mean_and_variance(scaled(pair, self.ratio))
         return self.path_loss(pair) + field[:, 0], self.scale_db * (variance + self.kernel.noise).sqrt()
 
     def _restored(self) -> None:

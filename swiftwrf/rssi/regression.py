@@ -28,6 +28,7 @@ from scipy.linalg.blas import ssymv
 from torch import Tensor
 from torch.nn import functional
 
+from swiftwrf.data.splits import each_fold
 from swiftwrf.errors import FitError
 from swiftwrf.gp import GaussianProcess, Kernel, held_out_errors, subsample
 from swiftwrf.rssi.base import RssiConfig
@@ -90,7 +91,7 @@ def fit_receiver(number: int, data: RssiTraining, config: RssiConfig, device: to
                 root[:, 1], feature[:, 1] = 0.0, 0.0
                 *found, factor = solved()
             precision, fold = torch.cholesky_inverse(factor), data.fold[used]
-            for part in ((fold == out).nonzero()[:, 0] for out in fold.unique()):
+            for part, _ in each_fold(fold):
                 error[used[part]] = held_out_errors(precision, found[0][:, None], part.to(device))[:, 0].cpu()
         except torch.linalg.LinAlgError as reason:  # type: ignore[attr-defined]
             raise FitError(
@@ -397,7 +398,7 @@ def _trend(position: Tensor, receiver: Tensor) -> Tensor:
 def _variances(
     process: GaussianProcess, receiver: Tensor, covariance: Tensor, position: Tensor
 ) -> tuple[Tensor, Tensor]:
-    mean, of_field = process.condition(position)
+    mean, of_field = process.mean_and_variance(position)
     level, slope = (_trend(position, receiver) - mean).split([1, len(receiver)], dim=1)
     of_level, both, of_slope = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     trend = of_level * level.square() + 2 * both * level * slope + of_slope * slope.square()
@@ -410,9 +411,8 @@ def held_out_std(bins: Bins, kernel: Kernel, prior_db: tuple[Tensor, Tensor], co
     `prior_db` are the standard deviations of latent field and noise, each (R,) [dB]; the rest is as in `uncertainty`.
     """
     (field_db, noise_db), std = prior_db, torch.empty_like(bins.rssi)
-    for number in bins.fold.unique():
-        out = bins.fold == number
-        left = uncertainty(kernel, bins.position[~out], bins.receiver, covariance)
+    for out, kept in each_fold(bins.fold):
+        left = uncertainty(kernel, bins.position[kept], bins.receiver, covariance)
         variance, trend = left(bins.position[out])
         std[out] = (noise_db.square() + field_db.square() * variance[:, None] + trend).sqrt()
     return std

@@ -14,7 +14,7 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.splits import MIN_TRAINING, folds
+from swiftwrf.data.splits import MIN_TRAINING, each_fold, folds
 from swiftwrf.errors import InputError
 from swiftwrf.gp import Kernel, candidates, held_out_errors, subsample
 from swiftwrf.positions import cells
@@ -105,14 +105,12 @@ def prepare(pool: Rssi, own: Tensor, config: RssiConfig, shift: Tensor, curve: D
         level = PathLoss(mean, torch.zeros_like(mean)).where(~mean.isnan(), loss.shared)
         return PathLoss(*(torch.stack(values) for values in zip(loss.own, loss.shared, level, strict=True)))
 
-    kept = [torch.ones_like(fold, dtype=torch.bool), *(fold != number for number in fold.unique())]
-    everything = fit(kept[0], curve)
-    losses = [everything, *(fit(rows, everything.detection) for rows in kept[1:])]
-    baselines, *partial = map(simple, losses, kept)
+    everything = fit(torch.arange(len(fold)), curve)
+    baselines = simple(everything, torch.arange(len(fold)))
     distance = log_distance(bins.position, bins.receiver)
     held_out = torch.empty(3, *distance.shape, dtype=torch.float64)
-    for baseline, rows in zip(partial, kept[1:], strict=True):
-        held_out[:, ~rows] = baseline(distance[~rows])
+    for out, kept in each_fold(fold):
+        held_out[:, out] = simple(fit(kept, everything.detection), kept)(distance[out])
     residual = (every - everything.own(log_distance(bins.position, receiver)))[:, often_detected(pool)]
     kernel, helps = choose_residual_kernel(bins.position, residual, fold, pool.floors is not None)
     n_primitives = config.n_primitives if helps else 0
@@ -220,10 +218,9 @@ def choose_residual_kernel(
     residual = residual[:, columns]
     held_out = []  # (receiver, number of values, rows)
     for r, missing in enumerate(residual.isnan().T):
-        parts = [((fold == number) & ~missing).nonzero()[:, 0] for number in fold.unique()]
         # missing rows are held out with every part, so that the zeros in their place have no effect
-        gaps = missing.nonzero()[:, 0]
-        held_out += [(r, len(part), torch.cat([part, gaps])) for part in parts if len(part)]
+        measured, gaps = (~missing).nonzero()[:, 0], missing.nonzero()[:, 0]
+        held_out += [(r, len(part), torch.cat([part, gaps])) for part, _ in each_fold(fold, measured)]
 
     # rough fields only: a choice among mixtures with a smooth part follows chance, and its errors are no lower
     rough = [kernel for kernel in candidates(position, RELATIVE_NOISE_VARIANCES) if kernel.matern12_weight == 1]

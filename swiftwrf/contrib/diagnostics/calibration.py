@@ -31,7 +31,7 @@ from swiftwrf.array.beamforming import of_unit_power, unit, unit_phasor
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.contrib.diagnostics import elements
 from swiftwrf.data.snapshots import Snapshots
-from swiftwrf.data.splits import FOLDS, MIN_TRAINING, slabs, some_rows
+from swiftwrf.data.splits import FOLDS, MIN_TRAINING, each_fold, slabs, some_rows
 from swiftwrf.errors import InputError, ranges
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import checked
@@ -264,13 +264,12 @@ class _Problem:
         if torch.linalg.matrix_rank(normal, rtol=SINGULAR, hermitian=True) < len(normal):
             return torch.full_like(found.phase, math.inf), torch.full_like(found.turn, math.inf)
         group = slabs(self.position, min(20, len(self.position)))
-        count = int(group.max()) + 1
         away = []
-        for number in range(count):
-            other = self.subset(group != number).descend(found)
+        for _, kept in each_fold(group):
+            other = self.subset(kept).descend(found)
             turn = Rotation.from_rotvec(found.turn.numpy()).inv() * Rotation.from_rotvec(other.turn.numpy())
             away.append(torch.cat([wrap(other.phase - found.phase), torch.from_numpy(turn.as_rotvec())]))
-        spread = torch.stack(away)
+        spread, count = torch.stack(away), len(away)
         deviation = ((count - 1) / count * (spread - spread.mean(dim=0)).square().sum(dim=0)).sqrt()
         return deviation[:-3], deviation[-3:]
 
@@ -278,7 +277,6 @@ class _Problem:
         """Return the mean fraction along the line of sight at held-out positions, without and with a calibration."""
         nothing = _Found(torch.zeros_like(found.phase), torch.zeros_like(found.turn))
         after = torch.empty(len(fold), dtype=torch.float64)
-        for number in range(int(fold.max()) + 1):
-            out = fold == number
-            after[out] = self.subset(out).shares(self.subset(~out).descend(found))
+        for out, kept in each_fold(fold):
+            after[out] = self.subset(out).shares(self.subset(kept).descend(found))
         return float(self.shares(nothing).mean()), float(after.mean())

@@ -15,7 +15,7 @@ from torch import Tensor
 from swiftwrf.contrib.online.scores import ALLOWANCE, Alarm, Scores, alarm_threshold, learnt, score
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.data.splits import MIN_TRAINING
+from swiftwrf.data.splits import MIN_TRAINING, each_fold
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import psnr
 from swiftwrf.models.base import FieldModel
@@ -58,10 +58,10 @@ def adapted(before: ProcessModel, after: Spectra) -> tuple[ProcessModel, float]:
 
     def held_out(model: ProcessModel) -> float:
         scores = []
-        for number in parts.unique() if len(after) > 1 else ():
-            out = after.subset(parts == number)
-            predicted = model.update(after.subset(parts != number)).synthesize(out.position)
-            scores.append(psnr(predicted.cpu(), out.spectrum))
+        for out, kept in each_fold(parts) if len(after) > 1 else ():
+            held = after.subset(out)
+            predicted = model.update(after.subset(kept)).synthesize(held.position)
+            scores.append(psnr(predicted.cpu(), held.spectrum))
         return float(torch.cat(scores).mean()) if scores else 0.0
 
     best = max((1.0, 0.8, 0.6, 0.4, 0.2, 0.05), key=lambda correlation: held_out(before.aged(correlation)))

@@ -13,7 +13,7 @@ from torch import Tensor
 from swiftwrf.array.beamforming import covariance
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.data.splits import MIN_TRAINING, folds
+from swiftwrf.data.splits import MIN_TRAINING, each_fold, folds
 from swiftwrf.errors import InputError
 from swiftwrf.gp import subsample
 from swiftwrf.models.base import FieldConfig
@@ -93,7 +93,8 @@ def search_room(train: Spectra, config: GeometryConfig, progress: bool) -> RoomE
     assert used.array is not None
     scene, few = observed.around(used.fixed_position), config.n_search_positions
     fold = folds(scene.moving, config.validation, config.seed)
-    held, kept = (scene.subset(rows.nonzero()[:, 0]) for rows in (fold == 0, fold != 0))
+    splits = split(scene, fold)
+    (kept, held), *_ = splits
     some, more = (_some(scene, most, config.seed) for most in (few, max(few, N_FINAL)))
     with progress_bar(progress) as bar:
         task = bar.add_task("finding the room", total=N_STARTS + len(SIGNS) + 1)
@@ -105,7 +106,6 @@ def search_room(train: Spectra, config: GeometryConfig, progress: bool) -> RoomE
             bar.advance(task)
         room, (signs, start) = min(zip(improved, rooms, strict=True), key=lambda item: float(item[0].score))
         score = correlation_score(held, refine(kept, start), used.array)
-        splits = split(scene, fold)
         room = _pruned(_without_aliases(refine(scene, room), scene, config), scene, splits, config)
         room = _with_weak_planes(room, scene, some, splits, signs, config)
         room = _with_further_planes(room, scene, some, splits, config)
@@ -133,7 +133,7 @@ def refine_room(room: RoomEstimate, train: Spectra, config: GeometryConfig) -> R
     scene, _ = observe(train, config)
     assert train.array is not None
     planes, fold = plane_set(room.planes, room.order), folds(scene.moving, config.validation, config.seed)
-    held, kept = (scene.subset(rows.nonzero()[:, 0]) for rows in (fold == 0, fold != 0))
+    (kept, held), *_ = split(scene, fold)
     score = correlation_score(held, refine(kept, planes), train.array)
     return assess(train, scene, refine(scene, planes), score, searched=False)
 
@@ -180,8 +180,7 @@ def _some(scene: PhaseObservations, most: int, seed: int) -> PhaseObservations:
 
 def split(scene: PhaseObservations, fold: Tensor) -> Splits:
     """Return pairs of kept and held-out positions, one for each fold."""
-    out = [fold == number for number in fold.unique()]
-    return [(scene.subset((~o).nonzero()[:, 0]), scene.subset(o.nonzero()[:, 0])) for o in out]
+    return [(scene.subset(kept), scene.subset(out)) for out, kept in each_fold(fold)]
 
 
 def observe(train: Spectra, config: GeometryConfig | None = None) -> tuple[PhaseObservations, Tensor]:

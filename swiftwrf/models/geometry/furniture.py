@@ -28,6 +28,7 @@ from scipy.sparse import csr_array
 from torch import Tensor
 from torch.nn.functional import softplus
 
+from swiftwrf.data.splits import each_fold
 from swiftwrf.errors import InputError
 from swiftwrf.models.geometry.channels import Channels, coherence, field, waves
 from swiftwrf.models.geometry.images import MAX_COSINE, PhaseObservations, PlaneSet, Sequence, mirror
@@ -406,7 +407,7 @@ def find_furniture(
         empty.append(Furniture(low, voxel, torch.zeros(shape), cells, torch.zeros(shape), penalty))
     some = torch.linspace(0, len(fold) - 1, min(MAX_CHOICE, len(fold))).long()
     chosen, fold = measured.subset(some), fold[some]
-    splits = [((fold != number).nonzero()[:, 0], (fold == number).nonzero()[:, 0]) for number in fold.unique()]
+    splits = [(kept, out) for out, kept in each_fold(fold)]
     few = max(2, math.ceil(MIN_HELD_OUT * len(splits) / len(fold)))
 
     def fitted(task: tuple[Furniture, tuple[Tensor, Tensor]]) -> Furniture:

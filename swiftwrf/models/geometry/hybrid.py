@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.data.splits import folds
+from swiftwrf.data.splits import each_fold, folds
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel, leave_folds_out, principal_components
 from swiftwrf.metrics import psnr
@@ -122,8 +122,8 @@ class HybridModel(ProcessModel):
             kernel = kernel_of(scene.moving)
             self._room, prior, fits = choose_prior(found, scene, fold[rows])
         known = torch.empty(len(train), *train.grid.shape)
-        for number in fold.unique().tolist():
-            out = (fold == number).nonzero()[:, 0]  # including spectra without observed phases
+        for out, _ in each_fold(fold):  # including spectra without observed phases
+            number = int(fold[out[0]])
             kept = scene.subset((fold[rows] != number).nonzero()[:, 0])
             self.path_gains = fits.get(number) or fit_path_gains(self.room, kept, kernel, prior)
             for part in out.split(self.batch):

@@ -21,6 +21,7 @@ import torch
 from scipy.linalg.blas import strmm
 from torch import Tensor
 
+from swiftwrf.data.splits import each_fold
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.models.geometry.channels import waves
@@ -198,15 +199,15 @@ def choose_prior(
     error: list[list[Tensor]] = [[] for _ in candidates]
     fits: list[dict[int, PathGains]] = [{} for _ in candidates]
     left = list(range(len(candidates)))
-    for number in fold.unique().tolist():
-        kept, held = (scene.subset(rows.nonzero()[:, 0]) for rows in (fold != number, fold == number))
+    for out, rows in each_fold(fold):
+        kept, held = scene.subset(rows), scene.subset(out)
 
         def fitted(row: int, kept: PhaseObservations = kept) -> PathGains:
             room, name = candidates[row]
             return fit_path_gains(room, kept, kernel, name)
 
         for row, gains in zip(left, parallel_map(fitted, left), strict=True):
-            fits[row][number] = gains
+            fits[row][int(fold[out[0]])] = gains
             error[row].append(_error(gains, candidates[row][0], held))
         so_far = {row: torch.cat(error[row]) for row in left}
         best = min(left, key=lambda row: float(so_far[row].mean()))
