@@ -133,7 +133,7 @@ def test_measurements_become_tables(room, floor, tmp_path):
 
 
 def test_a_geotiff_has_values_place_and_projection(geodetic, tmp_path):
-    """By another reader than the library that writes it."""
+    """The reader is another library than the writer."""
     one = RssiMap.predict(geodetic, cell=1.5).receivers(geodetic.receiver_names[:1])
     write_geotiff(tmp_path / "a.tif", replace(one, receiver_names=("hall & <stairs>",), origin=ORIGIN))
     with TiffFile(tmp_path / "a.tif") as image:

@@ -1,4 +1,4 @@
-"""What all comparisons of methods have: errors on test rows, their summaries, and what a run writes into its directory."""
+"""Base of comparisons: methods fitted to the training rows of a split, and their errors at the test rows."""
 
 from __future__ import annotations
 
