@@ -159,7 +159,8 @@ def _log_likelihoods(kept: Cells, lost: Cells, limit: Tensor, width: float, spre
         none = torch.zeros(len(limit), n_receivers, dtype=torch.float64)
         return cells[2] * none.index_add(1, cells[1], logarithm)
 
-    return torch.stack([summed(above + (-m).log1p(), kept) + summed((m + (1 - m) * below).log(), lost) for m in MISSES])
+    seen, n_seen = summed(above, kept), kept[2] * kept[1].bincount(minlength=n_receivers)
+    return torch.stack([seen + n_seen * (-m).log1p() + summed((m + (1 - m) * below).log(), lost) for m in MISSES])
 
 
 @dataclass(frozen=True, eq=False)
