@@ -37,6 +37,7 @@ from swiftwrf.runtime.checkpoint import Saved, load
 from swiftwrf.runtime.steps import MODEL, Memo, Steps, refusing_executor
 from swiftwrf.runtime.validation import Fraction, Preset, checked
 
+DISTANCES = ("from_receiver_m", "from_training_m")  # columns of the errors
 COVERED_DBM, CERTAINTY = -75.0, 0.9  # coverage of the maps
 
 
@@ -155,18 +156,24 @@ class RssiComparison(Comparison):
         return notes if model.detection is None else [*notes, model.detection.note(self.train.receiver_names)]
 
     def _columns(self, name: str) -> Mapping[str, Any]:
+        predicted = self._prediction(name).mean
+        error = (predicted - self._pair_columns["measured_dbm"]).abs()
+        names = ("receiver", "index", "place", "measured_dbm", "predicted_dbm", self.column, *DISTANCES)
+        columns = self._pair_columns | {"predicted_dbm": predicted, self.column: error}
+        return {column: columns[column] for column in names}
+
+    @cached_property
+    def _pair_columns(self) -> dict[str, Any]:
+        """Columns of the detected test pairs that are those of every method."""
         test, (row, column) = self.test, self._pairs
-        measured, predicted = test.rssi_dbm[row, column], self._prediction(name).mean
-        from_training = nearest(test.transmitter_position, self.train.transmitter_position, 1)[0]
+        away = distance(test.transmitter_position, test.receiver_position)[row, column]
+        from_training = nearest(test.transmitter_position, self.train.transmitter_position, 1)[0][row, 0]
         return {
             "receiver": self._receiver,
             "index": test.index[row],
             "place": places(test.transmitter_position, 2)[row],
-            "measured_dbm": measured,
-            "predicted_dbm": predicted,
-            "abs_error_db": (predicted - measured).abs(),
-            "from_receiver_m": distance(test.transmitter_position, test.receiver_position)[row, column],
-            "from_training_m": from_training[row, 0],
+            "measured_dbm": test.rssi_dbm[row, column],
+            **dict(zip(DISTANCES, (away, from_training), strict=True)),
         }
 
     @property

@@ -132,7 +132,7 @@ def test_a_tree_is_unpacked_as_it_was_packed(changes, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "message"),
     [
         ({"names": ("a", "b", "c")}, r"rows.value has shape \(4, 2\), but the configuration calls for \(4, 3\)"),
         ({"component": torch.ones(4, 7)}, r"component has shape \(4, 7\), .* \(5, 7\)"),
@@ -148,8 +148,8 @@ def test_a_tree_is_unpacked_as_it_was_packed(changes, tmp_path):
         ({"parts": [Origin(0.0, 0.0)]}, r"parts\.0\.\w+ is (unknown|missing)"),
     ],
 )
-def test_values_that_an_annotation_does_not_allow_are_refused(changes, says):
-    with pytest.raises(InputError, match=says):
+def test_values_that_an_annotation_does_not_allow_are_refused(changes, message):
+    with pytest.raises(InputError, match=message):
         unpack(Choice, *pack(tree(**changes)))
 
 
