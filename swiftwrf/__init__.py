@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from swiftwrf.data import Rssi as Rssi
     from swiftwrf.data import Snapshots as Snapshots
     from swiftwrf.data import Spectra as Spectra
+    from swiftwrf.data import Stations as Stations
     from swiftwrf.data import load_rssi as load_rssi
     from swiftwrf.data import load_snapshots as load_snapshots
     from swiftwrf.data import load_spectra as load_spectra

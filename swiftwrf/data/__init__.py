@@ -14,6 +14,7 @@ from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.spectra import Spectra
+from swiftwrf.data.stations import Stations
 from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, checked
 
 
@@ -129,5 +130,5 @@ def load_rssi(
     return data
 
 
-__all__ = ["PropagationPaths", "ReadOptions", "Rssi", "Snapshots", "Spectra"]
+__all__ = ["PropagationPaths", "ReadOptions", "Rssi", "Snapshots", "Spectra", "Stations"]
 __all__ += ["load_rssi", "load_snapshots", "load_spectra"]

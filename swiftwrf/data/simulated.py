@@ -1,4 +1,4 @@
-"""Built-in scenes with exact geometry: spectra in a rectangular room with a few boxes in it, RSSI on an office floor.
+"""Built-in scenes with exact geometry: spectra in rectangular rooms with a few boxes in them, RSSI on an office floor.
 
 Walls mirror the transmitter; up to two reflections give 25 image sources, each visible along a straight line through the
 unfolded rooms (J. B. Allen and D. A. Berkley, "Image method for efficiently simulating small-room acoustics", J. Acoust.
@@ -9,8 +9,10 @@ The geometry is exact. There is no diffraction, no scattering, and no material t
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
 import torch
+from annotated_types import Ge, Le
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid, ArrayPose
@@ -20,6 +22,7 @@ from swiftwrf.choices import Moving
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.spectra import Spectra, array_spectra
+from swiftwrf.data.stations import Stations
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.validation import (
     NonNegativeFloat,
@@ -177,6 +180,84 @@ def simulated_room(
         fixed_position=fixed,
         rotation=pose.rotation,
     )
+
+
+OFFICE = ShoeboxRoom(
+    size=(8.0, 6.0, 3.0),
+    boxes=(
+        ((1.0, 0.6, 0.0), (1.6, 1.9, 1.8)),
+        ((4.6, 3.6, 0.0), (5.4, 4.6, 2.2)),
+        ((2.2, 3.0, 0.0), (2.5, 4.2, 2.2)),
+        ((6.2, 1.0, 0.0), (6.6, 2.4, 2.0)),
+    ),
+    frequency_hz=2.44e9,
+)
+STATIONS = {
+    "west": ArrayPose((0.1, 2.9, 1.8), (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5))),
+    "east": ArrayPose((7.9, 3.3, 1.9), (0.0, -math.sqrt(0.5), 0.0, math.sqrt(0.5))),
+    "south": ArrayPose((4.1, 0.1, 2.0), (-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))),
+    "north": ArrayPose((3.7, 5.9, 2.1), (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))),
+}  # on the four walls, each facing the room
+OFFICE_REGION = ((1.5, 1.0, 0.9), (6.0, 5.0, 1.5))  # of the transmitter: opposite corners [m]
+
+
+@checked
+def simulated_stations(
+    n: PositiveInt = 125,
+    stations: Annotated[int, Ge(1), Le(len(STATIONS))] = 3,
+    seed: NonNegativeInt = 0,
+    grid: AngularGrid = GRID,
+    phase_noise: NonNegativeFloat = 0.1,
+    snr_db: float | None = None,
+) -> Stations:
+    """Return spectra of 4 x 4 arrays on the walls of a simulated office, with cupboards between them and the transmitter.
+
+    Args:
+        n: Number of positions of the transmitter, in a region of 4.5 x 4 x 0.6 m.
+        stations: Number of arrays.
+        seed: Seed of positions and noise.
+        grid: Directions of the spectra.
+        phase_noise: Standard deviation of the phase at each element [rad].
+        snr_db: Mean signal-to-noise ratio at an element [dB]. Defaults to channels without noise.
+
+    Raises:
+        InputError: An argument outside its range.
+
+    Example:
+        >>> simulated_stations(n=20, stations=2)
+        <Stations 'simulated-office': 20 transmissions at 2 stations (west, east), moving transmitter,
+         positions over ... m>
+    """
+    generator = torch.Generator().manual_seed(seed)
+    low, high = torch.tensor(OFFICE_REGION, dtype=torch.float64)
+    position = low + (high - low) * torch.rand(n, 3, dtype=torch.float64, generator=generator)
+    array = PlanarArray.square(4, OFFICE.frequency_hz)
+    spectra = {}
+    for name, pose in list(STATIONS.items())[:stations]:
+        channel, line_of_sight = _channel(OFFICE, position, pose, array)
+        turn = phase_noise * torch.randn(channel.shape, dtype=torch.float64, generator=generator)
+        channel = channel * unit_phasor(turn)
+        if snr_db is not None:
+            std = channel.abs().square().mean().sqrt() * 10 ** (-snr_db / 20)
+            channel = channel + std * torch.randn(channel.shape, dtype=channel.dtype, generator=generator)
+        spectra[name] = Spectra(
+            store=array_spectra(array, channel, grid),
+            position=position,
+            array=array,
+            pose=pose,
+            grid=grid,
+            line_of_sight=line_of_sight,
+            name=f"simulated-office {name}",
+        )
+    return Stations(spectra, name="simulated-office")
+
+
+def _channel(room: ShoeboxRoom, position: Tensor, pose: ArrayPose, array: PlanarArray) -> tuple[Tensor, Tensor]:
+    """Return channels (n, S, K) of a fixed array, and where the direct path is unobstructed, bool (n,)."""
+    fixed = torch.tensor(pose.position, dtype=torch.float64)
+    parts = [room.paths(some, fixed) for some in position.split(BATCH_POSITIONS)]
+    channel = torch.cat([paths.channel(array, pose.rotation) for paths in parts])
+    return channel, torch.cat([paths.line_of_sight for paths in parts])
 
 
 FLOOR = ShoeboxRoom(

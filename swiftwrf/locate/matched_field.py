@@ -1,10 +1,10 @@
-"""Matched-field processing: the position of the moving end from one spectrum, by the room that was found."""
+"""Matched-field processing: the position of the moving end from its spectra at one or several stations, by their rooms."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Self
 
 import torch
@@ -15,6 +15,7 @@ from swiftwrf.array.angles import AngularGrid, to_angles, to_direction
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.spectra import Spectra, check_training, direction_of_link
 from swiftwrf.data.splits import each_fold, folds
+from swiftwrf.data.stations import Stations
 from swiftwrf.errors import InputError, with_article
 from swiftwrf.gp import subsample
 from swiftwrf.locate.features import SpectrumFeatures
@@ -57,14 +58,48 @@ class MatchedFieldConfig:
     """seed of everything random"""
 
 
+Rooms = FieldModel | Mapping[str, FieldModel]
+ONE = ""  # name of the only station of plain spectra
+ALL = -1  # in place of the number of a fold: none is held out
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """Features of n transmissions at A stations.
+
+    Args:
+        row: Row of each transmission in the features of each station, int64 (n, A), -1 where a station did not receive it.
+        features: Features of each station, None of one that received nothing.
+    """
+
+    row: Tensor
+    features: Sequence[SpectrumFeatures | None]
+
+    def subset(self, rows: Tensor) -> Observed:
+        """Return the features of some of the transmissions."""
+        return replace(self, row=self.row[rows])
+
+    def stations(self) -> Iterator[tuple[Tensor, SpectrumFeatures | None]]:
+        """Yield the numbers of the transmissions that each station received, and their features there, None without any."""
+        for row, features in zip(self.row.T, self.features, strict=True):
+            received = (row >= 0).nonzero()[:, 0]
+            yield received, None if features is None or not len(received) else features.subset(row[received])
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+
 class MatchedField(Locator):
-    """Posterior over the position of the moving end, given a spectrum.
+    """Posterior over the position of the moving end, given its spectrum at one station or at several.
 
     Three likelihoods of spectra are pooled: co-array numbers predicted by constant path gains, by position-dependent path
     gains, and element phases under uncertain path gains. Those of channels are: channels under uncertain and under constant
     path gains, and co-array numbers predicted by constant path gains and measured channels nearby. Covariances, weights and
     the radii of credible regions come from held-out positions. Weights maximise the posterior density there. For each fold
     the room is refined, not searched, without it.
+
+    The likelihoods of several stations are pooled in the same way, so a station with a poor room has small weights. A
+    transmission need not have been received by all stations.
 
     Args:
         config: Options as one object. Defaults to `MatchedFieldConfig()`.
@@ -87,29 +122,49 @@ class MatchedField(Locator):
     config_type: ClassVar[type[MatchedFieldConfig]] = MatchedFieldConfig
     config: MatchedFieldConfig
 
-    saved = "likelihoods weight inflation region"
-    likelihoods: SpectrumLikelihoods | ChannelLikelihoods
+    saved = "stations likelihoods weight inflation region"
+    stations: Annotated[tuple[str, ...], "a"]
+    """names of the stations, one empty name for spectra of a single one"""
+    likelihoods: Annotated[tuple[SpectrumLikelihoods | ChannelLikelihoods, ...], "a"]
+    """likelihoods of each station"""
 
     @property
     def room(self) -> GeometryModel:
-        """Room whose paths the likelihoods use."""
-        return self.likelihoods.room
+        """Room whose paths the likelihoods use.
+
+        Raises:
+            InputError: There are several stations, each with its room in `rooms`.
+        """
+        if len(self.likelihoods) > 1:
+            raise InputError(f"{self!r} has a room for each station, see `rooms`")
+        return self.likelihoods[0].room
+
+    @property
+    def rooms(self) -> dict[str, GeometryModel]:
+        """Room of each station."""
+        return {name: each.room for name, each in zip(self.stations, self.likelihoods, strict=True)}
 
     @property
     def grid(self) -> AngularGrid:
-        """Grid of the training spectra."""
+        """Grid of the training spectra of a single station."""
         return self.room.grid
 
     @all_or_nothing
     @checked
     def fit(
-        self, train: Spectra, *, room: FieldModel | None = None, region: Region | None = None, progress: bool = False
+        self,
+        train: Spectra | Stations,
+        *,
+        room: Rooms | None = None,
+        region: Region | None = None,
+        progress: bool = False,
     ) -> Self:
         """Fit the likelihoods to measured spectra and return the locator.
 
         Args:
-            train: Measured spectra, at least 15, with array, rotation and fixed end.
-            room: Fitted model of the scene with a room. Defaults to a search for the room.
+            train: Measured spectra, at least 15 of each station, with array, rotation and fixed end.
+            room: Fitted model of the scene with a room, of several stations by their names. Defaults to a search for the
+                room of each station.
             region: Prior over positions. Defaults to the neighbourhood of the training positions, with the mass outside from
                 held-out ones.
             progress: Show a progress bar on a terminal.
@@ -117,59 +172,86 @@ class MatchedField(Locator):
         Raises:
             InputError: Too few spectra, a property of the data that is missing, or a room of another link.
         """
-        check_training(train)
-        if len(train) < MIN_SPECTRA:
-            raise InputError(
-                f"matched-field processing needs {MIN_SPECTRA} spectra to hold a fifth of them out, got {len(train)}"
-            )
-        if room is not None and room.room is None:
-            raise InputError(f"{with_article(room.kind)} has no room to locate by; fit geometry or hybrid")
-        seed, position = self.config.seed, train.position
-        own = GeometryModel(seed=seed).fit(train, like=room, progress=progress)
-        train = own.link.aligned(train)
+        data, seed, position = _by_station(train), self.config.seed, train.position
+        for station, (_, spectra) in data.items():
+            check_training(spectra)
+            if len(spectra) < MIN_SPECTRA:
+                raise InputError(
+                    f"matched-field processing needs {MIN_SPECTRA} spectra to hold a fifth of them out, got {len(spectra)}"
+                    f"{station and f' of station {station}'}"
+                )
+        if len({spectra.channel is None for _, spectra in data.values()}) > 1:
+            raise InputError(f"{train.name} has channels of some stations and none of others; locate by spectra alone")
+        known = room if isinstance(room, Mapping) else dict.fromkeys(data, room)
+        if different := data.keys() ^ known.keys():
+            raise InputError(f"{train.name} and the rooms have other stations: {', '.join(sorted(different))}")
+        for own in known.values():
+            if own is not None and own.room is None:
+                raise InputError(f"{with_article(own.kind)} has no room to locate by; fit geometry or hybrid")
         fold = folds(position, "random", seed)
-        kind = SpectrumLikelihoods if train.channel is None else ChannelLikelihoods
-        features, (*parts, self.likelihoods) = kind.fit(train, own, fold, seed)
+        fitted, features = list[dict[int, Likelihoods]](), list[SpectrumFeatures]()
+        for station, (rows, spectra) in data.items():
+            own = GeometryModel(seed=seed).fit(spectra, like=known[station], progress=progress)
+            kind = SpectrumLikelihoods if spectra.channel is None else ChannelLikelihoods
+            seen, parts = kind.fit(own.link.aligned(spectra), own, fold[rows], seed)
+            features.append(seen)
+            fitted.append(dict(zip([*fold[rows].unique().tolist(), ALL], parts, strict=True)))
+        self.stations, self.likelihoods = tuple(data), tuple(parts[ALL] for parts in fitted)
         held_out = ((Region(position[kept]), position[out]) for out, kept in each_fold(fold))
         self.region = region or Region(position, outside=outside_mass(held_out))
         self._prepare()
-        self.weight, self.inflation = torch.tensor(kind.start, dtype=torch.float64), 1.0
-        self._calibrate(self._held_out(position, features, fold, parts))
+        start = [weight for each in self.likelihoods for weight in each.start]
+        self.weight, self.inflation = torch.tensor(start, dtype=torch.float64), 1.0
+        self._calibrate(self._held_out(position, Observed(_rows(data, len(position)), features), fold, fitted))
         return self
 
     def _prepare(self) -> None:
         """Compute what all spectra share: cells of the region, and likelihoods there that choose those searched."""
-        spacing = self.config.spacing * self.room.array.wavelength
-        count = int(math.prod((self.region.extent / spacing).clamp_min(1).tolist()))
-        self.cells, self._screens = self.likelihoods.screens(self.region, count, self.config.max_cells)
+        wavelength = min(each.room.array.wavelength for each in self.likelihoods)
+        count = int(math.prod((self.region.extent / (self.config.spacing * wavelength)).clamp_min(1).tolist()))
+        prepared = [each.screens(self.region, count, self.config.max_cells) for each in self.likelihoods]
+        self.cells, self._screens = prepared[0][0], [screens for _, screens in prepared]
 
-    _screens: list[Screen]
+    _screens: list[list[Screen]]
 
     def _held_out(
-        self, position: Tensor, features: SpectrumFeatures, fold: Tensor, parts: Sequence[Likelihoods]
+        self, position: Tensor, observed: Observed, fold: Tensor, fitted: Sequence[Mapping[int, Likelihoods]]
     ) -> Iterator[HeldOut]:
-        """Yield some spectra of each fold with their likelihoods by the other folds."""
+        """Yield some transmissions of each fold with their likelihoods by the other folds."""
         (some,) = subsample(torch.arange(len(position)), rows=self.config.n_calibration)
         for rows, _ in each_fold(fold, some):
-            likelihoods, observed = parts[int(fold[rows[0]])], features.subset(rows)
-            at_truth = likelihoods(position[rows][:, None], observed, self.weight)[..., 0]
-            cells, values = zip(*self._searched(observed, likelihoods), strict=True)
-            at, volume = (torch.cat([getattr(part, name) for part in cells]) for name in ("position", "log_volume"))
+            number, part = int(fold[rows[0]]), observed.subset(rows)
+            likelihoods = [parts.get(number, parts[ALL]) for parts in fitted]  # a station may have none of the fold
+            at_truth = self._values(likelihoods, position[rows][:, None], part)[..., 0]
+            cells, values = zip(*self._searched(part, likelihoods), strict=True)
+            at, volume = (torch.cat([getattr(each, name) for each in cells]) for name in ("position", "log_volume"))
             yield HeldOut(position[rows], at_truth, at, torch.cat(values, dim=1).double(), volume)
 
-    def _searched(self, observed: SpectrumFeatures, likelihoods: Likelihoods) -> Iterator[tuple[Cells, Tensor]]:
-        """Yield cells (b, m) and log-likelihoods (k, b, m) of some observations at a time."""
+    def _values(self, likelihoods: Sequence[Likelihoods], position: Tensor, observed: Observed) -> Tensor:
+        """Return log-likelihoods (k, n, m) at candidates (n, m, 3), 0 by stations that did not receive a transmission."""
+        weights = self.weight.split([len(each.start) for each in likelihoods])
+        found = []
+        for likelihood, weight, (received, features) in zip(likelihoods, weights, observed.stations(), strict=True):
+            values = torch.zeros(len(weight), *position.shape[:2])
+            if features is not None:
+                values[:, received] = likelihood(position[received], features, weight)
+            found.append(values)
+        return torch.cat(found)
+
+    def _searched(self, observed: Observed, likelihoods: Sequence[Likelihoods]) -> Iterator[tuple[Cells, Tensor]]:
+        """Yield cells (b, m) and log-likelihoods (k, b, m) of some transmissions at a time."""
         generator = torch.Generator().manual_seed(self.config.seed)
         config = self.config
         for rows in torch.arange(len(observed)).split(16):  # likelihoods at all cells: 26 MB at most, of channels 205
             part = observed.subset(rows)
 
-            def evaluate(position: Tensor, part: SpectrumFeatures = part) -> Tensor:
-                return likelihoods(position, part, self.weight)
+            def evaluate(position: Tensor, part: Observed = part) -> Tensor:
+                return self._values(likelihoods, position, part)
 
-            total, *others = (screen(part) for screen in self._screens)
-            for other in others:
-                total.add_(other)
+            total = torch.zeros(len(part), len(self.cells.position))
+            for screens, (received, features) in zip(self._screens, part.stations(), strict=True):
+                for screen in screens if features is not None else ():
+                    total.index_add_(0, received, screen(features))
             cells = best_cells(self.cells, total.neg_(), config.n_best, config.n_background, generator)
             values = evaluate(cells.position)
             for _ in range(config.n_rounds):
@@ -178,40 +260,80 @@ class MatchedField(Locator):
             yield cells, values
 
     @torch.no_grad()
-    def locate(self, spectrum: Numbers | Spectra) -> Posterior:
+    def locate(self, spectrum: Numbers | Spectra | Stations) -> Posterior:
         """Return the posterior over the position of the moving end for each spectrum.
 
         Args:
             spectrum: Magnitudes in [0, 1], tensor or array (n, n_elevation, n_azimuth) on the grid of the training spectra.
                 A locator that was fitted to channels takes channels in their place, complex (n, S, K). `Spectra` may contain
-                both.
+                both. A locator of several stations takes `Stations`, of which some may be missing.
 
         Raises:
             InputError: No row, spectra on another grid or of another link, no channels where the training data had them, a
-                number that is not finite, or a locator that is not fitted.
+                number that is not finite, other stations, or a locator that is not fitted.
         """
         self.check_fitted()
         if not len(spectrum):
             raise InputError("there is no row to locate")
-        if isinstance(spectrum, Spectra):
-            spectrum = self.room.link.aligned(spectrum)
-        observed = self.likelihoods.features(spectrum, self.config.seed)
+        data, features = self._by_station(spectrum), []
+        row = torch.full((len(spectrum), len(self.stations)), -1)
+        for number, (station, likelihoods) in enumerate(zip(self.stations, self.likelihoods, strict=True)):
+            if station in data:
+                rows, spectra = data[station]
+                row[rows, number] = torch.arange(len(rows))
+                aligned = likelihoods.room.link.aligned(spectra) if isinstance(spectra, Spectra) else spectra
+                features.append(likelihoods.features(aligned, self.config.seed))
+            else:
+                features.append(None)
+        observed = Observed(row, features)
         parts = self._searched(observed, self.likelihoods)
         found = Posterior.cat([self._posterior(cells.position, values, cells.log_volume) for cells, values in parts])
         # within half a wavelength the field changes too little for a second mode
-        return replace(found, mode_width_m=self.room.array.wavelength / 2)
+        return replace(found, mode_width_m=max(each.room.array.wavelength for each in self.likelihoods) / 2)
+
+    def _by_station(self, spectrum: Numbers | Spectra | Stations) -> Mapping[str, tuple[Tensor, Numbers | Spectra]]:
+        """Return the rows that stations of this locator received, and their spectra, by station.
+
+        Raises:
+            InputError: Plain spectra for several stations, or stations of which this locator has none.
+        """
+        if isinstance(spectrum, Stations):
+            if unknown := spectrum.spectra.keys() - set(self.stations):
+                known = ", ".join(filter(None, self.stations)) or "plain spectra"
+                raise InputError(f"this locator was fitted to {known}, not to {', '.join(sorted(unknown))}")
+            return {station: spectrum.of(station) for station in spectrum.spectra if len(spectrum.of(station)[0])}
+        if len(self.stations) > 1:
+            raise InputError(f"this locator takes Stations with {', '.join(self.stations)}, or some of them")
+        return {self.stations[0]: (torch.arange(len(spectrum)), spectrum)}
 
     @property
     def _resolution_m(self) -> float:
         return float(self.cells.edge_m / 2**self.config.n_rounds)
 
-    def predict(self, spectrum: Numbers | Spectra) -> Tensor:
-        """Return azimuth and elevation (n, 2) [rad] of the transmitter that minimise the expected angular error."""
-        return self.direction(self.locate(spectrum))
+    def predict(self, spectrum: Numbers | Spectra | Stations) -> Tensor:
+        """Return azimuth and elevation [rad] of the moving end that minimise the expected angular error.
 
-    def direction(self, posterior: Posterior) -> Tensor:
-        """Return azimuth and elevation (n, 2) [rad] of the smallest expected angular error under a posterior."""
-        room, at = self.room, posterior.position
+        Returns:
+            Directions (n, 2), of several stations (n, A, 2).
+        """
+        posterior = self.locate(spectrum)
+        found = torch.stack([self.direction(posterior, station) for station in self.stations], dim=1)
+        return found if len(self.stations) > 1 else found[:, 0]
+
+    def direction(self, posterior: Posterior, station: str | None = None) -> Tensor:
+        """Return azimuth and elevation (n, 2) [rad] of the smallest expected angular error under a posterior.
+
+        Args:
+            posterior: Posterior of n transmissions.
+            station: Station of the directions, one of several.
+
+        Raises:
+            InputError: No station of this name, or none of several.
+        """
+        room = self.room if station is None else self.rooms.get(station)
+        if room is None:
+            raise InputError(f"there is no station {station!r}; choose one of {', '.join(self.stations)}")
+        at = posterior.position
         label = direction_of_link(at.reshape(-1, 3), room.fixed_position, room.rotation, room.moving, room.array)
         vectors = to_direction(*label.unbind(-1)).reshape(at.shape)
         return torch.stack(to_angles(posterior.direction(vectors)), dim=-1)
@@ -219,8 +341,27 @@ class MatchedField(Locator):
     def __repr__(self) -> str:
         if not self.is_fitted:
             return f"{type(self).__name__}(not fitted)"
-        return f"{type(self).__name__}(fitted, {len(self.room.planes)} planes, {len(self.cells.position):,} cells)"
+        planes = " + ".join(str(len(room.planes)) for room in self.rooms.values())
+        return f"{type(self).__name__}(fitted, {planes} planes, {len(self.cells.position):,} cells)"
 
     def _restored(self) -> None:
-        self.likelihoods.check()
+        for each in self.likelihoods:
+            each.check()
+        if len(self.weight) != sum(len(each.start) for each in self.likelihoods):
+            raise InputError(f"{len(self.stations)} stations do not have {len(self.weight)} weights")
         self._prepare()
+
+
+def _by_station(data: Spectra | Stations) -> dict[str, tuple[Tensor, Spectra]]:
+    """Return the rows that each station received, and its spectra, by station."""
+    if isinstance(data, Stations):
+        return {station: data.of(station) for station in data.spectra}
+    return {ONE: (torch.arange(len(data)), data)}
+
+
+def _rows(data: Mapping[str, tuple[Tensor, Spectra]], n: int) -> Tensor:
+    """Return the row of each of n transmissions at each station, (n, A), -1 where a station did not receive it."""
+    row = torch.full((n, len(data)), -1)
+    for number, (rows, _) in enumerate(data.values()):
+        row[rows, number] = torch.arange(len(rows))
+    return row

@@ -28,7 +28,7 @@ CHUNK = 2**22  # pairs of candidates whose distances are computed together
 MAX_KEPT_PAIRS = 4096**2  # pairs of shared candidates whose distances are kept from step to step
 MAX_PAIRS = 20_000**2  # pairs of candidates of two consecutive observations
 RIDGE = 1e-3  # of the weights: keeps those that the data do not determine near their start
-PoolWeights = Annotated[Tensor, "float64 3", Ge(0), Le(1e3)]
+PoolWeights = Annotated[Tensor, "float64 k", Ge(0), Le(1e3)]
 Inflation = Annotated[float, Ge(0), Lt(math.inf)]
 
 
