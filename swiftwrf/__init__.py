@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from swiftwrf.data import load_spectra as load_spectra
     from swiftwrf.data.simulated import rssi_room as rssi_room
     from swiftwrf.data.simulated import simulated_room as simulated_room
+    from swiftwrf.data.simulated import simulated_stations as simulated_stations
     from swiftwrf.errors import FitError as FitError
     from swiftwrf.errors import InputError as InputError
     from swiftwrf.locate import MatchedField as MatchedField

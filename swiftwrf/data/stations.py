@@ -74,7 +74,7 @@ class Stations(PositionedData):
                 )
             row[at, number], position[at] = torch.arange(len(at)), each.position
         first = next((each for each in spectra.values() if len(each) == len(index)), None)
-        given = {
+        given: dict[str, Any] = {
             "named_splits": {} if first is None else _by_transmission(first, index),
             "source": {
                 f"{station}/{file}": sha for station, each in spectra.items() for file, sha in each.source.items()
@@ -112,13 +112,16 @@ class Stations(PositionedData):
         return received, self.spectra[station].subset(row[received])
 
     def only(self, *stations: str) -> Stations:
-        """Return the data of some stations, with the transmissions that one of them received.
+        """Return the same transmissions with some stations, of which none may have received some.
 
         Raises:
             InputError: No station of a name.
         """
-        parts = {station: self.of(station)[1] for station in stations}
-        return Stations(parts, name=self.name, notes=self.notes)
+        for station in stations:
+            self.of(station)
+        chosen = torch.tensor([self.names.index(station) for station in stations])
+        spectra = {station: self.spectra[station] for station in stations}
+        return self.derived(row=self.row[:, chosen], spectra=spectra)
 
     def _columns(self) -> dict[str, Any]:
         return {f"received_{name}": column.numpy() for name, column in zip(self.spectra, self.received.T, strict=True)}

@@ -75,6 +75,8 @@ class Likelihoods(ABC):
 
     start: ClassVar[tuple[float, ...]]
     """weights by which the calibration searches"""
+    names: ClassVar[tuple[str, ...]]
+    """what each likelihood is of"""
 
     @property
     @abstractmethod
@@ -142,6 +144,7 @@ class SpectrumLikelihoods(Likelihoods):
     coarray: tuple[Student, Student]
 
     start = (0.05, 0.05, 0.3)
+    names = ("constant gains", "varying gains", "phases")
 
     @property
     def parts(self) -> tuple[Likelihood, ...]:
@@ -227,6 +230,7 @@ class ChannelLikelihoods(Likelihoods):
     fields: ChannelLikelihood
 
     start = (0.5, 0.05, 0.05)
+    names = ("paths", "nearby channels", "constant gains")
 
     @property
     def parts(self) -> tuple[Likelihood, ...]:

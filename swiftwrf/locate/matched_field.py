@@ -189,7 +189,7 @@ class MatchedField(Locator):
             if own is not None and own.room is None:
                 raise InputError(f"{with_article(own.kind)} has no room to locate by; fit geometry or hybrid")
         fold = folds(position, "random", seed)
-        fitted, features = list[dict[int, Likelihoods]](), list[SpectrumFeatures]()
+        fitted, features = list[dict[int, SpectrumLikelihoods | ChannelLikelihoods]](), list[SpectrumFeatures]()
         for station, (rows, spectra) in data.items():
             own = GeometryModel(seed=seed).fit(spectra, like=known[station], progress=progress)
             kind = SpectrumLikelihoods if spectra.channel is None else ChannelLikelihoods
@@ -250,8 +250,9 @@ class MatchedField(Locator):
 
             total = torch.zeros(len(part), len(self.cells.position))
             for screens, (received, features) in zip(self._screens, part.stations(), strict=True):
-                for screen in screens if features is not None else ():
-                    total.index_add_(0, received, screen(features))
+                if features is not None:
+                    for screen in screens:
+                        total.index_add_(0, received, screen(features))
             cells = best_cells(self.cells, total.neg_(), config.n_best, config.n_background, generator)
             values = evaluate(cells.position)
             for _ in range(config.n_rounds):
@@ -275,7 +276,7 @@ class MatchedField(Locator):
         self.check_fitted()
         if not len(spectrum):
             raise InputError("there is no row to locate")
-        data, features = self._by_station(spectrum), []
+        data, features = self._by_station(spectrum), list[SpectrumFeatures | None]()
         row = torch.full((len(spectrum), len(self.stations)), -1)
         for number, (station, likelihoods) in enumerate(zip(self.stations, self.likelihoods, strict=True)):
             if station in data:

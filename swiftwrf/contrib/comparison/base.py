@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pandas import DataFrame, concat
 
 from swiftwrf.data import Rssi
+from swiftwrf.data.dataset import PositionedData
 from swiftwrf.data.splits import MAX_REPEATED, places, repeated_fraction
 from swiftwrf.metrics import method_summary, summaries
 from swiftwrf.runtime.registry import reporter
@@ -81,8 +82,8 @@ class Comparison(Result):
     further: ClassVar[tuple[str, ...]] = ()
     """further errors in `errors`"""
 
-    train: Rssi
-    test: Rssi
+    train: PositionedData
+    test: PositionedData
     values: Mapping[str, Values]
     options: Values
 
@@ -112,9 +113,12 @@ class Comparison(Result):
 
     @property
     def notes(self) -> list[str]:
-        """Sentences on the split, the data and the offsets between groups."""
-        offsets = [] if self.train.offsets is None else [self.train.offsets.note()]
-        return [*split_notes(self.train, self.test, self.options["split"]), *self.train.notes, *offsets]
+        """Sentences on the split, the data and the offsets between groups of RSSI."""
+        train, test = self.train, self.test
+        if not (isinstance(train, Rssi) and isinstance(test, Rssi)):
+            return list(train.notes)
+        offsets = [] if train.offsets is None else [train.offsets.note()]
+        return [*split_notes(train, test, self.options["split"]), *train.notes, *offsets]
 
     def recorded(self) -> Recorded:
         metrics = {

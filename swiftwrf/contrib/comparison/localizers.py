@@ -36,12 +36,14 @@ class Located:
         ambiguous: True where a second position is likely, bool (n,). None without a posterior.
         floor_probability: Probability of the floor of the estimate, (n,): its part of the posterior or of the neighbours'
             weights. None without floors.
+        direction: Azimuth and elevation at each station by the posterior, (n, A, 2) [rad]. None without arrays.
     """
 
     position: Tensor
     radius: Tensor | None = None
     ambiguous: Tensor | None = None
     floor_probability: Tensor | None = None
+    direction: Tensor | None = None
 
 
 class Localizer(ABC):

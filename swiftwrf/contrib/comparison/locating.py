@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -12,14 +13,17 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from swiftwrf.contrib.comparison.base import Comparison, Recorded, Values
 from swiftwrf.contrib.comparison.localizers import LEVELS, LOCALIZERS, PosteriorLocalizer
 from swiftwrf.data import Rssi
-from swiftwrf.data.coordinates import degree_columns
+from swiftwrf.data.coordinates import Floors, GeodeticOrigin, degree_columns
 from swiftwrf.data.rssi import PLACE
 from swiftwrf.data.splits import matching_validation, places
 from swiftwrf.errors import InputError
+from swiftwrf.locate.locator import Locator
+from swiftwrf.locate.posterior import Posterior
 from swiftwrf.locate.rssi import RssiLocator
 from swiftwrf.metrics import LEVEL, summary
 from swiftwrf.rssi import estimate_offsets
@@ -32,7 +36,113 @@ N_MAPS = 6  # test rows whose posteriors are drawn
 
 
 @dataclass(frozen=True, eq=False)
-class LocateComparison(Comparison):
+class PositionComparison(Comparison):
+    """Localizers that were fitted to the training rows of a split, and their position errors on its test rows.
+
+    Args:
+        locator: Locator of all training rows.
+    """
+
+    task = "locate"
+    column = "position_error_m"
+    further = ("horizontal_error_m",)
+    model = "posterior"
+
+    locator: Locator | None = None
+
+    @property
+    @abstractmethod
+    def receivers(self) -> Sequence[str]:
+        """Names of the receivers or stations."""
+
+    @property
+    def floors(self) -> Floors | None:
+        """Floors of the building. None if there is one only."""
+        return None
+
+    @property
+    def origin(self) -> GeodeticOrigin | None:
+        """Origin of the coordinates. None if they have no degrees."""
+        return None
+
+    @abstractmethod
+    def _positions(self) -> tuple[Tensor, Tensor]:
+        """Return the training and the test positions, (n, 3) [m]."""
+
+    @abstractmethod
+    def _posterior(self, rows: NDArray[np.int64]) -> Posterior:
+        """Return the posterior of test rows by the locator."""
+
+    @property
+    def coverage(self) -> dict[float, float]:
+        """Fraction of the test positions in the credible regions of the posterior, by their probability."""
+        own = self.errors[self.errors["method"] == self.model]
+        return {p: float((own[self.column] <= own[_radius(p)]).mean()) for p in LEVELS}
+
+    @property
+    def overall(self) -> dict[str, Values]:
+        """Position errors in space and in plan [m] of each localizer, its seconds, and its floor hit rate.
+
+        The floor of an estimate is the one of the nearest height. Data without floors have no floor hit rate.
+        """
+        found = super().overall
+        if self.floors is not None:
+            for name, own in self.errors.groupby("method"):
+                found[name]["floor_hit_rate"] = float((own["floor"] == own["truth_floor"]).mean())
+        return found
+
+    def recorded(self) -> Recorded:
+        found = super().recorded()
+        metrics = {
+            "n_receivers": len(self.receivers),
+            "calibration": {str(level): fraction for level, fraction in self.coverage.items()},
+            "weights": self.values[self.model]["weights"],
+        }
+        return replace(found, metrics=found.metrics | metrics, arrays={"maps": self._maps()})
+
+    def _maps(self) -> dict[str, NDArray[Any]]:
+        """Return posteriors in plan of at most six test rows, from the smallest error to the largest."""
+        order = self.errors.loc[self.errors["method"] == self.model, self.column].to_numpy().argsort()
+        shown = order[np.linspace(0, len(order) - 1, min(N_MAPS, len(order))).round().astype(int)]
+        (train, test), posterior = self._positions(), self._posterior(shown)
+        plans = [posterior.in_plan(row) for row in range(len(posterior))]
+        return {
+            "x": plans[0].x,
+            "y": plans[0].y,
+            "density": np.stack([plan.values for plan in plans]).astype(np.float32),
+            "index": self.test.index[shown].numpy(),
+            "truth": test[shown].numpy(),
+            "estimate": posterior.median.numpy(),
+            "radius_80_m": posterior.credible_radius(LEVEL).numpy(),
+            "training_position": train.numpy(),
+        }
+
+    def _columns(self, name: str) -> Mapping[str, Any]:
+        values = self.values[name]
+        truth, estimate = (torch.as_tensor(values[name], dtype=torch.float64) for name in ("truth", "estimate"))
+        away = estimate - truth
+        columns: Values = {"index": values["index"], "place": places(truth, 2)}
+        columns |= {"position_error_m": away.norm(dim=1), "horizontal_error_m": away[:, :2].norm(dim=1)}
+        columns |= dict(zip(("x_m", "y_m", "z_m"), estimate.T, strict=True))
+        columns |= dict(zip(("truth_x_m", "truth_y_m", "truth_z_m"), truth.T, strict=True))
+        columns |= degree_columns(self.origin, estimate.numpy())
+        if (floors := self.floors) is not None:
+            columns["floor"], columns["truth_floor"] = (floors.named(at) for at in (estimate, truth))
+        if "floor_probability" in values:
+            columns["floor_probability"] = values["floor_probability"]
+        if "radius" in values:
+            radius = torch.as_tensor(values["radius"], dtype=torch.float64)
+            columns |= {_radius(p): r for p, r in zip(LEVELS, radius.T, strict=True)}
+            columns["ambiguous"] = values["ambiguous"]
+        return columns
+
+
+def _radius(level: float) -> str:
+    return f"credible_radius_{100 * level:.0f}_m"
+
+
+@dataclass(frozen=True, eq=False)
+class LocateComparison(PositionComparison):
     """Result of `compare`.
 
     Args:
@@ -50,13 +160,10 @@ class LocateComparison(Comparison):
         12
     """
 
-    task = "locate"
-    column = "position_error_m"
-    further = ("horizontal_error_m",)
-    model = "posterior"
-
-    n_undetected: int = 0
+    train: Rssi
+    test: Rssi
     locator: RssiLocator | None = None
+    n_undetected: int = 0
 
     @classmethod
     def of(cls, data: Rssi, split: str, n_cells: int, seed: int, reference: str | None = None) -> LocateComparison:
@@ -91,7 +198,7 @@ class LocateComparison(Comparison):
             offsets = estimate_offsets(train, reference)
             train, test = offsets.removed(train), offsets.removed(test)
         options = {"split": split, "n_cells": n_cells, "seed": seed}
-        return cls(train, test, {}, options, int((~kept).sum()))
+        return cls(train, test, {}, options, n_undetected=int((~kept).sum()))
 
     def fit(self, folder: Path | None, name: str) -> Values:
         """Fit a localizer and locate the test rows. Return its values. A folder gets the locator.
@@ -127,73 +234,27 @@ class LocateComparison(Comparison):
         return values
 
     @property
-    def coverage(self) -> dict[float, float]:
-        """Fraction of the test positions in the credible regions of the posterior, by their probability."""
-        own = self.errors[self.errors["method"] == self.model]
-        return {p: float((own[self.column] <= own[_radius(p)]).mean()) for p in LEVELS}
+    def receivers(self) -> Sequence[str]:
+        return self.train.receiver_names
 
     @property
-    def overall(self) -> dict[str, Values]:
-        """Position errors in space and in plan [m] of each localizer, its seconds, and its floor hit rate.
+    def floors(self) -> Floors | None:
+        return self.train.floors
 
-        The floor of an estimate is the one of the nearest height. Data without floors have no floor hit rate.
-        """
-        found = super().overall
-        if self.train.floors is not None:
-            for name, own in self.errors.groupby("method"):
-                found[name]["floor_hit_rate"] = float((own["floor"] == own["truth_floor"]).mean())
-        return found
+    @property
+    def origin(self) -> GeodeticOrigin | None:
+        return self.train.origin
+
+    def _positions(self) -> tuple[Tensor, Tensor]:
+        return self.train.transmitter_position, self.test.transmitter_position
+
+    def _posterior(self, rows: NDArray[np.int64]) -> Posterior:
+        assert self.locator is not None
+        return self.locator.locate(self.test.rssi_dbm[rows])
 
     def recorded(self) -> Recorded:
         found = super().recorded()
-        metrics = {
-            "n_receivers": len(self.train.receiver_names),
-            "n_undetected": self.n_undetected,
-            "calibration": {str(level): fraction for level, fraction in self.coverage.items()},
-            "weights": self.values[self.model]["weights"],
-        }
-        return replace(found, metrics=found.metrics | metrics, arrays={"maps": self._maps()})
-
-    def _maps(self) -> dict[str, NDArray[Any]]:
-        """Return posteriors in plan of at most six test rows, from the smallest error to the largest."""
-        assert self.locator is not None
-        order = self.errors.loc[self.errors["method"] == self.model, self.column].to_numpy().argsort()
-        shown = order[np.linspace(0, len(order) - 1, min(N_MAPS, len(order))).round().astype(int)]
-        posterior = self.locator.locate(self.test.rssi_dbm[shown])
-        plans = [posterior.in_plan(row) for row in range(len(posterior))]
-        return {
-            "x": plans[0].x,
-            "y": plans[0].y,
-            "density": np.stack([plan.values for plan in plans]).astype(np.float32),
-            "index": self.test.index[shown].numpy(),
-            "truth": self.test.transmitter_position[shown].numpy(),
-            "estimate": posterior.median.numpy(),
-            "radius_80_m": posterior.credible_radius(LEVEL).numpy(),
-            "training_position": self.train.transmitter_position.numpy(),
-        }
-
-    def _columns(self, name: str) -> Mapping[str, Any]:
-        values = self.values[name]
-        truth, estimate = (torch.as_tensor(values[name], dtype=torch.float64) for name in ("truth", "estimate"))
-        away = estimate - truth
-        columns: Values = {"index": values["index"], "place": places(truth, 2)}
-        columns |= {"position_error_m": away.norm(dim=1), "horizontal_error_m": away[:, :2].norm(dim=1)}
-        columns |= dict(zip(("x_m", "y_m", "z_m"), estimate.T, strict=True))
-        columns |= dict(zip(("truth_x_m", "truth_y_m", "truth_z_m"), truth.T, strict=True))
-        columns |= degree_columns(self.train.origin, estimate.numpy())
-        if (floors := self.train.floors) is not None:
-            columns["floor"], columns["truth_floor"] = (floors.named(at) for at in (estimate, truth))
-        if "floor_probability" in values:
-            columns["floor_probability"] = values["floor_probability"]
-        if "radius" in values:
-            radius = torch.as_tensor(values["radius"], dtype=torch.float64)
-            columns |= {_radius(p): r for p, r in zip(LEVELS, radius.T, strict=True)}
-            columns["ambiguous"] = values["ambiguous"]
-        return columns
-
-
-def _radius(level: float) -> str:
-    return f"credible_radius_{100 * level:.0f}_m"
+        return replace(found, metrics=found.metrics | {"n_undetected": self.n_undetected})
 
 
 @checked

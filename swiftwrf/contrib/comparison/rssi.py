@@ -111,6 +111,8 @@ class RssiComparison(Comparison):
     task = "rssi"
     column = "abs_error_db"
 
+    train: Rssi
+    test: Rssi
     left_out: Mapping[str, str] = field(default_factory=dict)
     predictors: Mapping[str, RssiPredictor] = field(default_factory=dict)
     by_rows: DataFrame = field(default_factory=DataFrame)

@@ -1,0 +1,88 @@
+"""Rooms of several stations that agree: one station's phases leave a plane ambiguous, those of another determine it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from copy import copy
+from dataclasses import replace
+
+import torch
+
+from swiftwrf.data.spectra import Spectra
+from swiftwrf.models.geometry.fit import observe, refine_room
+from swiftwrf.models.geometry.model import GeometryModel
+from swiftwrf.models.geometry.planes import Plane, RoomEstimate, plane_set, robust_advantage
+
+
+def agreed(
+    rooms: Mapping[str, GeometryModel],
+    spectra: Mapping[str, Spectra],
+    max_tilt: float = 0.05,
+    significance: float = 2.5,
+) -> dict[str, GeometryModel]:
+    """Return the rooms of several stations with planes where the most certain station has them.
+
+    Planes of two rooms are one plane if they are parallel and less than a wavelength apart. The offset and the sign of the
+    gain are those of the station with the highest probability. A station keeps its own plane where its spectra contradict.
+
+    Args:
+        rooms: Fitted room of each station.
+        spectra: Spectra that each room was fitted to.
+        max_tilt: Sine of the angle between the normals of one plane. Not studied.
+        significance: Standard errors by which a station's own room must explain its spectra better to be kept, as in
+            `GeometryConfig`.
+
+    Example:
+        >>> import swiftwrf
+        >>> from swiftwrf.models.geometry import Plane
+        >>> spectra = swiftwrf.simulated_room(n=30)
+        >>> here, off = (Plane((0.0, 0.0, -1.0), z, -0.6, probability=p) for z, p in ((0.0, 1.0), (0.15, 0.6)))
+        >>> rooms = {name: GeometryModel.of_planes(spectra, [plane]) for name, plane in (("a", here), ("b", off))}
+        >>> round(agreed(rooms, {"a": spectra, "b": spectra})["b"].planes[0].offset_m, 2)
+        0.0
+    """
+    reference = list[Plane]()
+    for plane in sorted((p for room in rooms.values() for p in room.planes), key=lambda p: (-p.probability, p.std_mm)):
+        wavelength = max(room.array.wavelength for room in rooms.values())
+        if not any(_is_same(plane, other, max_tilt, wavelength) for other in reference):
+            reference.append(plane)
+    return {name: _placed(room, spectra[name], reference, max_tilt, significance) for name, room in rooms.items()}
+
+
+def _is_same(a: Plane, b: Plane, max_tilt: float, wavelength: float) -> bool:
+    normals = torch.tensor([a.normal, b.normal], dtype=torch.float64)
+    sine = float(torch.linalg.cross(*normals).norm())
+    return sine < max_tilt and float(normals[0] @ normals[1]) > 0 and abs(a.offset_m - b.offset_m) < wavelength
+
+
+def _placed(
+    room: GeometryModel, spectra: Spectra, reference: list[Plane], max_tilt: float, significance: float
+) -> GeometryModel:
+    """Return a room whose planes are moved where the reference has them elsewhere: all of them, else one after the other.
+
+    One wrong plane keeps others from their right offsets, because images of higher order are reflected in both.
+    """
+    config, wavelength = room.config, room.array.wavelength
+    elsewhere = dict[int, Plane]()
+    for number, plane in enumerate(room.planes):
+        other = next(each for each in reference if _is_same(plane, each, max_tilt, wavelength))
+        if abs(other.offset_m - plane.offset_m) > wavelength / 8:
+            gain = abs(plane.gain) * (1 if other.gain > 0 else -1)
+            elsewhere[number] = replace(plane, offset_m=other.offset_m, gain=gain)
+    if not elsewhere:
+        return room
+    scene, _ = observe(spectra, config)
+
+    def moved(estimate: RoomEstimate, numbers: Iterable[int]) -> RoomEstimate:
+        """Return a room with some planes at the offsets of the reference, or as it is where the spectra contradict."""
+        planes = [elsewhere[n] if n in numbers else plane for n, plane in enumerate(estimate.planes)]
+        tried = refine_room(replace(estimate, planes=planes), spectra, config)
+        here, there = (plane_set(each.planes, each.order).coherence(scene) for each in (estimate, tried))
+        return tried if robust_advantage(here, there) < significance else estimate
+
+    found = copy(room)
+    found.estimate = moved(room.estimate, elsewhere)
+    if found.estimate is room.estimate:
+        for number in elsewhere:
+            found.estimate = moved(found.estimate, [number])
+    return found
