@@ -208,6 +208,8 @@ class LocateConfig(Options):
     """receivers: names, numbers counted from 1, or all"""
     split: str = "random"
     """a split that comes with the data, or a seeded one: random or block"""
+    stations: Annotated[int, Ge(0), Le(4)] = 0
+    """number of antenna arrays in the built-in office, whose spectra locate the transmitter in place of RSSI"""
     cells: Annotated[int, Ge(10), Le(1_000_000)] = 4000
     """number of candidate positions of the posterior"""
     suggest: Annotated[int, Ge(0), Le(MAX_SUGGESTIONS)] = 0
@@ -224,6 +226,10 @@ class LocateConfig(Options):
     def check(self) -> None:
         super().check()
         self.table.check_used(self.data)
+        if self.stations and self.data is not None:
+            raise InputError("--stations is for the built-in office; with --data the data determine the stations")
+        if self.stations and (self.rx != ("all",) or self.suggest):
+            raise InputError("--rx and --suggest are for RSSI; leave them out with --stations")
 
 
 @options

@@ -174,12 +174,12 @@ class MatchedField(Locator):
         """
         data, seed, position = _by_station(train), self.config.seed, train.position
         for station, (_, spectra) in data.items():
-            check_training(spectra)
             if len(spectra) < MIN_SPECTRA:
                 raise InputError(
                     f"matched-field processing needs {MIN_SPECTRA} spectra to hold a fifth of them out, got {len(spectra)}"
                     f"{station and f' of station {station}'}"
                 )
+            check_training(spectra)
         if len({spectra.channel is None for _, spectra in data.values()}) > 1:
             raise InputError(f"{train.name} has channels of some stations and none of others; locate by spectra alone")
         known = room if isinstance(room, Mapping) else dict.fromkeys(data, room)

@@ -104,7 +104,7 @@ class Posterior(Displayed):
     def _median_radius(self) -> str:
         return f"{float(self.credible_radius().median()):.2f} m"
 
-    def in_plan(self, row: int = 0) -> PlanMap:
+    def in_plan(self, row: int = 0, region: Tensor | None = None) -> PlanMap:
         """Return the mass of an observation summed over height and square pixels, relative to the largest sum.
 
         A pixel without a candidate has the value of the nearest pixel with one, and nan if that is farther away than the
@@ -112,6 +112,7 @@ class Posterior(Displayed):
 
         Args:
             row: Number of the observation.
+            region: Positions whose extent the map has, (n, 3) [m]. Defaults to the candidates.
 
         Example:
             >>> at = torch.tensor([[[0.0, 0, 0], [0.0, 0, 1], [1.0, 0, 0]]], dtype=torch.float64)
@@ -120,10 +121,12 @@ class Posterior(Displayed):
             [1.0, 1.0]
         """
         at = self.position[row if len(self.position) > 1 else 0, :, :2]
-        low, extent = at.amin(dim=0), at.amax(dim=0) - at.amin(dim=0)
+        spread = at if region is None else region[:, :2]
+        low, extent = spread.amin(dim=0), spread.amax(dim=0) - spread.amin(dim=0)
         pixel = float(extent.max()) / PLAN_PIXELS or 1.0
         width, height = (round(side / pixel) + 1 for side in extent.tolist())
         column, line = ((at - low) / pixel).round().long().unbind(dim=1)
+        column, line = column.clamp(0, width - 1), line.clamp(0, height - 1)
         filled, owner = (line * width + column).unique(return_inverse=True)
         mass = torch.zeros(len(filled), dtype=torch.float64).index_add_(0, owner, self.weight[row])
         every = torch.arange(height * width)

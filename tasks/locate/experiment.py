@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from augment.suggest import suggest_positions
-from swiftwrf import Rssi, rssi_room
-from swiftwrf.contrib.comparison.locating import compare
+from swiftwrf import Rssi, Stations, rssi_room, simulated_stations
+from swiftwrf.contrib.comparison.locating import LocateComparison, PositionComparison, compare
+from swiftwrf.contrib.comparison.stations import compare_stations
 from swiftwrf.data.coordinates import degree_columns
 from tasks.configs import LocateConfig
 from tasks.directory import Run
@@ -14,6 +15,7 @@ from tasks.environment import choose_device
 from tasks.locate.page import SUGGESTED, page
 from tasks.page.page import finish
 from tasks.page.shared import write_suggestion
+from tasks.records import Row
 from tasks.source import measured_rssi
 from tasks.terminal import console, terminal
 from tasks.workers import connected, workers_of
@@ -29,40 +31,48 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
     data = measurements(config)
     for note in data.notes:
         console.print(f"{data.name}: {note}")
-    label = f"rx{'_'.join(config.rx)}-s{config.seed}"
-    described = "{median:.2f} m".format_map
+    label = f"{'stations' if isinstance(data, Stations) else 'rx' + '_'.join(config.rx)}-s{config.seed}"
     with (
         connected(config.scheduler, device) as cluster,
-        Run("locate", label, config, device, data.source, resume, described=described) as directory,
+        Run("locate", label, config, device, data.source, resume, described=_described) as directory,
     ):
         with workers_of(directory, cluster) as workers, terminal.progress():
-            result = compare(
-                data,
-                split=config.split,
-                seed=config.seed,
-                n_cells=config.cells,
-                reference=config.table.reference,
-                keep=directory,
-                executor=workers,
-            )
-        train = result.train
-        if result.n_undetected:
-            console.print(f"{data.name}: test rows that no receiver detected are left out: {result.n_undetected}")
-        if train.offsets is not None:
-            console.print(f"{data.name}: {train.offsets.note()}")
-        if config.suggest and result.locator is not None:
-            found = suggest_positions(result.locator, train, config.suggest, config.seed)
-            degrees = degree_columns(train.origin, found.position.numpy())
-            measured = train.transmitter_position
-            write_suggestion(directory.path(SUGGESTED), measured, found.position, found.variance, degrees)
+            common: Row = {"split": config.split, "seed": config.seed, "keep": directory, "executor": workers}
+            if isinstance(data, Stations):
+                result: PositionComparison = compare_stations(data, **common)
+            else:
+                result = compare(data, n_cells=config.cells, reference=config.table.reference, **common)
+        if isinstance(result, LocateComparison):
+            _conclude(result, config, directory)
         finish(directory, result.recorded(), page)
 
 
-def measurements(config: LocateConfig) -> Rssi:
-    """Return the RSSI of a run at the receivers that are asked for.
+def _described(values: Row) -> str:
+    """Return the result of a step in a few words."""
+    return f"{values['median']:.2f} m" if "median" in values else str(values.get("conclusion", ""))
+
+
+def _conclude(result: LocateComparison, config: LocateConfig, directory: Run) -> None:
+    """Print what was left out and removed, and write the positions to measure next."""
+    train = result.train
+    if result.n_undetected:
+        console.print(f"{train.name}: test rows that no receiver detected are left out: {result.n_undetected}")
+    if train.offsets is not None:
+        console.print(f"{train.name}: {train.offsets.note()}")
+    if config.suggest and result.locator is not None:
+        found = suggest_positions(result.locator, train, config.suggest, config.seed)
+        degrees = degree_columns(train.origin, found.position.numpy())
+        measured = train.transmitter_position
+        write_suggestion(directory.path(SUGGESTED), measured, found.position, found.variance, degrees)
+
+
+def measurements(config: LocateConfig) -> Rssi | Stations:
+    """Return the RSSI of a run at the receivers that are asked for, or the spectra of several stations.
 
     Raises:
         InputError: The data cannot be read, or have no such receiver.
     """
+    if config.stations:
+        return simulated_stations(stations=config.stations, seed=config.seed)
     measured = measured_rssi(config.data, config.table)
     return (rssi_room(seed=config.seed) if measured is None else measured).receivers(config.rx)

@@ -17,7 +17,7 @@ from swiftwrf.metrics import LEVEL
 from swiftwrf.plotting import corners_of
 from tasks import labels
 from tasks.page import figures
-from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of
+from tasks.page.page import Number, Page, Plot, Section, Summary, Table, number, provenance, sections_of
 from tasks.page.shared import (
     again,
     by_method,
@@ -35,11 +35,19 @@ from tasks.records import Records, notes
 from tasks.terminal import Answer, Method, NextStep
 
 OWN = "posterior"  # the localizer that all others are compared with
-NEIGHBOURS = ("knn", "knn_difference")
+BASELINES = {
+    "receiver": (("knn", "knn_difference"), "the best nearest-neighbour fingerprinting"),
+    "station": (("triangulation", "triangulation_matched", "knn"), "the best baseline"),
+}  # by what receives: localizers without a model of the scene, and what they are together
 SUGGESTED = "suggested"  # name of the files with suggested positions
 TRUTH, ESTIMATE = "#cf4a4a", "#ffffff"
 COLUMNS = ["index", "place", "method", "position_error_m"]  # of the errors of methods
 COLOURS = labels.LOCALIZERS
+LIMITS_OF_STATIONS = (
+    "Candidate positions lie in and around the training positions. A transmitter elsewhere is located at their edge.",
+    "Positions and orientations of the stations are taken as given. An error of a station's pose is an error of its room.",
+    "Training and test transmissions are of one time, unless the split separates these.",
+)
 LIMITS = (
     "Rows that no receiver detected have no position. They are left out of the errors.",
     "Candidate positions lie in and around the training positions. A transmitter elsewhere is located at their edge.",
@@ -54,11 +62,12 @@ def page(runs: list[Records]) -> Page:
     sections = [
         sections_of("Where was it?", runs, lambda run: _posteriors(run, several=len(runs) > 1)),
         sections_of("Errors", runs, lambda run: _errors(run, answers[run]), labels.meanings(LOCALIZERS)),
+        sections_of("Directions at each station", runs, _directions),
         sections_of("How sure is it?", runs, lambda run: Section("", plots=[_calibration(run)])),
-        limits(runs[0], *LIMITS),
+        limits(runs[0], *(LIMITS if runs[0].metrics["received_by"] == "receiver" else LIMITS_OF_STATIONS)),
     ]
     if any(run.arrays(SUGGESTED) for run in runs):
-        sections.insert(3, sections_of("Where to measure next", runs, _suggestion))
+        sections.insert(-1, sections_of("Where to measure next", runs, _suggestion))
     names = ", ".join(dict.fromkeys(run.place for run in runs))
     if len(runs) == 1:
         first = _summary(runs[0], answers[runs[0]])
@@ -70,17 +79,18 @@ def page(runs: list[Records]) -> Page:
 
 def _summary(run: Records, found: Answer) -> Summary:
     error = {name: entry["position_error_m"]["median"] for name, entry in run.metrics["overall"].items()}
-    nearest = min(NEIGHBOURS, key=lambda name: error[name])
+    names, described = BASELINES[run.metrics["received_by"]]
+    nearest = min(names, key=lambda name: error[name])
     numbers = [
         Number(f"{error[OWN]:.2f} m", "median position error of the posterior"),
-        Number(f"{error[nearest]:.2f} m", f"that of {nearest}, the best nearest-neighbour fingerprinting"),
+        Number(f"{error[nearest]:.2f} m", f"that of {nearest}, {described}"),
         Number(f"{run.metrics['calibration'][str(LEVEL)]:.0%}", f"of the true positions in their {LEVEL:.0%} region"),
     ]
     return Summary(numbers, [_overview(run, "summary")], found.conclusion, found.next_steps, notes=notes(run))
 
 
 def _errors(run: Records, found: Answer) -> Section:
-    n_undetected = run.metrics["n_undetected"]
+    n_undetected = run.metrics.get("n_undetected", 0)
     return errors_section(
         found,
         run.table("errors")[COLUMNS],
@@ -91,6 +101,22 @@ def _errors(run: Records, found: Answer) -> Section:
         "test places.",
         paragraphs=[f"Test rows that no receiver detected are left out: {n_undetected}."] if n_undetected else [],
     )
+
+
+def _directions(run: Records) -> Section | None:
+    """Return the angular errors at each station, None for data without arrays."""
+    if run.metrics["received_by"] != "station":
+        return None
+    table = run.table("directions")
+    rows = [
+        [str(name), str(count), *(f"{value:.2f}" for value in values)]
+        for name, count, *values in table.itertuples(index=False)
+    ]
+    heads = ["station", "received", "posterior of all [deg]", "posterior of this station alone [deg]", "peak [deg]"]
+    text = (
+        "Median angular errors of the direction of the transmitter. A position found by all stations determines each."
+    )
+    return Section("", paragraphs=[text], tables=[Table(heads, rows)])
 
 
 def _suggestion(run: Records) -> Section | None:
@@ -167,6 +193,8 @@ def posteriors(maps: Mapping[str, NDArray[Any]]) -> list[Figure]:
         truth, estimate = maps["truth"][i], maps["estimate"][i]
         drawn = ax.imshow(maps["density"][i], origin="lower", extent=extent, cmap="magma", vmin=0, vmax=1)
         ax.plot(*maps["training_position"].T[:2], ".", color="#888888", markersize=1, rasterized=True)
+        if "stations" in maps:
+            ax.plot(*maps["stations"].T[:2], "^", color=labels.colour(COLOURS, OWN), markersize=7, clip_on=False)
         ax.add_patch(Circle(estimate[:2], maps["radius_80_m"][i], fill=False, color=ESTIMATE, linewidth=1))
         ax.plot(*estimate[:2], "o", color=ESTIMATE, markeredgecolor="#000001", markersize=5)
         ax.plot(*truth[:2], "x", color=TRUTH, markersize=8, markeredgewidth=2)
@@ -190,21 +218,22 @@ def answer(run: Records) -> Answer:
         seconds = entry["seconds"]["fit"], entry["seconds"]["predict"]
         is_reference = name == "mean" != chosen
         methods.append(Method(name, entry["position_error_m"], is_reference, seconds, cells))
-    return Answer("m", methods, chosen, conclusion(run), _steps(run), NEIGHBOURS)
+    return Answer("m", methods, chosen, conclusion(run), _steps(run), BASELINES[run.metrics["received_by"]][0])
 
 
 def conclusion(run: Records) -> list[str]:
     """Return the position error, how sure it is, and how the posterior compares with the best other localizer."""
     error = {name: entry["position_error_m"] for name, entry in run.metrics["overall"].items()}
     best = min((name for name in error if name != OWN), key=lambda name: error[name]["median"])
-    own, receivers, n_test = error[OWN], run.metrics["n_receivers"], run.metrics["n_test"]
+    own, n_test = error[OWN], run.metrics["n_test"]
+    receivers = f"{run.metrics['n_receivers']} {run.metrics['received_by']}{'s' * (run.metrics['n_receivers'] > 1)}"
     return [
         *recommendation(run, OWN, "m")[1],
         f"Positions are found within {own['median']:.2f} m (median error; 90 % within {own['p90']:.1f} m).",
         f"The median's 95 % interval is {own['low']:.2f} to {own['high']:.2f} m, and "
         f"{run.metrics['calibration'][str(LEVEL)]:.0%} of the true positions lie in the {LEVEL:.0%} region that comes with "
-        f"each estimate. Tested on {n_test} rows, fitted to {run.metrics['n_train']} rows at {receivers} "
-        f"{'receiver' if receivers == 1 else 'receivers'}; {run.scene}.",
+        f"each estimate. Tested on {n_test} rows, fitted to {run.metrics['n_train']} rows at {receivers}; "
+        f"{run.scene}.",
         comparison_sentence(
             by_method(run.table("errors")[COLUMNS]),
             OWN,

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -47,6 +47,8 @@ class PositionComparison(Comparison):
     column = "position_error_m"
     further = ("horizontal_error_m",)
     model = "posterior"
+    received_by: ClassVar[str] = "receiver"
+    """what receives the transmitter"""
 
     locator: Locator | None = None
 
@@ -95,6 +97,7 @@ class PositionComparison(Comparison):
         found = super().recorded()
         metrics = {
             "n_receivers": len(self.receivers),
+            "received_by": self.received_by,
             "calibration": {str(level): fraction for level, fraction in self.coverage.items()},
             "weights": self.values[self.model]["weights"],
         }
@@ -105,7 +108,8 @@ class PositionComparison(Comparison):
         order = self.errors.loc[self.errors["method"] == self.model, self.column].to_numpy().argsort()
         shown = order[np.linspace(0, len(order) - 1, min(N_MAPS, len(order))).round().astype(int)]
         (train, test), posterior = self._positions(), self._posterior(shown)
-        plans = [posterior.in_plan(row) for row in range(len(posterior))]
+        region = None if len(posterior.position) == 1 else posterior.position.flatten(0, 1)
+        plans = [posterior.in_plan(row, region) for row in range(len(posterior))]
         return {
             "x": plans[0].x,
             "y": plans[0].y,

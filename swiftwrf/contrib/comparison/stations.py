@@ -48,6 +48,8 @@ class StationsComparison(PositionComparison):
         locator: Locator of all training transmissions.
     """
 
+    received_by = "station"
+
     train: Stations
     test: Stations
     locator: MatchedField | None = None

@@ -22,6 +22,7 @@ from swiftwrf.models.geometry.phase_retrieval import correlations, retrieve_phas
 from swiftwrf.models.geometry.planes import (
     MAX_ORDER,
     MIN_MISSING,
+    Plane,
     RoomEstimate,
     advantage,
     correlation_score,
@@ -136,6 +137,30 @@ def refine_room(room: RoomEstimate, train: Spectra, config: GeometryConfig) -> R
     (kept, held), *_ = split(scene, fold)
     score = correlation_score(held, refine(kept, planes), train.array)
     return assess(train, scene, refine(scene, planes), score, searched=False)
+
+
+@single_thread()
+def widened_room(room: RoomEstimate, planes: list[Plane], train: Spectra, config: GeometryConfig) -> RoomEstimate:
+    """Add known planes to a room, of which those stay that explain held-out spectra significantly better.
+
+    Args:
+        room: Estimate without the planes.
+        planes: Planes, e.g. of the room of another station.
+        train: Spectra that the room was estimated from.
+        config: Options of the search.
+
+    Raises:
+        InputError: As `search_room`.
+    """
+    scene, _ = observe(train, config)
+    assert train.array is not None
+    splits = split(scene, folds(scene.moving, config.validation, config.seed))
+    found = _pruned(refine(scene, plane_set([*room.planes, *planes], room.order)), scene, splits, config)
+    if found.normal.shape[1] <= len(room.planes):
+        return room
+    (kept, held), *_ = splits
+    score = correlation_score(held, refine(kept, found), train.array)
+    return assess(train, scene, refine(scene, found), score, searched=False)
 
 
 def update_room(room: RoomEstimate, new: Spectra, config: GeometryConfig) -> RoomEstimate:
