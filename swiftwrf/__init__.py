@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from swiftwrf.data import load_rssi as load_rssi
     from swiftwrf.data import load_snapshots as load_snapshots
     from swiftwrf.data import load_spectra as load_spectra
+    from swiftwrf.data import load_stations as load_stations
     from swiftwrf.data.simulated import rssi_room as rssi_room
     from swiftwrf.data.simulated import simulated_room as simulated_room
     from swiftwrf.data.simulated import simulated_stations as simulated_stations

@@ -194,16 +194,17 @@ class RssiTaskConfig(Options):
 
 @options
 class LocateConfig(Options):
-    """Locate transmitters from RSSI, and report the errors.
+    """Locate transmitters from RSSI, or from the spectra of several antenna arrays, and report the errors.
 
-    Without --data the built-in simulated floor is used. swiftwrf resume DIR.partial continues an interrupted run. Positions
+    Without --data the built-in simulated floor is used, with --stations 3 an office with arrays on three walls. swiftwrf resume DIR.partial continues an interrupted run. Positions
     of new rows: swiftwrf predict.
 
     Example: swiftwrf locate --rx all --data DIR
     """
 
     data: str | None = None
-    """survey table (CSV, Parquet, JSON, GPX, KML), folder in NeRF2 layout, or name of a public data set"""
+    """survey table (CSV, Parquet, JSON, GPX, KML), folder in NeRF2 layout, folder with a folder of spectra or snapshots for
+    each array, or name of a public data set"""
     rx: tuple[str, ...] = ("all",)
     """receivers: names, numbers counted from 1, or all"""
     split: str = "random"

@@ -10,6 +10,7 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.coordinates import Coordinates, Up
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, ReadOptions, read, read_spectra
+from swiftwrf.data.formats.stations import read_stations
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.snapshots import Snapshots
@@ -78,6 +79,26 @@ def load_snapshots(path: str | Path, **options: Any) -> Snapshots:
     return data
 
 
+def load_stations(path: str | Path, **options: Any) -> Stations:
+    """Read the spectra of several stations: a folder with one of `load_spectra` for each, or files with several arrays.
+
+    Rows of one position, or of one number in the files packets.txt of all folders, are one transmission.
+
+    Args:
+        path: Folder or file.
+        options: Options of `load_spectra`, which hold for all stations, without `station`.
+
+    Raises:
+        InputError: As `load_spectra`, no stations, or transmissions that cannot be joined.
+
+    Example:
+        >>> load_stations("nowhere")
+        Traceback (most recent call last):
+        swiftwrf.errors.InputError: nowhere has no stations: expected a folder of measurements for each, or ...
+    """
+    return read_stations(Path(path), ReadOptions(**options))
+
+
 @checked
 def load_rssi(
     path: str | Path,
@@ -131,4 +152,4 @@ def load_rssi(
 
 
 __all__ = ["PropagationPaths", "ReadOptions", "Rssi", "Snapshots", "Spectra", "Stations"]
-__all__ += ["load_rssi", "load_snapshots", "load_spectra"]
+__all__ += ["load_rssi", "load_snapshots", "load_spectra", "load_stations"]

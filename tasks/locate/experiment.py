@@ -9,6 +9,8 @@ from swiftwrf import Rssi, Stations, rssi_room, simulated_stations
 from swiftwrf.contrib.comparison.locating import LocateComparison, PositionComparison, compare
 from swiftwrf.contrib.comparison.stations import compare_stations
 from swiftwrf.data.coordinates import degree_columns
+from swiftwrf.data.formats import ReadOptions
+from swiftwrf.data.formats.stations import read_stations, station_names
 from tasks.configs import LocateConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
@@ -16,7 +18,7 @@ from tasks.locate.page import SUGGESTED, page
 from tasks.page.page import finish
 from tasks.page.shared import write_suggestion
 from tasks.records import Row
-from tasks.source import measured_rssi
+from tasks.source import located, measured_rssi
 from tasks.terminal import console, terminal
 from tasks.workers import connected, workers_of
 
@@ -74,5 +76,7 @@ def measurements(config: LocateConfig) -> Rssi | Stations:
     """
     if config.stations:
         return simulated_stations(stations=config.stations, seed=config.seed)
+    if config.data is not None and (path := Path(located(config.data))).exists() and station_names(path):
+        return read_stations(path, ReadOptions())
     measured = measured_rssi(config.data, config.table)
     return (rssi_room(seed=config.seed) if measured is None else measured).receivers(config.rx)

@@ -57,6 +57,9 @@ class DeepMimo(Format[Spectra]):
     def recognises(self, path: Path) -> bool:
         return bool(_pairs(path))
 
+    def stations(self, path: Path) -> list[str]:
+        return _pairs(path)
+
     def read(self, path: Path, options: ReadOptions) -> Spectra:
         pairs = _pairs(path)
         pair = pairs[station(f"{path} holds {len(pairs)} pairs of transmitter and receivers", pairs, options.station)]

@@ -71,6 +71,10 @@ class Records(Format[Snapshots]):
     def recognises(self, path: Path) -> bool:
         return bool(_record_files(path))
 
+    def stations(self, path: Path) -> list[str]:
+        described = _description(path)
+        return [] if described is None else _station_names(described[1])
+
     def read(self, path: Path, options: ReadOptions) -> Snapshots:
         files, described = _record_files(path), _description(path)
         if described is None:
@@ -170,11 +174,15 @@ def _description(path: Path) -> tuple[Path, dict[str, Any]] | None:
     return None
 
 
+def _station_names(content: dict[str, Any]) -> list[str]:
+    return [str(antenna.get("name", "")) or f"array {n}" for n, antenna in enumerate(content["antennas"], start=1)]
+
+
 def _read_station(
     file: Path, content: dict[str, Any], number: int | None, assigned: bool
 ) -> tuple[str, Arrays, list[int]]:
     """Return name, arrays as of snapshots.npz, and antennas of the elements, of the array with that number from 1."""
-    names = [str(antenna.get("name", "")) for antenna in content["antennas"]]
+    names = _station_names(content)
     index = station(f"{file} describes {len(names)} arrays", names, number)
     antenna = content["antennas"][index]
     right, up = antenna.get("spacingX"), antenna.get("spacingY")

@@ -85,6 +85,10 @@ class Format(ABC, Generic[Data]):
     def recognises(self, path: Path) -> bool:
         """Return True if the folder or file is of this layout, though `read` may find it incomplete."""
 
+    def stations(self, path: Path) -> list[str]:
+        """Return the names of the arrays in a source that describes several; `ReadOptions.station` chooses one from 1 on."""
+        return []
+
     @abstractmethod
     def read(self, path: Path, options: ReadOptions) -> Data:
         """Return the measurements.
@@ -97,6 +101,23 @@ class Format(ABC, Generic[Data]):
 SPECTRA_FORMATS: Registry[Format[Spectra]] = Registry("format of spectra", "swiftwrf.readers.spectra")
 SNAPSHOT_FORMATS: Registry[Format[Snapshots]] = Registry("format of array snapshots", "swiftwrf.readers.snapshots")
 RSSI_FORMATS: Registry[Format[Rssi]] = Registry("format of RSSI", "swiftwrf.readers.rssi")
+
+
+def _readers(source: Path, options: ReadOptions, *registries: Registry[Format[Any]]) -> list[tuple[str, Format[Any]]]:
+    """Return the formats that recognise a source, by name. Names of arrays state the format."""
+    readers = [(name, registry[name]()) for registry in registries for name in registry]
+    return [(n, r) for n, r in readers if ("arrays" in r.takes if options.arrays else r.recognises(source))]
+
+
+def reader_of(path: Path, options: ReadOptions, *registries: Registry[Format[Any]]) -> Format[Any] | None:
+    """Return the one format that recognises a source, None if there is none or several.
+
+    Example:
+        >>> reader_of(Path("nowhere"), ReadOptions(), SPECTRA_FORMATS) is None
+        True
+    """
+    found = _readers(path, options, *registries) if path.exists() else []
+    return found[0][1] if len(found) == 1 else None
 
 
 def read(path: str | Path, options: ReadOptions, *registries: Registry[Format[Any]]) -> Any:
@@ -116,9 +137,7 @@ def read(path: str | Path, options: ReadOptions, *registries: Registry[Format[An
     if not os.path.isdir(source) and not os.path.isfile(source):  # Path.is_dir raises for a name that is too long
         raise InputError(f"{source} is not a folder or file; expected measurements (formats: {known})")
     try:
-        readers = [(name, registry[name]()) for registry in registries for name in registry]
-        # names of arrays state the format
-        found = [(n, r) for n, r in readers if ("arrays" in r.takes if options.arrays else r.recognises(source))]
+        found = _readers(source, options, *registries)
         if not found:
             raise InputError(f"{source} is in none of the known formats ({known}); docs/formats.md describes them")
         if len(found) > 1:

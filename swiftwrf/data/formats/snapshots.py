@@ -14,8 +14,8 @@ from torch import Tensor
 from swiftwrf.array.angles import ArrayPose
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.archives import ARCHIVES, Arrays, array_names, read_arrays, refusing_broken
-from swiftwrf.data.files import check_carrier, digests
-from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
+from swiftwrf.data.files import check_carrier, digests, read_yaml
+from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions, station
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.splits import read_splits
 from swiftwrf.errors import InputError, listed, ranges
@@ -26,6 +26,8 @@ POSE = ("array_orientation", "array_normal", "array_up")  # the first, or the ot
 OPTIONAL = (*POSE, "element_position", "rows", "columns", "spacing_m", "line_of_sight", "time")
 SCALARS = ("frequency_hz", "rows", "columns", "spacing_m")
 SPACINGS_WAVELENGTHS = (0.01, 20.0)  # of neighbouring elements; beyond, the unit is another one
+STATIONS = "stations.yml"  # descriptions of several arrays, whose number is the second axis of csi
+PER_ROW = ("csi", "position", "line_of_sight", "time")
 VECTORS = ("array_position", *POSE, "line_of_sight", "time", "frequency_hz")
 
 
@@ -33,20 +35,36 @@ VECTORS = ("array_position", *POSE, "line_of_sight", "time", "frequency_hz")
 class SnapshotArrays(Format[Snapshots]):
     """Arrays by name, one row a position of the transmitter."""
 
-    takes = frozenset({"arrays", "beamformer", "grid", "every", "drop_null", "drop_elements", "round_trip"})
+    takes = frozenset({"arrays", "beamformer", "grid", "every", "station", "drop_null", "drop_elements", "round_trip"})
 
     def recognises(self, path: Path) -> bool:
         return _file(path) is not None
+
+    def stations(self, path: Path) -> list[str]:
+        described = _described_stations(_file(path) or path)
+        return [] if described is None else [name for name, _ in described[1]]
 
     def read(self, path: Path, options: ReadOptions) -> Snapshots:
         file, stated = _file(path) or path, options.arrays or {}
         name = {array: stated.get(array, array) for array in (*REQUIRED_ARRAYS, *OPTIONAL)}
         if file.is_dir() or stated.keys() - name.keys():
             raise InputError(f"arrays takes {', '.join(name)} of a file that is named, got {listed(stated)} of {file}")
-        needed = [name[array] for array in dict.fromkeys((*REQUIRED_ARRAYS, *stated))]
+        described = _described_stations(file)
+        if described is None and options.station is not None:
+            raise InputError(f"{file} holds one array; leave station out")
+        required = REQUIRED_ARRAYS if described is None else ("csi", "position")
+        needed = [name[array] for array in dict.fromkeys((*required, *stated))]
         found = read_arrays(file, needed, [name[array] for array in OPTIONAL if array not in stated])
         arrays = {array: found[own] for array, own in name.items() if own in found}
-        return snapshots_of(file, arrays, options, [file], file.stem if file.stem != "snapshots" else None)
+        label = file.stem if file.stem != "snapshots" else None
+        if described is None:
+            return snapshots_of(file, arrays, options, [file], label)
+        beside, parts = described
+        number = station(f"{beside} describes {len(parts)} arrays", [part for part, _ in parts], options.station)
+        own, received = _of_station(file, arrays | parts[number][1], number, len(parts))
+        rows = received[:: options.every or 1]
+        own = {array: values[rows] if array in PER_ROW else values for array, values in own.items()}
+        return snapshots_of(file, own, options, [file, beside], label, index=rows.tolist())
 
 
 def snapshots_of(
@@ -107,6 +125,44 @@ def snapshots_of(
         notes=(*notes, *reversed_axes, *polarisations, *missing),
     )
     return data if step == 1 else data.subset(torch.arange(0, n, step))
+
+
+def _described_stations(file: Path) -> tuple[Path, list[tuple[str, Arrays]]] | None:
+    """Return the file stations.yml beside the arrays that lists several stations, and name and description of each.
+
+    Raises:
+        InputError: A file that is no list of stations with names.
+    """
+    beside = file.parent / STATIONS
+    content = read_yaml(beside) if file.is_file() and beside.is_file() else {}
+    if not content:
+        return None
+    each_station = content.get("stations")
+    if not isinstance(each_station, list) or not all(isinstance(x, dict) and "name" in x for x in each_station):
+        raise InputError(f"{beside} must have stations, a list of arrays, each with its name, got {each_station!r}")
+    common = {name: value for name, value in content.items() if name != "stations"}
+    return beside, [(str(each["name"]), described_arrays(beside, common | each)) for each in each_station]
+
+
+def _of_station(file: Path, arrays: Arrays, number: int, count: int) -> tuple[Arrays, NDArray[np.int64]]:
+    """Return the arrays of one station, and the numbers of the rows that it received.
+
+    Raises:
+        InputError: csi without an axis of the stations, or nothing received.
+    """
+    csi = arrays["csi"]
+    if csi.ndim not in (3, 4) or csi.shape[1] != count:
+        raise InputError(
+            f"{file}: csi must have shape (n, {count}, [subcarriers or packets,] elements) for the {count} arrays of "
+            f"stations.yml, got {csi.shape}"
+        )
+    own = csi[:, number]
+    received = np.isfinite(own).reshape(len(own), -1).any(axis=1) & (np.nan_to_num(own) != 0).reshape(len(own), -1).any(
+        axis=1
+    )
+    if not received.any():
+        raise InputError(f"{file}: array {number + 1} of stations.yml received nothing; leave it out")
+    return arrays | {"csi": own}, received.nonzero()[0]
 
 
 def _file(path: Path) -> Path | None:

@@ -25,8 +25,9 @@ def agreed(
     """Return the rooms of several stations with planes where the most certain station has them.
 
     Planes of two rooms are one plane if they are parallel and less than 1.5 wavelengths apart. The offset and the sign of
-    the gain are those of the station with the highest probability. A station keeps its own plane where its spectra contradict.
-    Identifiable planes that a station did not find are added if they explain its held-out spectra significantly better.
+    the gain are those of the station with the highest probability. A station keeps its own plane where its spectra
+    contradict. Identifiable planes that a station did not find are added if they explain its held-out spectra significantly
+    better.
 
     Args:
         rooms: Fitted room of each station.
