@@ -124,8 +124,12 @@ def scenes(config: Config) -> Iterator[tuple[str, Iterable[Spectra]]]:
         yield "furnished rooms" + where, map(partial(furnished_room, config), range(config.rooms))
 
 
-def furnished_room(config: Config, seed: int) -> Spectra:
-    """Return spectra and channels in a room of random size with boxes of wood, metal and chipboard on its floor."""
+def furnished_room(config: Config, seed: int, corner: int | None = None) -> Spectra:
+    """Return spectra and channels in a room of random size with boxes of wood, metal and chipboard on its floor.
+
+    The fixed end is under the ceiling in the first corner, and either end moves. If a corner is given, 0 to 3, the transmitter
+    moves, and the array is in that corner of the same room.
+    """
     generator = np.random.default_rng(seed)
     size = generator.uniform((5, 4, 2.6), (7, 6, 3.2))
     fixed = np.append(generator.uniform(0.2, 0.6, 2), size[2] - 0.3)  # under the ceiling in a corner
@@ -140,7 +144,11 @@ def furnished_room(config: Config, seed: int) -> Spectra:
     surfaces = [s if s.material.name != WALL.name else replace(s, material=WALL) for s in room.surfaces()]
     position = torch.from_numpy(generator.uniform((0.4, 0.4, 0.8), (*size[:2] - 0.4, 1.7), (4 * N_POSITIONS, 3)))
     position = position[room.free(position)][:N_POSITIONS]
-    ends = torch.from_numpy(fixed), position, get_args(Moving)[seed % 2]
+    moving: Moving = get_args(Moving)[seed % 2]
+    if corner is not None:
+        moving, mirrored = "transmitter", np.array([corner % 2, corner // 2, 0], dtype=bool)
+        fixed = np.where(mirrored, size - fixed, fixed)
+    ends = torch.from_numpy(fixed), position, moving
     paths = trace(Scene(surfaces, 2.4e9), *ends, Tracing(order=2, seed=seed), progress=False).reached
     grid = AngularGrid.hemisphere(30, 120)
     return paths.spectra("furnished room", grid=grid, subcarriers=config.subcarriers, bandwidth_hz=config.bandwidth)

@@ -12,7 +12,7 @@ import torch
 from pandas import DataFrame
 from torch import Tensor
 
-from swiftwrf.data import Rssi, Spectra
+from swiftwrf.data import Rssi, Spectra, Stations
 from swiftwrf.data.coordinates import Floors, degree_columns
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.store import Store
@@ -32,13 +32,14 @@ Columns = dict[str, Any]  # of tensors, and arrays of names
 
 
 def predict(
-    model: Any, new: Numbers | Rssi | Spectra | Store, *, track: float | None = None, truth: bool = True
+    model: Any, new: Numbers | Rssi | Spectra | Stations | Store, *, track: float | None = None, truth: bool = True
 ) -> Prediction | DataFrame:
     """Apply a fitted model to new positions or measurements.
 
     Args:
         model: The model, or its file. Models of spectra and RSSI take positions (n, 3) [m], an `RssiLocator` takes `Rssi` at
             its receivers, a `MatchedField` and estimators of the direction take `Spectra`, or a store of unknown positions.
+            A `MatchedField` of several stations takes `Stations`.
         new: Positions or measurements.
         track: Speed [m/s] of a walk, along which positions are smoothed: the standard deviation of each component.
         truth: Compare with the positions of the measurements.
@@ -74,6 +75,10 @@ def predict(
         columns = _positions_of_rssi(model, new, track, truth)
     elif not hasattr(model, "predict"):
         raise InputError(f"expected a fitted model or its file, got {type(model).__name__}")
+    elif isinstance(new, Stations):
+        if not isinstance(model, MatchedField):
+            raise InputError(f"{with_article(model.kind)} takes the spectra of one station; give data.of(station)[1]")
+        columns = _positions_of_stations(model, new, track, truth)
     else:
         known = new if isinstance(new, Spectra) else None
         store = (
@@ -115,6 +120,17 @@ def _positions_of_spectra(locator: MatchedField, store: Store, known: Spectra | 
 
     columns = _located(map(with_direction, posteriors), index, None if known is None else known.position)
     return columns | _directions(torch.cat(found), known)
+
+
+def _positions_of_stations(locator: MatchedField, data: Stations, track: float | None, truth: bool) -> Columns:
+    data = data.subset(data.received.any(dim=1))
+    rows = torch.arange(len(data)).split(BATCH_ROWS)
+    posteriors: Iterable[Posterior] = (locator.locate(data.subset(part)) for part in rows)
+    if track is not None:
+        posteriors = _tracked(posteriors, data.index.double(), track)
+    columns = _located(posteriors, data.index, data.position if truth else None)
+    received = {f"received_{name}": column for name, column in zip(data.names, data.received.T, strict=True)}
+    return columns | received
 
 
 def _directions(estimate: Tensor, known: Spectra | None) -> Columns:

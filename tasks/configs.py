@@ -196,8 +196,8 @@ class RssiTaskConfig(Options):
 class LocateConfig(Options):
     """Locate transmitters from RSSI, or from the spectra of several antenna arrays, and report the errors.
 
-    Without --data the built-in simulated floor is used, with --stations 3 an office with arrays on three walls. swiftwrf resume DIR.partial continues an interrupted run. Positions
-    of new rows: swiftwrf predict.
+    Without --data the built-in simulated floor is used, with --stations 3 an office with arrays on three walls.
+    swiftwrf resume DIR.partial continues an interrupted run. Positions of new rows: swiftwrf predict.
 
     Example: swiftwrf locate --rx all --data DIR
     """

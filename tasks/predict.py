@@ -13,6 +13,7 @@ from swiftwrf.data import ReadOptions
 from swiftwrf.data.coordinates import PlanFrame
 from swiftwrf.data.files import read_table
 from swiftwrf.data.formats import RSSI_FORMATS, read
+from swiftwrf.data.formats.stations import read_stations
 from swiftwrf.data.receivers import read_places
 from swiftwrf.data.survey import has_positions
 from swiftwrf.errors import with_article
@@ -64,6 +65,9 @@ def run(config: PredictConfig) -> None:
         if silent := int((~data.detected.any(dim=1)).sum()):
             console.print(f"{data.name}: rows that no receiver detected are left out: {silent}")
         table = predict(model, data, track=config.track, truth=is_known)
+    elif isinstance(model, MatchedField) and len(model.stations) > 1:
+        data_of_all = read_stations(Path(located(config.source)), reading(config.spectra, config.table))
+        table = predict(model, data_of_all, track=config.track)
     elif isinstance(model, MatchedField | Estimator):
         kind = "locator" if isinstance(model, MatchedField) else "estimator"
         store, known = observed_spectra(config.source, reading(config.spectra, config.table), model.grid, kind)
