@@ -121,14 +121,21 @@ def scenes(config: Config) -> Iterator[tuple[str, Iterable[Spectra]]]:
         options = {"subcarriers": config.subcarriers, "bandwidth": config.bandwidth, "round_trip": config.round_trip}
         yield folder.name + where, repeat(load_spectra(folder, **options), config.draws)
     if config.rooms:
-        yield "furnished rooms" + where, map(partial(furnished_room, config), range(config.rooms))
+        yield (
+            "furnished rooms" + where,
+            map(
+                partial(furnished_room, subcarriers=config.subcarriers, bandwidth=config.bandwidth), range(config.rooms)
+            ),
+        )
 
 
-def furnished_room(config: Config, seed: int, corner: int | None = None) -> Spectra:
+def furnished_room(
+    seed: int, subcarriers: int | None = None, bandwidth: float | None = None, corner: int | None = None
+) -> Spectra:
     """Return spectra and channels in a room of random size with boxes of wood, metal and chipboard on its floor.
 
-    The fixed end is under the ceiling in the first corner, and either end moves. If a corner is given, 0 to 3, the transmitter
-    moves, and the array is in that corner of the same room.
+    The fixed end is under the ceiling in the first corner, and either end moves. If a corner is given, 0 to 3, the array
+    is in that corner of the same room, and the transmitter moves.
     """
     generator = np.random.default_rng(seed)
     size = generator.uniform((5, 4, 2.6), (7, 6, 3.2))
@@ -151,7 +158,7 @@ def furnished_room(config: Config, seed: int, corner: int | None = None) -> Spec
     ends = torch.from_numpy(fixed), position, moving
     paths = trace(Scene(surfaces, 2.4e9), *ends, Tracing(order=2, seed=seed), progress=False).reached
     grid = AngularGrid.hemisphere(30, 120)
-    return paths.spectra("furnished room", grid=grid, subcarriers=config.subcarriers, bandwidth_hz=config.bandwidth)
+    return paths.spectra("furnished room", grid=grid, subcarriers=subcarriers, bandwidth_hz=bandwidth)
 
 
 def impaired(data: Spectra, snr_db: float, seed: int) -> Spectra:

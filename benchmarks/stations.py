@@ -27,7 +27,7 @@ from swiftwrf.contrib.comparison.stations import ALONE, compare_stations
 from swiftwrf.metrics import LEVEL
 
 N_MEASURED, N_ARRAYS = 100, 3
-OFFICES: dict[str, dict[str, float]] = {"office": {"phase_noise": 0.1}, "noisy": {"phase_noise": 0.4, "snr_db": 15.0}}
+OFFICES: dict[str, dict[str, Any]] = {"office": {"phase_noise": 0.1}, "noisy": {"phase_noise": 0.4, "snr_db": 15.0}}
 SPLIT = "measured"
 
 
@@ -80,7 +80,7 @@ def scenes(config: Config) -> Iterator[tuple[str, Iterator[Stations]]]:
 
 def furnished_rooms(config: Config, seed: int) -> Stations:
     """Return the spectra of three arrays in one traced room, those of `locating_aoa` in three corners."""
-    parts = [furnished_room(config, seed, corner) for corner in range(N_ARRAYS)]
+    parts = [furnished_room(seed, config.subcarriers, config.bandwidth, corner) for corner in range(N_ARRAYS)]
     if config.snr_db is not None:
         parts = [impaired(part, config.snr_db, N_ARRAYS * seed + n) for n, part in enumerate(parts)]
     data = Stations({f"corner {n}": part for n, part in enumerate(parts, start=1)}, name="furnished room")
