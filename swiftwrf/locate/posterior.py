@@ -112,7 +112,8 @@ class Posterior(Displayed):
 
         Args:
             row: Number of the observation.
-            region: Positions whose extent the map has, (n, 3) [m]. Defaults to the candidates.
+            region: Positions whose extent the map has, (n, 3) [m]. A pixel without a candidate then has the value 0.
+                Defaults to the candidates.
 
         Example:
             >>> at = torch.tensor([[[0.0, 0, 0], [0.0, 0, 1], [1.0, 0, 0]]], dtype=torch.float64)
@@ -133,7 +134,10 @@ class Posterior(Displayed):
         pixels = torch.stack([every % width, every // width, torch.zeros(len(every))], dim=1).double()
         away, number = nearest(pixels, pixels[filled], 1)
         values = (mass / mass.max())[number[:, 0]]
-        values[away[:, 0] * pixel > max(self.resolution_m, pixel)] = torch.nan
+        if region is None:
+            values[away[:, 0] * pixel > max(self.resolution_m, pixel)] = torch.nan
+        else:
+            values[away[:, 0] > 0] = 0
         x, y = (float(start) + pixel * np.arange(size) for start, size in zip(low, (width, height), strict=True))
         return PlanMap(x, y, values.reshape(height, width).numpy())
 

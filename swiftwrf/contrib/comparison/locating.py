@@ -71,6 +71,10 @@ class PositionComparison(Comparison):
     def _positions(self) -> tuple[Tensor, Tensor]:
         """Return the training and the test positions, (n, 3) [m]."""
 
+    def _extent(self) -> Tensor | None:
+        """Return positions whose extent maps of the posterior have, (n, 3) [m]. None if all rows have the same candidates."""
+        return None
+
     @abstractmethod
     def _posterior(self, rows: NDArray[np.int64]) -> Posterior:
         """Return the posterior of test rows by the locator."""
@@ -108,8 +112,7 @@ class PositionComparison(Comparison):
         order = self.errors.loc[self.errors["method"] == self.model, self.column].to_numpy().argsort()
         shown = order[np.linspace(0, len(order) - 1, min(N_MAPS, len(order))).round().astype(int)]
         (train, test), posterior = self._positions(), self._posterior(shown)
-        region = None if len(posterior.position) == 1 else posterior.position.flatten(0, 1)
-        plans = [posterior.in_plan(row, region) for row in range(len(posterior))]
+        plans = [posterior.in_plan(row, self._extent()) for row in range(len(posterior))]
         return {
             "x": plans[0].x,
             "y": plans[0].y,

@@ -167,6 +167,9 @@ class StationsComparison(PositionComparison):
     def _positions(self) -> tuple[Tensor, Tensor]:
         return self.train.position, self.test.position
 
+    def _extent(self) -> Tensor:
+        return torch.cat([self.train.position, self.test.position, station_positions(self.train)])
+
     def _posterior(self, rows: NDArray[np.int64]) -> Posterior:
         assert self.locator is not None
         return self.locator.locate(self.test.subset(rows))
