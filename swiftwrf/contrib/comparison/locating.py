@@ -72,7 +72,7 @@ class PositionComparison(Comparison):
         """Return the training and the test positions, (n, 3) [m]."""
 
     def _extent(self) -> Tensor | None:
-        """Return positions whose extent maps of the posterior have, (n, 3) [m]. None if all rows have the same candidates."""
+        """Return positions whose extent maps of the posterior have, (n, 3) [m]. None if all have the same candidates."""
         return None
 
     @abstractmethod
