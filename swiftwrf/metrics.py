@@ -6,16 +6,14 @@ SSIM is scikit-image's default (7 x 7 uniform window, sample covariance, borders
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 from statistics import NormalDist
-from typing import Any, TypedDict
+from typing import TypedDict
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from pandas import DataFrame
 from scipy import stats
 from torch import Tensor
 
@@ -23,10 +21,6 @@ from swiftwrf.array.angles import angular_distance, to_direction, wrap
 from swiftwrf.errors import InputError
 
 WINDOW = 7
-MIN_GROUPS = 10  # of test rows, for an interval of differences
-N_BOOTSTRAP = 1000  # resamplings of an interval
-N_CHANGE = 2000  # of a change, whose distribution has long tails
-SMALLEST_ERROR_DEG = 1e-9  # a change is relative to at least this median
 LEVEL = 0.8  # probability of every interval and region that held-out places calibrate
 HALF_WIDTH = NormalDist().inv_cdf((1 + LEVEL) / 2)  # of the interval of a normal variable, in standard deviations
 
@@ -194,7 +188,7 @@ class ErrorSummary(TypedDict):
     n: int
 
 
-def resampled(group: ArrayLike, n: int = N_BOOTSTRAP) -> Iterator[NDArray[np.int64]]:
+def resampled(group: ArrayLike, n: int) -> Iterator[NDArray[np.int64]]:
     """Yield n bootstrap samples of rows (rows,), ascending, in which rows of one group, e.g. of one place, stay together.
 
     Example:
@@ -209,7 +203,7 @@ def resampled(group: ArrayLike, n: int = N_BOOTSTRAP) -> Iterator[NDArray[np.int
 
 
 def bootstrap_interval(
-    statistic: Callable[[NDArray[np.int64]], float], group: ArrayLike, n: int = N_BOOTSTRAP
+    statistic: Callable[[NDArray[np.int64]], float], group: ArrayLike, n: int = 1000
 ) -> tuple[float, float]:
     """Return the 95 % interval of a statistic of rows, by a bootstrap over groups of rows that are not independent.
 
@@ -260,106 +254,3 @@ def summary(errors: ArrayLike, group: ArrayLike | None = None) -> ErrorSummary:
         "high": high,
         "n": len(values),
     }
-
-
-class ChangeMetrics(TypedDict):
-    """Median error with synthetic spectra, its relative change (-0.3 is 30 % lower), and the change's 95 % interval."""
-
-    median_deg: float
-    change: float
-    low: float
-    high: float
-
-
-def paired_change(before: ArrayLike, after: ArrayLike, group: ArrayLike | None = None) -> ChangeMetrics:
-    """Return the median of `after`, its change relative to the median of `before`, and the change's 95 % interval.
-
-    The interval is a bootstrap over groups of test rows. All errors of a group are resampled together, so that differences
-    between rows do not widen it, and repeats do not narrow it.
-
-    Args:
-        before: Errors (n,) of test rows, or (n, repeats).
-        after: Errors of the same rows and repeats.
-        group: Group of each row, e.g. its place, (n,). Defaults to independent rows.
-
-    Example:
-        >>> change = paired_change([1.0, 2.0, 3.0], [0.5, 1.0, 1.5])
-        >>> change["change"], change["low"], change["high"]
-        (-0.5, -0.5, -0.5)
-    """
-    first, second = np.asarray(before, dtype=float), np.asarray(after, dtype=float)
-
-    def change(rows: NDArray[np.int64]) -> float:
-        return float(np.median(second[rows]) / max(np.median(first[rows]), SMALLEST_ERROR_DEG) - 1)
-
-    every = np.arange(len(first))
-    low, high = bootstrap_interval(change, every if group is None else group, N_CHANGE)
-    return {"median_deg": float(np.median(second)), "change": change(every), "low": low, "high": high}
-
-
-def paired_difference(errors: DataFrame, method: str, other: str) -> tuple[float, float, float]:
-    """Return the mean of one method's errors minus another's on equal pairs, and its 95 % interval.
-
-    The interval is a bootstrap over the places of test rows, or over test rows if places are unknown, because the receivers
-    of one row are not independent. It is nan for fewer than 10 of them with a pair, with which a bootstrap finds false
-    differences. Without any pair all three are nan.
-
-    Args:
-        errors: Errors with a column for each method and a row for each pair, indexed by `index` (the test row), and
-            `receiver` and `place` if they exist.
-        method: Column of the method.
-        other: Column of the method that it is compared to.
-    """
-    level = "place" if "place" in errors.index.names else "index"
-    found = (errors[method] - errors[other]).dropna()
-    group, values = found.index.get_level_values(level), found.to_numpy()
-    low = high = math.nan
-    if group.nunique() >= MIN_GROUPS:
-        low, high = bootstrap_interval(lambda rows: float(values[rows].mean()), group)
-    return float(found.mean()), low, high
-
-
-def summaries(errors: DataFrame, by: str | list[str], columns: Sequence[str]) -> dict[Any, dict[str, ErrorSummary]]:
-    """Return a summary of columns of errors for each value of a column, or for each combination of values of columns.
-
-    Args:
-        errors: Errors, with the test row `index`, `receiver` where a row has several errors, and `place` of the row if it is
-            known. Repeats of a test row count once in `n`.
-        by: Column, e.g. "method", or columns.
-        columns: Columns of errors.
-
-    Example:
-        >>> errors = DataFrame({"method": ["a", "a", "b"], "index": [0, 1, 0], "place": [0, 1, 0], "m": [1.0, 3.0, 5.0]})
-        >>> {name: found["m"]["median"] for name, found in summaries(errors, "method", ["m"]).items()}
-        {'a': 2.0, 'b': 5.0}
-    """
-    keys = [name for name in ("index", "receiver") if name in errors]
-
-    def of(part: DataFrame, column: str) -> ErrorSummary:
-        found = summary(part[column], part.get("place", part["index"]))
-        return {**found, "n": len(part.dropna(subset=column).drop_duplicates(keys))}
-
-    return {name: {column: of(part, column) for column in columns} for name, part in errors.groupby(by, sort=False)}
-
-
-def method_summary(errors: DataFrame, column: str, reference: str) -> DataFrame:
-    """Return a summary of the errors of each method, and their mean difference to those of a reference.
-
-    Args:
-        errors: A row for each `method` and test row `index`, `receiver` where a row has several errors, and `place` of the
-            row if it is known.
-        column: Column of errors.
-        reference: Method of the differences, which are paired over test rows.
-
-    Returns:
-        A row for each method: the keys of `ErrorSummary`, `difference` and its 95 % interval `difference_low`,
-        `difference_high`.
-    """
-    keys = [name for name in ("index", "receiver", "place") if name in errors]
-    pairs = errors.groupby([*keys, "method"])[column].mean().unstack("method")
-    columns = ("difference", "difference_low", "difference_high")
-    rows = {
-        name: {**found[column], **dict(zip(columns, paired_difference(pairs, name, reference), strict=True))}
-        for name, found in summaries(errors, "method", [column]).items()
-    }
-    return DataFrame.from_dict(rows, orient="index").rename_axis("method")

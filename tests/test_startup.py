@@ -9,9 +9,10 @@ import pytest
 import augment
 import swiftwrf
 from swiftwrf.array.beamforming import BEAMFORMERS
-from swiftwrf.choices import FIELD_MODELS, ROOMS, RSSI_PREDICTORS
+from swiftwrf.choices import FIELD_MODELS, RSSI_PREDICTORS
 from swiftwrf.contrib.comparison.localizers import LOCALIZERS
 from swiftwrf.contrib.raytraced import ROOMS as BUILT_IN_ROOMS
+from swiftwrf.contrib.raytraced.names import ROOMS
 from tasks import labels
 from tasks.command import COMMANDS
 

@@ -9,12 +9,10 @@ from typing import Literal
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
-from scipy.stats import wasserstein_distance
 from torch import Tensor
 
 from swiftwrf.data.files import read_text
 from swiftwrf.errors import InputError
-from swiftwrf.positions import nearest
 from swiftwrf.runtime.validation import PositiveInt, checked
 
 TEST_SHARE = 0.2
@@ -250,26 +248,3 @@ def each_fold(fold: Tensor, rows: Tensor | None = None) -> Iterator[tuple[Tensor
     rows = torch.arange(len(fold)) if rows is None else rows
     for number in fold[rows].unique():
         yield rows[fold[rows] == number], (fold != number).nonzero()[:, 0]
-
-
-def matching_validation(train: Tensor, test: Tensor) -> Validation:
-    """Return the kind of folds whose held-out distances resemble those of the test positions.
-
-    A distance is that to the nearest training position (C. Mila et al., Methods in Ecology and Evolution 13, 2022).
-
-    Example:
-        >>> line = torch.linspace(0, 99, 100)[:, None] * torch.tensor([1.0, 0.0, 0.0])
-        >>> matching_validation(line, line + 0.5), matching_validation(line, line + 50)
-        ('random', 'block')
-    """
-
-    def distances(known: Tensor, other: Tensor) -> Tensor:
-        return nearest(other, known, 1)[0][:, 0]
-
-    def misfit(validation: Validation) -> float:
-        fold = folds(train, validation, 0)
-        held_out = [distances(train[kept], train[out]) for out, kept in each_fold(fold)]
-        return float(wasserstein_distance(torch.cat(held_out), distances(train, test)))
-
-    kinds: tuple[Validation, Validation] = ("random", "block")
-    return min(kinds, key=misfit)

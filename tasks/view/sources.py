@@ -11,17 +11,17 @@ import numpy as np
 import torch
 
 from augment import withhold
+from augment.choices import fraction_key
 from augment.cross_validation import LOCATOR as MATCHED_FIELD
 from augment.turbo.artifacts import model_file
 from swiftwrf import FieldModel, InputError, RssiModel, load
-from swiftwrf.choices import fraction_key
+from swiftwrf.contrib.comparison.steps import LOCATOR, MODEL
 from swiftwrf.errors import with_article
 from swiftwrf.locate import RssiLocator
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import Plane
 from swiftwrf.rssi.base import RssiPredictor
 from swiftwrf.runtime.checkpoint import refusing
-from swiftwrf.runtime.steps import LOCATOR, MODEL
 from tasks.aoa.experiment import measurements as spectra_of
 from tasks.command_line import parse
 from tasks.configs import AoaConfig, LocateConfig, ViewConfig

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
 import swiftwrf
+from swiftwrf.contrib.comparison.errors import method_summary
 from swiftwrf.locate import Posterior
 from swiftwrf.metrics import (
     LEVEL,
@@ -19,7 +20,6 @@ from swiftwrf.metrics import (
     covered,
     interval_factor,
     median_interval,
-    method_summary,
     ssim,
     summary,
 )

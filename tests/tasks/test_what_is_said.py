@@ -30,6 +30,7 @@ from swiftwrf import AngularGrid, Rssi, RssiModel, calibrate, make_model, rssi_r
 from swiftwrf.contrib.comparison.base import split_notes
 from swiftwrf.contrib.comparison.localizers import PosteriorLocalizer
 from swiftwrf.contrib.comparison.locating import LocateComparison
+from swiftwrf.contrib.comparison.steps import Memo
 from swiftwrf.contrib.online import score
 from swiftwrf.data.cells import seconds
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin
@@ -39,7 +40,6 @@ from swiftwrf.metrics import summary
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.rssi import RssiComparison, RssiPredictor, estimate_offsets, log_distance
 from swiftwrf.runtime.durable import write_json
-from swiftwrf.runtime.steps import Memo
 from tasks.aoa import page as aoa_page
 from tasks.aoa import room as aoa_room
 from tasks.aoa import synthesis

@@ -94,9 +94,29 @@ class Format(ABC, Generic[Data]):
         """
 
 
-SPECTRA_FORMATS: Registry[Format[Spectra]] = Registry("format of spectra", "swiftwrf.readers.spectra")
-SNAPSHOT_FORMATS: Registry[Format[Snapshots]] = Registry("format of array snapshots", "swiftwrf.readers.snapshots")
-RSSI_FORMATS: Registry[Format[Rssi]] = Registry("format of RSSI", "swiftwrf.readers.rssi")
+SPECTRA_FORMATS: Registry[Format[Spectra]] = Registry(
+    "format of spectra",
+    "swiftwrf.readers.spectra",
+    {
+        "deepmimo": "swiftwrf.contrib.formats.deepmimo:DeepMimo",
+        "nerf2": "swiftwrf.data.formats.nerf2:Nerf2",
+        "paths": "swiftwrf.data.formats.paths:PathArchive",
+    },
+)
+SNAPSHOT_FORMATS: Registry[Format[Snapshots]] = Registry(
+    "format of array snapshots",
+    "swiftwrf.readers.snapshots",
+    {
+        "captures": "swiftwrf.contrib.formats.captures:Captures",
+        "records": "swiftwrf.contrib.formats.records:Records",
+        "snapshots": "swiftwrf.data.formats.snapshots:SnapshotArrays",
+    },
+)
+RSSI_FORMATS: Registry[Format[Rssi]] = Registry(
+    "format of RSSI",
+    "swiftwrf.readers.rssi",
+    {"nerf2": "swiftwrf.data.formats.nerf2:Nerf2Rssi", "survey": "swiftwrf.data.formats.survey:SurveyTable"},
+)
 
 
 def read(path: str | Path, options: ReadOptions, *registries: Registry[Format[Any]]) -> Any:

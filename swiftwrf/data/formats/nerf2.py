@@ -45,7 +45,7 @@ from swiftwrf.data.cells import column_of_numbers, seconds, text_of
 from swiftwrf.data.columns import column_of
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin, PlanFrame, without_fix
 from swiftwrf.data.files import digests, numbers, read_bytes, read_table, read_xyz, read_yaml, sha256
-from swiftwrf.data.formats.base import RSSI_FORMATS, SPECTRA_FORMATS, Format, ReadOptions
+from swiftwrf.data.formats.base import Format, ReadOptions
 from swiftwrf.data.formats.snapshots import array_of, described_arrays, pose_of
 from swiftwrf.data.powers import NOT_DETECTED_DBM, find_fillers, without_fillers
 from swiftwrf.data.receivers import read_receivers
@@ -63,7 +63,6 @@ PROPERTIES = ("origin", "floors", "receiver_moves", "groups", "offsets", "labels
 FILES = ("gateway_rssi.csv", *POSITIONS, *RECEIVERS)  # any of which marks the layout
 
 
-@SPECTRA_FORMATS.register("nerf2")
 class Nerf2(Format[Spectra]):
     """Images or an array; row i of the positions belongs to the image numbered i from 1, or to row i of the array."""
 
@@ -214,7 +213,6 @@ def _decode(
         return np.asarray(image)
 
 
-@RSSI_FORMATS.register("nerf2")
 class Nerf2Rssi(Format[Rssi]):
     """One row a position of the end that moves, one column a receiver."""
 

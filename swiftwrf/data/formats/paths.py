@@ -19,7 +19,7 @@ from torch import Tensor
 
 from swiftwrf.data.archives import array_names, read_arrays
 from swiftwrf.data.files import check_carrier, digests
-from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format, ReadOptions
+from swiftwrf.data.formats.base import Format, ReadOptions
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import read_splits
@@ -32,7 +32,6 @@ MIN_DISTANCE_M = 1e-9  # between two points
 MAX_GAIN = 1e100  # sums of larger ones overflow
 
 
-@SPECTRA_FORMATS.register("paths")
 class PathArchive(Format[Spectra]):
     """Traced paths, from which spectra are computed."""
 

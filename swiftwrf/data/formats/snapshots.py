@@ -15,7 +15,7 @@ from swiftwrf.array.angles import ArrayPose
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.archives import ARCHIVES, Arrays, array_names, read_arrays, refusing_broken
 from swiftwrf.data.files import check_carrier, digests
-from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
+from swiftwrf.data.formats.base import Format, ReadOptions
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.splits import read_splits
 from swiftwrf.errors import InputError, listed, ranges
@@ -29,7 +29,6 @@ SPACINGS_WAVELENGTHS = (0.01, 20.0)  # of neighbouring elements; beyond, the uni
 VECTORS = ("array_position", *POSE, "line_of_sight", "time", "frequency_hz")
 
 
-@SNAPSHOT_FORMATS.register("snapshots")
 class SnapshotArrays(Format[Snapshots]):
     """Arrays by name, one row a position of the transmitter."""
 

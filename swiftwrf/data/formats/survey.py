@@ -13,7 +13,7 @@ import torch
 
 from swiftwrf.data.columns import is_coordinate, is_rssi
 from swiftwrf.data.files import SUFFIXES, TABLES, digests, has_header, read_table
-from swiftwrf.data.formats.base import RSSI_FORMATS, SNAPSHOT_FORMATS, Format, ReadOptions
+from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
 from swiftwrf.data.formats.nerf2 import FILES as NERF2_FILES
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
@@ -26,7 +26,6 @@ HALF = re.compile(rf"[ _-]*(?:rssi?(?![a-z])|{COORDINATES.pattern})[ _-]*")
 MAX_COORDINATES = 6  # columns of a table of positions: x, y, z, floor, building, ...
 
 
-@RSSI_FORMATS.register("survey")
 class SurveyTable(Format[Rssi]):
     """Table of a walk test; positions of receivers are unknown unless receivers.csv beside it contains them."""
 
