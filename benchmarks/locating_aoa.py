@@ -48,11 +48,12 @@ from swiftwrf import (
     simulated_room,
 )
 from swiftwrf.choices import Moving
+from swiftwrf.contrib.comparison.errors import summary
 from swiftwrf.contrib.raytraced import FurnishedRoom, Material, Scene, Tracing, trace
 from swiftwrf.data.spectra import array_spectra
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import GaussianProcess, choose_kernel
-from swiftwrf.metrics import LEVEL, angle_errors, summary
+from swiftwrf.metrics import LEVEL, angle_errors
 from swiftwrf.models.geometry.channels import coherence, field, waves
 
 KERNEL = "kernel_regression"

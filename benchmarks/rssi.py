@@ -30,10 +30,10 @@ from record import kept, options, write_result
 from torch import Tensor
 
 from swiftwrf import Rssi, load_rssi, rssi_room
-from swiftwrf.contrib.comparison.errors import method_summary
+from swiftwrf.contrib.comparison.errors import method_summary, summary
 from swiftwrf.contrib.comparison.rssi import compare
 from swiftwrf.contrib.comparison.steps import Memo
-from swiftwrf.metrics import LEVEL, summary
+from swiftwrf.metrics import LEVEL
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.rssi import RssiModel
 from swiftwrf.rssi.coverage import at_least, reach

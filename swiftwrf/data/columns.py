@@ -68,8 +68,6 @@ GROUPS_OF_ROWS = re.compile(  # columns that distinguish rows, but not the recei
     r"|app\w*|sample\w*|index|idx|row|count\w*|seq\w*|packet\w*|frame\w*|node_?addr\w*|dev_?(?:eui|addr))"
     r"(?:_?(?:id|name|no|number))?"
 )
-MIN_ROWS = 5  # for a comparison of values
-MIN_REFERENCE_DBM = -25.0  # median of a column that is a received power by its values alone
 GEODETIC = {"x": "longitude", "y": "latitude"}  # that take the place of x and y
 
 
@@ -133,11 +131,24 @@ def find_roles(
     return roles
 
 
-def receiver_columns(table: pd.DataFrame, names: Sequence[str]) -> tuple[list[str], list[str], list[str]]:
+def receiver_columns(
+    table: pd.DataFrame,
+    names: Sequence[str],
+    min_rows: int = 5,
+    max_median_dbm: float = -25.0,
+    max_positive: float = 0.02,
+) -> tuple[list[str], list[str], list[str]]:
     """Return those columns that hold the RSSI of receivers, others that look like it, and notes on these.
 
     Names of other quantities are left out. Of several columns whose names are nothing but received power, the most specific
     one counts. Other columns must be akin to columns of received power, by their names or by their values.
+
+    Args:
+        table: Columns of receivers and others.
+        names: Columns that may hold RSSI.
+        min_rows: Values are compared from this number of rows on. The bounds are not studied.
+        max_median_dbm: Largest median of a column that is a received power by its values alone.
+        max_positive: Fraction of positive values in such a column, at most.
 
     Example:
         >>> table = pd.DataFrame({"AP1": [-60] * 9, "AP2": [-70] * 9, "SNR": [-3] * 9, "drift": [-20.5] * 9})
@@ -152,11 +163,14 @@ def receiver_columns(table: pd.DataFrame, names: Sequence[str]) -> tuple[list[st
     found = [name for name in found if name not in (*others, *weaker)]
     values = {name: parsed(table[name])[0] for name in found}
     powers = {name: v[np.isfinite(v) & ~np.isin(v, KNOWN_FILLERS)] for name, v in values.items()}
-    usual = {n: not len(p) or (np.median(p) <= MIN_REFERENCE_DBM and (p > 0).mean() < 0.02) for n, p in powers.items()}
+    usual = {
+        name: not len(p) or (np.median(p) <= max_median_dbm and (p > 0).mean() < max_positive)
+        for name, p in powers.items()
+    }
     plausible = [name for name in found if usual[name]] or found
-    whole = [name for name in plausible if (powers[name] % 1 == 0).all()]
-    reference = whole if len(whole) > 1 or set(whole) & set(bare) else plausible
-    if len(table) < MIN_ROWS:  # e.g. one of a stream
+    of_integers = [name for name in plausible if (powers[name] % 1 == 0).all()]
+    reference = of_integers if len(of_integers) > 1 or set(of_integers) & set(bare) else plausible
+    if len(table) < min_rows:  # e.g. one of a stream
         reference = found
     kin = {_kinship(plain[name]) for name in reference}
     doubtful = [name for name in found if name not in reference and _kinship(plain[name]) not in kin]

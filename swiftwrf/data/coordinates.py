@@ -21,13 +21,10 @@ from swiftwrf.errors import InputError
 Floats = NDArray[np.float64]
 Coordinates = Literal["degrees", "metres"]
 Up = Literal["y", "z"]
-FAR_RATIO = 10.0  # distance of the origin relative to the distance between positions, or to their extent
-MAX_EXTENT_DEG = 2.0  # of positions that are recognised as degrees
 # x and y that receivers of satellites write without a position
 NO_FIX = (0.0, -1.0, 999.0, -999.0, 9999.0, -9999.0)
-MIN_EXTENT_M, MAX_EXTENT_MINUTES = 2.0, 30.0  # of walks in metres, and in ddmm.mmmm
 STOREY_M = 4.0  # height of a floor where heights are missing or count from the floor
-MIN_STOREY_M, SAME_HEIGHT_M = 1.5, 0.5  # differences of the heights of two floors, and of one floor
+MIN_STOREY_M = 1.5  # between the heights of two floors
 BELOW_GROUND = re.compile(r"(?:b|ug|u\.g\.?|basement|cellar|keller|sub|lower)[ ._-]*(?:level|floor)?[ ._-]*(\d*)")
 VALUE, PX, METRE = r"(\d+(?:[.,]\d+)?)", "(?:px|pixels?)", "m(?:et(?:er|re)s?)?"
 SCALES = [  # of a plan in lines above a table: pixels in a metre, and metres in a pixel, whose power is -1
@@ -186,8 +183,11 @@ def without_fix(position: Floats) -> tuple[NDArray[np.bool_], list[str]]:
     return omitted, notes
 
 
-def _is_apart(others: Floats, same: Floats) -> bool:
-    """Return True if repeated positions (m, 3) are no place among the others (n, 3)."""
+def _is_apart(others: Floats, same: Floats, far_ratio: float = 10.0) -> bool:
+    """Return True if repeated positions (m, 3) are no place among the others (n, 3).
+
+    They are far at `far_ratio` times the distance between neighbours (not studied).
+    """
     places, times = np.unique(others[:, :2], axis=0, return_counts=True)
     if len(places) < 2:
         return False
@@ -196,11 +196,20 @@ def _is_apart(others: Floats, same: Floats) -> bool:
     distance = float(tree.query(same[0, :2])[0])
     of_no_height = not bool(same.any()) and bool((others[:, 2] != 0).all())
     more_often = len(same) > int(times.max())
-    return of_no_height or distance > FAR_RATIO * spacing or (more_often and distance > spacing)
+    return of_no_height or distance > far_ratio * spacing or (more_often and distance > spacing)
 
 
 def degrees_in(
-    label: object, names: tuple[str, str], xy: Floats, named: bool, asked: Coordinates | None
+    label: object,
+    names: tuple[str, str],
+    xy: Floats,
+    named: bool,
+    asked: Coordinates | None,
+    far_ratio: float = 10.0,
+    max_extent_deg: float = 2.0,
+    max_walk_deg: float = 0.05,
+    min_extent_m: float = 2.0,
+    max_extent_minutes: float = 30.0,
 ) -> tuple[Floats | None, list[str]]:
     """Return latitudes and longitudes (n, 2) [deg], None if the coordinates are metres, and a note on their unit.
 
@@ -213,6 +222,11 @@ def degrees_in(
         xy: Longitude or x, and latitude or y, (n, 2). Without names, x is the latitude if y exceeds 90.
         named: Whether the columns are named after longitude and latitude.
         asked: What the user states.
+        far_ratio: Distance of degrees from 0, 0 in their extents, at least. The bounds are not studied.
+        max_extent_deg: Largest extent of positions that are recognised as degrees.
+        max_walk_deg: Largest extent of degrees without names, 5 km: in metres it is 5 cm, and no walk.
+        min_extent_m: Extent of a walk in metres.
+        max_extent_minutes: Largest extent of a walk in ddmm.mmmm.
 
     Raises:
         InputError: Values that are no degrees though the user or their names state it, or that may be either.
@@ -228,18 +242,18 @@ def degrees_in(
         return None, notes
     size = np.abs(xy)
     if named and (size > 180).any():
-        whole, minutes = np.divmod(size, 100)
+        degree, minutes = np.divmod(size, 100)
         extent = float(np.ptp(xy, axis=0).max())
         if bool((xy % 1 == 0).all()) and (size <= (180e7, 90e7)).all() and size.min(axis=0).max() >= 1e7:
             xy = xy / 1e7
             notes.append(f"{columns} count 1e-7 degrees, which are converted to degrees")
-        elif not ((minutes >= 60).any() or (whole > (180, 90)).any() or extent > MAX_EXTENT_MINUTES):
-            if extent > MIN_EXTENT_M:
+        elif not ((minutes >= 60).any() or (degree > (180, 90)).any() or extent > max_extent_minutes):
+            if extent > min_extent_m:
                 raise InputError(
                     f"{label}: {columns} may be degrees and minutes (ddmm.mmmm) or metres; convert them to degrees, or "
                     "give --coordinates metres"
                 )
-            xy = np.sign(xy) * (whole + minutes / 60)
+            xy = np.sign(xy) * (degree + minutes / 60)
             notes.append(f"{columns} count degrees and minutes (ddmm.mmmm), which are converted to degrees")
     swapped = not named and bool((np.abs(xy[:, 1]) > 90).any())
     degrees = xy if swapped else xy[:, ::-1]
@@ -258,11 +272,11 @@ def degrees_in(
         return None, notes
     east = (degrees[:, 1] - degrees[0, 1] + 180) % 360  # on either side of the antimeridian
     extent, distance = float(max(np.ptp(degrees[:, 0]), np.ptp(east))), float(np.abs(xy).max())
-    if asked == "degrees" or (named and extent <= MAX_EXTENT_DEG):
+    if asked == "degrees" or (named and extent <= max_extent_deg):
         return degrees, notes
-    if not named and (distance <= FAR_RATIO * extent or extent == 0 or extent > MAX_EXTENT_DEG):
+    if not named and (distance <= far_ratio * extent or extent == 0 or extent > max_extent_deg):
         return None, notes
-    if not named and extent <= 0.05:  # a walk in degrees (5 km), and none in metres (5 cm)
+    if not named and extent <= max_walk_deg:
         return degrees, notes
     raise InputError(
         f"{label}: {columns} extend over {extent:.3g} and may be degrees or metres; choose --coordinates degrees or "
@@ -328,9 +342,9 @@ def floors_of(label: object, floor: list[str], position: Floats) -> Floors | Non
     return Floors(tuple(", ".join(level) for level in levels), tuple(heights)) if len(levels) > 1 else None
 
 
-def _overlap(a: Floats, b: Floats) -> bool:
-    """Return True if more than half of the positions of one floor are in the box of the other, or nearly so in height."""
-    margin = np.array([0.0, 0.0, SAME_HEIGHT_M])
+def _overlap(a: Floats, b: Floats, margin_m: float = 0.5) -> bool:
+    """Return True if more than half of the positions of one floor are in the box of the other, with a margin in height."""
+    margin = np.array([0.0, 0.0, margin_m])
     boxes = ((p >= q.min(axis=0) - margin) & (p <= q.max(axis=0) + margin) for p, q in ((a, b), (b, a)))
     return any(float(inside.all(axis=1).mean()) > 0.5 for inside in boxes)
 

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 Numbers = Any  # a tensor, array, list or table of numbers
 Rows = Any  # numbers of rows (tensor, array or list), a mask, or a slice
 Data = TypeVar("Data", bound="PositionedData")
-MAX_DIGEST_VALUES = 64  # of a row, about; more take time and distinguish no more rows
-ROTATION_TOLERANCE = 1e-3  # of the products of its columns, from rounding
 Arrays = dict[str, Any]  # in the form of xarray: dimensions, values, and a dictionary of units if there are any
 DEGREE_UNITS = {"latitude": "degrees_north", "longitude": "degrees_east"}
 
@@ -168,14 +166,17 @@ class PositionedData(Labelled, Displayed):
 
     __getitem__ = subset
 
-    def row_digests(self) -> Tensor:
-        """Return a digest of each row by its number, its time, its position and some of its values, int64 (n,)."""
+    def row_digests(self, max_values: int = 64) -> Tensor:
+        """Return a digest of each row by its number, its time, its position and some of its values, int64 (n,).
+
+        About `max_values` equally spaced values count: more take time and distinguish no more rows.
+        """
         values, time = getattr(self, self.row_fields[1]), getattr(self, "time", None)
         number = torch.stack([self.index.double(), torch.zeros(len(self)).double() if time is None else time], dim=1)
         found = [b""]
         for rows in [slice(None)] if isinstance(values, Tensor) else values.parts():
             part = values[rows].flatten(1)
-            some = part[:, :: max(1, part.shape[1] // MAX_DIGEST_VALUES)].double()
+            some = part[:, :: max(1, part.shape[1] // max_values)].double()
             known = torch.cat([number[rows], self._position[rows], some], dim=1)
             cells = (1000 * known).round().nan_to_num(-1.0).long().numpy()  # to a millisecond and a millimetre
             found += [hashlib.blake2b(cell.tobytes(), digest_size=8).digest() for cell in cells]
@@ -250,15 +251,17 @@ def to_positions(name: str, value: Numbers, shape: tuple[int | None, ...] = (Non
     return check_positions(value, name, shape, missing).detach().cpu()
 
 
-def to_rotation(value: Numbers) -> Tensor:
+def to_rotation(value: Numbers, tolerance: float = 1e-3) -> Tensor:
     """Return a matrix that rotates array into world coordinates as float64 (3, 3).
+
+    Products of its columns are those of unit vectors to the tolerance, because of rounding.
 
     Raises:
         InputError: As `to_tensor`, or columns that are no right-handed set of unit vectors at right angles.
     """
     rotation = to_tensor("rotation", value, torch.float64, (3, 3))
     error = float((rotation.T @ rotation - torch.eye(3)).abs().max())
-    if error > ROTATION_TOLERANCE or float(rotation.det()) < 0:
+    if error > tolerance or float(rotation.det()) < 0:
         raise InputError(
             "rotation must be a rotation matrix (orthonormal, determinant 1), got "
             f"{rotation.tolist()}; a pose=ArrayPose(position, quaternion) gives one"

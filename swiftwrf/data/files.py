@@ -35,8 +35,6 @@ DOCUMENTS: Registry[pd.DataFrame] = Registry(
 TABLES = (*SUFFIXES, *DOCUMENTS)  # of tables that are named
 SEPARATORS = ",;\t"
 MAX_TEXT_BYTES = 2**28  # a million rows of positions take a tenth of it
-MAX_PREAMBLE_LINES = 20  # before the header of a table
-MAX_MISSING_CELLS = 3  # at the end of all rows
 
 
 def sha256(file: Path) -> str:
@@ -123,12 +121,13 @@ def numbers(value: Any, count: int) -> tuple[float, ...] | None:
     return found if all(map(math.isfinite, found)) else None
 
 
-def _lines_before_header(text: str) -> int:
-    """Return the number of lines before the header of a table, e.g. 1 for a first line of metadata.
+def _lines_before_header(text: str, max_lines: int = 20, max_missing_cells: int = 3) -> int:
+    """Return the number of lines before the header of a table, e.g. 1 for a first line of metadata, at most 20.
 
-    The header is the first line of names that has as many cells as the line below, or that is followed by numbers.
+    The header is the first line of names that has as many cells as the line below, or that is followed by numbers and up to
+    3 cells longer or shorter.
     """
-    lines = text.split("\n", MAX_PREAMBLE_LINES + 2)[: MAX_PREAMBLE_LINES + 2]
+    lines = text.split("\n", max_lines + 2)[: max_lines + 2]
     for skipped, (line, below) in enumerate(itertools.pairwise(lines)):
         separator = _separator(line)
         try:
@@ -140,7 +139,7 @@ def _lines_before_header(text: str) -> int:
         if len(header) == len(row) > 1 and (is_header or not skipped):
             return skipped
         has_numbers = sum(not math.isnan(number(cell)) for cell in row) > 1
-        if is_header and has_numbers and abs(len(header) - len(row)) <= MAX_MISSING_CELLS:
+        if is_header and has_numbers and abs(len(header) - len(row)) <= max_missing_cells:
             return skipped
     return 0
 
@@ -219,8 +218,13 @@ def table_of(label: object, text: str, header: bool = True) -> pd.DataFrame:
     return table
 
 
-def _regular(label: object, lines: list[list[str]]) -> tuple[list[str], list[list[str]], list[str]]:
-    """Return names of columns, rows of equal length, and notes on lines, rows and columns without content."""
+def _regular(
+    label: object, lines: list[list[str]], max_missing_cells: int = 3
+) -> tuple[list[str], list[list[str]], list[str]]:
+    """Return names of columns, rows of equal length, and notes on lines, rows and columns without content.
+
+    All rows may lack up to 3 cells at their end.
+    """
     names = _names_in(lines[0])
     repeated = [line for line in lines[1:] if line[0].strip(" #") == names[0] and _names_in(line) == names]
     rows = [line for line in lines[1:] if line not in repeated and any(map(str.strip, line))]
@@ -232,7 +236,7 @@ def _regular(label: object, lines: list[list[str]]) -> tuple[list[str], list[lis
     widths = {len(line) for line in rows}
     width, missing = len(rows[0]), len(names) - len(rows[0])
     if len(widths) == 1 < len(rows):
-        if 0 < missing <= MAX_MISSING_CELLS:
+        if 0 < missing <= max_missing_cells:
             notes.append(f"rows lack the last columns, which count as empty: {', '.join(names[width:])}")
             rows = [line + [""] * missing for line in rows]
         elif missing < 0 and not any(cell.strip() for line in rows for cell in line[len(names) :]):

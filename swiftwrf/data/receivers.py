@@ -21,9 +21,7 @@ from swiftwrf.errors import InputError, listed
 from swiftwrf.positions import check_positions
 
 Floats = NDArray[np.float64]
-MAC = "mac"  # pools radios by the first five bytes of their addresses
 ADDRESS = re.compile(r"((?:[0-9a-f]{2}[:-]?){4}[0-9a-f]{2})[:-]?[0-9a-f]{2}", re.IGNORECASE)
-MAX_FROM_ORIGIN_DEG = 2.0  # of receivers in degrees
 
 
 def plain_receiver(name: str) -> str:
@@ -72,11 +70,11 @@ def pool_names(names: Sequence[str], by: str) -> list[str]:
         ['hall', 'hall']
     """
     try:
-        pattern = ADDRESS if by == MAC else re.compile(by)
+        pattern = ADDRESS if by == "mac" else re.compile(by)
     except re.error as error:
         raise InputError(f"pool_by {by!r} is no column and no regular expression ({error})") from None
     if pattern.groups != 1:
-        raise InputError(f"pool_by takes {MAC}, a column, or a regular expression with one group, got {by!r}")
+        raise InputError(f"pool_by takes mac, a column, or a regular expression with one group, got {by!r}")
     found = [pattern.fullmatch(name) for name in names]
     if not any(found):
         raise InputError(f"pool_by {by!r} matches no receiver; there are {listed(names)}")
@@ -152,8 +150,10 @@ def read_places(file: Path, origin: GeodeticOrigin | None, frame: PlanFrame, flo
     return check_positions(position, f"positions of {file}")
 
 
-def _positions(file: Path, table: pd.DataFrame, origin: GeodeticOrigin | None, frame: PlanFrame) -> Floats:
-    """Return the positions (n, 3) [m] in a table, nan where a cell is empty."""
+def _positions(
+    file: Path, table: pd.DataFrame, origin: GeodeticOrigin | None, frame: PlanFrame, max_from_origin_deg: float = 2.0
+) -> Floats:
+    """Return the positions (n, 3) [m] in a table, nan where a cell is empty; degrees lie near the origin."""
     columns = [column_of(table, axis, {}) or column_of(table, GEODETIC[axis], {}) for axis in "xy"]
     both = [name for name in columns if name is not None]
     if len(both) < 2:
@@ -173,9 +173,9 @@ def _positions(file: Path, table: pd.DataFrame, origin: GeodeticOrigin | None, f
         return frame_of(file, table, both, frame)[0].to_world(position)
     away = xy - (origin.longitude, origin.latitude)
     away[:, 0] = (away[:, 0] + 180) % 360 - 180
-    if not (np.abs(away) <= MAX_FROM_ORIGIN_DEG).all():
+    if not (np.abs(away) <= max_from_origin_deg).all():
         raise InputError(
-            f"{file}: positions must be in degrees as the measurements are, within {MAX_FROM_ORIGIN_DEG:g} degrees of "
+            f"{file}: positions must be in degrees as the measurements are, within {max_from_origin_deg:g} degrees of "
             f"{origin}"
         )
     position[known, :2] = origin.to_metres(xy[:, ::-1])

@@ -24,9 +24,8 @@ from swiftwrf.runtime.validation import NonNegativeInt, checked
 
 META = "meta.csv"  # file of the NeRF2 layout with a row for each measurement
 SURVEY = "survey.yml"  # file of the toolkit's own layout with properties of all measurements
-PLACE, MIN_PLACES = "place", 5  # split by receiver, a fifth of which is held out
+PLACE = "place"  # split by receiver, a fifth of which is held out
 
-UNKNOWN = (float("nan"),) * 3  # position of a receiver
 NO_NAME = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")  # line breaks, controls, halves of characters
 
 
@@ -159,7 +158,7 @@ class Rssi(PositionedData):
         """
         found = read_survey("the table", frame, TableOptions(**options))
         if receiver_position:
-            places = [list(receiver_position.get(receiver, UNKNOWN)) for receiver in found["receiver_names"]]
+            places = [list(receiver_position.get(receiver, [float("nan")] * 3)) for receiver in found["receiver_names"]]
             found["receiver_position"] = places
         return cls(**found, name=name)
 
@@ -214,9 +213,9 @@ class Rssi(PositionedData):
         if name != PLACE or name in self.named_splits:
             return super().split(name, seed)
         located = self.receiver_located.nonzero()[:, 0]
-        if len(located) < MIN_PLACES:
+        if len(located) < 5:  # a fifth of which is held out
             raise InputError(
-                f"split {PLACE!r} needs at least {MIN_PLACES} receivers of known position; {self.name} has {len(located)}"
+                f"split {PLACE!r} needs at least 5 receivers of known position; {self.name} has {len(located)}"
             )
         places = self.receiver_position[located]
         is_test = torch.zeros(len(self.receiver_names), dtype=torch.bool)

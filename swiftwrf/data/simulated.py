@@ -30,7 +30,6 @@ from swiftwrf.runtime.validation import (
     configuration,
 )
 
-MAX_ORDER = 2  # reflections
 Point = tuple[float, float, float]
 GRID = AngularGrid.hemisphere(30, 120)
 FACING_X = ArrayPose((0.1, 2.4, 1.2), (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)))  # on the wall x = 0, its normal is +x
@@ -38,9 +37,6 @@ CEILING = ArrayPose((3.0, 2.5, 2.7))  # position of the fixed transmitter, orien
 REGION = ((2.2, 1.6, 0.9), (4.2, 3.4, 1.5))  # of the moving end: opposite corners [m]
 BATCH_POSITIONS = 4096  # whose paths take half a gigabyte
 CHANNELS_HZ = (2.402e9, 2.426e9, 2.480e9)  # of BLE advertisements; a receiver does not report the channel
-TRANSMIT_DBM = -8.0
-PACKET_NOISE_DB = 2.0
-SENSITIVITY_DBM = -85.0  # of a simple receiver: weaker packets leave their cells empty
 
 
 @configuration
@@ -80,9 +76,9 @@ class ShoeboxRoom:
             if not bool(((position > 0) & (position < size)).all()):
                 raise InputError(f"a {name} stands outside the room of {self.size} m")
         # mirrored rooms (25, 3) that at most two reflections reach, the room itself first
-        steps = torch.arange(-MAX_ORDER, MAX_ORDER + 1, dtype=torch.float64)
+        steps = torch.arange(-2, 3, dtype=torch.float64)
         rooms = torch.cartesian_prod(steps, steps, steps)
-        rooms = rooms[rooms.abs().sum(dim=1) <= MAX_ORDER]
+        rooms = rooms[rooms.abs().sum(dim=1) <= 2]
         rooms = rooms[rooms.abs().sum(dim=1).argsort(stable=True)]
         inside = torch.where(rooms % 2 == 0, transmitter[:, None], size - transmitter[:, None])
         ray = rooms * size + inside - receiver[:, None]  # (n, 25, 3)
@@ -198,6 +194,9 @@ FLOOR = ShoeboxRoom(
 def rssi_room(n: PositiveInt = 600, seed: NonNegativeInt = 0) -> Rssi:
     """Return simulated RSSI at twelve receivers, one packet a row and receiver on a random channel.
 
+    The transmitter has -8 dBm, packets vary by 2 dB (standard deviation), and a tenth are missed. So are those below
+    -85 dBm, the sensitivity of a simple receiver.
+
     Args:
         n: Number of positions of the transmitter.
         seed: Seed of positions, gains, channels, noise and misses.
@@ -218,9 +217,9 @@ def rssi_room(n: PositiveInt = 600, seed: NonNegativeInt = 0) -> Rssi:
     gain_db = 2 * torch.randn(12, dtype=torch.float64, generator=generator)  # receivers differ
     power = torch.stack([_power(position, place) for place in receiver], dim=1)  # (n, R, channels)
     channel = torch.randint(len(CHANNELS_HZ), (n, 12, 1), generator=generator)
-    noise = PACKET_NOISE_DB * torch.randn(n, 12, dtype=torch.float64, generator=generator)
-    rssi = (TRANSMIT_DBM + gain_db + power.gather(2, channel)[..., 0] + noise).round()
-    missed = (torch.rand(n, 12, generator=generator) < 0.1) | (rssi < SENSITIVITY_DBM)
+    noise = 2.0 * torch.randn(n, 12, dtype=torch.float64, generator=generator)
+    rssi = (-8.0 + gain_db + power.gather(2, channel)[..., 0] + noise).round()
+    missed = (torch.rand(n, 12, generator=generator) < 0.1) | (rssi < -85.0)
     return Rssi(
         torch.where(missed, torch.nan, rssi),
         position,

@@ -29,8 +29,6 @@ from swiftwrf.runtime.validation import check_value, checked
 GRID = AngularGrid.hemisphere(90, 360)  # of spectra that are computed
 OF_SPECTRA = ("line_of_sight", "label", "channel", "frequency_hz")  # arrays beside the spectra in spectrum.npz
 DIRECTION = ("elevation", "azimuth")  # names of the dimensions of a spectrum
-MAX_BAND_RATIO = 2.05  # of the frequencies of channels and of the array; 2 is the way there and back
-MAX_LABEL = torch.tensor([math.tau, math.pi / 2], dtype=torch.float64) + 1e-6  # azimuth and elevation [rad], rounded
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -259,7 +257,8 @@ def to_magnitudes(name: str, value: Any, shape: tuple[int | None, ...]) -> Tenso
 def to_directions(name: str, value: Any, n: int | None = None, missing: bool = False) -> Tensor:
     """Return azimuth and elevation [rad] of n spectra as float64 (n, 2); refuse other numbers, e.g. degrees."""
     found = to_tensor(name, value, torch.float64, (n, 2), missing)
-    if bool((bad := (found.abs() > MAX_LABEL).any(dim=1)).any()):
+    largest = torch.tensor([math.tau, math.pi / 2], dtype=torch.float64) + 1e-6  # from rounding
+    if bool((bad := (found.abs() > largest).any(dim=1)).any()):
         raise InputError(
             f"{name} must be azimuth up to 2 pi and elevation up to pi / 2 [rad], got {found[bad][0].tolist()}; convert "
             "degrees by deg2rad"
@@ -267,8 +266,12 @@ def to_directions(name: str, value: Any, n: int | None = None, missing: bool = F
     return found
 
 
-def snapshot_frequencies(frequency_hz: Numbers | None, channel: Tensor, array: PlanarArray | None) -> Tensor | None:
+def snapshot_frequencies(
+    frequency_hz: Numbers | None, channel: Tensor, array: PlanarArray | None, max_ratio: float = 2.05
+) -> Tensor | None:
     """Return the frequency of each snapshot of channels (n, S, K), float64 (S,) [Hz], checked; None if none are given.
+
+    The ratio to the frequency of the array is at most `max_ratio`; 2 is the way there and back.
 
     Raises:
         InputError: Another number of frequencies than snapshots, one that no carrier has, or one far from the array's.
@@ -278,7 +281,7 @@ def snapshot_frequencies(frequency_hz: Numbers | None, channel: Tensor, array: P
     found = to_tensor("frequency_hz", frequency_hz, torch.float64, (channel.shape[1],))
     low, high = CARRIERS_HZ
     if array is not None:
-        low, high = array.frequency_hz / MAX_BAND_RATIO, array.frequency_hz * MAX_BAND_RATIO
+        low, high = array.frequency_hz / max_ratio, array.frequency_hz * max_ratio
     if len(found) and not low <= float(found.max()) <= 2 * float(found.min()) <= 2 * high:
         raise InputError(
             f"frequency_hz must be frequencies of one carrier's snapshots, {low:.4g} to {high:.4g} Hz, got "

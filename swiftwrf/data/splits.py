@@ -15,11 +15,9 @@ from swiftwrf.data.files import read_text
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.validation import PositiveInt, checked
 
-TEST_SHARE = 0.2
 MIN_TRAINING = 10  # measurements
 MAX_REPEATED = 0.1  # fraction of test rows at training positions, beyond which a split tests look-up
 FOLDS = 5
-PLACE_RADIUS = 0.05  # of a place, relative to the mean spacing of places; repeats by motion capture lie within 3 %
 
 Validation = Literal["random", "block", "session"]
 
@@ -86,13 +84,18 @@ def kept_splits(splits: dict[str, tuple[Tensor, Tensor]], kept: Tensor, n: int) 
     return {name: (train[train >= 0], test[test >= 0]) for name, (train, test) in parts.items()}
 
 
-def places(position: Tensor, n_parts: int = 1) -> Tensor:
+def places(position: Tensor, n_parts: int = 1, radius: float = 0.05) -> Tensor:
     """Return the number of the place of each row (n, 3), int64 (n,).
 
     Robots, motion capture and satellite receivers report other coordinates each time they return to a place. So a place is
-    a ball with a radius of 5 % of the mean spacing of places: sqrt(area / places), or length / places along a line. Its
-    centre is the position with most others within the radius, outside all balls before. The order of the rows has no
-    effect. Each row is a place of its own if there are fewer places than parts.
+    a ball, whose centre is the position with most others within the radius, outside all balls before. The order of the rows
+    has no effect. Each row is a place of its own if there are fewer places than parts.
+
+    Args:
+        position: Positions, (n, 3) [m].
+        n_parts: Number of parts that places are divided into.
+        radius: Radius of the balls in mean spacings of places: sqrt(area / places), or length / places along a line. Repeats
+            by motion capture lie within 0.03.
 
     Example:
         >>> places(torch.tensor([[5.0, 0, 0], [0.0, 0, 0], [5.001, 0, 0]]))
@@ -102,7 +105,7 @@ def places(position: Tensor, n_parts: int = 1) -> Tensor:
     length, width, _ = (spots.amax(dim=0) - spots.amin(dim=0)).sort(descending=True).values.tolist()
     tree, number, last = cKDTree(spots.numpy()), torch.arange(len(spots)), len(spots) + 1
     while (count := int(number.max()) + 1) < last:  # fewer places are farther apart
-        number, last = _balls(tree, PLACE_RADIUS * max((length * width / count) ** 0.5, length / count)), count
+        number, last = _balls(tree, radius * max((length * width / count) ** 0.5, length / count)), count
     return number[spot] if count >= n_parts else torch.arange(len(position))
 
 
@@ -146,12 +149,12 @@ def some_rows(n: int, most: int) -> Tensor:
     return torch.linspace(0, n - 1, min(most, n)).round().long()
 
 
-def random_split(position: Tensor, seed: int) -> tuple[Tensor, Tensor]:
-    """Return training rows and a random fifth as test rows, both ascending. Rows at one place are in one part.
+def random_split(position: Tensor, seed: int, fraction: float = 0.2) -> tuple[Tensor, Tensor]:
+    """Return training rows and a random fraction as test rows, both ascending. Rows at one place are in one part.
 
     Suits positions drawn independently.
     """
-    test = random_rows(position, round(TEST_SHARE * len(position)), seed)
+    test = random_rows(position, round(fraction * len(position)), seed)
     is_test = torch.zeros(len(position), dtype=torch.bool).index_fill(0, test, value=True)
     return (~is_test).nonzero()[:, 0], test
 
@@ -187,9 +190,8 @@ def slabs(position: Tensor, n_slabs: int) -> Tensor:
     return slab
 
 
-def block_split(position: Tensor, seed: int) -> tuple[Tensor, Tensor]:
-    """Return training rows and one slab out of five as test rows, chosen by the seed, both ascending."""
-    n_slabs = round(1 / TEST_SHARE)
+def block_split(position: Tensor, seed: int, n_slabs: int = 5) -> tuple[Tensor, Tensor]:
+    """Return training rows and one slab of several as test rows, chosen by the seed, both ascending."""
     held_out = slabs(position, n_slabs) == seed % n_slabs
     return (~held_out).nonzero()[:, 0], held_out.nonzero()[:, 0]
 

@@ -1,16 +1,102 @@
-"""Errors of several methods at equal test rows: summaries, and differences with intervals over places."""
+"""Summaries of errors, and of differences between methods at equal test rows, with intervals over places."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pandas import DataFrame
+from scipy import stats
 
-from swiftwrf.metrics import ErrorSummary, bootstrap_interval, summary
+
+def median_interval(values: ArrayLike) -> tuple[float, float]:
+    """Return the 95 % confidence interval of the median of independent values (n,), from order statistics.
+
+    With too few values for the confidence it is their range, without values nan.
+
+    Example:
+        >>> median_interval(range(100))
+        (39.0, 60.0)
+    """
+    ordered = np.sort(np.asarray(values, dtype=float))
+    n = len(ordered)
+    if n == 0:
+        return float("nan"), float("nan")
+    low = max(int(stats.binom.ppf(0.025, n, 0.5)) - 1, 0)
+    return float(ordered[low]), float(ordered[n - 1 - low])
+
+
+class ErrorSummary(TypedDict):
+    """Summary of `n` errors or scores; `low` and `high` are the 95 % interval of the median."""
+
+    median: float
+    p90: float
+    mean: float
+    low: float
+    high: float
+    n: int
+
+
+def bootstrap_interval(
+    statistic: Callable[[NDArray[np.int64]], float], group: ArrayLike, n: int = 1000
+) -> tuple[float, float]:
+    """Return the 95 % interval of a statistic of rows, by a bootstrap over groups of rows that are not independent.
+
+    Args:
+        statistic: Function of row numbers (k,), ascending, which may repeat.
+        group: Group of each row, e.g. its place, (rows,) or (rows, k).
+        n: Number of bootstrap samples.
+
+    Example:
+        >>> error, place = np.array([1.0, 1.0, 1.0, 4.0, 4.0, 4.0]), [0, 0, 0, 1, 1, 1]
+        >>> bootstrap_interval(lambda rows: float(np.median(error[rows])), place)
+        (1.0, 4.0)
+    """
+    number = np.unique(np.asarray(group), return_inverse=True, axis=0)[1]
+    n_groups, draw, values = int(number.max()) + 1, np.random.default_rng(0), []
+    for _ in range(n):
+        times = np.bincount(draw.integers(n_groups, size=n_groups), minlength=n_groups)
+        values.append(statistic(np.repeat(np.arange(len(number)), times[number])))
+    low, high = np.percentile(values, (2.5, 97.5)).tolist()
+    return low, high
+
+
+def summary(errors: ArrayLike, group: ArrayLike | None = None) -> ErrorSummary:
+    """Return `median`, `p90`, `mean`, `n` and the 95 % interval of the median (`low`, `high`) of finite errors (n,).
+
+    Args:
+        errors: Errors (n,).
+        group: Group of each error, e.g. its place, (n,) or (n, k). Errors of one group are not independent, so the interval
+            is a bootstrap over groups, and that of a single group the range of its errors. Defaults to independent errors.
+
+    Example:
+        >>> found = summary([1.0, 2.0, 3.0, float("nan")])
+        >>> found["median"], found["n"]
+        (2.0, 3)
+    """
+    values = np.asarray(errors, dtype=float)
+    finite = np.isfinite(values)
+    values = values[finite]
+    if len(values) == 0:
+        nan = float("nan")
+        return ErrorSummary(median=nan, p90=nan, mean=nan, low=nan, high=nan, n=0)
+    low, high = median_interval(values)
+    group = None if group is None else np.asarray(group)[finite]
+    if group is not None and (n_groups := len(np.unique(group, axis=0))) < len(values):
+        low, high = float(values.min()), float(values.max())
+        if n_groups > 1:
+            low, high = bootstrap_interval(lambda rows: float(np.median(values[rows])), group)
+    return {
+        "median": float(np.median(values)),
+        "p90": float(np.percentile(values, 90)),
+        "mean": float(values.mean()),
+        "low": low,
+        "high": high,
+        "n": len(values),
+    }
 
 
 class ChangeMetrics(TypedDict):

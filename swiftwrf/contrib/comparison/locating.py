@@ -16,6 +16,7 @@ from scipy.stats import wasserstein_distance
 from torch import Tensor
 
 from swiftwrf.contrib.comparison.base import Comparison, Recorded, Values
+from swiftwrf.contrib.comparison.errors import summary
 from swiftwrf.contrib.comparison.localizers import LEVELS, LOCALIZERS, PosteriorLocalizer
 from swiftwrf.contrib.comparison.steps import LOCATOR, Memo, Steps
 from swiftwrf.data import Rssi
@@ -24,7 +25,7 @@ from swiftwrf.data.rssi import PLACE
 from swiftwrf.data.splits import Validation, each_fold, folds, places
 from swiftwrf.errors import InputError
 from swiftwrf.locate.rssi import RssiLocator
-from swiftwrf.metrics import LEVEL, summary
+from swiftwrf.metrics import LEVEL
 from swiftwrf.positions import nearest
 from swiftwrf.rssi import estimate_offsets
 from swiftwrf.runtime.checkpoint import load

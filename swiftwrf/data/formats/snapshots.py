@@ -25,7 +25,6 @@ REQUIRED_ARRAYS = ("csi", "position", "frequency_hz", "array_position")
 POSE = ("array_orientation", "array_normal", "array_up")  # the first, or the others
 OPTIONAL = (*POSE, "element_position", "rows", "columns", "spacing_m", "line_of_sight", "time")
 SCALARS = ("frequency_hz", "rows", "columns", "spacing_m")
-SPACINGS_WAVELENGTHS = (0.01, 20.0)  # of neighbouring elements; beyond, the unit is another one
 VECTORS = ("array_position", *POSE, "line_of_sight", "time", "frequency_hz")
 
 
@@ -280,8 +279,11 @@ def pose_of(file: Path, arrays: Arrays) -> ArrayPose:
         return ArrayPose.facing(where, turned, tuple(arrays.get("array_up", np.eye(3)[2]).flatten().tolist()))
 
 
-def array_of(file: Path, arrays: Arrays) -> PlanarArray:
-    """Return the array, described by the positions of its elements or by rows, columns and spacing."""
+def array_of(file: Path, arrays: Arrays, spacing_wavelengths: tuple[float, float] = (0.01, 20.0)) -> PlanarArray:
+    """Return the array, described by the positions of its elements or by rows, columns and spacing.
+
+    Neighbouring elements that are closer or farther apart than the given spacings have another unit.
+    """
     frequency = arrays["frequency_hz"]
     if frequency.shape != ():
         raise InputError(f"{file}: frequency_hz must be one number, the carrier, got shape {frequency.shape}")
@@ -303,7 +305,7 @@ def array_of(file: Path, arrays: Arrays) -> PlanarArray:
         raise InputError(
             f"{file} describes an array of one element, which resolves no directions; at least 2 are needed"
         )
-    apart, (low, high) = array.spacing_wavelengths, SPACINGS_WAVELENGTHS
+    apart, (low, high) = array.spacing_wavelengths, spacing_wavelengths
     if not low <= apart <= high:
         raise InputError(
             f"{file}: neighbouring elements are {apart * array.wavelength:.4g} m, {apart:.3g} wavelengths apart; expected "

@@ -23,7 +23,6 @@ from swiftwrf.errors import InputError, listed
 RECEIVERS = "receivers.csv"  # beside the table: receiver,x,y,z
 COORDINATES = re.compile(r"(?:crd|coord(?:inate)?s?|pos(?:ition)?s?|loc(?:ation)?s?|places?)(?![a-z])")
 HALF = re.compile(rf"[ _-]*(?:rssi?(?![a-z])|{COORDINATES.pattern})[ _-]*")
-MAX_COORDINATES = 6  # columns of a table of positions: x, y, z, floor, building, ...
 
 
 class SurveyTable(Format[Rssi]):
@@ -90,12 +89,15 @@ def _table(path: Path) -> tuple[Path, list[Path], pd.DataFrame]:
     return file, [other], table
 
 
-def _holds_places(file: Path, table: pd.DataFrame) -> bool | None:
-    """Return True for a table of positions alone, False for one of RSSI alone, None for another one."""
+def _holds_places(file: Path, table: pd.DataFrame, max_columns: int = 6) -> bool | None:
+    """Return True for a table of positions alone, False for one of RSSI alone, None for another one.
+
+    Positions have up to 6 columns: x, y, z, floor, building, ...
+    """
     powers = [is_rssi(table[name]) and not is_coordinate(name) for name in table]
     if has_positions(table, {}):
-        return None if any(powers) or len(powers) > MAX_COORDINATES else True
-    may_be_places = 2 <= len(powers) <= MAX_COORDINATES and "1" in table  # without header
+        return None if any(powers) or len(powers) > max_columns else True
+    may_be_places = 2 <= len(powers) <= max_columns and "1" in table  # without header
     if may_be_places and (not all(powers) or COORDINATES.search(file.stem.lower())):
         return True
     return False if all(powers) else None
