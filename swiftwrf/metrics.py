@@ -1,7 +1,7 @@
 """Errors of spectra and angles as the papers of this field define them, and the factor of calibrated intervals.
 
 SSIM is scikit-image's default (7 x 7 uniform window, sample covariance, borders cropped) with data_range 1; PSNR is
-10 log10(1 / MSE) per spectrum. Other conventions move SSIM by up to 0.07, so tables name this one.
+10 log10(1 / MSE) of each spectrum. Other conventions move SSIM by up to 0.07, so tables name this one.
 """
 
 from __future__ import annotations
@@ -149,9 +149,9 @@ def angle_errors(estimate: Tensor | NDArray[np.floating], truth: Tensor | NDArra
         >>> round(float(errors["azimuth"]), 2), round(float(errors["great_circle"]), 2)
         (0.18, 0.18)
     """
-    found, true = (torch.as_tensor(given, dtype=torch.float64) for given in (estimate, truth))
+    estimated, true = (torch.as_tensor(given, dtype=torch.float64) for given in (estimate, truth))
     return {
-        "azimuth": wrap(found[:, 0] - true[:, 0]).abs(),
-        "elevation": (found[:, 1] - true[:, 1]).abs(),
-        "great_circle": angular_distance(to_direction(*found.unbind(-1)), to_direction(*true.unbind(-1))),
+        "azimuth": wrap(estimated[:, 0] - true[:, 0]).abs(),
+        "elevation": (estimated[:, 1] - true[:, 1]).abs(),
+        "great_circle": angular_distance(to_direction(*estimated.unbind(-1)), to_direction(*true.unbind(-1))),
     }

@@ -82,10 +82,10 @@ def candidates(table: pd.DataFrame, role: str) -> list[str]:
     A column of powers does not hold names of receivers.
     """
     plain = {name: plain_name(name) for name in map(str, table.columns)}
-    found = [name for pattern in ROLES[role] for name in plain if re.fullmatch(pattern, plain[name])]
+    matches = [name for pattern in ROLES[role] for name in plain if re.fullmatch(pattern, plain[name])]
     if role == "receiver":
-        return [name for name in found if not is_rssi(table[name])]
-    return [name for name in found if not NO_POWER.fullmatch(plain[name])]
+        return [name for name in matches if not is_rssi(table[name])]
+    return [name for name in matches if not NO_POWER.fullmatch(plain[name])]
 
 
 def find_roles(
@@ -103,14 +103,15 @@ def find_roles(
             raise InputError(f"{label} has no column {name!r} for {role}; there are {listed(table.columns)}")
     roles = {role: name for role, name in asked.items() if name in table.columns}
     for role in ROLES:
-        found = [name for name in candidates(table, role) if name not in (*roles.values(), *taken)]
-        if role in asked or not found:
+        matches = [name for name in candidates(table, role) if name not in (*roles.values(), *taken)]
+        if role in asked or not matches:
             continue
-        if len(found) > 1 and role in (*GEODETIC, *GEODETIC.values()):
+        if len(matches) > 1 and role in (*GEODETIC, *GEODETIC.values()):
             raise InputError(
-                f"{label} has {len(found)} columns that may be {role} ({listed(found)}); choose one with columns {role}=NAME"
+                f"{label} has {len(matches)} columns that may be {role} ({listed(matches)}); choose one with columns "
+                f"{role}=NAME"
             )
-        roles[role] = found[0]
+        roles[role] = matches[0]
     for role, other in GEODETIC.items():
         if other in roles and role in roles:
             del roles[other]
@@ -155,25 +156,25 @@ def receiver_columns(
         >>> receiver_columns(table, list(table))[0]
         ['AP1', 'AP2']
     """
-    found = [name for name in names if is_rssi(table[name]) and not is_coordinate(name)]
-    plain = {name: plain_name(name) for name in found}
-    others = [name for name in found if NO_POWER.fullmatch(plain[name])]
-    bare = [name for name in candidates(table, "rssi") if name in found]
+    receivers = [name for name in names if is_rssi(table[name]) and not is_coordinate(name)]
+    plain = {name: plain_name(name) for name in receivers}
+    others = [name for name in receivers if NO_POWER.fullmatch(plain[name])]
+    bare = [name for name in candidates(table, "rssi") if name in receivers]
     weaker = bare[1:]
-    found = [name for name in found if name not in (*others, *weaker)]
-    values = {name: parsed(table[name])[0] for name in found}
+    receivers = [name for name in receivers if name not in (*others, *weaker)]
+    values = {name: parsed(table[name])[0] for name in receivers}
     powers = {name: v[np.isfinite(v) & ~np.isin(v, KNOWN_FILLERS)] for name, v in values.items()}
     usual = {
         name: not len(p) or (np.median(p) <= max_median_dbm and (p > 0).mean() < max_positive)
         for name, p in powers.items()
     }
-    plausible = [name for name in found if usual[name]] or found
+    plausible = [name for name in receivers if usual[name]] or receivers
     of_integers = [name for name in plausible if (powers[name] % 1 == 0).all()]
     reference = of_integers if len(of_integers) > 1 or set(of_integers) & set(bare) else plausible
     if len(table) < min_rows:  # e.g. one of a stream
-        reference = found
+        reference = receivers
     kin = {_kinship(plain[name]) for name in reference}
-    doubtful = [name for name in found if name not in reference and _kinship(plain[name]) not in kin]
+    doubtful = [name for name in receivers if name not in reference and _kinship(plain[name]) not in kin]
     notes = []
     if others or weaker:
         notes.append(f"columns of other quantities than the received power are left out: {listed([*others, *weaker])}")
@@ -182,13 +183,13 @@ def receiver_columns(
             f"columns are left out whose values are unlike those of {listed(reference[:3])}: {listed(doubtful)}; if "
             "they are receivers, give --columns rssi=PATTERN"
         )
-    found = [name for name in found if name not in doubtful]
-    families = pd.Series([_kinship(plain[name]) for name in found], dtype=object)
+    receivers = [name for name in receivers if name not in doubtful]
+    families = pd.Series([_kinship(plain[name]) for name in receivers], dtype=object)
     sizes = families.value_counts()
-    if len(sizes) > 1 and sizes.iloc[0] >= max(3, 0.6 * len(found)):
-        odd = [name for name, family in zip(found, families, strict=True) if family != sizes.index[0]]
+    if len(sizes) > 1 and sizes.iloc[0] >= max(3, 0.6 * len(receivers)):
+        odd = [name for name, family in zip(receivers, families, strict=True) if family != sizes.index[0]]
         notes.append(f"columns count as receivers though they are named unlike the others: {listed(odd)}")
-    return found, [*others, *weaker, *doubtful], notes
+    return receivers, [*others, *weaker, *doubtful], notes
 
 
 def _kinship(name: str) -> str:

@@ -53,7 +53,7 @@ def stated_scale(text: str) -> float | None:
         (20.7, 20.0, None)
     """
     for pattern, power in SCALES:
-        if (found := pattern.search(text)) and (value := float(found[1].replace(",", "."))) > 0:
+        if (match := pattern.search(text)) and (value := float(match[1].replace(",", "."))) > 0:
             return float(value**power)
     return None
 
@@ -168,17 +168,19 @@ def without_fix(position: Floats) -> tuple[NDArray[np.bool_], list[str]]:
         array([False, False,  True,  True])
     """
     empty, finite = np.isnan(position.sum(axis=1)), np.isfinite(position).all(axis=1)
-    found = {"without a position": empty}
+    reasons = {"without a position": empty}
     omitted = empty.copy()
     for value in NO_FIX:
         rows = (position[:, 0] == value) & (position[:, 1] == value)
         if (rows.sum() > 1 or (value == 0 and rows.any())) and _is_apart(
             position[finite & ~omitted & ~rows], position[rows]
         ):
-            found[f"at {value:g}, {value:g}, apart from all others"] = rows
+            reasons[f"at {value:g}, {value:g}, apart from all others"] = rows
             omitted |= rows
     notes = [
-        f"rows {what} are left out: {int(rows.sum())} of {len(position)}" for what, rows in found.items() if rows.any()
+        f"rows {what} are left out: {int(rows.sum())} of {len(position)}"
+        for what, rows in reasons.items()
+        if rows.any()
     ]
     return omitted, notes
 
@@ -325,7 +327,7 @@ def floors_of(label: object, floor: list[str], position: Floats) -> Floors | Non
     """
     of_row = np.array(floor, dtype=object)
     rows = {name: position[of_row == name] for name in set(floor) - {""}}
-    height = {name: float(np.median(own[:, 2])) for name, own in rows.items()}
+    height = {name: float(np.median(at[:, 2])) for name, at in rows.items()}
     levels: list[list[str]] = []
     for name in sorted(height, key=lambda name: (height[name], name)):
         if levels and height[name] - height[levels[-1][0]] < MIN_STOREY_M:

@@ -52,10 +52,10 @@ class Labelled(ABC):
         Raises:
             InputError: xarray is not installed.
         """
-        found: xarray.Dataset = optional_module("xarray", "to_xarray needs xarray", "xarray").Dataset(
+        dataset: xarray.Dataset = optional_module("xarray", "to_xarray needs xarray", "xarray").Dataset(
             self.variables(), self.coordinates()
         )
-        return found
+        return dataset
 
 
 def position_coordinates(position: NDArray[np.float64], origin: GeodeticOrigin | None = None) -> Arrays:
@@ -65,12 +65,12 @@ def position_coordinates(position: NDArray[np.float64], origin: GeodeticOrigin |
         >>> list(position_coordinates(np.zeros((2, 3)), GeodeticOrigin(48.0, 11.0)))
         ['x', 'y', 'z', 'latitude', 'longitude']
     """
-    found: Arrays = {
+    coordinates: Arrays = {
         axis: (("position",), values, {"units": "m"}) for axis, values in zip("xyz", position.T, strict=True)
     }
     for (name, units), values in zip(DEGREE_UNITS.items(), degree_columns(origin, position).values(), strict=False):
-        found[name] = (("position",), values, {"units": units})
-    return found
+        coordinates[name] = (("position",), values, {"units": units})
+    return coordinates
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -147,18 +147,18 @@ class PositionedData(Labelled, Displayed):
             (10, [4, 29])
         """
         try:
-            found = np.arange(len(self))[rows.cpu().numpy() if isinstance(rows, Tensor) else rows]
+            chosen = np.arange(len(self))[rows.cpu().numpy() if isinstance(rows, Tensor) else rows]
         except CONTENT_ERRORS:
-            found = None
-        if found is None or found.ndim != 1:
+            chosen = None
+        if chosen is None or chosen.ndim != 1:
             raise InputError(
                 f"rows of {self.name} must be a list of numbers below {len(self)}, a mask of that length or a slice, "
                 f"got {rows!r}"
             )
-        number = torch.from_numpy(found.copy())
+        number = torch.from_numpy(chosen.copy())
         values = {field: getattr(self, field) for field in self.row_fields}
         kept: dict[str, Any] = {
-            f: v[number] if isinstance(v, Tensor) else v.iloc[found] if isinstance(v, pd.Series) else v.subset(number)
+            f: v[number] if isinstance(v, Tensor) else v.iloc[chosen] if isinstance(v, pd.Series) else v.subset(number)
             for f, v in values.items()
             if v is not None
         }
@@ -173,21 +173,21 @@ class PositionedData(Labelled, Displayed):
         """
         values, time = getattr(self, self.row_fields[1]), getattr(self, "time", None)
         number = torch.stack([self.index.double(), torch.zeros(len(self)).double() if time is None else time], dim=1)
-        found = [b""]
+        digests = [b""]
         for rows in [slice(None)] if isinstance(values, Tensor) else values.parts():
             part = values[rows].flatten(1)
-            some = part[:, :: max(1, part.shape[1] // max_values)].double()
-            known = torch.cat([number[rows], self._position[rows], some], dim=1)
+            sample = part[:, :: max(1, part.shape[1] // max_values)].double()
+            known = torch.cat([number[rows], self._position[rows], sample], dim=1)
             cells = (1000 * known).round().nan_to_num(-1.0).long().numpy()  # to a millisecond and a millimetre
-            found += [hashlib.blake2b(cell.tobytes(), digest_size=8).digest() for cell in cells]
-        return torch.from_numpy(np.frombuffer(b"".join(found), np.int64).copy())
+            digests += [hashlib.blake2b(cell.tobytes(), digest_size=8).digest() for cell in cells]
+        return torch.from_numpy(np.frombuffer(b"".join(digests), np.int64).copy())
 
     def derived(self: Data, **fields: Any) -> Data:
         """Return a copy with other values of some fields, which follow from checked ones and are not checked again."""
-        found: Data = object.__new__(type(self))
+        copy: Data = object.__new__(type(self))
         for field, value in (vars(self) | fields).items():
-            object.__setattr__(found, field, value)
-        return found
+            object.__setattr__(copy, field, value)
+        return copy
 
     @checked
     def split(self: Data, name: str = "random", seed: NonNegativeInt = 0) -> tuple[Data, Data]:
@@ -238,8 +238,8 @@ class PositionedData(Labelled, Displayed):
         return f"{head}\n positions over {extent(self._position)}>"
 
     def _facts(self) -> dict[str, str]:
-        found = {"name": self.name, "measurements": self._summary(), "positions over": extent(self._position)}
-        return found | {f"note {number}": note for number, note in enumerate(self.notes, start=1)}
+        facts = {"name": self.name, "measurements": self._summary(), "positions over": extent(self._position)}
+        return facts | {f"note {number}": note for number, note in enumerate(self.notes, start=1)}
 
     def _summary(self) -> str:
         """Return number and kind of the measurements."""

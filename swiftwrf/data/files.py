@@ -117,8 +117,8 @@ def read_yaml(file: Path) -> dict[str, Any]:
 
 def numbers(value: Any, count: int) -> tuple[float, ...] | None:
     """Return `count` finite numbers from a list of `read_yaml`, None if it is something else."""
-    found = tuple(number(item) for item in value) if isinstance(value, list) and len(value) == count else (math.nan,)
-    return found if all(map(math.isfinite, found)) else None
+    values = tuple(number(item) for item in value) if isinstance(value, list) and len(value) == count else (math.nan,)
+    return values if all(map(math.isfinite, values)) else None
 
 
 def _lines_before_header(text: str, max_lines: int = 20, max_missing_cells: int = 3) -> int:

@@ -39,17 +39,17 @@ def find_fillers(
     is_filler = impossible & np.isin(value, KNOWN_FILLERS)
     if (others := impossible & ~is_filler).sum() == 1:
         is_filler |= others & (count >= min_repeats)
-    found: list[float] = value[is_filler].tolist()
+    fillers: list[float] = value[is_filler].tolist()
     value, count = value[~impossible], count[~impossible]
     while len(value) and value[-1] >= min_usual_dbm and _is_frequent(value, count, len(value) - 1, within_db):
-        found.append(float(value[-1]))
+        fillers.append(float(value[-1]))
         value, count = value[:-1], count[:-1]
     usual = np.flatnonzero(value == NOT_DETECTED_DBM)
     if len(usual) and (usual[0] == 0 or _is_frequent(value, count, int(usual[0]))):
-        found.append(NOT_DETECTED_DBM)
+        fillers.append(NOT_DETECTED_DBM)
     elif _fills_the_lower_edge(rssi, value, count):
-        found.append(float(value[0]))
-    return found
+        fillers.append(float(value[0]))
+    return fillers
 
 
 def has_frequent_edge(rssi: Floats, min_values: int = 5, min_fraction: float = 0.2) -> bool:

@@ -47,12 +47,12 @@ def spelled_as(names: Sequence[str], known: Sequence[str]) -> tuple[list[str], l
     plain = plain[~plain.index.duplicated(keep=False)]
     mine = pd.Series([plain_receiver(name) for name in names], dtype=object)
     once = ~mine.duplicated(keep=False)
-    found = [
+    spelled = [
         plain[key] if name not in known and single and key in plain.index else name
         for name, key, single in zip(names, mine, once, strict=True)
     ]
-    other = [f"{name} is {as_known}" for name, as_known in zip(names, found, strict=True) if name != as_known]
-    return found, [f"receivers are matched whose names are spelled differently: {listed(other)}"] * bool(other)
+    other = [f"{name} is {as_known}" for name, as_known in zip(names, spelled, strict=True) if name != as_known]
+    return spelled, [f"receivers are matched whose names are spelled differently: {listed(other)}"] * bool(other)
 
 
 def pool_names(names: Sequence[str], by: str) -> list[str]:
@@ -75,10 +75,10 @@ def pool_names(names: Sequence[str], by: str) -> list[str]:
         raise InputError(f"pool_by {by!r} is no column and no regular expression ({error})") from None
     if pattern.groups != 1:
         raise InputError(f"pool_by takes mac, a column, or a regular expression with one group, got {by!r}")
-    found = [pattern.fullmatch(name) for name in names]
-    if not any(found):
+    matches = [pattern.fullmatch(name) for name in names]
+    if not any(matches):
         raise InputError(f"pool_by {by!r} matches no receiver; there are {listed(names)}")
-    return [name if match is None else match.group(1) for name, match in zip(names, found, strict=True)]
+    return [name if match is None else match.group(1) for name, match in zip(names, matches, strict=True)]
 
 
 def read_receivers(
@@ -111,10 +111,10 @@ def read_receivers(
     unknown = [name for name in names if name not in place]
     if len(unknown) == len(names):
         raise InputError(f"{file} has none of the receivers ({listed(names)}); there are {listed(listed_names)}")
-    found = torch.tensor([place.get(name, [float("nan")] * 3) for name in names], dtype=torch.float64)
+    positions = torch.tensor([place.get(name, [float("nan")] * 3) for name in names], dtype=torch.float64)
     if unknown:
         notes.append(f"the position of these receivers is unknown, so they have no path-loss model: {listed(unknown)}")
-    return found, notes
+    return positions, notes
 
 
 def _positions_by_name(file: Path, names: Sequence[str]) -> pd.DataFrame:
@@ -122,7 +122,7 @@ def _positions_by_name(file: Path, names: Sequence[str]) -> pd.DataFrame:
     content = {name: value for name, value in read_yaml(file).items() if value not in ("", "~", "null", "none")}
     place = {name: numbers(value, 3) for name, value in content.items()}
     spelled, _ = spelled_as(list(content), names)
-    if wrong := [name for name, own in zip(content, spelled, strict=True) if place[name] is None and own in names]:
+    if wrong := [name for name, known in zip(content, spelled, strict=True) if place[name] is None and known in names]:
         got = reprlib.repr(content[wrong[0]])  # references may make it as long as any memory
         raise InputError(f"{file}: receiver {wrong[0]!r} needs a position of 3 finite numbers [m], got {got}")
     rows = [(name, *position) for name, position in place.items() if position is not None]

@@ -158,7 +158,7 @@ def simulated_room(
     pose = FACING_X if moving == "transmitter" else CEILING
     fixed = torch.tensor(pose.position, dtype=torch.float64)
     array = PlanarArray.square(4, room.frequency_hz)
-    links = [(some, fixed) if moving == "transmitter" else (fixed, some) for some in position.split(BATCH_POSITIONS)]
+    links = [(part, fixed) if moving == "transmitter" else (fixed, part) for part in position.split(BATCH_POSITIONS)]
     parts = [room.paths(*ends) for ends in links]
     channel = torch.cat([paths.channel(array, pose.rotation) for paths in parts])
     noise = phase_noise * torch.randn(channel.shape, dtype=torch.float64, generator=generator)
@@ -231,7 +231,7 @@ def rssi_room(n: PositiveInt = 600, seed: NonNegativeInt = 0) -> Rssi:
 
 def _power(position: Tensor, receiver: Tensor) -> Tensor:
     """Return the power gain of the coherent sum of all paths on each channel, (n, channels) [dB]."""
-    paths = PropagationPaths.joined([FLOOR.paths(some, receiver) for some in position.split(BATCH_POSITIONS)])
+    paths = PropagationPaths.joined([FLOOR.paths(part, receiver) for part in position.split(BATCH_POSITIONS)])
     assert paths.length is not None
     power = []
     for frequency in CHANNELS_HZ:

@@ -114,8 +114,8 @@ def _balls(tree: cKDTree, radius: float) -> Tensor:
     number, count, size = np.full(tree.n, -1), 0, tree.query_ball_point(tree.data, radius, return_length=True)
     for row in np.argsort(-size, kind="stable"):
         if number[row] < 0:
-            own = np.array([row] if size[row] == 1 else tree.query_ball_point(tree.data[row], radius))
-            number[own[number[own] < 0]] = count
+            inside = np.array([row] if size[row] == 1 else tree.query_ball_point(tree.data[row], radius))
+            number[inside[number[inside] < 0]] = count
             count += 1
     return torch.from_numpy(number)
 
@@ -222,13 +222,13 @@ def folds(
     if validation == "session":
         if session is None:
             raise InputError('validation="session" needs measurements with sessions, see docs/formats.md')
-        _, own, size = session.unique(return_inverse=True, return_counts=True)
+        _, number_of_session, size = session.unique(return_inverse=True, return_counts=True)
         if len(size) > 1:  # whole sessions in folds of nearly equal size
             fold, filled = torch.zeros_like(size), torch.zeros(min(number, len(size)), dtype=torch.int64)
             for which in size.argsort(descending=True, stable=True).tolist():
                 fold[which] = filled.argmin()
                 filled[fold[which]] += size[which]
-            return fold[own]
+            return fold[number_of_session]
     if validation == "block":
         return slabs(position, number)
     place = places(position, number)

@@ -448,7 +448,7 @@ class _Survey:
         ends = self.coordinate[:, 3:], self.coordinate[:, :3]
         other, self.coordinate = sorted(ends, key=lambda end: len(np.unique(end, axis=0)))
         number, edge = cells(torch.from_numpy(other), max_receivers)
-        position = pd.DataFrame(other).groupby(number.numpy()).mean().to_numpy()
+        position: Floats = pd.DataFrame(other).groupby(number.numpy()).mean().to_numpy()
         n = len(position)
         self.notes.append(f"both ends move; {n} positions of one of them count as receivers place1 to place{n}")
         if edge:
@@ -546,7 +546,7 @@ def _columns_of_end(label: object, table: pd.DataFrame, given: Sequence[str]) ->
         return next((MARKS[word] for word in plain_name(name).split("_") if word in MARKS), "")
 
     marked = {axis: {end_of(name): name for name in reversed(candidates(table, axis))} for axis in "xyz"}
-    for mark, beside in (("transmitter", {"receiver", ""}), ("receiver", {""})):
-        if all(mark in marked[axis] and beside & marked[axis].keys() for axis in "xy"):
+    for mark, others in (("transmitter", {"receiver", ""}), ("receiver", {""})):
+        if all(mark in marked[axis] and others & marked[axis].keys() for axis in "xy"):
             return {axis: names[mark] for axis, names in marked.items() if mark in names}
     return {}

@@ -34,7 +34,7 @@ class Descent(ABC, Generic[Model]):
         groups: Parameter groups of Adam, each with its peak learning rate, `peak`.
         steps: Number of steps.
         check_every: Steps between two evaluations, at which a record is sent and the state is saved.
-        averaging: Decay per step of the weights in the averaged parameters; 0 takes the last parameters.
+        averaging: Decay of the weight of earlier parameters at each step; 0 takes the last parameters.
         clip: Maximum norm of the gradient.
         betas, weight_decay: Options of Adam.
         max_growth: A fit is refused if its loss ends above this multiple of the first one. It exceeds 1, because steps have

@@ -138,15 +138,15 @@ def read(path: str | Path, options: ReadOptions, *registries: Registry[Format[An
     try:
         readers = [(name, registry[name]()) for registry in registries for name in registry]
         # names of arrays state the format
-        found = [(n, r) for n, r in readers if ("arrays" in r.takes if options.arrays else r.recognises(source))]
-        if not found:
+        matches = [(n, r) for n, r in readers if ("arrays" in r.takes if options.arrays else r.recognises(source))]
+        if not matches:
             raise InputError(f"{source} is in none of the known formats ({known}); docs/formats.md describes them")
-        if len(found) > 1:
-            names = " and ".join(name for name, _ in found)
+        if len(matches) > 1:
+            names = " and ".join(name for name, _ in matches)
             raise InputError(
                 f"{source} holds several formats ({names}); keep one in the folder, or name the file itself"
             )
-        ((name, reader),) = found
+        ((name, reader),) = matches
         logger.info("%s is read as %s", source, name)
         for option in options.given:
             if option not in reader.takes:
@@ -165,8 +165,8 @@ def read_spectra(path: str | Path, options: ReadOptions) -> Spectra:
     Raises:
         InputError: As `read`.
     """
-    found: Spectra = options.spectra_of(read(path, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS))
-    return found
+    spectra: Spectra = options.spectra_of(read(path, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS))
+    return spectra
 
 
 def station(holds: str, names: Sequence[str], number: int | None) -> int:

@@ -42,8 +42,8 @@ class SnapshotArrays(Format[Snapshots]):
         if file.is_dir() or stated.keys() - name.keys():
             raise InputError(f"arrays takes {', '.join(name)} of a file that is named, got {listed(stated)} of {file}")
         needed = [name[array] for array in dict.fromkeys((*REQUIRED_ARRAYS, *stated))]
-        found = read_arrays(file, needed, [name[array] for array in OPTIONAL if array not in stated])
-        arrays = {array: found[own] for array, own in name.items() if own in found}
+        stored = read_arrays(file, needed, [name[array] for array in OPTIONAL if array not in stated])
+        arrays = {array: stored[name_in_file] for array, name_in_file in name.items() if name_in_file in stored}
         return snapshots_of(file, arrays, options, [file], file.stem if file.stem != "snapshots" else None)
 
 
@@ -147,7 +147,7 @@ def _polarisations(source: Path, arrays: Arrays) -> tuple[Arrays, tuple[str, ...
         )
     order = np.argsort(place.reshape(-1), kind="stable").reshape(-1, ports).T  # elements of each polarisation
     order = order[:, np.argsort(order[0])]
-    split = np.concatenate([csi.reshape(len(csi), -1, len(element))[..., some] for some in order], axis=1)
+    split = np.concatenate([csi.reshape(len(csi), -1, len(element))[..., elements] for elements in order], axis=1)
     arrays |= {"csi": split, "element_position": element[order[0]]}
     if carrier.ndim == 1 and csi.ndim == 3:
         arrays |= {"frequency_hz": np.tile(carrier, ports)}
@@ -230,8 +230,8 @@ def measured(
                 f"null subcarriers, the same at every position and element, are {used_how} ({int(null.sum())} of {count}, "
                 f"counted from 0): {ranges(null.nonzero()[:, 0].tolist())}{remedy}"
             )
-    if some := int((missing & ~empty[..., None]).sum()):
-        notes.append(f"{some} of {missing.numel()} values of single elements are 0 or NaN and not used")
+    if n_single := int((missing & ~empty[..., None]).sum()):
+        notes.append(f"{n_single} of {missing.numel()} values of single elements are 0 or NaN and not used")
     return channel[:, kept], kept.nonzero()[:, 0], used.nonzero()[:, 0], tuple(notes)
 
 

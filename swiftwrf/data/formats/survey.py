@@ -38,11 +38,11 @@ class SurveyTable(Format[Rssi]):
         receivers = file.with_name(RECEIVERS)
         stated = receivers if receivers.is_file() else None
         splits = read_splits(file.parent, len(table), first=0)
-        found = read_survey(file, table, options, stated, keeps_rows=bool(splits))
+        arguments = read_survey(file, table, options, stated, keeps_rows=bool(splits))
         data = Rssi(
-            **found,
+            **arguments,
             name=file.stem,
-            named_splits=kept_splits(splits, torch.from_numpy(found["index"]), len(table)),
+            named_splits=kept_splits(splits, torch.from_numpy(arguments["index"]), len(table)),
             source=digests([file, *others, *([stated] if stated else [])], file.parent),
         )
         if data.receiver_moves and bool(data.receiver_position.isnan().any()):
