@@ -155,15 +155,15 @@ def cells(position: Tensor, n: int) -> tuple[Tensor, float]:
     if int(spot.max()) < n:
         return spot, 0.0
     local = position - position.min(dim=0).values
-    fine, coarse, coarsest = 0.0, float(local.max()), torch.zeros(len(position), dtype=torch.int64)
+    fine, coarse, cell = 0.0, float(local.max()), torch.zeros(len(position), dtype=torch.int64)
     for _ in range(20):  # to a millionth of the extent
         edge = (fine + coarse) / 2
         number = torch.unique((local / edge).floor().long(), dim=0, return_inverse=True)[1]
         if int(number.max()) < n:
-            coarse, coarsest = edge, number
+            coarse, cell = edge, number
         else:
             fine = edge
-    return coarsest, coarse
+    return cell, coarse
 
 
 class Neighbours:

@@ -138,6 +138,7 @@ def receiver_columns(
     min_rows: int = 5,
     max_median_dbm: float = -25.0,
     max_positive: float = 0.02,
+    min_family: float = 0.6,
 ) -> tuple[list[str], list[str], list[str]]:
     """Return those columns that hold the RSSI of receivers, others that look like it, and notes on these.
 
@@ -150,6 +151,7 @@ def receiver_columns(
         min_rows: Values are compared from this number of rows on. The bounds are not studied.
         max_median_dbm: Largest median of a column that is a received power by its values alone.
         max_positive: Fraction of positive values in such a column, at most.
+        min_family: Fraction of the receivers with names of one kind, from which on others are reported.
 
     Example:
         >>> table = pd.DataFrame({"AP1": [-60] * 9, "AP2": [-70] * 9, "SNR": [-3] * 9, "drift": [-20.5] * 9})
@@ -186,7 +188,7 @@ def receiver_columns(
     receivers = [name for name in receivers if name not in doubtful]
     families = pd.Series([_kinship(plain[name]) for name in receivers], dtype=object)
     sizes = families.value_counts()
-    if len(sizes) > 1 and sizes.iloc[0] >= max(3, 0.6 * len(receivers)):
+    if len(sizes) > 1 and sizes.iloc[0] >= max(3, min_family * len(receivers)):
         odd = [name for name, family in zip(receivers, families, strict=True) if family != sizes.index[0]]
         notes.append(f"columns count as receivers though they are named unlike the others: {listed(odd)}")
     return receivers, [*others, *weaker, *doubtful], notes
@@ -200,12 +202,21 @@ def _kinship(name: str) -> str:
 
 
 def check_receiver_known(
-    label: object, table: pd.DataFrame, rssi: str, others: Sequence[str], place: Sequence[str]
+    label: object,
+    table: pd.DataFrame,
+    rssi: str,
+    others: Sequence[str],
+    place: Sequence[str],
+    min_repeats: float = 3.0,
+    min_text: float = 0.9,
+    min_together: float = 0.3,
+    min_different: float = 0.8,
+    min_changes: float = 0.5,
 ) -> None:
     """Refuse a table with one column of RSSI beside names that may be those of its receivers.
 
-    Such names repeat in one of the other columns. Several of them occur at one place and time, or they alternate from row to
-    row.
+    Such names repeat in one of the other columns, each in `min_repeats` rows on average. Several of them occur at one place
+    and time, or they alternate from row to row. All other bounds are fractions of rows. None of them was studied.
 
     Raises:
         InputError: The question whether the column contains the receivers.
@@ -217,12 +228,12 @@ def check_receiver_known(
         cell = text_of(table[name])
         values, is_text = parsed(table[name])
         count = cell.value_counts()
-        if not 2 <= len(count) <= len(cell) / 3 or "" in count.index:
+        if not 2 <= len(count) <= len(cell) / min_repeats or "" in count.index:
             continue
-        is_name = is_text.mean() > 0.9 or bool((values % 1 == 0).all())
+        is_name = is_text.mean() > min_text or bool((values % 1 == 0).all())
         apart = ~pd.DataFrame({"row": together, "cell": cell}).duplicated(keep=False)
-        is_packet = several.mean() > 0.3 and apart[several].mean() > 0.8
-        alternates = is_text.all() and not several.any() and (cell != cell.shift()).mean() > 0.5
+        is_packet = several.mean() > min_together and apart[several].mean() > min_different
+        alternates = is_text.all() and not several.any() and (cell != cell.shift()).mean() > min_changes
         if (group := GROUPS_OF_ROWS.fullmatch(plain_name(name))) and not (timed and is_packet and group[1] == "device"):
             continue
         if is_name and (is_packet or alternates):

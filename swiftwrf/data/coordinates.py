@@ -210,8 +210,6 @@ def degrees_in(
     far_ratio: float = 10.0,
     max_extent_deg: float = 2.0,
     max_walk_deg: float = 0.05,
-    min_extent_m: float = 2.0,
-    max_extent_minutes: float = 30.0,
 ) -> tuple[Floats | None, list[str]]:
     """Return latitudes and longitudes (n, 2) [deg], None if the coordinates are metres, and a note on their unit.
 
@@ -227,8 +225,6 @@ def degrees_in(
         far_ratio: Distance of degrees from 0, 0 in their extents, at least. The bounds are not studied.
         max_extent_deg: Largest extent of positions that are recognised as degrees.
         max_walk_deg: Largest extent of degrees without names, 5 km: in metres it is 5 cm, and no walk.
-        min_extent_m: Extent of a walk in metres.
-        max_extent_minutes: Largest extent of a walk in ddmm.mmmm.
 
     Raises:
         InputError: Values that are no degrees though the user or their names state it, or that may be either.
@@ -244,19 +240,7 @@ def degrees_in(
         return None, notes
     size = np.abs(xy)
     if named and (size > 180).any():
-        degree, minutes = np.divmod(size, 100)
-        extent = float(np.ptp(xy, axis=0).max())
-        if bool((xy % 1 == 0).all()) and (size <= (180e7, 90e7)).all() and size.min(axis=0).max() >= 1e7:
-            xy = xy / 1e7
-            notes.append(f"{columns} count 1e-7 degrees, which are converted to degrees")
-        elif not ((minutes >= 60).any() or (degree > (180, 90)).any() or extent > max_extent_minutes):
-            if extent > min_extent_m:
-                raise InputError(
-                    f"{label}: {columns} may be degrees and minutes (ddmm.mmmm) or metres; convert them to degrees, or "
-                    "give --coordinates metres"
-                )
-            xy = np.sign(xy) * (degree + minutes / 60)
-            notes.append(f"{columns} count degrees and minutes (ddmm.mmmm), which are converted to degrees")
+        xy, notes = _plain_degrees(label, columns, xy)
     swapped = not named and bool((np.abs(xy[:, 1]) > 90).any())
     degrees = xy if swapped else xy[:, ::-1]
     stated = named or asked == "degrees"
@@ -284,6 +268,31 @@ def degrees_in(
         f"{label}: {columns} extend over {extent:.3g} and may be degrees or metres; choose --coordinates degrees or "
         "--coordinates metres"
     )
+
+
+def _plain_degrees(
+    label: object, columns: str, xy: Floats, min_extent_m: float = 2.0, max_extent_minutes: float = 30.0
+) -> tuple[Floats, list[str]]:
+    """Return values (n, 2) [deg] of counts of 1e-7 degrees or of ddmm.mmmm, and a note; others as they are.
+
+    A walk extends over at least `min_extent_m` in metres, and at most `max_extent_minutes` in ddmm.mmmm (not studied).
+
+    Raises:
+        InputError: Values that may be ddmm.mmmm or metres.
+    """
+    size, extent = np.abs(xy), float(np.ptp(xy, axis=0).max())
+    degree, minutes = np.divmod(size, 100)
+    if bool((xy % 1 == 0).all()) and (size <= (180e7, 90e7)).all() and size.min(axis=0).max() >= 1e7:
+        return xy / 1e7, [f"{columns} count 1e-7 degrees, which are converted to degrees"]
+    if (minutes >= 60).any() or (degree > (180, 90)).any() or extent > max_extent_minutes:
+        return xy, []
+    if extent > min_extent_m:
+        raise InputError(
+            f"{label}: {columns} may be degrees and minutes (ddmm.mmmm) or metres; convert them to degrees, or give "
+            "--coordinates metres"
+        )
+    note = f"{columns} count degrees and minutes (ddmm.mmmm), which are converted to degrees"
+    return np.sign(xy) * (degree + minutes / 60), [note]
 
 
 @dataclass(frozen=True)

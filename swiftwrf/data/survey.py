@@ -376,12 +376,8 @@ class _Survey:
     def _times(self, max_speed_m_s: float = 2e-3, max_step_m: float = 1.0, min_rows: int = 6) -> Floats | None:
         """Return the times of the rows [s], None without a column of them.
 
-        Whole numbers at which the positions move slower than anybody walks, but not in milliseconds, are milliseconds.
-
-        Args:
-            max_speed_m_s: Speed below which nobody walks, if the numbers were seconds.
-            max_step_m: Median distance between rows of a log of movement.
-            min_rows: Number of rows of such a log. The bounds are not studied.
+        Whole numbers at which the positions move slower than anybody walks, but not in milliseconds, are milliseconds. They
+        are those of a log of movement, with at least 6 rows and a median step below 1 m (not studied).
         """
         if "time" not in self.roles:
             return None
