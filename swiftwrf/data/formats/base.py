@@ -107,9 +107,9 @@ SNAPSHOT_FORMATS: Registry[Format[Snapshots]] = Registry(
     "format of array snapshots",
     "swiftwrf.readers.snapshots",
     {
+        "snapshots": "swiftwrf.data.formats.snapshots:SnapshotArrays",
         "captures": "swiftwrf.contrib.formats.captures:Captures",
         "records": "swiftwrf.contrib.formats.records:Records",
-        "snapshots": "swiftwrf.data.formats.snapshots:SnapshotArrays",
     },
 )
 RSSI_FORMATS: Registry[Format[Rssi]] = Registry(
