@@ -130,7 +130,7 @@ def _stream(file: Path, name: str) -> Iterator[tuple[Any, int]]:
 
 @contextmanager
 def refusing_broken(file: object, kind: str) -> Iterator[None]:
-    """Turn exceptions on a broken file, or what a label names, into an InputError with its expected kind."""
+    """Turn exceptions on a broken file, or on any source of data, into an InputError with its expected kind."""
     try:
         yield
     except InputError as error:

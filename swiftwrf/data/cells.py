@@ -119,7 +119,7 @@ def _number_in(cell: str) -> float | None:
     return None if np.isnan(value) else value
 
 
-def column_of_numbers(label: object, table: pd.DataFrame, name: str) -> Floats:
+def column_of_numbers(source: object, table: pd.DataFrame, name: str) -> Floats:
     """Return a column as numbers, nan where a cell is empty.
 
     Raises:
@@ -128,7 +128,7 @@ def column_of_numbers(label: object, table: pd.DataFrame, name: str) -> Floats:
     values, text = parsed(table[name])
     if text.any():
         row = int(text.argmax())
-        raise InputError(f"{label} row {row + 1}, column {name}: {table[name].iloc[row]!r} is not a number")
+        raise InputError(f"{source} row {row + 1}, column {name}: {table[name].iloc[row]!r} is not a number")
     return values
 
 

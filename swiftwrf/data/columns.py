@@ -72,7 +72,7 @@ GEODETIC = {"x": "longitude", "y": "latitude"}  # that take the place of x and y
 
 
 def column_of(table: pd.DataFrame, role: str, columns: Mapping[str, str]) -> str | None:
-    """Return the first column of a role, by the names of columns given by role or by its own name. None without one."""
+    """Return the column of a role: the one that `columns` names, or else the first with a known name. None without one."""
     return columns[role] if role in columns else next(iter(candidates(table, role)), None)
 
 
@@ -89,7 +89,7 @@ def candidates(table: pd.DataFrame, role: str) -> list[str]:
 
 
 def find_roles(
-    label: object, table: pd.DataFrame, asked: Mapping[str, str], taken: Collection[str] = ()
+    source: object, table: pd.DataFrame, asked: Mapping[str, str], taken: Collection[str] = ()
 ) -> dict[str, str]:
     """Return the column of each role: the one asked for, or else the first one with a known name that is not taken.
 
@@ -100,7 +100,7 @@ def find_roles(
         if role not in ROLES:
             raise InputError(f"columns takes {', '.join(ROLES)}, got {role!r}")
         if name not in table.columns and not (role == "rssi" and fnmatch.filter(table.columns, name)):
-            raise InputError(f"{label} has no column {name!r} for {role}; there are {listed(table.columns)}")
+            raise InputError(f"{source} has no column {name!r} for {role}; there are {listed(table.columns)}")
     roles = {role: name for role, name in asked.items() if name in table.columns}
     for role in ROLES:
         matches = [name for name in candidates(table, role) if name not in (*roles.values(), *taken)]
@@ -108,7 +108,7 @@ def find_roles(
             continue
         if len(matches) > 1 and role in (*GEODETIC, *GEODETIC.values()):
             raise InputError(
-                f"{label} has {len(matches)} columns that may be {role} ({listed(matches)}); choose one with columns "
+                f"{source} has {len(matches)} columns that may be {role} ({listed(matches)}); choose one with columns "
                 f"{role}=NAME"
             )
         roles[role] = matches[0]
@@ -117,7 +117,7 @@ def find_roles(
             del roles[other]
         if role not in roles and other not in roles:
             raise InputError(
-                f"{label} has no column for {role}; there are {listed(table.columns)}; choose one with columns {role}=NAME"
+                f"{source} has no column for {role}; there are {listed(table.columns)}; choose one with columns {role}=NAME"
             )
     name = roles.get("receiver", "")
     if "receiver" not in asked and re.fullmatch(CELL_ID, plain_name(name)) and table[name].nunique() == 1:
@@ -126,9 +126,9 @@ def find_roles(
     if "receiver" in roles and "rssi" not in roles:
         if "receiver" in asked or len(receiver_columns(table, others)[0]) < 2:
             raise InputError(
-                f"{label} has receivers in column {roles['receiver']!r}, but no RSSI beside; name it with columns rssi=NAME"
+                f"{source} has receivers in column {roles['receiver']!r}, but no RSSI beside; name it with columns rssi=NAME"
             )
-        del roles["receiver"]  # a label of the rows of a wide table
+        del roles["receiver"]  # which distinguishes rows of a wide table
     return roles
 
 
@@ -195,14 +195,14 @@ def receiver_columns(
 
 
 def _kinship(name: str) -> str:
-    """Return what related names share: that of MAC addresses, or the first word without digits."""
+    """Return the kind of a name: "address" for a MAC address, otherwise its first word without digits."""
     if re.fullmatch(r"(?:[0-9a-f]{2}_?){5}[0-9a-f]{2}", name):
         return "address"
     return re.split(r"[_\d]", name, maxsplit=1)[0] or "number"
 
 
 def check_receiver_known(
-    label: object,
+    source: object,
     table: pd.DataFrame,
     rssi: str,
     others: Sequence[str],
@@ -238,7 +238,7 @@ def check_receiver_known(
             continue
         if is_name and (is_packet or alternates):
             raise InputError(
-                f"{label}: is {name!r} the receiver of each row? Then give --columns receiver={name}, or --columns "
+                f"{source}: is {name!r} the receiver of each row? Then give --columns receiver={name}, or --columns "
                 f"rssi={rssi} if all rows are of one receiver"
             )
 

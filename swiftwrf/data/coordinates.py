@@ -83,12 +83,14 @@ class PlanFrame(NamedTuple):
         return np.stack([x, -z, y] if self.up == "y" else [x, y, z], axis=1)
 
 
-def frame_of(label: object, table: pd.DataFrame, names: Sequence[str], frame: PlanFrame) -> tuple[PlanFrame, list[str]]:
+def frame_of(
+    source: object, table: pd.DataFrame, names: Sequence[str], frame: PlanFrame
+) -> tuple[PlanFrame, list[str]]:
     """Return the frame of coordinates in two columns, with the scale and direction that they state, and notes on these."""
     unit, stated = unit_of(table[names[0]]), stated_scale(table.attrs.get("preamble", ""))
     scale = frame.scale or stated
     if unit in PIXELS and scale is None:
-        raise InputError(f"{label}: columns {' and '.join(names)} are in pixels; give --scale PIXELS_PER_METRE")
+        raise InputError(f"{source}: columns {' and '.join(names)} are in pixels; give --scale PIXELS_PER_METRE")
     in_pixels = unit in PIXELS or (frame.scale is None and stated is not None and not unit)
     frame = PlanFrame(UNITS.get(unit) or scale or 1.0, frame.y_down or in_pixels, frame.up)
     notes = []
@@ -186,7 +188,7 @@ def without_fix(position: Floats) -> tuple[NDArray[np.bool_], list[str]]:
 
 
 def _is_apart(others: Floats, same: Floats, far_ratio: float = 10.0) -> bool:
-    """Return True if repeated positions (m, 3) are no place among the others (n, 3).
+    """Return True if one repeated position, (m, 3), is apart from the places of the others (n, 3).
 
     They are far at `far_ratio` times the distance between neighbours (not studied).
     """
@@ -202,7 +204,7 @@ def _is_apart(others: Floats, same: Floats, far_ratio: float = 10.0) -> bool:
 
 
 def degrees_in(
-    label: object,
+    source: object,
     names: tuple[str, str],
     xy: Floats,
     named: bool,
@@ -217,7 +219,7 @@ def degrees_in(
     if none of them can be degrees. Longitudes may count from 0 to 360 degrees.
 
     Args:
-        label: Name of the table, for messages.
+        source: Name of the table, for messages.
         names: Names of both columns.
         xy: Longitude or x, and latitude or y, (n, 2). Without names, x is the latitude if y exceeds 90.
         named: Whether the columns are named after longitude and latitude.
@@ -240,7 +242,7 @@ def degrees_in(
         return None, notes
     size = np.abs(xy)
     if named and (size > 180).any():
-        xy, notes = _plain_degrees(label, columns, xy)
+        xy, notes = _plain_degrees(source, columns, xy)
     swapped = not named and bool((np.abs(xy[:, 1]) > 90).any())
     degrees = xy if swapped else xy[:, ::-1]
     stated = named or asked == "degrees"
@@ -254,7 +256,7 @@ def degrees_in(
             fault = "latitudes beyond 90 degrees; are they swapped? Name them with columns latitude=NAME longitude=NAME"
             if not (np.abs(degrees) <= 180).all():
                 fault = "values beyond 180 degrees; if they are metres, give --coordinates metres"
-            raise InputError(f"{label}: {columns} hold {fault}")
+            raise InputError(f"{source}: {columns} hold {fault}")
         return None, notes
     east = (degrees[:, 1] - degrees[0, 1] + 180) % 360  # on either side of the antimeridian
     extent, distance = float(max(np.ptp(degrees[:, 0]), np.ptp(east))), float(np.abs(xy).max())
@@ -265,13 +267,13 @@ def degrees_in(
     if not named and extent <= max_walk_deg:
         return degrees, notes
     raise InputError(
-        f"{label}: {columns} extend over {extent:.3g} and may be degrees or metres; choose --coordinates degrees or "
+        f"{source}: {columns} extend over {extent:.3g} and may be degrees or metres; choose --coordinates degrees or "
         "--coordinates metres"
     )
 
 
 def _plain_degrees(
-    label: object, columns: str, xy: Floats, min_extent_m: float = 2.0, max_extent_minutes: float = 30.0
+    source: object, columns: str, xy: Floats, min_extent_m: float = 2.0, max_extent_minutes: float = 30.0
 ) -> tuple[Floats, list[str]]:
     """Return values (n, 2) [deg] of counts of 1e-7 degrees or of ddmm.mmmm, and a note; others as they are.
 
@@ -288,7 +290,7 @@ def _plain_degrees(
         return xy, []
     if extent > min_extent_m:
         raise InputError(
-            f"{label}: {columns} may be degrees and minutes (ddmm.mmmm) or metres; convert them to degrees, or give "
+            f"{source}: {columns} may be degrees and minutes (ddmm.mmmm) or metres; convert them to degrees, or give "
             "--coordinates metres"
         )
     note = f"{columns} count degrees and minutes (ddmm.mmmm), which are converted to degrees"
@@ -321,13 +323,13 @@ class Floors:
         return [self.names[number] for number in self.number(position).tolist()]
 
 
-def floors_of(label: object, floor: list[str], position: Floats) -> Floors | None:
+def floors_of(source: object, floor: list[str], position: Floats) -> Floors | None:
     """Return the floors by the name of each row's floor and its position (n, 3) [m]; None if there is one only.
 
     Names of one height at different places, e.g. in two buildings, are one floor.
 
     Raises:
-        InputError: Floors of one height at the same places; the label names the table.
+        InputError: Floors of one height at the same places; the sentence begins with the source.
 
     Example:
         >>> position = np.array([[0, 0, 5.0], [0, 0, 1.0], [0, 0, 5.2]])
@@ -342,7 +344,7 @@ def floors_of(label: object, floor: list[str], position: Floats) -> Floors | Non
         if levels and height[name] - height[levels[-1][0]] < MIN_STOREY_M:
             if above := [other for other in levels[-1] if _overlap(rows[name], rows[other])]:
                 raise InputError(
-                    f"{label}: floors {above[0]!r} and {name!r} have heights of {height[above[0]]:.3g} and "
+                    f"{source}: floors {above[0]!r} and {name!r} have heights of {height[above[0]]:.3g} and "
                     f"{height[name]:.3g} m at the same places; give heights above one ground, or numbers of the floors "
                     "without heights"
                 )

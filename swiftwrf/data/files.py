@@ -197,20 +197,20 @@ def _holds_values(cells: list[str]) -> bool:
     return is_number and (len(set(cells)) < len(cells) or any(set("-.") & set(cell) for cell in cells))
 
 
-def table_of(label: object, text: str, header: bool = True) -> pd.DataFrame:
-    """Return the table in the text of a CSV file, as `read_table`; the label stands for it in messages."""
+def table_of(source: object, text: str, header: bool = True) -> pd.DataFrame:
+    """Return the table in the text of a CSV file, as `read_table`; messages begin with the source."""
     separator = _separator(text.split("\n", 1)[0])
-    with refusing_broken(label, "a comma-separated table"):
+    with refusing_broken(source, "a comma-separated table"):
         lines = [line for line in csv.reader(io.StringIO(text, newline=""), delimiter=separator) if line]
     if not lines:
-        raise InputError(f"{label} is empty; expected a header and one row a measurement")
+        raise InputError(f"{source} is empty; expected a header and one row a measurement")
     if header and _holds_values(lines[0]):
         raise InputError(
-            f"{label} has no header, its first line holds numbers; write the names of the columns above it"
+            f"{source} has no header, its first line holds numbers; write the names of the columns above it"
         )
     if not header:
         lines = [[str(column) for column in range(1, len(lines[0]) + 1)], *lines]
-    names, rows, notes = _regular(label, lines)
+    names, rows, notes = _regular(source, lines)
     if separator != ",":
         rows = [[DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in line] for line in rows]
     table = pd.DataFrame(rows, columns=names, dtype=object)
@@ -219,7 +219,7 @@ def table_of(label: object, text: str, header: bool = True) -> pd.DataFrame:
 
 
 def _regular(
-    label: object, lines: list[list[str]], max_missing_cells: int = 3
+    source: object, lines: list[list[str]], max_missing_cells: int = 3
 ) -> tuple[list[str], list[list[str]], list[str]]:
     """Return names of columns, rows of equal length, and notes on lines, rows and columns without content.
 
@@ -232,7 +232,7 @@ def _regular(
     if repeated:
         notes.append(f"lines that repeat the header are left out: {len(repeated)}")
     if not rows:
-        raise InputError(f"{label} has a header but no rows")
+        raise InputError(f"{source} has a header but no rows")
     widths = {len(line) for line in rows}
     width, missing = len(rows[0]), len(names) - len(rows[0])
     if len(widths) == 1 < len(rows):
@@ -243,7 +243,7 @@ def _regular(
             rows = [line[: len(names)] for line in rows]
     for row, line in enumerate(rows, start=1):
         if len(line) != len(names):
-            raise InputError(f"{label} row {row} has {len(line)} values, but the header has {len(names)}")
+            raise InputError(f"{source} row {row} has {len(line)} values, but the header has {len(names)}")
     filled = [column for column, cell in enumerate(rows[0]) if cell.strip()]
     is_text = all(math.isnan(number(rows[0][c])) and not NO_VALUE.fullmatch(rows[0][c]) for c in filled)
     if len(rows) > 1 and is_text and sum(not math.isnan(number(rows[1][c])) for c in filled) > 1:  # e.g. of units
@@ -255,14 +255,14 @@ def _regular(
         empty.append(0)  # the index of a data frame
     if set(nameless) - set(empty):
         raise InputError(
-            f"{label} has no name for column {min(set(nameless) - set(empty)) + 1}; give it one in the header"
+            f"{source} has no name for column {min(set(nameless) - set(empty)) + 1}; give it one in the header"
         )
     if empty:
         rows = [[cell for column, cell in enumerate(line) if column not in empty] for line in rows]
         names = list(filter(None, names))
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"{label} names column {twice!r} twice; each needs a name of its own")
+        raise InputError(f"{source} names column {twice!r} twice; each needs a name of its own")
     return names, rows, notes
 
 

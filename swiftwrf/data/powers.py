@@ -83,7 +83,7 @@ def _fills_the_lower_edge(
     min_values: int = 5,
     min_repeats: int = 5,
 ) -> bool:
-    """Return True if the least value is frequent, and the least of more than a fraction of the receivers."""
+    """Return True if the least value is frequent, and is that of more than a fraction of the receivers."""
     if len(value) <= min_values or count[0] < min_repeats or not _is_frequent(value, count, 0):
         return False
     weakest = np.where(rssi >= value[0], rssi, np.inf).min(axis=0)
@@ -125,10 +125,10 @@ def end_of_scale(rssi: Floats, min_fraction: float = 0.25) -> list[str]:
     return [f"the scale ends at {-value[0]:g} dBm: {cells} have this largest value, so their power is at least that"]
 
 
-def check_powers(label: object, rssi: Floats, receivers: Sequence[str], source: NDArray[np.int64]) -> None:
+def check_powers(source: object, rssi: Floats, receivers: Sequence[str], table_row: NDArray[np.int64]) -> None:
     """Refuse RSSI (n, R) [dBm] that is no received power.
 
-    The row of a value in the table, counted from 0, is its source (n, R) or (n, 1).
+    Rows of the values in the table are counted from 0, (n, R) or (n, 1).
 
     Raises:
         InputError: The first such value, with its row and receiver.
@@ -136,10 +136,10 @@ def check_powers(label: object, rssi: Floats, receivers: Sequence[str], source: 
     bad = (rssi < MIN_RSSI_DBM) | (rssi > MAX_RSSI_DBM)
     if not bad.any():
         return
-    rows = np.broadcast_to(source, rssi.shape)
+    rows = np.broadcast_to(table_row, rssi.shape)
     row, column = min(np.argwhere(bad), key=lambda cell: rows[tuple(cell)])
     value = rssi[row, column]
     raise InputError(
-        f"{label} row {rows[row, column] + 1}, receiver {receivers[column]}: {value:g} dBm is no received power; expected "
+        f"{source} row {rows[row, column] + 1}, receiver {receivers[column]}: {value:g} dBm is no received power; expected "
         f"{MIN_RSSI_DBM:g} to {MAX_RSSI_DBM:g}; if it stands for not detected, give nan or --filler {value:g}"
     )

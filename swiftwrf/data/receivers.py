@@ -37,7 +37,7 @@ def plain_receiver(name: str) -> str:
 
 
 def spelled_as(names: Sequence[str], known: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return names in the spelling of those that are known, and a note on those that differ in it.
+    """Return names as the known ones are spelled, and a note on names that were spelled differently.
 
     Example:
         >>> spelled_as(["AA-BB-CC-DD-EE-01", "hall"], ["aa:bb:cc:dd:ee:01", "office"])[0]
@@ -97,21 +97,21 @@ def read_receivers(
         InputError: A name twice, no position of any receiver, or a position that is not usable.
     """
     table = _positions_by_name(file, names) if file.suffix == ".yml" else read_table(file)
-    label = column_of(table, "receiver", {}) or ("name" if "name" in table.columns else None)
-    if label is None and len(table) != len(names):
+    name_column = column_of(table, "receiver", {}) or ("name" if "name" in table.columns else None)
+    if name_column is None and len(table) != len(names):
         raise InputError(f"{file} has {len(table)} rows and no column of names, but there are {len(names)} receivers")
-    listed_names = list(names) if label is None else table[label].astype(str).str.strip().tolist()
+    listed_names = list(names) if name_column is None else table[name_column].astype(str).str.strip().tolist()
     if len(set(listed_names)) < len(listed_names):
         raise InputError(f"{file} must have each receiver once, got {listed(listed_names)}")
     listed_names, notes = spelled_as(listed_names, names)
     position = _positions(file, table, origin, frame)
     given = np.flatnonzero(~np.isnan(position[:, :2]).all(axis=1))
     position, listed_names = position[given], [listed_names[row] for row in given]
-    place = dict(zip(listed_names, check_positions(position, f"positions of {file}").tolist(), strict=True))
-    unknown = [name for name in names if name not in place]
+    position_of = dict(zip(listed_names, check_positions(position, f"positions of {file}").tolist(), strict=True))
+    unknown = [name for name in names if name not in position_of]
     if len(unknown) == len(names):
         raise InputError(f"{file} has none of the receivers ({listed(names)}); there are {listed(listed_names)}")
-    positions = torch.tensor([place.get(name, [float("nan")] * 3) for name in names], dtype=torch.float64)
+    positions = torch.tensor([position_of.get(name, [float("nan")] * 3) for name in names], dtype=torch.float64)
     if unknown:
         notes.append(f"the position of these receivers is unknown, so they have no path-loss model: {listed(unknown)}")
     return positions, notes
@@ -120,12 +120,14 @@ def read_receivers(
 def _positions_by_name(file: Path, names: Sequence[str]) -> pd.DataFrame:
     """Return the table of a file with NAME: [x, y, z], without receivers of unknown position and other content."""
     content = {name: value for name, value in read_yaml(file).items() if value not in ("", "~", "null", "none")}
-    place = {name: numbers(value, 3) for name, value in content.items()}
+    position_of = {name: numbers(value, 3) for name, value in content.items()}
     spelled, _ = spelled_as(list(content), names)
-    if wrong := [name for name, known in zip(content, spelled, strict=True) if place[name] is None and known in names]:
+    if wrong := [
+        name for name, known in zip(content, spelled, strict=True) if position_of[name] is None and known in names
+    ]:
         got = reprlib.repr(content[wrong[0]])  # references may make it as long as any memory
         raise InputError(f"{file}: receiver {wrong[0]!r} needs a position of 3 finite numbers [m], got {got}")
-    rows = [(name, *position) for name, position in place.items() if position is not None]
+    rows = [(name, *position) for name, position in position_of.items() if position is not None]
     return pd.DataFrame(rows, columns=["receiver", "x", "y", "z"])
 
 

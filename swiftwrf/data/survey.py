@@ -74,14 +74,14 @@ def has_positions(table: pd.DataFrame, columns: Mapping[str, str]) -> bool:
 
 
 def read_survey(
-    label: object, table: pd.DataFrame, options: TableOptions, receivers: Path | None = None, keeps_rows: bool = False
+    source: object, table: pd.DataFrame, options: TableOptions, receivers: Path | None = None, keeps_rows: bool = False
 ) -> dict[str, Any]:
     """Return the arguments of `Rssi` that a survey table determines: RSSI, positions, receivers and what rows are of.
 
     Columns get their roles, cells their units, and then rows are formed: one a place, time and packet of a receiver.
 
     Args:
-        label: Name of the table, for messages.
+        source: Name of the table, for messages.
         table: Columns of positions and RSSI.
         options: What the user states.
         receivers: Table of the receivers' positions.
@@ -90,7 +90,7 @@ def read_survey(
     Raises:
         InputError: A column that is missing or ambiguous, or a value that is no position or received power.
     """
-    survey = _Survey(label, table, options)
+    survey = _Survey(source, table, options)
     survey.form_rows()
     survey.clean_powers()
     survey.leave_out_rows(keeps_rows)
@@ -114,14 +114,14 @@ class _Survey:
         index: Number of each row before rows are left out, (n,).
     """
 
-    def __init__(self, label: object, table: pd.DataFrame, options: TableOptions) -> None:
-        self.label, self.options, self.notes = label, options, list(table.attrs.get("notes", ()))
+    def __init__(self, source: object, table: pd.DataFrame, options: TableOptions) -> None:
+        self.source, self.options, self.notes = source, options, list(table.attrs.get("notes", ()))
         table = table.set_axis([str(name).strip() for name in table.columns], axis=1).reset_index(drop=True)
         if not len(table) or not table.columns.is_unique:
-            raise InputError(f"{label} must have rows, and a name of its own for each column")
+            raise InputError(f"{source} must have rows, and a name of its own for each column")
         if options.offset_by not in (None, *table.columns):
             raise InputError(
-                f"{label} has no column {options.offset_by!r} for offsets; there are {listed(table.columns)}"
+                f"{source} has no column {options.offset_by!r} for offsets; there are {listed(table.columns)}"
             )
         with suppress(TypeError):  # cells that are lists
             if n := int(table.duplicated().sum()):
@@ -131,8 +131,8 @@ class _Survey:
         if len(options.transmitter) == 1:
             asked["receiver"] = options.transmitter[0]
         elif options.transmitter or not {"x", "y"} & asked.keys():
-            self.end = _columns_of_end(label, table, options.transmitter)
-        self.roles = find_roles(label, table, asked, self.end.values())
+            self.end = _columns_of_end(source, table, options.transmitter)
+        self.roles = find_roles(source, table, asked, self.end.values())
         if (floor := self.text("floor")) is not None and not floor.any():
             self.notes.append(f"column {self.roles.pop('floor')} is empty, so there are no floors")
         used = {options.offset_by, options.pool_by, *self.end.values()}
@@ -170,7 +170,7 @@ class _Survey:
         by = self.options.pool_by
         fillers = find_fillers(self.rssi) if self.options.filler is None else list(self.options.filler)
         self.rssi, notes = without_fillers(self.rssi, fillers)
-        check_powers(self.label, self.rssi, self.names, self.table_row)
+        check_powers(self.source, self.rssi, self.names, self.table_row)
         self.notes += notes + end_of_scale(self.rssi)
         if by is not None:
             n_radios = len(self.names)
@@ -184,7 +184,7 @@ class _Survey:
         """Leave out rows without a position, and cached scans unless `keeps_rows`."""
         omitted, notes = without_fix(self.coordinate[:, :3])
         if omitted.all():
-            raise InputError(f"{self.label} has no row with a position; {notes[0]}")
+            raise InputError(f"{self.source} has no row with a position; {notes[0]}")
         row = np.flatnonzero(~omitted)
         repeated = _repeated_scans(self.coordinate[row], self.rssi[row])
         if repeated.any():
@@ -203,7 +203,7 @@ class _Survey:
         self.coordinate, self.origin = self._local_metres()
         kept = (~np.isnan(self.rssi)).any(axis=0)
         if not kept.any():
-            raise InputError(f"{self.label} holds no RSSI that a receiver detected")
+            raise InputError(f"{self.source} holds no RSSI that a receiver detected")
         if not kept.all():
             self.notes.append(f"receivers that never detected the transmitter are left out: {int((~kept).sum())}")
         self.names, self.rssi = [self.names[i] for i in np.flatnonzero(kept)], self.rssi[:, kept]
@@ -214,7 +214,7 @@ class _Survey:
         if window is not None:
             if self.time is None:
                 raise InputError(
-                    f"{self.label} has no column of times, which a window of {window:g} s needs; leave it out"
+                    f"{self.source} has no column of times, which a window of {window:g} s needs; leave it out"
                 )
             kind, n = self.kind.to_numpy()[self.table_row], len(self.rssi)
             first, self.rssi, self.coordinate, self.time = _windows(kind, self.time, self.rssi, self.coordinate, window)
@@ -226,8 +226,8 @@ class _Survey:
     def arguments(self, receivers: Path | None) -> dict[str, Any]:
         """Return the arguments of `Rssi`, with the positions of receivers in a table or those of a second end."""
         options, floor = self.options, self.text("floor")
-        floors = None if floor is None else floors_of(self.label, floor.iloc[self.table_row].tolist(), self.coordinate)
-        places = self._end_as_receivers() if self.end else None
+        floors = None if floor is None else floors_of(self.source, floor.iloc[self.table_row].tolist(), self.coordinate)
+        receiver_position = self._end_as_receivers() if self.end else None
         labels, moves = self._labels(), bool(self.end or options.transmitter)
         if labels and not options.offset_by:
             self.notes.append(
@@ -236,15 +236,15 @@ class _Survey:
         if moves and not self.end:
             column = options.transmitter[0]
             self.notes.append(f"both ends move; {len(self.names)} positions of column {column} count as receivers")
-        if receivers is not None and places is None:
+        if receivers is not None and receiver_position is None:
             known, notes = read_receivers(receivers, self.names, self.origin, self.frame)
-            places = known.numpy()
+            receiver_position = known.numpy()
             self.notes += notes
         group = self.group.iloc[self.table_row].rename(options.offset_by) if options.offset_by else None
         return {
             "rssi_dbm": self.rssi,
             "transmitter_position": self.coordinate,
-            "receiver_position": places,
+            "receiver_position": receiver_position,
             "receiver_names": self.names,
             "origin": self.origin,
             "groups": group,
@@ -271,13 +271,13 @@ class _Survey:
             self.names, left_out, notes = receiver_columns(table, others)
         if not self.names:
             raise InputError(
-                f"{self.label} has no column of RSSI in dBm (numbers below 0) besides positions; there are "
+                f"{self.source} has no column of RSSI in dBm (numbers below 0) besides positions; there are "
                 f"{listed(table.columns)}; choose with columns rssi=NAME or rssi='PREFIX*'"
             )
         if len(self.names) == 1 and "rssi" not in asked and not self.end:
-            place = [self.roles[role] for role in ("x", "y", "longitude", "latitude", "time") if role in self.roles]
+            where = [self.roles[role] for role in ("x", "y", "longitude", "latitude", "time") if role in self.roles]
             check_receiver_known(
-                self.label, table, self.names[0], [name for name in others if name not in self.names], place
+                self.source, table, self.names[0], [name for name in others if name not in self.names], where
             )
         return left_out, notes
 
@@ -305,28 +305,28 @@ class _Survey:
             self.notes.append(f"{words[0]!r} counts as not detected: {cells}")
             return values
         for name in np.array(names)[text.any(axis=0)]:
-            column_of_numbers(self.label, self.table, name)
+            column_of_numbers(self.source, self.table, name)
         return values
 
     def _coordinates(self, roles: Mapping[str, str], frame: PlanFrame) -> tuple[Floats, PlanFrame, list[str]]:
         """Return the coordinates of the rows (n, 3) [m] or [deg], nan where empty, the frame they were in, and notes."""
-        label, table = self.label, self.table
+        source, table = self.source, self.table
         both = [roles.get(role) or roles[GEODETIC[role]] for role in "xy"]
-        x, y = (column_of_numbers(label, table, name) for name in both)
+        x, y = (column_of_numbers(source, table, name) for name in both)
         if "x" not in roles and frame != PlanFrame():
-            raise InputError(f"{label} has longitudes and latitudes, which --scale, --y-down and --up do not apply to")
-        frame, notes = frame_of(label, table, both, frame) if "x" in roles else (frame, [])
+            raise InputError(f"{source} has longitudes and latitudes, which --scale, --y-down and --up do not apply to")
+        frame, notes = frame_of(source, table, both, frame) if "x" in roles else (frame, [])
         if "floor" in roles:
             floor, text = parsed(table[roles["floor"]])
             floor_names = text_of(table[roles["floor"]])
             floor = np.where(text, floor_numbers(floor_names.tolist()), floor)
             unknown = sorted(set(floor_names[text & np.isnan(floor)]))
         if "z" in roles:
-            z = column_of_numbers(label, table, roles["z"]) / UNITS.get(unit_of(table[roles["z"]]), 1.0)
+            z = column_of_numbers(source, table, roles["z"]) / UNITS.get(unit_of(table[roles["z"]]), 1.0)
         elif "floor" in roles:
             if unknown:
                 raise InputError(
-                    f"{label} has no height, and the order of floor {unknown[0]!r} is unknown; number the floors or add "
+                    f"{source} has no height, and the order of floor {unknown[0]!r} is unknown; number the floors or add "
                     "column z"
                 )
             z = STOREY_M * floor
@@ -350,11 +350,11 @@ class _Survey:
         A walk that is wider and higher than `min_extent_m`, and five times as high as deep, may have another axis upwards
         (not studied).
         """
-        label, roles, asked = self.label, self.roles, self.options.coordinates
+        source, roles, asked = self.source, self.roles, self.options.coordinates
         position, origin = self.coordinate.reshape(-1, 3), None
         both = roles.get("x") or roles["longitude"], roles.get("y") or roles["latitude"]
         named = "longitude" in roles and "latitude" in roles
-        degrees, notes = degrees_in(label, both, position[:, :2], named, asked)
+        degrees, notes = degrees_in(source, both, position[:, :2], named, asked)
         self.notes += notes
         if degrees is not None:
             origin = GeodeticOrigin.amid(degrees)
@@ -370,7 +370,7 @@ class _Survey:
                     f"y spans {depth:.1f} m and z {height:.1f} m; if y is the height, give --up y, and else this stands as "
                     "it is"
                 )
-        check_positions(position, f"positions of {label}")
+        check_positions(position, f"positions of {source}")
         return position.reshape(len(self.coordinate), -1), origin
 
     def _times(self, max_speed_m_s: float = 2e-3, max_step_m: float = 1.0, min_rows: int = 6) -> Floats | None:
@@ -409,7 +409,7 @@ class _Survey:
         receiver = text_of(self.table[self.roles["receiver"]])
         power, time, named = self._powers([self.roles["rssi"]])[:, 0], self.text("time"), (receiver != "").to_numpy()
         if len(nameless := np.flatnonzero(~named & ~np.isnan(power))):
-            raise InputError(f"{self.label} row {nameless[0] + 1} has no receiver in column {self.roles['receiver']}")
+            raise InputError(f"{self.source} row {nameless[0] + 1} has no receiver in column {self.roles['receiver']}")
         plain = receiver.map(plain_receiver)
         one = plain.map(dict(zip(plain[::-1], receiver[::-1], strict=True)))  # in the first spelling
         if len(others := receiver[one != receiver].unique()):
@@ -425,7 +425,7 @@ class _Survey:
         _, first = np.unique(row, return_index=True)
         if len(first) * len(names) > max_values:
             raise InputError(
-                f"{self.label} has {len(first)} rows and {len(names)} receivers; at most {max_values} values are read"
+                f"{self.source} has {len(first)} rows and {len(names)} receivers; at most {max_values} values are read"
             )
         self.names, self.coordinate, at = list(names), self.coordinate[first], (row[named], column)
         self.rssi, self.table_row = np.full((len(first), len(names)), np.nan), np.tile(first[:, None], len(names))
@@ -438,7 +438,7 @@ class _Survey:
         """
         if self.rssi.shape[1] != 1:
             raise InputError(
-                f"{self.label} has positions of both ends and RSSI of {self.rssi.shape[1]} receivers; name one: columns "
+                f"{self.source} has positions of both ends and RSSI of {self.rssi.shape[1]} receivers; name one: columns "
                 "rssi=NAME, or pool them: pool_by"
             )
         ends = self.coordinate[:, 3:], self.coordinate[:, :3]
@@ -461,12 +461,12 @@ class _Survey:
         receiver = self.text("receiver")
         if receiver is None:
             raise InputError(
-                f"{self.label} has a column for each receiver; pool by their names: mac or a regular expression"
+                f"{self.source} has a column for each receiver; pool by their names: mac or a regular expression"
             )
         pairs = pd.DataFrame({"radio": receiver, "pool": text_of(self.table[by])}).drop_duplicates()
         if len(several := pairs["radio"][pairs["radio"].duplicated()]):
             raise InputError(
-                f"{self.label}: receiver {several.iloc[0]!r} has several values in column {by!r}, so it is no access point"
+                f"{self.source}: receiver {several.iloc[0]!r} has several values in column {by!r}, so it is no access point"
             )
         pool = dict(zip(pairs["radio"], pairs["pool"], strict=True))
         return [pool[name] or name for name in self.names]
@@ -512,8 +512,8 @@ def _windows(
     row, receiver = np.nonzero(~np.isnan(rssi))
     most = -1
     for phase in np.linspace(0, 1, n_phases, endpoint=False):
-        place = np.where(np.isnan(time), alone, np.floor((time - np.nanmin(time)) / window + phase))
-        keys = pd.DataFrame({"kind": kind, "window": place})
+        number_of_window = np.where(np.isnan(time), alone, np.floor((time - np.nanmin(time)) / window + phase))
+        keys = pd.DataFrame({"kind": kind, "window": number_of_window})
         tried = keys.groupby(["kind", "window"], sort=False).ngroup().to_numpy()
         if (n := len(np.unique(tried[row] * rssi.shape[1] + receiver))) > most:
             most, number = n, tried
@@ -523,7 +523,7 @@ def _windows(
     return first, means[:, :n_rssi], means[:, n_rssi : n_rssi + n_position], means[:, -1]
 
 
-def _columns_of_end(label: object, table: pd.DataFrame, given: Sequence[str]) -> dict[str, str]:
+def _columns_of_end(source: object, table: pd.DataFrame, given: Sequence[str]) -> dict[str, str]:
     """Return the columns of the second end by x, y and z; none in a table with positions of one end.
 
     They are the given ones. Otherwise they are those marked tx or transmitter beside others, or those marked rx or receiver
@@ -533,7 +533,7 @@ def _columns_of_end(label: object, table: pd.DataFrame, given: Sequence[str]) ->
         missing = [name for name in given if name not in table.columns]
         if missing or len(given) not in (2, 3) or len(set(given)) < len(given):
             raise InputError(
-                f"{label}: transmitter takes the columns of x, y and, if it is known, z, or one column of names, got "
+                f"{source}: transmitter takes the columns of x, y and, if it is known, z, or one column of names, got "
                 f"{' '.join(given)}; there are {listed(table.columns)}"
             )
         return dict(zip("xyz", given, strict=False))

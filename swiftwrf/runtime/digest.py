@@ -22,7 +22,7 @@ DESCRIPTORS = (property, cached_property, staticmethod, classmethod)
 def digest(*values: Any) -> str:
     """Return the SHA-256 of values by their content, equal in every process.
 
-    Functions and classes count by their code and by what it names, those of installed packages by their names alone.
+    A function or class counts by its code and what the code names, one of an installed package by its name.
 
     Raises:
         InputError: A value such as an open file, which cannot be compared with one of another process.
