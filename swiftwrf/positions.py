@@ -116,7 +116,7 @@ def check_near(
         )
 
 
-def frame(position: Tensor) -> tuple[Tensor, Tensor]:
+def centre_and_half_side(position: Tensor) -> tuple[Tensor, Tensor]:
     """Return centre (3,) and half the longest side () of the box around positions (n, 3) [m], float64."""
     low, high = position.double().min(dim=0).values, position.double().max(dim=0).values
     half = (high - low).max() / 2

@@ -178,8 +178,8 @@ class PositionedData(Labelled, Displayed):
             part = values[rows].flatten(1)
             sample = part[:, :: max(1, part.shape[1] // max_values)].double()
             known = torch.cat([number[rows], self._position[rows], sample], dim=1)
-            cells = (1000 * known).round().nan_to_num(-1.0).long().numpy()  # to a millisecond and a millimetre
-            digests += [hashlib.blake2b(cell.tobytes(), digest_size=8).digest() for cell in cells]
+            rounded = (1000 * known).round().nan_to_num(-1.0).long().numpy()  # to a millisecond and a millimetre
+            digests += [hashlib.blake2b(row.tobytes(), digest_size=8).digest() for row in rounded]
         return torch.from_numpy(np.frombuffer(b"".join(digests), np.int64).copy())
 
     def derived(self: Data, **fields: Any) -> Data:

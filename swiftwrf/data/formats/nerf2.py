@@ -225,23 +225,23 @@ class Nerf2Rssi(Format[Rssi]):
         return raw or any((path / name).is_file() for name in (*TABLES[:1], *RECEIVERS[:1]))
 
     def read(self, path: Path, options: ReadOptions) -> Rssi:
-        table, positions = _one_of(path, TABLES), _one_of(path, POSITIONS)
+        rssi_file, position_file = _one_of(path, TABLES), _one_of(path, POSITIONS)
         receivers = next((path / name for name in RECEIVERS if (path / name).is_file()), None)
-        frame, position = read_table(table), read_xyz(positions)
-        names = list(map(str, frame.columns))
+        table, position = read_table(rssi_file), read_xyz(position_file)
+        names = list(map(str, table.columns))
         omitted, missing = without_fix(position)
         if omitted.all():
-            raise InputError(f"{positions} needs 3 finite numbers [m] in each row")
-        if len(frame) != len(position):
+            raise InputError(f"{position_file} needs 3 finite numbers [m] in each row")
+        if len(table) != len(position):
             raise InputError(
-                f"{path}: {table.name} has {len(frame)} rows, {positions.name} {len(position)}; they must match"
+                f"{path}: {rssi_file.name} has {len(table)} rows, {position_file.name} {len(position)}; they must match"
             )
-        rssi = np.stack([column_of_numbers(table, frame, name) for name in names], axis=1)
+        rssi = np.stack([column_of_numbers(rssi_file, table, name) for name in names], axis=1)
         fillers = sorted({NOT_DETECTED_DBM, *find_fillers(rssi)}) if options.filler is None else list(options.filler)
         rssi, notes = without_fillers(rssi, fillers)
         row = torch.from_numpy(~omitted).nonzero()[:, 0]
         receiver_position, unknown = read_receivers(receivers, names, None, PlanFrame()) if receivers else (None, [])
-        if positions.name == "rx_pos.csv":
+        if position_file.name == "rx_pos.csv":
             missing.append(
                 "the receiver moves; RSSI is reciprocal, so it counts as the transmitter and the others as receivers"
             )
@@ -253,7 +253,7 @@ class Nerf2Rssi(Format[Rssi]):
                 f"{path} has groups of {groups}, not of {options.offset_by}; convert the table again by these"
             )
         of_rows, units = _of_rows(meta, len(rssi), groups) if meta.is_file() else ({}, [])
-        stated = (positions, table, receivers, of_rows and meta, properties and survey)
+        stated = (position_file, rssi_file, receivers, of_rows and meta, properties and survey)
         return Rssi(
             rssi[row],
             position[row],
@@ -271,19 +271,19 @@ class Nerf2Rssi(Format[Rssi]):
 
 def _of_rows(file: Path, n: int, groups: str | None) -> tuple[dict[str, Any], list[str]]:
     """Return session, time and named group of n rows, as far as a table has these columns, and a note on times."""
-    frame = read_table(file)
-    session, time = (column_of(frame, role, {}) for role in ("session", "time"))
+    table = read_table(file)
+    session, time = (column_of(table, role, {}) for role in ("session", "time"))
     columns: dict[str, Any] = {}
     notes: list[str] = []
     if session is not None:
-        columns["session"] = text_of(frame[session]).to_numpy()
+        columns["session"] = text_of(table[session]).to_numpy()
     if time is not None:
-        columns["time"], notes = seconds(frame[time])
-    if groups is not None and "group" in frame:
-        group = text_of(frame["group"])
+        columns["time"], notes = seconds(table[time])
+    if groups is not None and "group" in table:
+        group = text_of(table["group"])
         columns["groups"] = group.where(group != "").rename(groups)
-    if columns and len(frame) != n:
-        raise InputError(f"{file} has {len(frame)} rows, the RSSI {n}; they must match")
+    if columns and len(table) != n:
+        raise InputError(f"{file} has {len(table)} rows, the RSSI {n}; they must match")
     return columns, notes
 
 
