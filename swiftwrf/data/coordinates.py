@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from swiftwrf.data.cells import PIXELS, UNITS, unit_of
+from swiftwrf.data.cells import PIXELS, UNITS, Floats, unit_of
 from swiftwrf.errors import InputError
 
-Floats = NDArray[np.float64]
 Coordinates = Literal["degrees", "metres"]
 Up = Literal["y", "z"]
 # x and y that receivers of satellites write without a position

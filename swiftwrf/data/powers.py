@@ -11,9 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from swiftwrf.data.cells import Floats
 from swiftwrf.errors import InputError
 
-Floats = NDArray[np.float64]
 NOT_DETECTED_DBM = -100.0  # the usual filler
 KNOWN_FILLERS = (NOT_DETECTED_DBM, -200.0, 0.0, 100.0, 127.0)
 MIN_RSSI_DBM, MAX_RSSI_DBM = -150.0, 30.0

@@ -10,17 +10,15 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from swiftwrf.data.cells import column_of_numbers, text_of
+from swiftwrf.data.cells import Floats, column_of_numbers, text_of
 from swiftwrf.data.columns import GEODETIC, column_of
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin, PlanFrame, frame_of
 from swiftwrf.data.files import numbers, read_table, read_yaml
 from swiftwrf.errors import InputError, listed
 from swiftwrf.positions import check_positions
 
-Floats = NDArray[np.float64]
 ADDRESS = re.compile(r"((?:[0-9a-f]{2}[:-]?){4}[0-9a-f]{2})[:-]?[0-9a-f]{2}", re.IGNORECASE)
 
 

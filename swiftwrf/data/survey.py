@@ -17,7 +17,17 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 
-from swiftwrf.data.cells import CLOCK_ONLY, UNITS, column_of_numbers, parsed, plain_name, seconds, text_of, unit_of
+from swiftwrf.data.cells import (
+    CLOCK_ONLY,
+    UNITS,
+    Floats,
+    column_of_numbers,
+    parsed,
+    plain_name,
+    seconds,
+    text_of,
+    unit_of,
+)
 from swiftwrf.data.columns import GEODETIC, candidates, check_receiver_known, column_of, find_roles, receiver_columns
 from swiftwrf.data.coordinates import (
     MIN_STOREY_M,
@@ -38,7 +48,6 @@ from swiftwrf.errors import InputError, listed
 from swiftwrf.positions import cells, check_positions
 from swiftwrf.runtime.validation import PositiveFloat, configuration
 
-Floats = NDArray[np.float64]
 MARKS = {"tx": "transmitter", "transmitter": "transmitter", "rx": "receiver", "receiver": "receiver"}  # words in names
 
 
