@@ -23,8 +23,9 @@ from torch import Tensor
 
 from augment import Fold, Mixed, synthetic_positions
 from augment.estimators import make_estimator
+from swiftwrf.contrib.comparison.errors import paired_change
 from swiftwrf.data.splits import places
-from swiftwrf.metrics import angle_errors, paired_change
+from swiftwrf.metrics import angle_errors
 from swiftwrf.models.base import synthesized
 from swiftwrf.runtime.threads import parallel_map
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from augment.choices import MAX_SUGGESTIONS
 from augment.positions import sample_positions
 from swiftwrf import InputError, Rssi, Spectra
-from swiftwrf.choices import MAX_SUGGESTIONS
 from swiftwrf.data.spectra import check_training
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import choose_kernel, most_informative, subsample

@@ -8,7 +8,7 @@ from record import RESULTS, load, markdown
 
 from augment.turbo.condition import FULL_NETWORK, LOCATED, MEASURED_NETWORK, Condition, conditions_of
 from augment.turbo.condition import headline as chosen
-from swiftwrf.metrics import ChangeMetrics
+from swiftwrf.contrib.comparison.errors import ChangeMetrics
 
 SPECTRA = ("locating_rooms", "locating_newrf")  # results of locating_aoa.py
 

@@ -35,10 +35,11 @@ from swiftwrf import AngularGrid, FieldModel, FitError, InputError, Spectra, Swi
 from swiftwrf import load_spectra as read
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.choices import Moving
+from swiftwrf.contrib.comparison.errors import summary
 from swiftwrf.contrib.raytraced import ROOMS
 from swiftwrf.data.splits import places
 from swiftwrf.gp import subsample
-from swiftwrf.metrics import covered, l1, psnr, ssim, summary
+from swiftwrf.metrics import covered, l1, psnr, ssim
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.neighbours import MemoryModel
 from swiftwrf.positions import Neighbours

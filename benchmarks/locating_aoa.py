@@ -32,6 +32,7 @@ import torch
 from record import RESULTS, options, write_result
 
 from augment import Mixed, withhold
+from augment.choices import fraction_key
 from augment.estimators import ESTIMATORS, make_estimator
 from augment.turbo.experiment import ROOM_MODEL
 from augment.turbo.stages import located
@@ -46,12 +47,13 @@ from swiftwrf import (
     make_model,
     simulated_room,
 )
-from swiftwrf.choices import Moving, fraction_key
+from swiftwrf.choices import Moving
+from swiftwrf.contrib.comparison.errors import summary
 from swiftwrf.contrib.raytraced import FurnishedRoom, Material, Scene, Tracing, trace
 from swiftwrf.data.spectra import array_spectra
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import GaussianProcess, choose_kernel
-from swiftwrf.metrics import LEVEL, angle_errors, summary
+from swiftwrf.metrics import LEVEL, angle_errors
 from swiftwrf.models.geometry.channels import coherence, field, waves
 
 KERNEL = "kernel_regression"

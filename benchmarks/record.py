@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import torch
 import tyro
 
-from swiftwrf.metrics import ErrorSummary
+from swiftwrf.contrib.comparison.errors import ErrorSummary
 from tasks.environment import environment
 
 ROOT = Path(__file__).parent.parent

@@ -30,13 +30,14 @@ from record import kept, options, write_result
 from torch import Tensor
 
 from swiftwrf import Rssi, load_rssi, rssi_room
+from swiftwrf.contrib.comparison.errors import method_summary, summary
 from swiftwrf.contrib.comparison.rssi import compare
-from swiftwrf.metrics import LEVEL, method_summary, summary
+from swiftwrf.contrib.comparison.steps import Memo
+from swiftwrf.metrics import LEVEL
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.rssi import RssiModel
 from swiftwrf.rssi.coverage import at_least, reach
 from swiftwrf.rssi.head import DB_PER_UNIT, Head, render
-from swiftwrf.runtime.steps import Memo
 
 RESULT = "rssi"
 SPLITS = {

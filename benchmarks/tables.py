@@ -15,9 +15,10 @@ import tyro
 from record import ROOT, age, load, loaded, markdown
 
 from augment.turbo.condition import LOCATED
-from swiftwrf.choices import ROOMS, RSSI_PREDICTORS
+from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.contrib.comparison.localizers import LOCALIZERS
 from swiftwrf.contrib.datasets import catalogue
+from swiftwrf.contrib.raytraced.names import ROOMS
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from tasks import configs, labels
 from tasks.command import COMMANDS

@@ -26,8 +26,8 @@ def one_line(message: str) -> str:
 
 def listed(names: Iterable[object]) -> str:
     """Return the first names and the number of further ones."""
-    found = [str(name) for name in names]
-    return ", ".join(found[:MAX_NAMES]) + (f" and {len(found) - MAX_NAMES} more" if found[MAX_NAMES:] else "")
+    texts = [str(name) for name in names]
+    return ", ".join(texts[:MAX_NAMES]) + (f" and {len(texts) - MAX_NAMES} more" if texts[MAX_NAMES:] else "")
 
 
 def ranges(numbers: Iterable[int]) -> str:

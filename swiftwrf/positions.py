@@ -14,9 +14,7 @@ from swiftwrf.errors import InputError
 
 MAX_COORDINATE_M = 1e9  # of a position: beyond, float64 does not resolve a wavelength
 MAX_COORDINATE = 1e15
-MAX_EXTENTS, MIN_FAR_M = 10.0, 100.0  # between positions and the box of those that a model was fitted to
 MAX_NORMALISED = 1e6  # normalised: beyond, all is equally far, and float32 must not overflow
-MIN_REACH = 1.5  # of the largest distance between neighbours, for positions on a line
 MIN_TREE_POSITIONS = 2000  # known positions from which on a tree finds the nearest ones faster than all distances do
 
 
@@ -101,22 +99,24 @@ def check_positions(
     return position.to_dense().double() if isinstance(position, Tensor) else checked
 
 
-def check_near(name: str, position: Tensor, known: Tensor) -> None:
+def check_near(
+    name: str, position: Tensor, known: Tensor, min_far_m: float = 100.0, max_diagonals: float = 10.0
+) -> None:
     """Refuse positions (n, 3) [m] so far away from known ones (m, 3) [m] that they are in another unit or frame.
 
     Raises:
-        InputError: A position more than 100 m and 10 diagonals away from the box around the known ones.
+        InputError: A position more than 100 m and 10 diagonals away from the box around the known ones (not studied).
     """
     low, high = known.amin(dim=0), known.amax(dim=0)
     away, extent = (position - position.clamp(low, high)).norm(dim=1), float((high - low).norm())
-    if bool((away > max(MIN_FAR_M, MAX_EXTENTS * extent)).any()):
+    if bool((away > max(min_far_m, max_diagonals * extent)).any()):
         raise InputError(
             f"{name} has a position {float(away.max()):.3g} m away from those that the model was fitted to, which extend "
             f"over {extent:.3g} m; give positions in the unit and frame of these"
         )
 
 
-def frame(position: Tensor) -> tuple[Tensor, Tensor]:
+def centre_and_half_side(position: Tensor) -> tuple[Tensor, Tensor]:
     """Return centre (3,) and half the longest side () of the box around positions (n, 3) [m], float64."""
     low, high = position.double().min(dim=0).values, position.double().max(dim=0).values
     half = (high - low).max() / 2
@@ -155,15 +155,15 @@ def cells(position: Tensor, n: int) -> tuple[Tensor, float]:
     if int(spot.max()) < n:
         return spot, 0.0
     local = position - position.min(dim=0).values
-    fine, coarse, found = 0.0, float(local.max()), torch.zeros(len(position), dtype=torch.int64)
+    fine, coarse, cell = 0.0, float(local.max()), torch.zeros(len(position), dtype=torch.int64)
     for _ in range(20):  # to a millionth of the extent
         edge = (fine + coarse) / 2
         number = torch.unique((local / edge).floor().long(), dim=0, return_inverse=True)[1]
         if int(number.max()) < n:
-            coarse, found = edge, number
+            coarse, cell = edge, number
         else:
             fine = edge
-    return found, coarse
+    return cell, coarse
 
 
 class Neighbours:
@@ -201,10 +201,11 @@ def nearest(position: Tensor, known: Tensor, k: int) -> tuple[Tensor, Tensor]:
     return Neighbours(known)(position, k)
 
 
-def inside(position: ArrayLike, known: ArrayLike) -> NDArray[np.bool_]:
+def inside(position: ArrayLike, known: ArrayLike, reach: float = 1.5) -> NDArray[np.bool_]:
     """Return whether positions (..., 2 or 3) [m] lie inside the convex hull of known ones (n, 2 or 3), in plan.
 
-    Known positions on a line have no hull. There a position is inside if it lies near one of them.
+    Known positions on a line have no hull. There a position is inside if it lies within `reach` times the largest distance
+    between neighbours of one of them (not studied).
 
     Example:
         >>> inside([[0.5, 0.2], [2.0, 0.2]], [[0, 0], [1, 0], [0, 1], [1, 1]]).tolist()
@@ -218,4 +219,4 @@ def inside(position: ArrayLike, known: ArrayLike) -> NDArray[np.bool_]:
         places = np.unique(points, axis=0)
         tree = cKDTree(places)
         apart = tree.query(places, min(2, len(places)))[0].reshape(len(places), -1)[:, -1]
-        return np.asarray(tree.query(at)[0] <= MIN_REACH * max(float(apart.max()), 1e-6))
+        return np.asarray(tree.query(at)[0] <= reach * max(float(apart.max()), 1e-6))

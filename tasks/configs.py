@@ -8,20 +8,9 @@ from typing import Annotated, Literal
 import tyro
 from annotated_types import Ge, Gt, Le, Lt
 
-from swiftwrf.choices import (
-    AUTO,
-    CARRIERS_HZ,
-    FIELD_MODELS,
-    MAX_SUGGESTIONS,
-    RAYTRACE,
-    ROOMS,
-    RSSI_PREDICTORS,
-    SCENE_FILE,
-    Moving,
-    NotDetected,
-    check_scene,
-    fraction_key,
-)
+from augment.choices import AUTO, MAX_SUGGESTIONS, fraction_key
+from swiftwrf.choices import CARRIERS_HZ, FIELD_MODELS, RSSI_PREDICTORS, Moving, NotDetected
+from swiftwrf.contrib.raytraced.names import RAYTRACE, ROOMS, SCENE_FILE, check_scene
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.validation import Fraction, NonNegativeInt, PositiveFloat, PositiveInt, Preset
 from tasks import labels

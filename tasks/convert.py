@@ -11,11 +11,12 @@ import torch
 
 from swiftwrf import FieldModel, InputError, RssiModel, load
 from swiftwrf.contrib.diagnostics.calibration import Calibration, calibrate
+from swiftwrf.contrib.formats.deepmimo import write_deepmimo
 from swiftwrf.data import Rssi, Snapshots, Spectra
 from swiftwrf.data.dataset import Labelled
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
 from swiftwrf.data.formats.paths import read_paths
-from swiftwrf.data.writing import write_deepmimo, write_mat, write_rssi, write_spectra
+from swiftwrf.data.writing import write_mat, write_rssi, write_spectra
 from swiftwrf.errors import with_article
 from swiftwrf.locate import RssiLocator
 from swiftwrf.rssi.base import RssiPredictor

@@ -19,9 +19,9 @@ import torch
 from filelock import FileLock, Timeout
 
 from swiftwrf import InputError
+from swiftwrf.contrib.comparison.steps import LOCATOR, MODEL, STEPS, Memo, check_unchanged
 from swiftwrf.runtime.digest import digest
 from swiftwrf.runtime.durable import rename, strict, write_json
-from swiftwrf.runtime.steps import LOCATOR, MODEL, STEPS, Memo, check_unchanged
 from swiftwrf.runtime.threads import set_threads
 from tasks.environment import environment, invocation, now, number_of_processes, stamp
 from tasks.options import plain

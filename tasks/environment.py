@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from swiftwrf import InputError
-from swiftwrf.runtime.steps import packages
+from swiftwrf.contrib.comparison.steps import packages
 from swiftwrf.runtime.threads import to_device
 from tasks.preload import MAX_PROCESSES
 

@@ -24,7 +24,7 @@ from swiftwrf.runtime.progress import forwarding
 from tasks.options import Answered, Output
 
 if TYPE_CHECKING:  # which imports torch
-    from swiftwrf.metrics import ErrorSummary
+    from swiftwrf.contrib.comparison.errors import ErrorSummary
 
 LOGGERS = ("swiftwrf", "augment", "tasks")  # whose messages --verbose shows
 PLAIN_WIDTH = 140  # characters of a table that is not shown on a terminal

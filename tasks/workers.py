@@ -27,8 +27,8 @@ from uuid import uuid4
 import torch
 
 from swiftwrf import FitError, InputError
+from swiftwrf.contrib.comparison.steps import POLL_S, STEPS, packages
 from swiftwrf.runtime.progress import silent
-from swiftwrf.runtime.steps import POLL_S, STEPS, packages
 from swiftwrf.runtime.threads import set_threads, to_device
 from tasks.directory import Run
 from tasks.environment import machine

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 
 from swiftwrf import InputError
-from swiftwrf.runtime.steps import Steps
+from swiftwrf.contrib.comparison.steps import Steps
 from tasks.configs import AoaConfig
 from tasks.directory import Run
 from tasks.workers import workers_of

@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, TypeVar
 
+from augment.choices import AUTO, fraction_key
 from augment.cross_validation import LOCATOR, STAND_IN
 from augment.estimators import ESTIMATORS
-from swiftwrf.choices import AUTO, fraction_key
 from swiftwrf.runtime.validation import Preset
 
 Row = dict[str, Any]

@@ -11,13 +11,13 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from augment.choices import AUTO
 from augment.choose import blind_folds, candidates, held_out
 from augment.cross_validation import LOCATOR, STAND_IN
 from augment.estimators import ESTIMATORS, Estimator, make_estimator
 from augment.mix import Mixed, withhold
 from augment.positions import SyntheticPositions
 from augment.turbo.condition import NETWORKS, MeasuredSubset, Row, Training
-from swiftwrf.choices import AUTO
 from swiftwrf.data import Spectra
 from swiftwrf.errors import InputError
 from swiftwrf.locate.matched_field import MIN_SPECTRA

@@ -9,6 +9,7 @@ from itertools import zip_longest
 
 import torch
 
+from augment.choices import AUTO
 from augment.choose import candidates
 from augment.cross_validation import LOCATOR, STAND_IN
 from augment.estimators import Estimator
@@ -17,11 +18,10 @@ from augment.turbo.condition import CHOSEN, LOCATED, NETWORKS, Condition, Measur
 from augment.turbo.experiment import ROOM_MODEL, Experiment
 from augment.turbo.results import TurboResult
 from augment.turbo.stages import compare, evaluate, find_room, hold_out, locate, synthesize
-from swiftwrf.choices import AUTO
+from swiftwrf.contrib.comparison.steps import Memo, Steps
 from swiftwrf.data import Spectra
 from swiftwrf.models import FieldModel
 from swiftwrf.runtime.checkpoint import Saved
-from swiftwrf.runtime.steps import Memo, Steps
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, Preset, checked
 
 

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from pandas import DataFrame, concat
 
+from augment.choices import fraction_key
 from augment.cross_validation import LOCATOR, choose_estimator
 from augment.estimators import Estimator
 from augment.turbo.artifacts import model_file
@@ -26,13 +27,13 @@ from augment.turbo.condition import (
 from augment.turbo.experiment import ROOM_MODEL, Experiment
 from augment.turbo.stages import training_set
 from swiftwrf import load
-from swiftwrf.choices import fraction_key
 from swiftwrf.contrib.comparison.base import Recorded, Result
+from swiftwrf.contrib.comparison.errors import ChangeMetrics, paired_change, summaries
+from swiftwrf.contrib.comparison.steps import Memo
 from swiftwrf.data.splits import places
 from swiftwrf.locate import MatchedField
-from swiftwrf.metrics import LEVEL, ChangeMetrics, angle_errors, paired_change, summaries
+from swiftwrf.metrics import LEVEL, angle_errors
 from swiftwrf.models import FIELD_MODELS
-from swiftwrf.runtime.steps import Memo
 
 ANGLES = ("azimuth_deg", "elevation_deg", "great_circle_deg")
 

@@ -20,12 +20,12 @@ from augment.turbo.artifacts import as_bytes, model_file, save_examples, save_lo
 from augment.turbo.condition import Condition, MeasuredSubset, Row
 from augment.turbo.experiment import ROOM_MODEL, Experiment
 from swiftwrf import FitError, GeometryModel, InputError, Spectra, load
+from swiftwrf.contrib.comparison.steps import STEPS
 from swiftwrf.data.store import Store
 from swiftwrf.locate import MatchedField, MatchedFieldConfig, Posterior
 from swiftwrf.metrics import LEVEL, l1, psnr, ssim
 from swiftwrf.models.base import synthesized
 from swiftwrf.runtime.checkpoint import Saved, read, write
-from swiftwrf.runtime.steps import STEPS
 
 KIND = "synthetic spectra"
 SCORE = {"psnr_db": psnr, "ssim": ssim, "l1": l1}

@@ -50,9 +50,9 @@ def read_arrays(file: Path, needed: Sequence[str], optional: Sequence[str] = (),
         raise InputError(f"{file} is missing")
     kind = "an HDF5 file" if _is_hdf5(file) else "a MATLAB file" if file.suffix in MATLAB else "an npz archive"
     with refusing_broken(file, f"{kind} of plain numbers"), _opened(file, kinds) as (names, find):
-        found = {name: find(name) for name in _choose(file, names, needed, optional)}
-        _check_total(sum(size for size, _ in found.values()), file)
-        return {name: read() for name, (_, read) in found.items()}
+        stored = {name: find(name) for name in _choose(file, names, needed, optional)}
+        _check_total(sum(size for size, _ in stored.values()), file)
+        return {name: read() for name, (_, read) in stored.items()}
 
 
 @contextmanager
@@ -130,7 +130,7 @@ def _stream(file: Path, name: str) -> Iterator[tuple[Any, int]]:
 
 @contextmanager
 def refusing_broken(file: object, kind: str) -> Iterator[None]:
-    """Turn exceptions on a broken file, or what a label names, into an InputError with its expected kind."""
+    """Turn exceptions on a broken file, or on any source of data, into an InputError with its expected kind."""
     try:
         yield
     except InputError as error:
@@ -182,8 +182,8 @@ def _in_hdf5(content: Any, name: str) -> Stored:
     owner, key = content, name
     if is_own(content, name, h5py.Group) and {"type", "value"} <= set(content[name]):  # as Octave saves variables
         owner, key = content[name], "value"
-    own = is_own(owner, key, h5py.Dataset) and not (owner[key].is_virtual or owner[key].external)
-    dtype: Any = owner[key].dtype if own else np.dtype(object)
+    is_inside = is_own(owner, key, h5py.Dataset) and not (owner[key].is_virtual or owner[key].external)
+    dtype: Any = owner[key].dtype if is_inside else np.dtype(object)
     if dtype.names == ("real", "imag") and dtype[0] == dtype[1] and dtype[0].kind == "f" and dtype.itemsize in (8, 16):
         dtype = np.dtype(f"{dtype[0].byteorder}c{dtype.itemsize}")  # as MATLAB saves complex numbers
     if dtype.kind not in NUMBERS:

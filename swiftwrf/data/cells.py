@@ -71,10 +71,10 @@ def unit_of(column: pd.Series) -> str:
     words = _words(str(column.name))
     if {*PIXELS} & {*words.split("_")}:
         return PIXELS[0]
-    found = UNIT_AT_THE_END.search(words)
+    in_name = UNIT_AT_THE_END.search(words)
     cells = text_of(column[column.notna()].iloc[:1])
     number = NUMBER.fullmatch(cells.iloc[0].translate(MINUS)) if len(cells) else None
-    return found[1] if found else number[2].lower() if number else ""
+    return in_name[1] if in_name else number[2].lower() if number else ""
 
 
 def _words(name: str) -> str:
@@ -97,14 +97,14 @@ def parsed(column: pd.Series) -> tuple[Floats, NDArray[np.bool_]]:
     if column.dtype.kind in "biuf":
         return column.to_numpy(np.float64), np.zeros(len(column), dtype=bool)
     with suppress(ValueError, TypeError):  # numbers alone, the usual case, are parsed fast
-        if "_" not in (whole := "".join(column)) and whole.isascii():
+        if "_" not in (joined := "".join(column)) and joined.isascii():
             return np.fromiter(map(float, column), np.float64, len(column)), np.zeros(len(column), dtype=bool)
     cells = column.astype(str).str.strip()
     values = pd.to_numeric(cells, errors="coerce").to_numpy(np.float64, copy=True)
     rest = np.isnan(values) & column.notna().to_numpy()
-    found = {word: _number_in(word) for word in cells[rest].unique()}
-    text = rest & cells.isin([word for word, number in found.items() if number is None]).to_numpy()
-    values[rest & ~text] = cells[rest & ~text].map(found).to_numpy(np.float64)
+    number_of = {word: _number_in(word) for word in cells[rest].unique()}
+    text = rest & cells.isin([word for word, number in number_of.items() if number is None]).to_numpy()
+    values[rest & ~text] = cells[rest & ~text].map(number_of).to_numpy(np.float64)
     return values, text
 
 
@@ -119,7 +119,7 @@ def _number_in(cell: str) -> float | None:
     return None if np.isnan(value) else value
 
 
-def column_of_numbers(label: object, table: pd.DataFrame, name: str) -> Floats:
+def column_of_numbers(source: object, table: pd.DataFrame, name: str) -> Floats:
     """Return a column as numbers, nan where a cell is empty.
 
     Raises:
@@ -128,7 +128,7 @@ def column_of_numbers(label: object, table: pd.DataFrame, name: str) -> Floats:
     values, text = parsed(table[name])
     if text.any():
         row = int(text.argmax())
-        raise InputError(f"{label} row {row + 1}, column {name}: {table[name].iloc[row]!r} is not a number")
+        raise InputError(f"{source} row {row + 1}, column {name}: {table[name].iloc[row]!r} is not a number")
     return values
 
 
@@ -161,9 +161,9 @@ def seconds(column: pd.Series, date: pd.Series | None = None) -> tuple[Floats, l
         values = column.dt.total_seconds().to_numpy(np.float64)
     if len(filled) and filled.str.fullmatch(DIGITS_OF_DATE).all():
         notes.append(f"column {column.name} holds dates as digits (yyyymmddhhmmss)")
-        whole = pd.to_datetime(text.str[:14], errors="coerce", utc=True, format="%Y%m%d%H%M%S")
+        second = pd.to_datetime(text.str[:14], errors="coerce", utc=True, format="%Y%m%d%H%M%S")
         part = pd.to_numeric(text.str[14:], errors="coerce").fillna(0).to_numpy(np.float64)
-        values = (whole - whole.min()).dt.total_seconds().to_numpy(np.float64) + part / 1e3
+        values = (second - second.min()).dt.total_seconds().to_numpy(np.float64) + part / 1e3
     elif np.isnan(values).all():
         if date is not None:
             column = text_of(date).str.split().str[0].fillna("") + " " + text

@@ -68,13 +68,11 @@ GROUPS_OF_ROWS = re.compile(  # columns that distinguish rows, but not the recei
     r"|app\w*|sample\w*|index|idx|row|count\w*|seq\w*|packet\w*|frame\w*|node_?addr\w*|dev_?(?:eui|addr))"
     r"(?:_?(?:id|name|no|number))?"
 )
-MIN_ROWS = 5  # for a comparison of values
-MIN_REFERENCE_DBM = -25.0  # median of a column that is a received power by its values alone
 GEODETIC = {"x": "longitude", "y": "latitude"}  # that take the place of x and y
 
 
 def column_of(table: pd.DataFrame, role: str, columns: Mapping[str, str]) -> str | None:
-    """Return the first column of a role, by the names of columns given by role or by its own name. None without one."""
+    """Return the column of a role: the one that `columns` names, or else the first with a known name. None without one."""
     return columns[role] if role in columns else next(iter(candidates(table, role)), None)
 
 
@@ -84,14 +82,14 @@ def candidates(table: pd.DataFrame, role: str) -> list[str]:
     A column of powers does not hold names of receivers.
     """
     plain = {name: plain_name(name) for name in map(str, table.columns)}
-    found = [name for pattern in ROLES[role] for name in plain if re.fullmatch(pattern, plain[name])]
+    matches = [name for pattern in ROLES[role] for name in plain if re.fullmatch(pattern, plain[name])]
     if role == "receiver":
-        return [name for name in found if not is_rssi(table[name])]
-    return [name for name in found if not NO_POWER.fullmatch(plain[name])]
+        return [name for name in matches if not is_rssi(table[name])]
+    return [name for name in matches if not NO_POWER.fullmatch(plain[name])]
 
 
 def find_roles(
-    label: object, table: pd.DataFrame, asked: Mapping[str, str], taken: Collection[str] = ()
+    source: object, table: pd.DataFrame, asked: Mapping[str, str], taken: Collection[str] = ()
 ) -> dict[str, str]:
     """Return the column of each role: the one asked for, or else the first one with a known name that is not taken.
 
@@ -102,23 +100,24 @@ def find_roles(
         if role not in ROLES:
             raise InputError(f"columns takes {', '.join(ROLES)}, got {role!r}")
         if name not in table.columns and not (role == "rssi" and fnmatch.filter(table.columns, name)):
-            raise InputError(f"{label} has no column {name!r} for {role}; there are {listed(table.columns)}")
+            raise InputError(f"{source} has no column {name!r} for {role}; there are {listed(table.columns)}")
     roles = {role: name for role, name in asked.items() if name in table.columns}
     for role in ROLES:
-        found = [name for name in candidates(table, role) if name not in (*roles.values(), *taken)]
-        if role in asked or not found:
+        matches = [name for name in candidates(table, role) if name not in (*roles.values(), *taken)]
+        if role in asked or not matches:
             continue
-        if len(found) > 1 and role in (*GEODETIC, *GEODETIC.values()):
+        if len(matches) > 1 and role in (*GEODETIC, *GEODETIC.values()):
             raise InputError(
-                f"{label} has {len(found)} columns that may be {role} ({listed(found)}); choose one with columns {role}=NAME"
+                f"{source} has {len(matches)} columns that may be {role} ({listed(matches)}); choose one with columns "
+                f"{role}=NAME"
             )
-        roles[role] = found[0]
+        roles[role] = matches[0]
     for role, other in GEODETIC.items():
         if other in roles and role in roles:
             del roles[other]
         if role not in roles and other not in roles:
             raise InputError(
-                f"{label} has no column for {role}; there are {listed(table.columns)}; choose one with columns {role}=NAME"
+                f"{source} has no column for {role}; there are {listed(table.columns)}; choose one with columns {role}=NAME"
             )
     name = roles.get("receiver", "")
     if "receiver" not in asked and re.fullmatch(CELL_ID, plain_name(name)) and table[name].nunique() == 1:
@@ -127,39 +126,57 @@ def find_roles(
     if "receiver" in roles and "rssi" not in roles:
         if "receiver" in asked or len(receiver_columns(table, others)[0]) < 2:
             raise InputError(
-                f"{label} has receivers in column {roles['receiver']!r}, but no RSSI beside; name it with columns rssi=NAME"
+                f"{source} has receivers in column {roles['receiver']!r}, but no RSSI beside; name it with columns rssi=NAME"
             )
-        del roles["receiver"]  # a label of the rows of a wide table
+        del roles["receiver"]  # which distinguishes rows of a wide table
     return roles
 
 
-def receiver_columns(table: pd.DataFrame, names: Sequence[str]) -> tuple[list[str], list[str], list[str]]:
+def receiver_columns(
+    table: pd.DataFrame,
+    names: Sequence[str],
+    min_rows: int = 5,
+    max_median_dbm: float = -25.0,
+    max_positive: float = 0.02,
+    min_family: float = 0.6,
+) -> tuple[list[str], list[str], list[str]]:
     """Return those columns that hold the RSSI of receivers, others that look like it, and notes on these.
 
     Names of other quantities are left out. Of several columns whose names are nothing but received power, the most specific
     one counts. Other columns must be akin to columns of received power, by their names or by their values.
+
+    Args:
+        table: Columns of receivers and others.
+        names: Columns that may hold RSSI.
+        min_rows: Values are compared from this number of rows on. The bounds are not studied.
+        max_median_dbm: Largest median of a column that is a received power by its values alone.
+        max_positive: Fraction of positive values in such a column, at most.
+        min_family: Fraction of the receivers with names of one kind, from which on others are reported.
 
     Example:
         >>> table = pd.DataFrame({"AP1": [-60] * 9, "AP2": [-70] * 9, "SNR": [-3] * 9, "drift": [-20.5] * 9})
         >>> receiver_columns(table, list(table))[0]
         ['AP1', 'AP2']
     """
-    found = [name for name in names if is_rssi(table[name]) and not is_coordinate(name)]
-    plain = {name: plain_name(name) for name in found}
-    others = [name for name in found if NO_POWER.fullmatch(plain[name])]
-    bare = [name for name in candidates(table, "rssi") if name in found]
+    receivers = [name for name in names if is_rssi(table[name]) and not is_coordinate(name)]
+    plain = {name: plain_name(name) for name in receivers}
+    others = [name for name in receivers if NO_POWER.fullmatch(plain[name])]
+    bare = [name for name in candidates(table, "rssi") if name in receivers]
     weaker = bare[1:]
-    found = [name for name in found if name not in (*others, *weaker)]
-    values = {name: parsed(table[name])[0] for name in found}
+    receivers = [name for name in receivers if name not in (*others, *weaker)]
+    values = {name: parsed(table[name])[0] for name in receivers}
     powers = {name: v[np.isfinite(v) & ~np.isin(v, KNOWN_FILLERS)] for name, v in values.items()}
-    usual = {n: not len(p) or (np.median(p) <= MIN_REFERENCE_DBM and (p > 0).mean() < 0.02) for n, p in powers.items()}
-    plausible = [name for name in found if usual[name]] or found
-    whole = [name for name in plausible if (powers[name] % 1 == 0).all()]
-    reference = whole if len(whole) > 1 or set(whole) & set(bare) else plausible
-    if len(table) < MIN_ROWS:  # e.g. one of a stream
-        reference = found
+    usual = {
+        name: not len(p) or (np.median(p) <= max_median_dbm and (p > 0).mean() < max_positive)
+        for name, p in powers.items()
+    }
+    plausible = [name for name in receivers if usual[name]] or receivers
+    of_integers = [name for name in plausible if (powers[name] % 1 == 0).all()]
+    reference = of_integers if len(of_integers) > 1 or set(of_integers) & set(bare) else plausible
+    if len(table) < min_rows:  # e.g. one of a stream
+        reference = receivers
     kin = {_kinship(plain[name]) for name in reference}
-    doubtful = [name for name in found if name not in reference and _kinship(plain[name]) not in kin]
+    doubtful = [name for name in receivers if name not in reference and _kinship(plain[name]) not in kin]
     notes = []
     if others or weaker:
         notes.append(f"columns of other quantities than the received power are left out: {listed([*others, *weaker])}")
@@ -168,29 +185,38 @@ def receiver_columns(table: pd.DataFrame, names: Sequence[str]) -> tuple[list[st
             f"columns are left out whose values are unlike those of {listed(reference[:3])}: {listed(doubtful)}; if "
             "they are receivers, give --columns rssi=PATTERN"
         )
-    found = [name for name in found if name not in doubtful]
-    families = pd.Series([_kinship(plain[name]) for name in found], dtype=object)
+    receivers = [name for name in receivers if name not in doubtful]
+    families = pd.Series([_kinship(plain[name]) for name in receivers], dtype=object)
     sizes = families.value_counts()
-    if len(sizes) > 1 and sizes.iloc[0] >= max(3, 0.6 * len(found)):
-        odd = [name for name, family in zip(found, families, strict=True) if family != sizes.index[0]]
+    if len(sizes) > 1 and sizes.iloc[0] >= max(3, min_family * len(receivers)):
+        odd = [name for name, family in zip(receivers, families, strict=True) if family != sizes.index[0]]
         notes.append(f"columns count as receivers though they are named unlike the others: {listed(odd)}")
-    return found, [*others, *weaker, *doubtful], notes
+    return receivers, [*others, *weaker, *doubtful], notes
 
 
 def _kinship(name: str) -> str:
-    """Return what related names share: that of MAC addresses, or the first word without digits."""
+    """Return the kind of a name: "address" for a MAC address, otherwise its first word without digits."""
     if re.fullmatch(r"(?:[0-9a-f]{2}_?){5}[0-9a-f]{2}", name):
         return "address"
     return re.split(r"[_\d]", name, maxsplit=1)[0] or "number"
 
 
 def check_receiver_known(
-    label: object, table: pd.DataFrame, rssi: str, others: Sequence[str], place: Sequence[str]
+    source: object,
+    table: pd.DataFrame,
+    rssi: str,
+    others: Sequence[str],
+    place: Sequence[str],
+    min_repeats: float = 3.0,
+    min_text: float = 0.9,
+    min_together: float = 0.3,
+    min_different: float = 0.8,
+    min_changes: float = 0.5,
 ) -> None:
     """Refuse a table with one column of RSSI beside names that may be those of its receivers.
 
-    Such names repeat in one of the other columns. Several of them occur at one place and time, or they alternate from row to
-    row.
+    Such names repeat in one of the other columns, each in `min_repeats` rows on average. Several of them occur at one place
+    and time, or they alternate from row to row. All other bounds are fractions of rows. None of them was studied.
 
     Raises:
         InputError: The question whether the column contains the receivers.
@@ -202,17 +228,17 @@ def check_receiver_known(
         cell = text_of(table[name])
         values, is_text = parsed(table[name])
         count = cell.value_counts()
-        if not 2 <= len(count) <= len(cell) / 3 or "" in count.index:
+        if not 2 <= len(count) <= len(cell) / min_repeats or "" in count.index:
             continue
-        is_name = is_text.mean() > 0.9 or bool((values % 1 == 0).all())
+        is_name = is_text.mean() > min_text or bool((values % 1 == 0).all())
         apart = ~pd.DataFrame({"row": together, "cell": cell}).duplicated(keep=False)
-        is_packet = several.mean() > 0.3 and apart[several].mean() > 0.8
-        alternates = is_text.all() and not several.any() and (cell != cell.shift()).mean() > 0.5
+        is_packet = several.mean() > min_together and apart[several].mean() > min_different
+        alternates = is_text.all() and not several.any() and (cell != cell.shift()).mean() > min_changes
         if (group := GROUPS_OF_ROWS.fullmatch(plain_name(name))) and not (timed and is_packet and group[1] == "device"):
             continue
         if is_name and (is_packet or alternates):
             raise InputError(
-                f"{label}: is {name!r} the receiver of each row? Then give --columns receiver={name}, or --columns "
+                f"{source}: is {name!r} the receiver of each row? Then give --columns receiver={name}, or --columns "
                 f"rssi={rssi} if all rows are of one receiver"
             )
 

@@ -15,19 +15,15 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from swiftwrf.data.cells import PIXELS, UNITS, unit_of
+from swiftwrf.data.cells import PIXELS, UNITS, Floats, unit_of
 from swiftwrf.errors import InputError
 
-Floats = NDArray[np.float64]
 Coordinates = Literal["degrees", "metres"]
 Up = Literal["y", "z"]
-FAR_RATIO = 10.0  # distance of the origin relative to the distance between positions, or to their extent
-MAX_EXTENT_DEG = 2.0  # of positions that are recognised as degrees
 # x and y that receivers of satellites write without a position
 NO_FIX = (0.0, -1.0, 999.0, -999.0, 9999.0, -9999.0)
-MIN_EXTENT_M, MAX_EXTENT_MINUTES = 2.0, 30.0  # of walks in metres, and in ddmm.mmmm
 STOREY_M = 4.0  # height of a floor where heights are missing or count from the floor
-MIN_STOREY_M, SAME_HEIGHT_M = 1.5, 0.5  # differences of the heights of two floors, and of one floor
+MIN_STOREY_M = 1.5  # between the heights of two floors
 BELOW_GROUND = re.compile(r"(?:b|ug|u\.g\.?|basement|cellar|keller|sub|lower)[ ._-]*(?:level|floor)?[ ._-]*(\d*)")
 VALUE, PX, METRE = r"(\d+(?:[.,]\d+)?)", "(?:px|pixels?)", "m(?:et(?:er|re)s?)?"
 SCALES = [  # of a plan in lines above a table: pixels in a metre, and metres in a pixel, whose power is -1
@@ -56,7 +52,7 @@ def stated_scale(text: str) -> float | None:
         (20.7, 20.0, None)
     """
     for pattern, power in SCALES:
-        if (found := pattern.search(text)) and (value := float(found[1].replace(",", "."))) > 0:
+        if (match := pattern.search(text)) and (value := float(match[1].replace(",", "."))) > 0:
             return float(value**power)
     return None
 
@@ -86,12 +82,14 @@ class PlanFrame(NamedTuple):
         return np.stack([x, -z, y] if self.up == "y" else [x, y, z], axis=1)
 
 
-def frame_of(label: object, table: pd.DataFrame, names: Sequence[str], frame: PlanFrame) -> tuple[PlanFrame, list[str]]:
+def frame_of(
+    source: object, table: pd.DataFrame, names: Sequence[str], frame: PlanFrame
+) -> tuple[PlanFrame, list[str]]:
     """Return the frame of coordinates in two columns, with the scale and direction that they state, and notes on these."""
     unit, stated = unit_of(table[names[0]]), stated_scale(table.attrs.get("preamble", ""))
     scale = frame.scale or stated
     if unit in PIXELS and scale is None:
-        raise InputError(f"{label}: columns {' and '.join(names)} are in pixels; give --scale PIXELS_PER_METRE")
+        raise InputError(f"{source}: columns {' and '.join(names)} are in pixels; give --scale PIXELS_PER_METRE")
     in_pixels = unit in PIXELS or (frame.scale is None and stated is not None and not unit)
     frame = PlanFrame(UNITS.get(unit) or scale or 1.0, frame.y_down or in_pixels, frame.up)
     notes = []
@@ -171,23 +169,28 @@ def without_fix(position: Floats) -> tuple[NDArray[np.bool_], list[str]]:
         array([False, False,  True,  True])
     """
     empty, finite = np.isnan(position.sum(axis=1)), np.isfinite(position).all(axis=1)
-    found = {"without a position": empty}
+    reasons = {"without a position": empty}
     omitted = empty.copy()
     for value in NO_FIX:
         rows = (position[:, 0] == value) & (position[:, 1] == value)
         if (rows.sum() > 1 or (value == 0 and rows.any())) and _is_apart(
             position[finite & ~omitted & ~rows], position[rows]
         ):
-            found[f"at {value:g}, {value:g}, apart from all others"] = rows
+            reasons[f"at {value:g}, {value:g}, apart from all others"] = rows
             omitted |= rows
     notes = [
-        f"rows {what} are left out: {int(rows.sum())} of {len(position)}" for what, rows in found.items() if rows.any()
+        f"rows {what} are left out: {int(rows.sum())} of {len(position)}"
+        for what, rows in reasons.items()
+        if rows.any()
     ]
     return omitted, notes
 
 
-def _is_apart(others: Floats, same: Floats) -> bool:
-    """Return True if repeated positions (m, 3) are no place among the others (n, 3)."""
+def _is_apart(others: Floats, same: Floats, far_ratio: float = 10.0) -> bool:
+    """Return True if one repeated position, (m, 3), is apart from the places of the others (n, 3).
+
+    They are far at `far_ratio` times the distance between neighbours (not studied).
+    """
     places, times = np.unique(others[:, :2], axis=0, return_counts=True)
     if len(places) < 2:
         return False
@@ -196,11 +199,18 @@ def _is_apart(others: Floats, same: Floats) -> bool:
     distance = float(tree.query(same[0, :2])[0])
     of_no_height = not bool(same.any()) and bool((others[:, 2] != 0).all())
     more_often = len(same) > int(times.max())
-    return of_no_height or distance > FAR_RATIO * spacing or (more_often and distance > spacing)
+    return of_no_height or distance > far_ratio * spacing or (more_often and distance > spacing)
 
 
 def degrees_in(
-    label: object, names: tuple[str, str], xy: Floats, named: bool, asked: Coordinates | None
+    source: object,
+    names: tuple[str, str],
+    xy: Floats,
+    named: bool,
+    asked: Coordinates | None,
+    far_ratio: float = 10.0,
+    max_extent_deg: float = 2.0,
+    max_walk_deg: float = 0.05,
 ) -> tuple[Floats | None, list[str]]:
     """Return latitudes and longitudes (n, 2) [deg], None if the coordinates are metres, and a note on their unit.
 
@@ -208,11 +218,14 @@ def degrees_in(
     if none of them can be degrees. Longitudes may count from 0 to 360 degrees.
 
     Args:
-        label: Name of the table, for messages.
+        source: Name of the table, for messages.
         names: Names of both columns.
         xy: Longitude or x, and latitude or y, (n, 2). Without names, x is the latitude if y exceeds 90.
         named: Whether the columns are named after longitude and latitude.
         asked: What the user states.
+        far_ratio: Distance of degrees from 0, 0 in their extents, at least. The bounds are not studied.
+        max_extent_deg: Largest extent of positions that are recognised as degrees.
+        max_walk_deg: Largest extent of degrees without names, 5 km: in metres it is 5 cm, and no walk.
 
     Raises:
         InputError: Values that are no degrees though the user or their names state it, or that may be either.
@@ -228,19 +241,7 @@ def degrees_in(
         return None, notes
     size = np.abs(xy)
     if named and (size > 180).any():
-        whole, minutes = np.divmod(size, 100)
-        extent = float(np.ptp(xy, axis=0).max())
-        if bool((xy % 1 == 0).all()) and (size <= (180e7, 90e7)).all() and size.min(axis=0).max() >= 1e7:
-            xy = xy / 1e7
-            notes.append(f"{columns} count 1e-7 degrees, which are converted to degrees")
-        elif not ((minutes >= 60).any() or (whole > (180, 90)).any() or extent > MAX_EXTENT_MINUTES):
-            if extent > MIN_EXTENT_M:
-                raise InputError(
-                    f"{label}: {columns} may be degrees and minutes (ddmm.mmmm) or metres; convert them to degrees, or "
-                    "give --coordinates metres"
-                )
-            xy = np.sign(xy) * (whole + minutes / 60)
-            notes.append(f"{columns} count degrees and minutes (ddmm.mmmm), which are converted to degrees")
+        xy, notes = _plain_degrees(source, columns, xy)
     swapped = not named and bool((np.abs(xy[:, 1]) > 90).any())
     degrees = xy if swapped else xy[:, ::-1]
     stated = named or asked == "degrees"
@@ -254,20 +255,45 @@ def degrees_in(
             fault = "latitudes beyond 90 degrees; are they swapped? Name them with columns latitude=NAME longitude=NAME"
             if not (np.abs(degrees) <= 180).all():
                 fault = "values beyond 180 degrees; if they are metres, give --coordinates metres"
-            raise InputError(f"{label}: {columns} hold {fault}")
+            raise InputError(f"{source}: {columns} hold {fault}")
         return None, notes
     east = (degrees[:, 1] - degrees[0, 1] + 180) % 360  # on either side of the antimeridian
     extent, distance = float(max(np.ptp(degrees[:, 0]), np.ptp(east))), float(np.abs(xy).max())
-    if asked == "degrees" or (named and extent <= MAX_EXTENT_DEG):
+    if asked == "degrees" or (named and extent <= max_extent_deg):
         return degrees, notes
-    if not named and (distance <= FAR_RATIO * extent or extent == 0 or extent > MAX_EXTENT_DEG):
+    if not named and (distance <= far_ratio * extent or extent == 0 or extent > max_extent_deg):
         return None, notes
-    if not named and extent <= 0.05:  # a walk in degrees (5 km), and none in metres (5 cm)
+    if not named and extent <= max_walk_deg:
         return degrees, notes
     raise InputError(
-        f"{label}: {columns} extend over {extent:.3g} and may be degrees or metres; choose --coordinates degrees or "
+        f"{source}: {columns} extend over {extent:.3g} and may be degrees or metres; choose --coordinates degrees or "
         "--coordinates metres"
     )
+
+
+def _plain_degrees(
+    source: object, columns: str, xy: Floats, min_extent_m: float = 2.0, max_extent_minutes: float = 30.0
+) -> tuple[Floats, list[str]]:
+    """Return values (n, 2) [deg] of counts of 1e-7 degrees or of ddmm.mmmm, and a note; others as they are.
+
+    A walk extends over at least `min_extent_m` in metres, and at most `max_extent_minutes` in ddmm.mmmm (not studied).
+
+    Raises:
+        InputError: Values that may be ddmm.mmmm or metres.
+    """
+    size, extent = np.abs(xy), float(np.ptp(xy, axis=0).max())
+    degree, minutes = np.divmod(size, 100)
+    if bool((xy % 1 == 0).all()) and (size <= (180e7, 90e7)).all() and size.min(axis=0).max() >= 1e7:
+        return xy / 1e7, [f"{columns} count 1e-7 degrees, which are converted to degrees"]
+    if (minutes >= 60).any() or (degree > (180, 90)).any() or extent > max_extent_minutes:
+        return xy, []
+    if extent > min_extent_m:
+        raise InputError(
+            f"{source}: {columns} may be degrees and minutes (ddmm.mmmm) or metres; convert them to degrees, or give "
+            "--coordinates metres"
+        )
+    note = f"{columns} count degrees and minutes (ddmm.mmmm), which are converted to degrees"
+    return np.sign(xy) * (degree + minutes / 60), [note]
 
 
 @dataclass(frozen=True)
@@ -296,13 +322,13 @@ class Floors:
         return [self.names[number] for number in self.number(position).tolist()]
 
 
-def floors_of(label: object, floor: list[str], position: Floats) -> Floors | None:
+def floors_of(source: object, floor: list[str], position: Floats) -> Floors | None:
     """Return the floors by the name of each row's floor and its position (n, 3) [m]; None if there is one only.
 
     Names of one height at different places, e.g. in two buildings, are one floor.
 
     Raises:
-        InputError: Floors of one height at the same places; the label names the table.
+        InputError: Floors of one height at the same places; the sentence begins with the source.
 
     Example:
         >>> position = np.array([[0, 0, 5.0], [0, 0, 1.0], [0, 0, 5.2]])
@@ -311,13 +337,13 @@ def floors_of(label: object, floor: list[str], position: Floats) -> Floors | Non
     """
     of_row = np.array(floor, dtype=object)
     rows = {name: position[of_row == name] for name in set(floor) - {""}}
-    height = {name: float(np.median(own[:, 2])) for name, own in rows.items()}
+    height = {name: float(np.median(at[:, 2])) for name, at in rows.items()}
     levels: list[list[str]] = []
     for name in sorted(height, key=lambda name: (height[name], name)):
         if levels and height[name] - height[levels[-1][0]] < MIN_STOREY_M:
             if above := [other for other in levels[-1] if _overlap(rows[name], rows[other])]:
                 raise InputError(
-                    f"{label}: floors {above[0]!r} and {name!r} have heights of {height[above[0]]:.3g} and "
+                    f"{source}: floors {above[0]!r} and {name!r} have heights of {height[above[0]]:.3g} and "
                     f"{height[name]:.3g} m at the same places; give heights above one ground, or numbers of the floors "
                     "without heights"
                 )
@@ -328,9 +354,9 @@ def floors_of(label: object, floor: list[str], position: Floats) -> Floors | Non
     return Floors(tuple(", ".join(level) for level in levels), tuple(heights)) if len(levels) > 1 else None
 
 
-def _overlap(a: Floats, b: Floats) -> bool:
-    """Return True if more than half of the positions of one floor are in the box of the other, or nearly so in height."""
-    margin = np.array([0.0, 0.0, SAME_HEIGHT_M])
+def _overlap(a: Floats, b: Floats, margin_m: float = 0.5) -> bool:
+    """Return True if more than half of the positions of one floor are in the box of the other, with a margin in height."""
+    margin = np.array([0.0, 0.0, margin_m])
     boxes = ((p >= q.min(axis=0) - margin) & (p <= q.max(axis=0) + margin) for p, q in ((a, b), (b, a)))
     return any(float(inside.all(axis=1).mean()) > 0.5 for inside in boxes)
 

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 Numbers = Any  # a tensor, array, list or table of numbers
 Rows = Any  # numbers of rows (tensor, array or list), a mask, or a slice
 Data = TypeVar("Data", bound="PositionedData")
-MAX_DIGEST_VALUES = 64  # of a row, about; more take time and distinguish no more rows
-ROTATION_TOLERANCE = 1e-3  # of the products of its columns, from rounding
 Arrays = dict[str, Any]  # in the form of xarray: dimensions, values, and a dictionary of units if there are any
 DEGREE_UNITS = {"latitude": "degrees_north", "longitude": "degrees_east"}
 
@@ -54,10 +52,10 @@ class Labelled(ABC):
         Raises:
             InputError: xarray is not installed.
         """
-        found: xarray.Dataset = optional_module("xarray", "to_xarray needs xarray", "xarray").Dataset(
+        dataset: xarray.Dataset = optional_module("xarray", "to_xarray needs xarray", "xarray").Dataset(
             self.variables(), self.coordinates()
         )
-        return found
+        return dataset
 
 
 def position_coordinates(position: NDArray[np.float64], origin: GeodeticOrigin | None = None) -> Arrays:
@@ -67,12 +65,12 @@ def position_coordinates(position: NDArray[np.float64], origin: GeodeticOrigin |
         >>> list(position_coordinates(np.zeros((2, 3)), GeodeticOrigin(48.0, 11.0)))
         ['x', 'y', 'z', 'latitude', 'longitude']
     """
-    found: Arrays = {
+    coordinates: Arrays = {
         axis: (("position",), values, {"units": "m"}) for axis, values in zip("xyz", position.T, strict=True)
     }
     for (name, units), values in zip(DEGREE_UNITS.items(), degree_columns(origin, position).values(), strict=False):
-        found[name] = (("position",), values, {"units": units})
-    return found
+        coordinates[name] = (("position",), values, {"units": units})
+    return coordinates
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -149,18 +147,18 @@ class PositionedData(Labelled, Displayed):
             (10, [4, 29])
         """
         try:
-            found = np.arange(len(self))[rows.cpu().numpy() if isinstance(rows, Tensor) else rows]
+            chosen = np.arange(len(self))[rows.cpu().numpy() if isinstance(rows, Tensor) else rows]
         except CONTENT_ERRORS:
-            found = None
-        if found is None or found.ndim != 1:
+            chosen = None
+        if chosen is None or chosen.ndim != 1:
             raise InputError(
                 f"rows of {self.name} must be a list of numbers below {len(self)}, a mask of that length or a slice, "
                 f"got {rows!r}"
             )
-        number = torch.from_numpy(found.copy())
+        number = torch.from_numpy(chosen.copy())
         values = {field: getattr(self, field) for field in self.row_fields}
         kept: dict[str, Any] = {
-            f: v[number] if isinstance(v, Tensor) else v.iloc[found] if isinstance(v, pd.Series) else v.subset(number)
+            f: v[number] if isinstance(v, Tensor) else v.iloc[chosen] if isinstance(v, pd.Series) else v.subset(number)
             for f, v in values.items()
             if v is not None
         }
@@ -168,25 +166,28 @@ class PositionedData(Labelled, Displayed):
 
     __getitem__ = subset
 
-    def row_digests(self) -> Tensor:
-        """Return a digest of each row by its number, its time, its position and some of its values, int64 (n,)."""
+    def row_digests(self, max_values: int = 64) -> Tensor:
+        """Return a digest of each row by its number, its time, its position and some of its values, int64 (n,).
+
+        About `max_values` equally spaced values count: more take time and distinguish no more rows.
+        """
         values, time = getattr(self, self.row_fields[1]), getattr(self, "time", None)
         number = torch.stack([self.index.double(), torch.zeros(len(self)).double() if time is None else time], dim=1)
-        found = [b""]
+        digests = [b""]
         for rows in [slice(None)] if isinstance(values, Tensor) else values.parts():
             part = values[rows].flatten(1)
-            some = part[:, :: max(1, part.shape[1] // MAX_DIGEST_VALUES)].double()
-            known = torch.cat([number[rows], self._position[rows], some], dim=1)
-            cells = (1000 * known).round().nan_to_num(-1.0).long().numpy()  # to a millisecond and a millimetre
-            found += [hashlib.blake2b(cell.tobytes(), digest_size=8).digest() for cell in cells]
-        return torch.from_numpy(np.frombuffer(b"".join(found), np.int64).copy())
+            sample = part[:, :: max(1, part.shape[1] // max_values)].double()
+            known = torch.cat([number[rows], self._position[rows], sample], dim=1)
+            rounded = (1000 * known).round().nan_to_num(-1.0).long().numpy()  # to a millisecond and a millimetre
+            digests += [hashlib.blake2b(row.tobytes(), digest_size=8).digest() for row in rounded]
+        return torch.from_numpy(np.frombuffer(b"".join(digests), np.int64).copy())
 
     def derived(self: Data, **fields: Any) -> Data:
         """Return a copy with other values of some fields, which follow from checked ones and are not checked again."""
-        found: Data = object.__new__(type(self))
+        copy: Data = object.__new__(type(self))
         for field, value in (vars(self) | fields).items():
-            object.__setattr__(found, field, value)
-        return found
+            object.__setattr__(copy, field, value)
+        return copy
 
     @checked
     def split(self: Data, name: str = "random", seed: NonNegativeInt = 0) -> tuple[Data, Data]:
@@ -237,8 +238,8 @@ class PositionedData(Labelled, Displayed):
         return f"{head}\n positions over {extent(self._position)}>"
 
     def _facts(self) -> dict[str, str]:
-        found = {"name": self.name, "measurements": self._summary(), "positions over": extent(self._position)}
-        return found | {f"note {number}": note for number, note in enumerate(self.notes, start=1)}
+        facts = {"name": self.name, "measurements": self._summary(), "positions over": extent(self._position)}
+        return facts | {f"note {number}": note for number, note in enumerate(self.notes, start=1)}
 
     def _summary(self) -> str:
         """Return number and kind of the measurements."""
@@ -250,15 +251,17 @@ def to_positions(name: str, value: Numbers, shape: tuple[int | None, ...] = (Non
     return check_positions(value, name, shape, missing).detach().cpu()
 
 
-def to_rotation(value: Numbers) -> Tensor:
+def to_rotation(value: Numbers, tolerance: float = 1e-3) -> Tensor:
     """Return a matrix that rotates array into world coordinates as float64 (3, 3).
+
+    Products of its columns are those of unit vectors to the tolerance, because of rounding.
 
     Raises:
         InputError: As `to_tensor`, or columns that are no right-handed set of unit vectors at right angles.
     """
     rotation = to_tensor("rotation", value, torch.float64, (3, 3))
     error = float((rotation.T @ rotation - torch.eye(3)).abs().max())
-    if error > ROTATION_TOLERANCE or float(rotation.det()) < 0:
+    if error > tolerance or float(rotation.det()) < 0:
         raise InputError(
             "rotation must be a rotation matrix (orthonormal, determinant 1), got "
             f"{rotation.tolist()}; a pose=ArrayPose(position, quaternion) gives one"

@@ -35,8 +35,6 @@ DOCUMENTS: Registry[pd.DataFrame] = Registry(
 TABLES = (*SUFFIXES, *DOCUMENTS)  # of tables that are named
 SEPARATORS = ",;\t"
 MAX_TEXT_BYTES = 2**28  # a million rows of positions take a tenth of it
-MAX_PREAMBLE_LINES = 20  # before the header of a table
-MAX_MISSING_CELLS = 3  # at the end of all rows
 
 
 def sha256(file: Path) -> str:
@@ -119,16 +117,17 @@ def read_yaml(file: Path) -> dict[str, Any]:
 
 def numbers(value: Any, count: int) -> tuple[float, ...] | None:
     """Return `count` finite numbers from a list of `read_yaml`, None if it is something else."""
-    found = tuple(number(item) for item in value) if isinstance(value, list) and len(value) == count else (math.nan,)
-    return found if all(map(math.isfinite, found)) else None
+    values = tuple(number(item) for item in value) if isinstance(value, list) and len(value) == count else (math.nan,)
+    return values if all(map(math.isfinite, values)) else None
 
 
-def _lines_before_header(text: str) -> int:
-    """Return the number of lines before the header of a table, e.g. 1 for a first line of metadata.
+def _lines_before_header(text: str, max_lines: int = 20, max_missing_cells: int = 3) -> int:
+    """Return the number of lines before the header of a table, e.g. 1 for a first line of metadata, at most 20.
 
-    The header is the first line of names that has as many cells as the line below, or that is followed by numbers.
+    The header is the first line of names that has as many cells as the line below, or that is followed by numbers and up to
+    3 cells longer or shorter.
     """
-    lines = text.split("\n", MAX_PREAMBLE_LINES + 2)[: MAX_PREAMBLE_LINES + 2]
+    lines = text.split("\n", max_lines + 2)[: max_lines + 2]
     for skipped, (line, below) in enumerate(itertools.pairwise(lines)):
         separator = _separator(line)
         try:
@@ -140,7 +139,7 @@ def _lines_before_header(text: str) -> int:
         if len(header) == len(row) > 1 and (is_header or not skipped):
             return skipped
         has_numbers = sum(not math.isnan(number(cell)) for cell in row) > 1
-        if is_header and has_numbers and abs(len(header) - len(row)) <= MAX_MISSING_CELLS:
+        if is_header and has_numbers and abs(len(header) - len(row)) <= max_missing_cells:
             return skipped
     return 0
 
@@ -198,20 +197,20 @@ def _holds_values(cells: list[str]) -> bool:
     return is_number and (len(set(cells)) < len(cells) or any(set("-.") & set(cell) for cell in cells))
 
 
-def table_of(label: object, text: str, header: bool = True) -> pd.DataFrame:
-    """Return the table in the text of a CSV file, as `read_table`; the label stands for it in messages."""
+def table_of(source: object, text: str, header: bool = True) -> pd.DataFrame:
+    """Return the table in the text of a CSV file, as `read_table`; messages begin with the source."""
     separator = _separator(text.split("\n", 1)[0])
-    with refusing_broken(label, "a comma-separated table"):
+    with refusing_broken(source, "a comma-separated table"):
         lines = [line for line in csv.reader(io.StringIO(text, newline=""), delimiter=separator) if line]
     if not lines:
-        raise InputError(f"{label} is empty; expected a header and one row a measurement")
+        raise InputError(f"{source} is empty; expected a header and one row a measurement")
     if header and _holds_values(lines[0]):
         raise InputError(
-            f"{label} has no header, its first line holds numbers; write the names of the columns above it"
+            f"{source} has no header, its first line holds numbers; write the names of the columns above it"
         )
     if not header:
         lines = [[str(column) for column in range(1, len(lines[0]) + 1)], *lines]
-    names, rows, notes = _regular(label, lines)
+    names, rows, notes = _regular(source, lines)
     if separator != ",":
         rows = [[DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in line] for line in rows]
     table = pd.DataFrame(rows, columns=names, dtype=object)
@@ -219,8 +218,13 @@ def table_of(label: object, text: str, header: bool = True) -> pd.DataFrame:
     return table
 
 
-def _regular(label: object, lines: list[list[str]]) -> tuple[list[str], list[list[str]], list[str]]:
-    """Return names of columns, rows of equal length, and notes on lines, rows and columns without content."""
+def _regular(
+    source: object, lines: list[list[str]], max_missing_cells: int = 3
+) -> tuple[list[str], list[list[str]], list[str]]:
+    """Return names of columns, rows of equal length, and notes on lines, rows and columns without content.
+
+    All rows may lack up to 3 cells at their end.
+    """
     names = _names_in(lines[0])
     repeated = [line for line in lines[1:] if line[0].strip(" #") == names[0] and _names_in(line) == names]
     rows = [line for line in lines[1:] if line not in repeated and any(map(str.strip, line))]
@@ -228,18 +232,18 @@ def _regular(label: object, lines: list[list[str]]) -> tuple[list[str], list[lis
     if repeated:
         notes.append(f"lines that repeat the header are left out: {len(repeated)}")
     if not rows:
-        raise InputError(f"{label} has a header but no rows")
+        raise InputError(f"{source} has a header but no rows")
     widths = {len(line) for line in rows}
     width, missing = len(rows[0]), len(names) - len(rows[0])
     if len(widths) == 1 < len(rows):
-        if 0 < missing <= MAX_MISSING_CELLS:
+        if 0 < missing <= max_missing_cells:
             notes.append(f"rows lack the last columns, which count as empty: {', '.join(names[width:])}")
             rows = [line + [""] * missing for line in rows]
         elif missing < 0 and not any(cell.strip() for line in rows for cell in line[len(names) :]):
             rows = [line[: len(names)] for line in rows]
     for row, line in enumerate(rows, start=1):
         if len(line) != len(names):
-            raise InputError(f"{label} row {row} has {len(line)} values, but the header has {len(names)}")
+            raise InputError(f"{source} row {row} has {len(line)} values, but the header has {len(names)}")
     filled = [column for column, cell in enumerate(rows[0]) if cell.strip()]
     is_text = all(math.isnan(number(rows[0][c])) and not NO_VALUE.fullmatch(rows[0][c]) for c in filled)
     if len(rows) > 1 and is_text and sum(not math.isnan(number(rows[1][c])) for c in filled) > 1:  # e.g. of units
@@ -251,14 +255,14 @@ def _regular(label: object, lines: list[list[str]]) -> tuple[list[str], list[lis
         empty.append(0)  # the index of a data frame
     if set(nameless) - set(empty):
         raise InputError(
-            f"{label} has no name for column {min(set(nameless) - set(empty)) + 1}; give it one in the header"
+            f"{source} has no name for column {min(set(nameless) - set(empty)) + 1}; give it one in the header"
         )
     if empty:
         rows = [[cell for column, cell in enumerate(line) if column not in empty] for line in rows]
         names = list(filter(None, names))
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"{label} names column {twice!r} twice; each needs a name of its own")
+        raise InputError(f"{source} names column {twice!r} twice; each needs a name of its own")
     return names, rows, notes
 
 

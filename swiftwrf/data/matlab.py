@@ -27,14 +27,14 @@ Stored = tuple[int, Callable[[], NDArray[Any]]]  # bytes of an array in memory, 
 
 def matlab_arrays(file: Path) -> dict[str, Stored]:
     """Return the variables of a file by name. A broken file, or one without numbers, raises an error of any type."""
-    found: dict[str, Stored] = {}
+    arrays: dict[str, Stored] = {}
     with file.open("rb") as stream:
         header, end = stream.read(128), file.stat().st_size
         if 0 in header[:4]:  # version 4, whose parser is not compiled
             for name, shape, kind in whosmat(file):
                 if kind not in ("char", "sparse"):
-                    found[name] = 16 * math.prod(shape), partial(_of_version_4, file, name)
-            return found
+                    arrays[name] = 16 * math.prod(shape), partial(_of_version_4, file, name)
+            return arrays
         order = {b"IM": "<", b"MI": ">"}[header[126:]]
         while tag := stream.read(8):
             kind, size = np.frombuffer(tag, f"{order}u4", 2).tolist()
@@ -44,12 +44,12 @@ def matlab_arrays(file: Path) -> dict[str, Stored]:
             content = partial(_content, file, start, size, kind == COMPRESSED)
             flags, shape, text = islice(_elements(content(HEAD_BYTES), order), 3)
             name = (shape if flags[0] & CLASS == OPAQUE else text).tobytes().decode()
-            if name in found:
+            if name in arrays:
                 raise ValueError(f"{name} is stored twice")
             sizes = shape.tolist()
-            found[name] = 16 * math.prod(sizes), partial(_array, content, order, int(flags[0]), sizes)  # if complex
+            arrays[name] = 16 * math.prod(sizes), partial(_array, content, order, int(flags[0]), sizes)  # if complex
             stream.seek(start + size)
-    return found
+    return arrays
 
 
 def _of_version_4(file: Path, name: str) -> NDArray[Any]:

@@ -73,9 +73,9 @@ class PropagationPaths:
     @property
     def reached(self) -> PropagationPaths:
         """The links that have a path."""
-        some = self.count > 0
+        has_path = self.count > 0
         per_link = ("transmitter", "receiver", "count", "line_of_sight")
-        kept: dict[str, Any] = {name: getattr(self, name)[some] for name in per_link}
+        kept: dict[str, Any] = {name: getattr(self, name)[has_path] for name in per_link}
         return replace(self, **kept)
 
     def last_point(self) -> Tensor:

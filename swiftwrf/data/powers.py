@@ -11,21 +11,24 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from swiftwrf.data.cells import Floats
 from swiftwrf.errors import InputError
 
-Floats = NDArray[np.float64]
 NOT_DETECTED_DBM = -100.0  # the usual filler
 KNOWN_FILLERS = (NOT_DETECTED_DBM, -200.0, 0.0, 100.0, 127.0)
 MIN_RSSI_DBM, MAX_RSSI_DBM = -150.0, 30.0
-# a frequent value from -1 dBm on is a filler, unless values within 10 dB are as frequent
-N_NEIGHBOURS_DB = 5  # of the next stronger values that a filler at the lower edge is compared with
-MIN_REPEATS = 5  # cells with a filler that is not known
-MIN_AT_END = 0.25  # fraction of the receivers that reach the upper end of the scale
-MIN_VALUES = 5  # different values that are left
 
 
-def find_fillers(rssi: Floats) -> list[float]:
+def find_fillers(
+    rssi: Floats, min_repeats: int = 5, min_usual_dbm: float = -1.0, within_db: float = 10.0
+) -> list[float]:
     """Return the values in a table of RSSI (n, R) [dBm] that stand for "not detected", apart from nan and -inf.
+
+    Args:
+        rssi: Values of the cells.
+        min_repeats: Number of cells with a filler that is not known. The bounds are not studied.
+        min_usual_dbm: A frequent value from here on is a filler, unless another one within `within_db` is as frequent.
+        within_db: Distance to the values that are compared [dB].
 
     Example:
         >>> find_fillers(np.array([[-60.0, 127.0], [-70.0, -65.0], [0.0, -80.0]]))
@@ -35,47 +38,56 @@ def find_fillers(rssi: Floats) -> list[float]:
     impossible = (value < MIN_RSSI_DBM) | (value > MAX_RSSI_DBM)
     is_filler = impossible & np.isin(value, KNOWN_FILLERS)
     if (others := impossible & ~is_filler).sum() == 1:
-        is_filler |= others & (count >= MIN_REPEATS)
-    found: list[float] = value[is_filler].tolist()
+        is_filler |= others & (count >= min_repeats)
+    fillers: list[float] = value[is_filler].tolist()
     value, count = value[~impossible], count[~impossible]
-    while len(value) and value[-1] >= -1.0 and _is_frequent(value, count, len(value) - 1, 10.0):
-        found.append(float(value[-1]))
+    while len(value) and value[-1] >= min_usual_dbm and _is_frequent(value, count, len(value) - 1, within_db):
+        fillers.append(float(value[-1]))
         value, count = value[:-1], count[:-1]
     usual = np.flatnonzero(value == NOT_DETECTED_DBM)
-    if len(usual) and (usual[0] == 0 or _is_frequent(value, count, int(usual[0]), N_NEIGHBOURS_DB)):
-        found.append(NOT_DETECTED_DBM)
+    if len(usual) and (usual[0] == 0 or _is_frequent(value, count, int(usual[0]))):
+        fillers.append(NOT_DETECTED_DBM)
     elif _fills_the_lower_edge(rssi, value, count):
-        found.append(float(value[0]))
-    return found
+        fillers.append(float(value[0]))
+    return fillers
 
 
-def has_frequent_edge(rssi: Floats) -> bool:
+def has_frequent_edge(rssi: Floats, min_values: int = 5, min_fraction: float = 0.2) -> bool:
     """Return True if the least of the values of a receiver (n,) [dBm] is far more frequent than those above it.
+
+    There are more than `min_values` different values, and at least a fraction of all are the least one (not studied).
 
     Example:
         >>> has_frequent_edge(np.array([-90.0] * 9 + [-89, -88, -87, -80, -75, -70, -60]))
         True
     """
     value, count = np.unique(rssi, return_counts=True)
-    if len(value) <= MIN_VALUES or int(count[0]) < 0.2 * len(rssi):
-        return False
-    return _is_frequent(value, count, 0, N_NEIGHBOURS_DB)
+    return len(value) > min_values and int(count[0]) >= min_fraction * len(rssi) and _is_frequent(value, count, 0)
 
 
-def _is_frequent(value: Floats, count: NDArray[np.int64], index: int, within_db: float) -> bool:
-    """Return True if a value is much more frequent than every other one within a distance, in bins of 1 dB."""
+def _is_frequent(
+    value: Floats, count: NDArray[np.int64], index: int, within_db: float = 5.0, ratio: float = 3.0
+) -> bool:
+    """Return True if a value is `ratio` times as frequent as every other one within a distance, in bins of 1 dB."""
     near = np.abs(value - value[index]) <= within_db
     near[index] = False
     bins = np.bincount((value[near] - value[index] + within_db).round().astype(int), count[near], minlength=1)
-    return bool(count[index] > 3.0 * bins.max())
+    return bool(count[index] > ratio * bins.max())
 
 
-def _fills_the_lower_edge(rssi: Floats, value: Floats, count: NDArray[np.int64], share: float = 0.5) -> bool:
-    """Return True if the least value is frequent, and the least of more than a fraction of the receivers."""
-    if len(value) <= MIN_VALUES or count[0] < MIN_REPEATS or not _is_frequent(value, count, 0, N_NEIGHBOURS_DB):
+def _fills_the_lower_edge(
+    rssi: Floats,
+    value: Floats,
+    count: NDArray[np.int64],
+    fraction: float = 0.5,
+    min_values: int = 5,
+    min_repeats: int = 5,
+) -> bool:
+    """Return True if the least value is frequent, and is that of more than a fraction of the receivers."""
+    if len(value) <= min_values or count[0] < min_repeats or not _is_frequent(value, count, 0):
         return False
     weakest = np.where(rssi >= value[0], rssi, np.inf).min(axis=0)
-    return bool((weakest[np.isfinite(weakest)] == value[0]).mean() > share)  # near receivers detect every row
+    return bool((weakest[np.isfinite(weakest)] == value[0]).mean() > fraction)  # near receivers detect every row
 
 
 def without_fillers(rssi: Floats, fillers: list[float]) -> tuple[Floats, list[str]]:
@@ -97,24 +109,26 @@ def without_fillers(rssi: Floats, fillers: list[float]) -> tuple[Floats, list[st
     return np.where(filled, np.nan, rssi), notes
 
 
-def end_of_scale(rssi: Floats) -> list[str]:
+def end_of_scale(rssi: Floats, min_fraction: float = 0.25) -> list[str]:
     """Return a note on the largest value of RSSI (n, R) [dBm] if it is as frequent as only the end of a scale is, or none.
+
+    More than `min_fraction` of the receivers reach it (not studied).
 
     Example:
         >>> end_of_scale(np.array([[-50.0] * 6 + [-51, -52, -53, -58, -60, -62]]).T)
         ['the scale ends at -50 dBm: 6 of 12 cells (50%) have this largest value, so their power is at least that']
     """
     value, count = np.unique(-rssi[~np.isnan(rssi)], return_counts=True)
-    if not _fills_the_lower_edge(-rssi, value, count, MIN_AT_END):
+    if not _fills_the_lower_edge(-rssi, value, count, min_fraction):
         return []
-    share = f"{count[0]} of {rssi.size} cells ({count[0] / rssi.size:.0%})"
-    return [f"the scale ends at {-value[0]:g} dBm: {share} have this largest value, so their power is at least that"]
+    cells = f"{count[0]} of {rssi.size} cells ({count[0] / rssi.size:.0%})"
+    return [f"the scale ends at {-value[0]:g} dBm: {cells} have this largest value, so their power is at least that"]
 
 
-def check_powers(label: object, rssi: Floats, receivers: Sequence[str], source: NDArray[np.int64]) -> None:
+def check_powers(source: object, rssi: Floats, receivers: Sequence[str], table_row: NDArray[np.int64]) -> None:
     """Refuse RSSI (n, R) [dBm] that is no received power.
 
-    The row of a value in the table, counted from 0, is its source (n, R) or (n, 1).
+    Rows of the values in the table are counted from 0, (n, R) or (n, 1).
 
     Raises:
         InputError: The first such value, with its row and receiver.
@@ -122,10 +136,10 @@ def check_powers(label: object, rssi: Floats, receivers: Sequence[str], source: 
     bad = (rssi < MIN_RSSI_DBM) | (rssi > MAX_RSSI_DBM)
     if not bad.any():
         return
-    rows = np.broadcast_to(source, rssi.shape)
+    rows = np.broadcast_to(table_row, rssi.shape)
     row, column = min(np.argwhere(bad), key=lambda cell: rows[tuple(cell)])
     value = rssi[row, column]
     raise InputError(
-        f"{label} row {rows[row, column] + 1}, receiver {receivers[column]}: {value:g} dBm is no received power; expected "
+        f"{source} row {rows[row, column] + 1}, receiver {receivers[column]}: {value:g} dBm is no received power; expected "
         f"{MIN_RSSI_DBM:g} to {MAX_RSSI_DBM:g}; if it stands for not detected, give nan or --filler {value:g}"
     )

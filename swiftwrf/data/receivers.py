@@ -10,20 +10,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from swiftwrf.data.cells import column_of_numbers, text_of
+from swiftwrf.data.cells import Floats, column_of_numbers, text_of
 from swiftwrf.data.columns import GEODETIC, column_of
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin, PlanFrame, frame_of
 from swiftwrf.data.files import numbers, read_table, read_yaml
 from swiftwrf.errors import InputError, listed
 from swiftwrf.positions import check_positions
 
-Floats = NDArray[np.float64]
-MAC = "mac"  # pools radios by the first five bytes of their addresses
 ADDRESS = re.compile(r"((?:[0-9a-f]{2}[:-]?){4}[0-9a-f]{2})[:-]?[0-9a-f]{2}", re.IGNORECASE)
-MAX_FROM_ORIGIN_DEG = 2.0  # of receivers in degrees
 
 
 def plain_receiver(name: str) -> str:
@@ -39,7 +35,7 @@ def plain_receiver(name: str) -> str:
 
 
 def spelled_as(names: Sequence[str], known: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return names in the spelling of those that are known, and a note on those that differ in it.
+    """Return names as the known ones are spelled, and a note on names that were spelled differently.
 
     Example:
         >>> spelled_as(["AA-BB-CC-DD-EE-01", "hall"], ["aa:bb:cc:dd:ee:01", "office"])[0]
@@ -49,12 +45,12 @@ def spelled_as(names: Sequence[str], known: Sequence[str]) -> tuple[list[str], l
     plain = plain[~plain.index.duplicated(keep=False)]
     mine = pd.Series([plain_receiver(name) for name in names], dtype=object)
     once = ~mine.duplicated(keep=False)
-    found = [
+    spelled = [
         plain[key] if name not in known and single and key in plain.index else name
         for name, key, single in zip(names, mine, once, strict=True)
     ]
-    other = [f"{name} is {as_known}" for name, as_known in zip(names, found, strict=True) if name != as_known]
-    return found, [f"receivers are matched whose names are spelled differently: {listed(other)}"] * bool(other)
+    other = [f"{name} is {as_known}" for name, as_known in zip(names, spelled, strict=True) if name != as_known]
+    return spelled, [f"receivers are matched whose names are spelled differently: {listed(other)}"] * bool(other)
 
 
 def pool_names(names: Sequence[str], by: str) -> list[str]:
@@ -72,15 +68,15 @@ def pool_names(names: Sequence[str], by: str) -> list[str]:
         ['hall', 'hall']
     """
     try:
-        pattern = ADDRESS if by == MAC else re.compile(by)
+        pattern = ADDRESS if by == "mac" else re.compile(by)
     except re.error as error:
         raise InputError(f"pool_by {by!r} is no column and no regular expression ({error})") from None
     if pattern.groups != 1:
-        raise InputError(f"pool_by takes {MAC}, a column, or a regular expression with one group, got {by!r}")
-    found = [pattern.fullmatch(name) for name in names]
-    if not any(found):
+        raise InputError(f"pool_by takes mac, a column, or a regular expression with one group, got {by!r}")
+    matches = [pattern.fullmatch(name) for name in names]
+    if not any(matches):
         raise InputError(f"pool_by {by!r} matches no receiver; there are {listed(names)}")
-    return [name if match is None else match.group(1) for name, match in zip(names, found, strict=True)]
+    return [name if match is None else match.group(1) for name, match in zip(names, matches, strict=True)]
 
 
 def read_receivers(
@@ -99,35 +95,37 @@ def read_receivers(
         InputError: A name twice, no position of any receiver, or a position that is not usable.
     """
     table = _positions_by_name(file, names) if file.suffix == ".yml" else read_table(file)
-    label = column_of(table, "receiver", {}) or ("name" if "name" in table.columns else None)
-    if label is None and len(table) != len(names):
+    name_column = column_of(table, "receiver", {}) or ("name" if "name" in table.columns else None)
+    if name_column is None and len(table) != len(names):
         raise InputError(f"{file} has {len(table)} rows and no column of names, but there are {len(names)} receivers")
-    listed_names = list(names) if label is None else table[label].astype(str).str.strip().tolist()
+    listed_names = list(names) if name_column is None else table[name_column].astype(str).str.strip().tolist()
     if len(set(listed_names)) < len(listed_names):
         raise InputError(f"{file} must have each receiver once, got {listed(listed_names)}")
     listed_names, notes = spelled_as(listed_names, names)
     position = _positions(file, table, origin, frame)
     given = np.flatnonzero(~np.isnan(position[:, :2]).all(axis=1))
     position, listed_names = position[given], [listed_names[row] for row in given]
-    place = dict(zip(listed_names, check_positions(position, f"positions of {file}").tolist(), strict=True))
-    unknown = [name for name in names if name not in place]
+    position_of = dict(zip(listed_names, check_positions(position, f"positions of {file}").tolist(), strict=True))
+    unknown = [name for name in names if name not in position_of]
     if len(unknown) == len(names):
         raise InputError(f"{file} has none of the receivers ({listed(names)}); there are {listed(listed_names)}")
-    found = torch.tensor([place.get(name, [float("nan")] * 3) for name in names], dtype=torch.float64)
+    positions = torch.tensor([position_of.get(name, [float("nan")] * 3) for name in names], dtype=torch.float64)
     if unknown:
         notes.append(f"the position of these receivers is unknown, so they have no path-loss model: {listed(unknown)}")
-    return found, notes
+    return positions, notes
 
 
 def _positions_by_name(file: Path, names: Sequence[str]) -> pd.DataFrame:
     """Return the table of a file with NAME: [x, y, z], without receivers of unknown position and other content."""
     content = {name: value for name, value in read_yaml(file).items() if value not in ("", "~", "null", "none")}
-    place = {name: numbers(value, 3) for name, value in content.items()}
+    position_of = {name: numbers(value, 3) for name, value in content.items()}
     spelled, _ = spelled_as(list(content), names)
-    if wrong := [name for name, own in zip(content, spelled, strict=True) if place[name] is None and own in names]:
+    if wrong := [
+        name for name, known in zip(content, spelled, strict=True) if position_of[name] is None and known in names
+    ]:
         got = reprlib.repr(content[wrong[0]])  # references may make it as long as any memory
         raise InputError(f"{file}: receiver {wrong[0]!r} needs a position of 3 finite numbers [m], got {got}")
-    rows = [(name, *position) for name, position in place.items() if position is not None]
+    rows = [(name, *position) for name, position in position_of.items() if position is not None]
     return pd.DataFrame(rows, columns=["receiver", "x", "y", "z"])
 
 
@@ -152,8 +150,10 @@ def read_places(file: Path, origin: GeodeticOrigin | None, frame: PlanFrame, flo
     return check_positions(position, f"positions of {file}")
 
 
-def _positions(file: Path, table: pd.DataFrame, origin: GeodeticOrigin | None, frame: PlanFrame) -> Floats:
-    """Return the positions (n, 3) [m] in a table, nan where a cell is empty."""
+def _positions(
+    file: Path, table: pd.DataFrame, origin: GeodeticOrigin | None, frame: PlanFrame, max_from_origin_deg: float = 2.0
+) -> Floats:
+    """Return the positions (n, 3) [m] in a table, nan where a cell is empty; degrees lie near the origin."""
     columns = [column_of(table, axis, {}) or column_of(table, GEODETIC[axis], {}) for axis in "xy"]
     both = [name for name in columns if name is not None]
     if len(both) < 2:
@@ -173,9 +173,9 @@ def _positions(file: Path, table: pd.DataFrame, origin: GeodeticOrigin | None, f
         return frame_of(file, table, both, frame)[0].to_world(position)
     away = xy - (origin.longitude, origin.latitude)
     away[:, 0] = (away[:, 0] + 180) % 360 - 180
-    if not (np.abs(away) <= MAX_FROM_ORIGIN_DEG).all():
+    if not (np.abs(away) <= max_from_origin_deg).all():
         raise InputError(
-            f"{file}: positions must be in degrees as the measurements are, within {MAX_FROM_ORIGIN_DEG:g} degrees of "
+            f"{file}: positions must be in degrees as the measurements are, within {max_from_origin_deg:g} degrees of "
             f"{origin}"
         )
     position[known, :2] = origin.to_metres(xy[:, ::-1])

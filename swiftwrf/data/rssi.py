@@ -24,9 +24,8 @@ from swiftwrf.runtime.validation import NonNegativeInt, checked
 
 META = "meta.csv"  # file of the NeRF2 layout with a row for each measurement
 SURVEY = "survey.yml"  # file of the toolkit's own layout with properties of all measurements
-PLACE, MIN_PLACES = "place", 5  # split by receiver, a fifth of which is held out
+PLACE = "place"  # split by receiver, a fifth of which is held out
 
-UNKNOWN = (float("nan"),) * 3  # position of a receiver
 NO_NAME = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")  # line breaks, controls, halves of characters
 
 
@@ -157,11 +156,13 @@ class Rssi(PositionedData):
             >>> Rssi.from_frame(pd.DataFrame({"x": [0, 1], "y": [0, 1], "z": [1, 1], "hall": [-50, -60]})).receiver_names
             ('hall',)
         """
-        found = read_survey("the table", frame, TableOptions(**options))
+        arguments = read_survey("the table", frame, TableOptions(**options))
         if receiver_position:
-            places = [list(receiver_position.get(receiver, UNKNOWN)) for receiver in found["receiver_names"]]
-            found["receiver_position"] = places
-        return cls(**found, name=name)
+            places = [
+                list(receiver_position.get(receiver, [float("nan")] * 3)) for receiver in arguments["receiver_names"]
+            ]
+            arguments["receiver_position"] = places
+        return cls(**arguments, name=name)
 
     @property
     def located(self) -> bool:
@@ -188,10 +189,10 @@ class Rssi(PositionedData):
         """Return the data in local metres about another origin. With None, or if the data have none, nothing changes."""
         if origin is None or self.origin is None or origin == self.origin:
             return self
-        own = self.origin
+        origin_of_data = self.origin
 
         def moved(position: Tensor) -> Tensor:
-            xy = origin.to_metres(own.to_degrees(position[:, :2].numpy()))
+            xy = origin.to_metres(origin_of_data.to_degrees(position[:, :2].numpy()))
             return torch.cat([torch.from_numpy(xy), position[:, 2:]], dim=1)
 
         places = self.receiver_position.clone()
@@ -214,9 +215,9 @@ class Rssi(PositionedData):
         if name != PLACE or name in self.named_splits:
             return super().split(name, seed)
         located = self.receiver_located.nonzero()[:, 0]
-        if len(located) < MIN_PLACES:
+        if len(located) < 5:  # a fifth of which is held out
             raise InputError(
-                f"split {PLACE!r} needs at least {MIN_PLACES} receivers of known position; {self.name} has {len(located)}"
+                f"split {PLACE!r} needs at least 5 receivers of known position; {self.name} has {len(located)}"
             )
         places = self.receiver_position[located]
         is_test = torch.zeros(len(self.receiver_names), dtype=torch.bool)
@@ -243,8 +244,8 @@ class Rssi(PositionedData):
             >>> train.validation_for("block", test)
             'block'
         """
-        own, others = ({*data.session.tolist()} if data.session is not None else {0} for data in (self, test))
-        if len(own) > 1 and own.isdisjoint(others):
+        sessions, others = ({*data.session.tolist()} if data.session is not None else {0} for data in (self, test))
+        if len(sessions) > 1 and sessions.isdisjoint(others):
             return "session"
         return "random" if split == "random" else "block"
 
@@ -265,10 +266,10 @@ class Rssi(PositionedData):
             enough = self.detected.sum(dim=0) >= MIN_TRAINING
             if not bool(enough.any()):
                 raise InputError(f"no receiver of {self.name} detected the transmitter in {MIN_TRAINING} rows")
-            found = self.columns(enough.nonzero()[:, 0].tolist())
-            rare = [name for name in self.receiver_names if name not in found.receiver_names]
+            kept = self.columns(enough.nonzero()[:, 0].tolist())
+            rare = [name for name in self.receiver_names if name not in kept.receiver_names]
             note = f"receivers that detected fewer than {MIN_TRAINING} rows are left out: {listed(rare)}"
-            return replace(found, notes=(*found.notes, note)) if rare else found
+            return replace(kept, notes=(*kept.notes, note)) if rare else kept
         columns = [receiver_row(self.receiver_names, name, self.name) for name in asked]
         if not columns:
             raise InputError("no receiver is asked for; give names, numbers from 1, or all")
@@ -330,8 +331,8 @@ class Rssi(PositionedData):
         }
 
     def _summary(self) -> str:
-        share = float(self.detected.double().mean()) if len(self) else 0.0
-        return f"{len(self)} rows at {len(self.receiver_names)} receivers, {share:.0%} detected"
+        fraction = float(self.detected.double().mean()) if len(self) else 0.0
+        return f"{len(self)} rows at {len(self.receiver_names)} receivers, {fraction:.0%} detected"
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,6 @@ from swiftwrf.runtime.validation import (
     configuration,
 )
 
-MAX_ORDER = 2  # reflections
 Point = tuple[float, float, float]
 GRID = AngularGrid.hemisphere(30, 120)
 FACING_X = ArrayPose((0.1, 2.4, 1.2), (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)))  # on the wall x = 0, its normal is +x
@@ -41,9 +40,6 @@ CEILING = ArrayPose((3.0, 2.5, 2.7))  # position of the fixed transmitter, orien
 REGION = ((2.2, 1.6, 0.9), (4.2, 3.4, 1.5))  # of the moving end: opposite corners [m]
 BATCH_POSITIONS = 4096  # whose paths take half a gigabyte
 CHANNELS_HZ = (2.402e9, 2.426e9, 2.480e9)  # of BLE advertisements; a receiver does not report the channel
-TRANSMIT_DBM = -8.0
-PACKET_NOISE_DB = 2.0
-SENSITIVITY_DBM = -85.0  # of a simple receiver: weaker packets leave their cells empty
 
 
 @configuration
@@ -83,9 +79,9 @@ class ShoeboxRoom:
             if not bool(((position > 0) & (position < size)).all()):
                 raise InputError(f"a {name} stands outside the room of {self.size} m")
         # mirrored rooms (25, 3) that at most two reflections reach, the room itself first
-        steps = torch.arange(-MAX_ORDER, MAX_ORDER + 1, dtype=torch.float64)
+        steps = torch.arange(-2, 3, dtype=torch.float64)
         rooms = torch.cartesian_prod(steps, steps, steps)
-        rooms = rooms[rooms.abs().sum(dim=1) <= MAX_ORDER]
+        rooms = rooms[rooms.abs().sum(dim=1) <= 2]
         rooms = rooms[rooms.abs().sum(dim=1).argsort(stable=True)]
         inside = torch.where(rooms % 2 == 0, transmitter[:, None], size - transmitter[:, None])
         ray = rooms * size + inside - receiver[:, None]  # (n, 25, 3)
@@ -165,7 +161,7 @@ def simulated_room(
     pose = FACING_X if moving == "transmitter" else CEILING
     fixed = torch.tensor(pose.position, dtype=torch.float64)
     array = PlanarArray.square(4, room.frequency_hz)
-    links = [(some, fixed) if moving == "transmitter" else (fixed, some) for some in position.split(BATCH_POSITIONS)]
+    links = [(part, fixed) if moving == "transmitter" else (fixed, part) for part in position.split(BATCH_POSITIONS)]
     parts = [room.paths(*ends) for ends in links]
     channel = torch.cat([paths.channel(array, pose.rotation) for paths in parts])
     noise = phase_noise * torch.randn(channel.shape, dtype=torch.float64, generator=generator)
@@ -279,6 +275,9 @@ FLOOR = ShoeboxRoom(
 def rssi_room(n: PositiveInt = 600, seed: NonNegativeInt = 0) -> Rssi:
     """Return simulated RSSI at twelve receivers, one packet a row and receiver on a random channel.
 
+    The transmitter has -8 dBm, packets vary by 2 dB (standard deviation), and a tenth are missed. So are those below
+    -85 dBm, the sensitivity of a simple receiver.
+
     Args:
         n: Number of positions of the transmitter.
         seed: Seed of positions, gains, channels, noise and misses.
@@ -299,9 +298,9 @@ def rssi_room(n: PositiveInt = 600, seed: NonNegativeInt = 0) -> Rssi:
     gain_db = 2 * torch.randn(12, dtype=torch.float64, generator=generator)  # receivers differ
     power = torch.stack([_power(position, place) for place in receiver], dim=1)  # (n, R, channels)
     channel = torch.randint(len(CHANNELS_HZ), (n, 12, 1), generator=generator)
-    noise = PACKET_NOISE_DB * torch.randn(n, 12, dtype=torch.float64, generator=generator)
-    rssi = (TRANSMIT_DBM + gain_db + power.gather(2, channel)[..., 0] + noise).round()
-    missed = (torch.rand(n, 12, generator=generator) < 0.1) | (rssi < SENSITIVITY_DBM)
+    noise = 2.0 * torch.randn(n, 12, dtype=torch.float64, generator=generator)
+    rssi = (-8.0 + gain_db + power.gather(2, channel)[..., 0] + noise).round()
+    missed = (torch.rand(n, 12, generator=generator) < 0.1) | (rssi < -85.0)
     return Rssi(
         torch.where(missed, torch.nan, rssi),
         position,
@@ -313,7 +312,7 @@ def rssi_room(n: PositiveInt = 600, seed: NonNegativeInt = 0) -> Rssi:
 
 def _power(position: Tensor, receiver: Tensor) -> Tensor:
     """Return the power gain of the coherent sum of all paths on each channel, (n, channels) [dB]."""
-    paths = PropagationPaths.joined([FLOOR.paths(some, receiver) for some in position.split(BATCH_POSITIONS)])
+    paths = PropagationPaths.joined([FLOOR.paths(part, receiver) for part in position.split(BATCH_POSITIONS)])
     assert paths.length is not None
     power = []
     for frequency in CHANNELS_HZ:

@@ -29,8 +29,6 @@ from swiftwrf.runtime.validation import check_value, checked
 GRID = AngularGrid.hemisphere(90, 360)  # of spectra that are computed
 OF_SPECTRA = ("line_of_sight", "label", "channel", "frequency_hz")  # arrays beside the spectra in spectrum.npz
 DIRECTION = ("elevation", "azimuth")  # names of the dimensions of a spectrum
-MAX_BAND_RATIO = 2.05  # of the frequencies of channels and of the array; 2 is the way there and back
-MAX_LABEL = torch.tensor([math.tau, math.pi / 2], dtype=torch.float64) + 1e-6  # azimuth and elevation [rad], rounded
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -249,42 +247,47 @@ class Spectra(PositionedData):
 def to_magnitudes(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:
     """Return spectra as float32, or as the bytes that they are; refuse magnitudes outside [0, 1] and other shapes."""
     is_bytes = getattr(value, "dtype", None) in (torch.uint8, "uint8")
-    found = to_tensor(name, value, torch.uint8 if is_bytes else torch.float32, shape)
-    low, high = (0.0, 1.0) if is_bytes or not found.numel() else map(float, found.aminmax())
+    magnitudes = to_tensor(name, value, torch.uint8 if is_bytes else torch.float32, shape)
+    low, high = (0.0, 1.0) if is_bytes or not magnitudes.numel() else map(float, magnitudes.aminmax())
     if low < -1e-6 or high > 1 + 1e-6:  # from rounding
         raise InputError(f"{name} are magnitudes in [0, 1], got {low:.4g} to {high:.4g}; divide them by the largest")
-    return found if is_bytes else found.clamp(0, 1)
+    return magnitudes if is_bytes else magnitudes.clamp(0, 1)
 
 
 def to_directions(name: str, value: Any, n: int | None = None, missing: bool = False) -> Tensor:
     """Return azimuth and elevation [rad] of n spectra as float64 (n, 2); refuse other numbers, e.g. degrees."""
-    found = to_tensor(name, value, torch.float64, (n, 2), missing)
-    if bool((bad := (found.abs() > MAX_LABEL).any(dim=1)).any()):
+    directions = to_tensor(name, value, torch.float64, (n, 2), missing)
+    largest = torch.tensor([math.tau, math.pi / 2], dtype=torch.float64) + 1e-6  # from rounding
+    if bool((bad := (directions.abs() > largest).any(dim=1)).any()):
         raise InputError(
-            f"{name} must be azimuth up to 2 pi and elevation up to pi / 2 [rad], got {found[bad][0].tolist()}; convert "
-            "degrees by deg2rad"
+            f"{name} must be azimuth up to 2 pi and elevation up to pi / 2 [rad], got {directions[bad][0].tolist()}; "
+            "convert degrees by deg2rad"
         )
-    return found
+    return directions
 
 
-def snapshot_frequencies(frequency_hz: Numbers | None, channel: Tensor, array: PlanarArray | None) -> Tensor | None:
+def snapshot_frequencies(
+    frequency_hz: Numbers | None, channel: Tensor, array: PlanarArray | None, max_ratio: float = 2.05
+) -> Tensor | None:
     """Return the frequency of each snapshot of channels (n, S, K), float64 (S,) [Hz], checked; None if none are given.
+
+    The ratio to the frequency of the array is at most `max_ratio`; 2 is the way there and back.
 
     Raises:
         InputError: Another number of frequencies than snapshots, one that no carrier has, or one far from the array's.
     """
     if frequency_hz is None:
         return None
-    found = to_tensor("frequency_hz", frequency_hz, torch.float64, (channel.shape[1],))
+    frequency = to_tensor("frequency_hz", frequency_hz, torch.float64, (channel.shape[1],))
     low, high = CARRIERS_HZ
     if array is not None:
-        low, high = array.frequency_hz / MAX_BAND_RATIO, array.frequency_hz * MAX_BAND_RATIO
-    if len(found) and not low <= float(found.max()) <= 2 * float(found.min()) <= 2 * high:
+        low, high = array.frequency_hz / max_ratio, array.frequency_hz * max_ratio
+    if len(frequency) and not low <= float(frequency.max()) <= 2 * float(frequency.min()) <= 2 * high:
         raise InputError(
             f"frequency_hz must be frequencies of one carrier's snapshots, {low:.4g} to {high:.4g} Hz, got "
-            f"{float(found.min()):.6g} to {float(found.max()):.6g}; give Hz of the array's band"
+            f"{float(frequency.min()):.6g} to {float(frequency.max()):.6g}; give Hz of the array's band"
         )
-    return found
+    return frequency
 
 
 def direction_coordinates(grid: AngularGrid) -> Arrays:

@@ -9,19 +9,15 @@ from typing import Literal
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
-from scipy.stats import wasserstein_distance
 from torch import Tensor
 
 from swiftwrf.data.files import read_text
 from swiftwrf.errors import InputError
-from swiftwrf.positions import nearest
 from swiftwrf.runtime.validation import PositiveInt, checked
 
-TEST_SHARE = 0.2
 MIN_TRAINING = 10  # measurements
 MAX_REPEATED = 0.1  # fraction of test rows at training positions, beyond which a split tests look-up
 FOLDS = 5
-PLACE_RADIUS = 0.05  # of a place, relative to the mean spacing of places; repeats by motion capture lie within 3 %
 
 Validation = Literal["random", "block", "session"]
 
@@ -88,13 +84,18 @@ def kept_splits(splits: dict[str, tuple[Tensor, Tensor]], kept: Tensor, n: int) 
     return {name: (train[train >= 0], test[test >= 0]) for name, (train, test) in parts.items()}
 
 
-def places(position: Tensor, n_parts: int = 1) -> Tensor:
+def places(position: Tensor, n_parts: int = 1, radius: float = 0.05) -> Tensor:
     """Return the number of the place of each row (n, 3), int64 (n,).
 
     Robots, motion capture and satellite receivers report other coordinates each time they return to a place. So a place is
-    a ball with a radius of 5 % of the mean spacing of places: sqrt(area / places), or length / places along a line. Its
-    centre is the position with most others within the radius, outside all balls before. The order of the rows has no
-    effect. Each row is a place of its own if there are fewer places than parts.
+    a ball, whose centre is the position with most others within the radius, outside all balls before. The order of the rows
+    has no effect. Each row is a place of its own if there are fewer places than parts.
+
+    Args:
+        position: Positions, (n, 3) [m].
+        n_parts: Number of parts that places are divided into.
+        radius: Radius of the balls in mean spacings of places: sqrt(area / places), or length / places along a line. Repeats
+            by motion capture lie within 0.03.
 
     Example:
         >>> places(torch.tensor([[5.0, 0, 0], [0.0, 0, 0], [5.001, 0, 0]]))
@@ -104,7 +105,7 @@ def places(position: Tensor, n_parts: int = 1) -> Tensor:
     length, width, _ = (spots.amax(dim=0) - spots.amin(dim=0)).sort(descending=True).values.tolist()
     tree, number, last = cKDTree(spots.numpy()), torch.arange(len(spots)), len(spots) + 1
     while (count := int(number.max()) + 1) < last:  # fewer places are farther apart
-        number, last = _balls(tree, PLACE_RADIUS * max((length * width / count) ** 0.5, length / count)), count
+        number, last = _balls(tree, radius * max((length * width / count) ** 0.5, length / count)), count
     return number[spot] if count >= n_parts else torch.arange(len(position))
 
 
@@ -113,8 +114,8 @@ def _balls(tree: cKDTree, radius: float) -> Tensor:
     number, count, size = np.full(tree.n, -1), 0, tree.query_ball_point(tree.data, radius, return_length=True)
     for row in np.argsort(-size, kind="stable"):
         if number[row] < 0:
-            own = np.array([row] if size[row] == 1 else tree.query_ball_point(tree.data[row], radius))
-            number[own[number[own] < 0]] = count
+            inside = np.array([row] if size[row] == 1 else tree.query_ball_point(tree.data[row], radius))
+            number[inside[number[inside] < 0]] = count
             count += 1
     return torch.from_numpy(number)
 
@@ -148,12 +149,12 @@ def some_rows(n: int, most: int) -> Tensor:
     return torch.linspace(0, n - 1, min(most, n)).round().long()
 
 
-def random_split(position: Tensor, seed: int) -> tuple[Tensor, Tensor]:
-    """Return training rows and a random fifth as test rows, both ascending. Rows at one place are in one part.
+def random_split(position: Tensor, seed: int, fraction: float = 0.2) -> tuple[Tensor, Tensor]:
+    """Return training rows and a random fraction as test rows, both ascending. Rows at one place are in one part.
 
     Suits positions drawn independently.
     """
-    test = random_rows(position, round(TEST_SHARE * len(position)), seed)
+    test = random_rows(position, round(fraction * len(position)), seed)
     is_test = torch.zeros(len(position), dtype=torch.bool).index_fill(0, test, value=True)
     return (~is_test).nonzero()[:, 0], test
 
@@ -189,9 +190,8 @@ def slabs(position: Tensor, n_slabs: int) -> Tensor:
     return slab
 
 
-def block_split(position: Tensor, seed: int) -> tuple[Tensor, Tensor]:
-    """Return training rows and one slab out of five as test rows, chosen by the seed, both ascending."""
-    n_slabs = round(1 / TEST_SHARE)
+def block_split(position: Tensor, seed: int, n_slabs: int = 5) -> tuple[Tensor, Tensor]:
+    """Return training rows and one slab of several as test rows, chosen by the seed, both ascending."""
     held_out = slabs(position, n_slabs) == seed % n_slabs
     return (~held_out).nonzero()[:, 0], held_out.nonzero()[:, 0]
 
@@ -222,13 +222,13 @@ def folds(
     if validation == "session":
         if session is None:
             raise InputError('validation="session" needs measurements with sessions, see docs/formats.md')
-        _, own, size = session.unique(return_inverse=True, return_counts=True)
+        _, number_of_session, size = session.unique(return_inverse=True, return_counts=True)
         if len(size) > 1:  # whole sessions in folds of nearly equal size
             fold, filled = torch.zeros_like(size), torch.zeros(min(number, len(size)), dtype=torch.int64)
             for which in size.argsort(descending=True, stable=True).tolist():
                 fold[which] = filled.argmin()
                 filled[fold[which]] += size[which]
-            return fold[own]
+            return fold[number_of_session]
     if validation == "block":
         return slabs(position, number)
     place = places(position, number)
@@ -250,26 +250,3 @@ def each_fold(fold: Tensor, rows: Tensor | None = None) -> Iterator[tuple[Tensor
     rows = torch.arange(len(fold)) if rows is None else rows
     for number in fold[rows].unique():
         yield rows[fold[rows] == number], (fold != number).nonzero()[:, 0]
-
-
-def matching_validation(train: Tensor, test: Tensor) -> Validation:
-    """Return the kind of folds whose held-out distances resemble those of the test positions.
-
-    A distance is that to the nearest training position (C. Mila et al., Methods in Ecology and Evolution 13, 2022).
-
-    Example:
-        >>> line = torch.linspace(0, 99, 100)[:, None] * torch.tensor([1.0, 0.0, 0.0])
-        >>> matching_validation(line, line + 0.5), matching_validation(line, line + 50)
-        ('random', 'block')
-    """
-
-    def distances(known: Tensor, other: Tensor) -> Tensor:
-        return nearest(other, known, 1)[0][:, 0]
-
-    def misfit(validation: Validation) -> float:
-        fold = folds(train, validation, 0)
-        held_out = [distances(train[kept], train[out]) for out, kept in each_fold(fold)]
-        return float(wasserstein_distance(torch.cat(held_out), distances(train, test)))
-
-    kinds: tuple[Validation, Validation] = ("random", "block")
-    return min(kinds, key=misfit)

@@ -144,7 +144,7 @@ def stored(
         return Store(values)
     owner = hashlib.sha256(f"{key()} {shape} {dtype}".encode()).hexdigest()
     file = cache_folder() / f"spectra-{owner}.npy"
-    if (found := _mapped(file, shape, dtype)) is None:
+    if (mapped := _mapped(file, shape, dtype)) is None:
         with refusing_unwritable(file.parent):
             file.parent.mkdir(parents=True, exist_ok=True)
             for other in file.parent.glob("*spectra-*"):  # without use for a month, or unfinished by killed processes
@@ -161,9 +161,9 @@ def stored(
             with replacing(file) as temporary, temporary.open("wb") as stream, progress_bar() as bar:
                 task = bar.add_task("storing spectra", total=shape[0])
                 write_npy(stream, shape, dtype, make(), lambda count: bar.advance(task, count))
-        found = _mapped(file, shape, dtype)
-    assert found is not None
-    return Store(found)
+        mapped = _mapped(file, shape, dtype)
+    assert mapped is not None
+    return Store(mapped)
 
 
 def _mapped(file: Path, shape: tuple[int, int, int], dtype: torch.dtype) -> Tensor | None:

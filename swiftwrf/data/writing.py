@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import zipfile
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -17,8 +16,7 @@ from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from swiftwrf.array.angles import AngularGrid, to_angles
-from swiftwrf.array.planar import LIGHT_SPEED
+from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.dataset import Labelled
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.powers import NOT_DETECTED_DBM
@@ -108,43 +106,6 @@ def write_paths(paths: PropagationPaths, folder: Path) -> None:
     }
     known = {name: values.numpy() for name, values in arrays.items() if values is not None}
     write_npz(folder / "paths.npz", known | {"frequency_hz": np.float64(paths.frequency_hz)})
-
-
-def write_deepmimo(paths: PropagationPaths, folder: Path) -> None:
-    """Write paths of known length from one transmitter as a folder of a DeepMIMO v4 scenario, which `load_spectra` reads.
-
-    Interactions (`inter`) are 0 for direct paths and nan for others, whose kinds the paths do not contain.
-
-    Raises:
-        InputError: Unknown lengths, or several transmitters.
-    """
-    if paths.length is None:
-        raise InputError("DeepMIMO contains delays, but the lengths of these paths are unknown (length in paths.npz)")
-    if len(transmitter := paths.transmitter.unique(dim=0)) > 1:
-        raise InputError(
-            f"DeepMIMO has one transmitter and many receivers, but these paths have {len(transmitter)} transmitters"
-        )
-    distance = (paths.transmitter - paths.receiver).norm(dim=1)
-    away = (paths.length / distance[paths.owner] - 1).abs()
-    direct = paths.line_of_sight[paths.owner] & (away < 1e-6)  # from rounding
-    azimuth, _ = to_angles(paths.direction)
-    zenith = paths.direction[:, 2].clamp(-1, 1).acos()  # beyond 90 degrees for paths from below
-    columns = {
-        "power": 20 * paths.gain.abs().log10(),
-        "phase": paths.gain.angle().rad2deg(),
-        "delay": paths.length / LIGHT_SPEED,
-        "aoa_az": azimuth.rad2deg(),
-        "aoa_el": zenith.rad2deg(),
-        "inter": torch.where(direct, 0.0, torch.nan),
-    }
-    first = paths.count.cumsum(0) - paths.count
-    place = paths.owner, torch.arange(len(paths.gain)) - first[paths.owner]
-    empty = torch.full((len(paths.count), int(paths.count.max())), torch.nan, dtype=torch.float64)
-    arrays = {name: empty.index_put(place, values.double()) for name, values in columns.items()}
-    for name, values in (arrays | {"rx_pos": paths.receiver, "tx_pos": transmitter}).items():
-        write_npz(folder / f"{name}_t000_tx000_r001.npz", {name: values.numpy()})
-    params = {"rt_params": {"frequency": paths.frequency_hz, "raytracer_name": "SwiftWRF"}}
-    write_text(folder / "params.json", json.dumps(params, indent=1) + "\n")
 
 
 def write_mat(data: Labelled, file: Path) -> None:

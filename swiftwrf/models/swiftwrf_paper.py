@@ -23,7 +23,7 @@ from swiftwrf.metrics import spectrum_loss
 from swiftwrf.models.base import CPU, FieldConfig, FieldModel
 from swiftwrf.models.mlp import SkipMLP, encode
 from swiftwrf.models.primitives import Primitives
-from swiftwrf.positions import frame, normalise
+from swiftwrf.positions import centre_and_half_side, normalise
 from swiftwrf.rasterize import prepare, rasterize_magnitude
 from swiftwrf.runtime.descent import Descent, Record, warm_cosine
 from swiftwrf.runtime.validation import (
@@ -211,7 +211,9 @@ class Optimisation(Descent[DeformableGaussians]):
         self.config, self.grid, steps = config, train.grid, config.steps
         self.coarse_steps = round(config.coarse_fraction * steps)
         generator = torch.Generator().manual_seed(config.seed)
-        field = DeformableGaussians(config.n_primitives, train.grid, *frame(train.position), generator=generator)
+        field = DeformableGaussians(
+            config.n_primitives, train.grid, *centre_and_half_side(train.position), generator=generator
+        )
         network = [*field.layers.parameters(), *field.output.parameters()]
         groups = [
             {"params": list(field.to(device).primitives.parameters()), "peak": config.rate},

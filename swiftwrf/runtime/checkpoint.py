@@ -182,7 +182,7 @@ def pack(value: Any, name: str = "") -> tuple[dict[str, Tensor], Any]:
         header = {part: plain for part, (_, plain) in parts.items()}
     else:
         return {}, value
-    return {of: tensor for own, _ in parts.values() for of, tensor in own.items()}, header
+    return {of: tensor for tensors, _ in parts.values() for of, tensor in tensors.items()}, header
 
 
 def unpack(
@@ -215,10 +215,10 @@ def unpack(
     if origin is Annotated and arguments[0] is Tensor:
         return _tensor(arguments[1:], tensors, name, sizes)
     if origin is Annotated and isinstance(arguments[1], str):
-        kind, words, whole = arguments[0], arguments[1].split(), name.rpartition(".")[0]
+        kind, words, parent = arguments[0], arguments[1].split(), name.rpartition(".")[0]
         if is_dataclass(kind):
             pairs = (word.split("=") for word in words)
-            sizes |= {_joined(name, pair[0]): sizes[_joined(whole, pair[-1])] for pair in pairs}
+            sizes |= {_joined(name, pair[0]): sizes[_joined(parent, pair[-1])] for pair in pairs}
             return unpack(kind, tensors, header, name, sizes)
         value = unpack(kind, tensors, header, name, sizes)
         _check_shape(name, (len(value),), words, sizes)
@@ -291,9 +291,9 @@ def _tensor(annotation: tuple[Any, ...], tensors: Mapping[str, Tensor], name: st
         raise InputError(f"{name} is missing")
     (text, *bounds), tensor = annotation, tensors[name]
     kinds, *words = text.removesuffix(" nan").split()
-    found = str(tensor.dtype).removeprefix("torch.")
-    if not found.startswith(tuple(kinds.split("|"))):
-        raise InputError(f"{name} has numbers of type {found}, expected {kinds}")
+    dtype = str(tensor.dtype).removeprefix("torch.")
+    if not dtype.startswith(tuple(kinds.split("|"))):
+        raise InputError(f"{name} has numbers of type {dtype}, expected {kinds}")
     _check_shape(name, tuple(tensor.shape), words, sizes)
     for bound in bounds:
         described, attribute, holds = RANGES[type(bound)]
@@ -309,12 +309,12 @@ def _tensor(annotation: tuple[Any, ...], tensors: Mapping[str, Tensor], name: st
 def _check_shape(name: str, shape: tuple[int, ...], words: list[str], sizes: dict[str, int]) -> None:
     """Refuse a shape that the words of an annotation do not allow. New names become those of the sizes found."""
 
-    def size(word: str, found: int) -> int:
+    def size(word: str, given: int) -> int:
         *added, last = word.split("+")
         constant, name_of_size = sum(map(int, added)), _joined(name.rpartition(".")[0], last)
-        return constant + (int(last) if last.isdecimal() else sizes.setdefault(name_of_size, found - constant))
+        return constant + (int(last) if last.isdecimal() else sizes.setdefault(name_of_size, given - constant))
 
-    wanted = [size(word, found) for word, found in zip(words, shape, strict=False)]
+    wanted = [size(word, given) for word, given in zip(words, shape, strict=False)]
     if [*shape] != wanted or len(words) > len(shape):
         known = ", ".join(map(str, [*wanted, *words[len(wanted) :]]))
         raise InputError(f"{name} has shape {shape}, but the configuration calls for ({known})")

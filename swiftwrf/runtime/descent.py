@@ -22,7 +22,6 @@ Record = dict[str, Any]  # one evaluation of a fit
 KIND = "fit state"
 Model = TypeVar("Model", bound=nn.Module)
 
-MAX_GROWTH = 1.1  # of the loss of a fit that is not refused: steps have different spectra, and a few improve little
 SAVED_VALUES = {"step": int, "seconds": float, "first_loss": float, "last_loss": float}  # attributes in a checkpoint
 
 
@@ -35,9 +34,11 @@ class Descent(ABC, Generic[Model]):
         groups: Parameter groups of Adam, each with its peak learning rate, `peak`.
         steps: Number of steps.
         check_every: Steps between two evaluations, at which a record is sent and the state is saved.
-        averaging: Decay per step of the weights in the averaged parameters; 0 takes the last parameters.
+        averaging: Decay of the weight of earlier parameters at each step; 0 takes the last parameters.
         clip: Maximum norm of the gradient.
         betas, weight_decay: Options of Adam.
+        max_growth: A fit is refused if its loss ends above this multiple of the first one. It exceeds 1, because steps have
+            different spectra, and a few steps improve little (not studied).
     """
 
     def __init__(
@@ -52,9 +53,10 @@ class Descent(ABC, Generic[Model]):
         clip: float = 1.0,
         betas: tuple[float, float] = (0.9, 0.99),
         weight_decay: float = 0.0,
+        max_growth: float = 1.1,
     ) -> None:
         self.name, self.model, self.steps, self.check_every = name, model, steps, check_every
-        self.averaging, self.clip = averaging, clip
+        self.averaging, self.clip, self.max_growth = averaging, clip, max_growth
         self.optimiser = torch.optim.Adam(groups, betas=betas, weight_decay=weight_decay)
         self.average = self.averaged()
         self.step, self.seconds = 0, 0.0
@@ -168,7 +170,7 @@ class Descent(ABC, Generic[Model]):
                     tensors, header = self._state()
                     files.write(checkpoint, KIND, tensors, header | {"fingerprint": owner, "records": records})
                 send(records[-1])
-        if self.last_loss > MAX_GROWTH * self.first_loss:  # also if the checkpoint is that of a completed run
+        if self.last_loss > self.max_growth * self.first_loss:  # also if the checkpoint is that of a completed run
             raise FitError(
                 f"the fit ended with a loss of {self.last_loss:.3g}, worse than the {self.first_loss:.3g} it began with; "
                 f"{self._advice()}"

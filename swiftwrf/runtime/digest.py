@@ -22,7 +22,7 @@ DESCRIPTORS = (property, cached_property, staticmethod, classmethod)
 def digest(*values: Any) -> str:
     """Return the SHA-256 of values by their content, equal in every process.
 
-    Functions and classes count by their code and by what it names, those of installed packages by their names alone.
+    A function or class counts by its code and what the code names, one of an installed package by its name.
 
     Raises:
         InputError: A value such as an open file, which cannot be compared with one of another process.
@@ -31,14 +31,14 @@ def digest(*values: Any) -> str:
         >>> digest([1.0], {"seed": 0}) == digest([1.0], {"seed": 0}) != digest([1.0], {"seed": 1})
         True
     """
-    found = hashlib.sha256()
-    content = _Content(SimpleNamespace(write=found.update), protocol=4)
+    sha256 = hashlib.sha256()
+    content = _Content(SimpleNamespace(write=sha256.update), protocol=4)
     content.fast = True  # without references, which equal values that are one object would have
     try:
         content.dump(values)
     except (pickle.PicklingError, AttributeError, TypeError, ValueError, RecursionError) as error:
         raise InputError(f"results of these values cannot be kept ({error}); leave keep out") from None
-    return found.hexdigest()
+    return sha256.hexdigest()
 
 
 class _Content(pickle._Pickler):
@@ -58,8 +58,8 @@ class _Content(pickle._Pickler):
             parts = [value.co_code, value.co_names, value.co_consts]
         elif isinstance(value, DESCRIPTORS):
             parts = [getattr(value, name, None) for name in ("fget", "fset", "func", "__func__")]
-        elif callable(own := getattr(value, "digest", None)):  # of spectra, which exceed the memory
-            parts = [own()]
+        elif callable(content_digest := getattr(value, "digest", None)):  # of spectra, which exceed the memory
+            parts = [content_digest()]
         elif is_dataclass(value):
             parts = [type(value), *(getattr(value, field.name) for field in fields(value))]
         return NotImplemented if parts is None else (list, (parts,))

@@ -24,11 +24,11 @@ def read_json(text: str) -> Any:
 
 
 def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    content = dict(pairs)
+    if len(content) < len(pairs):
         twice = Counter(name for name, _ in pairs).most_common(1)[0][0]
         raise ValueError(f"it names {twice!r} twice; each needs a name of its own")
-    return found
+    return content
 
 
 class _EachNameOnce(yaml.constructor.BaseConstructor):

@@ -6,14 +6,12 @@ Other packages declare implementations by entry points of the registry's group. 
 
 from __future__ import annotations
 
-import importlib
 import inspect
 import pkgutil
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from importlib.metadata import entry_points
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar
 
@@ -43,7 +41,6 @@ class Registry(Mapping[str, type[Made]]):
     def __init__(self, kind: str, group: str | None = None, declared: Mapping[str, str] = MappingProxyType({})) -> None:
         self.kind, self.group = kind, group
         self._registered: dict[str, Any] = dict(declared)  # implementations, and references before their first use
-        self._packages: tuple[str, ...] = ()  # whose modules register themselves
 
     def register(self, name: str) -> Callable[[Registered], Registered]:
         """Return a decorator that registers a class or function under a name.
@@ -59,14 +56,6 @@ class Registry(Mapping[str, type[Made]]):
 
         return decorate
 
-    def discover(self, *packages: str) -> None:
-        """Import every module of the packages in the order of their names, so that each registers itself."""
-        self._packages = packages
-        paths = {package: importlib.import_module(package).__path__ for package in packages}
-        modules = [(one.name, package) for package, path in paths.items() for one in pkgutil.iter_modules(path)]
-        for module, package in sorted(modules):
-            importlib.import_module(f"{package}.{module}")
-
     def check(self, name: str) -> None:
         """Refuse an unknown name.
 
@@ -81,10 +70,8 @@ class Registry(Mapping[str, type[Made]]):
         return (inspect.getdoc(self[name]) or "").partition("\n")[0].removesuffix(".")
 
     def _external(self) -> dict[str, Any]:
-        found = _entry_points(self.group, tuple(sys.path)) if self.group else ()
-        # the installed metadata may be older than the package and name modules that it no longer has
-        others = (point for point in found if point.module.rpartition(".")[0] not in self._packages)
-        return {point.name: point for point in others if point.name not in self._registered}
+        points = _entry_points(self.group, tuple(sys.path)) if self.group else ()
+        return {point.name: point for point in points if point.name not in self._registered}
 
     def __getitem__(self, name: str) -> Any:
         """Return the implementation of that name.
@@ -120,16 +107,3 @@ def _entry_points(group: str, path: tuple[str, ...]) -> tuple[Any, ...]:
     """Return the entry points of a group. A search reads the metadata of every installed package, so its result is kept."""
     # a backport of importlib.metadata, if another package has loaded it, returns its own class
     return tuple(entry_points(group=group))
-
-
-def reporter() -> Callable[[Any, Path | None], Any]:
-    """Return the function that writes the report of a result, by the entry point of the group `swiftwrf.reports`.
-
-    Raises:
-        InputError: The package is not installed, or was installed before it had this entry point.
-    """
-    points = _entry_points("swiftwrf.reports", tuple(sys.path))
-    if not points:
-        raise InputError("nothing here writes reports; install this package again: pip install -e .")
-    found: Callable[[Any, Path | None], Any] = points[0].load()
-    return found

@@ -76,14 +76,14 @@ def to_device(device: torch.device | str) -> torch.device:
         >>> to_device("cpu")
         device(type='cpu')
     """
-    found = None
+    known = None
     with suppress(RuntimeError, TypeError, ValueError):
-        found = torch.device(device)
-    if found is None or found.type not in ("cpu", "cuda"):
+        known = torch.device(device)
+    if known is None or known.type not in ("cpu", "cuda"):
         raise InputError(f"device must be a device of torch, cpu or cuda, got {str(device)!r}")
-    if found.type == "cuda" and (found.index or 0) >= torch.cuda.device_count():
-        raise InputError(f"device {found} needs an NVIDIA GPU that torch can use, and there is none; choose cpu")
-    return found
+    if known.type == "cuda" and (known.index or 0) >= torch.cuda.device_count():
+        raise InputError(f"device {known} needs an NVIDIA GPU that torch can use, and there is none; choose cpu")
+    return known
 
 
 def set_threads(number: int) -> None:

@@ -256,7 +256,7 @@ class Configured:
         def __getattr__(self, name: str) -> Any:
             """Refuse an attribute that the class declares and `fit` sets."""
             declared = (vars(kind) | getattr(kind, "__annotations__", {}) for kind in type(self).__mro__)
-            if any(name in own for own in declared):
+            if any(name in names for names in declared):
                 self.check_fitted()
             return self.__getattribute__(name)  # raises the usual error
 

@@ -7,11 +7,12 @@ from pathlib import Path
 import torch
 
 from augment import suggest
+from augment.choices import fraction_key
 from augment.turbo.experiment import Experiment
 from augment.turbo.learning import learn
 from swiftwrf import Spectra, make_model, simulated_room
-from swiftwrf.choices import RAYTRACE, fraction_key
 from swiftwrf.contrib.raytraced import sionna
+from swiftwrf.contrib.raytraced.names import RAYTRACE
 from swiftwrf.data.files import sha256
 from swiftwrf.data.formats import read_spectra
 from swiftwrf.metrics import angle_errors

@@ -9,7 +9,7 @@ from augment.cross_validation import LOCATOR
 from augment.estimators import ESTIMATORS
 from augment.turbo.condition import FULL_NETWORK, LOCATED, MEASURED_NETWORK, NETWORK, NETWORKS
 from augment.turbo.stages import MAX_HELD_OUT_EXTRA
-from swiftwrf.metrics import ChangeMetrics
+from swiftwrf.contrib.comparison.errors import ChangeMetrics
 from tasks import labels
 from tasks.aoa.records import FractionRecords, palette
 from tasks.aoa.room import choice_section, located_plan, locating_section, room_section

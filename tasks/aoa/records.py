@@ -11,8 +11,8 @@ from typing import Any
 from numpy.typing import NDArray
 from pandas import DataFrame
 
+from augment.choices import AUTO, fraction_key
 from augment.turbo.condition import Condition, Row, conditions_of, headline
-from swiftwrf.choices import AUTO, fraction_key
 from tasks import labels
 from tasks.records import Records
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pandas import DataFrame
 from torch import Tensor
 
-from swiftwrf.metrics import ErrorSummary, paired_difference
+from swiftwrf.contrib.comparison.errors import ErrorSummary, paired_difference
 from swiftwrf.runtime.durable import write_npz
 from tasks.environment import command
 from tasks.page import figures

@@ -9,9 +9,10 @@ import torch
 from matplotlib.figure import Figure
 
 from swiftwrf.choices import RSSI_PREDICTORS
+from swiftwrf.contrib.comparison.errors import paired_difference
 from swiftwrf.contrib.comparison.rssi import CERTAINTY, COVERED_DBM
 from swiftwrf.data.splits import places
-from swiftwrf.metrics import LEVEL, paired_difference
+from swiftwrf.metrics import LEVEL
 from tasks.labels import PREDICTORS, colour, meanings
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of

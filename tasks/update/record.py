@@ -10,13 +10,13 @@ from pathlib import Path
 import torch
 from pandas import DataFrame
 
+from swiftwrf.contrib.comparison.steps import MODEL
 from swiftwrf.contrib.online import Step
 from swiftwrf.data.files import read_bytes
 from swiftwrf.errors import InputError
 from swiftwrf.positions import nearest
 from swiftwrf.runtime.checkpoint import refusing
 from swiftwrf.runtime.durable import write_json, write_text
-from swiftwrf.runtime.steps import MODEL
 from tasks.environment import command
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table

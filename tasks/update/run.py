@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from swiftwrf import FieldModel, InputError, Rssi, Spectra, load
+from swiftwrf.contrib.comparison.steps import MODEL, check_unchanged
 from swiftwrf.contrib.online import Follower
 from swiftwrf.data import ReadOptions, Snapshots
 from swiftwrf.data.files import sha256
@@ -20,7 +21,6 @@ from swiftwrf.models.base import ALREADY_LEARNT
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime import checkpoint
 from swiftwrf.runtime.durable import write_json
-from swiftwrf.runtime.steps import MODEL, check_unchanged
 from tasks.configs import UpdateConfig
 from tasks.directory import Claim, begun, new_directory
 from tasks.environment import environment, invocation

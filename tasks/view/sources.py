@@ -11,17 +11,17 @@ import numpy as np
 import torch
 
 from augment import withhold
+from augment.choices import fraction_key
 from augment.cross_validation import LOCATOR as MATCHED_FIELD
 from augment.turbo.artifacts import model_file
-from swiftwrf import FieldModel, InputError, RssiModel, load
-from swiftwrf.choices import fraction_key
+from swiftwrf import FieldModel, GeometryModel, InputError, Rssi, RssiModel, load
+from swiftwrf.contrib.comparison.steps import LOCATOR, MODEL
 from swiftwrf.errors import with_article
 from swiftwrf.locate import RssiLocator
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import Plane
 from swiftwrf.rssi.base import RssiPredictor
 from swiftwrf.runtime.checkpoint import refusing
-from swiftwrf.runtime.steps import LOCATOR, MODEL
 from tasks.aoa.experiment import measurements as spectra_of
 from tasks.command_line import parse
 from tasks.configs import AoaConfig, LocateConfig, ViewConfig
@@ -155,12 +155,18 @@ def _planes_of_run(file: Path) -> list[dict[str, Any]]:
     return [Plane.from_json(plane).to_json() for plane in planes]
 
 
-def _locate_run(folder: Path, content: Row) -> RssiView:
+def _locate_run(folder: Path, content: Row) -> RssiView | SpectraView:
+    if len(rooms := sorted(folder.glob("room-*.safetensors"))):
+        models = [(file.stem.removeprefix("room-"), _opened(file, GeometryModel)) for file in rooms]
+        return SpectraView(
+            folder.name, [LoadedModel(f"at {name}", room, _planes(room)) for name, room in models], None, []
+        )
     locator, notes = _opened(folder / LOCATOR, RssiLocator), []
     with refusing(f"the records in {folder} are not those of a run"):
         config = parse(LocateConfig, [], "tasks.view", content["config"], folder)
         try:
             data = rssi_of(config)
+            assert isinstance(data, Rssi)
             train = _training_part(folder, config, data)
             locating = RssiLocating(locator, data, torch.isin(data.index, train.index))
         except InputError as error:

@@ -13,8 +13,8 @@ from augment.mix import withhold
 from augment.turbo.condition import MeasuredSubset
 from augment.turbo.experiment import Experiment
 from swiftwrf import AngularGrid, load, simulated_room
+from swiftwrf.contrib.comparison.steps import Memo
 from swiftwrf.metrics import angle_errors
-from swiftwrf.runtime.steps import Memo
 
 CALLS = []  # training sets of `Recorded`, and the spectra that it was applied to
 

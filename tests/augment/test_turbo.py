@@ -11,9 +11,9 @@ from quick import cheap
 from augment import turbo_learning
 from augment.estimators import Estimator
 from swiftwrf import AngularGrid, load_spectra, simulated_room
+from swiftwrf.contrib.comparison.steps import Memo
 from swiftwrf.metrics import angle_errors
 from swiftwrf.models.neighbours import NearestModel
-from swiftwrf.runtime.steps import Memo
 
 
 class Zenith(Estimator):

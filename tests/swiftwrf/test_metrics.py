@@ -12,17 +12,9 @@ from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
 import swiftwrf
+from swiftwrf.contrib.comparison.errors import median_interval, method_summary, summary
 from swiftwrf.locate import Posterior
-from swiftwrf.metrics import (
-    LEVEL,
-    angle_errors,
-    covered,
-    interval_factor,
-    median_interval,
-    method_summary,
-    ssim,
-    summary,
-)
+from swiftwrf.metrics import LEVEL, angle_errors, covered, interval_factor, ssim
 
 
 def test_ssim_is_that_of_scikit_image(generator):

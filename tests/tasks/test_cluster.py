@@ -16,7 +16,7 @@ from sums import STEPS, Sum, add, kill, kill_once, results
 from test_rssi_model import with_field
 
 from swiftwrf import FitError, InputError, fit_rssi
-from swiftwrf.runtime.steps import _compute
+from swiftwrf.contrib.comparison.steps import _compute
 from swiftwrf.runtime.threads import set_threads
 from tasks import workers
 from tasks.workers import connected

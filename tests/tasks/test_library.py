@@ -15,8 +15,8 @@ import augment
 import swiftwrf
 from swiftwrf import AngularGrid, InputError
 from swiftwrf.choices import RSSI_PREDICTORS
+from swiftwrf.contrib.comparison.steps import Memo
 from swiftwrf.models.neighbours import IDWModel
-from swiftwrf.runtime.steps import Memo
 
 
 @pytest.fixture(autouse=True)

@@ -100,7 +100,7 @@ def test_a_run_that_lost_a_process_continues_with_the_results_that_it_kept(tmp_p
 SCRIPT = """
 import sys, torch
 from sums import add
-from swiftwrf.runtime.steps import Steps
+from swiftwrf.contrib.comparison.steps import Steps
 from tasks.configs import AoaConfig
 from tasks.directory import Run
 from tasks.workers import workers_of

@@ -28,18 +28,18 @@ from augment.turbo.experiment import Experiment
 from augment.turbo.results import TurboResult
 from swiftwrf import AngularGrid, Rssi, RssiModel, calibrate, make_model, rssi_room, simulated_room
 from swiftwrf.contrib.comparison.base import split_notes
+from swiftwrf.contrib.comparison.errors import summary
 from swiftwrf.contrib.comparison.localizers import PosteriorLocalizer
 from swiftwrf.contrib.comparison.locating import LocateComparison
+from swiftwrf.contrib.comparison.steps import Memo
 from swiftwrf.contrib.online import score
 from swiftwrf.data.cells import seconds
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin
 from swiftwrf.data.rssi import Offsets
 from swiftwrf.locate import Posterior
-from swiftwrf.metrics import summary
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.rssi import RssiComparison, RssiPredictor, estimate_offsets, log_distance
 from swiftwrf.runtime.durable import write_json
-from swiftwrf.runtime.steps import Memo
 from tasks.aoa import page as aoa_page
 from tasks.aoa import room as aoa_room
 from tasks.aoa import synthesis

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -13,11 +14,11 @@ import torch
 from numpy.typing import NDArray
 from pandas import DataFrame, concat
 
+from swiftwrf.contrib.comparison.errors import method_summary, summaries
 from swiftwrf.data import Rssi
 from swiftwrf.data.dataset import PositionedData
 from swiftwrf.data.splits import MAX_REPEATED, places, repeated_fraction
-from swiftwrf.metrics import method_summary, summaries
-from swiftwrf.runtime.registry import reporter
+from swiftwrf.errors import InputError
 from swiftwrf.runtime.validation import checked
 
 Values = dict[str, Any]
@@ -59,7 +60,7 @@ class Result(ABC):
             >>> swiftwrf.locate.compare(swiftwrf.rssi_room(n=80), n_cells=300).answer().chosen
             'posterior'
         """
-        return reporter()(self.recorded(), None)
+        return _reporter()(self.recorded(), None)
 
     @checked
     def report(self, file: str | Path) -> None:
@@ -68,7 +69,20 @@ class Result(ABC):
         Raises:
             InputError: The file exists already.
         """
-        reporter()(self.recorded(), Path(file))
+        _reporter()(self.recorded(), Path(file))
+
+
+def _reporter() -> Callable[[Recorded, Path | None], Any]:
+    """Return the function that writes the report of a result, by the entry point of the group `swiftwrf.reports`.
+
+    Raises:
+        InputError: The package is not installed, or was installed before it had this entry point.
+    """
+    points = tuple(entry_points(group="swiftwrf.reports"))
+    if not points:
+        raise InputError("nothing here writes reports; install this package again: pip install -e .")
+    reporter: Callable[[Recorded, Path | None], Any] = points[0].load()
+    return reporter
 
 
 @dataclass(frozen=True, eq=False)

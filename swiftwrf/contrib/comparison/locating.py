@@ -13,22 +13,25 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.stats import wasserstein_distance
 from torch import Tensor
 
 from swiftwrf.contrib.comparison.base import Comparison, Recorded, Values
+from swiftwrf.contrib.comparison.errors import summary
 from swiftwrf.contrib.comparison.localizers import LEVELS, LOCALIZERS, PosteriorLocalizer
+from swiftwrf.contrib.comparison.steps import LOCATOR, Memo, Steps
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin, degree_columns
 from swiftwrf.data.rssi import PLACE
-from swiftwrf.data.splits import matching_validation, places
+from swiftwrf.data.splits import Validation, each_fold, folds, places
 from swiftwrf.errors import InputError
 from swiftwrf.locate.locator import Locator
 from swiftwrf.locate.posterior import Posterior
 from swiftwrf.locate.rssi import RssiLocator
-from swiftwrf.metrics import LEVEL, summary
+from swiftwrf.metrics import LEVEL
+from swiftwrf.positions import nearest
 from swiftwrf.rssi import estimate_offsets
 from swiftwrf.runtime.checkpoint import load
-from swiftwrf.runtime.steps import LOCATOR, Memo, Steps
 from swiftwrf.runtime.validation import checked
 
 MIN_ROWS = 20  # training rows that a receiver detected: five folds, of which four hold at least 10 rows
@@ -310,3 +313,26 @@ def compare(
     locator = load(memo.folder / LOCATOR)
     assert isinstance(locator, RssiLocator)
     return replace(begun, values=values, locator=locator)
+
+
+def matching_validation(train: Tensor, test: Tensor) -> Validation:
+    """Return the kind of folds whose held-out distances resemble those of the test positions.
+
+    A distance is that to the nearest training position (C. Mila et al., Methods in Ecology and Evolution 13, 2022).
+
+    Example:
+        >>> line = torch.linspace(0, 99, 100)[:, None] * torch.tensor([1.0, 0.0, 0.0])
+        >>> matching_validation(line, line + 0.5), matching_validation(line, line + 50)
+        ('random', 'block')
+    """
+
+    def distances(known: Tensor, other: Tensor) -> Tensor:
+        return nearest(other, known, 1)[0][:, 0]
+
+    def misfit(validation: Validation) -> float:
+        fold = folds(train, validation, 0)
+        held_out = [distances(train[kept], train[out]) for out, kept in each_fold(fold)]
+        return float(wasserstein_distance(torch.cat(held_out), distances(train, test)))
+
+    kinds: tuple[Validation, Validation] = ("random", "block")
+    return min(kinds, key=misfit)

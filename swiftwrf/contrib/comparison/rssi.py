@@ -18,12 +18,14 @@ from torch import Tensor
 
 from swiftwrf.choices import RSSI_PREDICTORS, NotDetected
 from swiftwrf.contrib.comparison.base import Comparison, Recorded, Values
+from swiftwrf.contrib.comparison.errors import summaries, summary
+from swiftwrf.contrib.comparison.steps import MODEL, Memo, Steps, refusing_executor
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.rssi import PLACE
 from swiftwrf.data.splits import MIN_TRAINING, Validation, places
 from swiftwrf.errors import InputError
-from swiftwrf.metrics import LEVEL, summaries, summary
+from swiftwrf.metrics import LEVEL
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import distance, nearest
 from swiftwrf.rssi.base import RssiPredictor
@@ -34,7 +36,6 @@ from swiftwrf.rssi.offsets import estimate_offsets
 from swiftwrf.rssi.pairs import PairModel
 from swiftwrf.rssi.paper import RssiPaperModel
 from swiftwrf.runtime.checkpoint import Saved, load
-from swiftwrf.runtime.steps import MODEL, Memo, Steps, refusing_executor
 from swiftwrf.runtime.validation import Fraction, Preset, checked
 
 DISTANCES = ("from_receiver_m", "from_training_m")  # columns of the errors

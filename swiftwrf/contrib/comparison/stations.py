@@ -16,20 +16,21 @@ from pandas import DataFrame
 from torch import Tensor
 
 from swiftwrf.contrib.comparison.base import Recorded, Values
+from swiftwrf.contrib.comparison.errors import summary
 from swiftwrf.contrib.comparison.localizers import Located
 from swiftwrf.contrib.comparison.locating import PositionComparison
 from swiftwrf.contrib.comparison.station_localizers import STATION_LOCALIZERS, StationsPosterior
+from swiftwrf.contrib.comparison.steps import LOCATOR, Memo, Steps
 from swiftwrf.data import Stations
 from swiftwrf.errors import InputError
 from swiftwrf.locate import MatchedField
 from swiftwrf.locate.matched_field import MIN_SPECTRA
 from swiftwrf.locate.posterior import Posterior
 from swiftwrf.locate.triangulation import bearings, peak_directions, station_positions, triangulated
-from swiftwrf.metrics import angle_errors, summary
+from swiftwrf.metrics import angle_errors
 from swiftwrf.models.geometry import GeometryModel
 from swiftwrf.models.geometry.agreement import agreed
 from swiftwrf.runtime.checkpoint import load
-from swiftwrf.runtime.steps import LOCATOR, Memo, Steps
 from swiftwrf.runtime.validation import checked
 
 ALONE = "posterior by "  # and the name of the station, of the posterior given the spectra of one station

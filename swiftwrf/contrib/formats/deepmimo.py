@@ -1,6 +1,6 @@
-"""Reader of DeepMIMO v4 folders, the exchange format of ray tracers (Sionna RT, Wireless InSite, AODT): one array a file.
+"""Reader and writer of DeepMIMO v4 folders, the exchange format of ray tracers (Sionna RT, Wireless InSite, AODT).
 
-`{key}_t{set}_tx{index}_r{set}.npz` holds the array `key`. Arrays of paths have up to 25 paths a receiver, nan for missing
+`{key}_t{set}_tx{index}_r{set}.npz` holds one array, `key`. Arrays of paths have up to 25 paths a receiver, nan for missing
 ones. params.json holds the carrier and the name of the ray tracer.
 
 - power [dB], phase [deg], delay [s].
@@ -15,6 +15,7 @@ phase -2 pi f delay of the propagation is added here. The line-of-sight paths, w
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from pathlib import Path
@@ -24,15 +25,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from swiftwrf.array.angles import angular_distance, to_direction
+from swiftwrf.array.angles import angular_distance, to_angles, to_direction
 from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.data.archives import read_arrays, refusing_broken
 from swiftwrf.data.files import check_carrier, digests, read_text
-from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format, ReadOptions, station
+from swiftwrf.data.formats.base import Format, ReadOptions, station
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.errors import InputError
 from swiftwrf.positions import check_positions
+from swiftwrf.runtime.durable import write_npz, write_text
 from swiftwrf.runtime.plain import read_json
 
 Floats = NDArray[np.float64]
@@ -48,7 +50,6 @@ NO_INTERACTIONS = (
 )
 
 
-@SPECTRA_FORMATS.register("deepmimo")
 class DeepMimo(Format[Spectra]):
     """Paths of a ray tracer, from which spectra are computed; `station` chooses a pair of transmitter and receivers."""
 
@@ -217,3 +218,40 @@ def _convention(phase: Floats, lag: Floats, tracer: str) -> str:
         if resultant[best] > 0.5:  # mean resultant length of phases that count as constant
             return best
     return "passband" if "sionna" in tracer.lower() else "whole"
+
+
+def write_deepmimo(paths: PropagationPaths, folder: Path) -> None:
+    """Write paths of known length from one transmitter as a folder of a DeepMIMO v4 scenario, which `load_spectra` reads.
+
+    Interactions (`inter`) are 0 for direct paths and nan for others, whose kinds the paths do not contain.
+
+    Raises:
+        InputError: Unknown lengths, or several transmitters.
+    """
+    if paths.length is None:
+        raise InputError("DeepMIMO contains delays, but the lengths of these paths are unknown (length in paths.npz)")
+    if len(transmitter := paths.transmitter.unique(dim=0)) > 1:
+        raise InputError(
+            f"DeepMIMO has one transmitter and many receivers, but these paths have {len(transmitter)} transmitters"
+        )
+    distance = (paths.transmitter - paths.receiver).norm(dim=1)
+    away = (paths.length / distance[paths.owner] - 1).abs()
+    direct = paths.line_of_sight[paths.owner] & (away < 1e-6)  # from rounding
+    azimuth, _ = to_angles(paths.direction)
+    zenith = paths.direction[:, 2].clamp(-1, 1).acos()  # beyond 90 degrees for paths from below
+    columns = {
+        "power": 20 * paths.gain.abs().log10(),
+        "phase": paths.gain.angle().rad2deg(),
+        "delay": paths.length / LIGHT_SPEED,
+        "aoa_az": azimuth.rad2deg(),
+        "aoa_el": zenith.rad2deg(),
+        "inter": torch.where(direct, 0.0, torch.nan),
+    }
+    first = paths.count.cumsum(0) - paths.count
+    place = paths.owner, torch.arange(len(paths.gain)) - first[paths.owner]
+    empty = torch.full((len(paths.count), int(paths.count.max())), torch.nan, dtype=torch.float64)
+    arrays = {name: empty.index_put(place, values.double()) for name, values in columns.items()}
+    for name, values in (arrays | {"rx_pos": paths.receiver, "tx_pos": transmitter}).items():
+        write_npz(folder / f"{name}_t000_tx000_r001.npz", {name: values.numpy()})
+    params = {"rt_params": {"frequency": paths.frequency_hz, "raytracer_name": "SwiftWRF"}}
+    write_text(folder / "params.json", json.dumps(params, indent=1) + "\n")

@@ -34,13 +34,13 @@ Row = ChainMap[Keys, Any]  # values of a record, then those of each record aroun
 Record = tuple[Keys, Row, dict[Keys, Any]]  # where a record is, its values with those around it, and the lists in it
 
 
-def table_in_document(label: object, text: str, suffix: str) -> pd.DataFrame:
-    """Return the records of a document as a table, whose cells are text. The label stands for it in messages.
+def table_in_document(source: object, text: str, suffix: str) -> pd.DataFrame:
+    """Return the records of a document as a table, whose cells are text. The source stands for it in messages.
 
     Of several lists, it is the one with positions and RSSI, the outermost first.
 
     Args:
-        label: Name of the document.
+        source: Name of the document.
         text: Its content.
         suffix: Its kind, one of `swiftwrf.data.files.DOCUMENTS`.
 
@@ -53,23 +53,23 @@ def table_in_document(label: object, text: str, suffix: str) -> pd.DataFrame:
         [['1', '2', 'a', '-60'], ['1', '2', 'b', '-70']]
     """
     records: list[Record] = []
-    with refusing_broken(label, f"a complete {suffix.lstrip('.').upper()} document"):
+    with refusing_broken(source, f"a complete {suffix.lstrip('.').upper()} document"):
         content = _points(text) if suffix in XML else read_json(text)
         if HALF_CHARACTER.search(text):
             json.dumps(content, ensure_ascii=False).encode()  # raises an error for half a character
         _collect(content, (), ChainMap(), records)
     if not records:
-        raise InputError(f"{label} holds no records with names, e.g. points with positions and RSSI")
+        raise InputError(f"{source} holds no records with names, e.g. points with positions and RSSI")
     rows: dict[Keys, list[Row]] = {}
     for where, row, _ in records:
         rows.setdefault(where, []).append(row)
     if len(rows) > MAX_LISTS:
-        raise InputError(f"{label} has lists of records under {len(rows)} names; at most {MAX_LISTS} are read")
+        raise InputError(f"{source} has lists of records under {len(rows)} names; at most {MAX_LISTS} are read")
     # values around many records make a table far larger than the document
     most = min(MAX_CELLS, max(MIN_CELLS, len(text)))
-    tables = {where: _table(label, found, most) for where, found in rows.items()}
+    tables = {where: _table(source, found, most) for where, found in rows.items()}
     path = max(tables, key=lambda path: (_n_known(tables[path]), -len(path), len(tables[path])))
-    table = _table(label, [row for at, row, lists in records if at == path or _is_empty(at, lists, path)], most)
+    table = _table(source, [row for at, row, lists in records if at == path or _is_empty(at, lists, path)], most)
     table.attrs["notes"] = [f"rows are the records in {' > '.join(path)}"] if path else []
     others = {
         " > ".join(where) for *_, lists in records for where, items in lists.items() if items and where not in rows
@@ -134,13 +134,13 @@ def _is_scan(value: Any) -> bool:
     )
 
 
-def _table(label: object, rows: list[Row], most: int) -> pd.DataFrame:
+def _table(source: object, rows: list[Row], most: int) -> pd.DataFrame:
     """Return rows as a table. Columns have the last key, or all keys where several have one last key."""
     parts = {id(part): part for row in rows for part in reversed(row.maps)}
     paths = list(dict.fromkeys(path for part in parts.values() for path in part))
     if len(paths) > MAX_NAMES or len(rows) * len(paths) > most:
         raise InputError(
-            f"{label} has {len(rows)} records of {len(paths)} values; at most {most} cells and {MAX_NAMES} values of a "
+            f"{source} has {len(rows)} records of {len(paths)} values; at most {most} cells and {MAX_NAMES} values of a "
             "record are read"
         )
     text = {key: {path: "" if x is None else str(x) for path, x in part.items()} for key, part in parts.items()}

@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 
 from swiftwrf.data.archives import MAX_UNPACKED_BYTES, Arrays, refusing_broken
 from swiftwrf.data.files import read_text
-from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions, station
+from swiftwrf.data.formats.base import Format, ReadOptions, station
 from swiftwrf.data.formats.snapshots import snapshots_of
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.errors import InputError, optional_module
@@ -59,7 +59,6 @@ DTYPES[18] = np.dtype("<c16")
 Assignments = list[list[Annotated[int, Ge(0), Lt(4096)] | None]]  # antenna of each row and column, None if missing
 
 
-@SNAPSHOT_FORMATS.register("records")
 class Records(Format[Snapshots]):
     """TFRecord files with channel and position, one record a measurement, of ESPARGOS or DICHASUS.
 

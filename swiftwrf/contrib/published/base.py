@@ -17,7 +17,7 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra, fingerprint
 from swiftwrf.models.base import CPU, FieldModel
 from swiftwrf.models.link import Linked
-from swiftwrf.positions import frame, normalise
+from swiftwrf.positions import centre_and_half_side, normalise
 from swiftwrf.runtime.descent import Descent, Model, warm_cosine
 from swiftwrf.runtime.validation import Fraction, NonNegativeInt, PositiveFloat, PositiveInt, configuration
 
@@ -136,12 +136,12 @@ class TrainedModel(Linked, FieldModel):
 
     def local(self, position: Tensor, device: torch.device) -> Tensor:
         """Return positions, float32 (n, 3) within [-1, 1]^3 in the box around the training positions, on a device."""
-        centre, scale = frame(self.bounds)
+        centre, scale = centre_and_half_side(self.bounds)
         return normalise(position.to(device), centre.to(device), scale.to(device))
 
     def ends(self, position: Tensor, device: torch.device) -> tuple[Tensor, Tensor]:
         """Return transmitter and receiver, float32 (n or 1, 3) [m from the centre], with the moving end at positions."""
-        centre = frame(self.bounds)[0].to(device)
+        centre = centre_and_half_side(self.bounds)[0].to(device)
         moved, fixed = (normalise(x.to(device), centre, 1.0) for x in (position, self.fixed_position[None]))
         return (moved, fixed) if self.moving == "transmitter" else (fixed, moved)
 

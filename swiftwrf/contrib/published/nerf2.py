@@ -44,7 +44,7 @@ from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.models.base import CPU, FIXED_END, check_predicted
 from swiftwrf.models.mlp import SkipMLP, encode
-from swiftwrf.positions import frame, normalise
+from swiftwrf.positions import centre_and_half_side, normalise
 from swiftwrf.rssi.base import RssiPredictor
 from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
@@ -278,7 +278,7 @@ class NeRF2Rssi(RssiPredictor, Saved):
 
     def _fit(self, train: Rssi, *, device: torch.device = CPU, progress: bool = False, **_: Any) -> None:
         """Descend the squared error of amplitudes where RSSI was detected."""
-        self.centre = frame(train.transmitter_position)[0]
+        self.centre = centre_and_half_side(train.transmitter_position)[0]
         config, field = self.config, self.blank()
         draw_parameters(field, torch.Generator().manual_seed(config.seed))
         detected = (~train.rssi_dbm.isnan()).any(dim=1)

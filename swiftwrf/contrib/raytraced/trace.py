@@ -20,7 +20,8 @@ from torch import Tensor
 
 from swiftwrf.array.angles import to_direction
 from swiftwrf.array.planar import LIGHT_SPEED
-from swiftwrf.choices import SCENE_FILE, Moving, check_scene
+from swiftwrf.choices import Moving
+from swiftwrf.contrib.raytraced.names import SCENE_FILE, check_scene
 from swiftwrf.contrib.raytraced.rooms import ROOMS, Material, Surface
 from swiftwrf.data.archives import refusing_broken
 from swiftwrf.data.paths import PropagationPaths

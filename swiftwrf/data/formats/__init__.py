@@ -10,6 +10,4 @@ from swiftwrf.data.formats.base import (
     read_spectra,
 )
 
-SPECTRA_FORMATS.discover(__name__, "swiftwrf.contrib.formats")  # and with them the formats of all kinds
-
 __all__ = ["RSSI_FORMATS", "SNAPSHOT_FORMATS", "SPECTRA_FORMATS", "Format", "ReadOptions", "read", "read_spectra"]

@@ -98,9 +98,29 @@ class Format(ABC, Generic[Data]):
         """
 
 
-SPECTRA_FORMATS: Registry[Format[Spectra]] = Registry("format of spectra", "swiftwrf.readers.spectra")
-SNAPSHOT_FORMATS: Registry[Format[Snapshots]] = Registry("format of array snapshots", "swiftwrf.readers.snapshots")
-RSSI_FORMATS: Registry[Format[Rssi]] = Registry("format of RSSI", "swiftwrf.readers.rssi")
+SPECTRA_FORMATS: Registry[Format[Spectra]] = Registry(
+    "format of spectra",
+    "swiftwrf.readers.spectra",
+    {
+        "deepmimo": "swiftwrf.contrib.formats.deepmimo:DeepMimo",
+        "nerf2": "swiftwrf.data.formats.nerf2:Nerf2",
+        "paths": "swiftwrf.data.formats.paths:PathArchive",
+    },
+)
+SNAPSHOT_FORMATS: Registry[Format[Snapshots]] = Registry(
+    "format of array snapshots",
+    "swiftwrf.readers.snapshots",
+    {
+        "snapshots": "swiftwrf.data.formats.snapshots:SnapshotArrays",
+        "captures": "swiftwrf.contrib.formats.captures:Captures",
+        "records": "swiftwrf.contrib.formats.records:Records",
+    },
+)
+RSSI_FORMATS: Registry[Format[Rssi]] = Registry(
+    "format of RSSI",
+    "swiftwrf.readers.rssi",
+    {"nerf2": "swiftwrf.data.formats.nerf2:Nerf2Rssi", "survey": "swiftwrf.data.formats.survey:SurveyTable"},
+)
 
 
 def _readers(source: Path, options: ReadOptions, *registries: Registry[Format[Any]]) -> list[tuple[str, Format[Any]]]:
@@ -137,15 +157,15 @@ def read(path: str | Path, options: ReadOptions, *registries: Registry[Format[An
     if not os.path.isdir(source) and not os.path.isfile(source):  # Path.is_dir raises for a name that is too long
         raise InputError(f"{source} is not a folder or file; expected measurements (formats: {known})")
     try:
-        found = _readers(source, options, *registries)
-        if not found:
+        matches = _readers(source, options, *registries)
+        if not matches:
             raise InputError(f"{source} is in none of the known formats ({known}); docs/formats.md describes them")
-        if len(found) > 1:
-            names = " and ".join(name for name, _ in found)
+        if len(matches) > 1:
+            names = " and ".join(name for name, _ in matches)
             raise InputError(
                 f"{source} holds several formats ({names}); keep one in the folder, or name the file itself"
             )
-        ((name, reader),) = found
+        ((name, reader),) = matches
         logger.info("%s is read as %s", source, name)
         for option in options.given:
             if option not in reader.takes:
@@ -164,8 +184,8 @@ def read_spectra(path: str | Path, options: ReadOptions) -> Spectra:
     Raises:
         InputError: As `read`.
     """
-    found: Spectra = options.spectra_of(read(path, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS))
-    return found
+    spectra: Spectra = options.spectra_of(read(path, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS))
+    return spectra
 
 
 def station(holds: str, names: Sequence[str], number: int | None) -> int:

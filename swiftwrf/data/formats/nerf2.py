@@ -14,10 +14,10 @@ RSSI, in a table with positions of the same rows:
 
 | file | content |
 |---|---|
-| `gateway_rssi.csv` | a column per receiver, named in the header [dBm]; -100 stands for not detected |
+| `gateway_rssi.csv` | a column a receiver, named in the header [dBm]; -100 stands for not detected |
 | `tx_pos.csv` or `rx_pos.csv` | header `x,y,z`: positions of the end that moves |
 | `gateway_position.yml` | optional: `NAME: [x, y, z]` of receivers with known positions |
-| `meta.csv` | optional: a row per measurement, with its session (`session`, `run` or `walk`), `time` [s] and `group` |
+| `meta.csv` | optional: a row a measurement, with its session (`session`, `run` or `walk`), `time` [s] and `group` |
 | `survey.yml` | optional: `origin: [latitude, longitude]`, `floors: {NAME: height}` [m], `receiver_moves: true`, ... |
 
 The BLE data of the NeRF2 paper are read unchanged: `rssi.csv`, `beacon_pos.csv` and `gateway_pos.csv`.
@@ -45,7 +45,7 @@ from swiftwrf.data.cells import column_of_numbers, seconds, text_of
 from swiftwrf.data.columns import column_of
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin, PlanFrame, without_fix
 from swiftwrf.data.files import digests, numbers, read_bytes, read_table, read_xyz, read_yaml, sha256
-from swiftwrf.data.formats.base import RSSI_FORMATS, SPECTRA_FORMATS, Format, ReadOptions
+from swiftwrf.data.formats.base import Format, ReadOptions
 from swiftwrf.data.formats.snapshots import array_of, described_arrays, pose_of
 from swiftwrf.data.powers import NOT_DETECTED_DBM, find_fillers, without_fillers
 from swiftwrf.data.receivers import read_receivers
@@ -63,7 +63,6 @@ PROPERTIES = ("origin", "floors", "receiver_moves", "groups", "offsets", "labels
 FILES = ("gateway_rssi.csv", *POSITIONS, *RECEIVERS)  # any of which marks the layout
 
 
-@SPECTRA_FORMATS.register("nerf2")
 class Nerf2(Format[Spectra]):
     """Images or an array; row i of the positions belongs to the image numbered i from 1, or to row i of the array."""
 
@@ -166,9 +165,11 @@ def _read_images(folder: Path, n: int) -> tuple[Store, str]:
     """Return `00001.png` to `n`.png as (n, H, W), all grey and of one shape, and the digest of all files."""
     if not folder.is_dir():
         raise InputError(f"{folder} is missing; expected one grey image a position, 00001.png to {n:05d}.png")
-    found = len(list(folder.glob("*.png")))
-    if found != n:
-        raise InputError(f"{folder} holds {found} images, but there are {n} positions; each position needs its image")
+    n_images = len(list(folder.glob("*.png")))
+    if n_images != n:
+        raise InputError(
+            f"{folder} holds {n_images} images, but there are {n} positions; each position needs its image"
+        )
     files = [folder / f"{number:05d}.png" for number in range(1, n + 1)]
     digest = hashlib.sha256()
     for file in files:
@@ -214,7 +215,6 @@ def _decode(
         return np.asarray(image)
 
 
-@RSSI_FORMATS.register("nerf2")
 class Nerf2Rssi(Format[Rssi]):
     """One row a position of the end that moves, one column a receiver."""
 
@@ -225,23 +225,23 @@ class Nerf2Rssi(Format[Rssi]):
         return raw or any((path / name).is_file() for name in (*TABLES[:1], *RECEIVERS[:1]))
 
     def read(self, path: Path, options: ReadOptions) -> Rssi:
-        table, positions = _one_of(path, TABLES), _one_of(path, POSITIONS)
+        rssi_file, position_file = _one_of(path, TABLES), _one_of(path, POSITIONS)
         receivers = next((path / name for name in RECEIVERS if (path / name).is_file()), None)
-        frame, position = read_table(table), read_xyz(positions)
-        names = list(map(str, frame.columns))
+        table, position = read_table(rssi_file), read_xyz(position_file)
+        names = list(map(str, table.columns))
         omitted, missing = without_fix(position)
         if omitted.all():
-            raise InputError(f"{positions} needs 3 finite numbers [m] in each row")
-        if len(frame) != len(position):
+            raise InputError(f"{position_file} needs 3 finite numbers [m] in each row")
+        if len(table) != len(position):
             raise InputError(
-                f"{path}: {table.name} has {len(frame)} rows, {positions.name} {len(position)}; they must match"
+                f"{path}: {rssi_file.name} has {len(table)} rows, {position_file.name} {len(position)}; they must match"
             )
-        rssi = np.stack([column_of_numbers(table, frame, name) for name in names], axis=1)
+        rssi = np.stack([column_of_numbers(rssi_file, table, name) for name in names], axis=1)
         fillers = sorted({NOT_DETECTED_DBM, *find_fillers(rssi)}) if options.filler is None else list(options.filler)
         rssi, notes = without_fillers(rssi, fillers)
         row = torch.from_numpy(~omitted).nonzero()[:, 0]
         receiver_position, unknown = read_receivers(receivers, names, None, PlanFrame()) if receivers else (None, [])
-        if positions.name == "rx_pos.csv":
+        if position_file.name == "rx_pos.csv":
             missing.append(
                 "the receiver moves; RSSI is reciprocal, so it counts as the transmitter and the others as receivers"
             )
@@ -253,7 +253,7 @@ class Nerf2Rssi(Format[Rssi]):
                 f"{path} has groups of {groups}, not of {options.offset_by}; convert the table again by these"
             )
         of_rows, units = _of_rows(meta, len(rssi), groups) if meta.is_file() else ({}, [])
-        stated = (positions, table, receivers, of_rows and meta, properties and survey)
+        stated = (position_file, rssi_file, receivers, of_rows and meta, properties and survey)
         return Rssi(
             rssi[row],
             position[row],
@@ -271,63 +271,63 @@ class Nerf2Rssi(Format[Rssi]):
 
 def _of_rows(file: Path, n: int, groups: str | None) -> tuple[dict[str, Any], list[str]]:
     """Return session, time and named group of n rows, as far as a table has these columns, and a note on times."""
-    frame = read_table(file)
-    session, time = (column_of(frame, role, {}) for role in ("session", "time"))
-    found: dict[str, Any] = {}
+    table = read_table(file)
+    session, time = (column_of(table, role, {}) for role in ("session", "time"))
+    columns: dict[str, Any] = {}
     notes: list[str] = []
     if session is not None:
-        found["session"] = text_of(frame[session]).to_numpy()
+        columns["session"] = text_of(table[session]).to_numpy()
     if time is not None:
-        found["time"], notes = seconds(frame[time])
-    if groups is not None and "group" in frame:
-        group = text_of(frame["group"])
-        found["groups"] = group.where(group != "").rename(groups)
-    if found and len(frame) != n:
-        raise InputError(f"{file} has {len(frame)} rows, the RSSI {n}; they must match")
-    return found, notes
+        columns["time"], notes = seconds(table[time])
+    if groups is not None and "group" in table:
+        group = text_of(table["group"])
+        columns["groups"] = group.where(group != "").rename(groups)
+    if columns and len(table) != n:
+        raise InputError(f"{file} has {len(table)} rows, the RSSI {n}; they must match")
+    return columns, notes
 
 
 def _properties(file: Path) -> dict[str, Any]:
     """Return the origin of the coordinates and other properties of all rows, as far as a file states them."""
     content = read_yaml(file)
-    found: dict[str, Any] = {name: str(content[name]) for name in ("groups",) if name in content}
+    properties: dict[str, Any] = {name: str(content[name]) for name in ("groups",) if name in content}
     if unknown := content.keys() - set(PROPERTIES):
         raise InputError(f"{file} states {listed(sorted(unknown))}; it holds {listed(PROPERTIES)} only")
     if "origin" in content:
         degrees = numbers(content["origin"], 2)
         if degrees is None or abs(degrees[0]) > 90 or abs(degrees[1]) > 180:
             raise InputError(f"{file}: origin must be latitude and longitude in degrees, got {content['origin']}")
-        found["origin"] = GeodeticOrigin(*degrees)
+        properties["origin"] = GeodeticOrigin(*degrees)
     if "floors" in content:
         floors = content["floors"]
         heights = numbers([*floors.values()], len(floors)) if isinstance(floors, dict) else None
         if not heights or list(heights) != sorted(set(heights)):
             raise InputError(f"{file}: floors must be names with ascending heights [m], got {floors}")
-        found["floors"] = Floors(tuple(floors), heights)
+        properties["floors"] = Floors(tuple(floors), heights)
     if "receiver_moves" in content:
         if content["receiver_moves"] not in ("true", "false"):
             raise InputError(f"{file}: receiver_moves must be true or false, got {content['receiver_moves']}")
-        found["receiver_moves"] = content["receiver_moves"] == "true"
+        properties["receiver_moves"] = content["receiver_moves"] == "true"
     with refusing_broken(file, "a description as convert writes it"):
         if not isinstance(labels := content.get("labels", []), list):
             raise TypeError(f"labels is {labels}, expected a list")
-        found["labels"] = tuple(map(str, labels))
+        properties["labels"] = tuple(map(str, labels))
         offsets = content.get("offsets", {})
         db = offsets.get("offset_db", {})
         values = numbers([content.get("plan_scale", "0"), offsets.get("explained", "0"), *db.values()], len(db) + 2)
         scale, explained, *decibels = values or ()
-        found["plan_scale"] = scale or None
+        properties["plan_scale"] = scale or None
         if offsets:
             by_name = dict(zip(db, decibels, strict=True))
-            found["offsets"] = Offsets(str(offsets["column"]), str(offsets["reference"]), by_name, explained)
-    return found
+            properties["offsets"] = Offsets(str(offsets["column"]), str(offsets["reference"]), by_name, explained)
+    return properties
 
 
 def _one_of(path: Path, names: tuple[str, ...]) -> Path:
     """Return the only file with one of these names, and refuse none or several."""
-    found = [path / name for name in names if (path / name).is_file()]
-    if len(found) > 1:
-        raise InputError(f"{path} holds {' and '.join(file.name for file in found)}; keep one of them")
-    if not found:
+    files = [path / name for name in names if (path / name).is_file()]
+    if len(files) > 1:
+        raise InputError(f"{path} holds {' and '.join(file.name for file in files)}; keep one of them")
+    if not files:
         raise InputError(f"{path / names[0]} is missing")
-    return found[0]
+    return files[0]

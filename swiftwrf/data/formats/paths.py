@@ -19,7 +19,7 @@ from torch import Tensor
 
 from swiftwrf.data.archives import array_names, read_arrays
 from swiftwrf.data.files import check_carrier, digests
-from swiftwrf.data.formats.base import SPECTRA_FORMATS, Format, ReadOptions
+from swiftwrf.data.formats.base import Format, ReadOptions
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import read_splits
@@ -28,11 +28,8 @@ from swiftwrf.positions import check_positions, to_tensor
 
 POSITIONS = ("transmitter_position", "receiver_position", "last_point")
 NEEDED = (*POSITIONS, "path_count", "gain", "line_of_sight", "frequency_hz")
-MIN_DISTANCE_M = 1e-9  # between two points
-MAX_GAIN = 1e100  # sums of larger ones overflow
 
 
-@SPECTRA_FORMATS.register("paths")
 class PathArchive(Format[Spectra]):
     """Traced paths, from which spectra are computed."""
 
@@ -55,8 +52,10 @@ class PathArchive(Format[Spectra]):
         )
 
 
-def read_paths(source: Path) -> PropagationPaths:
+def read_paths(source: Path, min_distance_m: float = 1e-9, max_gain: float = 1e100) -> PropagationPaths:
     """Return the paths in a paths.npz, or in a folder with one.
+
+    Closer points are one place, and sums of larger gains overflow.
 
     Raises:
         InputError: No paths, arrays that do not match, or values from which no spectra or labels follow.
@@ -79,15 +78,15 @@ def read_paths(source: Path) -> PropagationPaths:
     )
     gain, frequency_hz = checked("gain", torch.complex128, n_paths), float(checked("frequency_hz", torch.float64))
     check_carrier(file, frequency_hz)
-    same = ((transmitter - receiver).norm(dim=1) < MIN_DISTANCE_M).nonzero()
+    same = ((transmitter - receiver).norm(dim=1) < min_distance_m).nonzero()
     if len(same):
         raise InputError(f"{file}: transmitter and receiver of row {int(same[0])} are at one place; leave it out")
-    if float(gain.abs().max()) > MAX_GAIN:
-        raise InputError(f"{file}: gain holds a value beyond {MAX_GAIN:g}; give amplitudes")
+    if float(gain.abs().max()) > max_gain:
+        raise InputError(f"{file}: gain holds a value beyond {max_gain:g}; give amplitudes")
     owner = torch.arange(n).repeat_interleave(count)
     offset = last - receiver[owner]
     distance = offset.norm(dim=1, keepdim=True)
-    if len(none := (distance[:, 0] < MIN_DISTANCE_M).nonzero()):
+    if len(none := (distance[:, 0] < min_distance_m).nonzero()):
         raise InputError(
             f"{file}: last_point of path {int(none[0])} is the receiver itself, so the path comes from no direction"
         )

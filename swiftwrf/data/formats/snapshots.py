@@ -15,7 +15,7 @@ from swiftwrf.array.angles import ArrayPose
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.archives import ARCHIVES, Arrays, array_names, read_arrays, refusing_broken
 from swiftwrf.data.files import check_carrier, digests, read_yaml
-from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions, station
+from swiftwrf.data.formats.base import Format, ReadOptions, station
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.splits import read_splits
 from swiftwrf.errors import InputError, listed, ranges
@@ -25,13 +25,11 @@ REQUIRED_ARRAYS = ("csi", "position", "frequency_hz", "array_position")
 POSE = ("array_orientation", "array_normal", "array_up")  # the first, or the others
 OPTIONAL = (*POSE, "element_position", "rows", "columns", "spacing_m", "line_of_sight", "time")
 SCALARS = ("frequency_hz", "rows", "columns", "spacing_m")
-SPACINGS_WAVELENGTHS = (0.01, 20.0)  # of neighbouring elements; beyond, the unit is another one
 STATIONS = "stations.yml"  # descriptions of several arrays, whose number is the second axis of csi
 PER_ROW = ("csi", "position", "line_of_sight", "time")
 VECTORS = ("array_position", *POSE, "line_of_sight", "time", "frequency_hz")
 
 
-@SNAPSHOT_FORMATS.register("snapshots")
 class SnapshotArrays(Format[Snapshots]):
     """Arrays by name, one row a position of the transmitter."""
 
@@ -54,8 +52,8 @@ class SnapshotArrays(Format[Snapshots]):
             raise InputError(f"{file} holds one array; leave station out")
         required = REQUIRED_ARRAYS if described is None else ("csi", "position")
         needed = [name[array] for array in dict.fromkeys((*required, *stated))]
-        found = read_arrays(file, needed, [name[array] for array in OPTIONAL if array not in stated])
-        arrays = {array: found[own] for array, own in name.items() if own in found}
+        stored = read_arrays(file, needed, [name[array] for array in OPTIONAL if array not in stated])
+        arrays = {array: stored[name_in_file] for array, name_in_file in name.items() if name_in_file in stored}
         label = file.stem if file.stem != "snapshots" else None
         if described is None:
             return snapshots_of(file, arrays, options, [file], label)
@@ -157,9 +155,7 @@ def _of_station(file: Path, arrays: Arrays, number: int, count: int) -> tuple[Ar
             f"stations.yml, got {csi.shape}"
         )
     own = csi[:, number]
-    received = np.isfinite(own).reshape(len(own), -1).any(axis=1) & (np.nan_to_num(own) != 0).reshape(len(own), -1).any(
-        axis=1
-    )
+    received = (np.nan_to_num(own) != 0).reshape(len(own), -1).any(axis=1)
     if not received.any():
         raise InputError(f"{file}: array {number + 1} of stations.yml received nothing; leave it out")
     return arrays | {"csi": own}, received.nonzero()[0]
@@ -205,7 +201,7 @@ def _polarisations(source: Path, arrays: Arrays) -> tuple[Arrays, tuple[str, ...
         )
     order = np.argsort(place.reshape(-1), kind="stable").reshape(-1, ports).T  # elements of each polarisation
     order = order[:, np.argsort(order[0])]
-    split = np.concatenate([csi.reshape(len(csi), -1, len(element))[..., some] for some in order], axis=1)
+    split = np.concatenate([csi.reshape(len(csi), -1, len(element))[..., elements] for elements in order], axis=1)
     arrays |= {"csi": split, "element_position": element[order[0]]}
     if carrier.ndim == 1 and csi.ndim == 3:
         arrays |= {"frequency_hz": np.tile(carrier, ports)}
@@ -288,8 +284,8 @@ def measured(
                 f"null subcarriers, the same at every position and element, are {used_how} ({int(null.sum())} of {count}, "
                 f"counted from 0): {ranges(null.nonzero()[:, 0].tolist())}{remedy}"
             )
-    if some := int((missing & ~empty[..., None]).sum()):
-        notes.append(f"{some} of {missing.numel()} values of single elements are 0 or NaN and not used")
+    if n_single := int((missing & ~empty[..., None]).sum()):
+        notes.append(f"{n_single} of {missing.numel()} values of single elements are 0 or NaN and not used")
     return channel[:, kept], kept.nonzero()[:, 0], used.nonzero()[:, 0], tuple(notes)
 
 
@@ -337,8 +333,11 @@ def pose_of(file: Path, arrays: Arrays) -> ArrayPose:
         return ArrayPose.facing(where, turned, tuple(arrays.get("array_up", np.eye(3)[2]).flatten().tolist()))
 
 
-def array_of(file: Path, arrays: Arrays) -> PlanarArray:
-    """Return the array, described by the positions of its elements or by rows, columns and spacing."""
+def array_of(file: Path, arrays: Arrays, spacing_wavelengths: tuple[float, float] = (0.01, 20.0)) -> PlanarArray:
+    """Return the array, described by the positions of its elements or by rows, columns and spacing.
+
+    Neighbouring elements that are closer or farther apart than the given spacings have another unit.
+    """
     frequency = arrays["frequency_hz"]
     if frequency.shape != ():
         raise InputError(f"{file}: frequency_hz must be one number, the carrier, got shape {frequency.shape}")
@@ -360,7 +359,7 @@ def array_of(file: Path, arrays: Arrays) -> PlanarArray:
         raise InputError(
             f"{file} describes an array of one element, which resolves no directions; at least 2 are needed"
         )
-    apart, (low, high) = array.spacing_wavelengths, SPACINGS_WAVELENGTHS
+    apart, (low, high) = array.spacing_wavelengths, spacing_wavelengths
     if not low <= apart <= high:
         raise InputError(
             f"{file}: neighbouring elements are {apart * array.wavelength:.4g} m, {apart:.3g} wavelengths apart; expected "

@@ -10,7 +10,13 @@ import torch
 from torch import Tensor
 
 from swiftwrf.data.files import read_text
-from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, SPECTRA_FORMATS, ReadOptions, read_spectra, reader_of
+from swiftwrf.data.formats.base import (
+    SNAPSHOT_FORMATS,
+    SPECTRA_FORMATS,
+    ReadOptions,
+    read_spectra,
+    reader_of,
+)
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.stations import MAX_DIFFERENCE_M, Stations
 from swiftwrf.errors import InputError

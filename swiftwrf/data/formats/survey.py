@@ -13,7 +13,7 @@ import torch
 
 from swiftwrf.data.columns import is_coordinate, is_rssi
 from swiftwrf.data.files import SUFFIXES, TABLES, digests, has_header, read_table
-from swiftwrf.data.formats.base import RSSI_FORMATS, SNAPSHOT_FORMATS, Format, ReadOptions
+from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
 from swiftwrf.data.formats.nerf2 import FILES as NERF2_FILES
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
@@ -23,10 +23,8 @@ from swiftwrf.errors import InputError, listed
 RECEIVERS = "receivers.csv"  # beside the table: receiver,x,y,z
 COORDINATES = re.compile(r"(?:crd|coord(?:inate)?s?|pos(?:ition)?s?|loc(?:ation)?s?|places?)(?![a-z])")
 HALF = re.compile(rf"[ _-]*(?:rssi?(?![a-z])|{COORDINATES.pattern})[ _-]*")
-MAX_COORDINATES = 6  # columns of a table of positions: x, y, z, floor, building, ...
 
 
-@RSSI_FORMATS.register("survey")
 class SurveyTable(Format[Rssi]):
     """Table of a walk test; positions of receivers are unknown unless receivers.csv beside it contains them."""
 
@@ -40,11 +38,11 @@ class SurveyTable(Format[Rssi]):
         receivers = file.with_name(RECEIVERS)
         stated = receivers if receivers.is_file() else None
         splits = read_splits(file.parent, len(table), first=0)
-        found = read_survey(file, table, options, stated, keeps_rows=bool(splits))
+        arguments = read_survey(file, table, options, stated, keeps_rows=bool(splits))
         data = Rssi(
-            **found,
+            **arguments,
             name=file.stem,
-            named_splits=kept_splits(splits, torch.from_numpy(found["index"]), len(table)),
+            named_splits=kept_splits(splits, torch.from_numpy(arguments["index"]), len(table)),
             source=digests([file, *others, *([stated] if stated else [])], file.parent),
         )
         if data.receiver_moves and bool(data.receiver_position.isnan().any()):
@@ -91,12 +89,15 @@ def _table(path: Path) -> tuple[Path, list[Path], pd.DataFrame]:
     return file, [other], table
 
 
-def _holds_places(file: Path, table: pd.DataFrame) -> bool | None:
-    """Return True for a table of positions alone, False for one of RSSI alone, None for another one."""
+def _holds_places(file: Path, table: pd.DataFrame, max_columns: int = 6) -> bool | None:
+    """Return True for a table of positions alone, False for one of RSSI alone, None for another one.
+
+    Positions have up to 6 columns: x, y, z, floor, building, ...
+    """
     powers = [is_rssi(table[name]) and not is_coordinate(name) for name in table]
     if has_positions(table, {}):
-        return None if any(powers) or len(powers) > MAX_COORDINATES else True
-    may_be_places = 2 <= len(powers) <= MAX_COORDINATES and "1" in table  # without header
+        return None if any(powers) or len(powers) > max_columns else True
+    may_be_places = 2 <= len(powers) <= max_columns and "1" in table  # without header
     if may_be_places and (not all(powers) or COORDINATES.search(file.stem.lower())):
         return True
     return False if all(powers) else None

@@ -10,7 +10,7 @@ from swiftwrf.metrics import psnr
 from swiftwrf.models.mlp import encode
 from swiftwrf.models.primitives import MIN_WIDTH_PIXELS, Primitives
 from swiftwrf.models.swiftwrf_paper import DeformableGaussians, Optimisation, SwiftWRFPaper, SwiftWRFPaperConfig
-from swiftwrf.positions import frame
+from swiftwrf.positions import centre_and_half_side
 from swiftwrf.rasterize import rasterize_magnitude
 from swiftwrf.runtime.checkpoint import read, write
 
@@ -23,7 +23,7 @@ def field(n=6, shift=0.0):
     """Return random Gaussians whose network does not rest, and positions of their scene."""
     generator = torch.Generator().manual_seed(0)
     position = torch.rand(9, 3, generator=generator, dtype=torch.float64) * 2 + 5 + shift
-    gaussians = DeformableGaussians(n, GRID, *frame(position), generator=generator)
+    gaussians = DeformableGaussians(n, GRID, *centre_and_half_side(position), generator=generator)
     for parameter in gaussians.output.parameters():
         torch.nn.init.normal_(parameter, std=0.05, generator=generator)
     return gaussians, position
@@ -52,7 +52,7 @@ def test_encoding_is_that_of_the_paper():
 
 def test_the_network_has_the_papers_size_and_starts_at_rest(generator):
     position = torch.rand(3, 3, generator=generator, dtype=torch.float64)
-    gaussians = DeformableGaussians(5, GRID, *frame(position), generator=generator)
+    gaussians = DeformableGaussians(5, GRID, *centre_and_half_side(position), generator=generator)
     assert [layer.in_features for layer in gaussians.layers] == [81, 156, 237, 156, 237, 156, 237, 156]
     assert gaussians.output.out_features == 5
     for deformed, canonical in zip(*(gaussians(position.float(), deform=d) for d in (True, False)), strict=True):

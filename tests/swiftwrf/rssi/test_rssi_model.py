@@ -11,6 +11,7 @@ from scipy.optimize import minimize
 
 from swiftwrf import InputError, PairModel, Rssi, RssiLocator, RssiModel, fit_rssi, rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
+from swiftwrf.contrib.comparison.steps import Memo
 from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import Kernel
@@ -19,7 +20,6 @@ from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
 from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, harmonics, log_distance
 from swiftwrf.rssi.regression import DIRECTIVITY_STD_DB, RssiPosterior, fit_receiver
 from swiftwrf.rssi.training import RssiTraining, bin_locations, mixing_weights
-from swiftwrf.runtime.steps import Memo
 
 KERNEL = Kernel(4.0, 1.0, matern12_weight=0.6, noise=1.0)
 FIELD_DB, NOISE_DB, PATH_LOSS_STD_DB = 3.0, 2.0, 30.0

@@ -12,10 +12,10 @@ import pytest
 import torch
 
 from swiftwrf import AngularGrid, InputError, Rssi, RssiModel, make_model, rssi_room, simulated_room
+from swiftwrf.contrib.comparison.steps import Memo
 from swiftwrf.data.store import Store
 from swiftwrf.models.neighbours import IDWModel
 from swiftwrf.runtime.digest import digest
-from swiftwrf.runtime.steps import Memo
 
 ROOM = simulated_room(n=12, grid=AngularGrid.hemisphere(4, 8))
 FLOOR = rssi_room(n=20)
@@ -187,6 +187,6 @@ def test_results_of_another_version_are_refused(tmp_path, monkeypatch):
     memo = Memo(tmp_path)
     memo.of({})
     memo.keep("a", {"value": 1}, 0.0)
-    monkeypatch.setattr("swiftwrf.runtime.steps.packages", lambda: {"torch": "0.1"})
+    monkeypatch.setattr("swiftwrf.contrib.comparison.steps.packages", lambda: {"torch": "0.1"})
     with pytest.raises(InputError, match=r"\(.*torch"):
         Memo(tmp_path).of({})

@@ -16,6 +16,7 @@ from sklearn.model_selection import KFold
 from small import FIT, with_defaults
 
 from augment import Mixed, choose, cross_validation, turbo_learning
+from augment.choices import fraction_key
 from augment.estimators import ESTIMATORS, kernel_regression, make_estimator
 from augment.estimators.aann import AANN, AANNConfig
 from augment.estimators.aann_kernel import AANNKernel, AANNKernelConfig
@@ -25,13 +26,12 @@ from augment.turbo import experiment as context
 from augment.turbo.condition import Condition, conditions_of, headline
 from augment.turbo.experiment import Experiment
 from swiftwrf import AngularGrid, FitError, MatchedField, load, make_model, simulated_room
-from swiftwrf.choices import fraction_key
+from swiftwrf.contrib.comparison.steps import Memo
 from swiftwrf.data.store import Store
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.metrics import angle_errors
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import model as geometry
-from swiftwrf.runtime.steps import Memo
 from tasks.aoa import experiment
 from tasks.aoa.records import palette
 from tasks.aoa.room import cross_validation_sentences

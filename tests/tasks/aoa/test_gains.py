@@ -12,9 +12,9 @@ from augment.turbo.condition import Condition, MeasuredSubset, pooled
 from augment.turbo.experiment import Experiment
 from augment.turbo.results import TurboResult
 from swiftwrf import simulated_room
-from swiftwrf.metrics import median_interval, paired_change, summaries
-from swiftwrf.metrics import summary as error_summary
-from swiftwrf.runtime.steps import Memo
+from swiftwrf.contrib.comparison.errors import median_interval, paired_change, summaries
+from swiftwrf.contrib.comparison.errors import summary as error_summary
+from swiftwrf.contrib.comparison.steps import Memo
 from tasks.aoa.page import answer, conclusion, first_screen
 from tasks.aoa.records import FractionRecords
 from tasks.configs import AoaConfig

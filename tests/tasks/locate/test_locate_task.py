@@ -15,10 +15,10 @@ from small import FLOOR, known_planes
 from swiftwrf import AngularGrid, InputError, load, rssi_room, simulated_room
 from swiftwrf.contrib.comparison.localizers import LEVELS, LOCALIZERS
 from swiftwrf.contrib.comparison.locating import LocateComparison
+from swiftwrf.contrib.comparison.steps import LOCATOR as MODEL
 from swiftwrf.data import ReadOptions
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.locate import MatchedField
-from swiftwrf.runtime.steps import LOCATOR as MODEL
 from tasks.locate.page import answer
 from tasks.predict import read_rssi
 from tasks.records import Records
