@@ -177,7 +177,7 @@ def _posteriors(run: Records, several: bool) -> Section:
     caption = (
         f"Posteriors of {len(maps['index'])} test rows in plan, from the smallest error to the largest, each relative to "
         "its largest mass. Cross: true position; dot: estimate; circle: 80 % credible region; small dots: training "
-        "positions."
+        "positions" + ("; triangles: stations." if "stations" in maps else ".")
     )
     plot = Plot(f"posteriors-{run.file_name}", posteriors(maps), caption, data[np.isfinite(density)])
     return Section("", plots=[plot, *([_overview(run, f"overview-{run.file_name}")] if several else [])])
