@@ -102,7 +102,7 @@ class Posterior(Displayed):
 
     @property
     def _median_radius(self) -> str:
-        return f"{float(self.credible_radius().median()):.2f} m"
+        return f"{float(self.credible_radius().quantile(0.5)):.2f} m"
 
     def in_plan(self, row: int = 0, region: Tensor | None = None) -> PlanMap:
         """Return the mass of an observation summed over height and square pixels, relative to the largest sum.

@@ -17,7 +17,7 @@ from swiftwrf.contrib.comparison.localizers import LEVELS, Located
 from swiftwrf.data import Stations
 from swiftwrf.data.spectra import coarsening
 from swiftwrf.data.splits import each_fold, folds
-from swiftwrf.locate import MatchedField
+from swiftwrf.locate import MatchedField, MatchedFieldConfig
 from swiftwrf.locate.triangulation import bearings, peak_directions, triangulated
 from swiftwrf.models.geometry import GeometryModel
 from swiftwrf.runtime.registry import Registry
@@ -31,11 +31,11 @@ class StationLocalizer(ABC):
 
     Args:
         rooms: Room of each station, fitted to the same transmissions.
-        seed: Seed of everything random.
+        config: Options of posteriors, of which the seed is that of everything random.
     """
 
-    def __init__(self, rooms: Mapping[str, GeometryModel], seed: int = 0) -> None:
-        self.rooms, self.seed = rooms, seed
+    def __init__(self, rooms: Mapping[str, GeometryModel], config: MatchedFieldConfig | None = None) -> None:
+        self.rooms, self.config = rooms, config or MatchedFieldConfig()
 
     @abstractmethod
     def fit(self, train: Stations) -> Self:
@@ -58,7 +58,7 @@ class StationsPosterior(StationLocalizer):
 
     def fit(self, train: Stations) -> Self:
         rooms = {name: self.rooms[name] for name in train.names}
-        self.locator = MatchedField(seed=self.seed).fit(train, room=rooms)
+        self.locator = MatchedField(self.config).fit(train, room=rooms)
         return self
 
     def locate(self, data: Stations) -> Located:
@@ -104,7 +104,7 @@ class NearestSpectra(StationLocalizer):
     def fit(self, train: Stations) -> Self:
         x, y = features(train), train.position.numpy()
         errors: dict[int, list[float]] = {}
-        for out, kept in each_fold(folds(train.position, "random", self.seed)):
+        for out, kept in each_fold(folds(train.position, "random", self.config.seed)):
             away = nan_euclidean_distances(x[out], x[kept])
             for k in NEIGHBOUR_COUNTS:
                 if k <= len(kept):

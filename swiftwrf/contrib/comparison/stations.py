@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from swiftwrf.contrib.comparison.station_localizers import STATION_LOCALIZERS, S
 from swiftwrf.contrib.comparison.steps import LOCATOR, Memo, Steps
 from swiftwrf.data import Stations
 from swiftwrf.errors import InputError
-from swiftwrf.locate import MatchedField
+from swiftwrf.locate import MatchedField, MatchedFieldConfig
 from swiftwrf.locate.matched_field import MIN_SPECTRA
 from swiftwrf.locate.posterior import Posterior
 from swiftwrf.locate.triangulation import bearings, peak_directions, station_positions, triangulated
@@ -47,6 +47,8 @@ class StationsComparison(PositionComparison):
         values: What `fit` gave, by localizer.
         options: The split and the seed.
         locator: Locator of all training transmissions.
+        rooms: Known rooms of stations, which are not searched.
+        config: Options of the posteriors.
     """
 
     received_by = "station"
@@ -54,6 +56,8 @@ class StationsComparison(PositionComparison):
     train: Stations
     test: Stations
     locator: MatchedField | None = None
+    rooms: Mapping[str, GeometryModel] = field(default_factory=dict)
+    config: MatchedFieldConfig = field(default_factory=MatchedFieldConfig)
 
     @classmethod
     def of_stations(cls, data: Stations, split: str, seed: int) -> StationsComparison:
@@ -72,9 +76,11 @@ class StationsComparison(PositionComparison):
         return cls(train, test, {}, {"split": split, "seed": seed})
 
     def room(self, folder: Path, station: str) -> Values:
-        """Search the room of a station, and save it in a folder."""
+        """Search the room of a station, unless it is known, and save it in a folder."""
         began = time.perf_counter()
-        model = GeometryModel(seed=self.options["seed"]).fit(self.train.of(station)[1], progress=True)
+        model = self.rooms.get(station)
+        if model is None:
+            model = GeometryModel(seed=self.options["seed"]).fit(self.train.of(station)[1], progress=True)
         model.save(_room_file(folder, station))
         return {"conclusion": model.estimate.conclusion, "seconds": time.perf_counter() - began}
 
@@ -86,7 +92,7 @@ class StationsComparison(PositionComparison):
             kind = self.model
             train, test = (data.only(name.removeprefix(ALONE)) for data in (train, test))
         rooms = {station: _room(folder, station) for station in train.names}
-        localizer = STATION_LOCALIZERS[kind](rooms, self.options["seed"])
+        localizer = STATION_LOCALIZERS[kind](rooms, replace(self.config, seed=self.options["seed"]))
         began = time.perf_counter()
         localizer.fit(train)
         fitted = time.perf_counter()
@@ -138,7 +144,7 @@ class StationsComparison(PositionComparison):
             alone = torch.as_tensor(self.values[ALONE + name]["direction"], dtype=torch.float64)[received, 0]
             by = {"posterior": estimate[received, number], "alone": alone, "peak": peaks[name]}
             errors = {kind: angle_errors(each, spectra.label)["great_circle"] for kind, each in by.items()}
-            medians = {f"{kind}_deg": float(error.rad2deg().median()) for kind, error in errors.items()}
+            medians = {f"{kind}_deg": float(error.rad2deg().quantile(0.5)) for kind, error in errors.items()}
             rows.append({"station": name, "received": len(received), **medians})
         return DataFrame(rows)
 
@@ -192,6 +198,8 @@ def compare_stations(
     *,
     split: str = "random",
     seed: int = 0,
+    rooms: Mapping[str, GeometryModel] | None = None,
+    config: MatchedFieldConfig | None = None,
     keep: Memo | None = None,
     executor: Executor | None = None,
 ) -> StationsComparison:
@@ -201,6 +209,8 @@ def compare_stations(
         data: Spectra of the stations, each with array, position and orientation.
         split: Split that comes with the data, or a seeded one: random or block.
         seed: Seed of everything random.
+        rooms: Known rooms of all stations. Defaults to a search for the room of each, which then agree about their planes.
+        config: Options of the posteriors, of which the seed does not count. Defaults to those of `MatchedField`.
         keep: Results by the names of steps, in a folder, as of `compare`.
         executor: Processes that compute steps side by side, e.g. a `ProcessPoolExecutor`.
 
@@ -209,21 +219,27 @@ def compare_stations(
 
     Example:
         >>> import swiftwrf
-        >>> from swiftwrf.contrib.comparison.stations import compare_stations
-        >>> result = compare_stations(swiftwrf.simulated_stations(n=40, stations=2))  # doctest: +SKIP
-        >>> result.overall["posterior"]["position_error_m"]["median"]  # doctest: +SKIP
-        0.06
+        >>> from swiftwrf.models.geometry import Plane
+        >>> data = swiftwrf.simulated_stations(n=40, stations=2, grid=swiftwrf.AngularGrid.hemisphere(9, 36))
+        >>> floor = Plane((0.0, 0.0, -1.0), 0.0, -0.6)
+        >>> rooms = {name: GeometryModel.of_planes(data.of(name)[1], [floor]) for name in data.names}
+        >>> quick = MatchedFieldConfig(max_cells=1000, n_best=50, n_background=20, n_rounds=1)
+        >>> result = compare_stations(data, rooms=rooms, config=quick)
+        >>> list(result.values)[:4]
+        ['posterior', 'triangulation', 'knn', 'mean']
     """
     given = locals().copy()
-    begun = StationsComparison.of_stations(data, split, seed)
+    begun = replace(
+        StationsComparison.of_stations(data, split, seed), rooms=rooms or {}, config=config or MatchedFieldConfig()
+    )
     if keep is not None:
         keep.of(given | {"localizers": [STATION_LOCALIZERS[name] for name in STATION_LOCALIZERS]})
     memo = keep or Memo()
     steps = Steps(begun, memo, executor)
-    rooms = [steps.start(f"room {name}", f"room of {name}", StationsComparison.room, name) for name in data.names]
-    for name in rooms:
+    searches = [steps.start(f"room {name}", f"room of {name}", StationsComparison.room, name) for name in data.names]
+    for name in searches:
         steps[name]
-    if len(rooms) > 1:
+    if len(searches) > 1 and not rooms:
         steps[steps.start("rooms agree", "rooms agree", StationsComparison.agree)]
     alone = [ALONE + name for name in data.names]
     started = [steps.start(name, name, StationsComparison.fit, name) for name in [*STATION_LOCALIZERS, *alone]]
