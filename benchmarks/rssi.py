@@ -111,7 +111,7 @@ def measure(data: Rssi, split: str, also: tuple[str, ...] = ()) -> Row:
     """Return errors, differences to the best baseline, coverage of intervals and seconds of every predictor on a split."""
     result = compare(data, split=split, also=also)
     # results of the others are those of the call above
-    with TemporaryDirectory() as folder, patch("swiftwrf.rssi.training.render", in_phase), patch.object(Memo, "of"):
+    with TemporaryDirectory() as folder, patch("swiftwrf.rssi.head.render", in_phase), patch.object(Memo, "of"):
         others = Memo(Path(folder))
         for name in result.values.keys() - {RssiModel.name, result.model}:
             others.keep(name, result.values[name], 0.0)

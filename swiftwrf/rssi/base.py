@@ -131,7 +131,7 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
         Args:
             train: Training rows, at least 10 measurements in all. Missing values (nan) are ignored.
             pool: The same rows at every receiver of the data, from which properties common to all receivers are learnt.
-                Defaults to `train`. Receivers with fewer than 10 rows choose no kernel and no mixing weights.
+                Defaults to `train`. Receivers with fewer than 10 rows take no part in the choice of the kernel.
             device: Device to compute on. The fitted predictor is on the CPU.
             parallel: Function that maps a picklable fit over receivers as `map` does, e.g. on other machines. Defaults to
                 threads of this process.
@@ -176,7 +176,7 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
     def update(self, new: Rssi) -> Self:
         """Return the predictor with more training rows, by an update of its factorisation. This one stays as it is.
 
-        The result equals a fit to all rows with the same kernel, noise, mixing weights and weights of the earlier rows.
+        The result equals a fit to all rows with the same kernel, noise and weights of the earlier rows.
 
         Args:
             new: Rows at the receivers of the training rows, any number. Those that the predictor has already learnt are
@@ -189,7 +189,7 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
             >>> import swiftwrf
             >>> data = swiftwrf.rssi_room(n=60)
             >>> model = swiftwrf.RssiModel().fit(data.subset(torch.arange(50)))
-            >>> len(model.update(data.subset(torch.arange(50, 60))).anchor)
+            >>> len(model.update(data.subset(torch.arange(50, 60))).region())
             60
         """
         new = self._not_learnt(self.aligned(new))

@@ -19,11 +19,11 @@ from torch.nn import functional
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.errors import FitError
 from swiftwrf.models.base import CPU
-from swiftwrf.rssi.base import Map, RssiConfig, often_detected
-from swiftwrf.rssi.head import Head, mean_magnitude, render
+from swiftwrf.rssi.base import Map, RssiConfig, columns_of, often_detected
+from swiftwrf.rssi.head import Head, Heads, mean_magnitude, render
 from swiftwrf.rssi.model import RssiModel
-from swiftwrf.rssi.regression import held_out_std
-from swiftwrf.rssi.training import Bins, bin_locations, binned, check_comparable, choose_residual_kernel, prior_std
+from swiftwrf.rssi.regression import RssiPosterior, held_out_std
+from swiftwrf.rssi.training import Bins, check_folds, choose_residual_kernel, prior_std
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, configuration
@@ -73,15 +73,16 @@ class RssiPaperModel(RssiModel):
         progress: bool = False,
         **_: Any,
     ) -> None:
-        config, bins = self.config, binned(train, self.config)
-        pool_rssi = bin_locations(pool, config.max_locations)[1]
-        pool_residual = pool_rssi - pool_rssi.nanmean(dim=0)
+        config, of_pool = self.config, Bins.of(pool, self.config)
+        bins = of_pool.columns(columns_of(train.receiver_names, pool))
+        check_folds(bins.fold == HELD_OUT_FOLD, bins.rssi)
+        pool_residual = of_pool.rssi - of_pool.rssi.nanmean(dim=0)
         residual = pool_residual[:, often_detected(pool)]
-        self.kernel = choose_residual_kernel(bins.position, residual, bins.fold, train.floors is not None)[0]
+        kernel = choose_residual_kernel(bins.position, residual, bins.fold, train.floors is not None)[0]
         variance = (bins.rssi - bins.rssi.nanmean(dim=0)).square().nanmean(dim=0)
         variance = variance.nan_to_num(float(pool_residual.square().nanmean())).clamp_min(1e-6)
-        prior_db = prior_std(variance, self.kernel)
-        covariance = self.kernel(bins.position, bins.position)
+        prior_db = prior_std(variance, kernel)
+        covariance = kernel(bins.position, bins.position)
         covariance.diagonal().add_(1e-3)  # bins may nearly coincide
         root = torch.linalg.cholesky(covariance)  # the latent field in the bins is this times standard normal numbers
         task = partial(learn_receivers, bins=bins, root=root, prior_db=prior_db, config=config, device=device)
@@ -92,29 +93,31 @@ class RssiPaperModel(RssiModel):
             fits = (parallel or map)(task, parts)
             results = list(bar.track(fits, total=len(parts), description="receivers"))
         held_out, white, rendered = (torch.cat(values) for values in zip(*results, strict=True))
-        covariance = torch.zeros(n_receivers, 2, 2).double()
+        self.covariance, self.centre, self.detection_field = torch.zeros(n_receivers, 2, 2).double(), bins.centre, None
         out = ~bins.rssi.isnan() & (bins.fold == HELD_OUT_FOLD)[:, None]
         predicted = held_out.T.double().where(out, torch.nan)[bins.bin_of_row]
-        check_comparable(predicted[None], train.rssi_dbm)
-        std = held_out_std(bins, self.kernel, prior_db, covariance)[bins.bin_of_row]
+        std = held_out_std(bins, kernel, prior_db, self.covariance)[bins.bin_of_row]
         self._calibrate(train, predicted, std, *prior_db)
-        self.mixing_weight, self.baseline = torch.eye(4).double()[0], torch.zeros(n_receivers, 2).double()
-        self.centre, self.rendered, self.covariance, self.detection_field = bins.centre, rendered, covariance, None
         dual = torch.linalg.solve_triangular(root.T, white.T.double() * prior_db[0], upper=True).T
         level = LEVEL_DBM + mean_magnitude(rendered, torch.zeros(1, n_receivers))[0].double()
         # the dual coefficients are those of the kernel alone, without a path loss or noise
-        state = {
-            "anchor": bins.position,
-            "dual": dual,
-            "tangent": torch.ones_like(dual),
-            "variance": torch.zeros_like(dual),
-            "measured": torch.ones_like(dual),
-            "prior": torch.stack([level, torch.zeros_like(level)], dim=1),
-            "root": torch.zeros_like(covariance),
-            "field_db": torch.ones_like(level),
-            "noise_db": torch.zeros_like(level),
-        }
-        self._take(state)
+        self._set_posterior(
+            RssiPosterior(
+                kernel=kernel,
+                heads=Heads(rendered),
+                huber=config.huber,
+                receiver=bins.receiver,
+                position=bins.position,
+                dual=dual,
+                tangent=torch.ones_like(dual),
+                variance=torch.zeros_like(dual),
+                measured=torch.ones_like(dual),
+                prior=torch.stack([level, torch.zeros_like(level)], dim=1),
+                root=torch.zeros_like(self.covariance),
+                field_db=torch.ones_like(level),
+                noise_db=torch.zeros_like(level),
+            )
+        )
 
 
 @single_thread()

@@ -1,16 +1,12 @@
-"""Shared by all receivers in a fit: location bins, path-loss models, limits, the kernel, and weights of predictors.
-
-Weights follow by stacking (L. Breiman, Machine Learning 24, 1996).
-"""
+"""Shared by all receivers in a fit: location bins, path-loss models, limits and the kernel."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Self
 
-import numpy as np
 import torch
-from scipy.optimize import nnls
 from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
@@ -20,14 +16,13 @@ from swiftwrf.gp import Kernel, candidates, held_out_errors, subsample
 from swiftwrf.positions import cells
 from swiftwrf.rssi.base import RssiConfig, often_detected
 from swiftwrf.rssi.detection import Detection, empty_given
-from swiftwrf.rssi.head import Head, render
-from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_losses, log_distance
+from swiftwrf.rssi.head import Heads
+from swiftwrf.rssi.path_loss import PathLosses, fit_path_losses, log_distance
 from swiftwrf.runtime.threads import single_thread
 
-MAX_PAIRS = 20_000  # measurements that determine the mixing weights
 # variance of a packet relative to the variance of the field: fading is as large as shadowing
 RELATIVE_NOISE_VARIANCES = (0.3, 1.0, 2.0, 3.0)
-MAX_KERNEL_RECEIVERS = 12  # more do not change the chosen kernel or weights
+MAX_KERNEL_RECEIVERS = 12  # more do not change the chosen kernel
 CERTAIN = 0.99  # probability that the path loss alone explains an empty cell, or a random miss does: it is left out
 
 
@@ -55,6 +50,33 @@ class Bins:
     rssi: Tensor
     count: Tensor
 
+    @classmethod
+    def of(cls, rows: Rssi, config: RssiConfig) -> Self:
+        """Average rows by location bin, with the folds that the options state."""
+        position, rssi, count, bin_of_row = bin_locations(rows, config.max_locations)
+        session = rows.session
+        if session is not None:  # that most rows of each bin are of
+            _, number = session.unique(return_inverse=True)
+            times = torch.zeros(len(position), int(number.max()) + 1)
+            session = times.index_put((bin_of_row, number), torch.ones(()), accumulate=True).argmax(dim=1)
+        centre = position.mean(dim=0)
+        return cls(
+            receiver_names=tuple(map(str, rows.receiver_names)),
+            receiver=rows.receiver_position.double() - centre,
+            centre=centre,
+            position=position - centre,
+            bin_of_row=bin_of_row,
+            fold=folds(position, config.validation, config.seed, session=session),
+            rssi=rssi,
+            count=count,
+        )
+
+    def columns(self, number: Tensor) -> Self:
+        """Return the bins of some receivers."""
+        names = tuple(self.receiver_names[n] for n in number.tolist())
+        of_receivers = {"receiver": self.receiver[number], "rssi": self.rssi[:, number], "count": self.count[:, number]}
+        return replace(self, receiver_names=names, **of_receivers)
+
 
 @dataclass(frozen=True)
 class RssiTraining(Bins):
@@ -62,72 +84,50 @@ class RssiTraining(Bins):
 
     Args:
         kernel: Kernel of the latent field, lengths in [m].
-        rendered: Fields of each receiver's head, (R, 2, 2, directions).
+        heads: Head of all receivers.
         path_loss: Path loss of the receivers, the prior of the fit.
         shift: Received power less RSSI, by floors and offsets that were removed, (n, R) [dB].
         limit: Upper limit of RSSI in each empty cell that has a part in the fit, (n, R) [dBm], nan in all other cells and at
             receivers with fewer than 10 measured bins.
-        field_db: Prior standard deviation of the latent field, (R,) [dB].
+        field_db: Prior standard deviation of the latent field, (R,) [dB]; 0 without a field.
         noise_db: Standard deviation of one measurement about it, (R,) [dB].
-        baselines: Path-loss models of the simple predictors, (3, R): that of each receiver, that of all receivers, and the
-            mean of each receiver.
-        baseline_held_out: Their predictions of held-out bins, (3, n, R) [dBm].
     """
 
     kernel: Kernel
-    rendered: Tensor
+    heads: Heads
     path_loss: PathLosses
     shift: Tensor
     limit: Tensor
     field_db: Tensor
     noise_db: Tensor
-    baselines: PathLoss
-    baseline_held_out: Tensor
 
 
 @single_thread()
-def prepare(pool: Rssi, own: Tensor, config: RssiConfig, shift: Tensor, curve: Detection | None) -> RssiTraining:
+def prepare(pool: Rssi, fitted: Tensor, config: RssiConfig, shift: Tensor, curve: Detection | None) -> RssiTraining:
     """Average the rows by location bin, fit the path-loss models and choose the kernel; see `RssiPredictor._fit`.
 
-    `own` are the columns of the receivers that are fitted.
+    `fitted` are the columns of the receivers that are fitted.
     """
-    bins = binned(pool.columns(own.tolist()), config)
-    rssi, fold, every = bins.rssi, bins.fold, bin_locations(pool, config.max_locations)[1]
-    receiver = pool.receiver_position.double() - bins.centre
-    shift = _bin_means(shift, bins.bin_of_row, len(fold))
-
-    def fit(rows: Tensor, detection: Detection | None) -> PathLosses:
-        return fit_path_losses(bins.position[rows], receiver, every[rows], config.not_detected, shift[rows], detection)
-
-    def simple(loss: PathLosses, rows: Tensor) -> PathLoss:
-        """Return the simple predictors of the bins `rows`, from the path loss of all receivers of the pool."""
-        mean, loss = rssi[rows].nanmean(dim=0), loss.columns(own)
-        level = PathLoss(mean, torch.zeros_like(mean)).where(~mean.isnan(), loss.shared)
-        return PathLoss(*(torch.stack(values) for values in zip(loss.own, loss.shared, level, strict=True)))
-
-    everything = fit(torch.arange(len(fold)), curve)
-    baselines = simple(everything, torch.arange(len(fold)))
-    distance = log_distance(bins.position, bins.receiver)
-    held_out = torch.empty(3, *distance.shape, dtype=torch.float64)
-    for out, kept in each_fold(fold):
-        held_out[:, out] = simple(fit(kept, everything.detection), kept)(distance[out])
-    residual = (every - everything.own(log_distance(bins.position, receiver)))[:, often_detected(pool)]
-    kernel, helps = choose_residual_kernel(bins.position, residual, fold, pool.floors is not None)
-    n_primitives = config.n_primitives if helps else 0
-    loss = everything.columns(own)
-    field_db, noise_db = prior_std(loss.variance, kernel if n_primitives else None)
-    head = render([Head(n_primitives, config.seed).requires_grad_(False)])
+    of_pool = Bins.of(pool, config)
+    check_folds(of_pool.fold, of_pool.rssi)
+    bins, position = of_pool.columns(fitted), of_pool.position
+    shift = _bin_means(shift, bins.bin_of_row, len(position))
+    losses = fit_path_losses(position, of_pool.receiver, of_pool.rssi, config.not_detected, shift, curve)
+    residual = of_pool.rssi - losses.own(log_distance(position, of_pool.receiver))
+    kernel, has_field = choose_residual_kernel(
+        position, residual[:, often_detected(pool)], bins.fold, pool.floors is not None
+    )
+    loss, shift = losses.columns(fitted), shift[:, fitted]
+    field_db, noise_db = prior_std(loss.variance, kernel if has_field and config.n_primitives else None)
     return RssiTraining(
         **vars(bins),
         kernel=kernel,
-        rendered=head.expand(len(own), *head.shape[1:]),
+        heads=Heads.alike(config.n_primitives, config.seed),
         path_loss=loss,
-        shift=shift[:, own],
-        limit=_limits(rssi, loss, distance, shift[:, own]),
+        shift=shift,
+        limit=_limits(bins.rssi, loss, log_distance(position, bins.receiver), shift),
         field_db=field_db,
         noise_db=noise_db,
-        baselines=baselines,
-        baseline_held_out=held_out,
     )
 
 
@@ -145,25 +145,13 @@ def _limits(rssi: Tensor, loss: PathLosses, distance: Tensor, shift: Tensor) -> 
     return limit.where(rssi.isnan() & unexplained & loss.detection.is_limit & enough, torch.nan)
 
 
-def binned(train: Rssi, config: RssiConfig) -> Bins:
-    """Return the training rows by location bin, with the folds that the options state."""
-    position, rssi, count, bin_of_row = bin_locations(train, config.max_locations)
-    session = train.session
-    if session is not None:  # that most rows of each bin are of
-        _, own = session.unique(return_inverse=True)
-        times = torch.zeros(len(position), int(own.max()) + 1)
-        session = times.index_put((bin_of_row, own), torch.ones(()), accumulate=True).argmax(dim=1)
-    centre = position.mean(dim=0)
-    return Bins(
-        receiver_names=tuple(map(str, train.receiver_names)),
-        receiver=train.receiver_position.double() - centre,
-        centre=centre,
-        position=position - centre,
-        bin_of_row=bin_of_row,
-        fold=folds(position, config.validation, config.seed, session=session),
-        rssi=rssi,
-        count=count,
-    )
+def check_folds(fold: Tensor, rssi: Tensor) -> None:
+    """Raise InputError if fewer than two folds (n,) have a measurement (n, R), so that none predicts another."""
+    if len(fold[(~rssi.isnan()).any(dim=1)].unique()) < 2:
+        raise InputError(
+            "no rows can be held out to estimate the error of the model: all measurements are in one part of the "
+            'region; measure elsewhere, too, give a pool of more receivers, or take validation="random"'
+        )
 
 
 def prior_std(variance: Tensor, kernel: Kernel | None) -> tuple[Tensor, Tensor]:
@@ -231,65 +219,6 @@ def choose_residual_kernel(
     errors = [held_out_errors(precision, dual[:, :, r, None], out)[:, :n, 0] for r, n, out in held_out]
     score, best = torch.cat(errors, dim=1).abs().mean(dim=1).min(dim=0)
     return stretched[int(best)], bool(score < residual.abs().nanmean())
-
-
-def comparable(held_out: Tensor, measured: Tensor) -> Tensor:
-    """Return which measurements exist and are predicted by all predictors, bool (rows, R).
-
-    Args:
-        held_out: Held-out predictions (predictors, rows, R) [dBm], nan where there is none.
-        measured: Measurements (rows, R) [dBm], nan where not detected.
-    """
-    return (~held_out.isnan()).all(dim=0) & ~measured.isnan()
-
-
-def check_comparable(held_out: Tensor, measured: Tensor) -> None:
-    """Raise InputError if held-out predictions (predictors, rows, R) cannot be compared with any measurement (rows, R)."""
-    if not comparable(held_out, measured).any():
-        raise InputError(
-            "no rows can be held out to estimate the error of the model: all measurements are in one part of the "
-            'region; measure elsewhere, too, give a pool of more receivers, or take validation="random"'
-        )
-
-
-def mixing_weights(held_out: Tensor, measured: Tensor, shrinkage: float = 0.05) -> Tensor:
-    """Return the weights of the weighted mean of predictors with the lowest mean absolute error on held-out rows.
-
-    Args:
-        held_out: Held-out predictions (predictors, rows, R) [dBm], nan where there is none.
-        measured: Measurements (rows, R) [dBm], nan where not detected.
-        shrinkage: Ridge penalty on the distance of the weights to those of the first predictor alone, relative to the mean
-            squared error of a predictor. It steadies weights that few folds determine. The default is by nested
-            cross-validation.
-
-    Returns:
-        Non-negative weights of sum 1, float64 (predictors,); those of the first predictor alone without a comparable row.
-
-    Example:
-        >>> held_out = torch.tensor([[[1.0], [2.0], [3.0]], [[9.0], [9.0], [9.0]]])
-        >>> mixing_weights(held_out, held_out[0]).round(decimals=2)
-        tensor([1., 0.], dtype=torch.float64)
-    """
-    usable = comparable(held_out, measured)
-    if not bool(usable.any()):
-        return torch.eye(len(held_out), dtype=torch.float64)[0]
-    predicted, target = subsample(held_out[:, usable].T.double(), measured[usable].double(), rows=MAX_PAIRS)
-    error = (predicted - target[:, None]).numpy()  # the error of a mean with weights of sum 1 is the mean of the errors
-    n = error.shape[1]
-    weight, importance = np.full(n, 1 / n), np.ones(len(error))
-    scale = 1e-9 * max(float((error**2).mean()), 1.0)
-    away = np.eye(n)
-    away[0] -= 1.0  # weights less (1, 0, ...), for weights of sum 1
-    for _ in range(20):  # least absolute errors by weighted least squares
-        gram = (error * importance[:, None]).T @ error / max(len(error), 1)
-        gram += shrinkage * np.trace(gram) / n * away.T @ away
-        # the weights of least squares are proportional to argmin of w' G w / 2 - sum w over w >= 0
-        factor = np.linalg.cholesky(gram + scale * np.eye(n))
-        weight = nnls(factor.T, np.linalg.solve(factor, np.ones(n)))[0]
-        weight /= weight.sum()
-        # absolute errors below 0.5 dB count as squares, so that the solution is unique
-        importance = 1 / np.maximum(np.abs(error @ weight), 0.5)
-    return torch.from_numpy(weight)
 
 
 def rounding_std(rssi: Tensor) -> float:

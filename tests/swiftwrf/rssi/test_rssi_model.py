@@ -15,10 +15,10 @@ from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import Kernel
 from swiftwrf.rssi import RssiConfig, RssiPaperModel, compare
-from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
+from swiftwrf.rssi.head import Head, Heads, mean_magnitude, render
 from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, harmonics, log_distance
 from swiftwrf.rssi.regression import DIRECTIVITY_STD_DB, RssiPosterior, fit_receiver
-from swiftwrf.rssi.training import RssiTraining, bin_locations, mixing_weights
+from swiftwrf.rssi.training import RssiTraining, bin_locations
 from swiftwrf.runtime.steps import Memo
 
 KERNEL = Kernel(4.0, 1.0, matern12_weight=0.6, noise=1.0)
@@ -80,7 +80,7 @@ def training_of(data, n_primitives=50):
         rssi=data.rssi_dbm,
         count=torch.ones(n, r, dtype=torch.float64),
         kernel=KERNEL,
-        rendered=render([Head(n_primitives, 0).requires_grad_(False) for _ in data.receiver_names]),
+        heads=Heads.alike(n_primitives, seed=0),
         path_loss=PathLosses(
             own=path_loss,
             shared=path_loss,
@@ -93,19 +93,16 @@ def training_of(data, n_primitives=50):
         limit=torch.full((n, r), torch.nan).double(),
         field_db=torch.full((r,), FIELD_DB, dtype=torch.float64),
         noise_db=torch.full((r,), NOISE_DB, dtype=torch.float64),
-        baselines=PathLoss(*(values.expand(3, -1) for values in path_loss)),
-        baseline_held_out=torch.zeros(3, n, r, dtype=torch.float64),
     )
 
 
 def posterior(training, found):
     """The posterior of one receiver's fit."""
     tensors = {name: value[None] for name, value in found.items() if name not in ("covariance", "held_out")}
-    variances = {"field_db": training.field_db, "noise_db": training.noise_db}
-    measured, table = (~training.rssi.isnan()).T.double(), HeadTable(training.rendered)
-    rest = {"anchor": training.position, "measured": measured, **variances}
-    heads = {"receiver": training.receiver, "kernel": training.kernel, "table": table, "huber": 1.345}
-    return RssiPosterior(**heads, **tensors, **rest)
+    shared = {
+        name: getattr(training, name) for name in ("kernel", "heads", "receiver", "position", "field_db", "noise_db")
+    }
+    return RssiPosterior(huber=1.345, measured=(~training.rssi.isnan()).T.double(), **shared, **tensors)
 
 
 # --- the regression -------------------------------------------------------------------------------------------------
@@ -120,7 +117,7 @@ def test_solution_is_the_maximum_of_the_posterior():
     training, config = training_of(data), RssiConfig()
     found = posterior(training, fit_receiver(FIRST, training, config, CPU))
 
-    rendered = training.rendered.double()
+    rendered = training.heads.rendered.double()
     gram = KERNEL(training.position, training.position)
     root = torch.linalg.cholesky(gram + 1e-10 * torch.eye(40, dtype=torch.float64))
     distance = log_distance(training.position, training.receiver)[:, 0]
@@ -145,7 +142,7 @@ def test_solution_is_the_maximum_of_the_posterior():
     best = minimize(objective, np.zeros(50), jac=True, method="L-BFGS-B", options=options)
     level, slope = found.path_loss[0]
     mine = level + slope * distance + bearing @ found.directivity[0]
-    mine = mine + found.table(gram @ found.coefficient)[0][:, 0]
+    mine = mine + found.heads(gram @ found.coefficient)[0][:, 0]
     torch.testing.assert_close(mine, predicted(torch.tensor(best.x)), atol=0.06, rtol=0)
 
 
@@ -168,41 +165,18 @@ def test_held_out_is_a_fit_without_the_fold():
 def test_table_is_the_head():
     rendered = render([Head(50, seed).requires_grad_(False) for seed in (0, 1)])
     latent = torch.linspace(-30, 30, 200)[:, None].expand(-1, 2).contiguous()
-    value, slope = HeadTable(rendered)(latent)
+    value, slope = Heads(rendered)(latent)
     change = mean_magnitude(rendered, latent) - mean_magnitude(rendered, torch.zeros(1, 2))
     torch.testing.assert_close(value, change, atol=2e-3, rtol=0)
-    assert HeadTable(rendered)(torch.zeros(1, 2))[1].sub(1).abs().max() < 0.01  # 1 dB of the field is 1 dB of RSSI
+    assert Heads(rendered)(torch.zeros(1, 2))[1].sub(1).abs().max() < 0.01  # 1 dB of the field is 1 dB of RSSI
     assert (slope.diff(dim=0) > -1e-3).all()  # convex
-
-
-def test_mixing_weights_find_the_mixture():
-    generator = torch.Generator().manual_seed(0)
-    predictors = torch.randn(4, 3000, 2, generator=generator, dtype=torch.float64)
-    measured = 0.7 * predictors[1] + 0.3 * predictors[3] + 0.1 * torch.randn(3000, 2, generator=generator)
-    measured[::50] = torch.nan
-    measured[1::50] += 40.0  # outliers that squares would follow
-    weight = mixing_weights(predictors, measured, shrinkage=0.0)
-    torch.testing.assert_close(weight, torch.tensor([0.0, 0.7, 0.0, 0.3]).double(), atol=0.03, rtol=0)
-    assert float(weight.sum()) == pytest.approx(1)
-
-
-def test_shrinkage_keeps_the_first_of_equal_predictors():
-    generator = torch.Generator().manual_seed(0)
-    measured = torch.randn(40, 2, generator=generator, dtype=torch.float64)
-    noise = torch.randn(3, 40, 2, generator=generator, dtype=torch.float64)
-    free = mixing_weights(measured + noise, measured, shrinkage=0.0)
-    shrunk = mixing_weights(measured + noise, measured)
-    assert free[0] < shrunk[0] < 1
-    assert mixing_weights(measured + noise, measured, shrinkage=1e4)[0] > 0.999
-    better = torch.stack([measured + 5 * noise[0], measured + 0.1 * noise[1], measured + 5 * noise[2]])
-    assert mixing_weights(better, measured)[1] > 0.8
 
 
 # --- the model -------------------------------------------------------------------------------------------------------
 
 
 def test_errors_at_held_out_rows_are_those_of_the_model_and_of_the_receivers_means():
-    """RSSI that no place explains: the penalty on the weights costs more than the field gains. On a floor it gains."""
+    """RSSI that no place explains: the mean of a receiver is better than its path loss. On a floor the model is."""
     generator = np.random.default_rng(2)
     position = np.column_stack([generator.uniform(0, 10, (40, 2)), np.ones(40)])
     noise = Rssi(
@@ -234,13 +208,6 @@ def test_paper_head_learns_without_a_path_loss_model():
     assert found < 0.5 * mean
 
 
-def test_all_receivers_share_the_mixing_weights_of_the_pool():
-    pool = rssi_room(n=150)
-    among, alone = (RssiModel(validation="block").fit(d, pool=pool).mixing_weight for d in (pool, pool.columns([5])))
-    torch.testing.assert_close(alone, among)
-    assert 0 < float(among[0]) <= 1
-
-
 @pytest.mark.parametrize("split", ["random", "block"])
 def test_interval_has_its_nominal_coverage(split):
     """Over five floors with five receivers each."""
@@ -258,9 +225,10 @@ def test_interval_has_its_nominal_coverage(split):
 def test_far_away_the_prediction_is_the_path_loss_model():
     model = fit_rssi(with_field())
     far = torch.tensor([[4000.0, 0, 0]], dtype=torch.float64)
-    bearing = torch.einsum("brh,rh->br", harmonics(far, model.receiver).float(), model.directivity)
-    path_loss = (model.level + model.slope * log_distance(far, model.receiver)).float() + bearing
-    torch.testing.assert_close(model.predict(far).mean, path_loss, atol=1e-3, rtol=0)
+    receiver = model.receiver_position
+    bearing = torch.einsum("brh,rh->br", harmonics(far, receiver), model.posterior.directivity)
+    path_loss = model.level + model.slope * log_distance(far, receiver) + bearing
+    torch.testing.assert_close(model.predict(far).mean, path_loss.float(), atol=1e-3, rtol=0)
 
 
 @pytest.mark.parametrize("make", [RssiModel, PairModel])
@@ -379,7 +347,6 @@ def test_receivers_that_were_detected_a_few_times_choose_nothing(monkeypatch):
     assert found.errors.predicted_dbm.tolist() == expected.errors.predicted_dbm.tolist()
     alone, among = fit_rssi(data), fit_rssi(with_rare(data))
     assert among.kernel == alone.kernel
-    assert among.mixing_weight.sub(alone.mixing_weight).abs().max() < 0.05
 
 
 def test_predictions_far_away_are_finite_and_those_of_no_position_empty():
