@@ -36,7 +36,6 @@ from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import parallel_map, single_thread
 from swiftwrf.runtime.validation import checked
 
-MIN_PLACES = 30  # of a receiver; with fewer, held-out rows of all receivers calibrate its intervals
 RECEIVERS_AT_ONCE = 64  # between two steps of the progress bar; starting threads costs milliseconds
 
 
@@ -132,15 +131,18 @@ class RssiModel(RssiPredictor, Saved):
             )
         )
 
-    def _calibrate(self, train: Rssi, predicted: Tensor, std: Tensor, field_db: Tensor, noise_db: Tensor) -> Tensor:
+    def _calibrate(
+        self, train: Rssi, predicted: Tensor, std: Tensor, field_db: Tensor, noise_db: Tensor, min_places: int = 30
+    ) -> Tensor:
         """Calibrate the standard deviations by held-out predictions of the training rows, and return their factors (R,).
 
         `predicted` [dBm] and `std` [dB] are (n, R), the prior deviations of latent field and noise are (R,) [dB].
+        A receiver with fewer than `min_places` places has the factor of all receivers. Not studied.
         """
         score, place = (train.rssi_dbm - predicted).abs() / (HALF_WIDTH * std), places(train.transmitter_position)
         count = torch.zeros(int(place.max()) + 1, score.shape[1]).index_add(0, place, score.isfinite().float())
         scale = torch.full_like(field_db, interval_factor(score, place))
-        for r in ((count > 0).sum(dim=0) >= MIN_PLACES).nonzero()[:, 0].tolist():
+        for r in ((count > 0).sum(dim=0) >= min_places).nonzero()[:, 0].tolist():
             scale[r] = interval_factor(score[:, r], place)
         self.field_db = (scale * field_db).float()
         self.noise_db = (scale * noise_db).clamp_min(rounding_std(train.rssi_dbm)).float()

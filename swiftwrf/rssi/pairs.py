@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Self
 
@@ -22,7 +21,7 @@ from torch import Tensor
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import each_fold, folds, places
 from swiftwrf.errors import InputError
-from swiftwrf.gp import GaussianProcess, Kernel, candidates
+from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.gp.process import leave_folds_out_locally
 from swiftwrf.metrics import HALF_WIDTH, interval_factor
 from swiftwrf.models.base import FieldConfig
@@ -30,15 +29,12 @@ from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import check_positions, nearest
 from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiPredictor, in_batches
 from swiftwrf.rssi.path_loss import MIN_DISTANCE_M, fit_path_loss
-from swiftwrf.rssi.training import rounding_std
+from swiftwrf.rssi.training import rough_candidates, rounding_std
 from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import configuration
 
-RELATIVE_NOISE_VARIANCES = (0.03, 0.1, 0.3, 1.0, 3.0)  # variance of a measurement relative to that of the field
-RATIOS = (0.5, 1.0, 2.0)  # of distances that the transmitter moves to equivalent ones of the receiver
 BATCH_PAIRS = 2048  # predicted at a time, since each needs a matrix of 64 x 64
-MAX_HELD_OUT = 500  # pairs that choose the kernel; more do not change it
 
 
 @configuration
@@ -196,6 +192,45 @@ def scaled(pair: Tensor, ratio: float) -> Tensor:
     return pair * pair.new_tensor([1.0] * 3 + [ratio] * 3)
 
 
+def choose_pair_kernel(
+    pair: Tensor,
+    residual: Tensor,
+    fold: Tensor,
+    order: Tensor,
+    *,
+    ratios: tuple[float, ...] = (0.5, 1.0, 2.0),
+    noises: tuple[float, ...] = (0.03, 0.1, 0.3, 1.0, 3.0),
+    max_rows: int = 500,
+) -> tuple[Tensor, float, Kernel, Tensor]:
+    """Choose ratio and kernel with the lowest mean absolute error at held-out pairs.
+
+    Args:
+        pair: Measured pairs (m, 6) [m].
+        residual: Residuals of path-loss models fitted without each fold, (folds, m) [dB].
+        fold: Number of the fold of each pair, (m,).
+        order: Numbers of the pairs in random order, (m,).
+        ratios: Compared ratios of distances of the transmitter to equivalent ones of the receiver. Not studied.
+        noises: Compared variances of a measurement, relative to that of the field. Not studied.
+        max_rows: Pairs that choose. More do not change the kernel.
+
+    Returns:
+        Numbers of the pairs that choose, (k,), ratio, kernel, and the absolute errors at these pairs relative to their
+        standard deviations, (k,).
+    """
+    rows, best = order[:max_rows], (math.inf, 1.0, Kernel(), residual[0])
+    truth = residual[fold[rows], rows]
+    for ratio in ratios:
+        coordinates = scaled(pair, ratio)
+        near, weights = leave_folds_out_locally(coordinates, fold, rows)
+        values = residual[fold[rows, None], near]
+        for kernel in sorted(rough_candidates(coordinates, noises), key=lambda kernel: kernel.matern12_length):
+            weight, variance = weights(kernel)
+            error = (truth - (weight * values).sum(dim=1)).abs()
+            if float(error.mean()) < best[0]:
+                best = float(error.mean()), ratio, kernel, error / (variance + kernel.noise).sqrt()
+    return rows, *best[1:]
+
+
 class PairModel(PairPredictor, Saved):
     """A path-loss model in the distance of both ends, and a Gaussian process over both positions.
 
@@ -235,31 +270,16 @@ class PairModel(PairPredictor, Saved):
         self.pair, self.path_loss = pair, path_loss(torch.arange(len(pair)))
         self.residual = rssi - self.path_loss(pair)
         order = torch.randperm(len(pair), generator=torch.Generator().manual_seed(self.config.seed))
-        rows, (names, number) = order[:MAX_HELD_OUT], fold.unique(return_inverse=True)
+        names, number = fold.unique(return_inverse=True)
         # one region only: none is left to predict it from
         fold = number if len(names) > 1 else torch.arange(len(fold)) % 2
         # residuals (folds, pairs) of the path-loss model fitted without each fold
         residual = torch.stack([rssi - path_loss(kept)(pair) for _, kept in each_fold(fold)])
-        choices = (choice for ratio in RATIOS for choice in self._judged(ratio, fold, rows, residual))
-        _, self.ratio, self.kernel, score = min(choices, key=lambda choice: choice[0])
+        rows, self.ratio, self.kernel, score = choose_pair_kernel(pair, residual, fold, order)
         place = places(pair[rows, 3:] if self.config.new_places else pair[rows, :3], 2)  # of the end that is held out
         scale = interval_factor(score / HALF_WIDTH, place)
         self.scale_db = score.new_tensor([max(scale, rounding_std(rssi) / self.kernel.noise**0.5)])
         self._precompute()
-
-    def _judged(
-        self, ratio: float, fold: Tensor, rows: Tensor, residual: Tensor
-    ) -> Iterator[tuple[float, float, Kernel, Tensor]]:
-        """Yield kernels with their mean absolute error at held-out pairs, and the errors by their relative deviations."""
-        coordinates = scaled(self.pair, ratio)
-        near, weights = leave_folds_out_locally(coordinates, fold, rows)
-        values, truth = residual[fold[rows, None], near], residual[fold[rows], rows]
-        # rough fields only, as in the model of each receiver
-        kernels = [k for k in candidates(coordinates, RELATIVE_NOISE_VARIANCES) if k.matern12_weight == 1]
-        for kernel in sorted(kernels, key=lambda kernel: kernel.matern12_length):
-            weight, variance = weights(kernel)
-            error = (truth - (weight * values).sum(dim=1)).abs()
-            yield float(error.mean()), ratio, kernel, error / (variance + kernel.noise).sqrt()
 
     def region(self) -> Tensor:
         """Return the training positions (n, 3) [m], one for each pair."""

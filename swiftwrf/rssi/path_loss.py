@@ -19,7 +19,6 @@ from swiftwrf.rssi.detection import Detection, empty_given
 from swiftwrf.runtime.threads import single_thread
 
 MIN_DISTANCE_M = 0.3  # shorter distances count as this one: the model does not hold in the near field
-SPREAD_DB = 6.0  # prior standard deviation of levels and slopes over receivers
 
 
 def log_distance(position: Tensor, receiver: Tensor) -> Tensor:
@@ -150,6 +149,7 @@ def fit_path_losses(
     crossed: Tensor | None = None,
     *,
     max_unexplained: float = 0.4,
+    spread_db: float = 6.0,
 ) -> PathLosses:
     """Fit the path-loss models of all receivers together, by expectation maximisation.
 
@@ -168,6 +168,7 @@ def fit_path_losses(
             horizontal. Defaults to none.
         max_unexplained: Fraction of the empty cells of a receiver where a value was expected, beyond which "auto" ignores
             them. Not studied.
+        spread_db: Prior standard deviation of levels and slopes about those of all receivers [dB]. Not studied.
 
     Example:
         >>> import swiftwrf
@@ -191,14 +192,14 @@ def fit_path_losses(
     def fit(curve: Detection | None) -> tuple[PathLosses, Tensor]:
         mean, none = rssi.nanmean().repeat(len(receiver)), torch.zeros(len(receiver), dtype=torch.float64)
         # a kind of receivers that measured nothing has the mean of the others
-        fields = {"own_level": mean, "shared_level": mean.clone(), "variance": none + SPREAD_DB**2}
+        fields = {"own_level": mean, "shared_level": mean.clone(), "variance": none + spread_db**2}
         fields |= {name: none.clone() for name in ("own_slope", "shared_slope", "unexplained", "floor_db")}
-        fields["root"] = SPREAD_DB * torch.eye(2, dtype=torch.float64).repeat(len(receiver), 1, 1)
+        fields["root"] = spread_db * torch.eye(2, dtype=torch.float64).repeat(len(receiver), 1, 1)
         for kind in (located, ~located):
             if bool(rssi[:, kind].isfinite().any()):
                 of_kind = curve and curve.columns(kind)
                 cells = distance[:, kind], floors[:, kind], rssi[:, kind], shift[:, kind]
-                for name, value in _maximise(*cells, of_kind, repeats).items():
+                for name, value in _maximise(*cells, of_kind, repeats, spread_db).items():
                     fields[name][kind] = value
         own, shared = (PathLoss(fields[f"{of}_level"], fields[f"{of}_slope"] * located) for of in ("own", "shared"))
         fields["root"][~located, :, 1] = 0.0
@@ -220,9 +221,9 @@ def _maximise(
     shift: Tensor,
     detection: Detection | None,
     repeats: float,
+    spread_db: float,
     *,
     slope_prior: tuple[float, float] = (-30.0, 15.0),
-    spread_db: float = SPREAD_DB,
     spread_worth: float = 4.0,
     floor_std_db: float = 20.0,
     rows_worth: float = 10.0,
@@ -246,10 +247,10 @@ def _maximise(
         shift: Received power less RSSI, (n, R) [dB].
         detection: Curve of detection; None if empty cells are ignored.
         repeats: Number of rows that count as one, since rows near each other have like errors.
+        spread_db: See `fit_path_losses`.
         slope_prior: Mean and standard deviation of the slope of all receivers [dB a decade]: path-loss exponents of 1.5 to
             4.5 (T. S. Rappaport, "Wireless Communications", 2nd ed., 2002, table 4.2).
-        spread_db: Prior standard deviation of levels and slopes about those of all receivers [dB]. Not studied.
-        spread_worth: Number of receivers that this prior counts as. Not studied.
+        spread_worth: Number of receivers that the prior `spread_db` counts as. Not studied.
         floor_std_db: Prior standard deviation of the attenuation of a floor about 0 [dB]: any that is measured. Not studied.
         rows_worth: Prior rows: a receiver with 10 rows weighs its own variance and the pooled one equally, and likewise the
             fractions of misses. Not studied.

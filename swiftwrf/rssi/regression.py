@@ -39,12 +39,7 @@ from swiftwrf.rssi.training import Bins, RssiTraining
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import PositiveFloat
 
-DIRECTIVITY_STD_DB = 2.0  # prior of each harmonic of a receiver's antenna and surroundings
-NO_SITE = 1e6  # variance of an empty cell without effect [dB^2]
-WEIGHT_TOLERANCE = 3e-3  # each weight is in (0, 1]
-NEW_WEIGHT_TOLERANCE = WEIGHT_TOLERANCE / 100  # of rows after the fit, so that their order does not matter
 MAX_NEW_ROWS = 256  # beyond, the weights of new rows are fixed and the inverses are computed again
-MAX_VARIANCE_POSITIONS = 200  # measured positions that determine where the field is known
 
 
 @single_thread()  # several threads add up sums in another order
@@ -105,17 +100,19 @@ def fit_receiver(number: int, data: RssiTraining, config: RssiConfig, device: to
     return rows | {"prior": prior, "root": root, "covariance": covariance}
 
 
-def regressors(position: Tensor, receiver: Tensor, root: Tensor) -> Tensor:
+def regressors(position: Tensor, receiver: Tensor, root: Tensor, directivity_std_db: float = 2.0) -> Tensor:
     """Return the regressors of level, slope and directivity with standard normal coefficients, float64 (R, n, 10).
 
     Args:
         position: Positions (n, 3) [m].
         receiver: Positions of the receivers (R, 3) [m].
         root: See `RssiPosterior`.
+        directivity_std_db: Prior standard deviation of each harmonic of a receiver's antenna and surroundings [dB]. Not
+            studied.
     """
     apart = log_distance(position, receiver).T
     trend = torch.stack([torch.ones_like(apart), apart], dim=-1) @ root
-    return torch.cat([trend, DIRECTIVITY_STD_DB * harmonics(position, receiver).transpose(0, 1)], dim=-1)
+    return torch.cat([trend, directivity_std_db * harmonics(position, receiver).transpose(0, 1)], dim=-1)
 
 
 def covariance_of(field: Tensor, a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> Tensor:
@@ -142,7 +139,7 @@ def solve(
     censored: tuple[float, float] | None = None,
     *,
     damping: float = 0.7,
-    weight_tolerance: float = WEIGHT_TOLERANCE,
+    weight_tolerance: float = 3e-3,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Fit value = F b + head(c) + noise in n bins, with b standard normal and c of covariance K.
 
@@ -176,10 +173,10 @@ def solve(
     target, limit = value.masked_fill(weak, 0.0), value[weak]
     site = value.new_zeros(2, len(limit))  # precision, and precision times value, in place of each limit
     unit = torch.eye(len(value)).to(value)[:, weak]
-    step, last_change = 1.0, math.inf
+    step, last_change, vague = 1.0, math.inf, 1e6  # variance of a limit without effect [dB^2]
     for _ in range(30):
         head, slope = (x[:, 0] for x in heads(latent[:, None]))
-        variance = (noise / weight).masked_scatter(weak, 1 / site[0].clamp_min(1 / NO_SITE))
+        variance = (noise / weight).masked_scatter(weak, 1 / site[0].clamp_min(1 / vague))
         total = covariance_of(covariance, (slope, feature), (slope, feature))
         total.diagonal().add_(variance)
         factor, solved = torch.linalg.cholesky(total), target
@@ -196,7 +193,7 @@ def solve(
             others = target[weak] - dual[weak] / diagonal, (1 / diagonal - variance[weak]).clamp_min(1e-6)
             site = site + damping * (_site(*others, limit, noise[weak], censored) - site)
             previous = target[weak]
-            now = (site[1] / site[0].clamp_min(1e-9)).where(site[0] > 1 / NO_SITE, 0.0)
+            now = (site[1] / site[0].clamp_min(1e-9)).where(site[0] > 1 / vague, 0.0)
             target = target.masked_scatter(weak, now)
             settled &= float(((now - previous) * site[0].sqrt()).abs().mean()) < 0.02
         if settled and (step == 1 or mean_change < 0.1):
@@ -289,11 +286,6 @@ class RssiPosterior:
         """RSSI at 1 m [dBm] and slope [dB a decade], float64 (R, 2)."""
         return self.prior + (self.root @ self._linear[:, :2])[..., 0]
 
-    @property
-    def directivity(self) -> Tensor:
-        """Coefficients of the harmonics, float64 (R, 8) [dB]."""
-        return DIRECTIVITY_STD_DB * self._linear[:, 2:, 0]
-
     @cached_property
     def coefficient(self) -> Tensor:
         """Coefficients of the kernel to the rows whose sum is the latent field, float64 (n, R) [dB]."""
@@ -355,10 +347,13 @@ class RssiPosterior:
         vars(posterior).update(feature=features, added=AddedRows(fit, influence, error, covariance))
         return posterior
 
-    def _robust(self, covariance: Tensor, error: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
+    def _robust(
+        self, covariance: Tensor, error: Tensor, variance: Tensor, weight_tolerance: float = 3e-5
+    ) -> tuple[Tensor, Tensor]:
         """Return dual coefficients and noise over weight by iteratively reweighted least squares, from one to start with.
 
-        Errors, variances and results are (R, m), the covariance of the errors without noise is (R, m, m).
+        Errors, variances and results are (R, m), the covariance of the errors without noise is (R, m, m). The tolerance of
+        the weights is small, so that the order of rows has no effect.
         """
         noise = self.noise_db.square()[:, None].where(variance > 0, 1.0)
         weight = (noise / variance).where(variance > 0, 1.0)
@@ -366,7 +361,7 @@ class RssiPosterior:
             used = noise / weight
             dual = torch.linalg.solve(covariance + torch.diag_embed(used), error)
             previous, weight = weight, huber_weight(used * dual, noise.sqrt(), self.huber)
-            if bool(((weight - previous).abs() < NEW_WEIGHT_TOLERANCE).all()):
+            if bool(((weight - previous).abs() < weight_tolerance).all()):
                 break
         return dual, used.where(variance > 0, 0.0)
 
@@ -388,7 +383,7 @@ class AddedRows(NamedTuple):
 
 
 def uncertainty(
-    kernel: Kernel, known: Tensor, receiver: Tensor, covariance: Tensor
+    kernel: Kernel, known: Tensor, receiver: Tensor, covariance: Tensor, max_positions: int = 200
 ) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
     """Return the function from positions to the variance that n measured positions leave open.
 
@@ -399,11 +394,12 @@ def uncertainty(
 
     Args:
         kernel: Kernel of the latent field.
-        known: Measured positions less the centre, (n, 3) [m]; 200 of them count.
+        known: Measured positions less the centre, (n, 3) [m].
         receiver: Positions of the receivers less the centre, (R, 3) [m].
         covariance: Covariance of level and slope of each receiver, (R, 2, 2).
+        max_positions: Measured positions that determine where the field is known. Not studied.
     """
-    (known,) = subsample(known, rows=MAX_VARIANCE_POSITIONS)
+    (known,) = subsample(known, rows=max_positions)
     process = GaussianProcess(kernel, known, _trend(known, receiver))
     return partial(_variances, process, receiver, covariance)  # a function that can be pickled
 

@@ -20,11 +20,6 @@ from swiftwrf.rssi.head import Heads
 from swiftwrf.rssi.path_loss import PathLosses, fit_path_losses, log_distance
 from swiftwrf.runtime.threads import single_thread
 
-# variance of a packet relative to the variance of the field: fading is as large as shadowing
-RELATIVE_NOISE_VARIANCES = (0.3, 1.0, 2.0, 3.0)
-MAX_KERNEL_RECEIVERS = 12  # more do not change the chosen kernel
-CERTAIN = 0.99  # probability that the path loss alone explains an empty cell, or a random miss does: it is left out
-
 
 @dataclass(frozen=True)
 class Bins:
@@ -131,15 +126,18 @@ def prepare(pool: Rssi, fitted: Tensor, config: RssiConfig, shift: Tensor, curve
     )
 
 
-def _limits(rssi: Tensor, loss: PathLosses, distance: Tensor, shift: Tensor) -> Tensor:
-    """Return the upper limit (n, R) [dBm] in each empty cell that neither path loss nor chance explains; nan elsewhere."""
+def _limits(rssi: Tensor, loss: PathLosses, distance: Tensor, shift: Tensor, certain: float = 0.99) -> Tensor:
+    """Return the upper limit (n, R) [dBm] in each empty cell that neither path loss nor chance explains; nan elsewhere.
+
+    A cell is explained with the probability `certain`, which saves time. Not studied.
+    """
     if loss.detection is None:
         return torch.full_like(rssi, torch.nan)
     limit = loss.detection.limit - shift
     std = (loss.variance + loss.detection.width**2).sqrt()
     z = (limit - loss.own(distance)) / std
     weak = empty_given(z, loss.detection.missed)[1]
-    unexplained = (torch.special.ndtr(z) < CERTAIN) & (weak > 1 - CERTAIN)
+    unexplained = (torch.special.ndtr(z) < certain) & (weak > 1 - certain)
     # a few rows are no evidence of weak signals elsewhere, e.g. those of a phone that passed
     enough = (~rssi.isnan()).sum(dim=0) >= MIN_TRAINING
     return limit.where(rssi.isnan() & unexplained & loss.detection.is_limit & enough, torch.nan)
@@ -190,35 +188,55 @@ def _bin_means(values: Tensor, bin_of_row: Tensor, n: int) -> Tensor:
 
 
 def choose_residual_kernel(
-    position: Tensor, residual: Tensor, fold: Tensor, has_floors: bool = False
+    position: Tensor,
+    residual: Tensor,
+    fold: Tensor,
+    has_floors: bool = False,
+    *,
+    noises: tuple[float, ...] = (0.3, 1.0, 2.0, 3.0),
+    max_rows: int = 300,
+    max_receivers: int = 12,
 ) -> tuple[Kernel, bool]:
     """Choose the kernel with the lowest mean absolute error on held-out residuals of the path-loss model.
 
-    Residuals are (n, R) [dB], nan where not detected. With floors, differences in height may count more than others.
+    Args:
+        position: Positions (n, 3) [m].
+        residual: Residuals (n, R) [dB], nan where not detected.
+        fold: Fold of each row, (n,).
+        has_floors: Whether differences in height may count more than others.
+        noises: Compared variances of a packet, relative to that of the field: fading is about as large as shadowing. Not
+            studied.
+        max_rows: Rows that choose. More do not change the chosen kernel.
+        max_receivers: Receivers that choose. More do not change the chosen kernel.
 
     Returns:
         The kernel, and whether its error is lower than that of no field at all.
     """
-    some = (~residual.isnan()).any(dim=1)
-    position, residual, fold = subsample(position[some], residual[some], fold[some], rows=300)
+    detected = (~residual.isnan()).any(dim=1)
+    position, residual, fold = subsample(position[detected], residual[detected], fold[detected], rows=max_rows)
     residual = residual[:, (~residual.isnan()).any(dim=0)]
-    (columns,) = subsample(torch.arange(residual.shape[1]), rows=MAX_KERNEL_RECEIVERS)
+    (columns,) = subsample(torch.arange(residual.shape[1]), rows=max_receivers)
     residual = residual[:, columns]
-    held_out = []  # (receiver, number of values, rows)
-    for r, missing in enumerate(residual.isnan().T):
-        # missing rows are held out with every part, so that the zeros in their place have no effect
-        measured, gaps = (~missing).nonzero()[:, 0], missing.nonzero()[:, 0]
-        held_out += [(r, len(part), torch.cat([part, gaps])) for part, _ in each_fold(fold, measured)]
-
-    # rough fields only: a choice among mixtures with a smooth part follows chance, and its errors are no lower
-    rough = [kernel for kernel in candidates(position, RELATIVE_NOISE_VARIANCES) if kernel.matern12_weight == 1]
     # floors alike, or nearly independent beyond their attenuation
-    stretched = [replace(kernel, vertical=vertical) for vertical in (1.0, 5.0)[: 1 + has_floors] for kernel in rough]
-    precision = torch.linalg.inv(torch.stack([kernel.covariance(position) for kernel in stretched]))
-    dual = precision @ residual.nan_to_num()
-    errors = [held_out_errors(precision, dual[:, :, r, None], out)[:, :n, 0] for r, n, out in held_out]
+    kernels = [
+        replace(kernel, vertical=vertical)
+        for vertical in (1.0, 5.0)[: 1 + has_floors]
+        for kernel in rough_candidates(position, noises)
+    ]
+    precision = torch.linalg.inv(torch.stack([kernel.covariance(position) for kernel in kernels]))
+    dual, errors = precision @ residual.nan_to_num(), []
+    for r, missing in enumerate(residual.isnan().T):
+        # missing rows are held out with every fold, so that the zeros in their place have no effect
+        for out, _ in each_fold(fold, (~missing).nonzero()[:, 0]):
+            every = torch.cat([out, missing.nonzero()[:, 0]])
+            errors.append(held_out_errors(precision, dual[:, :, r, None], every)[:, : len(out), 0])
     score, best = torch.cat(errors, dim=1).abs().mean(dim=1).min(dim=0)
-    return stretched[int(best)], bool(score < residual.abs().nanmean())
+    return kernels[int(best)], bool(score < residual.abs().nanmean())
+
+
+def rough_candidates(position: Tensor, noises: tuple[float, ...]) -> list[Kernel]:
+    """Return candidates (see `swiftwrf.gp.candidates`) without a smooth part, which chance would choose."""
+    return [kernel for kernel in candidates(position, noises) if kernel.matern12_weight == 1]
 
 
 def rounding_std(rssi: Tensor) -> float:

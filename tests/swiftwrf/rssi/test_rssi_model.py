@@ -1,5 +1,6 @@
 """The RSSI model: its regression against slow definitions, its intervals, its files, and awkward data."""
 
+import math
 from dataclasses import replace
 from functools import partial
 from unittest import mock
@@ -16,8 +17,8 @@ from swiftwrf.data.splits import folds
 from swiftwrf.gp import Kernel
 from swiftwrf.rssi import RssiConfig, RssiPaperModel, compare
 from swiftwrf.rssi.head import Head, Heads, mean_magnitude, render
-from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, harmonics, log_distance
-from swiftwrf.rssi.regression import DIRECTIVITY_STD_DB, RssiPosterior, fit_receiver
+from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, log_distance
+from swiftwrf.rssi.regression import RssiPosterior, fit_receiver, regressors
 from swiftwrf.rssi.training import RssiTraining, bin_locations
 from swiftwrf.runtime.steps import Memo
 
@@ -121,14 +122,13 @@ def test_solution_is_the_maximum_of_the_posterior():
     gram = KERNEL(training.position, training.position)
     root = torch.linalg.cholesky(gram + 1e-10 * torch.eye(40, dtype=torch.float64))
     distance = log_distance(training.position, training.receiver)[:, 0]
-    bearing = harmonics(training.position, training.receiver)[:, 0]
+    linear = regressors(training.position, training.receiver, training.path_loss.root)[0]
 
     def predicted(parameters):
-        level, slope = PATH_LOSS_STD_DB * parameters[0], PATH_LOSS_STD_DB * parameters[1]
         latent = FIELD_DB * root @ parameters[10:]
-        path_loss = training.path_loss.shared.level[0] + level + (training.path_loss.shared.slope[0] + slope) * distance
+        path_loss = training.path_loss.shared.level[0] + training.path_loss.shared.slope[0] * distance
         head = mean_magnitude(rendered, latent[:, None]) - mean_magnitude(rendered, torch.zeros(1, 1).double())
-        return path_loss + DIRECTIVITY_STD_DB * bearing @ parameters[2:10] + head[:, 0]
+        return path_loss + linear @ parameters[:10] + head[:, 0]
 
     def objective(x):
         parameters = torch.tensor(x, requires_grad=True)
@@ -140,10 +140,9 @@ def test_solution_is_the_maximum_of_the_posterior():
 
     options = {"maxiter": 5000, "maxfun": 9000, "ftol": 1e-14}
     best = minimize(objective, np.zeros(50), jac=True, method="L-BFGS-B", options=options)
-    level, slope = found.path_loss[0]
-    mine = level + slope * distance + bearing @ found.directivity[0]
-    mine = mine + found.heads(gram @ found.coefficient)[0][:, 0]
-    torch.testing.assert_close(mine, predicted(torch.tensor(best.x)), atol=0.06, rtol=0)
+    torch.testing.assert_close(
+        found.at(training.position, gram)[0][:, 0], predicted(torch.tensor(best.x)), atol=0.06, rtol=0
+    )
 
 
 def test_held_out_is_a_fit_without_the_fold():
@@ -155,10 +154,7 @@ def test_held_out_is_a_fit_without_the_fold():
         out = training.fold == number
         rest = replace(training, rssi=torch.where(out[:, None], torch.nan, training.rssi))
         alone = posterior(training, fit_receiver(FIRST, rest, gentle, CPU))
-        level, slope = alone.path_loss[0]
-        distance = log_distance(training.position, training.receiver)[:, 0]
-        expected = level + slope * distance
-        expected = expected + harmonics(training.position, training.receiver)[:, 0] @ alone.directivity[0]
+        expected = alone.at(training.position, KERNEL(training.position, training.position))[0][:, 0]
         torch.testing.assert_close(whole[out], expected[out], atol=1e-5, rtol=0)
 
 
@@ -223,12 +219,14 @@ def test_interval_has_its_nominal_coverage(split):
 
 
 def test_far_away_the_prediction_is_the_path_loss_model():
+    """Directivity is equal in one direction, and nearly 0 on average over all."""
     model = fit_rssi(with_field())
-    far = torch.tensor([[4000.0, 0, 0]], dtype=torch.float64)
-    receiver = model.receiver_position
-    bearing = torch.einsum("brh,rh->br", harmonics(far, receiver), model.posterior.directivity)
-    path_loss = model.level + model.slope * log_distance(far, receiver) + bearing
-    torch.testing.assert_close(model.predict(far).mean, path_loss.float(), atol=1e-3, rtol=0)
+    direction = torch.nn.functional.normalize(torch.randn(2000, 3, generator=torch.Generator().manual_seed(0)).double())
+    near, far = (model.predict(metres * direction).mean for metres in (4e5, 8e5))
+    decades = model.slope.float() * math.log10(2)
+    torch.testing.assert_close(far - near, decades.expand_as(far), atol=2e-3, rtol=0)
+    path_loss = model.level + model.slope * math.log10(4e5)
+    torch.testing.assert_close(near.mean(dim=0), path_loss.float(), atol=0.1, rtol=0)
 
 
 @pytest.mark.parametrize("make", [RssiModel, PairModel])
