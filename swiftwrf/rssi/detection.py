@@ -79,7 +79,7 @@ class Detection:
                 `benchmarks/not_detected.py --insensitive-dbm -70`.
 
         Returns:
-            The curve; None if every cell has a value. With fewer than 5 empty cells beside values all limits are the lowest
+            The curve; None if every cell has a value. With fewer than 5 empty cells near values all limits are the lowest
             value.
 
         Example:
@@ -146,7 +146,7 @@ class Detection:
         return ", ".join(clauses)
 
     def columns(self, number: Tensor | slice) -> Self:
-        """Return the curve of some receivers."""
+        """Return the curve of the receivers `number`."""
         return replace(self, **{name: getattr(self, name)[number] for name in ("limit", "missed", "is_limit")})
 
     def given_detection(self, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:

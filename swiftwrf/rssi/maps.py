@@ -109,10 +109,10 @@ class RssiMap(Labelled, Displayed):
             origin=model.origin,
         )
         with torch.no_grad():
-            found = model.predict_detected(cells) if detected else model.predict(grid)
-        assert found.std is not None
-        each = (found.mean, found.std, model.predict_detection(grid))
-        mean, std, detection = (values.T.reshape(-1, len(y), len(x)).float().numpy() for values in each)
+            rssi = model.predict_detected(cells) if detected else model.predict(grid)
+        assert rssi.std is not None
+        fields = (rssi.mean, rssi.std, model.predict_detection(grid))
+        mean, std, detection = (values.T.reshape(-1, len(y), len(x)).float().numpy() for values in fields)
         return cls(x, y, z, cell, mean, std, detection, model.receiver_names, model.origin)
 
     def receivers(self, asked: Sequence[str]) -> RssiMap:
@@ -175,7 +175,7 @@ class RssiMap(Labelled, Displayed):
 
     def coordinates(self) -> Arrays:
         metres = {"units": "m"}
-        found: Arrays = {
+        coordinates: Arrays = {
             "x": (("x",), self.x, metres),
             "y": (("y",), self.y, metres),
             "z": ((), np.array(self.height), metres),
@@ -183,8 +183,8 @@ class RssiMap(Labelled, Displayed):
         cells = np.stack(np.meshgrid(self.x, self.y), axis=-1)
         degrees = degree_columns(self.origin, cells.reshape(-1, 2)).values()
         for (name, units), values in zip(DEGREE_UNITS.items(), degrees, strict=False):
-            found[name] = (("y", "x"), values.reshape(cells.shape[:2]), {"units": units})
-        return found | {"receiver": (("receiver",), np.array(self.receiver_names))}
+            coordinates[name] = (("y", "x"), values.reshape(cells.shape[:2]), {"units": units})
+        return coordinates | {"receiver": (("receiver",), np.array(self.receiver_names))}
 
     def variables(self) -> Arrays:
         dimensions = ("receiver", "y", "x")

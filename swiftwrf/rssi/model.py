@@ -102,7 +102,7 @@ class RssiModel(RssiPredictor, Saved):
         fitted = {name: torch.stack([result[name] for result in results]) for name in results[0]}
         held_out, covariance = fitted.pop("held_out").T, fitted.pop("covariance")
         loss, shift, measured, rows = training.path_loss, training.shift, ~training.rssi.isnan(), training.bin_of_row
-        level = held_out.where(~held_out.isnan(), loss.own(log_distance(training.position, training.receiver))) + shift
+        level = held_out.where(~held_out.isnan(), loss.each(log_distance(training.position, training.receiver))) + shift
         std = held_out_std(training, training.kernel, (training.field_db, training.noise_db), covariance)
         self.detection, self.detection_field, power = loss.detection, None, level
         if self.detection is not None:

@@ -42,13 +42,13 @@ class PairConfig(FieldConfig):
     """Options of models over pairs of positions."""
 
     new_places: bool = True
-    """fit for receivers at positions without a measurement, with one path-loss model; otherwise for new positions of the
-    transmitter, as `validation` states, with a path-loss model for each receiver"""
+    """True: receivers are predicted at new positions, so all have one path loss, and folds hold out receivers. False:
+    receivers are the same, so each has a correction, and folds hold out positions of the transmitter (`validation`)"""
 
 
 @dataclass(frozen=True, eq=False)
 class PairPathLoss:
-    """The log-distance path-loss model over pairs of positions: one for all receivers, and corrections at some places.
+    """The log-distance path-loss model over pairs of positions: one for all receivers, and corrections of places.
 
     Args:
         shared: RSSI at 1 m [dBm] and slope [dB a decade] of all receivers, float64 (2,).
@@ -66,25 +66,26 @@ class PairPathLoss:
     correction: Annotated[Tensor, "float64 p 2"]
 
     @classmethod
-    def fit(cls, pair: Tensor, rssi: Tensor, by_place: bool) -> Self:
+    def fit(cls, pair: Tensor, rssi: Tensor, by_place: bool, rows_worth: float = 10.0) -> Self:
         """Fit the model by least squares, the corrections with a ridge penalty.
 
         Args:
             pair: Positions of transmitter and receiver, (m, 6) [m].
             rssi: Measurements (m,) [dBm].
             by_place: Whether each position of a receiver has a correction.
+            rows_worth: Ridge penalty. A place with 10 measurements has half of their mean residual. Not studied.
         """
-        apart = _pair_log_distance(pair)
-        shared = torch.cat(fit_path_loss(apart[:, None], rssi[:, None].double()))
+        distance = _pair_log_distance(pair)
+        shared = torch.cat(fit_path_loss(distance[:, None], rssi[:, None].double()))
         place, row = pair[: len(pair) if by_place else 0, 3:].double().unique(dim=0, return_inverse=True)
         if not len(place):
             return cls(shared, place.reshape(0, 3), torch.zeros(0, 2, dtype=torch.float64))
-        centre = apart.mean()
-        own = torch.stack([torch.ones_like(apart), apart - centre], dim=1)
-        normal = 10.0 * torch.eye(2).double().repeat(len(place), 1, 1)  # half after 10 measurements
-        normal = normal.index_add(0, row, own[:, :, None] * own[:, None])
-        residual = rssi - shared[0] - shared[1] * apart
-        right = torch.zeros(len(place), 2, dtype=torch.float64).index_add(0, row, own * residual[:, None])
+        centre = distance.mean()
+        feature = torch.stack([torch.ones_like(distance), distance - centre], dim=1)
+        normal = rows_worth * torch.eye(2).double().repeat(len(place), 1, 1)
+        normal = normal.index_add(0, row, feature[:, :, None] * feature[:, None])
+        residual = rssi - shared[0] - shared[1] * distance
+        right = torch.zeros(len(place), 2, dtype=torch.float64).index_add(0, row, feature * residual[:, None])
         slope = torch.linalg.solve(normal, right)[:, 1].clamp_max(-shared[1])  # the sum of both slopes is at most 0
         level = (right[:, 0] - normal[:, 0, 1] * slope) / normal[:, 0, 0]
         return cls(shared, place, torch.stack([level - slope * centre, slope], dim=1))
@@ -93,8 +94,8 @@ class PairPathLoss:
         """Return the RSSI (m,) [dBm] at pairs (m, 6) [m]; at places without a correction by the shared model."""
         values = self.shared.expand(len(pair), 2)
         if len(self.place) and len(pair):
-            away, number = (found[:, 0] for found in nearest(pair[:, 3:], self.place, 1))
-            values = values + self.correction[number].where(away[:, None] < 1e-3, 0.0)
+            distance, number = nearest(pair[:, 3:], self.place, 1)
+            values = values + self.correction[number[:, 0]].where(distance < 1e-3, 0.0)
         return values[:, 0] + values[:, 1] * _pair_log_distance(pair)
 
 
@@ -151,12 +152,12 @@ class PairPredictor(RssiPredictor):
         """Predict the RSSI where it is measured; nan elsewhere, which saves time where a row has few receivers."""
         data = self.aligned(data)
         row, column = data.detected.nonzero(as_tuple=True)
-        found = self.predict_pairs(data.transmitter_position[row], self.receiver_position[column])
+        predicted = self.predict_pairs(data.transmitter_position[row], self.receiver_position[column])
 
-        def spread(values: Tensor) -> Tensor:
+        def table(values: Tensor) -> Tensor:
             return torch.full(data.rssi_dbm.shape, torch.nan).double().index_put((row, column), values.double())
 
-        return Prediction(spread(found.mean), None if found.std is None else spread(found.std))
+        return Prediction(table(predicted.mean), None if predicted.std is None else table(predicted.std))
 
     def predict_pairs(self, transmitter_position: Tensor, receiver_position: Tensor) -> Prediction:
         """Predict the RSSI of pairs of positions, measured or not.

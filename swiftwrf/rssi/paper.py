@@ -122,14 +122,14 @@ class RssiPaperModel(RssiModel):
 
 @single_thread()
 def learn_receivers(
-    some: slice,
+    part: slice,
     bins: Bins,
     root: Tensor,
     prior_db: tuple[Tensor, Tensor],
     config: RssiPaperConfig,
     device: torch.device,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Fit some receivers twice: without one fold, and with all.
+    """Fit the receivers of a part twice: without one fold, and with all.
 
     The receivers share the steps, which saves time, but no parameter, loss or moment: each is fitted as if alone. `root` is
     the Cholesky factor of the covariance of the latent field in the n bins, (n, n), and `prior_db` are the standard
@@ -142,13 +142,13 @@ def learn_receivers(
     Raises:
         FitError: A loss that is not finite.
     """
-    names, root = bins.receiver_names[some], root.float().to(device)
-    field_db, noise_db = (x[some].float().to(device) for x in prior_db)
-    measured, count = (x[:, some].float().to(device) for x in (bins.rssi, bins.count))
+    names, root = bins.receiver_names[part], root.float().to(device)
+    field_db, noise_db = (x[part].float().to(device) for x in prior_db)
+    measured, count = (x[:, part].float().to(device) for x in (bins.rssi, bins.count))
     noise_db = noise_db / count.clamp_min(1).sqrt()
 
     def descend(rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return predictions in all bins (R, n) by the fit to some bins, the normal numbers (R, n), and the heads."""
+        """Return predictions in all bins (R, n) by the fit to the bins `rows`, the normal numbers (R, n), and the heads."""
         generator = torch.Generator().manual_seed(config.seed)
         heads = [Head(config.n_primitives, config.seed).to(device) for _ in names]
         white = nn.Parameter(torch.zeros_like(measured))

@@ -115,7 +115,7 @@ class PathLosses(NamedTuple):
     """Path loss of R receivers that is learnt together: level and slope of each are normal about those of all.
 
     Args:
-        own: Model of each receiver, (R,); that of all receivers where a receiver has no measurements.
+        each: Model of each receiver, (R,); that of all receivers where a receiver has no measurements.
         shared: Model of all receivers of its kind, of known or of unknown position, (R,).
         root: A factor of the covariance of the receivers' level and slope about the shared ones, with the uncertainty of the
             latter, root @ root^T, (R, 2, 2). Level and slope are independent at some distance.
@@ -124,7 +124,7 @@ class PathLosses(NamedTuple):
         floor_db: Attenuation of a floor for each receiver's kind, (R,) [dB]; 0 without floors.
     """
 
-    own: PathLoss
+    each: PathLoss
     shared: PathLoss
     root: Tensor
     variance: Tensor
@@ -132,10 +132,10 @@ class PathLosses(NamedTuple):
     floor_db: Tensor
 
     def columns(self, number: Tensor | slice) -> PathLosses:
-        """Return the path loss of some receivers."""
-        own, shared = (PathLoss(*(value[number] for value in model)) for model in (self.own, self.shared))
+        """Return the path loss of the receivers `number`."""
+        each, shared = (PathLoss(*(value[number] for value in model)) for model in (self.each, self.shared))
         detection = self.detection and self.detection.columns(number)
-        return PathLosses(own, shared, self.root[number], self.variance[number], detection, self.floor_db[number])
+        return PathLosses(each, shared, self.root[number], self.variance[number], detection, self.floor_db[number])
 
 
 @single_thread()
@@ -153,9 +153,9 @@ def fit_path_losses(
 ) -> PathLosses:
     """Fit the path-loss models of all receivers together, by expectation maximisation.
 
-    A receiver has what its rows determine, and for the rest what the other receivers have (a hierarchical model: A. Gelman
-    et al., "Bayesian Data Analysis", 3rd ed., 2013, chapter 5). An empty cell is an upper limit of the power, see
-    `Detection`, unless most empty cells of its receiver are where the path loss expects a value.
+    Level and slope of a receiver are shrunk to those of all receivers in proportion to how badly its rows determine them (a
+    hierarchical model: A. Gelman et al., "Bayesian Data Analysis", 3rd ed., 2013, chapter 5). An empty cell is an upper
+    limit of the power, see `Detection`, unless most empty cells of its receiver are where the path loss expects a value.
 
     Args:
         position: Positions of the transmitter, (n, 3) [m].
@@ -174,7 +174,7 @@ def fit_path_losses(
         >>> import swiftwrf
         >>> room = swiftwrf.rssi_room(n=200)
         >>> losses = fit_path_losses(room.transmitter_position, room.receiver_position, room.rssi_dbm)
-        >>> -30 < float(losses.own.slope.mean()) < -10
+        >>> -30 < float(losses.each.slope.mean()) < -10
         True
     """
     shift = torch.zeros_like(rssi) if shift is None else shift
@@ -192,8 +192,8 @@ def fit_path_losses(
     def fit(curve: Detection | None) -> tuple[PathLosses, Tensor]:
         mean, none = rssi.nanmean().repeat(len(receiver)), torch.zeros(len(receiver), dtype=torch.float64)
         # a kind of receivers that measured nothing has the mean of the others
-        fields = {"own_level": mean, "shared_level": mean.clone(), "variance": none + spread_db**2}
-        fields |= {name: none.clone() for name in ("own_slope", "shared_slope", "unexplained", "floor_db")}
+        fields = {"each_level": mean, "shared_level": mean.clone(), "variance": none + spread_db**2}
+        fields |= {name: none.clone() for name in ("each_slope", "shared_slope", "unexplained", "floor_db")}
         fields["root"] = spread_db * torch.eye(2, dtype=torch.float64).repeat(len(receiver), 1, 1)
         for kind in (located, ~located):
             if bool(rssi[:, kind].isfinite().any()):
@@ -201,9 +201,9 @@ def fit_path_losses(
                 cells = distance[:, kind], floors[:, kind], rssi[:, kind], shift[:, kind]
                 for name, value in _maximise(*cells, of_kind, repeats, spread_db).items():
                     fields[name][kind] = value
-        own, shared = (PathLoss(fields[f"{of}_level"], fields[f"{of}_slope"] * located) for of in ("own", "shared"))
+        each, shared = (PathLoss(fields[f"{of}_level"], fields[f"{of}_slope"] * located) for of in ("each", "shared"))
         fields["root"][~located, :, 1] = 0.0
-        losses = PathLosses(own, shared, fields["root"], fields["variance"], curve, fields["floor_db"])
+        losses = PathLosses(each, shared, fields["root"], fields["variance"], curve, fields["floor_db"])
         return losses, fields["unexplained"]
 
     losses, unexplained = fit(detection)
@@ -283,13 +283,13 @@ def _maximise(
         deviation = deviation - posterior[:, :, 1] / posterior[:, 1:2, 1] * excess[:, None]
         moments = (deviation.square() + posterior.diagonal(dim1=1, dim2=2))[:, :2].sum(dim=0)
         spread[:2] = (moments + spread_worth * spread_db**2) / (n_receivers + spread_worth)
-        own = shared + deviation
-        mean, count = (feature * own).sum(dim=-1), weight.sum(dim=0)
+        each = shared + deviation
+        mean, count = (feature * each).sum(dim=-1), weight.sum(dim=0)
         squares = (weight * ((value - mean).square() + value_variance)).sum(dim=0)
         variance = _shrunk(squares, count, rows_worth).clamp_min(1e-6)
-        if last is not None and float((own - last).abs().max()) < 0.01:
+        if last is not None and float((each - last).abs().max()) < 0.01:
             break
-        last = own
+        last = each
         if detection is not None and bool(limited.any()):
             weak_value, weak, weak_variance = _expected(
                 mean, variance, detection.limit - shift, detection.width, unexplained
@@ -300,12 +300,12 @@ def _maximise(
                 # weak packets are missed at random, too
                 others = (1 - weak).where(limited, 0.0).sum(dim=0)
                 unexplained = missed.maximum(_shrunk(others, (seen | limited).sum(dim=0), rows_worth))
-    own_level, shared_level = own[:, 0] - own[:, 1] * middle, shared[0] - shared[1] * middle
+    each_level, shared_level = each[:, 0] - each[:, 1] * middle, shared[0] - shared[1] * middle
     level_std, slope_std = (spread + precision.inverse().diagonal())[:2].sqrt().tolist()
     root = torch.tensor([[level_std, -float(middle) * slope_std], [0.0, slope_std]], dtype=torch.float64)
     return {
-        "own_level": own_level,
-        "own_slope": own[:, 1],
+        "each_level": each_level,
+        "each_slope": each[:, 1],
         "shared_level": shared_level.expand(n_receivers),
         "shared_slope": shared[1].expand(n_receivers),
         "root": root.expand(n_receivers, 2, 2),

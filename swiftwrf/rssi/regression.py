@@ -10,8 +10,8 @@ At its end the rows of a receiver are a Gaussian process with the kernel and the
     tangent_i field(x_i, x_j) tangent_j + f_i . f_j,        noise / weight_i
 
 for the latent field and the regressors f of the path loss. Given the rows of the fit, more rows have a Gaussian
-prior, which costs one product with the inverse covariance, computed once. Their robust weights are found with all of them
-together, so their order has no effect. Tangents and weights of the rows of the fit stay.
+prior, which costs one product with the inverse covariance, computed once. Their robust weights are those of all of
+them together, so their order has no effect. Tangents and weights of the rows of the fit stay.
 """
 
 from __future__ import annotations
@@ -57,15 +57,20 @@ def fit_receiver(number: int, data: RssiTraining, config: RssiConfig, device: to
     Raises:
         FitError: A system that cannot be solved, for positions or values beyond any measurement.
     """
-    rssi, limit, loss, one = data.rssi[:, number], data.limit[:, number], data.path_loss, slice(number, number + 1)
+    rssi, limit, loss, receiver = (
+        data.rssi[:, number],
+        data.limit[:, number],
+        data.path_loss,
+        data.receiver[number, None],
+    )
     prior, root = torch.stack([loss.shared.level[number], loss.shared.slope[number]]), loss.root[number].clone()
-    distance, field_db = log_distance(data.position, data.receiver[one])[:, 0], float(data.field_db[number])
+    distance, field_db = log_distance(data.position, receiver)[:, 0], float(data.field_db[number])
     used = (~rssi.isnan() | ~limit.isnan()).nonzero()[:, 0]
     error, dual, tangent, variance = (torch.zeros_like(rssi) for _ in range(4))
     covariance = root @ root.T
     if len(used):
         at, weak = data.position[used].to(device), limit[used].isnan().logical_not()
-        feature = regressors(data.position[used], data.receiver[one], root[None])[0]
+        feature = regressors(data.position[used], receiver, root[None])[0]
         noise_db = (data.noise_db[number] / data.count[used, number].clamp_min(1).sqrt()).to(device)
         detection = loss.detection
         censored = None if detection is None or not weak.any() else (detection.width, float(detection.missed[number]))
@@ -77,23 +82,23 @@ def fit_receiver(number: int, data: RssiTraining, config: RssiConfig, device: to
             return solve(*system, data.heads, config.huber, censored)
 
         try:
-            *found, factor = solved()
+            *solution, factor = solved()
             trend = feature[:, :2].to(device)
-            open_ = torch.eye(2).double() - (trend.T @ torch.cholesky_solve(trend, factor)).cpu()
-            covariance = root @ open_ @ root.T  # a slope that is held at 0 is as uncertain as a free one
-            if float(prior[1] + root[1, 1] * (found[0].cpu() @ feature[:, 1])) > 0:
+            remaining = torch.eye(2).double() - (trend.T @ torch.cholesky_solve(trend, factor)).cpu()
+            covariance = root @ remaining @ root.T  # a slope that is held at 0 is as uncertain as a free one
+            if float(prior[1] + root[1, 1] * (solution[0].cpu() @ feature[:, 1])) > 0:
                 # at the distance where level and slope are independent
                 prior = torch.stack([prior[0] - prior[1] * root[0, 1] / root[1, 1], torch.zeros(()).double()])
                 root[:, 1], feature[:, 1] = 0.0, 0.0
-                *found, factor = solved()
+                *solution, factor = solved()
             precision, fold = torch.cholesky_inverse(factor), data.fold[used]
             for part, _ in each_fold(fold):
-                error[used[part]] = held_out_errors(precision, found[0][:, None], part.to(device))[:, 0].cpu()
+                error[used[part]] = held_out_errors(precision, solution[0][:, None], part.to(device))[:, 0].cpu()
         except torch.linalg.LinAlgError as reason:  # type: ignore[attr-defined]
             raise FitError(
                 f"the RSSI fit of receiver {data.receiver_names[number]!r} broke ({reason}); are its values sane?"
             ) from None
-        dual[used], tangent[used], variance[used], target = (x.cpu() for x in found)
+        dual[used], tangent[used], variance[used], target = (x.cpu() for x in solution)
         error[used] -= target  # prediction less prior
     held_out = (prior[0] + prior[1] * distance - error).where(variance > 0, torch.nan)
     rows = {"dual": dual, "tangent": field_db * tangent, "variance": variance, "held_out": held_out}
@@ -110,8 +115,8 @@ def regressors(position: Tensor, receiver: Tensor, root: Tensor, directivity_std
         directivity_std_db: Prior standard deviation of each harmonic of a receiver's antenna and surroundings [dB]. Not
             studied.
     """
-    apart = log_distance(position, receiver).T
-    trend = torch.stack([torch.ones_like(apart), apart], dim=-1) @ root
+    distance = log_distance(position, receiver).T
+    trend = torch.stack([torch.ones_like(distance), distance], dim=-1) @ root
     return torch.cat([trend, directivity_std_db * harmonics(position, receiver).transpose(0, 1)], dim=-1)
 
 
@@ -387,10 +392,9 @@ def uncertainty(
 ) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
     """Return the function from positions to the variance that n measured positions leave open.
 
-    The variance is that of the latent field, (m,), relative to that far from all rows, and of the path loss as a trend
-    beside it, (m, R) [dB^2]. The trend is that of universal kriging (N. Cressie, "Statistics for Spatial Data", revised ed.,
-    1993, section 3.4): a level or slope that the rows determine badly counts where the field does not follow from rows
-    nearby.
+    The variance is that of the latent field, (m,), relative to that far from all rows, and that of the path loss as a trend,
+    (m, R) [dB^2]. The trend is that of universal kriging (N. Cressie, "Statistics for Spatial Data", revised ed., 1993,
+    section 3.4): a level or slope that the rows determine badly counts where no rows nearby determine the field.
 
     Args:
         kernel: Kernel of the latent field.
@@ -406,8 +410,8 @@ def uncertainty(
 
 def _trend(position: Tensor, receiver: Tensor) -> Tensor:
     """Return the regressors of level, and of the slope of each receiver, (n, 1 + R)."""
-    apart = log_distance(position, receiver)
-    return torch.cat([torch.ones_like(apart[:, :1]), apart], dim=1)
+    distance = log_distance(position, receiver)
+    return torch.cat([torch.ones_like(distance[:, :1]), distance], dim=1)
 
 
 def _variances(

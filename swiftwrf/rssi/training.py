@@ -67,7 +67,7 @@ class Bins:
         )
 
     def columns(self, number: Tensor) -> Self:
-        """Return the bins of some receivers."""
+        """Return the bins of the receivers `number`."""
         names = tuple(self.receiver_names[n] for n in number.tolist())
         of_receivers = {"receiver": self.receiver[number], "rssi": self.rssi[:, number], "count": self.count[:, number]}
         return replace(self, receiver_names=names, **of_receivers)
@@ -108,7 +108,7 @@ def prepare(pool: Rssi, fitted: Tensor, config: RssiConfig, shift: Tensor, curve
     bins, position = of_pool.columns(fitted), of_pool.position
     shift = _bin_means(shift, bins.bin_of_row, len(position))
     losses = fit_path_losses(position, of_pool.receiver, of_pool.rssi, config.not_detected, shift, curve)
-    residual = of_pool.rssi - losses.own(log_distance(position, of_pool.receiver))
+    residual = of_pool.rssi - losses.each(log_distance(position, of_pool.receiver))
     kernel, has_field = choose_residual_kernel(
         position, residual[:, often_detected(pool)], bins.fold, pool.floors is not None
     )
@@ -135,7 +135,7 @@ def _limits(rssi: Tensor, loss: PathLosses, distance: Tensor, shift: Tensor, cer
         return torch.full_like(rssi, torch.nan)
     limit = loss.detection.limit - shift
     std = (loss.variance + loss.detection.width**2).sqrt()
-    z = (limit - loss.own(distance)) / std
+    z = (limit - loss.each(distance)) / std
     weak = empty_given(z, loss.detection.missed)[1]
     unexplained = (torch.special.ndtr(z) < certain) & (weak > 1 - certain)
     # a few rows are no evidence of weak signals elsewhere, e.g. those of a phone that passed

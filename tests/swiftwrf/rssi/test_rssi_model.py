@@ -83,7 +83,7 @@ def training_of(data, n_primitives=50):
         kernel=KERNEL,
         heads=Heads.alike(n_primitives, seed=0),
         path_loss=PathLosses(
-            own=path_loss,
+            each=path_loss,
             shared=path_loss,
             root=PATH_LOSS_STD_DB * torch.eye(2).double().repeat(r, 1, 1),
             variance=torch.full((r,), FIELD_DB**2 + NOISE_DB**2).double(),
