@@ -28,8 +28,8 @@ from swiftwrf.positions import check_positions
 from swiftwrf.rssi.base import Map, RssiConfig, RssiPredictor, columns_of
 from swiftwrf.rssi.detection import Detection, DetectionField
 from swiftwrf.rssi.maps import RssiMap
-from swiftwrf.rssi.path_loss import log_distance
-from swiftwrf.rssi.regression import RssiPosterior, fit_receiver, held_out_std, uncertainty
+from swiftwrf.rssi.path_loss import PathLoss, log_distance
+from swiftwrf.rssi.regression import RssiPosterior, fit_receiver, held_out_std, predictive_std
 from swiftwrf.rssi.training import prepare, rounding_std
 from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.progress import progress_bar
@@ -117,18 +117,16 @@ class RssiModel(RssiPredictor, Saved):
         self.held_out_db = {name: float((each - train.rssi_dbm).abs().nanmean()) for name, each in errors.items()}
         scale = self._calibrate(train, predicted, std[rows], training.field_db, training.noise_db)
         self.covariance, self.centre = scale.square()[:, None, None] * covariance, training.centre
-        self._set_posterior(
-            RssiPosterior(
-                kernel=training.kernel,
-                heads=training.heads,
-                huber=self.config.huber,
-                receiver=training.receiver,
-                position=training.position,
-                measured=measured.T.double(),
-                field_db=training.field_db,
-                noise_db=training.noise_db,
-                **fitted,
-            )
+        self.posterior = RssiPosterior(
+            kernel=training.kernel,
+            heads=training.heads,
+            huber=self.config.huber,
+            receiver=training.receiver,
+            position=training.position,
+            measured=measured.T.double(),
+            field_db=training.field_db,
+            noise_db=training.noise_db,
+            **fitted,
         )
 
     def _calibrate(
@@ -148,29 +146,15 @@ class RssiModel(RssiPredictor, Saved):
         self.noise_db = (scale * noise_db).clamp_min(rounding_std(train.rssi_dbm)).float()
         return scale
 
-    def _set_posterior(self, posterior: RssiPosterior) -> None:
-        """Take a posterior, and compute what all standard deviations share."""
-        self.posterior = posterior
-        self._uncertainty = uncertainty(posterior.kernel, posterior.position, posterior.receiver, self.covariance)
-
-    def _restored(self) -> None:
-        super()._restored()
-        self._set_posterior(self.posterior)
-
     @property
     def kernel(self) -> Kernel:
         """Kernel of the latent field, lengths in [m]."""
         return self.posterior.kernel
 
     @property
-    def level(self) -> Tensor:
-        """RSSI at 1 m, float64 (R,) [dBm]."""
-        return self.posterior.path_loss[:, 0]
-
-    @property
-    def slope(self) -> Tensor:
-        """RSSI by distance, float64 (R,) [dB a decade]."""
-        return self.posterior.path_loss[:, 1]
+    def path_loss(self) -> PathLoss:
+        """Path-loss model of each receiver, (R,)."""
+        return self.posterior.path_loss
 
     @property
     def n_primitives(self) -> int:
@@ -186,7 +170,7 @@ class RssiModel(RssiPredictor, Saved):
         at = new.transmitter_position - self.centre
         if self.detection_field is not None:
             self.detection_field = self.detection_field.updated(at, new.detected)
-        self._set_posterior(self.posterior.updated(at, new.rssi_dbm))
+        self.posterior = self.posterior.updated(at, new.rssi_dbm)
 
     def with_chosen_kernel(self, without: Tensor | None = None) -> Self:
         """Return the model fitted again to all rows that it has learnt, with kernel and noise chosen again.
@@ -238,9 +222,9 @@ class RssiModel(RssiPredictor, Saved):
     def _predict(self, position: Tensor) -> tuple[Tensor, Tensor]:
         offset, posterior = position - self.centre, self.posterior
         mean = posterior.at(offset, self.kernel(offset.float(), posterior.position.float()))[0]
-        variance, trend = self._uncertainty(offset)
-        variance = self.field_db.square() * variance.float()[:, None] + trend.float()
-        return mean.float(), (self.noise_db.square() + variance).sqrt()
+        prior_db = self.field_db, self.noise_db
+        std = predictive_std(posterior.trend, posterior.receiver, offset, prior_db, self.covariance)
+        return mean.float(), std.float()
 
     @checked
     def predict_detected(self, data: Rssi) -> Prediction:

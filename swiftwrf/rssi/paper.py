@@ -101,22 +101,20 @@ class RssiPaperModel(RssiModel):
         dual = torch.linalg.solve_triangular(root.T, white.T.double() * prior_db[0], upper=True).T
         level = LEVEL_DBM + mean_magnitude(rendered, torch.zeros(1, n_receivers))[0].double()
         # the dual coefficients are those of the kernel alone, without a path loss or noise
-        self._set_posterior(
-            RssiPosterior(
-                kernel=kernel,
-                heads=Heads(rendered),
-                huber=config.huber,
-                receiver=bins.receiver,
-                position=bins.position,
-                dual=dual,
-                tangent=torch.ones_like(dual),
-                variance=torch.zeros_like(dual),
-                measured=torch.ones_like(dual),
-                prior=torch.stack([level, torch.zeros_like(level)], dim=1),
-                root=torch.zeros_like(self.covariance),
-                field_db=torch.ones_like(level),
-                noise_db=torch.zeros_like(level),
-            )
+        self.posterior = RssiPosterior(
+            kernel=kernel,
+            heads=Heads(rendered),
+            huber=config.huber,
+            receiver=bins.receiver,
+            position=bins.position,
+            dual=dual,
+            tangent=torch.ones_like(dual),
+            variance=torch.zeros_like(dual),
+            measured=torch.ones_like(dual),
+            prior=torch.stack([level, torch.zeros_like(level)], dim=1),
+            root=torch.zeros_like(self.covariance),
+            field_db=torch.ones_like(level),
+            noise_db=torch.zeros_like(level),
         )
 
 

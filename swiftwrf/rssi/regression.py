@@ -17,9 +17,8 @@ them together, so their order has no effect. Tangents and weights of the rows of
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -287,9 +286,14 @@ class RssiPosterior:
         return self.feature.mT @ self.dual[..., None]
 
     @property
-    def path_loss(self) -> Tensor:
-        """RSSI at 1 m [dBm] and slope [dB a decade], float64 (R, 2)."""
-        return self.prior + (self.root @ self._linear[:, :2])[..., 0]
+    def path_loss(self) -> PathLoss:
+        """Path-loss model of each receiver, (R,)."""
+        return PathLoss(*(self.prior + (self.root @ self._linear[:, :2])[..., 0]).T)
+
+    @cached_property
+    def trend(self) -> GaussianProcess:
+        """Process for the standard deviation of predictions; see `predictive_std`."""
+        return trend_process(self.kernel, self.position, self.receiver)
 
     @cached_property
     def coefficient(self) -> Tensor:
@@ -387,25 +391,17 @@ class AddedRows(NamedTuple):
     covariance: Tensor
 
 
-def uncertainty(
-    kernel: Kernel, known: Tensor, receiver: Tensor, covariance: Tensor, max_positions: int = 200
-) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
-    """Return the function from positions to the variance that n measured positions leave open.
-
-    The variance is that of the latent field, (m,), relative to that far from all rows, and that of the path loss as a trend,
-    (m, R) [dB^2]. The trend is that of universal kriging (N. Cressie, "Statistics for Spatial Data", revised ed., 1993,
-    section 3.4): a level or slope that the rows determine badly counts where no rows nearby determine the field.
+def trend_process(kernel: Kernel, known: Tensor, receiver: Tensor, max_positions: int = 200) -> GaussianProcess:
+    """Return the process of a field and of the trend of its path loss at measured positions; see `predictive_std`.
 
     Args:
         kernel: Kernel of the latent field.
         known: Measured positions less the centre, (n, 3) [m].
         receiver: Positions of the receivers less the centre, (R, 3) [m].
-        covariance: Covariance of level and slope of each receiver, (R, 2, 2).
         max_positions: Measured positions that determine where the field is known. Not studied.
     """
     (known,) = subsample(known, rows=max_positions)
-    process = GaussianProcess(kernel, known, _trend(known, receiver))
-    return partial(_variances, process, receiver, covariance)  # a function that can be pickled
+    return GaussianProcess(kernel, known, _trend(known, receiver))
 
 
 def _trend(position: Tensor, receiver: Tensor) -> Tensor:
@@ -414,24 +410,37 @@ def _trend(position: Tensor, receiver: Tensor) -> Tensor:
     return torch.cat([torch.ones_like(distance[:, :1]), distance], dim=1)
 
 
-def _variances(
-    process: GaussianProcess, receiver: Tensor, covariance: Tensor, position: Tensor
-) -> tuple[Tensor, Tensor]:
-    mean, of_field = process.mean_and_variance(position)
+def predictive_std(
+    process: GaussianProcess,
+    receiver: Tensor,
+    position: Tensor,
+    prior_db: tuple[Tensor, Tensor],
+    covariance: Tensor,
+) -> Tensor:
+    """Return the standard deviation of a measurement (m, R) [dB] at positions (m, 3) less the centre [m].
+
+    The path loss has the variance of a trend in universal kriging (N. Cressie, "Statistics for Spatial Data", revised ed.,
+    1993, section 3.4): a level or slope that the rows determine badly counts where no rows nearby determine the field.
+
+    Args:
+        process: Process of the measured positions, see `trend_process`.
+        receiver: Positions of the receivers less the centre, (R, 3) [m].
+        position: Positions.
+        prior_db: Standard deviations of the field far from all rows, and of a measurement about it, each (R,) [dB].
+        covariance: Covariance of level and slope of each receiver, (R, 2, 2).
+    """
+    (field_db, noise_db), (mean, variance) = prior_db, process.mean_and_variance(position)
     level, slope = (_trend(position, receiver) - mean).split([1, len(receiver)], dim=1)
     of_level, both, of_slope = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     trend = of_level * level.square() + 2 * both * level * slope + of_slope * slope.square()
-    return of_field, trend.clamp_min(0)
+    std: Tensor = (noise_db.square() + field_db.square() * variance[:, None] + trend.clamp_min(0)).sqrt()
+    return std
 
 
 def held_out_std(bins: Bins, kernel: Kernel, prior_db: tuple[Tensor, Tensor], covariance: Tensor) -> Tensor:
-    """Return the standard deviations (n, R) [dB] that models without a bin's fold predict, before they are calibrated.
-
-    `prior_db` are the standard deviations of latent field and noise, each (R,) [dB]; the rest is as in `uncertainty`.
-    """
-    (field_db, noise_db), std = prior_db, torch.empty_like(bins.rssi)
+    """Return the standard deviations (n, R) [dB] that models without a bin's fold predict; see `predictive_std`."""
+    std = torch.empty_like(bins.rssi)
     for out, kept in each_fold(bins.fold):
-        left = uncertainty(kernel, bins.position[kept], bins.receiver, covariance)
-        variance, trend = left(bins.position[out])
-        std[out] = (noise_db.square() + field_db.square() * variance[:, None] + trend).sqrt()
+        process = trend_process(kernel, bins.position[kept], bins.receiver)
+        std[out] = predictive_std(process, bins.receiver, bins.position[out], prior_db, covariance)
     return std

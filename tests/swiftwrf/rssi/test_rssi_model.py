@@ -196,7 +196,7 @@ def test_primitives_are_for_a_field():
 def test_paper_head_learns_without_a_path_loss_model():
     train, test = with_field().columns([0]).split("random")
     model = RssiPaperModel(steps=200).fit(train)
-    assert not model.slope.any()
+    assert not model.path_loss.slope.any()
     found, mean = (
         (predicted - test.rssi_dbm).abs().median()
         for predicted in (model.predict(test.transmitter_position).mean, train.rssi_dbm.mean(dim=0))
@@ -223,9 +223,9 @@ def test_far_away_the_prediction_is_the_path_loss_model():
     model = fit_rssi(with_field())
     direction = torch.nn.functional.normalize(torch.randn(2000, 3, generator=torch.Generator().manual_seed(0)).double())
     near, far = (model.predict(metres * direction).mean for metres in (4e5, 8e5))
-    decades = model.slope.float() * math.log10(2)
+    decades = model.path_loss.slope.float() * math.log10(2)
     torch.testing.assert_close(far - near, decades.expand_as(far), atol=2e-3, rtol=0)
-    path_loss = model.level + model.slope * math.log10(4e5)
+    path_loss = model.path_loss.level + model.path_loss.slope * math.log10(4e5)
     torch.testing.assert_close(near.mean(dim=0), path_loss.float(), atol=0.1, rtol=0)
 
 
