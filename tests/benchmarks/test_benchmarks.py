@@ -138,7 +138,9 @@ def test_scans_are_counted_where_coverage_is_predicted(monkeypatch):
     monkeypatch.setattr(rssi, "kept", lambda name, key: {})
     monkeypatch.setattr(rssi, "rssi_room", lambda seed: data)
     monkeypatch.setattr(rssi, "write_result", lambda name, content, rows: written.append((name, content["scenes"])))
-    monkeypatch.setattr(rssi, "predicted_above", lambda model, scans, _: 0.05 + 0.9 * (scans.index % 2 == 0).double())
+    monkeypatch.setattr(
+        rssi, "predicted_above", lambda model, scans, *_, **__: 0.05 + 0.9 * (scans.index % 2 == 0).double()
+    )
     rssi.main(rssi.Config(data=Path(), study="coverage", receivers=4))
     ((name, scenes),) = written
     found, (train, test) = scenes["simulated-floor-3 random"], data.split()
