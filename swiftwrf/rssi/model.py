@@ -102,17 +102,18 @@ class RssiModel(RssiPredictor, Saved):
         fitted = {name: torch.stack([result[name] for result in results]) for name in results[0]}
         held_out, covariance = fitted.pop("held_out").T, fitted.pop("covariance")
         loss, shift, measured, rows = training.path_loss, training.shift, ~training.rssi.isnan(), training.bin_of_row
-        level = held_out.where(~held_out.isnan(), loss.each(log_distance(training.position, training.receiver))) + shift
+        distance = log_distance(training.position, training.receiver)
+        level = held_out.where(~held_out.isnan(), loss.each(distance)) + shift
         std = held_out_std(training, training.kernel, (training.field_db, training.noise_db), covariance)
         self.detection, self.detection_field, power = loss.detection, None, level
         if self.detection is not None:
             bins = training.position, measured, training.fold, level
             self.detection_field = DetectionField.fit(training.kernel, *bins, self.detection.limit)
             power, std = self.detection.given_detection(level, std)
-        predicted, means = (power - shift)[rows], torch.empty_like(level)
+        predicted, means = (power - shift)[rows], loss.shared(distance)
         for out, kept in each_fold(training.fold):
-            values = training.rssi[kept]
-            means[out] = values.nanmean(dim=0).nan_to_num(float(values.nanmean()))
+            mean = training.rssi[kept].nanmean(dim=0)
+            means[out] = mean.where(~mean.isnan(), means[out])
         errors = {self.name: predicted, "mean": means[rows]}
         self.held_out_db = {name: float((each - train.rssi_dbm).abs().nanmean()) for name, each in errors.items()}
         scale = self._calibrate(train, predicted, std[rows], training.field_db, training.noise_db)
