@@ -97,7 +97,6 @@ def estimate_offsets(
     train: Rssi,
     reference: str | None = None,
     *,
-    max_rows: int = 300,
     relative_length: float = 0.25,
     prior_precision: float = 0.05,
 ) -> Offsets:
@@ -109,7 +108,6 @@ def estimate_offsets(
     Args:
         train: Training rows with groups.
         reference: Group with offset 0. Defaults to the most frequent one.
-        max_rows: Rows of a receiver that determine the offsets. The time grows with the cube of their number.
         relative_length: Correlation length of the process relative to the extent of the positions. Not studied.
         prior_precision: Prior precision of an offset relative to the variance of the field: a standard deviation of 10 dB
             for a usual field. Not studied.
@@ -151,7 +149,8 @@ def estimate_offsets(
     generator = torch.Generator().manual_seed(0)
     for r, rssi in enumerate(train.as_measured().rssi_dbm.T):
         rows = (~rssi.isnan()).nonzero()[:, 0]
-        rows = rows[torch.randperm(len(rows), generator=generator)[:max_rows]]  # evenly spaced rows may be of one group
+        # the time grows with the cube of the number of rows, and evenly spaced ones may be of one group
+        rows = rows[torch.randperm(len(rows), generator=generator)[:300]]
         if not len(rows):
             continue
         free = torch.stack([torch.ones_like(distance[rows, r]), distance[rows, r]], dim=1)

@@ -201,7 +201,6 @@ def choose_pair_kernel(
     *,
     ratios: tuple[float, ...] = (0.5, 1.0, 2.0),
     noises: tuple[float, ...] = (0.03, 0.1, 0.3, 1.0, 3.0),
-    max_rows: int = 500,
 ) -> tuple[Tensor, float, Kernel, Tensor]:
     """Choose ratio and kernel with the lowest mean absolute error at held-out pairs.
 
@@ -212,13 +211,13 @@ def choose_pair_kernel(
         order: Numbers of the pairs in random order, (m,).
         ratios: Compared ratios of distances of the transmitter to equivalent ones of the receiver. Not studied.
         noises: Compared variances of a measurement, relative to that of the field. Not studied.
-        max_rows: Pairs that choose. More do not change the kernel.
 
     Returns:
         Numbers of the pairs that choose, (k,), ratio, kernel, and the absolute errors at these pairs relative to their
         standard deviations, (k,).
     """
-    rows, best = order[:max_rows], (math.inf, 1.0, Kernel(), residual[0])
+    # more pairs do not change the choice
+    rows, best = order[:500], (math.inf, 1.0, Kernel(), residual[0])
     truth = residual[fold[rows], rows]
     for ratio in ratios:
         coordinates = scaled(pair, ratio)

@@ -194,8 +194,6 @@ def choose_residual_kernel(
     has_floors: bool = False,
     *,
     noises: tuple[float, ...] = (0.3, 1.0, 2.0, 3.0),
-    max_rows: int = 300,
-    max_receivers: int = 12,
 ) -> tuple[Kernel, bool]:
     """Choose the kernel with the lowest mean absolute error on held-out residuals of the path-loss model.
 
@@ -206,16 +204,14 @@ def choose_residual_kernel(
         has_floors: Whether differences in height may count more than others.
         noises: Compared variances of a packet, relative to that of the field: fading is about as large as shadowing. Not
             studied.
-        max_rows: Rows that choose. More do not change the chosen kernel.
-        max_receivers: Receivers that choose. More do not change the chosen kernel.
 
     Returns:
         The kernel, and whether its error is lower than that of no field at all.
     """
     detected = (~residual.isnan()).any(dim=1)
-    position, residual, fold = subsample(position[detected], residual[detected], fold[detected], rows=max_rows)
+    position, residual, fold = subsample(position[detected], residual[detected], fold[detected], rows=300)
     residual = residual[:, (~residual.isnan()).any(dim=0)]
-    (columns,) = subsample(torch.arange(residual.shape[1]), rows=max_receivers)
+    (columns,) = subsample(torch.arange(residual.shape[1]), rows=12)  # more rows or receivers do not change the choice
     residual = residual[:, columns]
     # floors alike, or nearly independent beyond their attenuation
     kernels = [
