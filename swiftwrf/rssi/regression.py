@@ -56,14 +56,10 @@ def fit_receiver(number: int, data: RssiTraining, config: RssiConfig, device: to
     Raises:
         FitError: A system that cannot be solved, for positions or values beyond any measurement.
     """
-    rssi, limit, loss, receiver = (
-        data.rssi[:, number],
-        data.limit[:, number],
-        data.path_loss,
-        data.receiver[number, None],
-    )
+    rssi, limit, loss = data.rssi[:, number], data.limit[:, number], data.path_loss
     prior, root = torch.stack([loss.shared.level[number], loss.shared.slope[number]]), loss.root[number].clone()
-    distance, field_db = log_distance(data.position, receiver)[:, 0], float(data.field_db[number])
+    receiver, field_db = data.receiver[number, None], float(data.field_db[number])
+    distance = log_distance(data.position, receiver)[:, 0]
     used = (~rssi.isnan() | ~limit.isnan()).nonzero()[:, 0]
     error, dual, tangent, variance = (torch.zeros_like(rssi) for _ in range(4))
     covariance = root @ root.T
@@ -364,15 +360,16 @@ class RssiPosterior:
         Errors, variances and results are (R, m), the covariance of the errors without noise is (R, m, m). The tolerance of
         the weights is small, so that the order of rows has no effect.
         """
-        noise = self.noise_db.square()[:, None].where(variance > 0, 1.0)
-        weight = (noise / variance).where(variance > 0, 1.0)
+        used = variance > 0
+        noise = self.noise_db.square()[:, None].where(used, 1.0)
+        weight = (noise / variance).where(used, 1.0)
         for _ in range(100):
-            used = noise / weight
-            dual = torch.linalg.solve(covariance + torch.diag_embed(used), error)
-            previous, weight = weight, huber_weight(used * dual, noise.sqrt(), self.huber)
+            variance = noise / weight
+            dual = torch.linalg.solve(covariance + torch.diag_embed(variance), error)
+            previous, weight = weight, huber_weight(variance * dual, noise.sqrt(), self.huber)
             if bool(((weight - previous).abs() < weight_tolerance).all()):
                 break
-        return dual, used.where(variance > 0, 0.0)
+        return dual, variance.where(used, 0.0)
 
 
 class AddedRows(NamedTuple):
