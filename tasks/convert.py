@@ -11,7 +11,7 @@ import torch
 
 from swiftwrf import FieldModel, InputError, RssiModel, load
 from swiftwrf.contrib.diagnostics.calibration import Calibration, calibrate
-from swiftwrf.contrib.formats.maps import write_geojson, write_geotiff, write_world_file
+from swiftwrf.contrib.map_files import write_geojson, write_geotiff, write_world_file
 from swiftwrf.data import Rssi, Snapshots, Spectra
 from swiftwrf.data.dataset import Labelled
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.errors import FitError
+from swiftwrf.errors import FitError, InputError
 from swiftwrf.models.base import CPU
 from swiftwrf.rssi.base import Map, RssiConfig, columns_of, often_detected
 from swiftwrf.rssi.head import Head, Heads, mean_magnitude, render
@@ -116,6 +116,11 @@ class RssiPaperModel(RssiModel):
             field_db=torch.ones_like(level),
             noise_db=torch.zeros_like(level),
         )
+
+    def _restored(self) -> None:
+        super()._restored()
+        if len(self.posterior.heads.rendered) != len(self.receiver_names):
+            raise InputError("each receiver needs its head")
 
 
 @single_thread()

@@ -28,7 +28,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from swiftwrf.data.splits import each_fold
-from swiftwrf.errors import FitError
+from swiftwrf.errors import FitError, InputError
 from swiftwrf.gp import GaussianProcess, Kernel, held_out_errors, subsample
 from swiftwrf.rssi.base import RssiConfig
 from swiftwrf.rssi.detection import empty_given
@@ -259,6 +259,10 @@ class RssiPosterior:
     field_db: Annotated[Tensor, "float64 r"]
     noise_db: Annotated[Tensor, "float64 r"]
     added: AddedRows | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        if len(self.heads.rendered) not in (1, len(self.receiver)):
+            raise InputError(f"expected one head, or one for each of {len(self.receiver)} receivers")
 
     @cached_property
     def feature(self) -> Tensor:

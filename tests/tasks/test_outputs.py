@@ -17,7 +17,7 @@ from sklearn.neighbors import KNeighborsRegressor
 from tifffile import TiffFile, imread
 
 from swiftwrf import AngularGrid, RssiModel, Spectra, load_spectra, make_model, rssi_room
-from swiftwrf.contrib.formats.maps import write_geojson, write_geotiff, write_world_file
+from swiftwrf.contrib.map_files import write_geojson, write_geotiff, write_world_file
 from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.simulated import ShoeboxRoom
 from swiftwrf.data.writing import write_deepmimo, write_mat, write_paths, write_rssi, write_spectra

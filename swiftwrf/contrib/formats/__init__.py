@@ -1,1 +1,1 @@
-"""Readers of rare formats, which register themselves, and files of maps."""
+"""Readers of rare formats, which register themselves."""
