@@ -23,7 +23,7 @@ from swiftwrf.runtime.threads import single_thread
 
 @dataclass(frozen=True)
 class Bins:
-    """Training rows averaged by location bin.
+    """Training rows averaged by location bin: each row by itself, or in the cubes of a grid if there are too many rows.
 
     Args:
         receiver_names: R names.
@@ -48,12 +48,14 @@ class Bins:
     @classmethod
     def of(cls, rows: Rssi, config: RssiConfig) -> Self:
         """Average rows by location bin, with the folds that the options state."""
-        position, rssi, count, bin_of_row = bin_locations(rows, config.max_locations)
-        session = rows.session
+        at, session = rows.transmitter_position, rows.session
+        bin_of_row = cells(at, config.max_locations)[0] if len(at) > config.max_locations else torch.arange(len(at))
+        position = _bin_sums(at, bin_of_row) / bin_of_row.bincount()[:, None]
+        count = _bin_sums(rows.detected, bin_of_row)
+        rssi = _bin_sums(rows.rssi_dbm.nan_to_num(), bin_of_row) / count  # 0 / 0 is nan: not detected
         if session is not None:  # that most rows of each bin are of
-            _, number = session.unique(return_inverse=True)
-            times = torch.zeros(len(position), int(number.max()) + 1)
-            session = times.index_put((bin_of_row, number), torch.ones(()), accumulate=True).argmax(dim=1)
+            number = session.unique(return_inverse=True)[1]
+            session = _bin_sums(torch.nn.functional.one_hot(number), bin_of_row).argmax(dim=1)
         centre = position.mean(dim=0)
         return cls(
             receiver_names=tuple(map(str, rows.receiver_names)),
@@ -66,11 +68,21 @@ class Bins:
             count=count,
         )
 
+    def means(self, values: Tensor) -> Tensor:
+        """Return the means of values (rows, c) in each bin, float64 (n, c)."""
+        return _bin_sums(values, self.bin_of_row) / self.bin_of_row.bincount()[:, None]
+
     def columns(self, number: Tensor) -> Self:
         """Return the bins of the receivers `number`."""
         names = tuple(self.receiver_names[n] for n in number.tolist())
         of_receivers = {"receiver": self.receiver[number], "rssi": self.rssi[:, number], "count": self.count[:, number]}
         return replace(self, receiver_names=names, **of_receivers)
+
+
+def _bin_sums(values: Tensor, bin_of_row: Tensor) -> Tensor:
+    """Return the sums of values (rows, c) in each bin, float64 (n, c)."""
+    n = int(bin_of_row.max()) + 1
+    return torch.zeros(n, values.shape[1], dtype=torch.float64).index_add(0, bin_of_row, values.double())
 
 
 @dataclass(frozen=True)
@@ -106,7 +118,7 @@ def prepare(pool: Rssi, fitted: Tensor, config: RssiConfig, shift: Tensor, curve
     of_pool = Bins.of(pool, config)
     check_folds(of_pool.fold, of_pool.rssi)
     bins, position = of_pool.columns(fitted), of_pool.position
-    shift = _bin_means(shift, bins.bin_of_row, len(position))
+    shift = bins.means(shift)
     losses = fit_path_losses(position, of_pool.receiver, of_pool.rssi, config.not_detected, shift, curve)
     residual = of_pool.rssi - losses.each(log_distance(position, of_pool.receiver))
     kernel, has_field = choose_residual_kernel(
@@ -159,32 +171,6 @@ def prior_std(variance: Tensor, kernel: Kernel | None) -> tuple[Tensor, Tensor]:
     """
     noise = 1.0 if kernel is None else kernel.noise / (1 + kernel.noise)
     return ((1 - noise) * variance).sqrt(), (noise * variance).sqrt()
-
-
-def bin_locations(rows: Rssi, max_locations: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Average measurements by location bin: each row by itself, or in the cubes of a grid if there are too many rows.
-
-    Returns:
-        Mean position (n, 3) [m], mean RSSI (n, R) [dBm] (nan where not detected), the number of measurements in each mean
-        (n, R), and the bin of each row (rows,).
-    """
-    position = rows.transmitter_position
-    bin_of_row = torch.arange(len(position))
-    if len(position) > max_locations:
-        bin_of_row = cells(position, max_locations)[0]
-    n = int(bin_of_row.max()) + 1
-    count = _bin_sums((~rows.rssi_dbm.isnan()).double(), bin_of_row, n)
-    rssi = _bin_sums(rows.rssi_dbm.nan_to_num(), bin_of_row, n) / count  # 0 / 0 is nan: not detected
-    return _bin_means(position, bin_of_row, n), rssi, count, bin_of_row
-
-
-def _bin_sums(values: Tensor, bin_of_row: Tensor, n: int) -> Tensor:
-    """Return the sums of values (rows, c) in n bins, float64 (n, c)."""
-    return torch.zeros(n, values.shape[1], dtype=torch.float64).index_add(0, bin_of_row, values.double())
-
-
-def _bin_means(values: Tensor, bin_of_row: Tensor, n: int) -> Tensor:
-    return _bin_sums(values, bin_of_row, n) / bin_of_row.bincount(minlength=n)[:, None]
 
 
 def choose_residual_kernel(

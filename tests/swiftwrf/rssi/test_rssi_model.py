@@ -19,7 +19,7 @@ from swiftwrf.rssi import RssiConfig, RssiPaperModel, compare
 from swiftwrf.rssi.head import Head, Heads, mean_magnitude, render
 from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, log_distance
 from swiftwrf.rssi.regression import RssiPosterior, fit_receiver, regressors
-from swiftwrf.rssi.training import RssiTraining, bin_locations
+from swiftwrf.rssi.training import Bins, RssiTraining
 from swiftwrf.runtime.steps import Memo
 
 KERNEL = Kernel(4.0, 1.0, matern12_weight=0.6, noise=1.0)
@@ -248,14 +248,14 @@ def test_same_data_same_model_and_any_batch(monkeypatch):
 def test_many_rows_are_averaged_by_location():
     data = path_loss_only(n=4000)
     data.rssi_dbm[::7, 1] = torch.nan
-    position, rssi, count, bin_of_row = bin_locations(data, 1500)
-    assert 1200 < len(position) <= 1500
-    assert int(count.sum()) == int((~data.rssi_dbm.isnan()).sum())
-    first = int(bin_of_row[0])
-    own = data.subset((bin_of_row == first).nonzero()[:, 0])
-    torch.testing.assert_close(position[first], own.transmitter_position.mean(dim=0))
-    torch.testing.assert_close(rssi[first], own.rssi_dbm.nanmean(dim=0), equal_nan=True)
-    assert torch.equal(bin_locations(data, 4000)[0], data.transmitter_position)
+    bins, alone = (Bins.of(data, RssiConfig(max_locations=n)) for n in (1500, 4000))
+    assert 1200 < len(bins.position) <= 1500
+    assert int(bins.count.sum()) == int((~data.rssi_dbm.isnan()).sum())
+    first = int(bins.bin_of_row[0])
+    rows = data.subset((bins.bin_of_row == first).nonzero()[:, 0])
+    torch.testing.assert_close(bins.position[first] + bins.centre, rows.transmitter_position.mean(dim=0))
+    torch.testing.assert_close(bins.rssi[first], rows.rssi_dbm.nanmean(dim=0), equal_nan=True)
+    torch.testing.assert_close(alone.position + alone.centre, data.transmitter_position)
 
 
 @pytest.mark.parametrize("make", [RssiModel, partial(RssiPaperModel, steps=5)], ids=["quick", "paper"])
