@@ -117,7 +117,7 @@ def few_kernels() -> Iterator[None]:
         return islice(candidates(position, noises), 0, None, 12)
 
     with ExitStack() as patches:
-        for place in ("gp.choice", "rssi.training", "rssi.pairs"):
+        for place in ("gp.choice", "rssi.training"):
             patches.enter_context(mock.patch(f"swiftwrf.{place}.candidates", few))
         yield
 

@@ -220,9 +220,11 @@ class GaussianProcess:
 
     def variance(self, position: Tensor) -> Tensor:
         """Return the posterior variance, without noise, at positions (m, 3), relative to k(0) = 1, float64 (m,)."""
-        if not self.is_exact:
-            return self._local(position)[2]
-        root = torch.linalg.solve_triangular(self._factor, self._cross(position).T, upper=False)
+        return self._variance(self._cross(position)) if self.is_exact else self._local(position)[2]
+
+    def _variance(self, cross: Tensor) -> Tensor:
+        """Return the posterior variance (m,) at positions by their covariances with the values, (m, n)."""
+        root = torch.linalg.solve_triangular(self._factor, cross.T, upper=False)
         variance: Tensor = 1 - root.square().sum(dim=0)
         return variance.clamp(0, 1)
 
@@ -245,9 +247,10 @@ class GaussianProcess:
         return Neighbours(self.known)
 
     def mean_and_variance(self, position: Tensor) -> tuple[Tensor, Tensor]:
-        """Return posterior mean (m, K) and variance (m,) at positions (m, 3), by one search for neighbours."""
+        """Return posterior mean (m, K) and variance (m,) at positions (m, 3), by one kernel matrix or one search."""
         if self.is_exact:
-            return self.mean(position), self.variance(position)
+            cross = self._cross(position)
+            return cross.to(self.coefficient) @ self.coefficient, self._variance(cross)
         number, weight, variance = self._local(position)
         return torch.einsum("mk,mkc->mc", weight, self.value[number].double()), variance
 

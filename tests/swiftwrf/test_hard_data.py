@@ -174,11 +174,11 @@ def test_rssi_falls_with_the_distance_beyond_the_data_and_grows_uncertain():
     for data in (floor, rising):
         model = RssiModel().fit(data)
         found = model.predict(at)
-        assert (model.slope <= 0).all()
+        assert (model.path_loss.slope <= 0).all()
         assert (found.mean[1:] <= found.mean[1] + 0.1).all()
         assert (found.std[1:].diff(dim=0) > 0.1).all()
         updated = model.update(data.subset(torch.arange(3)))
-        assert (updated.slope[model.slope == 0] == 0).all()
+        assert (updated.path_loss.slope[model.path_loss.slope == 0] == 0).all()
 
 
 def test_path_loss_models_of_pairs_fall_with_the_distance_at_every_place():

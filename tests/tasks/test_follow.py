@@ -228,7 +228,7 @@ def test_an_update_by_the_rows_that_trained_the_model_learns_the_others(model, t
     said = capsys.readouterr()
     assert "data: 40 of 60 rows are already in the model and are left out" in said.err.replace("\n", " ")
     assert "20 measurements learnt" in said.out
-    assert len(load(tmp_path / "out" / "model.safetensors").anchor) == 60
+    assert len(load(tmp_path / "out" / "model.safetensors").region()) == 60
     options[0], options[-1] = str(tmp_path / "out" / "model.safetensors"), str(tmp_path / "again")
     assert run_command("update", options, "swiftwrf update") == 2
     assert "data: 60 of 60 rows are already in the model and are left out; give others" in capsys.readouterr().err
@@ -456,7 +456,7 @@ def test_an_update_from_files_or_a_public_data_set_writes_model_table_and_page(
     assert run_command("update", options, "swiftwrf update") == 0
     assert "10 measurements learnt" in capsys.readouterr().out
     assert {"model.safetensors", "report.html", "measurements.csv", "update.json"} <= {f.name for f in out.iterdir()}
-    assert len(load(out / "model.safetensors").anchor) == 50
+    assert len(load(out / "model.safetensors").region()) == 50
     assert run_command("update", options, "swiftwrf update") == 2
 
 

@@ -18,10 +18,11 @@ from tifffile import TiffFile, imread
 
 from swiftwrf import AngularGrid, RssiModel, Spectra, load_spectra, make_model, rssi_room
 from swiftwrf.contrib.formats.deepmimo import write_deepmimo
+from swiftwrf.contrib.map_files import write_geojson, write_geotiff, write_world_file
 from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.simulated import ShoeboxRoom
 from swiftwrf.data.writing import write_mat, write_paths, write_rssi, write_spectra
-from swiftwrf.rssi.maps import RssiMap, write_geojson, write_geotiff, write_world_file
+from swiftwrf.rssi.maps import RssiMap
 
 GRID = AngularGrid.hemisphere(8, 32)
 ORIGIN = GeodeticOrigin(48.1, 11.6)

@@ -96,7 +96,7 @@ def test_sessions_by_name():
 
 def test_kernel_is_chosen_again_without_sessions():
     model = RssiModel(validation="session").fit(of_sessions(n=60))
-    assert len(model.with_chosen_kernel().anchor) == 60
+    assert len(model.with_chosen_kernel().region()) == 60
 
 
 @pytest.mark.data

@@ -185,13 +185,13 @@ def test_rows_at_other_receivers_are_refused(short_fits, tmp_path, predictor):
 def test_unknown_positions_of_receivers_are_not_compared(tmp_path):
     unlocated = Rssi(FLOOR.rssi_dbm, FLOOR.transmitter_position, receiver_names=FLOOR.receiver_names)
     model = RssiModel().fit(unlocated)
-    assert not model.slope.any()
-    assert not model.directivity.any()
+    assert not model.path_loss.slope.any()
+    assert not model.posterior.feature[..., 2:].any()  # nor directivity
     model.save(tmp_path / "model")
     again = load(tmp_path / "model")
     assert again.receiver_position.isnan().all()
     new = replace(FLOOR.subset(torch.arange(5)), index=torch.arange(100, 105))
-    torch.testing.assert_close(again.update(new).level, model.update(new).level)
+    torch.testing.assert_close(again.update(new).path_loss.level, model.update(new).path_loss.level)
 
 
 @pytest.mark.parametrize(
