@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -230,6 +231,15 @@ def write_survey(folder: Path, name: str = "walk.csv", header: list[str] | None 
     lines = [",".join(header), *(",".join(str(v) for v in row) for row in rows)]
     (folder / name).write_text("\n".join(lines) + "\n")
     return folder / name
+
+
+def walk(seed: int = 2) -> pd.DataFrame:
+    """A walk with RSSI of four receivers in whole decibels: x, y, a, b, c, d."""
+    draw = np.random.default_rng(seed)
+    xy = np.column_stack([np.linspace(0.5, 23, 60), draw.uniform(0.4, 11, 60)]).round(2)
+    away = np.linalg.norm(xy[:, None] - draw.uniform((0, 0), (24, 12), (4, 2)), axis=2)
+    rssi = (-42 - 24 * np.log10(1 + away) + draw.normal(0, 2, (60, 4))).round()
+    return pd.DataFrame(np.column_stack([xy, rssi]), columns=["x", "y", "a", "b", "c", "d"])
 
 
 ROW = {"rows": 1, "columns": 3, "spacing_m": 0.0288, "frequency_hz": 5.2e9}  # the antennas of an Intel 5300

@@ -14,7 +14,6 @@ from samples import write_nerf2, write_nerf2_rssi, write_paths
 
 from swiftwrf import InputError, load_rssi, load_spectra, rssi_room
 from swiftwrf.data.spectra import coarsening
-from swiftwrf.data.splits import block_split, random_split, slabs, split_names
 
 N = 12
 
@@ -231,40 +230,6 @@ def test_small_archives_that_claim_much_are_refused_before_memory_is_taken(tmp_p
     with pytest.raises(InputError, match="claims"):
         load_spectra(tmp_path)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 2**20  # KiB
-
-
-def test_seeded_splits_are_partitions(generator):
-    position = torch.rand(57, 3, generator=generator)
-    for split in (lambda seed: random_split(position, seed), lambda seed: block_split(position, seed)):
-        train, test = split(3)
-        assert sorted([*train.tolist(), *test.tolist()]) == list(range(57))
-        assert len(test) in (11, 12)
-        assert split(3)[1].tolist() == test.tolist()
-        assert split(4)[1].tolist() != test.tolist()
-
-
-def test_repeats_at_one_place_share_a_slab(generator):
-    spot = torch.rand(23, 3, generator=generator, dtype=torch.float64)
-    repeated = spot.repeat_interleave(20, 0)[torch.randperm(460, generator=generator)]
-    slab = slabs(repeated, 5)
-    assert slab.unique().tolist() == [0, 1, 2, 3, 4]
-    for place in spot:
-        assert len(slab[(repeated == place).all(dim=1)].unique()) == 1
-    assert slabs(torch.zeros(10, 3), 5).bincount().tolist() == [2] * 5  # one place cannot be held out whole
-
-
-def test_files_that_only_begin_as_splits_do(tmp_path):
-    for name in ("train_index.txt", "train_index_days.txt", "train_index2.txt", "train_index (copy).txt"):
-        (tmp_path / name).touch()
-    assert split_names(tmp_path) == ["random", "days"]
-
-
-def test_slabs_are_equal_and_do_not_interleave(generator):
-    position = torch.rand(50, 3, generator=generator) * torch.tensor([1.0, 20.0, 1.0])
-    slab = slabs(position, 5)
-    assert slab.bincount().tolist() == [10] * 5
-    means = [position[slab == i, 1].mean() for i in range(5)]
-    assert means == sorted(means) or means == sorted(means, reverse=True)
 
 
 def test_coarsen_averages(nerf2):
