@@ -2,13 +2,27 @@
 
 import io
 import json
+import pickle
 import zlib
 
 import numpy as np
 import pytest
-from fuzz.kinds import DATA, N
+from fuzz.kinds import DATA, SNAPSHOTS, N
 from PIL import Image
-from samples import array_yml, bfee, nexmon, nexmon_payload, pcap, write_dichasus, write_paths, write_records
+from samples import (
+    FREQUENCY,
+    array_yml,
+    bfee,
+    nexmon,
+    nexmon_payload,
+    pcap,
+    snapshot_arrays,
+    write_deepmimo,
+    write_dichasus,
+    write_paths,
+    write_records,
+    write_snapshots,
+)
 
 from swiftwrf import InputError
 from swiftwrf.errors import MAX_LENGTH
@@ -154,6 +168,54 @@ PATHS = [
 ]
 
 
+def stored(**changes):
+    return lambda folder: write_snapshots(folder, data=SNAPSHOTS, **changes)
+
+
+def csi(change):
+    return stored(csi=change(SNAPSHOTS.channel.numpy()))
+
+
+def elements(change):
+    return stored(element_position=change(snapshot_arrays(SNAPSHOTS)["element_position"]))
+
+
+SNAPSHOT_ARRAYS = [
+    ("must hold complex numbers", csi(np.abs)),
+    ("join real and imaginary parts", csi(lambda c: np.stack([c.real, c.imag], -1))),
+    (r"give csi.transpose\(0, 2, 1\)", csi(lambda c: c.transpose(0, 2, 1))),
+    ("4 elements", csi(lambda c: c[..., :3])),
+    ("for 12 positions", csi(lambda c: c[:5])),
+    ("row 7 has no power", csi(lambda c: c * (np.arange(N) != 7)[:, None, None])),
+    ("row 0 has no power", csi(lambda c: c + np.nan)),
+    ("no power, or more than numbers hold", csi(lambda c: c + np.inf)),
+    ("values at 1 elements", csi(lambda c: c * (np.arange(4) == 3))),
+    ("lacks csi", stored(csi=None)),
+    ("the array must rest", stored(array_position=np.zeros((N, 3)))),
+    ("1 to 2 elements at one place", elements(lambda e: e[[0, *range(3)]])),
+    ("wavelengths", elements(lambda e: 1000 * e)),
+    ("along z", elements(lambda e: e[:, [2, 0, 1]])),
+    ("lacks the array", stored(element_position=None)),
+    ("whole numbers", stored(element_position=None, rows=4.5, columns=4, spacing_m=0.06)),
+    ("lacks array_orientation", stored(array_orientation=None)),
+    ("Euler angles", stored(array_orientation=np.zeros(3))),
+    ("unit quaternion", stored(array_orientation=np.ones(4))),
+    ("the array's normal", stored(array_orientation=None, array_normal=1.0)),
+    (r"shape \(n, 3\)", stored(position=np.zeros((N, 2)))),
+    ("equal to array_position", stored(position=np.tile([0.2, 2.4, 1.2], (N, 1)))),
+    ("position must be real", stored(position=np.ones((N, 3), complex))),
+    ("carrier in Hz", stored(frequency_hz=2.4)),
+    ("frequency_hz", stored(frequency_hz=np.full(7, FREQUENCY))),
+    ("time has 3 rows", stored(time=np.zeros(3))),
+    (r"\(it is no zip archive\)$", {"snapshots.npz": pickle.dumps({"csi": 1})}),  # without advice to load a pickle
+]
+
+
+def of_rays(**changes):
+    """Change arrays of a folder of DeepMIMO, each computed from all."""
+    return lambda folder: write_deepmimo(folder, **changes)
+
+
 def traced(name, values):
     return lambda folder: np.savez(folder / f"{name}_t000_tx000_r001.npz", **{name: values})
 
@@ -167,6 +229,17 @@ DEEPMIMO = [
     ("rx_pos of pair", traced("rx_pos", np.zeros((3, 3)))),
     ("must be finite", traced("rx_pos", np.full((N, 3), np.nan))),
     ("no receiver with a path", traced("power", np.full((N, 25), np.nan))),
+    *(
+        (
+            "look like radians",
+            of_rays(**{name: lambda a, name=name: np.deg2rad(a[name]) for name in ("aoa_az", "aoa_el")}),
+        ),
+        ("of propagation", of_rays(aoa_el=lambda a: 180 - a["aoa_el"], aoa_az=lambda a: a["aoa_az"] + 180)),
+        ("x and y are swapped", of_rays(**{n: lambda a, n=n: a[n][:, [1, 0, 2]] for n in ("rx_pos", "tx_pos")})),
+        ("turns clockwise", of_rays(aoa_az=lambda a: -a["aoa_az"])),
+        ("not in metres", of_rays(rx_pos=lambda a: 1000 * a["rx_pos"])),
+        ("not in metres or delays not in seconds", of_rays(delay=lambda a: 1e9 * a["delay"])),
+    ),
 ]
 
 
@@ -272,6 +345,7 @@ REFUSED = {
     "format of spectra nerf2": SPECTRA,
     "format of RSSI nerf2": RSSI,
     "format of spectra paths": PATHS,
+    "format of array snapshots snapshots": SNAPSHOT_ARRAYS,
     "format of spectra deepmimo": DEEPMIMO,
     "format of array snapshots records": RECORDS,
     "records with offsets": DICHASUS,
