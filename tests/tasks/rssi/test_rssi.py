@@ -140,14 +140,9 @@ def test_whole_run(small, tmp_path):
         assert run("--rx", "1", "receiver06", *floor, "--also", "nerf2", "--out", tmp_path / "run") == 0
     out = tmp_path / "run"
     metrics = json.loads((out / "metrics.json").read_text(), parse_constant=lambda name: pytest.fail(name))
-    assert (metrics["task"], metrics["data"], metrics["split"]) == ("rssi", "simulated-floor", "random")
     assert set(metrics["overall"]) == set(RSSI_PREDICTORS) - {"pairs", "knn_pairs"}  # which are for two moving ends
     assert set(metrics["receivers"]) == {"receiver01", "receiver06"}
     assert set(metrics["seconds"]) == {"fit", "predict"}
-    errors = pd.read_csv(out / "errors.csv")
-    own = errors[errors.method == "knn"].abs_error_db
-    assert metrics["overall"]["knn"]["abs_error_db"]["median"] == pytest.approx(own.median())
-    assert metrics["overall"]["knn"]["abs_error_db"]["n"] == len(own)
     predictions = pd.read_csv(out / "predictions.csv")
     assert list(predictions) == ["x", "y", "z", "receiver", "measured", "predicted", "low", "high"]
     assert (predictions.low <= predictions.predicted).all()
