@@ -7,7 +7,7 @@ import pytest
 import torch
 from rooms import mirror_room
 from small import FLOOR as FLOOR_PLANE
-from small import few_kernels, short_path_gains
+from small import small
 
 from swiftwrf import (
     FieldModel,
@@ -53,7 +53,7 @@ def given_room(data):
 @pytest.fixture(scope="module")
 def models(room):
     known = given_room(room)
-    with short_path_gains(), few_kernels():
+    with small("path gains", "kernels"):
         closed_form = [make_model(name).fit(room) for name in ("gp", "coarray")]
         return [*closed_form, known, HybridModel().fit(room, like=known)]
 
