@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tomllib
 from dataclasses import fields, replace
+from functools import partial
 from itertools import count
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import pytest
 import torch
 from fuzz.kinds import DATA
 from samples import FREQUENCY, install, snapshots, write_paths
+from small import known_planes
 
 import swiftwrf
 from augment import Mixed
@@ -22,18 +24,20 @@ from augment.estimators import ESTIMATORS
 from augment.estimators.kernel_regression import KernelRegression
 from augment.estimators.subspace import SnapshotEstimator
 from augment.testing import check_estimator
-from swiftwrf import AngularGrid, InputError, Spectra, make_model, rssi_room
+from swiftwrf import AngularGrid, InputError, Spectra, make_model, rssi_room, simulated_room
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.contrib.comparison.rssi import make_predictor
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.locate import MatchedField, RssiLocator
 from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.base import model_type as model_type_of
+from swiftwrf.models.geometry import Plane
 from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.testing import check_field_model, check_not_fitted, check_predictor, check_reader
 
 OPTIONS = {"swiftwrf": {"n_primitives": 24}}
 NOT_DIFFERENTIABLE = {"nearest", "raytrace"}  # piecewise constant; its ray tracer gives no gradients
+WITHOUT_GRADIENT = {"mean", "knn", "mri_residual", "gp", "knn_pairs"}
 ON_GPU = {"swiftwrf", "swiftwrf_paper", "nerf2", "wrfgs", "vae", "dcgan"}  # the other models stay on the CPU
 FORMATS = {f"{kind.kind} {name}": kind for kind in (SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS) for name in kind}
 
@@ -61,7 +65,7 @@ def test_field_models(small_published, floor_alone, room, device, name):
 def test_predictors(small_published, short_fits, name):
     train, test = rssi_room(n=60).columns([0, 1, 2, 3]).split("random")
     predictor = make_predictor(name, validation="block")
-    check_predictor(predictor, train)
+    check_predictor(predictor, train, is_differentiable=name not in WITHOUT_GRADIENT)
     prediction = predictor.predict(test.transmitter_position)
     assert (prediction.std is not None) == (name in ("swiftwrf", "pairs"))
     assert (prediction.mean - test.rssi_dbm).abs().nanmedian() < (100 if name == "nerf2" else 9)  # in so few steps
@@ -83,16 +87,32 @@ def test_readers(tmp_path, name):
 
 
 @pytest.mark.parametrize("kind", [RssiLocator, MatchedField])
-def test_locators_before_their_fit(kind):
-    check_not_fitted(kind())
+def test_locators_before_their_fit(tmp_path, kind):
+    locator = kind()
+    check_not_fitted(locator)
+    assert repr(locator) == f"{kind.__name__}(not fitted)"
+    for use in (lambda: locator.locate(torch.zeros(1, 12)), lambda: locator.save(tmp_path / "locator")):
+        with pytest.raises(InputError, match="call fit first"):
+            use()
     with pytest.raises(AttributeError, match="no attribute 'predcit'"):
-        kind().predcit  # noqa: B018
+        locator.predcit  # noqa: B018
+
+
+@pytest.mark.parametrize("name", ["geometry", "hybrid"])
+def test_rooms_of_a_moving_receiver(short_fits, name):
+    model, walls = make_model(name), [Plane((1.0, 0.0, 0.0), 6.0, -0.5), Plane((0.0, 0.0, -1.0), 0.0, -0.5)]
+    with known_planes(*walls):
+        check_field_model(model, simulated_room(n=40, moving="receiver", grid=AngularGrid.hemisphere(10, 40)))
+    if name == "hybrid":
+        assert model.mixing_weight > 0
+        assert model.process.value.shape[1]
 
 
 # mistakes
 
 
 COUNT = count(1)
+WITHOUT_GRADIENTS = partial(check_predictor, is_differentiable=False)
 IDW, MEAN, NEAREST = FIELD_MODELS["idw"], RSSI_PREDICTORS["mean"], ESTIMATORS["nearest_spectrum"]
 
 
@@ -144,7 +164,7 @@ MISTAKES = {
 def test_a_mistake_is_found(tmp_path, monkeypatch, words):
     monkeypatch.setattr(Saved, "kinds", dict(Saved.kinds))
     base, methods = MISTAKES[words]
-    checks = {IDW: check_field_model, MEAN: check_predictor, NEAREST: check_estimator}
+    checks = {IDW: check_field_model, MEAN: WITHOUT_GRADIENTS, NEAREST: check_estimator}
     check = checks.get(base, lambda reader: check_reader(reader, write_paths(tmp_path)))
     with pytest.raises(AssertionError, match=f"Mistaken.*{words}"):
         check(type("Mistaken", (base,), {"kind": "mistaken", **methods})())

@@ -328,16 +328,6 @@ def test_a_locator_whose_numbers_overflow_is_refused(closed_form, name, value, s
         MatchedField.from_state(damaged, header).locate(test.spectrum[:2])
 
 
-@pytest.mark.parametrize("locator", [MatchedField, RssiLocator])
-def test_a_locator_that_is_not_fitted_is_refused(locator, tmp_path):
-    unfitted = locator()
-    assert repr(unfitted) == f"{locator.__name__}(not fitted)"
-    with pytest.raises(InputError, match="call fit first"):
-        unfitted.locate(torch.zeros(1, 12))
-    with pytest.raises(InputError, match="call fit first"):
-        unfitted.save(tmp_path / "locator.safetensors")
-
-
 def test_values_have_the_density_of_a_common_offset_and_missing_ones_count_as_missing():
     observed = torch.tensor([[-61.0, math.nan, -84.0], [-50.0, -71.0, -80.0]], dtype=torch.float64)
     maps = torch.tensor([[-60.0, -70.0, -80.0], [-55.0, -66.0, -75.0]]), torch.tensor([[2.0, 3, 4], [1, 2, 5]])
