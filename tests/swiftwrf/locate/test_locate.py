@@ -477,26 +477,22 @@ def kalman(observed, variances):
     return torch.tensor(found, dtype=torch.float64)
 
 
+@pytest.mark.parametrize("is_timed", [True, False])
 @pytest.mark.parametrize("is_shared", [True, False])
-def test_a_random_walk_has_the_means_of_the_kalman_smoother(is_shared):
-    truth, observed = walk()
+def test_a_random_walk_has_the_means_of_the_kalman_smoother(is_shared, is_timed):
+    """The time between observations widens the step."""
+    truth, observed = walk(n=30 if is_timed else 60)
+    time = torch.arange(30.0, dtype=torch.float64).square() / 10 if is_timed else None
     at = line() if is_shared else line().expand(len(observed), -1, -1).contiguous()
     alone = gaussian(at, observed)
-    found = smoothed(alone, None, STEP_M)
-    expected = kalman(observed, [STEP_M**2 + 0.1**2 / 6] * (len(observed) - 1))
-    assert (found.mean[:, 0] - expected).abs().max() < 0.05
-    error, before = ((p.mean[:, 0] - truth).square().mean().sqrt() for p in (found, alone))
-    assert error < 0.6 * before
-    assert found.weight.sum(dim=1).allclose(torch.ones(len(observed), dtype=torch.float64))
-
-
-def test_the_time_between_observations_widens_the_step():
-    _, observed = walk(n=30)
-    time = torch.arange(30.0, dtype=torch.float64).square() / 10
-    found = smoothed(gaussian(line(), observed), time, STEP_M)
-    expected = kalman(observed, ((STEP_M * time.diff()) ** 2 + 0.1**2 / 6).tolist())
+    found = smoothed(alone, time, STEP_M)
+    step = STEP_M * (time.diff() if is_timed else torch.ones(len(observed) - 1))
+    expected = kalman(observed, (step**2 + 0.1**2 / 6).tolist())
     inside = expected[:, None].sub(torch.tensor([0.0, 30.0])).abs().amin(dim=1) > 5  # away from the ends of the line
-    assert (found.mean[:, 0] - expected)[inside].abs().max() < 0.1
+    assert (found.mean[:, 0] - expected)[inside].abs().max() < (0.1 if is_timed else 0.05)
+    error, before = ((p.mean[:, 0] - truth).square().mean().sqrt() for p in (found, alone))
+    assert is_timed or error < 0.6 * before
+    assert found.weight.sum(dim=1).allclose(torch.ones(len(observed), dtype=torch.float64))
 
 
 def test_products_in_chunks_are_the_same(monkeypatch):

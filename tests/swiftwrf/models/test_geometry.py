@@ -1,7 +1,7 @@
 """Rooms in closed form found again, conclusions on what is not identifiable, samples, state."""
 
 from copy import copy
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -420,16 +420,7 @@ def test_the_same_seed_finds_the_same_room(noisy):
 def test_json_and_images_describe_the_room(room):
     content = room.to_json()
     assert set(content) == {"planes", "order", "score_held_out", "unexplained"}
-    assert set(content["planes"][0]) == {
-        "normal",
-        "offset_m",
-        "gain",
-        "std_mm",
-        "probability",
-        "rival_m",
-        "certain",
-        "dielectric",
-    }
+    assert set(content["planes"][0]) == {*(field.name for field in fields(Plane)), "certain"}
     position, gain, order = room.image_sources()
     assert len(position) == len(gain) == len(order) == 25
     assert torch.equal(position[0], room.fixed_position)
