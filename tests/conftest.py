@@ -12,7 +12,7 @@ from filelock import FileLock
 from PIL import Image
 from small import FLOOR, known_planes, small
 
-from swiftwrf import AngularGrid, InputError, Spectra, make_model, simulated_room
+from swiftwrf import AngularGrid, GeometryModel, InputError, Spectra, make_model, simulated_room
 from swiftwrf.contrib.raytraced import sionna
 from swiftwrf.data.writing import write_spectra
 
@@ -84,6 +84,13 @@ small_published = during_a_test(small, "published")
 short_searches = during_a_test(small, "searches")
 short_fits = during_a_test(small, "kernels", "distributions", "path gains")
 floor_alone = during_a_test(known_planes, FLOOR)  # the only plane that any search finds
+
+
+@pytest.fixture(scope="module")
+def without_furniture() -> Iterator[None]:
+    """No search for furniture, which takes most of the time of a fit to channels, and has tests of its own."""
+    with mock.patch.object(GeometryModel, "_furnish"):
+        yield
 
 
 @pytest.fixture

@@ -37,6 +37,8 @@ PUBLISHED: dict[str, Config] = {
 PAPER = SwiftWRFPaperConfig(n_primitives=4, steps=30, check_every=5)
 PUBLISHED_RSSI = NeRF2RssiConfig(width=8, bands=2, samples=4, azimuths=4, elevations=2, **LONGER)
 FEW_CELLS = MatchedFieldConfig(max_cells=2000, n_best=40, n_background=20, n_rounds=1, n_calibration=16)
+COARSE = {"spacing": 1.0, "max_cells": 500, "n_best": 20, "n_background": 10, "n_split": 4, "n_rounds": 2}
+COARSEST = {"spacing": 4.0, "max_cells": 100, "n_best": 10, "n_background": 5, "n_split": 2, "n_calibration": 10}
 GLANCE = GeometryConfig(
     search_distance_m=0.5, n_search_positions=10, beam_width=1, max_order=1, max_extra_planes=0
 )  # a short search that finds little

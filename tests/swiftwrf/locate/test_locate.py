@@ -9,6 +9,7 @@ import pytest
 import torch
 from quick import command
 from rooms import mirror_room
+from small import COARSEST
 
 from swiftwrf import AngularGrid, InputError, Rssi, load, rssi_room, simulated_room
 from swiftwrf.array.angles import angular_distance, to_direction
@@ -305,8 +306,7 @@ def test_spectra_at_one_position_are_held_out_together():
     train = simulated_room(n=24, seed=3, grid=AngularGrid.hemisphere(15, 60))
     twice = train.subset(torch.arange(len(train)).repeat_interleave(2))
     room = GeometryModel.of_planes(train, ROOM)
-    coarse = {"spacing": 4.0, "max_cells": 100, "n_best": 10, "n_background": 5, "n_split": 2, "n_calibration": 10}
-    once, repeated = (MatchedField(**coarse).fit(some, room=room).likelihoods for some in (train, twice))
+    once, repeated = (MatchedField(**COARSEST).fit(some, room=room).likelihoods for some in (train, twice))
     # errors of path gains that follow the position, which a spectrum at the same position would lower
     assert repeated.coarray[1].scale.trace() == pytest.approx(float(once.coarray[1].scale.trace()), rel=0.1)
 
