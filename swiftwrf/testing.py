@@ -63,19 +63,18 @@ def check_field_model(
     if model.requires:
         require_refusal(model, f"spectra without {' and '.join(model.requires)}", lambda: model.fit(bare))
     require(model, model.fit(data, device=device) is model and model.is_fitted, "fit does not return the fitted model")
-    require(
-        model, not any(tensor.requires_grad for tensor in model.parameters()), "fit leaves parameters with gradients"
-    )
+    is_trained = any(tensor.requires_grad for tensor in model.parameters())
+    require(model, not is_trained, "fit leaves parameters that require gradients")
     require(model, model.region().device.type == "cpu", "region is not on the CPU")
     position = data.position[:3] + torch.tensor([0.05, -0.03, 0.02], dtype=torch.float64)
     prediction = model.predict(position)
     mean = prediction.mean
     _check_prediction(model, model.predict, position, (3, *data.grid.shape), atol=2e-5)
     require(model, mean.dtype == torch.float32 and mean.device == model.device, "the mean is not float32 on its device")
-    require(model, bool(((mean >= 0) & (mean <= 1)).all()), "the mean is outside [0, 1]")
+    require(model, ((mean >= 0) & (mean <= 1)).all(), "the mean is outside [0, 1]")
     require(model, torch.equal(model.synthesize(position), mean), "synthesize gives another mean than predict")
     far = torch.tensor([[1e7] * 3, [1e9] * 3], dtype=torch.float64)
-    require(model, bool(model.synthesize(far).isfinite().all()), "the mean far away is not finite")
+    require(model, model.synthesize(far).isfinite().all(), "the mean far away is not finite")
     require_refusal(model, "positions in a plane", lambda: model.predict(torch.zeros(4, 2)), "shape (n, 3)")
     require_refusal(model, "a position of nan", lambda: model.predict(torch.full((1, 3), torch.nan)), "finite")
     _check_gradient(model, lambda at: model.predict(at).mean, position, is_differentiable)
@@ -83,6 +82,10 @@ def check_field_model(
     if model.any_grid:  # on a grid twice as fine, every second pixel is the same
         for of_fine, part in zip(_parts(model.predict(position, fine)), _parts(prediction), strict=True):
             close(model, of_fine[:, 1::2, ::2], part, "a finer grid gives other values", 1e-4)
+        odd = model.synthesize(position, AngularGrid.hemisphere(7, 30))
+        require(
+            model, odd.shape == (3, 7, 30), f"a grid of 7 x 30 directions gives spectra of shape {tuple(odd.shape)}"
+        )
     else:
         require_refusal(model, "another grid", lambda: model.predict(position, fine))
     if type(model).saved == FieldModel.saved:
@@ -91,7 +94,7 @@ def check_field_model(
         check_saved(model, lambda loaded: loaded.predict(position))
     if type(model).accepts_like(model):
         again = type(model)(model.config).fit(data.subset(torch.arange(30)), like=model)
-        require(model, bool(again.predict(position).mean.isfinite().all()), "a fit with its structure is not finite")
+        require(model, again.predict(position).mean.isfinite().all(), "a fit with its structure is not finite")
 
 
 def check_predictor(predictor: RssiPredictor, data: Rssi | None = None, *, is_differentiable: bool = True) -> None:
@@ -125,12 +128,12 @@ def check_predictor(predictor: RssiPredictor, data: Rssi | None = None, *, is_di
         part = partial(lambda at, number: _parts(predictor.predict(at))[number], number=number)
         _check_gradient(predictor, part, position, is_differentiable)
     far = _parts(predictor.predict(torch.tensor([[1e8, 0.0, 0.0]])))
-    require(predictor, all(bool(part.isfinite().all()) for part in far), "a prediction far away is not finite")
+    require(predictor, all(part.isfinite().all() for part in far), "a prediction far away is not finite")
     renamed = replace(data, receiver_names=tuple(f"z{99 - number}" for number in range(len(data.receiver_names))))
     again = _parts(kind(predictor.config).fit(renamed).predict(position))
     close(predictor, torch.cat(again), torch.cat(parts), "names of receivers change a prediction", atol=1e-3)
     detection = predictor.predict_detection(position)
-    require(predictor, bool(((detection >= 0) & (detection <= 1)).all()), "the probability of detection leaves [0, 1]")
+    require(predictor, ((detection >= 0) & (detection <= 1)).all(), "the probability of detection leaves [0, 1]")
     require_refusal(predictor, "positions in a plane", lambda: predictor.predict(torch.zeros(4, 2)), "shape (n, 3)")
     rare = data.rssi_dbm.clone()
     rare[:, 0] = rare[1:, 1] = torch.nan
@@ -140,9 +143,7 @@ def check_predictor(predictor: RssiPredictor, data: Rssi | None = None, *, is_di
             require_refusal(predictor, "data that lack a requirement", partial(predictor.fit, rows), lacking)
         else:
             mean = kind(predictor.config).fit(rows).predict(position).mean
-            require(
-                predictor, bool(mean.isfinite().all()), "the mean at receivers that are rarely detected is not finite"
-            )
+            require(predictor, mean.isfinite().all(), "the mean is not finite at receivers that are rarely detected")
     if isinstance(predictor, Saved):
         check_saved(predictor, lambda loaded: loaded.predict(position))
 
@@ -190,22 +191,16 @@ def check_reader(reader: Format[Any] | type[Format[Any]], path: str | Path, opti
                 except InputError:
                     continue
                 except Exception as error:
-                    raise AssertionError(
-                        f"{_name(reader)}: a damaged {file.name} raises {error!r}, not InputError"
-                    ) from error
+                    require(reader, False, f"a damaged {file.name} raises {error!r}, not InputError")
 
 
 # what the checks share
 
 
-def _name(subject: object) -> str:
-    return type(subject).__name__
-
-
-def require(subject: object, holds: bool, sentence: str) -> None:
-    """Raise AssertionError with the class and a sentence unless something holds."""
+def require(subject: object, holds: bool | Tensor, sentence: str) -> None:
+    """Raise AssertionError with the class and a sentence unless a condition holds."""
     if not holds:
-        raise AssertionError(f"{_name(subject)}: {sentence}")
+        raise AssertionError(f"{type(subject).__name__}: {sentence}")
 
 
 def require_refusal(subject: object, what: str, call: Callable[[], object], words: str = "") -> None:
@@ -221,7 +216,12 @@ def require_refusal(subject: object, what: str, call: Callable[[], object], word
 def close(subject: object, tensor: Tensor, expected: Tensor, sentence: str, atol: float) -> None:
     """Require that a tensor is close to another one, of the same shape and type."""
     torch.testing.assert_close(
-        tensor, expected, atol=atol, rtol=0, equal_nan=True, msg=lambda text: f"{_name(subject)}: {sentence}. {text}"
+        tensor,
+        expected,
+        atol=atol,
+        rtol=0,
+        equal_nan=True,
+        msg=lambda text: f"{type(subject).__name__}: {sentence}. {text}",
     )
 
 
@@ -237,9 +237,7 @@ def check_not_fitted(model: Configured) -> None:
                 except NotFitted:  # a property that no fit determines has a value
                     pass
                 except Exception as error:
-                    raise AssertionError(
-                        f"{_name(model)}: {name} before the fit raises {error!r}, not NotFitted"
-                    ) from error
+                    require(model, False, f"{name} before the fit raises {error!r}, not NotFitted")
 
 
 def check_saved(model: Saved, predict: Callable[[Any], Prediction | Tensor]) -> None:
@@ -248,12 +246,11 @@ def check_saved(model: Saved, predict: Callable[[Any], Prediction | Tensor]) -> 
         model.save(Path(folder, "model"))
         loaded = load(Path(folder, "model"))
     require(
-        model, type(loaded) is type(model) and loaded.config == model.config, "a file gives another class or options"
+        model, (type(loaded), loaded.config) == (type(model), model.config), "a file gives another class or options"
     )
     for of_file, expected in zip(_parts(predict(loaded)), _parts(predict(model)), strict=True):
-        close(
-            model, of_file, expected, "a file gives other predictions", 1e-6 if expected.device.type == "cpu" else 1e-4
-        )
+        atol = 1e-6 if expected.device.type == "cpu" else 1e-4  # a file is loaded to the CPU
+        close(model, of_file, expected.cpu(), "a file gives other predictions", atol)
 
 
 def _parts(prediction: Prediction | Tensor) -> list[Tensor]:
@@ -270,10 +267,10 @@ def _check_prediction(
     parts, again = _parts(predict(position)), _parts(predict(position))
     for part, repeated in zip(parts, again, strict=True):
         require(model, part.shape == shape, f"a prediction has shape {tuple(part.shape)}, not {shape}")
-        require(model, bool(part.isfinite().all()), "a prediction is not finite")
+        require(model, part.isfinite().all(), "a prediction is not finite")
         require(model, torch.equal(part, repeated), "a second prediction differs from the first")
         require(model, not part.requires_grad, "a prediction requires gradients that nobody asked for")
-    require(model, len(parts) == 1 or bool((parts[1] >= 0).all()), "a standard deviation is negative")
+    require(model, (parts[-1] >= 0).all() or len(parts) == 1, "a standard deviation is negative")
     if len(parts) == 1:
         require_refusal(model, "an interval", predict(position).interval, "no standard deviation")
     for part, *each in zip(parts, *(_parts(predict(one[None])) for one in position), strict=True):
@@ -297,13 +294,10 @@ def _check_gradient(
     require(model, sums.requires_grad == is_differentiable, f"is_differentiable={is_differentiable} is not so")
     if is_differentiable:
         (gradient,) = torch.autograd.grad(sums.sum(), position)
+        steps = torch.tensor(STEPS_M, dtype=torch.float64)[:, None, None] * torch.eye(3, dtype=torch.float64)
         with torch.no_grad(), torch.backends.cudnn.flags(allow_tf32=False):  # whose 10 bits drown differences on a GPU
-            by_step = [
-                torch.stack([total(position + step) - total(position - step) for step in size * torch.eye(3)], dim=1)
-                / (2 * size)
-                for size in STEPS_M
-            ]
-        first, second = by_step
+            ends = [[total(position + step) - total(position - step) for step in axes] for axes in steps]
+        first, second = (torch.stack(end, dim=1) / (2 * step) for end, step in zip(ends, STEPS_M, strict=True))
         expected = first.where((first - gradient).abs() <= (second - gradient).abs(), second)
         atol = 0.03 * float(first.abs().max())
         close(model, gradient, expected, "gradients are not those of finite differences in metres", atol)

@@ -13,7 +13,7 @@ from pathlib import Path
 from unittest import mock
 
 from matplotlib.figure import Figure
-from small import FEW_CELLS, glances, known_planes, small
+from small import FEW_CELLS, glances, known_planes, only, small
 
 from augment.estimators import ESTIMATORS, kernel_regression
 from augment.estimators.baselines import Constant
@@ -34,7 +34,6 @@ TASKS = {
     name: (getattr(configs, command.options), import_module(command.module).run) for name, command in COMMANDS.items()
 }
 FOR_LIFE = ExitStack()
-PREDICTORS_KEPT = ("swiftwrf", "mean", "mri_pooled", "mri_receiver")
 
 
 class QuickNetwork(Constant):
@@ -76,12 +75,11 @@ def cheap() -> Iterator[None]:
     """Small parts for runs and examples on any data: glances for rooms, few primitives, cells and predictors, no network."""
     with (
         glances(),
-        small("primitives", "cells", "kernels", "distributions", "path gains", "furniture"),
+        small("primitives", "cells", "kernels", "distributions", "path gains", "furniture", "maps"),
         mock.patch("augment.turbo.stages.HELD_OUT_LOCATOR", FEW_CELLS),
         mock.patch.multiple(kernel_regression, MAX_ROWS=400, MAX_CHOICE_ROWS=150),
-        mock.patch("swiftwrf.rssi.maps.CELLS", 8),
-        mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
-        mock.patch.object(RSSI_PREDICTORS, "_registered", {name: RSSI_PREDICTORS[name] for name in PREDICTORS_KEPT}),
+        only(ESTIMATORS, *ESTIMATORS, **dict.fromkeys(NETWORKS.values(), QuickNetwork)),
+        only(RSSI_PREDICTORS, "swiftwrf", "mean", "mri_pooled", "mri_receiver"),
     ):
         yield
 

@@ -22,7 +22,8 @@ from swiftwrf.models.geometry.planes import Plane, RoomEstimate
 from swiftwrf.models.geometry.search import Search
 from swiftwrf.models.swiftwrf import SwiftWRFConfig
 from swiftwrf.models.swiftwrf_paper import SwiftWRFPaperConfig
-from swiftwrf.rssi import RssiConfig
+from swiftwrf.rssi import RssiConfig, maps
+from swiftwrf.runtime.registry import Registry
 from swiftwrf.runtime.validation import configuration
 
 FIT = SwiftWRFConfig(n_primitives=16)  # the search for their number has its own tests
@@ -72,6 +73,7 @@ SIZES: dict[str, list[tuple[Any, Any]]] = {
     "distributions": [(spectrum_likelihood, {"DEGREES": (5.0,)})],
     "path gains": [(PRIORS, {"tight": replace(PRIORS["tight"], steps=15)})],
     "furniture": [(furniture, {"SETTINGS": furniture.SETTINGS[:1], "N_STEPS": 10, "MIN_HELD_OUT": 20})],
+    "maps": [(maps, {"CELLS": 8})],
     "searches": [
         (search, {"SIGNS": search.SIGNS[:1], "MAX_ALTERNATIVES": {2: 5, 3: 2}, "MAX_MOVES": 1, "N_REFINED": 2}),
         (search, {"N_HORIZONTAL_NORMALS": 20, "N_SPHERE_NORMALS": 20}),
@@ -92,6 +94,13 @@ def small(*groups: str) -> Iterator[None]:
             else:
                 patch = mock.patch.object(owner, "config_type", with_defaults(values))
             patches.enter_context(patch)
+        yield
+
+
+@contextmanager
+def only(registry: Registry[Any], *names: str, **others: Any) -> Iterator[None]:
+    """Let a registry have these of its names alone, and other implementations."""
+    with mock.patch.object(registry, "_registered", {name: registry[name] for name in names} | others):
         yield
 
 

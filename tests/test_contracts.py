@@ -50,8 +50,12 @@ def device(request):
 @pytest.mark.parametrize("name", FIELD_MODELS)
 def test_field_models(small_published, floor_alone, room, device, name):
     model = make_model(name, **OPTIONS.get(name, {}))
+    assert repr(model) == f"{type(model).__name__}(not fitted)"
+    with pytest.raises(InputError, match="call fit first"):
+        model.state()
     check_field_model(model, room, device=device, is_differentiable=name not in NOT_DIFFERENTIABLE)
     assert type(model) is FIELD_MODELS[name]
+    assert repr(model) == f"{type(model).__name__}(fitted, 15 x 60 directions)"
     assert model.name == name
     assert FIELD_MODELS.summary(name)
     assert model.device.type == (device if name in ON_GPU else "cpu")
@@ -146,7 +150,7 @@ MISTAKES = {
     "a file gives other predictions": (IDW, {"_restored": lambda self: self.position.mul_(2)}),
     "requires names an unknown property": (IDW, {"requires": ("weather",)}),
     "fit does not return the": (MEAN, {"fit": lambda self, *rows, **_: MEAN.fit(self, *rows) and None}),
-    "receivers that are rarely detected is not finite": (
+    "not finite at receivers that are rarely detected": (
         MEAN,
         {"_fit": lambda self, train, **_: setattr(self, "_mean", train.rssi_dbm.nanmean(dim=0))},
     ),

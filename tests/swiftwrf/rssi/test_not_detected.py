@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from small import only
 from test_floors import FLOOR_DB, RECEIVERS, building, rssi
 
 from swiftwrf import Rssi, RssiModel, load, rssi_room
@@ -147,8 +148,8 @@ def test_a_receiver_seen_at_one_distance_has_the_slope_of_all():
     assert float(found.std[0, 0]) > float(found.std[2, 0]) + 0.5  # the trend is uncertain far from the rows
 
 
-def test_detections_are_predicted_and_scored(fitted, monkeypatch):
-    monkeypatch.setattr(RSSI_PREDICTORS, "_registered", {name: RSSI_PREDICTORS[name] for name in ("swiftwrf", "mean")})
+@only(RSSI_PREDICTORS, "swiftwrf", "mean")
+def test_detections_are_predicted_and_scored(fitted):
     data, _, model = fitted
     found = compare(data, split="random")
     score = found.summary()["detection"]

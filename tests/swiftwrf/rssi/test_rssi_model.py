@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import minimize
+from small import only
 
 from swiftwrf import InputError, PairModel, Rssi, RssiLocator, RssiModel, fit_rssi, rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
@@ -26,9 +27,8 @@ FIELD_DB, NOISE_DB, PATH_LOSS_STD_DB = 3.0, 2.0, 30.0
 CPU, FIRST = torch.device("cpu"), 0
 
 
-def test_errors_by_the_number_of_training_rows(monkeypatch, tmp_path):
-    kept = {name: RSSI_PREDICTORS[name] for name in ("swiftwrf", "mean", "knn")}
-    monkeypatch.setattr(RSSI_PREDICTORS, "_registered", kept)
+@only(RSSI_PREDICTORS, "swiftwrf", "mean", "knn")
+def test_errors_by_the_number_of_training_rows(tmp_path):
     room = rssi_room(n=200, seed=1)
     asked = []
     whole, found = compare(room, receivers=["6"]), compare(room, receivers=["6"], fewer=(0.01, 0.25, 0.5)).by_rows
@@ -343,9 +343,9 @@ def with_rare(data, n_rare=60):
     )
 
 
-def test_receivers_that_were_detected_a_few_times_choose_nothing(monkeypatch):
+@only(RSSI_PREDICTORS, "swiftwrf")
+def test_receivers_that_were_detected_a_few_times_choose_nothing():
     data = replace(with_field(), receiver_position=torch.full((3, 3), torch.nan))
-    monkeypatch.setattr(RSSI_PREDICTORS, "_registered", {"swiftwrf": RSSI_PREDICTORS["swiftwrf"]})
     expected, found = compare(data), compare(with_rare(data))
     assert found.errors.predicted_dbm.tolist() == expected.errors.predicted_dbm.tolist()
     alone, among = fit_rssi(data), fit_rssi(with_rare(data))
