@@ -12,10 +12,10 @@ from augment import Mixed, SyntheticPositions
 from augment.estimators import Estimator
 from swiftwrf import AngularGrid, InputError, Spectra, simulated_room
 from swiftwrf.array.angles import to_direction
+from swiftwrf.contrib.testing import check_not_fitted, check_saved, close, require, require_refusal
 from swiftwrf.data.spectra import to_directions
 from swiftwrf.data.store import Store
 from swiftwrf.runtime.checkpoint import Saved
-from swiftwrf.testing import check_not_fitted, check_saved, close, require, require_refusal
 
 
 def check_estimator(estimator: Estimator, data: Spectra | None = None) -> None:

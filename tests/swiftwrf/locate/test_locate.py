@@ -25,6 +25,7 @@ from swiftwrf.locate.rssi_likelihood import METRICS, DetectionLikelihood, Finger
 from swiftwrf.locate.spectrum_likelihood import BOUNDS, PhaseLikelihood, Student
 from swiftwrf.models.geometry import GeometryModel, Plane
 from swiftwrf.models.geometry.path_gains import PathGains
+from swiftwrf.testing import check_saved
 
 SMALL = {"n_best": 60, "n_background": 40, "n_split": 8, "spacing": 0.4, "n_calibration": 40}
 ROOM = [
@@ -262,13 +263,12 @@ def test_rssi_is_located_better_than_by_fingerprints(floor):
     assert found.median() < nearest.median()
 
 
-def test_the_prior_region_can_be_given(floor, tmp_path):
+def test_the_prior_region_can_be_given(floor):
     train, test, _ = floor
     corner = Region(train.transmitter_position[train.transmitter_position[:, 0] < 5], margin=0.0, outside=0.01)
     locator = RssiLocator(n_cells=600).fit(train, region=corner)
     assert locator.locate(test.rssi_dbm).median[:, 0].max() < 5.5
-    locator.save(tmp_path / "locator.safetensors")
-    assert torch.equal(load(tmp_path / "locator.safetensors").cells.position, locator.cells.position)
+    check_saved(locator, lambda loaded: loaded.cells.position)
 
 
 def test_a_region_takes_finite_positions_of_any_kind():
@@ -281,11 +281,11 @@ def test_a_region_takes_finite_positions_of_any_kind():
             Region(given)
 
 
-def test_rows_at_one_position_are_located_there(tmp_path):
+def test_rows_at_one_position_are_located_there():
     room = rssi_room(n=60)
     locator = RssiLocator(n_cells=50).fit(replace(room, transmitter_position=torch.ones(60, 3)))
-    locator.save(tmp_path / "locator.safetensors")
-    assert torch.equal(load(tmp_path / "locator.safetensors").locate(room.rssi_dbm).median, torch.ones(60, 3).double())
+    check_saved(locator, lambda loaded: loaded.locate(room.rssi_dbm).median)
+    assert torch.equal(locator.locate(room.rssi_dbm).median, torch.ones(60, 3).double())
 
 
 def test_neighbours_that_cannot_be_held_out_are_refused():
@@ -356,7 +356,7 @@ def building():
     return Rssi(rssi, at, floors=Floors(("ground", "first"), (0.0, 3.0)))
 
 
-def test_floors_are_located_with_their_probability(building, short_fits, tmp_path):
+def test_floors_are_located_with_their_probability(building, short_fits):
     train, test = building.split()
     locator = RssiLocator(n_cells=400).fit(train)
     posterior = locator.locate(test.rssi_dbm)
@@ -367,8 +367,7 @@ def test_floors_are_located_with_their_probability(building, short_fits, tmp_pat
     assert probability.amax(dim=1).mean() == pytest.approx(float(right.double().mean()), abs=0.05)
     heights = (locator.cells.position, posterior.median.round(decimals=6))
     assert [set(position[:, 2].tolist()) for position in heights] == [{0.0, 3.0}] * 2
-    locator.save(tmp_path / "locator.safetensors")
-    assert torch.equal(load(tmp_path / "locator.safetensors").locate(test.rssi_dbm).log_weight, posterior.log_weight)
+    check_saved(locator, lambda loaded: loaded.locate(test.rssi_dbm).log_weight)
 
 
 def test_each_floor_may_be_a_session_of_its_own(building, short_fits):
