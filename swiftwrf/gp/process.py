@@ -88,8 +88,14 @@ class Kernel:
         return noisy
 
 
-def candidates(position: Tensor, noises: Sequence[float]) -> Iterator[Kernel]:
+def candidates(position: Tensor, noises: Sequence[float], *, n_lengths: int = 5, n_smooth: int = 5) -> Iterator[Kernel]:
     """Yield kernels with lengths from the extent of the positions (n, 3) [m] down, with and without a smooth part.
+
+    Args:
+        position: Positions (n, 3) [m].
+        noises: Variances of the noise.
+        n_lengths: Number of lengths of the rough part, each half the one before. Not studied.
+        n_smooth: Number of lengths of the smooth part, each half the one before. Not studied.
 
     Example:
         >>> kernels = list(candidates(torch.rand(50, 3, dtype=torch.float64), noises=[0.01]))
@@ -98,10 +104,12 @@ def candidates(position: Tensor, noises: Sequence[float]) -> Iterator[Kernel]:
     """
     extent = float((position.max(0).values - position.min(0).values).max()) or 1.0
     for noise in noises:
-        for k in range(5):
+        for k in range(n_lengths):
             length = extent / 2**k
             yield Kernel(length, extent, matern12_weight=1.0, noise=noise)
-            yield from (Kernel(length, extent / 3 / 2**j, matern12_weight=0.6, noise=noise) for j in range(1, 6))
+            yield from (
+                Kernel(length, extent / 3 / 2**j, matern12_weight=0.6, noise=noise) for j in range(1, n_smooth + 1)
+            )
 
 
 @dataclass(frozen=True, eq=False)

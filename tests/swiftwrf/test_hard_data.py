@@ -5,7 +5,7 @@ from functools import cache
 
 import pytest
 import torch
-from small import GLANCE
+from small import COARSEST, GLANCE
 
 from swiftwrf import (
     AngularGrid,
@@ -140,8 +140,7 @@ def test_matched_field_locators_of_hard_data(case):
     data = spectra(case)
     try:
         room = make_model("geometry", **SHORT).fit(data)
-        locator = MatchedField(spacing=4.0, max_cells=100, n_best=10, n_background=5, n_split=2, n_calibration=10)
-        posterior = locator.fit(data, room=room).locate(data.spectrum[:3])
+        posterior = MatchedField(**COARSEST).fit(data, room=room).locate(data.spectrum[:3])
     except InputError:
         return
     assert posterior.median.isfinite().all()
