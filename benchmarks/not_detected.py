@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -20,7 +19,6 @@ from record import options, write_result
 from swiftwrf import Rssi, RssiModel
 from swiftwrf.choices import NotDetected
 from swiftwrf.gp import Kernel
-from swiftwrf.rssi import detection
 from swiftwrf.rssi.detection import Detection
 from swiftwrf.rssi.path_loss import log_distance
 
@@ -84,9 +82,12 @@ def limits(seeds: int, insensitive_dbm: float) -> None:
     for n in (80, 300):
         surveys = [survey(seed, n, insensitive_dbm, missed=0.1)[0] for seed in range(seeds)]
         for std_db in PRIORS_DB:
-            with patch.object(detection, "LIMIT_STD_DB", std_db):
-                found = [Detection.estimate(data.transmitter_position, data.rssi_dbm) for data in surveys]
-            error = torch.stack([curve.limit for curve in found]) - torch.tensor([LIMIT_DBM, insensitive_dbm]).repeat(4)
+            curves = [
+                Detection.estimate(data.transmitter_position, data.rssi_dbm, limit_std_db=std_db) for data in surveys
+            ]
+            error = torch.stack([curve.limit for curve in curves]) - torch.tensor([LIMIT_DBM, insensitive_dbm]).repeat(
+                4
+            )
             each = [float(error[:, first::2].abs().mean()) for first in (0, 1)]
             print(f"{n} rows, prior {std_db:g} dB: limits within {each[0]:.2f} and {each[1]:.2f} dB", flush=True)
 

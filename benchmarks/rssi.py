@@ -8,8 +8,8 @@ heads whose primitives are in phase in all directions, so that they do not chang
 
 `coverage`: `swiftwrf` is fitted to the training rows of simulated floors and of measured sets with several receivers. The
 probability that any receiver is above a threshold is compared with the test scans that pass. The correlation of errors in a
-scan (`swiftwrf.rssi.coverage.CORRELATION`) is the one with the lowest Brier score on a fifth of the training rows, which the
-fit for it leaves out.
+scan (default of `swiftwrf.rssi.coverage.at_least`) is the one with the lowest Brier score on a fifth of the training rows,
+which the fit for it leaves out.
 
 The result is written after each split, and `--resume` skips the splits that it contains.
 """
@@ -112,7 +112,7 @@ def measure(data: Rssi, split: str, also: tuple[str, ...] = ()) -> Row:
     """Return errors, differences to the best baseline, coverage of intervals and seconds of every predictor on a split."""
     result = compare(data, split=split, also=also)
     # results of the others are those of the call above
-    with TemporaryDirectory() as folder, patch("swiftwrf.rssi.training.render", in_phase), patch.object(Memo, "of"):
+    with TemporaryDirectory() as folder, patch("swiftwrf.rssi.head.render", in_phase), patch.object(Memo, "of"):
         others = Memo(Path(folder))
         for name in result.values.keys() - {RssiModel.name, result.model}:
             others.keep(name, result.values[name], 0.0)
@@ -206,21 +206,20 @@ def thresholds(train: Rssi) -> list[float]:
     return [float(strongest[strongest.isfinite()].quantile(q).floor()) + 0.5 for q in QUANTILES]
 
 
-def predicted_above(model: RssiModel, scans: Rssi, threshold: float) -> Tensor:
+def predicted_above(model: RssiModel, scans: Rssi, threshold: float, **options: float) -> Tensor:
     """Return the probability that any receiver of each scan is above a threshold, (n,)."""
     found, detection = model.predict_detected(scans), model.predict_detection(scans.transmitter_position)
     assert found.std is not None
-    return at_least(1, found.mean.T, found.std.T, detection.T, threshold)
+    return at_least(1, found.mean.T, found.std.T, detection.T, threshold, **options)
 
 
 def brier(model: RssiModel, scans: Rssi, limits: list[float], correlation: float) -> float:
     """Return the mean squared error of the probability that any receiver is above thresholds, by the correlation."""
-    with patch("swiftwrf.rssi.coverage.CORRELATION", correlation):
-        errors = [
-            (predicted_above(model, scans, limit) - (scans.rssi_dbm > limit).any(dim=1).double()).square().mean()
-            for limit in limits
-        ]
-    return float(torch.stack(errors).mean())
+    errors = [
+        predicted_above(model, scans, limit, correlation=correlation) - (scans.rssi_dbm > limit).any(dim=1).double()
+        for limit in limits
+    ]
+    return float(torch.cat(errors).square().mean())
 
 
 def in_phase(heads: Iterable[Head]) -> Tensor:

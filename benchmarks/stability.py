@@ -17,7 +17,7 @@ from swiftwrf import AngularGrid, FieldModel, FitError, InputError, Spectra, Swi
 from swiftwrf.data.store import Store
 from swiftwrf.metrics import psnr
 from swiftwrf.models.swiftwrf_paper import DeformableGaussians, SwiftWRFPaper
-from swiftwrf.positions import frame
+from swiftwrf.positions import centre_and_half_side
 from swiftwrf.rasterize import Backend, rasterize_magnitude
 
 
@@ -75,7 +75,7 @@ def precision(device: torch.device) -> list[dict[str, Any]]:
     generator = torch.Generator().manual_seed(0)
     grid = AngularGrid.hemisphere(90, 360)
     anchor = torch.rand(100, 3, generator=generator)
-    model = DeformableGaussians(200, grid, *frame(anchor), generator=generator)
+    model = DeformableGaussians(200, grid, *centre_and_half_side(anchor), generator=generator)
     for parameter in (*model.primitives.parameters(), *model.output.parameters()):
         parameter.data += 0.3 * torch.randn(parameter.shape, generator=generator)
     model = model.to(device).requires_grad_(False)

@@ -79,7 +79,7 @@ def rssi(config: Config) -> list[dict[str, Any]]:
     model = fitted.update(data.subset(torch.tensor([n + REPEATS])))
     first = time.perf_counter() - began
     found = milliseconds(lambda number: model.update(data.subset(torch.tensor([n + number]))))
-    return [{"rows": n, "bins": len(fitted.anchor), "fit_s": fit, "first_update_s": first, **found}]
+    return [{"rows": n, "bins": len(fitted.region()), "fit_s": fit, "first_update_s": first, **found}]
 
 
 def scene(moving: Any, part: str, n: int, place: tuple[float, float] | None = None) -> Spectra:

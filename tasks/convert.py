@@ -12,6 +12,7 @@ import torch
 from swiftwrf import FieldModel, InputError, RssiModel, load
 from swiftwrf.contrib.diagnostics.calibration import Calibration, calibrate
 from swiftwrf.contrib.formats.deepmimo import write_deepmimo
+from swiftwrf.contrib.map_files import write_geojson, write_geotiff, write_world_file
 from swiftwrf.data import Rssi, Snapshots, Spectra
 from swiftwrf.data.dataset import Labelled
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
@@ -20,7 +21,7 @@ from swiftwrf.data.writing import write_mat, write_rssi, write_spectra
 from swiftwrf.errors import with_article
 from swiftwrf.locate import RssiLocator
 from swiftwrf.rssi.base import RssiPredictor
-from swiftwrf.rssi.maps import RssiMap, write_geojson, write_geotiff, write_world_file
+from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.durable import replacing, write_json
 from tasks.configs import FILES, MAP_FILES, ConvertConfig

@@ -2,18 +2,17 @@
 
 import os
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack
-from functools import partial
+from contextlib import AbstractContextManager
 from pathlib import Path
 from unittest import mock
 
 import pytest
-import small
 import torch
 from filelock import FileLock
 from PIL import Image
+from small import FLOOR, known_planes, small
 
-from swiftwrf import AngularGrid, InputError, Spectra, make_model, simulated_room
+from swiftwrf import AngularGrid, GeometryModel, InputError, Spectra, make_model, simulated_room
 from swiftwrf.contrib.raytraced import sionna
 from swiftwrf.data.writing import write_spectra
 
@@ -70,23 +69,28 @@ def measured_data() -> Path:
     return Path(os.environ["SWIFTWRF_DATA"])
 
 
-def during_a_test(*contexts: Callable[[], AbstractContextManager[None]]) -> Callable[..., object]:
-    """Return a fixture that is in these contexts."""
+def during_a_test(context: Callable[..., AbstractContextManager[None]], *arguments: object) -> Callable[..., object]:
+    """Return a fixture that is in this context."""
 
     @pytest.fixture
     def entered() -> Iterator[None]:
-        with ExitStack() as stack:
-            for context in contexts:
-                stack.enter_context(context())
+        with context(*arguments):
             yield
 
     return entered
 
 
-small_published = during_a_test(small.small_published)
-short_searches = during_a_test(small.short_searches)
-short_fits = during_a_test(small.few_kernels, small.one_distribution, small.short_path_gains)
-floor_alone = during_a_test(partial(small.known_planes, small.FLOOR))  # the only plane that any search finds
+small_published = during_a_test(small, "published")
+short_searches = during_a_test(small, "searches")
+short_fits = during_a_test(small, "kernels", "distributions", "path gains")
+floor_alone = during_a_test(known_planes, FLOOR)  # the only plane that any search finds
+
+
+@pytest.fixture(scope="module")
+def without_furniture() -> Iterator[None]:
+    """No search for furniture, which takes most of the time of a fit to channels, and has tests of its own."""
+    with mock.patch.object(GeometryModel, "_furnish"):
+        yield
 
 
 @pytest.fixture

@@ -13,27 +13,14 @@ from pathlib import Path
 from unittest import mock
 
 from matplotlib.figure import Figure
-from small import (
-    few_kernels,
-    glances,
-    known_planes,
-    one_distribution,
-    short_path_gains,
-    small_published,
-    small_swiftwrf,
-    with_defaults,
-)
+from small import FEW_CELLS, glances, known_planes, only, small
 
 from augment.estimators import ESTIMATORS, kernel_regression
 from augment.estimators.baselines import Constant
 from augment.turbo.condition import NETWORKS
-from swiftwrf import AngularGrid, MatchedField, Rssi, RssiModel, Spectra, rssi_room, simulated_room
+from swiftwrf import AngularGrid, Rssi, Spectra, rssi_room, simulated_room
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.errors import MAX_LENGTH
-from swiftwrf.locate import MatchedFieldConfig
-from swiftwrf.models.geometry import furniture
-from swiftwrf.rssi import RssiConfig
-from swiftwrf.runtime.validation import configuration
 from tasks import configs
 from tasks.aoa import experiment as aoa
 from tasks.aoa import synthesis
@@ -46,16 +33,7 @@ from tasks.rssi import experiment as rssi
 TASKS = {
     name: (getattr(configs, command.options), import_module(command.module).run) for name, command in COMMANDS.items()
 }
-FEW_CELLS = MatchedFieldConfig(max_cells=2000, n_best=40, n_background=20, n_rounds=1, n_calibration=16)
 FOR_LIFE = ExitStack()
-PREDICTORS_KEPT = ("swiftwrf", "mean", "mri_pooled", "mri_receiver")
-
-
-@configuration
-class QuickRssiConfig(RssiConfig):
-    """A fit without primitives, in a class that workers of a cluster find by its name."""
-
-    n_primitives: int = 0
 
 
 class QuickNetwork(Constant):
@@ -97,18 +75,11 @@ def cheap() -> Iterator[None]:
     """Small parts for runs and examples on any data: glances for rooms, few primitives, cells and predictors, no network."""
     with (
         glances(),
-        small_swiftwrf(),
-        mock.patch.object(MatchedField, "config_type", with_defaults(FEW_CELLS)),
+        small("primitives", "cells", "kernels", "distributions", "path gains", "furniture", "maps"),
         mock.patch("augment.turbo.stages.HELD_OUT_LOCATOR", FEW_CELLS),
         mock.patch.multiple(kernel_regression, MAX_ROWS=400, MAX_CHOICE_ROWS=150),
-        one_distribution(),
-        few_kernels(),
-        short_path_gains(),
-        mock.patch.multiple(furniture, SETTINGS=furniture.SETTINGS[:1], N_STEPS=10, MIN_HELD_OUT=20),
-        mock.patch.object(RssiModel, "config_type", QuickRssiConfig),
-        mock.patch("swiftwrf.rssi.maps.CELLS", 8),
-        mock.patch.dict(ESTIMATORS._registered, dict.fromkeys(NETWORKS.values(), QuickNetwork)),
-        mock.patch.object(RSSI_PREDICTORS, "_registered", {name: RSSI_PREDICTORS[name] for name in PREDICTORS_KEPT}),
+        only(ESTIMATORS, *ESTIMATORS, **dict.fromkeys(NETWORKS.values(), QuickNetwork)),
+        only(RSSI_PREDICTORS, "swiftwrf", "mean", "mri_pooled", "mri_receiver"),
     ):
         yield
 
@@ -125,7 +96,7 @@ def quick(drawn: bool = False) -> Iterator[None]:
     spectra, floor, located = toys()
     with (
         cheap(),
-        small_published(),
+        small("published"),
         known_planes(),
         mock.patch.object(aoa, "simulated_room", return_value=spectra),
         mock.patch.object(rssi, "rssi_room", return_value=floor),

@@ -2,16 +2,19 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cache
 
 import torch
+from small import FLOOR
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.array.planar import PlanarArray
+from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.choices import Moving
 from swiftwrf.data.simulated import ShoeboxRoom
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.store import Store
+from swiftwrf.models.geometry import GeometryModel
 from swiftwrf.models.geometry.images import SIDES, PhaseObservations, PlaneSet
 from swiftwrf.models.geometry.planes import Plane
 
@@ -72,6 +75,16 @@ def mirror_room(
         fixed_position=fixed,
         rotation=rotation,
     )
+
+
+@cache
+def floor_channels() -> Spectra:
+    """Return spectra of the channels that a floor reflects at five subcarriers, which rise in frequency."""
+    base = mirror_room({}, moving="transmitter", n=40)
+    away = torch.tensor([-20.0, -9, 1, 8, 20], dtype=torch.float64)
+    frequency = LIGHT_SPEED / base.array.wavelength + 1e6 * away
+    channel = GeometryModel.of_planes(base, [FLOOR]).channel(base.position, frequency)
+    return replace(base, channel=channel, frequency_hz=frequency)
 
 
 def built_in_walls(gain: float = -0.6) -> list[Plane]:

@@ -7,11 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from swiftwrf import rssi_room
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.contrib.formats.records import checksum
 from swiftwrf.data import Snapshots
@@ -215,20 +215,24 @@ def write_dichasus(folder: Path, offsets: bool = False, **changes: object) -> Pa
     return folder
 
 
-def survey_rows(n: int = 40) -> tuple[list[str], list[list[object]]]:
-    """Return header and rows of a wide table: x, y, z and three receivers, -100 where nothing was detected."""
-    data = rssi_room(n=n).columns([0, 4, 8])
-    values = torch.cat([data.transmitter_position, data.rssi_dbm.nan_to_num(-100)], dim=1)
-    return ["x", "y", "z", *data.receiver_names], values.tolist()
+def walk(seed: int = 2) -> pd.DataFrame:
+    """A walk with RSSI of four receivers in whole decibels: x, y, a, b, c, d."""
+    draw = np.random.default_rng(seed)
+    xy = np.column_stack([np.linspace(0.5, 23, 60), draw.uniform(0.4, 11, 60)]).round(2)
+    away = np.linalg.norm(xy[:, None] - draw.uniform((0, 0), (24, 12), (4, 2)), axis=2)
+    rssi = (-42 - 24 * np.log10(1 + away) + draw.normal(0, 2, (60, 4))).round()
+    return pd.DataFrame(np.column_stack([xy, rssi]), columns=["x", "y", "a", "b", "c", "d"])
 
 
-def write_survey(folder: Path, name: str = "walk.csv", header: list[str] | None = None, rows: object = None) -> Path:
-    """A table of comma-separated values."""
-    usual = survey_rows()
-    header, rows = header or usual[0], rows or usual[1]
+def survey() -> pd.DataFrame:
+    """Return the walk with -100 where RSSI counts as not detected."""
+    return walk().mask(walk() < -76, -100)
+
+
+def write_survey(folder: Path, name: str = "walk.csv") -> Path:
+    """Write the survey as a table of comma-separated values."""
     folder.mkdir(exist_ok=True)
-    lines = [",".join(header), *(",".join(str(v) for v in row) for row in rows)]
-    (folder / name).write_text("\n".join(lines) + "\n")
+    survey().to_csv(folder / name, index=False)
     return folder / name
 
 

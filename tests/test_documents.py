@@ -18,8 +18,8 @@ from small import FLOOR, known_planes
 from tables import FILES, rewrite
 
 import swiftwrf
-from augment import Mixed
-from swiftwrf import AngularGrid, load, simulated_room
+from swiftwrf import AngularGrid, simulated_room
+from swiftwrf.testing import check_reader
 
 ROOT = Path(__file__).parent.parent
 FENCES = re.compile(r"```(python|bash)\n(.*?)```(?:\n+```text\n(.*?)```)?", flags=re.DOTALL)  # with its output
@@ -135,17 +135,9 @@ def test_documented_extensions_work(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = run_blocks("docs/development/architecture.md")
     room = simulated_room(n=30, grid=AngularGrid.hemisphere(15, 60))
-    mean = names["MeanModel"]().fit(room)
-    mean.save("mean.safetensors")
-    found, expected = (model.predict(room.position[:2]).mean for model in (load("mean.safetensors"), mean))
-    torch.testing.assert_close(found, expected)
-    np.save("spectra.npy", room.spectrum)
-    np.save("positions.npy", room.position)
-    reader = names["TwoArrays"]()
-    assert reader.recognises(tmp_path)
-    torch.testing.assert_close(reader.read(tmp_path, None).spectrum, room.spectrum)
-    estimator = names["MeanDirection"]().fit(Mixed.measured(room))
-    torch.testing.assert_close(estimator.predict(room.spectrum)[0], room.label.mean(dim=0))
+    np.savez("measured.npz", spectra=room.spectrum, positions=room.position)
+    check_reader(names["TwoArrays"], tmp_path)
+    torch.testing.assert_close(names["TwoArrays"]().read(tmp_path, None).spectrum, room.spectrum)
 
 
 @pytest.mark.long

@@ -150,7 +150,7 @@ def _earliest(array: PlanarArray, channel: Tensor) -> Tensor:
         return matched
 
     each = torch.cat([power(cosine[None], at.expand(1, len(cosine))) for at in delay], dim=1)
-    whole = each.reshape(n, 1, len(delay), len(axis), -1)
+    whole = each.reshape(n, 1, len(delay), len(axis), len(cosine) // len(axis))
     around = torch.cat([whole[:, :, -1:], whole, whole[:, :, :1]], dim=2)
     highest = torch.nn.functional.max_pool3d(around, 3, stride=1, padding=(0, 1, 1))
     top = (whole * (whole == highest)).flatten(1).topk(most, dim=1)

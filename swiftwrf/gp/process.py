@@ -88,8 +88,14 @@ class Kernel:
         return noisy
 
 
-def candidates(position: Tensor, noises: Sequence[float]) -> Iterator[Kernel]:
+def candidates(position: Tensor, noises: Sequence[float], *, n_lengths: int = 5, n_smooth: int = 5) -> Iterator[Kernel]:
     """Yield kernels with lengths from the extent of the positions (n, 3) [m] down, with and without a smooth part.
+
+    Args:
+        position: Positions (n, 3) [m].
+        noises: Variances of the noise.
+        n_lengths: Number of lengths of the rough part, each half the one before. Not studied.
+        n_smooth: Number of lengths of the smooth part, each half the one before. Not studied.
 
     Example:
         >>> kernels = list(candidates(torch.rand(50, 3, dtype=torch.float64), noises=[0.01]))
@@ -98,10 +104,12 @@ def candidates(position: Tensor, noises: Sequence[float]) -> Iterator[Kernel]:
     """
     extent = float((position.max(0).values - position.min(0).values).max()) or 1.0
     for noise in noises:
-        for k in range(5):
+        for k in range(n_lengths):
             length = extent / 2**k
             yield Kernel(length, extent, matern12_weight=1.0, noise=noise)
-            yield from (Kernel(length, extent / 3 / 2**j, matern12_weight=0.6, noise=noise) for j in range(1, 6))
+            yield from (
+                Kernel(length, extent / 3 / 2**j, matern12_weight=0.6, noise=noise) for j in range(1, n_smooth + 1)
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,9 +228,11 @@ class GaussianProcess:
 
     def variance(self, position: Tensor) -> Tensor:
         """Return the posterior variance, without noise, at positions (m, 3), relative to k(0) = 1, float64 (m,)."""
-        if not self.is_exact:
-            return self._local(position)[2]
-        root = torch.linalg.solve_triangular(self._factor, self._cross(position).T, upper=False)
+        return self._variance(self._cross(position)) if self.is_exact else self._local(position)[2]
+
+    def _variance(self, cross: Tensor) -> Tensor:
+        """Return the posterior variance (m,) at positions by their covariances with the values, (m, n)."""
+        root = torch.linalg.solve_triangular(self._factor, cross.T, upper=False)
         variance: Tensor = 1 - root.square().sum(dim=0)
         return variance.clamp(0, 1)
 
@@ -245,9 +255,10 @@ class GaussianProcess:
         return Neighbours(self.known)
 
     def mean_and_variance(self, position: Tensor) -> tuple[Tensor, Tensor]:
-        """Return posterior mean (m, K) and variance (m,) at positions (m, 3), by one search for neighbours."""
+        """Return posterior mean (m, K) and variance (m,) at positions (m, 3), by one kernel matrix or one search."""
         if self.is_exact:
-            return self.mean(position), self.variance(position)
+            cross = self._cross(position)
+            return cross.to(self.coefficient) @ self.coefficient, self._variance(cross)
         number, weight, variance = self._local(position)
         return torch.einsum("mk,mkc->mc", weight, self.value[number].double()), variance
 

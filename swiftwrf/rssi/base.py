@@ -48,16 +48,21 @@ class RssiConfig(FieldConfig):
     """
 
     n_primitives: NonNegativeInt = 50
-    """primitives a receiver; a fit uses none if the path-loss model predicts held-out rows as well as a field"""
+    """primitives a receiver; 0 for a path-loss model without a field, which a fit also takes if it predicts held-out rows as
+    well"""
     huber: PositiveFloat = 1.345
     """number of standard deviations of the noise beyond which an error counts linearly (Huber's constant: 95 % efficient
     for Gaussian noise), since packets have outliers"""
     max_locations: Annotated[int, Ge(10)] = 1500
     """location bins that the rows are averaged in; the time of a fit grows with the cube of their number"""
     not_detected: NotDetected = "auto"
-    """meaning of an empty cell: "weak", the power was below the limit of detection; "unknown", it is ignored; "auto" decides
-    for each receiver by whether its empty cells are where its path loss expects no value. Only the path loss of a receiver
-    with fewer than 10 values counts its empty cells"""
+    """meaning of an empty cell.
+
+    - "weak": the power was below the limit of detection.
+    - "unknown": the cell is ignored.
+    - "auto": "weak" at each receiver whose empty cells are where its path loss expects no value, otherwise "unknown".
+
+    Only the path loss counts the empty cells of a receiver with fewer than 10 values"""
 
 
 class RssiPredictor(Updatable, Configured, Displayed, ABC):
@@ -131,7 +136,7 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
         Args:
             train: Training rows, at least 10 measurements in all. Missing values (nan) are ignored.
             pool: The same rows at every receiver of the data, from which properties common to all receivers are learnt.
-                Defaults to `train`. Receivers with fewer than 10 rows choose no kernel and no mixing weights.
+                Defaults to `train`. Receivers with fewer than 10 rows take no part in the choice of the kernel.
             device: Device to compute on. The fitted predictor is on the CPU.
             parallel: Function that maps a picklable fit over receivers as `map` does, e.g. on other machines. Defaults to
                 threads of this process.
@@ -162,8 +167,8 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
             shift = shift + train.offsets.of(pool)[:, None]
         if train.floors is not None:
             of_pool = estimate_floor_attenuation(pool)
-            own = columns_of(self.receiver_names, pool).tolist()
-            self.attenuation = replace(of_pool, receiver_floor=tuple(of_pool.receiver_floor[c] for c in own))
+            columns = columns_of(self.receiver_names, pool).tolist()
+            self.attenuation = replace(of_pool, receiver_floor=tuple(of_pool.receiver_floor[c] for c in columns))
             shift = shift + of_pool.of(pool.transmitter_position)
             train, pool = self.attenuation.removed(train), of_pool.removed(pool)
         curve = Detection.estimate(pool.transmitter_position, pool.rssi_dbm + shift)
@@ -176,7 +181,7 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
     def update(self, new: Rssi) -> Self:
         """Return the predictor with more training rows, by an update of its factorisation. This one stays as it is.
 
-        The result equals a fit to all rows with the same kernel, noise, mixing weights and weights of the earlier rows.
+        The result equals a fit to all rows with the same kernel, noise and weights of the earlier rows.
 
         Args:
             new: Rows at the receivers of the training rows, any number. Those that the predictor has already learnt are
@@ -189,7 +194,7 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
             >>> import swiftwrf
             >>> data = swiftwrf.rssi_room(n=60)
             >>> model = swiftwrf.RssiModel().fit(data.subset(torch.arange(50)))
-            >>> len(model.update(data.subset(torch.arange(50, 60))).anchor)
+            >>> len(model.update(data.subset(torch.arange(50, 60))).region())
             60
         """
         new = self._not_learnt(self.aligned(new))
@@ -220,15 +225,16 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
                 positions in degrees for a predictor in metres or the reverse, on other floors, or far away.
         """
         self.check_fitted()
-        names, own = list(data.receiver_names), list(self.receiver_names)
-        if sorted(names) != sorted(own):
+        names, fitted = data.receiver_names, self.receiver_names
+        if sorted(names) != sorted(fitted):
             raise InputError(
-                f"{data.name} has the receivers {listed(names)}, but the predictor was fitted to {listed(own)}; give these"
+                f"{data.name} has the receivers {listed(names)}, but the predictor was fitted to {listed(fitted)}; "
+                "give these"
             )
-        data = (data if names == own else data.columns([names.index(name) for name in own])).about(self.origin)
-        apart = (data.receiver_position - self.receiver_position).norm(dim=1).nan_to_num(0.0)
-        if len(moved := (apart > 0.01).nonzero()[:, 0]):
-            name, metres = self.receiver_names[int(moved[0])], float(apart[moved[0]])
+        data = (data if names == fitted else data.columns(columns_of(fitted, data).tolist())).about(self.origin)
+        moved = (data.receiver_position - self.receiver_position).norm(dim=1).nan_to_num(0.0)
+        if bool((moved > 0.01).any()):
+            name, metres = fitted[int(moved.argmax())], float(moved.max())
             raise InputError(
                 f"{data.name} has receiver {name} {metres:.3g} m away from its position in the rows that the predictor was "
                 "fitted to; fit a predictor to rows with the receivers at these positions"
@@ -240,12 +246,14 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
     def _on_own_floors(self, data: Rssi) -> Rssi:
         """Return rows with the floors of the training rows. Refuse another unit, other floors and positions far away."""
         if data.origin != self.origin:
-            found, own = ("metres" if origin is None else "degrees" for origin in (data.origin, self.origin))
-            raise InputError(f"{data.name} has positions in {found}, but the predictor was fitted to {own}; give {own}")
+            unit, fitted = ("metres" if origin is None else "degrees" for origin in (data.origin, self.origin))
+            raise InputError(
+                f"{data.name} has positions in {unit}, but the predictor was fitted to {fitted}; give {fitted}"
+            )
         floors, at = self.attenuation and self.attenuation.floors, data.transmitter_position
         if data.floors is not None:
             pairs = zip(data.floors.named(at), floors.named(at) if floors else [""] * len(at), strict=True)
-            if other := {name for name, own in pairs if not {*name.split(", ")} & {*own.split(", ")}}:
+            if other := {name for name, fitted in pairs if not {*name.split(", ")} & {*fitted.split(", ")}}:
                 raise InputError(
                     f"{data.name} has rows on floor {listed(sorted(other))} at heights of other floors of the rows that the "
                     f"predictor was fitted to ({listed(floors.names) if floors else 'none'}); fit a predictor to all floors"
@@ -344,7 +352,7 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
 def in_batches(
     predict: Callable[[Tensor], tuple[Tensor, Tensor | None]], rows: Tensor, size: int
 ) -> tuple[Tensor, Tensor | None]:
-    """Return mean and standard deviation, or None, of all rows, predicted some rows at a time."""
+    """Return mean and standard deviation, or None, of all rows, predicted in parts of `size` rows."""
     means, stds = zip(*map(predict, rows.split(size)), strict=True)
     return torch.cat(means), None if stds[0] is None else torch.cat(stds)
 

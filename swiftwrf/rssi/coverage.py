@@ -26,12 +26,10 @@ from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.pairs import PairModel
 
-MAX_OPEN_VARIANCE, MAX_WIDENING = 0.5, 1.2  # of the field, and of an interval, at the reach of a scan
-CORRELATION = 0.2  # of the errors of a scan, by held-out training rows in `benchmarks/rssi.py coverage`
-NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(15)  # of the factor that the errors share
 
-
-def at_least(number: int, mean: Tensor, std: Tensor, detection: Tensor, threshold_dbm: float) -> Tensor:
+def at_least(
+    number: int, mean: Tensor, std: Tensor, detection: Tensor, threshold_dbm: float, correlation: float = 0.2
+) -> Tensor:
     """Return the probability that a scan has at least a number of R receivers above a threshold, float64 (...).
 
     Args:
@@ -40,6 +38,7 @@ def at_least(number: int, mean: Tensor, std: Tensor, detection: Tensor, threshol
         std: Their standard deviation (R, ...) [dB].
         detection: Probability of a detection (R, ...).
         threshold_dbm: Threshold.
+        correlation: Correlation of the errors of a scan, by held-out training rows in `benchmarks/rssi.py coverage`.
 
     Example:
         >>> at_least(1, torch.tensor([-75.0]), torch.tensor([4.0]), torch.tensor([0.8]), -75.0).round(decimals=3)
@@ -48,21 +47,26 @@ def at_least(number: int, mean: Tensor, std: Tensor, detection: Tensor, threshol
     z = (mean.double() - threshold_dbm) / std.double().clamp_min(1e-6)
     score = torch.special.ndtri(detection.double() * torch.special.ndtr(z))
     total = torch.zeros_like(score[0])
-    for node, weight in zip(NODES, WEIGHTS / WEIGHTS.sum(), strict=True):
-        given = torch.special.ndtr((score + math.sqrt(CORRELATION) * node) / math.sqrt(1 - CORRELATION))
+    nodes, weights = np.polynomial.hermite_e.hermegauss(15)  # of the factor that the errors share
+    for node, weight in zip(nodes, weights / weights.sum(), strict=True):
+        given = torch.special.ndtr((score + math.sqrt(correlation) * node) / math.sqrt(1 - correlation))
         counts = [torch.ones_like(total), *(torch.zeros_like(total) for _ in range(number - 1))]
-        for own in given:  # probabilities of 0 to number - 1 receivers
-            fewer = [torch.zeros_like(own), *counts[:-1]]
-            counts = [count * (1 - own) + less * own for count, less in zip(counts, fewer, strict=True)]
+        for above in given:  # probabilities of 0 to number - 1 receivers
+            fewer = [torch.zeros_like(above), *counts[:-1]]
+            counts = [count * (1 - above) + less * above for count, less in zip(counts, fewer, strict=True)]
         total += weight * (1 - torch.stack(counts).sum(dim=0))
     return total
 
 
-def reach(model: RssiModel | PairModel) -> float:
+def reach(model: RssiModel | PairModel, max_open_variance: float = 0.5, max_widening: float = 1.2) -> float:
     """Return the distance [m] from a scan up to which it determines the field of a fitted model.
 
-    Beyond, more than half of the variance of the field is open, and the interval of a measurement is more than 1.2 times as
-    wide as at the scan. It is infinite if no interval is so wide, since the field explains little.
+    Beyond it both limits are exceeded. It is infinite if no interval is so wide, since the field explains little.
+
+    Args:
+        model: Fitted model.
+        max_open_variance: Fraction of the variance of the field that remains. A definition.
+        max_widening: Width of the interval of a measurement relative to that at the scan. A definition.
 
     Example:
         >>> import swiftwrf
@@ -70,7 +74,7 @@ def reach(model: RssiModel | PairModel) -> float:
         1.64
     """
     kernel = model.kernel  # whose rough part alone has a weight: exp(-r / l)
-    open_variance = max(MAX_OPEN_VARIANCE, (MAX_WIDENING**2 - 1) * kernel.noise)
+    open_variance = max(max_open_variance, (max_widening**2 - 1) * kernel.noise)
     is_flat = isinstance(model, RssiModel) and not bool(model.field_db.any())
     return math.inf if is_flat or open_variance >= 1 else -kernel.matern12_length / 2 * math.log(1 - open_variance)
 
@@ -121,7 +125,7 @@ class Coverage:
         parts = {"covered": covered, "not_covered": not_covered, "uncertain": ~covered & ~not_covered}
         # a row at a receiver that moves is no scan
         parts |= {"not_measured": ~measured[enclosed], "scans_above": above[: 0 if scans.receiver_moves else None]}
-        shares = {name: float(part.mean()) if len(part) else None for name, part in parts.items()}
+        fractions = {name: float(part.mean()) if len(part) else None for name, part in parts.items()}
         limited = {"threshold_dbm": threshold_dbm, "certainty": certainty, "n_scans": len(above)}
         reach_m = reach if math.isfinite(reach) else None
-        return cls(probability, enclosed, measured, {**limited, "reach_m": reach_m, **shares})
+        return cls(probability, enclosed, measured, {**limited, "reach_m": reach_m, **fractions})

@@ -2,8 +2,8 @@
 
     p(detected | y) = (1 - missed_r) Phi((y - limit_r) / width)
 
-y is the received power of a packet, limit_r the limit of receiver r, width that of all receivers, and missed_r the share of
-packets that receiver r misses whatever their power. An empty cell is then an upper limit that may be wrong (censored
+y is the received power of a packet, limit_r the limit of receiver r, width that of all receivers, and missed_r the fraction
+of packets that receiver r misses whatever their power. An empty cell is then an upper limit that may be wrong (censored
 regression with misclassification: J. Tobin, Econometrica 26, 1958; J. A. Hausman et al., Journal of Econometrics 87, 1998).
 """
 
@@ -24,16 +24,7 @@ from swiftwrf.gp import GaussianProcess, Kernel, leave_folds_out, subsample
 from swiftwrf.positions import Neighbours
 from swiftwrf.runtime.validation import PositiveFloat
 
-NEIGHBOURS, FEWEST = 6, 3  # rows beside a cell, and values among them, that determine its level
-OWN_FEWEST = 2  # of these values for the limit of one receiver, which has fewer cells
-MISSED = 1e-3  # share of random misses at least: no value is impossible
-MISSES_WORTH = 30.0  # strong cells of a receiver that count as much as the share of misses of all receivers
-MISSES = torch.tensor([MISSED, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3], dtype=torch.float64)  # shares that are compared
-WIDTHS_DB = 0.5, 1.0, 2.0, 3.0, 5.0, 8.0
-LIMIT_STD_DB = 20.0  # prior of a receiver's limit about that of all; `benchmarks/not_detected.py --insensitive-dbm -70`
-OFFSETS_DB = torch.arange(-40.0, 41.0, dtype=torch.float64)  # of a receiver's limit that are compared
-MAX_ROUNDS = 5  # of the limits of all receivers and of each
-MAX_ROWS, MAX_CELLS, MAX_OWN_CELLS = 1500, 4000, 50_000  # that determine the curve, and the limits of the receivers
+MISSES = torch.tensor([1e-3, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3], dtype=torch.float64)  # compared fractions of misses
 Cells = tuple[Tensor, Tensor, float]  # values [dB], their receivers, and the number of cells that each stands for
 
 
@@ -44,7 +35,7 @@ class Detection:
     Args:
         limit: Received power at which each receiver detects half of the packets, float64 (R,) [dBm].
         width: Standard deviation of the limit over packets [dB].
-        missed: Share of packets of any power that each receiver misses, float64 (R,).
+        missed: Fraction of packets of any power that each receiver misses, float64 (R,).
         is_limit: Whether an empty cell is an upper limit for its receiver, bool (R,); else it is ignored.
 
     Example:
@@ -59,18 +50,36 @@ class Detection:
     is_limit: Annotated[Tensor, "bool r"]
 
     @classmethod
-    def estimate(cls, position: Tensor, rssi: Tensor) -> Self | None:
-        """Estimate the curve by greatest likelihood, from cells with values beside them; no model of the power is needed.
+    def estimate(
+        cls,
+        position: Tensor,
+        rssi: Tensor,
+        *,
+        n_neighbours: int = 6,
+        min_values: int = 3,
+        min_own_values: int = 2,
+        misses_worth: float = 30.0,
+        limit_std_db: float = 20.0,
+    ) -> Self | None:
+        """Estimate the curve by greatest likelihood, from cells with values in nearby rows, without a model of the power.
 
-        What is missing beside strong values is missed at random, and what is missing beside weak ones is below the limit.
-        Limit and width of all receivers, and the limit of each with a normal prior about that of all, follow in turn.
+        The level of a cell is the mean value of nearby rows. An empty cell of a high level is missed at random, one of a low
+        level is below the limit. Two steps alternate: limit and width of all receivers, and the limit of each receiver with
+        a normal prior about that of all.
 
         Args:
             position: Positions of the rows, (n, 3) [m].
             rssi: Measurements (n, R) [dBm], nan where not detected; at least one value.
+            n_neighbours: Number of nearby rows that determine the level of a cell. Not studied.
+            min_values: Least number of values among them for limit and width of all receivers. Not studied.
+            min_own_values: Least number of values among them for the limit of one receiver, which has fewer cells.
+            misses_worth: Prior strong cells: a receiver with 30 of them weighs its own fraction of misses and that of all
+                receivers equally. Not studied.
+            limit_std_db: Prior standard deviation of a receiver's limit about that of all [dB], by
+                `benchmarks/not_detected.py --insensitive-dbm -70`.
 
         Returns:
-            The curve; None if every cell has a value. With fewer than 5 empty cells beside values all limits are the lowest
+            The curve; None if every cell has a value. With fewer than 5 empty cells near values all limits are the lowest
             value.
 
         Example:
@@ -83,58 +92,61 @@ class Detection:
         if bool(rssi.isfinite().all()) or len(position) < 2:
             return None
         is_limit, lowest = rssi.isnan().any(dim=0), float(rssi[~rssi.isnan()].min())
-        position, rssi = subsample(position, rssi, rows=MAX_ROWS)
-        seen, missed = ~rssi.isnan(), torch.full((rssi.shape[1],), MISSED, dtype=torch.float64)
-        number = Neighbours(position)(position, min(NEIGHBOURS + 1, len(position)))[1]
-        near = rssi[number].masked_fill((number == torch.arange(len(rssi))[:, None])[..., None], torch.nan)  # (n, 7, R)
+        position, rssi = subsample(position, rssi, rows=1500)
+        seen, missed = ~rssi.isnan(), MISSES[0].repeat(rssi.shape[1])
+        number = Neighbours(position)(position, min(n_neighbours + 1, len(position)))[1]
+        near = rssi[number].masked_fill((number == torch.arange(len(rssi))[:, None])[..., None], torch.nan)
         level, n_near = near.nanmean(dim=1), (~near.isnan()).sum(dim=1)
-        usable, own = n_near >= FEWEST, torch.zeros_like(missed)
+        usable, offset = n_near >= min_values, torch.zeros_like(missed)
         if int((usable & ~seen).sum()) < 5 or int((usable & seen).sum()) < 5:
-            return cls(own + lowest, 0.5, missed, is_limit)
+            return cls(offset + lowest, 0.5, missed, is_limit)
         spread = 1.25 * float((rssi - level)[usable & seen].abs().mean())
 
-        def cells(fewest: int, rows: int) -> Iterator[Cells]:
+        widths = 0.5, 1.0, 2.0, 3.0, 5.0, 8.0  # [dB]
+        offsets = torch.arange(-40.0, 41.0, dtype=torch.float64)  # of a receiver's limit about that of all [dB]
+
+        def cells(min_near: int, rows: int) -> Iterator[Cells]:
             for value, kind in ((rssi, seen), (level, ~seen)):
-                every = (kind & (n_near >= fewest)).nonzero()
+                every = (kind & (n_near >= min_near)).nonzero()
                 row, receiver = subsample(every, rows=rows)[0].T
                 yield value[row, receiver], receiver, max(1.0, len(every) / rows)
 
-        shared, each = list(cells(FEWEST, MAX_CELLS)), list(cells(OWN_FEWEST, MAX_OWN_CELLS))
-        for _ in range(MAX_ROUNDS):
-            kept, lost = ((db - own[receiver], receiver, weight) for db, receiver, weight in shared)
+        shared, each = list(cells(min_values, 4000)), list(cells(min_own_values, 50_000))
+        for _ in range(5):
+            kept, lost = ((db - offset[receiver], receiver, weight) for db, receiver, weight in shared)
             limits = torch.linspace(float(kept[0].min()) - 0.5, float(kept[0].median()), 30, dtype=torch.float64)
-            likely = torch.stack([_log_likelihoods(kept, lost, limits, w, spread, len(own)).sum(-1) for w in WIDTHS_DB])
+            likely = torch.stack([_log_likelihoods(kept, lost, limits, w, spread, len(offset)).sum(-1) for w in widths])
             best = np.unravel_index(int(likely.argmax()), likely.shape)
-            width, misses, limit = WIDTHS_DB[best[0]], MISSES[best[1]], limits[best[2]]
+            width, misses, limit = widths[best[0]], MISSES[best[1]], limits[best[2]]
             kept, lost = ((db - limit, receiver, weight) for db, receiver, weight in each)
-            score = _log_likelihoods(kept, lost, OFFSETS_DB, width, spread, len(own))
-            score += MISSES_WORTH * (misses * MISSES.log() + (1 - misses) * (-MISSES).log1p())[:, None, None]
-            score -= (OFFSETS_DB / LIMIT_STD_DB).square()[:, None] / 2
-            previous, own = own, OFFSETS_DB[score.amax(dim=0).argmax(dim=0)]
-            if torch.equal(previous, own):
+            score = _log_likelihoods(kept, lost, offsets, width, spread, len(offset))
+            score += misses_worth * (misses * MISSES.log() + (1 - misses) * (-MISSES).log1p())[:, None, None]
+            score -= (offsets / limit_std_db).square()[:, None] / 2
+            previous, offset = offset, offsets[score.amax(dim=0).argmax(dim=0)]
+            if torch.equal(previous, offset):
                 break
-        strong = usable & (level > limit + own + 2 * math.hypot(spread, width))
-        lost_count = (strong & ~seen).sum(dim=0).double() + MISSES_WORTH * misses
-        return cls(limit + own, width, lost_count / (strong.sum(dim=0) + MISSES_WORTH), is_limit)
+        strong = usable & (level > limit + offset + 2 * math.hypot(spread, width))
+        lost_count = (strong & ~seen).sum(dim=0).double() + misses_worth * misses
+        return cls(limit + offset, width, lost_count / (strong.sum(dim=0) + misses_worth), is_limit)
 
     def note(self, receiver_names: Sequence[str]) -> str:
         """Return a sentence on the meaning of empty cells of these R receivers."""
         weak = [name for name, limit in zip(receiver_names, self.is_limit.tolist(), strict=True) if limit]
         others = [name for name in receiver_names if name not in weak]
         missed = float(self.missed[self.is_limit].mean()) if weak else 0.0
-        said = []
+        clauses = []
         if weak:
             limits = dict.fromkeys(f"{limit:.0f}" for limit in self.limit[self.is_limit].aminmax())
-            said.append(f"an empty cell means that the signal was below about {' to '.join(limits)} dBm")
+            clauses.append(f"an empty cell means that the signal was below about {' to '.join(limits)} dBm")
             if missed > 0.03:
-                said.append(f"{missed:.0%} of all packets are missed at any power")
+                clauses.append(f"{missed:.0%} of all packets are missed at any power")
         if others:
             where = f"at {len(others)} of {len(receiver_names)} receivers ({listed(others[:5])})" if weak else "here"
-            said.append(f"{where} empty cells say nothing")
-        return ", ".join(said)
+            clauses.append(f"{where} empty cells say nothing")
+        return ", ".join(clauses)
 
     def columns(self, number: Tensor | slice) -> Self:
-        """Return the curve of some receivers."""
+        """Return the curve of the receivers `number`."""
         return replace(self, **{name: getattr(self, name)[number] for name in ("limit", "missed", "is_limit")})
 
     def given_detection(self, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
@@ -148,7 +160,7 @@ class Detection:
 
 
 def _log_likelihoods(kept: Cells, lost: Cells, limit: Tensor, width: float, spread: float, n_receivers: int) -> Tensor:
-    """Return log-likelihoods (7, L, R) of values and of levels beside empty cells, for shares of misses and limits (L,).
+    """Return log-likelihoods (7, L, R) of values and of levels of empty cells, for fractions of misses and limits (L,).
 
     `spread` is the standard deviation of a value about its level [dB].
     """
@@ -165,15 +177,16 @@ def _log_likelihoods(kept: Cells, lost: Cells, limit: Tensor, width: float, spre
 
 @dataclass(frozen=True, eq=False)
 class DetectionField:
-    """Probability that a packet is detected: logistic in the received power and in the share of detections nearby.
+    """Probability that a packet is detected: logistic in the received power and in the fraction of detections nearby.
 
-    The share is a Gaussian process of the position, which follows what no path loss explains, e.g. a receiver that was off.
+    This fraction is a Gaussian process of the position, which follows what no path loss explains, e.g. a receiver that was
+    off.
 
     Args:
         process: Process of the detections (1 or 0) less their mean at each receiver, (n, R) at n bins.
         mean: Fraction of the bins where each receiver detects something, float64 (R,).
         limit: Received power that the logistic curve of each receiver counts from, float64 (R,) [dBm].
-        weight: Constant, weight of the power [per 10 dB], and weight of the share, float64 (3,).
+        weight: Constant, weight of the power [per 10 dB], and weight of the fraction, float64 (3,).
     """
 
     process: Annotated[GaussianProcess, "k=r"]
@@ -193,22 +206,22 @@ class DetectionField:
             return None
         value, mean = detected.double(), detected.double().mean(dim=0)
         process = GaussianProcess(kernel, position, value - mean)
-        share = torch.empty_like(value)
+        nearby = torch.empty_like(value)
         for out, kept, weight, _ in leave_folds_out(kernel, position, fold):
-            own = value[kept].mean(dim=0)
-            share[out] = own + weight @ (value[kept] - own)
+            of_kept = value[kept].mean(dim=0)
+            nearby[out] = of_kept + weight @ (value[kept] - of_kept)
         known = level.isfinite()
-        features = torch.stack([(level - limit) / 10, share], dim=-1)[known]
+        features = torch.stack([(level - limit) / 10, nearby], dim=-1)[known]
         detected, order = detected[known].sort(stable=True)  # the first and the last cell, one of each kind, are kept
-        some = subsample(features[order], detected, rows=MAX_CELLS * 20)
-        found = LogisticRegression(C=100.0).fit(some[0].numpy(), some[1].numpy())
-        weight = torch.tensor([*found.intercept_, *found.coef_[0]], dtype=torch.float64)
+        features, detected = subsample(features[order], detected, rows=80_000)
+        regression = LogisticRegression(C=100.0).fit(features.numpy(), detected.numpy())
+        weight = torch.tensor([*regression.intercept_, *regression.coef_[0]], dtype=torch.float64)
         return cls(process, mean, limit, weight)
 
     def probability(self, level: Tensor, position: Tensor) -> Tensor:
         """Return the probability of a detection, float64 (m, R), by the power (m, R) [dBm] at positions (m, 3) [m]."""
-        share = self.mean + self.process.mean(position)
-        return torch.sigmoid(self.weight[0] + self.weight[1] * (level - self.limit) / 10 + self.weight[2] * share)
+        nearby = self.mean + self.process.mean(position)
+        return torch.sigmoid(self.weight[0] + self.weight[1] * (level - self.limit) / 10 + self.weight[2] * nearby)
 
     def updated(self, position: Tensor, detected: Tensor) -> Self:
         """Return the field with more rows, detections bool (m, R) at positions (m, 3) [m]."""

@@ -10,13 +10,16 @@ fixed, A and B are rendered once, and m is one convex function of one number.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated, Self
 
 import torch
 from torch import Tensor, nn
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.models.primitives import Primitives
-from swiftwrf.rasterize import rasterize
+from swiftwrf.rasterize import reference
 from swiftwrf.rasterize.operators import magnitude
 
 HEAD_GRID = AngularGrid.hemisphere(16, 16)
@@ -51,8 +54,8 @@ def render(heads: Iterable[Head]) -> Tensor:
     basis = torch.stack([head.basis for head in heads])
     weight = torch.stack([canonical, basis[..., None] * canonical], dim=1)  # (R, 2, N, 2)
     means, choleskys = (x[:, None].expand(-1, 2, -1, -1) for x in (mean, cholesky))
-    # so few kernels take less time than loading a compiled backend
-    fixed, varying = rasterize(means, choleskys, weight, HEAD_GRID, "reference").flatten(-2).unbind(1)
+    # 50 kernels take less time than loading a compiled backend
+    fixed, varying = reference.field(means, choleskys, weight, HEAD_GRID, cutoff=1e-4).flatten(-2).unbind(1)
     phase = fixed / magnitude(fixed[..., None]).squeeze(-1).unsqueeze(-2).clamp_min(1e-6)
     gain = DB_PER_UNIT * (phase * varying).sum(dim=-2).mean(dim=-1)
     return torch.stack([fixed, varying / gain.clamp_min(1e-3)[:, None, None]], dim=1)
@@ -65,21 +68,39 @@ def mean_magnitude(rendered: Tensor, latent: Tensor) -> Tensor:
     return DB_PER_UNIT * mean
 
 
-class HeadTable:
-    """Piecewise linear m(c) - m(0) of R receivers, tabulated every 0.125 dB, with an error below 2e-3 dB.
+@dataclass(frozen=True, eq=False)
+class Heads:
+    """The functions m(c) - m(0) of R receivers and their derivatives, piecewise linear with an error below 2e-3 dB.
 
     Args:
-        rendered: Fields (R, 2, 2, directions).
+        rendered: Fields A and B, float32 (R, 2, 2, directions), or (1, 2, 2, directions) for equal heads of all receivers.
+
+    Example:
+        >>> value, derivative = Heads.alike(n_primitives=50, seed=0)(torch.tensor([[0.0], [3.0]]))
+        >>> value.round(), derivative.round()
+        (tensor([[0.],
+                [3.]]), tensor([[1.],
+                [1.]]))
     """
 
-    def __init__(self, rendered: Tensor) -> None:
-        node = torch.arange(-TABLE_RANGE_DB, TABLE_RANGE_DB + TABLE_STEP_DB, TABLE_STEP_DB, device=rendered.device)
-        value = mean_magnitude(rendered, node[:, None].expand(-1, len(rendered))).double()  # (nodes, R)
-        self.value = value - value[len(node) // 2]
+    rendered: Annotated[Tensor, f"float32 h 2 2 {N_DIRECTIONS}"]
+
+    @classmethod
+    def alike(cls, n_primitives: int, seed: int) -> Self:
+        """Return one head for all receivers, whose primitives are not trained."""
+        return cls(render([Head(n_primitives, seed).requires_grad_(False)]))
+
+    @cached_property
+    def _table(self) -> Tensor:
+        """Values of m(c) - m(0) every 0.125 dB, float64 (nodes, R)."""
+        node = torch.arange(-TABLE_RANGE_DB, TABLE_RANGE_DB + TABLE_STEP_DB, TABLE_STEP_DB)
+        value = mean_magnitude(self.rendered, node[:, None].expand(-1, len(self.rendered))).double()
+        return value - value[len(node) // 2]
 
     def __call__(self, latent: Tensor) -> tuple[Tensor, Tensor]:
-        """Return m(c) - m(0) and its slope, each (n, R), at a latent field c (n, R) [dB]."""
+        """Return m(c) - m(0) and its derivative, each (n, R), at a latent field c (n, R) [dB]."""
         place = (latent + TABLE_RANGE_DB) / TABLE_STEP_DB
-        node = place.detach().floor().long().clamp(0, len(self.value) - 2)
-        low, high = (self.value.gather(0, n).to(latent) for n in (node, node + 1))
+        node = place.detach().floor().long().clamp(0, len(self._table) - 2)
+        table = self._table.to(latent.device).expand(-1, latent.shape[1])
+        low, high = (table.gather(0, number).to(latent) for number in (node, node + 1))
         return low + (place - node) * (high - low), (high - low) / TABLE_STEP_DB

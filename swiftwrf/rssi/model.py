@@ -1,15 +1,15 @@
 """SwiftWRF for RSSI: for each receiver a path-loss model, and a head whose latent field depends on the position.
 
-    rssi_r(s) = T_r - 10 gamma_r log10 |s - receiver_r| + directivity_r(s) + w_r (m_r(c_r(s)) - m_r(0))       [dBm]
+    rssi_r(s) = T_r - 10 gamma_r log10 |s - receiver_r| + directivity_r(s) + m_r(c_r(s)) - m_r(0)       [dBm]
 
-m_r is the mean magnitude of receiver r's primitives (`swiftwrf.rssi.head`), c_r a Gaussian process of the position,
-directivity_r a few harmonics of the direction from the receiver, and w_r the mixing weight of the field.
+m_r is the mean magnitude of receiver r's primitives (`swiftwrf.rssi.head`), c_r a Gaussian process of the position, and
+directivity_r a few harmonics of the direction from the receiver.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, ClassVar, Self
 
@@ -18,45 +18,36 @@ from torch import Tensor
 
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.data.splits import places
-from swiftwrf.gp import Kernel, subsample
+from swiftwrf.data.splits import each_fold, places
+from swiftwrf.gp import Kernel
 from swiftwrf.metrics import HALF_WIDTH, interval_factor
 from swiftwrf.models.base import CPU
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Axes
 from swiftwrf.positions import check_positions
-from swiftwrf.rssi.base import Map, RssiConfig, RssiPredictor, columns_of, often_detected
+from swiftwrf.rssi.base import Map, RssiConfig, RssiPredictor, columns_of
 from swiftwrf.rssi.detection import Detection, DetectionField
-from swiftwrf.rssi.head import N_DIRECTIONS, HeadTable
 from swiftwrf.rssi.maps import RssiMap
-from swiftwrf.rssi.path_loss import harmonics, log_distance
-from swiftwrf.rssi.regression import FittedRows, RssiPosterior, fit_receiver, held_out_std, uncertainty
-from swiftwrf.rssi.training import (
-    MAX_KERNEL_RECEIVERS,
-    check_comparable,
-    mixing_weights,
-    prepare,
-    rounding_std,
-)
+from swiftwrf.rssi.path_loss import PathLoss, log_distance
+from swiftwrf.rssi.regression import RssiPosterior, fit_receiver, held_out_std, predictive_std
+from swiftwrf.rssi.training import prepare, rounding_std
 from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import parallel_map, single_thread
 from swiftwrf.runtime.validation import checked
 
-MIN_PLACES = 30  # of a receiver; with fewer, held-out rows of all receivers calibrate its intervals
 RECEIVERS_AT_ONCE = 64  # between two steps of the progress bar; starting threads costs milliseconds
 
 
 class RssiModel(RssiPredictor, Saved):
-    """50 primitives a receiver on a log-distance path-loss model, mixed with simpler predictors by cross-validation.
+    """50 primitives a receiver on a log-distance path-loss model.
 
     It predicts RSSI at fixed receivers for any position of the transmitter, differentiable in the position.
-    Five held-out folds of the training rows determine the kernel, the presence of a field, the mixing weights and the scale
-    of the standard deviation. The field is mixed with simpler predictors: the path-loss model of the receiver, that of all
-    receivers, and the mean of the receiver. All receivers share the mixing weights. The path loss of a receiver is shrunk to
-    that of all receivers, by what its rows determine. If the positions of the receivers are unknown, it is a level. An empty
-    cell is an upper limit of the received power where the empty cells of a receiver are those of weak signals, see
-    `RssiConfig.not_detected`. `predict` gives the power of all packets, `predict_detected` that of detected ones.
+    Five held-out folds of the training rows determine the kernel, the presence of a field and the scale of the standard
+    deviation. The path loss of a receiver is shrunk to that of all receivers in proportion to how well its own rows
+    determine it. If the positions of the receivers are unknown, it is a level. An empty cell is an upper limit of the
+    received power where the empty cells of a receiver are those of weak signals, see `RssiConfig.not_detected`. `predict`
+    gives the power of all packets, `predict_detected` that of detected ones.
 
     The options are those of `RssiConfig`.
 
@@ -74,37 +65,19 @@ class RssiModel(RssiPredictor, Saved):
     config_type = RssiConfig
     updates = True
 
-    saved = "kernel mixing_weight centre covariance detection_field rendered field_db noise_db baseline _rows"
-    kernel: Kernel
-    """kernel of the latent field, lengths in [m]"""
-    mixing_weight: Annotated[Tensor, "float64 4"]
-    """weights (4,) of the field and the three simpler predictors at all receivers, contained in the tensors below"""
+    saved = "centre posterior covariance detection_field field_db noise_db"
     centre: Annotated[Tensor, "float64 3"]
     """centre of the measured positions, float64 (3,) [m]"""
-    level: Tensor
-    """RSSI at 1 m, float64 (R,) [dBm]"""
-    slope: Tensor
-    """float64 (R,) [dB a decade]"""
+    posterior: Annotated[RssiPosterior, "r"]
+    """Gaussian processes of the receivers at positions less the centre, which `update` continues"""
     covariance: Annotated[Tensor, "float64 r 2 2"]
     """calibrated covariance of level and slope, float64 (R, 2, 2)"""
     detection_field: Annotated[DetectionField, "r"] | None
     """probability of a detection; None if every cell has a value, or if empty cells are ignored"""
-    directivity: Tensor
-    """coefficients of the harmonics, (R, 8) [dB]"""
-    anchor: Tensor
-    """positions of the location bins less the centre, (n, 3) [m]"""
-    coefficient: Tensor
-    """coefficients of the kernel to the anchors, (n, R) [dB]"""
-    rendered: Annotated[Tensor, f"float32 r 2 2 {N_DIRECTIONS}"]
-    """fields of the heads, (R, 2, 2, directions)"""
     field_db: Annotated[Tensor, "float32 r"]
-    """calibrated standard deviation of the field far from all measurements, (R,) [dB]"""
+    """calibrated standard deviation of the field far from all measurements, (R,) [dB]; 0 without a field"""
     noise_db: Annotated[Tensor, "float32 r"]
     """calibrated standard deviation of a measurement about the field, (R,) [dB]"""
-    baseline: Annotated[Tensor, "float64 r 2"]
-    """RSSI at 1 m [dBm] and slope [dB a decade] of the simpler predictors by their mixing weights, float64 (R, 2)"""
-    posterior: RssiPosterior
-    """least squares of the fit, which `update` continues"""
     held_out_db: dict[str, float]
     """mean absolute errors [dB] of the model and of the receivers' means at held-out rows, set by `fit`, not saved"""
 
@@ -121,103 +94,87 @@ class RssiModel(RssiPredictor, Saved):
         progress: bool = False,
         **_: Any,
     ) -> None:
-        own, often = columns_of(train.receiver_names, pool), often_detected(pool)
-        (often,) = subsample(often, rows=MAX_KERNEL_RECEIVERS)
-        # receivers that determine the mixing weights are fitted, too: predictions do not depend on the receivers of `train`
-        every = torch.cat([own, often[~torch.isin(often, own)]])
-        training = prepare(pool, every, self.config, shift, curve)
+        training = prepare(pool, columns_of(train.receiver_names, pool), self.config, shift, curve)
         task = partial(fit_receiver, data=training, config=self.config, device=device)
         with progress_bar(progress) as bar:
-            fits = (parallel or _in_threads)(task, range(len(every)))
-            results = list(bar.track(fits, total=len(every), description="receivers"))
-        found = {name: torch.stack([result[name] for result in results]) for name in results[0]}
-        loss, shift, measured = training.path_loss, training.shift, ~training.rssi.isnan()
-        field = found.pop("held_out").T
-        # held-out predictions of the field and of the simpler predictors, given that the packets were detected
-        predictors = torch.cat([field.where(measured, torch.nan)[None], training.baseline_held_out])
-        prior_db = training.field_db, training.noise_db
-        std = held_out_std(training, training.kernel, prior_db, found["covariance"])
-        if loss.detection is not None:
-            given = [loss.detection.given_detection(mean + shift, std) for mean in predictors]
-            std = given[0][1].where(~predictors[0].isnan(), std)
-            predictors = torch.stack([mean for mean, _ in given]) - shift
-        predictors, std = predictors[:, training.bin_of_row], std[training.bin_of_row]
-        # one set of weights for all receivers: the few folds determine none for each of them
-        columns = list(map(every.tolist().index, often.tolist()))
-        weight = mixing_weights(predictors[..., columns], pool.rssi_dbm[:, often])
-        mine = slice(len(own))
-        found |= {"measured": measured.T.double(), "field_db": prior_db[0], "noise_db": prior_db[1]}
-        found = {name: value[mine] for name, value in found.items()}
-        predictors = predictors[..., mine]
-        check_comparable(predictors, train.rssi_dbm)
-        predicted = torch.einsum("k,knr->nr", weight[weight > 0], predictors[weight > 0])
-        means = ((self.name, predicted), ("mean", predictors[-1]))
-        self.held_out_db = {name: float((mean - train.rssi_dbm).abs().nanmean()) for name, mean in means}
-        scale = self._calibrate(train, predicted, std[:, mine], found["field_db"], found["noise_db"])
-        # only two predictors have the receiver's path loss
-        self.covariance = (weight[:2].sum() * scale).square()[:, None, None] * found.pop("covariance")
-        self.mixing_weight, self.kernel, self.centre = weight, training.kernel, training.centre
-        self.rendered = training.rendered[mine]
-        self.baseline = torch.stack([weight[1:] @ values[:, mine] for values in training.baselines], dim=1)
-        self.detection, self.detection_field = loss.detection and loss.detection.columns(mine), None
+            fits = (parallel or _in_threads)(task, range(len(training.receiver_names)))
+            results = list(bar.track(fits, total=len(training.receiver_names), description="receivers"))
+        fitted = {name: torch.stack([result[name] for result in results]) for name in results[0]}
+        held_out, covariance = fitted.pop("held_out").T, fitted.pop("covariance")
+        loss, shift, measured, rows = training.path_loss, training.shift, ~training.rssi.isnan(), training.bin_of_row
+        distance = log_distance(training.position, training.receiver)
+        level = held_out.where(~held_out.isnan(), loss.each(distance)) + shift
+        std = held_out_std(training, training.kernel, (training.field_db, training.noise_db), covariance)
+        self.detection, self.detection_field, power = loss.detection, None, level
         if self.detection is not None:
-            level = field.where(~field.isnan(), training.baseline_held_out[0]) + shift
-            bins = training.position, measured[:, mine], training.fold, level[:, mine]
+            bins = training.position, measured, training.fold, level
             self.detection_field = DetectionField.fit(training.kernel, *bins, self.detection.limit)
-        self._take(found | {"anchor": training.position})
+            power, std = self.detection.given_detection(level, std)
+        predicted, means = (power - shift)[rows], loss.shared(distance)
+        for out, kept in each_fold(training.fold):
+            mean = training.rssi[kept].nanmean(dim=0)
+            means[out] = mean.where(~mean.isnan(), means[out])
+        errors = {self.name: predicted, "mean": means[rows]}
+        self.held_out_db = {name: float((each - train.rssi_dbm).abs().nanmean()) for name, each in errors.items()}
+        scale = self._calibrate(train, predicted, std[rows], training.field_db, training.noise_db)
+        self.covariance, self.centre = scale.square()[:, None, None] * covariance, training.centre
+        self.posterior = RssiPosterior(
+            kernel=training.kernel,
+            heads=training.heads,
+            huber=self.config.huber,
+            receiver=training.receiver,
+            position=training.position,
+            measured=measured.T.double(),
+            field_db=training.field_db,
+            noise_db=training.noise_db,
+            **fitted,
+        )
 
-    def _calibrate(self, train: Rssi, predicted: Tensor, std: Tensor, field_db: Tensor, noise_db: Tensor) -> Tensor:
+    def _calibrate(
+        self, train: Rssi, predicted: Tensor, std: Tensor, field_db: Tensor, noise_db: Tensor, min_places: int = 30
+    ) -> Tensor:
         """Calibrate the standard deviations by held-out predictions of the training rows, and return their factors (R,).
 
         `predicted` [dBm] and `std` [dB] are (n, R), the prior deviations of latent field and noise are (R,) [dB].
+        A receiver with fewer than `min_places` places has the factor of all receivers. Not studied.
         """
         score, place = (train.rssi_dbm - predicted).abs() / (HALF_WIDTH * std), places(train.transmitter_position)
         count = torch.zeros(int(place.max()) + 1, score.shape[1]).index_add(0, place, score.isfinite().float())
         scale = torch.full_like(field_db, interval_factor(score, place))
-        for r in ((count > 0).sum(dim=0) >= MIN_PLACES).nonzero()[:, 0].tolist():
+        for r in ((count > 0).sum(dim=0) >= min_places).nonzero()[:, 0].tolist():
             scale[r] = interval_factor(score[:, r], place)
         self.field_db = (scale * field_db).float()
         self.noise_db = (scale * noise_db).clamp_min(rounding_std(train.rssi_dbm)).float()
         return scale
 
-    def _take(self, state: dict[str, Any]) -> None:
-        """Take the rows of a posterior over; see `FittedRows`."""
-        self._table, receiver = HeadTable(self.rendered), self.receiver_position - self.centre
-        self._set_posterior(
-            RssiPosterior(receiver=receiver, kernel=self.kernel, table=self._table, huber=self.config.huber, **state)
-        )
+    @property
+    def kernel(self) -> Kernel:
+        """Kernel of the latent field, lengths in [m]."""
+        return self.posterior.kernel
 
-    def _set_posterior(self, posterior: RssiPosterior) -> None:
-        """Mix a posterior with the simpler predictors, and compute what all predictions share."""
-        self.posterior, weight = posterior, self.mixing_weight[0]
-        self.level, self.slope = (self.baseline + weight * posterior.path_loss).T
-        self.directivity = (weight * posterior.directivity).float()
-        self.anchor, self.coefficient = posterior.anchor.float(), posterior.coefficient.float().contiguous()
-        self._uncertainty = uncertainty(self.kernel, posterior.anchor, posterior.receiver, self.covariance)
+    @property
+    def path_loss(self) -> PathLoss:
+        """Path-loss model of each receiver, (R,)."""
+        return self.posterior.path_loss
 
     @property
     def n_primitives(self) -> int:
         """Number of primitives a receiver; 0 if there is no field."""
-        return self.config.n_primitives if bool(self.rendered.any()) else 0
-
-    @property
-    def receiver(self) -> Tensor:
-        """Positions of the receivers, float64 (R, 3) [m]. Unknown ones are 0; their slope and directivity are 0, too."""
-        return self.receiver_position.nan_to_num(0.0)
+        return self.config.n_primitives if bool(self.field_db.any()) else 0
 
     def region(self) -> Tensor:
         """Return the positions (n, 3) [m] of the location bins."""
-        return self.anchor.double() + self.centre
+        return self.posterior.position + self.centre
 
     @single_thread()
     def _update(self, new: Rssi) -> None:
         at = new.transmitter_position - self.centre
         if self.detection_field is not None:
             self.detection_field = self.detection_field.updated(at, new.detected)
-        self._set_posterior(self.posterior.updated(at, new.rssi_dbm))
+        self.posterior = self.posterior.updated(at, new.rssi_dbm)
 
     def with_chosen_kernel(self, without: Tensor | None = None) -> Self:
-        """Return the model fitted again to all rows that it has learnt, with kernel, noise and mixing weights chosen again.
+        """Return the model fitted again to all rows that it has learnt, with kernel and noise chosen again.
 
         The rows follow from their residuals, the attenuation of floors is estimated again, and offsets stay as fitted. Rows
         that were averaged in location bins are bins here, so that the scatter of single measurements is unknown: standard
@@ -233,13 +190,13 @@ class RssiModel(RssiPredictor, Saved):
         Example:
             >>> import swiftwrf
             >>> model = RssiModel().fit(swiftwrf.rssi_room(n=60))
-            >>> len(model.with_chosen_kernel(without=torch.arange(10)).anchor)
+            >>> len(model.with_chosen_kernel(without=torch.arange(10)).region())
             50
         """
         self.check_fitted()
         self.check_updates()
         posterior = self.posterior
-        kept = torch.ones(len(posterior.anchor), dtype=torch.bool)
+        kept = torch.ones(len(posterior.position), dtype=torch.bool)
         if without is not None:
             kept[without] = False
         at, rssi, attenuation = self.region()[kept], posterior.rssi[kept], self.attenuation
@@ -256,7 +213,7 @@ class RssiModel(RssiPredictor, Saved):
         model = type(self)(replace(self.config, validation=validation)).fit(rows)
         model.offsets, model.row_digests = self.offsets, self.row_digests
         if without is not None:
-            model.row_digests = self._digests_without(without, len(posterior.anchor))
+            model.row_digests = self._digests_without(without, len(posterior.position))
         # a mean of several measurements has a smaller variance than one measurement
         if bool(((posterior.variance > 0) & (posterior.variance < 0.99 * posterior.noise_db.square()[:, None])).any()):
             model.field_db, model.noise_db = self.field_db, self.noise_db
@@ -264,17 +221,11 @@ class RssiModel(RssiPredictor, Saved):
 
     @single_thread()
     def _predict(self, position: Tensor) -> tuple[Tensor, Tensor]:
-        offset = position - self.centre
-        local = offset.float()
-        distance = log_distance(position, self.receiver)
-        path_loss = self.level + self.slope * distance
-        bearing = harmonics(local, (self.receiver - self.centre).float())
-        head = self._table(self.kernel(local, self.anchor) @ self.coefficient)[0]
-        mean = path_loss.float() + torch.einsum("brh,rh->br", bearing, self.directivity)
-        mean = mean + self.mixing_weight[0].float() * head
-        variance, trend = self._uncertainty(offset)
-        variance = self.field_db.square() * variance.float()[:, None] + trend.float()
-        return mean, (self.noise_db.square() + variance).sqrt()
+        offset, posterior = position - self.centre, self.posterior
+        mean = posterior.at(offset, self.kernel(offset.float(), posterior.position.float()))[0]
+        prior_db = self.field_db, self.noise_db
+        std = predictive_std(posterior.trend, posterior.receiver, offset, prior_db, self.covariance)
+        return mean.float(), std.float()
 
     @checked
     def predict_detected(self, data: Rssi) -> Prediction:
@@ -320,14 +271,6 @@ class RssiModel(RssiPredictor, Saved):
         """
         self.check_fitted()
         return RssiMap.predict(self, height=height_m).plot(receiver, ax)
-
-    @property
-    def _rows(self) -> Annotated[FittedRows, "r"]:
-        return FittedRows(**{field.name: getattr(self.posterior, field.name) for field in fields(FittedRows)})
-
-    @_rows.setter
-    def _rows(self, rows: FittedRows) -> None:
-        self._take(vars(rows))
 
 
 def fit_rssi(train: Rssi, config: RssiConfig | None = None, **options: Any) -> RssiModel:

@@ -21,9 +21,6 @@ from swiftwrf.gp import Kernel
 from swiftwrf.rssi.path_loss import fit_path_losses, log_distance
 from swiftwrf.runtime.threads import single_thread
 
-VAGUE = 1e6  # prior variance of a coefficient relative to the field
-MAX_ROWS = 300  # of a receiver, from which offsets are estimated; the cost grows with their cube
-
 
 @dataclass(frozen=True)
 class FloorAttenuation:
@@ -85,17 +82,24 @@ def estimate_floor_attenuation(data: Rssi) -> FloorAttenuation:
     weak = rssi.nan_to_num(float(rssi[data.detected].min()))  # what was not received was weak
     mean = (member.T @ weak) / member.sum(dim=0)[:, None]
     strongest = mean.where(count >= count.amax(dim=0).clamp(1, 3), -torch.inf).argmax(dim=0)
-    own = data.floors.number(data.receiver_position.nan_to_num(0.0)).where(data.receiver_located, strongest)
+    receiver_floor = data.floors.number(data.receiver_position.nan_to_num(0.0)).where(data.receiver_located, strongest)
     nearby = data.transmitter_position[rssi.nan_to_num(-torch.inf).topk(min(3, len(data)), dim=0).indices].mean(dim=0)
     receiver = data.receiver_position.where(data.receiver_located[:, None], nearby)
-    crossed = (floor[:, None] - own).abs().double()
-    found = fit_path_losses(data.transmitter_position, receiver, rssi, crossed=crossed)
+    crossed = (floor[:, None] - receiver_floor).abs().double()
+    losses = fit_path_losses(data.transmitter_position, receiver, rssi, crossed=crossed)
     measured = data.detected.sum(dim=0).double()
-    return FloorAttenuation(data.floors, tuple(own.tolist()), float(found.floor_db @ measured / measured.sum()))
+    db = float(losses.floor_db @ measured / measured.sum())
+    return FloorAttenuation(data.floors, tuple(receiver_floor.tolist()), db)
 
 
 @single_thread()
-def estimate_offsets(train: Rssi, reference: str | None = None) -> Offsets:
+def estimate_offsets(
+    train: Rssi,
+    reference: str | None = None,
+    *,
+    relative_length: float = 0.25,
+    prior_precision: float = 0.05,
+) -> Offsets:
     """Estimate the offset of each group of measured rows by generalised least squares.
 
     RSSI at a receiver is its path-loss model, plus a Gaussian process of the position, plus the offset of the row's group,
@@ -104,6 +108,9 @@ def estimate_offsets(train: Rssi, reference: str | None = None) -> Offsets:
     Args:
         train: Training rows with groups.
         reference: Group with offset 0. Defaults to the most frequent one.
+        relative_length: Correlation length of the process relative to the extent of the positions. Not studied.
+        prior_precision: Prior precision of an offset relative to the variance of the field: a standard deviation of 10 dB
+            for a usual field. Not studied.
 
     Raises:
         InputError: Rows without a group, one group only, or an unknown reference.
@@ -135,24 +142,25 @@ def estimate_offsets(train: Rssi, reference: str | None = None) -> Offsets:
         raise InputError(f"column {groups.name} has no value {chosen!r}; there are {listed(names)}")
     position = train.transmitter_position
     extent = float((position.amax(dim=0) - position.amin(dim=0)).max()) or 1.0
-    kernel = Kernel(0.25 * extent, matern12_weight=1.0, noise=1.0)  # fading is as large as shadowing
-    apart = log_distance(position, train.receiver_position)
+    kernel = Kernel(relative_length * extent, matern12_weight=1.0, noise=1.0)  # fading is as large as shadowing
+    distance = log_distance(position, train.receiver_position)
     member = torch.nn.functional.one_hot(code, len(names)).double()
     gram = torch.zeros(len(names) + 1, len(names) + 1, dtype=torch.float64)  # of members and RSSI
     generator = torch.Generator().manual_seed(0)
     for r, rssi in enumerate(train.as_measured().rssi_dbm.T):
         rows = (~rssi.isnan()).nonzero()[:, 0]
-        rows = rows[torch.randperm(len(rows), generator=generator)[:MAX_ROWS]]  # evenly spaced rows may be of one group
+        # the time grows with the cube of the number of rows, and evenly spaced ones may be of one group
+        rows = rows[torch.randperm(len(rows), generator=generator)[:300]]
         if not len(rows):
             continue
-        free = torch.stack([torch.ones_like(apart[rows, r]), apart[rows, r]], dim=1)
+        free = torch.stack([torch.ones_like(distance[rows, r]), distance[rows, r]], dim=1)
         # level and slope over log10 distance are fitted with the offsets, by a linear kernel
-        weight = torch.linalg.inv(kernel.covariance(position[rows]) + VAGUE * free @ free.T)
+        weight = torch.linalg.inv(kernel.covariance(position[rows]) + 1e6 * free @ free.T)
         values = torch.cat([member[rows], rssi[rows, None]], dim=1)
         gram += values.T @ weight @ values
     normal, right, total = gram[:-1, :-1], gram[:-1, -1], float(gram[-1, -1])
     others = torch.tensor([name != chosen for name in names])
-    prior = 0.05 * torch.eye(int(others.sum()), dtype=torch.float64)  # a standard deviation of 10 dB
+    prior = prior_precision * torch.eye(int(others.sum()), dtype=torch.float64)
     precision = normal[others][:, others] + prior
     offset = torch.zeros(len(names), dtype=torch.float64)
     offset[others] = torch.linalg.solve(precision, right[others])

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Self
 
@@ -22,7 +21,7 @@ from torch import Tensor
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import each_fold, folds, places
 from swiftwrf.errors import InputError
-from swiftwrf.gp import GaussianProcess, Kernel, candidates
+from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.gp.process import leave_folds_out_locally
 from swiftwrf.metrics import HALF_WIDTH, interval_factor
 from swiftwrf.models.base import FieldConfig
@@ -30,15 +29,12 @@ from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import check_positions, nearest
 from swiftwrf.rssi.base import RECEIVER_POSITIONS, RssiPredictor, in_batches
 from swiftwrf.rssi.path_loss import MIN_DISTANCE_M, fit_path_loss
-from swiftwrf.rssi.training import rounding_std
+from swiftwrf.rssi.training import rough_candidates, rounding_std
 from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import configuration
 
-RELATIVE_NOISE_VARIANCES = (0.03, 0.1, 0.3, 1.0, 3.0)  # variance of a measurement relative to that of the field
-RATIOS = (0.5, 1.0, 2.0)  # of distances that the transmitter moves to equivalent ones of the receiver
 BATCH_PAIRS = 2048  # predicted at a time, since each needs a matrix of 64 x 64
-MAX_HELD_OUT = 500  # pairs that choose the kernel; more do not change it
 
 
 @configuration
@@ -46,13 +42,13 @@ class PairConfig(FieldConfig):
     """Options of models over pairs of positions."""
 
     new_places: bool = True
-    """fit for receivers at positions without a measurement, with one path-loss model; otherwise for new positions of the
-    transmitter, as `validation` states, with a path-loss model for each receiver"""
+    """True: receivers are predicted at new positions, so all have one path loss, and folds hold out receivers. False:
+    receivers are the same, so each has a correction, and folds hold out positions of the transmitter (`validation`)"""
 
 
 @dataclass(frozen=True, eq=False)
 class PairPathLoss:
-    """The log-distance path-loss model over pairs of positions: one for all receivers, and corrections at some places.
+    """The log-distance path-loss model over pairs of positions: one for all receivers, and corrections of places.
 
     Args:
         shared: RSSI at 1 m [dBm] and slope [dB a decade] of all receivers, float64 (2,).
@@ -70,25 +66,26 @@ class PairPathLoss:
     correction: Annotated[Tensor, "float64 p 2"]
 
     @classmethod
-    def fit(cls, pair: Tensor, rssi: Tensor, by_place: bool) -> Self:
+    def fit(cls, pair: Tensor, rssi: Tensor, by_place: bool, rows_worth: float = 10.0) -> Self:
         """Fit the model by least squares, the corrections with a ridge penalty.
 
         Args:
             pair: Positions of transmitter and receiver, (m, 6) [m].
             rssi: Measurements (m,) [dBm].
             by_place: Whether each position of a receiver has a correction.
+            rows_worth: Ridge penalty. A place with 10 measurements has half of their mean residual. Not studied.
         """
-        apart = _pair_log_distance(pair)
-        shared = torch.cat(fit_path_loss(apart[:, None], rssi[:, None].double()))
+        distance = _pair_log_distance(pair)
+        shared = torch.cat(fit_path_loss(distance[:, None], rssi[:, None].double()))
         place, row = pair[: len(pair) if by_place else 0, 3:].double().unique(dim=0, return_inverse=True)
         if not len(place):
             return cls(shared, place.reshape(0, 3), torch.zeros(0, 2, dtype=torch.float64))
-        centre = apart.mean()
-        own = torch.stack([torch.ones_like(apart), apart - centre], dim=1)
-        normal = 10.0 * torch.eye(2).double().repeat(len(place), 1, 1)  # half after 10 measurements
-        normal = normal.index_add(0, row, own[:, :, None] * own[:, None])
-        residual = rssi - shared[0] - shared[1] * apart
-        right = torch.zeros(len(place), 2, dtype=torch.float64).index_add(0, row, own * residual[:, None])
+        centre = distance.mean()
+        feature = torch.stack([torch.ones_like(distance), distance - centre], dim=1)
+        normal = rows_worth * torch.eye(2).double().repeat(len(place), 1, 1)
+        normal = normal.index_add(0, row, feature[:, :, None] * feature[:, None])
+        residual = rssi - shared[0] - shared[1] * distance
+        right = torch.zeros(len(place), 2, dtype=torch.float64).index_add(0, row, feature * residual[:, None])
         slope = torch.linalg.solve(normal, right)[:, 1].clamp_max(-shared[1])  # the sum of both slopes is at most 0
         level = (right[:, 0] - normal[:, 0, 1] * slope) / normal[:, 0, 0]
         return cls(shared, place, torch.stack([level - slope * centre, slope], dim=1))
@@ -97,8 +94,8 @@ class PairPathLoss:
         """Return the RSSI (m,) [dBm] at pairs (m, 6) [m]; at places without a correction by the shared model."""
         values = self.shared.expand(len(pair), 2)
         if len(self.place) and len(pair):
-            away, number = (found[:, 0] for found in nearest(pair[:, 3:], self.place, 1))
-            values = values + self.correction[number].where(away[:, None] < 1e-3, 0.0)
+            distance, number = nearest(pair[:, 3:], self.place, 1)
+            values = values + self.correction[number[:, 0]].where(distance < 1e-3, 0.0)
         return values[:, 0] + values[:, 1] * _pair_log_distance(pair)
 
 
@@ -155,12 +152,12 @@ class PairPredictor(RssiPredictor):
         """Predict the RSSI where it is measured; nan elsewhere, which saves time where a row has few receivers."""
         data = self.aligned(data)
         row, column = data.detected.nonzero(as_tuple=True)
-        found = self.predict_pairs(data.transmitter_position[row], self.receiver_position[column])
+        predicted = self.predict_pairs(data.transmitter_position[row], self.receiver_position[column])
 
-        def spread(values: Tensor) -> Tensor:
+        def table(values: Tensor) -> Tensor:
             return torch.full(data.rssi_dbm.shape, torch.nan).double().index_put((row, column), values.double())
 
-        return Prediction(spread(found.mean), None if found.std is None else spread(found.std))
+        return Prediction(table(predicted.mean), None if predicted.std is None else table(predicted.std))
 
     def predict_pairs(self, transmitter_position: Tensor, receiver_position: Tensor) -> Prediction:
         """Predict the RSSI of pairs of positions, measured or not.
@@ -194,6 +191,44 @@ class PairPredictor(RssiPredictor):
 def scaled(pair: Tensor, ratio: float) -> Tensor:
     """Return pairs (m, 6), the receiver's coordinates times a ratio: coordinates in which pairs are near to each other."""
     return pair * pair.new_tensor([1.0] * 3 + [ratio] * 3)
+
+
+def choose_pair_kernel(
+    pair: Tensor,
+    residual: Tensor,
+    fold: Tensor,
+    order: Tensor,
+    *,
+    ratios: tuple[float, ...] = (0.5, 1.0, 2.0),
+    noises: tuple[float, ...] = (0.03, 0.1, 0.3, 1.0, 3.0),
+) -> tuple[Tensor, float, Kernel, Tensor]:
+    """Choose ratio and kernel with the lowest mean absolute error at held-out pairs.
+
+    Args:
+        pair: Measured pairs (m, 6) [m].
+        residual: Residuals of path-loss models fitted without each fold, (folds, m) [dB].
+        fold: Number of the fold of each pair, (m,).
+        order: Numbers of the pairs in random order, (m,).
+        ratios: Compared ratios of distances of the transmitter to equivalent ones of the receiver. Not studied.
+        noises: Compared variances of a measurement, relative to that of the field. Not studied.
+
+    Returns:
+        Numbers of the pairs that choose, (k,), ratio, kernel, and the absolute errors at these pairs relative to their
+        standard deviations, (k,).
+    """
+    # more pairs do not change the choice
+    rows, best = order[:500], (math.inf, 1.0, Kernel(), residual[0])
+    truth = residual[fold[rows], rows]
+    for ratio in ratios:
+        coordinates = scaled(pair, ratio)
+        near, weights = leave_folds_out_locally(coordinates, fold, rows)
+        values = residual[fold[rows, None], near]
+        for kernel in sorted(rough_candidates(coordinates, noises), key=lambda kernel: kernel.matern12_length):
+            weight, variance = weights(kernel)
+            error = (truth - (weight * values).sum(dim=1)).abs()
+            if float(error.mean()) < best[0]:
+                best = float(error.mean()), ratio, kernel, error / (variance + kernel.noise).sqrt()
+    return rows, *best[1:]
 
 
 class PairModel(PairPredictor, Saved):
@@ -235,31 +270,16 @@ class PairModel(PairPredictor, Saved):
         self.pair, self.path_loss = pair, path_loss(torch.arange(len(pair)))
         self.residual = rssi - self.path_loss(pair)
         order = torch.randperm(len(pair), generator=torch.Generator().manual_seed(self.config.seed))
-        rows, (names, number) = order[:MAX_HELD_OUT], fold.unique(return_inverse=True)
+        names, number = fold.unique(return_inverse=True)
         # one region only: none is left to predict it from
         fold = number if len(names) > 1 else torch.arange(len(fold)) % 2
         # residuals (folds, pairs) of the path-loss model fitted without each fold
         residual = torch.stack([rssi - path_loss(kept)(pair) for _, kept in each_fold(fold)])
-        choices = (choice for ratio in RATIOS for choice in self._judged(ratio, fold, rows, residual))
-        _, self.ratio, self.kernel, score = min(choices, key=lambda choice: choice[0])
+        rows, self.ratio, self.kernel, score = choose_pair_kernel(pair, residual, fold, order)
         place = places(pair[rows, 3:] if self.config.new_places else pair[rows, :3], 2)  # of the end that is held out
         scale = interval_factor(score / HALF_WIDTH, place)
         self.scale_db = score.new_tensor([max(scale, rounding_std(rssi) / self.kernel.noise**0.5)])
         self._precompute()
-
-    def _judged(
-        self, ratio: float, fold: Tensor, rows: Tensor, residual: Tensor
-    ) -> Iterator[tuple[float, float, Kernel, Tensor]]:
-        """Yield kernels with their mean absolute error at held-out pairs, and the errors by their relative deviations."""
-        coordinates = scaled(self.pair, ratio)
-        near, weights = leave_folds_out_locally(coordinates, fold, rows)
-        values, truth = residual[fold[rows, None], near], residual[fold[rows], rows]
-        # rough fields only, as in the model of each receiver
-        kernels = [k for k in candidates(coordinates, RELATIVE_NOISE_VARIANCES) if k.matern12_weight == 1]
-        for kernel in sorted(kernels, key=lambda kernel: kernel.matern12_length):
-            weight, variance = weights(kernel)
-            error = (truth - (weight * values).sum(dim=1)).abs()
-            yield float(error.mean()), ratio, kernel, error / (variance + kernel.noise).sqrt()
 
     def region(self) -> Tensor:
         """Return the training positions (n, 3) [m], one for each pair."""

@@ -17,13 +17,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from swiftwrf.data.rssi import Rssi
-from swiftwrf.errors import FitError
+from swiftwrf.errors import FitError, InputError
 from swiftwrf.models.base import CPU
-from swiftwrf.rssi.base import Map, RssiConfig, often_detected
-from swiftwrf.rssi.head import Head, mean_magnitude, render
+from swiftwrf.rssi.base import Map, RssiConfig, columns_of, often_detected
+from swiftwrf.rssi.head import Head, Heads, mean_magnitude, render
 from swiftwrf.rssi.model import RssiModel
-from swiftwrf.rssi.regression import held_out_std
-from swiftwrf.rssi.training import Bins, bin_locations, binned, check_comparable, choose_residual_kernel, prior_std
+from swiftwrf.rssi.regression import RssiPosterior, held_out_std
+from swiftwrf.rssi.training import Bins, check_folds, choose_residual_kernel, prior_std
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, configuration
@@ -73,15 +73,16 @@ class RssiPaperModel(RssiModel):
         progress: bool = False,
         **_: Any,
     ) -> None:
-        config, bins = self.config, binned(train, self.config)
-        pool_rssi = bin_locations(pool, config.max_locations)[1]
-        pool_residual = pool_rssi - pool_rssi.nanmean(dim=0)
+        config, of_pool = self.config, Bins.of(pool, self.config)
+        bins = of_pool.columns(columns_of(train.receiver_names, pool))
+        check_folds(bins.fold == HELD_OUT_FOLD, bins.rssi)
+        pool_residual = of_pool.rssi - of_pool.rssi.nanmean(dim=0)
         residual = pool_residual[:, often_detected(pool)]
-        self.kernel = choose_residual_kernel(bins.position, residual, bins.fold, train.floors is not None)[0]
+        kernel = choose_residual_kernel(bins.position, residual, bins.fold, train.floors is not None)[0]
         variance = (bins.rssi - bins.rssi.nanmean(dim=0)).square().nanmean(dim=0)
         variance = variance.nan_to_num(float(pool_residual.square().nanmean())).clamp_min(1e-6)
-        prior_db = prior_std(variance, self.kernel)
-        covariance = self.kernel(bins.position, bins.position)
+        prior_db = prior_std(variance, kernel)
+        covariance = kernel(bins.position, bins.position)
         covariance.diagonal().add_(1e-3)  # bins may nearly coincide
         root = torch.linalg.cholesky(covariance)  # the latent field in the bins is this times standard normal numbers
         task = partial(learn_receivers, bins=bins, root=root, prior_db=prior_db, config=config, device=device)
@@ -92,41 +93,46 @@ class RssiPaperModel(RssiModel):
             fits = (parallel or map)(task, parts)
             results = list(bar.track(fits, total=len(parts), description="receivers"))
         held_out, white, rendered = (torch.cat(values) for values in zip(*results, strict=True))
-        covariance = torch.zeros(n_receivers, 2, 2).double()
+        self.covariance, self.centre, self.detection_field = torch.zeros(n_receivers, 2, 2).double(), bins.centre, None
         out = ~bins.rssi.isnan() & (bins.fold == HELD_OUT_FOLD)[:, None]
         predicted = held_out.T.double().where(out, torch.nan)[bins.bin_of_row]
-        check_comparable(predicted[None], train.rssi_dbm)
-        std = held_out_std(bins, self.kernel, prior_db, covariance)[bins.bin_of_row]
+        std = held_out_std(bins, kernel, prior_db, self.covariance)[bins.bin_of_row]
         self._calibrate(train, predicted, std, *prior_db)
-        self.mixing_weight, self.baseline = torch.eye(4).double()[0], torch.zeros(n_receivers, 2).double()
-        self.centre, self.rendered, self.covariance, self.detection_field = bins.centre, rendered, covariance, None
         dual = torch.linalg.solve_triangular(root.T, white.T.double() * prior_db[0], upper=True).T
         level = LEVEL_DBM + mean_magnitude(rendered, torch.zeros(1, n_receivers))[0].double()
         # the dual coefficients are those of the kernel alone, without a path loss or noise
-        state = {
-            "anchor": bins.position,
-            "dual": dual,
-            "tangent": torch.ones_like(dual),
-            "variance": torch.zeros_like(dual),
-            "measured": torch.ones_like(dual),
-            "prior": torch.stack([level, torch.zeros_like(level)], dim=1),
-            "root": torch.zeros_like(covariance),
-            "field_db": torch.ones_like(level),
-            "noise_db": torch.zeros_like(level),
-        }
-        self._take(state)
+        self.posterior = RssiPosterior(
+            kernel=kernel,
+            heads=Heads(rendered),
+            huber=config.huber,
+            receiver=bins.receiver,
+            position=bins.position,
+            dual=dual,
+            tangent=torch.ones_like(dual),
+            variance=torch.zeros_like(dual),
+            measured=torch.ones_like(dual),
+            prior=torch.stack([level, torch.zeros_like(level)], dim=1),
+            root=torch.zeros_like(self.covariance),
+            field_db=torch.ones_like(level),
+            noise_db=torch.zeros_like(level),
+        )
+
+    def _restored(self) -> None:
+        super()._restored()
+        if len(self.posterior.heads.rendered) != len(self.receiver_names):
+            raise InputError("each receiver needs its head")
 
 
 @single_thread()
 def learn_receivers(
-    some: slice,
+    part: slice,
     bins: Bins,
     root: Tensor,
     prior_db: tuple[Tensor, Tensor],
     config: RssiPaperConfig,
     device: torch.device,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Fit some receivers twice: without one fold, and with all.
+    """Fit the receivers of a part twice: without one fold, and with all.
 
     The receivers share the steps, which saves time, but no parameter, loss or moment: each is fitted as if alone. `root` is
     the Cholesky factor of the covariance of the latent field in the n bins, (n, n), and `prior_db` are the standard
@@ -139,13 +145,13 @@ def learn_receivers(
     Raises:
         FitError: A loss that is not finite.
     """
-    names, root = bins.receiver_names[some], root.float().to(device)
-    field_db, noise_db = (x[some].float().to(device) for x in prior_db)
-    measured, count = (x[:, some].float().to(device) for x in (bins.rssi, bins.count))
+    names, root = bins.receiver_names[part], root.float().to(device)
+    field_db, noise_db = (x[part].float().to(device) for x in prior_db)
+    measured, count = (x[:, part].float().to(device) for x in (bins.rssi, bins.count))
     noise_db = noise_db / count.clamp_min(1).sqrt()
 
     def descend(rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return predictions in all bins (R, n) by the fit to some bins, the normal numbers (R, n), and the heads."""
+        """Return predictions in all bins (R, n) by the fit to the bins `rows`, the normal numbers (R, n), and the heads."""
         generator = torch.Generator().manual_seed(config.seed)
         heads = [Head(config.n_primitives, config.seed).to(device) for _ in names]
         white = nn.Parameter(torch.zeros_like(measured))

@@ -19,12 +19,6 @@ from swiftwrf.rssi.detection import Detection, empty_given
 from swiftwrf.runtime.threads import single_thread
 
 MIN_DISTANCE_M = 0.3  # shorter distances count as this one: the model does not hold in the near field
-MAX_ROUNDS = 40  # of expectation maximisation
-SLOPE_PRIOR = -30.0, 15.0  # of the slope of all receivers: path-loss exponents of 1.5 to 4.5 [dB a decade]
-SPREAD_DB, SPREAD_WORTH = 6.0, 4.0  # prior of the spread over receivers, and the number of receivers that it counts as
-FLOOR_STD_DB = 20.0  # prior standard deviation of the attenuation of a floor about 0
-ROWS_WORTH = 10.0  # rows of a receiver that count as much as the variance of all receivers
-MAX_UNEXPLAINED = 0.4  # share of empty cells where a value was expected, beyond which those of a receiver are ignored
 
 
 def log_distance(position: Tensor, receiver: Tensor) -> Tensor:
@@ -41,7 +35,9 @@ def log_distance(position: Tensor, receiver: Tensor) -> Tensor:
         >>> log_distance(torch.tensor([[0.0, 0.0, 10.0]]), torch.zeros(1, 3))
         tensor([[1.]], dtype=torch.float64)
     """
-    return distance(position.double(), receiver.double()).clamp_min(MIN_DISTANCE_M).log10().nan_to_num(0.0)
+    known = ~receiver.isnan().any(dim=1)
+    metres = distance(position.double(), receiver.double().nan_to_num(0.0))  # nan would be the gradient at a position
+    return metres.clamp_min(MIN_DISTANCE_M).log10().where(known, 0.0)
 
 
 def harmonics(position: Tensor, receiver: Tensor) -> Tensor:
@@ -50,10 +46,11 @@ def harmonics(position: Tensor, receiver: Tensor) -> Tensor:
     Returns:
         (n, R, 8), each of unit mean square over all directions. 0 for a receiver of unknown position (nan).
     """
-    x, y, z = functional.normalize(position[:, None] - receiver, dim=-1).unbind(-1)
+    known = ~receiver.isnan().any(dim=1)[:, None]
+    x, y, z = functional.normalize(position[:, None] - receiver.nan_to_num(0.0), dim=-1).unbind(-1)
     first = [math.sqrt(3) * c for c in (x, y, z)]
     second = [math.sqrt(15) * c for c in (x * y, y * z, z * x, (x * x - y * y) / 2)]
-    return torch.stack([*first, *second, math.sqrt(5) / 2 * (3 * z * z - 1)], dim=-1).nan_to_num(0.0)
+    return torch.stack([*first, *second, math.sqrt(5) / 2 * (3 * z * z - 1)], dim=-1).where(known, 0.0)
 
 
 class PathLoss(NamedTuple):
@@ -118,7 +115,7 @@ class PathLosses(NamedTuple):
     """Path loss of R receivers that is learnt together: level and slope of each are normal about those of all.
 
     Args:
-        own: Model of each receiver, (R,); that of all receivers where a receiver has no measurements.
+        each: Model of each receiver, (R,); that of all receivers where a receiver has no measurements.
         shared: Model of all receivers of its kind, of known or of unknown position, (R,).
         root: A factor of the covariance of the receivers' level and slope about the shared ones, with the uncertainty of the
             latter, root @ root^T, (R, 2, 2). Level and slope are independent at some distance.
@@ -127,7 +124,7 @@ class PathLosses(NamedTuple):
         floor_db: Attenuation of a floor for each receiver's kind, (R,) [dB]; 0 without floors.
     """
 
-    own: PathLoss
+    each: PathLoss
     shared: PathLoss
     root: Tensor
     variance: Tensor
@@ -135,10 +132,10 @@ class PathLosses(NamedTuple):
     floor_db: Tensor
 
     def columns(self, number: Tensor | slice) -> PathLosses:
-        """Return the path loss of some receivers."""
-        own, shared = (PathLoss(*(value[number] for value in model)) for model in (self.own, self.shared))
+        """Return the path loss of the receivers `number`."""
+        each, shared = (PathLoss(*(value[number] for value in model)) for model in (self.each, self.shared))
         detection = self.detection and self.detection.columns(number)
-        return PathLosses(own, shared, self.root[number], self.variance[number], detection, self.floor_db[number])
+        return PathLosses(each, shared, self.root[number], self.variance[number], detection, self.floor_db[number])
 
 
 @single_thread()
@@ -150,12 +147,15 @@ def fit_path_losses(
     shift: Tensor | None = None,
     detection: Detection | None = None,
     crossed: Tensor | None = None,
+    *,
+    max_unexplained: float = 0.4,
+    spread_db: float = 6.0,
 ) -> PathLosses:
     """Fit the path-loss models of all receivers together, by expectation maximisation.
 
-    A receiver has what its rows determine, and for the rest what the other receivers have (a hierarchical model: A. Gelman
-    et al., "Bayesian Data Analysis", 3rd ed., 2013, chapter 5). An empty cell is an upper limit of the power, see
-    `Detection`, unless most empty cells of its receiver are where the path loss expects a value.
+    Level and slope of a receiver are shrunk to those of all receivers in proportion to how badly its rows determine them (a
+    hierarchical model: A. Gelman et al., "Bayesian Data Analysis", 3rd ed., 2013, chapter 5). An empty cell is an upper
+    limit of the power, see `Detection`, unless most empty cells of its receiver are where the path loss expects a value.
 
     Args:
         position: Positions of the transmitter, (n, 3) [m].
@@ -166,12 +166,15 @@ def fit_path_losses(
         detection: Curve of detection. Defaults to an estimate.
         crossed: Number of floors between both ends, float64 (n, R), whose attenuation is fitted, too. Distances are then
             horizontal. Defaults to none.
+        max_unexplained: Fraction of the empty cells of a receiver where a value was expected, beyond which "auto" ignores
+            them. Not studied.
+        spread_db: Prior standard deviation of levels and slopes about those of all receivers [dB]. Not studied.
 
     Example:
         >>> import swiftwrf
         >>> room = swiftwrf.rssi_room(n=200)
-        >>> found = fit_path_losses(room.transmitter_position, room.receiver_position, room.rssi_dbm)
-        >>> -30 < float(found.own.slope.mean()) < -10
+        >>> losses = fit_path_losses(room.transmitter_position, room.receiver_position, room.rssi_dbm)
+        >>> -30 < float(losses.each.slope.mean()) < -10
         True
     """
     shift = torch.zeros_like(rssi) if shift is None else shift
@@ -189,93 +192,120 @@ def fit_path_losses(
     def fit(curve: Detection | None) -> tuple[PathLosses, Tensor]:
         mean, none = rssi.nanmean().repeat(len(receiver)), torch.zeros(len(receiver), dtype=torch.float64)
         # a kind of receivers that measured nothing has the mean of the others
-        fields = {"own_level": mean, "shared_level": mean.clone()}
-        fields |= {name: none.clone() for name in ("own_slope", "shared_slope", "unexplained", "floor_db")}
-        fields["root"] = SPREAD_DB * torch.eye(2, dtype=torch.float64).repeat(len(receiver), 1, 1)
-        fields["variance"] = torch.full((len(receiver),), SPREAD_DB**2, dtype=torch.float64)
+        fields = {"each_level": mean, "shared_level": mean.clone(), "variance": none + spread_db**2}
+        fields |= {name: none.clone() for name in ("each_slope", "shared_slope", "unexplained", "floor_db")}
+        fields["root"] = spread_db * torch.eye(2, dtype=torch.float64).repeat(len(receiver), 1, 1)
         for kind in (located, ~located):
             if bool(rssi[:, kind].isfinite().any()):
                 of_kind = curve and curve.columns(kind)
                 cells = distance[:, kind], floors[:, kind], rssi[:, kind], shift[:, kind]
-                for name, value in _maximise(*cells, of_kind, repeats).items():
+                for name, value in _maximise(*cells, of_kind, repeats, spread_db).items():
                     fields[name][kind] = value
-        own, shared = (PathLoss(fields[f"{of}_level"], fields[f"{of}_slope"] * located) for of in ("own", "shared"))
+        each, shared = (PathLoss(fields[f"{of}_level"], fields[f"{of}_slope"] * located) for of in ("each", "shared"))
         fields["root"][~located, :, 1] = 0.0
-        losses = PathLosses(own, shared, fields["root"], fields["variance"], curve, fields["floor_db"])
+        losses = PathLosses(each, shared, fields["root"], fields["variance"], curve, fields["floor_db"])
         return losses, fields["unexplained"]
 
-    found, unexplained = fit(detection)
+    losses, unexplained = fit(detection)
     if not_detected == "auto" and detection is not None:
-        explained = detection.is_limit & (unexplained <= MAX_UNEXPLAINED)
+        explained = detection.is_limit & (unexplained <= max_unexplained)
         if bool((explained != detection.is_limit).any()):
-            found, _ = fit(replace(detection, is_limit=explained))
-    return found
+            losses, _ = fit(replace(detection, is_limit=explained))
+    return losses
 
 
 def _maximise(
-    distance: Tensor, crossed: Tensor, rssi: Tensor, shift: Tensor, detection: Detection | None, repeats: float
+    distance: Tensor,
+    crossed: Tensor,
+    rssi: Tensor,
+    shift: Tensor,
+    detection: Detection | None,
+    repeats: float,
+    spread_db: float,
+    *,
+    slope_prior: tuple[float, float] = (-30.0, 15.0),
+    spread_worth: float = 4.0,
+    floor_std_db: float = 20.0,
+    rows_worth: float = 10.0,
 ) -> dict[str, Tensor]:
     """Fit the path loss of receivers of one kind, at log10 distances (n, R) [m]; see `fit_path_losses`.
 
-    Rows count as one for each `repeats` of them.
+    RSSI of receiver r in row i is y = f . (m + d_r) + noise of variance v_r, with f = (1, distance less its mean, -floors).
+    The deviations d_r are normal with the diagonal covariance D, the coefficients m of all receivers have the prior mean p
+    and precision P. With rows of weights w, A_r = sum f w f^T / v_r and h_r = sum f w y / v_r, a round of expectation
+    maximisation is:
+
+    1. m = (P + sum (I + A_r D)^-1 A_r)^-1 (P p + sum (I + A_r D)^-1 h_r).
+    2. d_r = C_r (h_r - A_r m), with C_r = (D^-1 + A_r)^-1. If the slope is above 0, d_r is that given a slope of 0.
+    3. D = mean of d_r d_r^T + C_r, and v_r = mean of w ((y - f . (m + d_r))^2 + variance of y), both shrunk.
+    4. Empty cells have the expectations of y and w, see `_expected`, and receivers fractions of random misses.
+
+    Args:
+        distance: log10 distances (n, R) [m].
+        crossed: Number of floors between both ends, (n, R).
+        rssi: Measurements (n, R) [dBm], nan where not detected.
+        shift: Received power less RSSI, (n, R) [dB].
+        detection: Curve of detection; None if empty cells are ignored.
+        repeats: Number of rows that count as one, since rows near each other have like errors.
+        spread_db: See `fit_path_losses`.
+        slope_prior: Mean and standard deviation of the slope of all receivers [dB a decade]: path-loss exponents of 1.5 to
+            4.5 (T. S. Rappaport, "Wireless Communications", 2nd ed., 2002, table 4.2).
+        spread_worth: Number of receivers that the prior `spread_db` counts as. Not studied.
+        floor_std_db: Prior standard deviation of the attenuation of a floor about 0 [dB]: any that is measured. Not studied.
+        rows_worth: Prior rows: a receiver with 10 rows weighs its own variance and the pooled one equally, and likewise the
+            fractions of misses. Not studied.
 
     Returns:
-        The fields of `PathLosses` by name, and the share `unexplained` (R,) of empty cells where a value was expected.
+        The fields of `PathLosses` by name, and the fraction `unexplained` (R,) of empty cells where a value was expected.
     """
     seen, n_receivers = ~rssi.isnan(), rssi.shape[1]
     middle = distance[seen].mean()
     feature = torch.stack([torch.ones_like(distance), distance - middle, -crossed], dim=-1)
-    eye, spread = torch.eye(3, dtype=torch.float64), torch.tensor([SPREAD_DB, SPREAD_DB, 1e-3]).double().square()
-    (expected, known), of_floor = SLOPE_PRIOR, FLOOR_STD_DB
-    certain = torch.tensor([1e-6, known**-2, of_floor**-2], dtype=torch.float64)
+    spread = torch.tensor([spread_db, spread_db, 1e-3]).double().square()  # diagonal of D; floors are alike
+    prior = torch.tensor([1e-6, slope_prior[1] ** -2, floor_std_db**-2], dtype=torch.float64)  # diagonal of P
+    prior_mean = torch.tensor([0.0, slope_prior[0], 0.0], dtype=torch.float64)
 
-    # unmeasured values, their weights and variances are expectations
-    value, weight, spare = rssi.nan_to_num(), seen.double(), torch.zeros_like(rssi)
+    value, weight, value_variance = rssi.nan_to_num(), seen.double(), torch.zeros_like(rssi)
     variance = rssi[seen].var(correction=0).clamp_min(1e-6).expand(n_receivers)
     missed = torch.zeros(n_receivers).double() if detection is None else detection.missed
     unexplained, last = missed, None
     limited = torch.zeros_like(seen) if detection is None else ~seen & detection.is_limit
-    for _ in range(MAX_ROUNDS):
+    for _ in range(40):
         weighted = (weight / (variance * repeats))[..., None] * feature
         normal, right = torch.einsum("nrk,nrl->rkl", weighted, feature), (weighted * value[..., None]).sum(dim=0)
-        shrink = torch.linalg.inv(eye + normal @ spread.diag())
-        total = (shrink @ normal).sum(dim=0) + certain.diag()
-        pull = (shrink @ right[..., None]).sum(dim=0)[:, 0] + torch.tensor([0.0, expected / known**2, 0.0]).double()
-        shared = torch.linalg.solve(total, pull)
+        shrink = torch.linalg.inv(torch.eye(3, dtype=torch.float64) + normal @ spread.diag())
+        precision = prior.diag() + (shrink @ normal).sum(dim=0)
+        shared = torch.linalg.solve(precision, prior * prior_mean + (shrink @ right[..., None]).sum(dim=0)[:, 0])
         posterior = torch.linalg.inv(spread.reciprocal().diag() + normal)
         deviation = (posterior @ (right - normal @ shared)[..., None])[..., 0]
         # received power does not rise with the distance; the level follows the slope
         excess = (shared[1] + deviation[:, 1]).clamp_min(0)
         deviation = deviation - posterior[:, :, 1] / posterior[:, 1:2, 1] * excess[:, None]
         moments = (deviation.square() + posterior.diagonal(dim1=1, dim2=2))[:, :2].sum(dim=0)
-        spread[:2] = (moments + SPREAD_WORTH * SPREAD_DB**2) / (n_receivers + SPREAD_WORTH)  # floors are alike
-        own = shared + deviation
-        mean, count = (feature * own).sum(dim=-1), weight.sum(dim=0)
-        squares = (weight * ((value - mean).square() + spare)).sum(dim=0)
-        variance = (squares + ROWS_WORTH * squares.sum() / count.sum()) / (count + ROWS_WORTH)
-        variance = variance.clamp_min(1e-6)
-        if last is not None and float((own - last).abs().max()) < 0.01:
+        spread[:2] = (moments + spread_worth * spread_db**2) / (n_receivers + spread_worth)
+        each = shared + deviation
+        mean, count = (feature * each).sum(dim=-1), weight.sum(dim=0)
+        squares = (weight * ((value - mean).square() + value_variance)).sum(dim=0)
+        variance = _shrunk(squares, count, rows_worth).clamp_min(1e-6)
+        if last is not None and float((each - last).abs().max()) < 0.01:
             break
-        last = own
-        if detection is None or not limited.any():
-            continue
-        std = (variance + detection.width**2).sqrt()
-        z = (detection.limit - shift - mean) / std
-        ratio, weak = empty_given(z, unexplained)
-        hazard = (ratio / weak.clamp_min(1e-12)).clamp_max(40)
-        value, weight = rssi.where(seen, mean - variance / std * hazard), weak.where(limited, seen.double())
-        spare = (variance * (1 - variance / std.square() * hazard * (z + hazard)).clamp(0, 1)).where(limited, 0.0)
-        # weak packets are missed at random, too
-        n_cells, other = (seen | limited).sum(dim=0), (1 - weak).where(limited, 0.0).sum(dim=0)
-        share = (other + ROWS_WORTH * other.sum() / n_cells.sum()) / (n_cells + ROWS_WORTH)
-        if bool((distance.std(dim=0) > 0).any()):  # without distances no power is expected anywhere
-            unexplained = missed.maximum(share)
-    own_level, shared_level = own[:, 0] - own[:, 1] * middle, shared[0] - shared[1] * middle
-    level_std, slope_std = (spread + total.inverse().diagonal())[:2].sqrt().tolist()
+        last = each
+        if detection is not None and bool(limited.any()):
+            weak_value, weak, weak_variance = _expected(
+                mean, variance, detection.limit - shift, detection.width, unexplained
+            )
+            value, weight = rssi.where(seen, weak_value), weak.where(limited, seen.double())
+            value_variance = weak_variance.where(limited, 0.0)
+            if bool((distance.std(dim=0) > 0).any()):  # without distances no power is expected anywhere
+                # weak packets are missed at random, too
+                others = (1 - weak).where(limited, 0.0).sum(dim=0)
+                unexplained = missed.maximum(_shrunk(others, (seen | limited).sum(dim=0), rows_worth))
+    each_level, shared_level = each[:, 0] - each[:, 1] * middle, shared[0] - shared[1] * middle
+    level_std, slope_std = (spread + precision.inverse().diagonal())[:2].sqrt().tolist()
     root = torch.tensor([[level_std, -float(middle) * slope_std], [0.0, slope_std]], dtype=torch.float64)
     return {
-        "own_level": own_level,
-        "own_slope": own[:, 1],
+        "each_level": each_level,
+        "each_slope": each[:, 1],
         "shared_level": shared_level.expand(n_receivers),
         "shared_slope": shared[1].expand(n_receivers),
         "root": root.expand(n_receivers, 2, 2),
@@ -283,3 +313,25 @@ def _maximise(
         "variance": variance,
         "unexplained": unexplained,
     }
+
+
+def _shrunk(total: Tensor, count: Tensor, prior_count: float) -> Tensor:
+    """Return total / count (R,) of each receiver, shrunk to that of all by a number of prior rows."""
+    return (total + prior_count * total.sum() / count.sum()) / (count + prior_count)
+
+
+def _expected(
+    mean: Tensor, variance: Tensor, limit: Tensor, width: float, missed: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return expectations of the value in empty cells, of its weight, and the variance of the value, each (n, R).
+
+    The weight is the probability that the cell is empty because of a weak signal. Given that, the value is normal of `mean`
+    (n, R) and `variance` (R,) below an uncertain limit: a truncated normal (C. E. Rasmussen and C. K. I. Williams, "Gaussian
+    Processes for Machine Learning", 2006, section 3.9).
+    """
+    std = (variance + width**2).sqrt()
+    z = (limit - mean) / std
+    derivative, weak = empty_given(z, missed)
+    hazard = (derivative / weak.clamp_min(1e-12)).clamp_max(40)
+    remaining = (1 - variance / std.square() * hazard * (z + hazard)).clamp(0, 1)
+    return mean - variance / std * hazard, weak, variance * remaining

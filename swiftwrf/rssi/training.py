@@ -1,16 +1,12 @@
-"""Shared by all receivers in a fit: location bins, path-loss models, limits, the kernel, and weights of predictors.
-
-Weights follow by stacking (L. Breiman, Machine Learning 24, 1996).
-"""
+"""Shared by all receivers in a fit: location bins, path-loss models, limits and the kernel."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Self
 
-import numpy as np
 import torch
-from scipy.optimize import nnls
 from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
@@ -20,20 +16,14 @@ from swiftwrf.gp import Kernel, candidates, held_out_errors, subsample
 from swiftwrf.positions import cells
 from swiftwrf.rssi.base import RssiConfig, often_detected
 from swiftwrf.rssi.detection import Detection, empty_given
-from swiftwrf.rssi.head import Head, render
-from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_losses, log_distance
+from swiftwrf.rssi.head import Heads
+from swiftwrf.rssi.path_loss import PathLosses, fit_path_losses, log_distance
 from swiftwrf.runtime.threads import single_thread
-
-MAX_PAIRS = 20_000  # measurements that determine the mixing weights
-# variance of a packet relative to the variance of the field: fading is as large as shadowing
-RELATIVE_NOISE_VARIANCES = (0.3, 1.0, 2.0, 3.0)
-MAX_KERNEL_RECEIVERS = 12  # more do not change the chosen kernel or weights
-CERTAIN = 0.99  # probability that the path loss alone explains an empty cell, or a random miss does: it is left out
 
 
 @dataclass(frozen=True)
 class Bins:
-    """Training rows averaged by location bin.
+    """Training rows averaged by location bin: each row by itself, or in the cubes of a grid if there are too many rows.
 
     Args:
         receiver_names: R names.
@@ -55,6 +45,45 @@ class Bins:
     rssi: Tensor
     count: Tensor
 
+    @classmethod
+    def of(cls, rows: Rssi, config: RssiConfig) -> Self:
+        """Average rows by location bin, with the folds that the options state."""
+        at, session = rows.transmitter_position, rows.session
+        bin_of_row = cells(at, config.max_locations)[0] if len(at) > config.max_locations else torch.arange(len(at))
+        position = _bin_sums(at, bin_of_row) / bin_of_row.bincount()[:, None]
+        count = _bin_sums(rows.detected, bin_of_row)
+        rssi = _bin_sums(rows.rssi_dbm.nan_to_num(), bin_of_row) / count  # 0 / 0 is nan: not detected
+        if session is not None:  # that most rows of each bin are of
+            number = session.unique(return_inverse=True)[1]
+            session = _bin_sums(torch.nn.functional.one_hot(number), bin_of_row).argmax(dim=1)
+        centre = position.mean(dim=0)
+        return cls(
+            receiver_names=tuple(map(str, rows.receiver_names)),
+            receiver=rows.receiver_position.double() - centre,
+            centre=centre,
+            position=position - centre,
+            bin_of_row=bin_of_row,
+            fold=folds(position, config.validation, config.seed, session=session),
+            rssi=rssi,
+            count=count,
+        )
+
+    def means(self, values: Tensor) -> Tensor:
+        """Return the means of values (rows, c) in each bin, float64 (n, c)."""
+        return _bin_sums(values, self.bin_of_row) / self.bin_of_row.bincount()[:, None]
+
+    def columns(self, number: Tensor) -> Self:
+        """Return the bins of the receivers `number`."""
+        names = tuple(self.receiver_names[n] for n in number.tolist())
+        of_receivers = {"receiver": self.receiver[number], "rssi": self.rssi[:, number], "count": self.count[:, number]}
+        return replace(self, receiver_names=names, **of_receivers)
+
+
+def _bin_sums(values: Tensor, bin_of_row: Tensor) -> Tensor:
+    """Return the sums of values (rows, c) in each bin, float64 (n, c)."""
+    n = int(bin_of_row.max()) + 1
+    return torch.zeros(n, values.shape[1], dtype=torch.float64).index_add(0, bin_of_row, values.double())
+
 
 @dataclass(frozen=True)
 class RssiTraining(Bins):
@@ -62,108 +91,77 @@ class RssiTraining(Bins):
 
     Args:
         kernel: Kernel of the latent field, lengths in [m].
-        rendered: Fields of each receiver's head, (R, 2, 2, directions).
+        heads: Head of all receivers.
         path_loss: Path loss of the receivers, the prior of the fit.
         shift: Received power less RSSI, by floors and offsets that were removed, (n, R) [dB].
         limit: Upper limit of RSSI in each empty cell that has a part in the fit, (n, R) [dBm], nan in all other cells and at
             receivers with fewer than 10 measured bins.
-        field_db: Prior standard deviation of the latent field, (R,) [dB].
+        field_db: Prior standard deviation of the latent field, (R,) [dB]; 0 without a field.
         noise_db: Standard deviation of one measurement about it, (R,) [dB].
-        baselines: Path-loss models of the simple predictors, (3, R): that of each receiver, that of all receivers, and the
-            mean of each receiver.
-        baseline_held_out: Their predictions of held-out bins, (3, n, R) [dBm].
     """
 
     kernel: Kernel
-    rendered: Tensor
+    heads: Heads
     path_loss: PathLosses
     shift: Tensor
     limit: Tensor
     field_db: Tensor
     noise_db: Tensor
-    baselines: PathLoss
-    baseline_held_out: Tensor
 
 
 @single_thread()
-def prepare(pool: Rssi, own: Tensor, config: RssiConfig, shift: Tensor, curve: Detection | None) -> RssiTraining:
+def prepare(pool: Rssi, fitted: Tensor, config: RssiConfig, shift: Tensor, curve: Detection | None) -> RssiTraining:
     """Average the rows by location bin, fit the path-loss models and choose the kernel; see `RssiPredictor._fit`.
 
-    `own` are the columns of the receivers that are fitted.
+    `fitted` are the columns of the receivers that are fitted.
     """
-    bins = binned(pool.columns(own.tolist()), config)
-    rssi, fold, every = bins.rssi, bins.fold, bin_locations(pool, config.max_locations)[1]
-    receiver = pool.receiver_position.double() - bins.centre
-    shift = _bin_means(shift, bins.bin_of_row, len(fold))
-
-    def fit(rows: Tensor, detection: Detection | None) -> PathLosses:
-        return fit_path_losses(bins.position[rows], receiver, every[rows], config.not_detected, shift[rows], detection)
-
-    def simple(loss: PathLosses, rows: Tensor) -> PathLoss:
-        """Return the simple predictors of the bins `rows`, from the path loss of all receivers of the pool."""
-        mean, loss = rssi[rows].nanmean(dim=0), loss.columns(own)
-        level = PathLoss(mean, torch.zeros_like(mean)).where(~mean.isnan(), loss.shared)
-        return PathLoss(*(torch.stack(values) for values in zip(loss.own, loss.shared, level, strict=True)))
-
-    everything = fit(torch.arange(len(fold)), curve)
-    baselines = simple(everything, torch.arange(len(fold)))
-    distance = log_distance(bins.position, bins.receiver)
-    held_out = torch.empty(3, *distance.shape, dtype=torch.float64)
-    for out, kept in each_fold(fold):
-        held_out[:, out] = simple(fit(kept, everything.detection), kept)(distance[out])
-    residual = (every - everything.own(log_distance(bins.position, receiver)))[:, often_detected(pool)]
-    kernel, helps = choose_residual_kernel(bins.position, residual, fold, pool.floors is not None)
-    n_primitives = config.n_primitives if helps else 0
-    loss = everything.columns(own)
-    field_db, noise_db = prior_std(loss.variance, kernel if n_primitives else None)
-    head = render([Head(n_primitives, config.seed).requires_grad_(False)])
+    of_pool = Bins.of(pool, config)
+    check_folds(of_pool.fold, of_pool.rssi)
+    bins, position = of_pool.columns(fitted), of_pool.position
+    shift = bins.means(shift)
+    losses = fit_path_losses(position, of_pool.receiver, of_pool.rssi, config.not_detected, shift, curve)
+    residual = of_pool.rssi - losses.each(log_distance(position, of_pool.receiver))
+    kernel, has_field = choose_residual_kernel(
+        position, residual[:, often_detected(pool)], bins.fold, pool.floors is not None
+    )
+    loss, shift = losses.columns(fitted), shift[:, fitted]
+    field_db, noise_db = prior_std(loss.variance, kernel if has_field and config.n_primitives else None)
     return RssiTraining(
         **vars(bins),
         kernel=kernel,
-        rendered=head.expand(len(own), *head.shape[1:]),
+        heads=Heads.alike(config.n_primitives, config.seed),
         path_loss=loss,
-        shift=shift[:, own],
-        limit=_limits(rssi, loss, distance, shift[:, own]),
+        shift=shift,
+        limit=_limits(bins.rssi, loss, log_distance(position, bins.receiver), shift),
         field_db=field_db,
         noise_db=noise_db,
-        baselines=baselines,
-        baseline_held_out=held_out,
     )
 
 
-def _limits(rssi: Tensor, loss: PathLosses, distance: Tensor, shift: Tensor) -> Tensor:
-    """Return the upper limit (n, R) [dBm] in each empty cell that neither path loss nor chance explains; nan elsewhere."""
+def _limits(rssi: Tensor, loss: PathLosses, distance: Tensor, shift: Tensor, certain: float = 0.99) -> Tensor:
+    """Return the upper limit (n, R) [dBm] in each empty cell that neither path loss nor chance explains; nan elsewhere.
+
+    A cell is explained with the probability `certain`, which saves time. Not studied.
+    """
     if loss.detection is None:
         return torch.full_like(rssi, torch.nan)
     limit = loss.detection.limit - shift
     std = (loss.variance + loss.detection.width**2).sqrt()
-    z = (limit - loss.own(distance)) / std
+    z = (limit - loss.each(distance)) / std
     weak = empty_given(z, loss.detection.missed)[1]
-    unexplained = (torch.special.ndtr(z) < CERTAIN) & (weak > 1 - CERTAIN)
+    unexplained = (torch.special.ndtr(z) < certain) & (weak > 1 - certain)
     # a few rows are no evidence of weak signals elsewhere, e.g. those of a phone that passed
     enough = (~rssi.isnan()).sum(dim=0) >= MIN_TRAINING
     return limit.where(rssi.isnan() & unexplained & loss.detection.is_limit & enough, torch.nan)
 
 
-def binned(train: Rssi, config: RssiConfig) -> Bins:
-    """Return the training rows by location bin, with the folds that the options state."""
-    position, rssi, count, bin_of_row = bin_locations(train, config.max_locations)
-    session = train.session
-    if session is not None:  # that most rows of each bin are of
-        _, own = session.unique(return_inverse=True)
-        times = torch.zeros(len(position), int(own.max()) + 1)
-        session = times.index_put((bin_of_row, own), torch.ones(()), accumulate=True).argmax(dim=1)
-    centre = position.mean(dim=0)
-    return Bins(
-        receiver_names=tuple(map(str, train.receiver_names)),
-        receiver=train.receiver_position.double() - centre,
-        centre=centre,
-        position=position - centre,
-        bin_of_row=bin_of_row,
-        fold=folds(position, config.validation, config.seed, session=session),
-        rssi=rssi,
-        count=count,
-    )
+def check_folds(fold: Tensor, rssi: Tensor) -> None:
+    """Raise InputError if fewer than two folds (n,) have a measurement (n, R), so that none predicts another."""
+    if len(fold[(~rssi.isnan()).any(dim=1)].unique()) < 2:
+        raise InputError(
+            "no rows can be held out to estimate the error of the model: all measurements are in one part of the "
+            'region; measure elsewhere, too, give a pool of more receivers, or take validation="random"'
+        )
 
 
 def prior_std(variance: Tensor, kernel: Kernel | None) -> tuple[Tensor, Tensor]:
@@ -175,121 +173,52 @@ def prior_std(variance: Tensor, kernel: Kernel | None) -> tuple[Tensor, Tensor]:
     return ((1 - noise) * variance).sqrt(), (noise * variance).sqrt()
 
 
-def bin_locations(rows: Rssi, max_locations: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Average measurements by location bin: each row by itself, or in the cubes of a grid if there are too many rows.
-
-    Returns:
-        Mean position (n, 3) [m], mean RSSI (n, R) [dBm] (nan where not detected), the number of measurements in each mean
-        (n, R), and the bin of each row (rows,).
-    """
-    position = rows.transmitter_position
-    bin_of_row = torch.arange(len(position))
-    if len(position) > max_locations:
-        bin_of_row = cells(position, max_locations)[0]
-    n = int(bin_of_row.max()) + 1
-    count = _bin_sums((~rows.rssi_dbm.isnan()).double(), bin_of_row, n)
-    rssi = _bin_sums(rows.rssi_dbm.nan_to_num(), bin_of_row, n) / count  # 0 / 0 is nan: not detected
-    return _bin_means(position, bin_of_row, n), rssi, count, bin_of_row
-
-
-def _bin_sums(values: Tensor, bin_of_row: Tensor, n: int) -> Tensor:
-    """Return the sums of values (rows, c) in n bins, float64 (n, c)."""
-    return torch.zeros(n, values.shape[1], dtype=torch.float64).index_add(0, bin_of_row, values.double())
-
-
-def _bin_means(values: Tensor, bin_of_row: Tensor, n: int) -> Tensor:
-    return _bin_sums(values, bin_of_row, n) / bin_of_row.bincount(minlength=n)[:, None]
-
-
 def choose_residual_kernel(
-    position: Tensor, residual: Tensor, fold: Tensor, has_floors: bool = False
+    position: Tensor,
+    residual: Tensor,
+    fold: Tensor,
+    has_floors: bool = False,
+    *,
+    noises: tuple[float, ...] = (0.3, 1.0, 2.0, 3.0),
 ) -> tuple[Kernel, bool]:
     """Choose the kernel with the lowest mean absolute error on held-out residuals of the path-loss model.
 
-    Residuals are (n, R) [dB], nan where not detected. With floors, differences in height may count more than others.
+    Args:
+        position: Positions (n, 3) [m].
+        residual: Residuals (n, R) [dB], nan where not detected.
+        fold: Fold of each row, (n,).
+        has_floors: Whether differences in height may count more than others.
+        noises: Compared variances of a packet, relative to that of the field: fading is about as large as shadowing. Not
+            studied.
 
     Returns:
         The kernel, and whether its error is lower than that of no field at all.
     """
-    some = (~residual.isnan()).any(dim=1)
-    position, residual, fold = subsample(position[some], residual[some], fold[some], rows=300)
+    detected = (~residual.isnan()).any(dim=1)
+    position, residual, fold = subsample(position[detected], residual[detected], fold[detected], rows=300)
     residual = residual[:, (~residual.isnan()).any(dim=0)]
-    (columns,) = subsample(torch.arange(residual.shape[1]), rows=MAX_KERNEL_RECEIVERS)
+    (columns,) = subsample(torch.arange(residual.shape[1]), rows=12)  # more rows or receivers do not change the choice
     residual = residual[:, columns]
-    held_out = []  # (receiver, number of values, rows)
-    for r, missing in enumerate(residual.isnan().T):
-        # missing rows are held out with every part, so that the zeros in their place have no effect
-        measured, gaps = (~missing).nonzero()[:, 0], missing.nonzero()[:, 0]
-        held_out += [(r, len(part), torch.cat([part, gaps])) for part, _ in each_fold(fold, measured)]
-
-    # rough fields only: a choice among mixtures with a smooth part follows chance, and its errors are no lower
-    rough = [kernel for kernel in candidates(position, RELATIVE_NOISE_VARIANCES) if kernel.matern12_weight == 1]
     # floors alike, or nearly independent beyond their attenuation
-    stretched = [replace(kernel, vertical=vertical) for vertical in (1.0, 5.0)[: 1 + has_floors] for kernel in rough]
-    precision = torch.linalg.inv(torch.stack([kernel.covariance(position) for kernel in stretched]))
-    dual = precision @ residual.nan_to_num()
-    errors = [held_out_errors(precision, dual[:, :, r, None], out)[:, :n, 0] for r, n, out in held_out]
+    kernels = [
+        replace(kernel, vertical=vertical)
+        for vertical in (1.0, 5.0)[: 1 + has_floors]
+        for kernel in rough_candidates(position, noises)
+    ]
+    precision = torch.linalg.inv(torch.stack([kernel.covariance(position) for kernel in kernels]))
+    dual, errors = precision @ residual.nan_to_num(), []
+    for r, missing in enumerate(residual.isnan().T):
+        # missing rows are held out with every fold, so that the zeros in their place have no effect
+        for out, _ in each_fold(fold, (~missing).nonzero()[:, 0]):
+            every = torch.cat([out, missing.nonzero()[:, 0]])
+            errors.append(held_out_errors(precision, dual[:, :, r, None], every)[:, : len(out), 0])
     score, best = torch.cat(errors, dim=1).abs().mean(dim=1).min(dim=0)
-    return stretched[int(best)], bool(score < residual.abs().nanmean())
+    return kernels[int(best)], bool(score < residual.abs().nanmean())
 
 
-def comparable(held_out: Tensor, measured: Tensor) -> Tensor:
-    """Return which measurements exist and are predicted by all predictors, bool (rows, R).
-
-    Args:
-        held_out: Held-out predictions (predictors, rows, R) [dBm], nan where there is none.
-        measured: Measurements (rows, R) [dBm], nan where not detected.
-    """
-    return (~held_out.isnan()).all(dim=0) & ~measured.isnan()
-
-
-def check_comparable(held_out: Tensor, measured: Tensor) -> None:
-    """Raise InputError if held-out predictions (predictors, rows, R) cannot be compared with any measurement (rows, R)."""
-    if not comparable(held_out, measured).any():
-        raise InputError(
-            "no rows can be held out to estimate the error of the model: all measurements are in one part of the "
-            'region; measure elsewhere, too, give a pool of more receivers, or take validation="random"'
-        )
-
-
-def mixing_weights(held_out: Tensor, measured: Tensor, shrinkage: float = 0.05) -> Tensor:
-    """Return the weights of the weighted mean of predictors with the lowest mean absolute error on held-out rows.
-
-    Args:
-        held_out: Held-out predictions (predictors, rows, R) [dBm], nan where there is none.
-        measured: Measurements (rows, R) [dBm], nan where not detected.
-        shrinkage: Ridge penalty on the distance of the weights to those of the first predictor alone, relative to the mean
-            squared error of a predictor. It steadies weights that few folds determine. The default is by nested
-            cross-validation.
-
-    Returns:
-        Non-negative weights of sum 1, float64 (predictors,); those of the first predictor alone without a comparable row.
-
-    Example:
-        >>> held_out = torch.tensor([[[1.0], [2.0], [3.0]], [[9.0], [9.0], [9.0]]])
-        >>> mixing_weights(held_out, held_out[0]).round(decimals=2)
-        tensor([1., 0.], dtype=torch.float64)
-    """
-    usable = comparable(held_out, measured)
-    if not bool(usable.any()):
-        return torch.eye(len(held_out), dtype=torch.float64)[0]
-    predicted, target = subsample(held_out[:, usable].T.double(), measured[usable].double(), rows=MAX_PAIRS)
-    error = (predicted - target[:, None]).numpy()  # the error of a mean with weights of sum 1 is the mean of the errors
-    n = error.shape[1]
-    weight, importance = np.full(n, 1 / n), np.ones(len(error))
-    scale = 1e-9 * max(float((error**2).mean()), 1.0)
-    away = np.eye(n)
-    away[0] -= 1.0  # weights less (1, 0, ...), for weights of sum 1
-    for _ in range(20):  # least absolute errors by weighted least squares
-        gram = (error * importance[:, None]).T @ error / max(len(error), 1)
-        gram += shrinkage * np.trace(gram) / n * away.T @ away
-        # the weights of least squares are proportional to argmin of w' G w / 2 - sum w over w >= 0
-        factor = np.linalg.cholesky(gram + scale * np.eye(n))
-        weight = nnls(factor.T, np.linalg.solve(factor, np.ones(n)))[0]
-        weight /= weight.sum()
-        # absolute errors below 0.5 dB count as squares, so that the solution is unique
-        importance = 1 / np.maximum(np.abs(error @ weight), 0.5)
-    return torch.from_numpy(weight)
+def rough_candidates(position: Tensor, noises: tuple[float, ...]) -> list[Kernel]:
+    """Return candidates (see `swiftwrf.gp.candidates`) without a smooth part, which chance would choose."""
+    return [kernel for kernel in candidates(position, noises) if kernel.matern12_weight == 1]
 
 
 def rounding_std(rssi: Tensor) -> float:

@@ -78,7 +78,7 @@ class RssiLocating:
         rows = Rssi(
             known.rssi.double(),
             known.position,
-            receiver_position=locator.model.receiver,
+            receiver_position=locator.model.receiver_position,
             receiver_names=locator.receiver_names,
         )
         return cls(locator, rows, torch.ones(len(rows), dtype=torch.bool))

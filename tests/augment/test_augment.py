@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rooms import built_in_walls
-from small import PUBLISHED, known_planes, short_path_gains
+from small import PUBLISHED, known_planes, only, small
 
 from augment import choose_model, mix, sample_positions, synthetic_positions, withhold
 from augment.choose import candidates
@@ -79,7 +79,7 @@ def fitted(name):
 @pytest.mark.parametrize("name", [name for name in FIELD_MODELS if not FIELD_MODELS[name].slow])  # they have their own
 def test_field_models_predict_unseen_spectra_better_than_the_mean_spectrum(name):
     """The search for the walls has its own tests."""
-    with known_planes(*built_in_walls()), short_path_gains():
+    with known_planes(*built_in_walls()), small("path gains"):
         predicted = fitted(name).synthesize(TEST.position)
     mean = psnr(TRAIN.spectrum.mean(dim=0), TEST.spectrum).median()
     assert psnr(predicted, TEST.spectrum).median() > mean + MARGIN_DB.get(name, 0.5)
@@ -156,7 +156,7 @@ def spied():
             self.structure = structure
             fits.append((train, structure))
 
-    with mock.patch.dict(FIELD_MODELS._registered, {"spy": Spy}):
+    with only(FIELD_MODELS, *FIELD_MODELS, spy=Spy):
         yield fits
 
 
@@ -244,7 +244,7 @@ def test_classes_and_models_are_candidates_like_names():
 
 
 def test_a_model_of_two_methods_is_registered_fitted_and_refuses_to_be_saved(tmp_path):
-    with mock.patch.dict(FIELD_MODELS._registered):
+    with only(FIELD_MODELS):
         FIELD_MODELS.register("mine")(Mean)
         model = make_model("mine").fit(TRAIN)
     assert "Mean" in model._repr_html_()

@@ -2,12 +2,12 @@
 
 import math
 from functools import cache
-from typing import Annotated
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
+from outside_mean import Mean
 
 from augment import Mixed, SyntheticPositions, choose_model, mix, synthetic_positions, turbo_learning, withhold
 from augment.estimators import Estimator, make_estimator
@@ -177,19 +177,6 @@ def test_an_estimator_that_changes_its_training_set_changes_no_other():
     data = simulated_room(n=20, grid=ROOM.grid)
     Careless().fit(Mixed.measured(data))
     assert data.label.abs().sum() > 0
-
-
-class Mean(FieldModel):
-    """Synthesizes one spectrum everywhere, as `constant_synthesizer` of the issue."""
-
-    saved = "mean"
-    mean: Annotated[torch.Tensor, "float32 grid.n_elevation grid.n_azimuth"]
-
-    def _fit(self, train, **_):
-        self.mean = train.spectrum.mean(0)
-
-    def _predict(self, position, grid, with_std):
-        return self.mean.expand(len(position), *grid.shape), None
 
 
 @pytest.mark.parametrize("name", ["kernel_regression", "aann_kernel"])  # which solve with a Gram matrix

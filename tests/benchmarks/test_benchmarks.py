@@ -14,7 +14,7 @@ import rssi_tables
 import torch
 
 from swiftwrf import AngularGrid, rssi_room, simulated_room
-from swiftwrf.rssi.head import Head, HeadTable
+from swiftwrf.rssi.head import Head, Heads
 
 METHODS = ("mean", "nearest", "swiftwrf", "vae")
 
@@ -138,7 +138,9 @@ def test_scans_are_counted_where_coverage_is_predicted(monkeypatch):
     monkeypatch.setattr(rssi, "kept", lambda name, key: {})
     monkeypatch.setattr(rssi, "rssi_room", lambda seed: data)
     monkeypatch.setattr(rssi, "write_result", lambda name, content, rows: written.append((name, content["scenes"])))
-    monkeypatch.setattr(rssi, "predicted_above", lambda model, scans, _: 0.05 + 0.9 * (scans.index % 2 == 0).double())
+    monkeypatch.setattr(
+        rssi, "predicted_above", lambda model, scans, *_, **__: 0.05 + 0.9 * (scans.index % 2 == 0).double()
+    )
     rssi.main(rssi.Config(data=Path(), study="coverage", receivers=4))
     ((name, scenes),) = written
     found, (train, test) = scenes["simulated-floor-3 random"], data.split()
@@ -157,7 +159,7 @@ def test_scans_are_counted_where_coverage_is_predicted(monkeypatch):
 
 def test_primitives_in_phase_are_the_identity():
     latent = torch.linspace(-60, 60, 25)[:, None].double()
-    table = HeadTable(rssi.in_phase([Head(50, 0).requires_grad_(False)]))
+    table = Heads(rssi.in_phase([Head(50, 0).requires_grad_(False)]))
     value, _ = table(latent)
     torch.testing.assert_close(value - table(0 * latent)[0], latent, atol=1e-3, rtol=0)
     assert not rssi.in_phase([Head(0, 0)]).any()

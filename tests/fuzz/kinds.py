@@ -19,7 +19,7 @@ import torch
 from samples import (
     snapshot_arrays,
     snapshots,
-    survey_rows,
+    survey,
     write_captures,
     write_deepmimo,
     write_dichasus,
@@ -113,13 +113,11 @@ def snapshots_mat(folder: Path, **options: Any) -> None:
 
 
 def survey_parquet(folder: Path) -> None:
-    header, rows = survey_rows()
-    pd.DataFrame(rows, columns=header).to_parquet(folder / "walk.parquet")
+    survey().to_parquet(folder / "walk.parquet")
 
 
 def survey_json(folder: Path) -> None:
-    header, rows = survey_rows()
-    points = [{"at": row[:2], "scan": dict(zip(header[3:], row[3:], strict=True))} for row in rows]
+    points = [{"at": [row.pop("x"), row.pop("y")], "scan": row} for row in survey().to_dict("records")]
     (folder / "walk.json").write_text(json.dumps({"survey": [{"name": "a", "points": points}]}))
 
 
@@ -182,7 +180,7 @@ MODELS: dict[str, Callable[[], Any]] = {
 
 def rssi_survey(folder: Path) -> None:
     write_survey(folder)
-    (folder / "receivers.csv").write_text("receiver,x,y,z\n" + "".join(f"{r},1,1,2\n" for r in survey_rows()[0][3:]))
+    (folder / "receivers.csv").write_text("receiver,x,y,z\n" + "".join(f"{r},1,1,2\n" for r in "abcd"))
 
 
 def read_spectra(folder: Path) -> Spectra:

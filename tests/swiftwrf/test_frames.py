@@ -16,13 +16,14 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from rooms import mirror_room
-from small import FLOOR
+from rooms import floor_channels
+from small import COARSE, FLOOR
 
 import augment
 import swiftwrf
 from augment.estimators import Estimator, make_estimator
 from augment.estimators.subspace import Music
+from augment.testing import check_estimator
 from swiftwrf import (
     FieldModel,
     GeometryModel,
@@ -38,7 +39,6 @@ from swiftwrf import (
     predict,
     rssi,
 )
-from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.contrib.comparison import rssi as comparison
 from swiftwrf.contrib.online import Follower, Monitor, adapted, prequential, score
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin
@@ -47,12 +47,13 @@ from swiftwrf.rssi.base import RssiPredictor
 from swiftwrf.rssi.coverage import Coverage
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.pairs import PairPredictor
+from swiftwrf.testing import check_field_model, check_predictor
 
 HERE = GeodeticOrigin(48.0, 11.0)
 RECEIVERS = {"hall": (2.0, 2.0, 1.0), "office": (18.0, 9.0, 1.0), "attic": (10.0, 3.0, 4.0), "lab": (4.0, 10.0, 1.0)}
 PHONE_DB = {"new": 0.0, "old": -8.0}
 N_TRAIN, N = 70, 90
-FREQUENCIES = 1e6 * torch.tensor([-20.0, -9, 1, 8, 20], dtype=torch.float64)  # about the carrier [Hz]
+pytestmark = pytest.mark.usefixtures("without_furniture")
 
 
 @cache
@@ -272,20 +273,9 @@ def test_spectra_far_away_are_refused():
         gp().update(far)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def without_furniture():
-    """Its search takes most of the time of a fit to channels, and has tests of its own."""
-    with mock.patch.object(GeometryModel, "_furnish"):
-        yield
-
-
 @cache
 def channels():
-    """Spectra of the channels of one plane at five subcarriers, which rise in frequency."""
-    base = mirror_room({}, moving="transmitter", n=40)
-    frequency = LIGHT_SPEED / base.array.wavelength + FREQUENCIES
-    channel = GeometryModel.of_planes(base, [FLOOR]).channel(base.position, frequency)
-    return replace(base, channel=channel, frequency_hz=frequency, label=None)
+    return replace(floor_channels(), label=None)
 
 
 def new_channels():
@@ -316,8 +306,7 @@ def gp():
 
 @cache
 def matched_field():
-    small = {"spacing": 1.0, "max_cells": 500, "n_best": 20, "n_background": 10, "n_split": 4, "n_rounds": 2}
-    return MatchedField(**small).fit(channels()[:30], room=room())
+    return MatchedField(**COARSE).fit(channels()[:30], room=room())
 
 
 def located_by_channels(data):
@@ -373,6 +362,9 @@ OF_NO_FRAME = {
     augment.synthetic_positions,
     augment.Mixed.measured,
     Rssi.validation_for,
+    check_field_model,
+    check_predictor,
+    check_estimator,
     *(kind.lacking for kind in (FieldModel, RssiPredictor, PairPredictor, Estimator, Music)),
     *(kind.compared for kind in (RssiPredictor, PairPredictor)),
 }

@@ -5,7 +5,7 @@ from functools import cache
 
 import pytest
 import torch
-from small import GLANCE
+from small import COARSEST, GLANCE
 
 from swiftwrf import (
     AngularGrid,
@@ -140,8 +140,7 @@ def test_matched_field_locators_of_hard_data(case):
     data = spectra(case)
     try:
         room = make_model("geometry", **SHORT).fit(data)
-        locator = MatchedField(spacing=4.0, max_cells=100, n_best=10, n_background=5, n_split=2, n_calibration=10)
-        posterior = locator.fit(data, room=room).locate(data.spectrum[:3])
+        posterior = MatchedField(**COARSEST).fit(data, room=room).locate(data.spectrum[:3])
     except InputError:
         return
     assert posterior.median.isfinite().all()
@@ -174,11 +173,11 @@ def test_rssi_falls_with_the_distance_beyond_the_data_and_grows_uncertain():
     for data in (floor, rising):
         model = RssiModel().fit(data)
         found = model.predict(at)
-        assert (model.slope <= 0).all()
+        assert (model.path_loss.slope <= 0).all()
         assert (found.mean[1:] <= found.mean[1] + 0.1).all()
         assert (found.std[1:].diff(dim=0) > 0.1).all()
         updated = model.update(data.subset(torch.arange(3)))
-        assert (updated.slope[model.slope == 0] == 0).all()
+        assert (updated.path_loss.slope[model.path_loss.slope == 0] == 0).all()
 
 
 def test_path_loss_models_of_pairs_fall_with_the_distance_at_every_place():

@@ -56,7 +56,7 @@ def test_a_single_position(tmp_path, capsys):
 def test_survey(tmp_path, capsys):
     assert run(write_survey(tmp_path / "walk"), "--out", tmp_path / "page") == 0
     text = capsys.readouterr().out
-    assert "40 rows of RSSI at 3 receivers" in text
+    assert "60 rows of RSSI at 4 receivers" in text
     assert "positions are unknown" in text
     assert (tmp_path / "page" / "report.html").read_text().count("<svg") == 1
 

@@ -18,10 +18,11 @@ from tifffile import TiffFile, imread
 
 from swiftwrf import AngularGrid, RssiModel, Spectra, load_spectra, make_model, rssi_room
 from swiftwrf.contrib.formats.deepmimo import write_deepmimo
+from swiftwrf.contrib.map_files import write_geojson, write_geotiff, write_world_file
 from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.simulated import ShoeboxRoom
 from swiftwrf.data.writing import write_mat, write_paths, write_rssi, write_spectra
-from swiftwrf.rssi.maps import RssiMap, write_geojson, write_geotiff, write_world_file
+from swiftwrf.rssi.maps import RssiMap
 
 GRID = AngularGrid.hemisphere(8, 32)
 ORIGIN = GeodeticOrigin(48.1, 11.6)
@@ -222,35 +223,36 @@ def test_cells_without_a_value_are_null_in_geojson(tmp_path):
     assert values == [None, -50.13]
 
 
-@pytest.fixture(scope="module")
-def paths():
-    generator = torch.Generator().manual_seed(0)
-    receiver = torch.tensor([0.5, 0.5, 0.6]) + torch.tensor([5.0, 4.0, 1.0]) * torch.rand(30, 3, generator=generator)
-    return ShoeboxRoom(frequency_hz=FREQUENCY).paths(torch.tensor([[3.0, 2.5, 2.7]]), receiver)
+def paths_of(receiver, transmitter, **room):
+    return ShoeboxRoom(frequency_hz=FREQUENCY, **room).paths(torch.tensor([transmitter]), receiver)
 
 
-def test_deepmimo_folders_come_back(paths, tmp_path):
+AROUND = torch.tensor([0.5, 0.5, 0.6]) + torch.tensor([5.0, 4.0, 1.0]) * torch.rand(
+    30, 3, generator=torch.Generator().manual_seed(0)
+)
+PATHS = {
+    "above": paths_of(AROUND, [3.0, 2.5, 2.7]),
+    "below": paths_of(torch.tensor([[1.0, 1.0, 2.0], [4.0, 3.0, 2.2]]), [3.0, 2.5, 0.4], boxes=()),
+}
+
+
+@pytest.mark.parametrize("place", PATHS)
+def test_deepmimo_folders_come_back(tmp_path, place):
+    paths = PATHS[place]
     write_deepmimo(paths, tmp_path)
     found, expected = load_spectra(tmp_path, grid=GRID), paths.spectra("made", grid=GRID)
     torch.testing.assert_close(found.spectrum, expected.spectrum, atol=1e-6, rtol=0)
     torch.testing.assert_close(found.label, expected.label, atol=1e-9, rtol=0)
     torch.testing.assert_close(found.position, expected.position)
     assert torch.equal(found.line_of_sight, expected.line_of_sight)
-    assert 0 < int(found.line_of_sight.sum()) < len(found)
     assert (found.moving, found.notes) == ("receiver", ())
-
-
-def test_deepmimo_folders_contain_paths_from_below(tmp_path):
-    receiver = torch.tensor([[1.0, 1.0, 2.0], [4.0, 3.0, 2.2]])
-    below = ShoeboxRoom(frequency_hz=FREQUENCY, boxes=()).paths(torch.tensor([[3.0, 2.5, 0.4]]), receiver)
-    write_deepmimo(below, tmp_path)
-    found, expected = load_spectra(tmp_path, grid=GRID), below.spectra("made", grid=GRID)
-    torch.testing.assert_close(found.spectrum, expected.spectrum, atol=1e-6, rtol=0)
+    assert bool(found.line_of_sight.all()) == (place == "below")
     with np.load(next(tmp_path.glob("aoa_el*.npz"))) as angles:
-        assert (angles["aoa_el"][:, 0] > 90).all()  # the direct paths
+        assert (angles["aoa_el"][:, 0] > 90).all() == (place == "below")  # the direct paths
 
 
-def test_deepmimo_folders_are_made_of_ray_paths(paths, tmp_path, capsys):
+def test_deepmimo_folders_are_made_of_ray_paths(tmp_path, capsys):
+    paths = PATHS["above"]
     corner = paths.receiver[paths.owner] + paths.direction
     made = replace(paths, corner=corner[:, None])
     for name, some in (("known", made), ("unknown", replace(made, length=None))):

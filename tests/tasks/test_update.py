@@ -165,13 +165,13 @@ def test_rssi_in_any_order_solves_the_least_squares_of_all_rows(order, sizes):
     state, before = updated.posterior, model.posterior
     for r in range(12):  # dense covariance of all rows times the dual coefficients is the data
         seen = state.variance[r] > 0
-        anchor, slope, feature = state.anchor[seen], state.tangent[r, seen], state.feature[r, seen]
-        field = slope[:, None] * state.kernel(anchor, anchor) * slope
+        known, slope, feature = state.position[seen], state.tangent[r, seen], state.feature[r, seen]
+        field = slope[:, None] * state.kernel(known, known) * slope
         whole = field + feature @ feature.T + torch.diag(state.variance[r, seen])
         old = before.dual[r, before.variance[r] > 0]
         target = whole[: len(old), : len(old)] @ old
         torch.testing.assert_close((whole @ state.dual[r, seen])[: len(old)], target, rtol=0, atol=1e-2)
-    assert set(updated.anchor.tolist()[0]) == set(once.anchor.tolist()[0])
+    assert set(updated.region().tolist()[0]) == set(once.region().tolist()[0])
 
 
 def test_rssi_is_updated_after_loading_and_beyond_its_rows_in_memory(tmp_path, monkeypatch):
@@ -254,7 +254,7 @@ def test_a_measurement_that_repeats_another_is_no_copy_of_it():
     """Equal values at one place are new if they are another row or of another time."""
     known = floor()[:60]
     again = replace(known[:4], index=torch.arange(60, 64))
-    assert len(fitted_rssi().update(again).anchor) == 64
+    assert len(fitted_rssi().update(again).region()) == 64
     timed = replace(known, time=torch.arange(60.0).index_fill(0, torch.tensor([2]), torch.nan))
     model = RssiModel().fit(timed)
     assert model.is_learnt(timed).all()

@@ -414,9 +414,12 @@ def test_examples_of_spectra(said):
 def test_the_room_and_posteriors_in_plan(said):
     fraction, result = said["aoa"]
     normal, offset = np.array([[-1.0, 0, 0], [0.8, 0.6, 0], [0.6, -0.8, 0]]), np.array([2.0, 3.0, 4.0])
-    known = {"gain": -0.5, "std_mm": 1.75, "dielectric": False, "order": 2, "probability": 0.875, "rival_m": 2.25}
+    known = {"gain": -0.5, "std_mm": 1.75, "order": 2, "probability": 0.875}
     planes = [
-        known | {"normal": list(n), "offset_m": at, "certain": at > 2} for n, at in zip(normal, offset, strict=True)
+        known
+        | {"normal": list(n), "offset_m": at, "certain": at > 2}
+        | {"dielectric": at == 2, "rival_m": 2.25 if at == 2 else None}
+        for n, at in zip(normal, offset, strict=True)
     ]
     room = {"planes": planes, "order": 2, "unexplained": 0.1, "score_held_out": 0.25}
     at = result.experiment.train.position.numpy()
@@ -429,7 +432,8 @@ def test_the_room_and_posteriors_in_plan(said):
     section = aoa_room.room_section(fraction)
     (table,), (plot,) = section.tables, section.plots
     assert [row[0] for row in table.rows][:2] == ["x = -2.000 m", "(0.800, 0.600, 0.000) . x = 3.000 m"]
-    assert table.rows[0][1:] == ["-0.50", "1.8", "87.5%", "x = -2.250 m", "no"]
+    assert table.rows[0][1:] == ["-0.50 (dielectric)", "1.8", "87.5%", "x = -2.250 m", "no"]
+    assert table.rows[1][1:] == ["-0.50", "1.8", "87.5%", "none", "yes"]
     assert said_of(table.caption) == [2, 90, 0.75, 90]
     for figure in (plot.panels[0], aoa_room.located_plan(fraction)):
         for wall, n, distance in zip(figure.axes[0].lines, normal, offset, strict=False):

@@ -95,7 +95,7 @@ class RssiComparison(Comparison):
         test: Test rows.
         values: What each predictor gave, by name: `predicted` at the detected test pairs (n,) [dBm], their standard
             deviations `std` (n,) [dB] or None, `median` absolute error [dB], `seconds` to `fit` and to `predict`.
-            `detection` are the shares of detected and of empty test cells that are predicted as such, or None. Predictors
+            `detection` are the fractions of detected and of empty test cells that are predicted as such, or None. Predictors
             without primitives have 0 `n_primitives`.
         options: The split, the preset and the seed.
         left_out: Reason for each predictor that the data do not suffice for.
@@ -129,11 +129,11 @@ class RssiComparison(Comparison):
         prediction = self._prediction(self.model)
         low, high = prediction.interval(LEVEL)
         values = {"measured": test.rssi_dbm[row, column], "predicted": prediction.mean, "low": low, "high": high}
-        found = DataFrame(test.transmitter_position[row].numpy().round(3), columns=["x", "y", "z"])
+        table = DataFrame(test.transmitter_position[row].numpy().round(3), columns=["x", "y", "z"])
         group = {} if test.groups is None else {"group": test.groups.iloc[row.tolist()].tolist()}
-        found = found.assign(receiver=self._receiver, **group)
-        found = found.assign(**{name: value.numpy().round(2) for name, value in values.items()})
-        return found.assign(**degree_columns(test.origin, test.transmitter_position[row].numpy()))
+        table = table.assign(receiver=self._receiver, **group)
+        table = table.assign(**{name: value.numpy().round(2) for name, value in values.items()})
+        return table.assign(**degree_columns(test.origin, test.transmitter_position[row].numpy()))
 
     @property
     def coverage(self) -> float:
@@ -145,11 +145,11 @@ class RssiComparison(Comparison):
         """Return a row for each method: errors [dB], and their mean difference to those of `model`; see `method_summary`.
 
         `detection` is the balanced accuracy of predicting which test cells are empty, if there are empty ones: the mean of
-        the shares of detected and of empty cells that are predicted as such.
+        the fractions of detected and of empty cells that are predicted as such.
         """
-        found = super().summary()
+        table = super().summary()
         right = {name: sum(value["detection"]) / 2 for name, value in self.values.items() if value.get("detection")}
-        return found.assign(detection=found.index.map(right)) if right else found
+        return table.assign(detection=table.index.map(right)) if right else table
 
     @property
     def notes(self) -> list[str]:
@@ -169,14 +169,14 @@ class RssiComparison(Comparison):
     def _pair_columns(self) -> dict[str, Any]:
         """Columns of the detected test pairs that are those of every method."""
         test, (row, column) = self.test, self._pairs
-        away = distance(test.transmitter_position, test.receiver_position)[row, column]
+        from_receiver = distance(test.transmitter_position, test.receiver_position)[row, column]
         from_training = nearest(test.transmitter_position, self.train.transmitter_position, 1)[0][row, 0]
         return {
             "receiver": self._receiver,
             "index": test.index[row],
             "place": places(test.transmitter_position, 2)[row],
             "measured_dbm": test.rssi_dbm[row, column],
-            **dict(zip(DISTANCES, (away, from_training), strict=True)),
+            **dict(zip(DISTANCES, (from_receiver, from_training), strict=True)),
         }
 
     @property
@@ -184,7 +184,7 @@ class RssiComparison(Comparison):
         return {name: entry | {"detection": self.values[name]["detection"]} for name, entry in super().overall.items()}
 
     def recorded(self) -> Recorded:
-        found, attenuation = super().recorded(), self._fitted.attenuation
+        recorded, attenuation = super().recorded(), self._fitted.attenuation
         maps, coverage = _maps(self._fitted, self.train)
         at_receiver, none = summaries(self.errors, ["receiver", "method"], [self.column]), {self.column: summary([])}
         metrics = {
@@ -204,7 +204,7 @@ class RssiComparison(Comparison):
             },
         }
         tables = {"errors": self.errors, "predictions": self.predictions}
-        return replace(found, metrics=found.metrics | metrics, tables=tables, arrays={"maps": maps})
+        return replace(recorded, metrics=recorded.metrics | metrics, tables=tables, arrays={"maps": maps})
 
     @property
     def _fitted(self) -> RssiModel | PairModel:
@@ -250,9 +250,9 @@ def _maps(model: RssiModel | PairModel, train: Rssi) -> tuple[dict[str, NDArray[
         "predicted": np.stack([chart.mean for chart in charts]),
         "width": (torch.stack(upper) - torch.stack(lower)).numpy(),
         "detection": np.stack([chart.detection for chart in charts]),
-        "above": np.stack([found.probability for found in coverage]),
-        "inside": np.stack([found.inside for found in coverage]),
-        "known": np.stack([found.measured for found in coverage]),
+        "above": np.stack([floor.probability for floor in coverage]),
+        "inside": np.stack([floor.inside for floor in coverage]),
+        "known": np.stack([floor.measured for floor in coverage]),
         "measured_position": train.transmitter_position.numpy(),
         "measured": train.rssi_dbm.numpy(),
         "receiver": train.receiver_position.numpy(),
@@ -261,7 +261,7 @@ def _maps(model: RssiModel | PairModel, train: Rssi) -> tuple[dict[str, NDArray[
         "floor_of_row": number.numpy(),
     }
     maps = maps if train.origin is None else maps | {"origin": np.array(train.origin)}
-    return maps, [{"floor": name} | found.values for name, found in zip(names, coverage, strict=True)]
+    return maps, [{"floor": name} | floor.values for name, floor in zip(names, coverage, strict=True)]
 
 
 @checked
@@ -327,7 +327,7 @@ def compare(
     if keep is not None:
         keep.of(given | {"predictors": [RSSI_PREDICTORS[name] for name in names]})
     begun = RssiComparison(train, test, {}, {"split": split, "preset": preset, "seed": seed}, left_out)
-    own, predictors = begun.model, dict[str, RssiPredictor]()
+    model_name, predictors = begun.model, dict[str, RssiPredictor]()
     parallel = None if executor is None else executor.map
 
     def compute(_: None, folder: Path, name: str, rows: Tensor | None = None) -> Values:
@@ -338,14 +338,16 @@ def compare(
         fitted = time.perf_counter()
         prediction = predictor.predict_detected(test)
         seconds = {"fit": fitted - began, "predict": time.perf_counter() - fitted}
-        found = None  # shares of detected and of empty test cells that are predicted as such, if there are both kinds
+        detection = (
+            None  # fractions of detected and of empty test cells that are predicted as such, if there are both kinds
+        )
         if rows is None:
             predictors[name], detected = predictor, test.detected
-            if name == own and isinstance(predictor, Saved):
+            if name == model_name and isinstance(predictor, Saved):
                 predictor.save(folder / MODEL)
             if predictor.detection is not None and not bool(detected.all()) and not test.receiver_moves:
                 above = predictor.predict_detection(test.transmitter_position, offset) > 0.5
-                found = float(above[detected].double().mean()), float((~above)[~detected].double().mean())
+                detection = float(above[detected].double().mean()), float((~above)[~detected].double().mean())
         std = None if prediction.std is None else prediction.std[test.detected]
         error = (prediction.mean + offset - test.rssi_dbm)[test.detected].abs()
         return {
@@ -355,14 +357,14 @@ def compare(
             "mean": float(error.mean()),
             "median": float(error.quantile(0.5)),
             "held_out": getattr(predictor, "held_out_db", {}),
-            "detection": found,
+            "detection": detection,
             "n_primitives": getattr(predictor, "n_primitives", 0),
         }
 
     order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))
     parts = [order[: round(fraction * len(train))].sort().values for fraction in fewer]
     parts = [rows for rows in parts if int(train.detected[rows].sum(dim=0).min()) >= MIN_TRAINING]
-    studied = [name for name in (own, "knn") if name in names]
+    studied = [name for name in (model_name, "knn") if name in names]
 
     def study(_: None, folder: Path) -> Values:
         less = {str(len(rows)): {name: compute(_, folder, name, rows)["mean"] for name in studied} for rows in parts}
@@ -376,10 +378,10 @@ def compare(
             steps.start("fewer rows", "fewer rows", study)
         values = {name: steps[name] for name in started}
         by_rows = DataFrame.from_dict(steps["fewer rows"] if fewer else {}, orient="index")
-        if own in names and own not in predictors:
+        if model_name in names and model_name not in predictors:
             model = load(memo.folder / MODEL)
             assert isinstance(model, RssiModel | PairModel)
-            predictors[own] = model
+            predictors[model_name] = model
     by_rows = by_rows.set_index(by_rows.index.astype(int)).rename_axis("n_train")
     return replace(begun, values=values, predictors=predictors, by_rows=by_rows)
 

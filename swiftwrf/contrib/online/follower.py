@@ -331,7 +331,7 @@ class Follower:
 
     def _choose_kernel(self, model: ProcessModel | RssiModel) -> list[str]:
         """Choose the kernel again if enough measurements are new; return a notice if another one predicts better."""
-        count, n = len(self._unjudged), len(model.process.known if isinstance(model, ProcessModel) else model.anchor)
+        count, n = len(self._unjudged), len(model.process.known if isinstance(model, ProcessModel) else model.region())
         if count < max(30, 0.1 * (n - count)) or n - count < MIN_TRAINING:
             return []
         last, self._unjudged = self._unjudged, []

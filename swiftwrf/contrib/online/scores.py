@@ -123,7 +123,7 @@ def prequential(model: Model, new: Spectra | Rssi, batch: PositiveInt = 1) -> tu
         >>> data = swiftwrf.rssi_room(n=80)
         >>> model = swiftwrf.RssiModel().fit(data.subset(torch.arange(60)))
         >>> scores, model = prequential(model, data.subset(torch.arange(60, 80)), batch=5)
-        >>> len(scores), len(model.anchor)
+        >>> len(scores), len(model.region())
         (20, 80)
     """
     parts = []

@@ -4,7 +4,6 @@ import io
 import math
 import resource
 import zipfile
-import zlib
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from samples import write_nerf2, write_nerf2_rssi, write_paths
 
 from swiftwrf import InputError, load_rssi, load_spectra, rssi_room
 from swiftwrf.data.spectra import coarsening
-from swiftwrf.data.splits import block_split, random_split, slabs, split_names
 
 N = 12
 
@@ -39,94 +37,6 @@ def test_reads_the_nerf2_layout(nerf2):
     train, test = data.split("random")
     assert train.index.tolist() == list(range(10))
     assert test.index.tolist() == [10, 11]
-
-
-def _write(name, text):
-    return lambda folder: (folder / name).write_bytes(text.encode() if isinstance(text, str) else text)
-
-
-def _image(name, array, kind="PNG"):
-    return lambda folder: Image.fromarray(array).save(folder / "spectrum" / name, format=kind)
-
-
-def _png(rows, columns, kind=b"IHDR"):
-    """A PNG of zeros, written without its pixels ever being in memory."""
-
-    def chunk(name, data):
-        return len(data).to_bytes(4, "big") + name + data + zlib.crc32(name + data).to_bytes(4, "big")
-
-    size = columns.to_bytes(4, "big") + rows.to_bytes(4, "big") + bytes([8, 0, 0, 0, 0])
-    return b"\x89PNG\r\n\x1a\n" + chunk(kind, size) + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
-
-
-def _positions(row):
-    return _write("tx_pos.csv", "x,y,z\n" + "".join(f"{i},1,1\n" for i in range(1, N)) + row + "\n")
-
-
-def _gateway(content):
-    return _write("gateway_info.yml", f"g: {{{content}}}\n")
-
-
-WRONG = {
-    "no pose": (lambda f: (f / "gateway_info.yml").unlink(), "gateway_info.yml is missing"),
-    "pose is no yaml": (_write("gateway_info.yml", "a: [1"), "not valid YAML"),
-    "pose runs code": (
-        _write("gateway_info.yml", "a: !!python/object/apply:os.getcwd []"),
-        "must describe one gateway",
-    ),
-    "quaternion": (_gateway("position: [0, 0, 0], orientation: [0, 0, 1, 1]"), "unit quaternion"),
-    "no gateway": (_write("gateway_info.yml", "name: x\n"), "one gateway"),
-    "short position": (
-        _gateway("position: [0, 0], orientation: [0, 0, 0, 1]"),
-        r"position must have shape \(3\)",
-    ),
-    "no positions": (lambda f: (f / "tx_pos.csv").unlink(), "one of tx_pos.csv"),
-    "both ends move": (_write("rx_pos.csv", "x,y,z\n1,1,1\n"), "one of tx_pos.csv"),
-    "header": (_write("tx_pos.csv", "a,b,c\n1,2,3\n"), "header x,y,z"),
-    "empty table": (_write("tx_pos.csv", ""), "is empty"),
-    "no rows": (_write("tx_pos.csv", "x,y,z\n"), "no rows"),
-    "nan": (_positions("nan,1,1"), "row 11, counted from 0"),
-    "infinite": (_positions("inf,1,1"), "row 11, counted from 0"),
-    "text": (_positions("here,1,1"), "row 12, column x: 'here' is not a number"),
-    "short row": (_positions("1,1"), "row 12 has 2 values"),
-    "at the gateway": (_positions("0,0,0"), "position 11 of .* is that of the fixed end"),
-    "more positions than images": (_write("tx_pos.csv", "x,y,z\n" + "1,1,1\n" * 13), "12 images, but there are 13"),
-    "no images": (lambda f: [p.unlink() for p in (f / "spectrum").iterdir()], "0 images"),
-    "a gap in the numbers": (
-        lambda f: (f / "spectrum/00003.png").rename(f / "spectrum/00099.png"),
-        "00003.png is missing",
-    ),
-    "shape": (_image("00003.png", np.zeros((10, 30), np.uint8)), "10 x 30 pixels"),
-    "another shape": (_image("00003.png", np.zeros((20, 80), np.uint8)), "must have one shape"),
-    "colour": (_image("00003.png", np.zeros((10, 40, 3), np.uint8)), "mode RGB"),
-    "empty image": (lambda f: (f / "spectrum/00003.png").write_bytes(b""), "not a complete PNG"),
-    "truncated image": (
-        lambda f: (f / "spectrum/00003.png").write_bytes((f / "spectrum/00003.png").read_bytes()[:60]),
-        "not a complete PNG",
-    ),
-    **{
-        f"{kind} called PNG": (_image("00001.png", np.zeros((10, 40), np.uint8), kind), "not a complete PNG")
-        for kind in ("EPS", "BMP", "TIFF", "GIF")
-    },
-    "images that are not decoded": (
-        lambda f: [image.write_bytes(_png(5000, 20000)) for image in (f / "spectrum").iterdir()],
-        "pixels; take one measurement of several",
-    ),
-    "index out of range": (_write("test_index.txt", "00013\n"), "expected 1 to 12"),
-    "index below range": (_write("test_index.txt", "0\n"), "expected 1 to 12"),
-    "index twice": (_write("test_index.txt", "11\n11\n"), "twice"),
-    "index is text": (_write("test_index.txt", "eleven\n"), "whole number"),
-    "overlap": (_write("test_index.txt", "10\n"), "both its training and its test"),
-    "one part only": (lambda f: (f / "test_index.txt").unlink(), "test_index.txt is missing"),
-}
-
-
-@pytest.mark.parametrize("name", WRONG)
-def test_refuses(nerf2, name):
-    spoil, says = WRONG[name]
-    spoil(nerf2)
-    with pytest.raises(InputError, match=says):
-        load_spectra(nerf2)
 
 
 def test_every_file_counts_as_input(nerf2):
@@ -162,42 +72,6 @@ def test_the_end_with_more_positions_moves(tmp_path):
     assert data.moving == "transmitter"
 
 
-def test_refuses_a_broken_archive(tmp_path):
-    write_paths(tmp_path / "paths")
-    file = tmp_path / "paths" / "paths.npz"
-    file.write_bytes(file.read_bytes()[:100])
-    with pytest.raises(InputError, match="not an npz archive"):
-        load_spectra(tmp_path / "paths")
-
-
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
-        ({"last_point": np.stack([np.arange(1.0, N + 1), np.zeros(N), np.ones(N)], axis=1)}, "no direction"),
-        ({"frequency_hz": np.float64(1e-320)}, "carrier"),
-        ({"receiver_position": np.tile([0.0, 0.0, 2.0], (N, 1))}, "at one place"),
-        ({"gain": np.zeros(N, dtype=np.complex64)}, "gain other than 0"),
-        ({"gain": np.full(N, 1e300 + 0j)}, "amplitudes"),
-        ({"transmitter_position": np.full((N, 3), 1e300)}, "at most 1e"),
-        ({"path_count": np.float64(1)}, "path_count"),
-        ({"path_count": np.full(N, np.nan)}, "path_count"),
-        ({"path_count": np.int32(3)}, "path_count"),
-        ({"path_count": np.full(N, 2**62)}, "must have shape"),
-        ({"gain": np.array(["a"] * N)}, "plain numbers"),
-        ({"transmitter_position": np.ones((N, 3), dtype=complex)}, "complex"),
-        ({"gain": None}, "lacks gain"),
-        ({"gain": np.ones(5, np.complex64)}, "gain must have shape"),
-        ({"gain": np.full(N, np.nan, np.complex64)}, "gain must be finite"),
-        ({"path_count": np.arange(N, dtype=np.int32)}, "at least one path"),
-        ({"frequency_hz": np.float64(-1)}, "frequency_hz"),
-        ({"last_point": np.array([object()] * N)}, "plain numbers"),
-    ],
-)
-def test_paths_without_usable_numbers_are_refused(tmp_path, changes, says):
-    with pytest.raises(InputError, match=says):
-        load_spectra(write_paths(tmp_path / "p", **changes))
-
-
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32, np.uint64, ">i4", np.longdouble])
 def test_paths_in_other_precisions(tmp_path, dtype):
     usual = load_spectra(write_paths(tmp_path / "a"))
@@ -231,40 +105,6 @@ def test_small_archives_that_claim_much_are_refused_before_memory_is_taken(tmp_p
     with pytest.raises(InputError, match="claims"):
         load_spectra(tmp_path)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 2**20  # KiB
-
-
-def test_seeded_splits_are_partitions(generator):
-    position = torch.rand(57, 3, generator=generator)
-    for split in (lambda seed: random_split(position, seed), lambda seed: block_split(position, seed)):
-        train, test = split(3)
-        assert sorted([*train.tolist(), *test.tolist()]) == list(range(57))
-        assert len(test) in (11, 12)
-        assert split(3)[1].tolist() == test.tolist()
-        assert split(4)[1].tolist() != test.tolist()
-
-
-def test_repeats_at_one_place_share_a_slab(generator):
-    spot = torch.rand(23, 3, generator=generator, dtype=torch.float64)
-    repeated = spot.repeat_interleave(20, 0)[torch.randperm(460, generator=generator)]
-    slab = slabs(repeated, 5)
-    assert slab.unique().tolist() == [0, 1, 2, 3, 4]
-    for place in spot:
-        assert len(slab[(repeated == place).all(dim=1)].unique()) == 1
-    assert slabs(torch.zeros(10, 3), 5).bincount().tolist() == [2] * 5  # one place cannot be held out whole
-
-
-def test_files_that_only_begin_as_splits_do(tmp_path):
-    for name in ("train_index.txt", "train_index_days.txt", "train_index2.txt", "train_index (copy).txt"):
-        (tmp_path / name).touch()
-    assert split_names(tmp_path) == ["random", "days"]
-
-
-def test_slabs_are_equal_and_do_not_interleave(generator):
-    position = torch.rand(50, 3, generator=generator) * torch.tensor([1.0, 20.0, 1.0])
-    slab = slabs(position, 5)
-    assert slab.bincount().tolist() == [10] * 5
-    means = [position[slab == i, 1].mean() for i in range(5)]
-    assert means == sorted(means) or means == sorted(means, reverse=True)
 
 
 def test_coarsen_averages(nerf2):
@@ -336,66 +176,6 @@ def test_receivers_by_number_name_and_all(folder):
         data.columns([2]).receivers(["all"])
     with pytest.raises(InputError, match="once"):
         data.receivers(["a", "1"])
-
-
-def _rssi(value):
-    return _write("gateway_rssi.csv", "a,b,c\n" + f"{value},-60,-70\n" + "-50,-60,-70\n" * (ROWS - 1))
-
-
-def _train_index(content):
-    return lambda f: [_write(name, text)(f) for name, text in (("train_index.txt", content), ("test_index.txt", "1\n"))]
-
-
-WRONG_RSSI = {
-    "positions in Latin-1": (_write("tx_pos.csv", "x,y,z\n\xe4,1,1\n".encode("latin-1")), "UTF-8"),
-    "positions in UTF-16": (_write("tx_pos.csv", "x,y,z\n1,1,1\n".encode("utf-16")), "UTF-8"),
-    "receivers in Latin-1": (_write("gateway_position.yml", "\xe4: [1, 2, 3]".encode("latin-1")), "UTF-8"),
-    "index in UTF-16": (_train_index("1\n".encode("utf-16")), "UTF-8"),
-    "index with an underscore": (_train_index(b"1_0\n"), "whole number"),
-    "index of 5,000 digits": (_train_index(b"9" * 5000), "whole number"),
-    "number with an underscore": (_write("tx_pos.csv", b"x,y,z\n1_0,1,1\n"), "not a number"),
-    "far position": (_write("tx_pos.csv", b"x,y,z\n1e10,1,1\n"), "must match"),
-    "a cell without end": (_write("tx_pos.csv", b'x,y,z\n"' + b"1" * 200_000 + b'",1,1\n'), "comma-separated"),
-    "no name": (_write("gateway_rssi.csv", b"a,\n" + b"-50,-60\n" * ROWS), "no name for column 2"),
-    "text as place": (_write("gateway_position.yml", b"a: '123'\nb: [5, 0, 1]\n"), "'a' needs a position"),
-    "date as place": (_write("gateway_position.yml", b"a: 2001-99-99\nb: [5, 0, 1]\n"), "'a' needs a position"),
-    "place of 5,000 digits": (
-        _write("gateway_position.yml", b"a: [0, 0, " + b"9" * 5000 + b"]\nb: [5, 0, 1]\n"),
-        "'a' needs a position",
-    ),
-    "deep YAML": (_write("gateway_position.yml", b"a: " + b"[" * 5000 + b"]" * 5000), "not valid YAML"),
-    "YAML in itself": (_write("gateway_position.yml", b"a: &a [*a]\nb: [1, 2, 3]"), "not valid YAML"),
-    "lists as names": (_write("gateway_position.yml", b"? [1, 2]\n: 3"), "is not valid YAML"),
-    "too strong": (_rssi(31), "row 1, receiver a: 31 dBm"),
-    "too weak": (_rssi(-151), "row 1, receiver a: -151 dBm"),
-    "text": (_rssi("loud"), "row 1, column a: 'loud' is not a number"),
-    "short row": (_rssi("-50,-60"), "row 1 has 4 values"),
-    "two of one name": (_write("gateway_rssi.csv", "a,a,c\n-1,-2,-3\n"), "'a' twice"),
-    "another number of rows": (_write("gateway_rssi.csv", "a,b,c\n-50,-60,-70\n"), "has 1 rows, tx_pos.csv 15"),
-    "empty": (_write("gateway_rssi.csv", ""), "is empty"),
-    "no receiver with a place": (_write("gateway_position.yml", "d: [0, 0, 1]\n"), "has none of the receivers"),
-    "two places of one name": (_write("gateway_position.yml", "a: [0, 0, 1]\na: [1, 1, 1]\n"), "'a' twice"),
-    "place of two numbers": (_write("gateway_position.yml", "a: [0, 0]\nb: [1, 1]\nc: [1, 2]\n"), "3 finite numbers"),
-    "nan positions": (_write("tx_pos.csv", "x,y,z\n" + "nan,1,1\n" * ROWS), "needs 3 finite numbers"),
-    "origin": (_write("survey.yml", "origin: [91, 0]"), "latitude and longitude"),
-    "floors": (_write("survey.yml", "floors: {up: 4, down: 1}"), "ascending"),
-    "one number of floors": (_write("survey.yml", "floors: 3"), "names with ascending heights"),
-    "moving receiver": (_write("survey.yml", "receiver_moves: perhaps"), "true or false"),
-    "unknown property": (_write("survey.yml", "storeys: 3"), "states storeys"),
-    "index out of range": (
-        lambda f: [_write(f"{part}_index.txt", text)(f) for part, text in (("train", "0\n"), ("test", "15\n"))],
-        "expected 0 to 14",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", WRONG_RSSI)
-def test_refuses_rssi(folder, name):
-    spoil, says = WRONG_RSSI[name]
-    spoil(folder)
-    with pytest.raises(InputError, match=says) as refused:
-        load_rssi(folder)
-    assert len(str(refused.value)) <= 300
 
 
 def two_receivers(folder, names="a,b", position="a: [0, 0, 1]\nb: [5, 0, 1]\n"):

@@ -121,10 +121,6 @@ def test_rssi_from_a_table_and_back():
     assert torch.equal(back.receiver_position, data.receiver_position)
     some = Rssi.from_frame(data.to_frame(), receiver_position={"receiver01": (0, 0, 0)})
     assert some.receiver_located.tolist() == [True] + [False] * 11
-    long = pd.DataFrame({"x": [0, 0, 1], "y": 0, "z": 1, "receiver": ["a", "b", "a"], "rssi": [-50, -60, -70]})
-    assert Rssi.from_frame(long).rssi_dbm.nan_to_num(0).tolist() == [[-50, -60], [-70, 0]]
-    with pytest.raises(InputError, match="the table row 2, receiver a: 40 dBm"):
-        Rssi.from_frame(pd.DataFrame({"x": [0, 1, 2], "y": 0, "a": [-50, 40, -60]}))
 
 
 def test_tables_and_one_line_of_a_data_set():

@@ -1,6 +1,5 @@
 """Array snapshots: what is read from npz and HDF5, and everything that is refused."""
 
-import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -72,44 +71,6 @@ def test_rows_columns_and_spacing_describe_an_array(tmp_path):
     assert (x, y) == pytest.approx((0.5 * WAVELENGTH / 2, -0.5 * WAVELENGTH / 2))
 
 
-def _csi(change):
-    return {"csi": change(snapshots().channel.numpy())}
-
-
-def _elements(change):
-    return {"element_position": change(snapshot_arrays(snapshots())["element_position"])}
-
-
-REFUSED = {
-    "real numbers": (_csi(np.abs), "must hold complex numbers"),
-    "parts apart": (_csi(lambda c: np.stack([c.real, c.imag], -1)), "join real and imaginary parts"),
-    "axes swapped": (_csi(lambda c: c.transpose(0, 2, 1)), r"give csi.transpose\(0, 2, 1\)"),
-    "other elements": (_csi(lambda c: c[..., :9]), "16 elements"),
-    "other rows": (_csi(lambda c: c[:50]), "for 120 positions"),
-    "silent": (_csi(lambda c: c * (np.arange(120) != 7)[:, None, None]), "row 7 has no power"),
-    "without a number": (_csi(lambda c: c + np.nan), "row 0 has no power"),
-    "not finite": (_csi(lambda c: c + np.inf), "no power, or more than numbers hold"),
-    "one element alone": (_csi(lambda c: c * (np.arange(16) == 3)), "values at 1 elements"),
-    "an array that moves": ({"array_position": np.zeros((120, 3))}, "the array must rest"),
-    "unequal polarisations": (_elements(lambda e: e[[0, *range(15)]]), "1 to 2 elements at one place"),
-    "no csi": ({"csi": None}, "lacks csi"),
-    "no pose": ({"array_orientation": None}, "lacks array_orientation"),
-    "Euler angles": ({"array_orientation": np.zeros(3)}, "Euler angles"),
-    "a normal of one number": ({"array_orientation": None, "array_normal": 1.0}, "the array's normal"),
-    "no unit quaternion": ({"array_orientation": np.ones(4)}, "unit quaternion"),
-    "flat positions": ({"position": np.zeros((120, 2))}, r"shape \(n, 3\)"),
-    "at the array": ({"position": np.tile([0.2, 2.4, 1.2], (120, 1))}, "equal to array_position"),
-    "no array": ({"element_position": None}, "lacks the array"),
-    "half rows": ({"element_position": None, "rows": 4.5, "columns": 4, "spacing_m": 0.06}, "whole numbers"),
-    "elements in millimetres": (_elements(lambda e: 1000 * e), "wavelengths"),
-    "elements upright": (_elements(lambda e: e[:, [2, 0, 1]]), "along z"),
-    "carrier in GHz": ({"frequency_hz": 2.4}, "carrier in Hz"),
-    "frequencies of others": ({"frequency_hz": np.full(7, FREQUENCY)}, "frequency_hz"),
-    "times of others": ({"time": np.zeros(3)}, "time has 3 rows"),
-    "complex positions": ({"position": np.ones((120, 3), complex)}, "position must be real"),
-}
-
-
 def test_an_array_is_turned_by_its_normal_and_its_upper_side(tmp_path):
     data = snapshots()
     side, up, normal = data.rotation.T.numpy()
@@ -119,13 +80,6 @@ def test_an_array_is_turned_by_its_normal_and_its_upper_side(tmp_path):
     for wrong in (given | {"array_up": normal}, given | {"array_normal": 0 * side}):
         with pytest.raises(InputError, match="along up"):
             load_snapshots(write_snapshots(tmp_path / "b", **wrong))
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_refuses(tmp_path, name):
-    changes, says = REFUSED[name]
-    with pytest.raises(InputError, match=says):
-        load_snapshots(write_snapshots(tmp_path / "a", **changes))
 
 
 def test_what_does_not_apply_is_refused(tmp_path):
@@ -320,9 +274,3 @@ def test_a_linear_array_receives_the_angle_to_its_axis(tmp_path):
     estimator = make_estimator("peak").fit(Mixed.measured(data))
     error = angle_errors(estimator.predict(data.spectrum), data.label)["great_circle"]
     torch.testing.assert_close(error, angular_distance(label, peak), atol=1e-6, rtol=0)
-
-
-def test_a_pickle_is_refused_without_advice_to_load_it(tmp_path):
-    (tmp_path / "snapshots.npz").write_bytes(pickle.dumps({"csi": 1}))
-    with pytest.raises(InputError, match=r"\(it is no zip archive\)$"):
-        read_arrays(tmp_path / "snapshots.npz", ["csi"])

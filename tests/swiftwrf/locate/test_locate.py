@@ -9,6 +9,7 @@ import pytest
 import torch
 from quick import command
 from rooms import mirror_room
+from small import COARSEST
 
 from swiftwrf import AngularGrid, InputError, Rssi, load, rssi_room, simulated_room
 from swiftwrf.array.angles import angular_distance, to_direction
@@ -24,6 +25,7 @@ from swiftwrf.locate.rssi_likelihood import METRICS, DetectionLikelihood, Finger
 from swiftwrf.locate.spectrum_likelihood import BOUNDS, PhaseLikelihood, Student
 from swiftwrf.models.geometry import GeometryModel, Plane
 from swiftwrf.models.geometry.path_gains import PathGains
+from swiftwrf.testing import check_saved
 
 SMALL = {"n_best": 60, "n_background": 40, "n_split": 8, "spacing": 0.4, "n_calibration": 40}
 ROOM = [
@@ -261,13 +263,12 @@ def test_rssi_is_located_better_than_by_fingerprints(floor):
     assert found.median() < nearest.median()
 
 
-def test_the_prior_region_can_be_given(floor, tmp_path):
+def test_the_prior_region_can_be_given(floor):
     train, test, _ = floor
     corner = Region(train.transmitter_position[train.transmitter_position[:, 0] < 5], margin=0.0, outside=0.01)
     locator = RssiLocator(n_cells=600).fit(train, region=corner)
     assert locator.locate(test.rssi_dbm).median[:, 0].max() < 5.5
-    locator.save(tmp_path / "locator.safetensors")
-    assert torch.equal(load(tmp_path / "locator.safetensors").cells.position, locator.cells.position)
+    check_saved(locator, lambda loaded: loaded.cells.position)
 
 
 def test_a_region_takes_finite_positions_of_any_kind():
@@ -280,11 +281,11 @@ def test_a_region_takes_finite_positions_of_any_kind():
             Region(given)
 
 
-def test_rows_at_one_position_are_located_there(tmp_path):
+def test_rows_at_one_position_are_located_there():
     room = rssi_room(n=60)
     locator = RssiLocator(n_cells=50).fit(replace(room, transmitter_position=torch.ones(60, 3)))
-    locator.save(tmp_path / "locator.safetensors")
-    assert torch.equal(load(tmp_path / "locator.safetensors").locate(room.rssi_dbm).median, torch.ones(60, 3).double())
+    check_saved(locator, lambda loaded: loaded.locate(room.rssi_dbm).median)
+    assert torch.equal(locator.locate(room.rssi_dbm).median, torch.ones(60, 3).double())
 
 
 def test_neighbours_that_cannot_be_held_out_are_refused():
@@ -305,8 +306,7 @@ def test_spectra_at_one_position_are_held_out_together():
     train = simulated_room(n=24, seed=3, grid=AngularGrid.hemisphere(15, 60))
     twice = train.subset(torch.arange(len(train)).repeat_interleave(2))
     room = GeometryModel.of_planes(train, ROOM)
-    coarse = {"spacing": 4.0, "max_cells": 100, "n_best": 10, "n_background": 5, "n_split": 2, "n_calibration": 10}
-    once, repeated = (MatchedField(**coarse).fit(some, room=room).likelihoods for some in (train, twice))
+    once, repeated = (MatchedField(**COARSEST).fit(some, room=room).likelihoods for some in (train, twice))
     # errors of path gains that follow the position, which a spectrum at the same position would lower
     assert repeated.coarray[1].scale.trace() == pytest.approx(float(once.coarray[1].scale.trace()), rel=0.1)
 
@@ -326,16 +326,6 @@ def test_a_locator_whose_numbers_overflow_is_refused(closed_form, name, value, s
     damaged = tensors | {name: torch.full_like(tensors[name], value)}
     with pytest.raises(InputError, match=says):
         MatchedField.from_state(damaged, header).locate(test.spectrum[:2])
-
-
-@pytest.mark.parametrize("locator", [MatchedField, RssiLocator])
-def test_a_locator_that_is_not_fitted_is_refused(locator, tmp_path):
-    unfitted = locator()
-    assert repr(unfitted) == f"{locator.__name__}(not fitted)"
-    with pytest.raises(InputError, match="call fit first"):
-        unfitted.locate(torch.zeros(1, 12))
-    with pytest.raises(InputError, match="call fit first"):
-        unfitted.save(tmp_path / "locator.safetensors")
 
 
 def test_values_have_the_density_of_a_common_offset_and_missing_ones_count_as_missing():
@@ -366,7 +356,7 @@ def building():
     return Rssi(rssi, at, floors=Floors(("ground", "first"), (0.0, 3.0)))
 
 
-def test_floors_are_located_with_their_probability(building, short_fits, tmp_path):
+def test_floors_are_located_with_their_probability(building, short_fits):
     train, test = building.split()
     locator = RssiLocator(n_cells=400).fit(train)
     posterior = locator.locate(test.rssi_dbm)
@@ -377,8 +367,7 @@ def test_floors_are_located_with_their_probability(building, short_fits, tmp_pat
     assert probability.amax(dim=1).mean() == pytest.approx(float(right.double().mean()), abs=0.05)
     heights = (locator.cells.position, posterior.median.round(decimals=6))
     assert [set(position[:, 2].tolist()) for position in heights] == [{0.0, 3.0}] * 2
-    locator.save(tmp_path / "locator.safetensors")
-    assert torch.equal(load(tmp_path / "locator.safetensors").locate(test.rssi_dbm).log_weight, posterior.log_weight)
+    check_saved(locator, lambda loaded: loaded.locate(test.rssi_dbm).log_weight)
 
 
 def test_each_floor_may_be_a_session_of_its_own(building, short_fits):
@@ -487,26 +476,22 @@ def kalman(observed, variances):
     return torch.tensor(found, dtype=torch.float64)
 
 
+@pytest.mark.parametrize("is_timed", [True, False])
 @pytest.mark.parametrize("is_shared", [True, False])
-def test_a_random_walk_has_the_means_of_the_kalman_smoother(is_shared):
-    truth, observed = walk()
+def test_a_random_walk_has_the_means_of_the_kalman_smoother(is_shared, is_timed):
+    """The time between observations widens the step."""
+    truth, observed = walk(n=30 if is_timed else 60)
+    time = torch.arange(30.0, dtype=torch.float64).square() / 10 if is_timed else None
     at = line() if is_shared else line().expand(len(observed), -1, -1).contiguous()
     alone = gaussian(at, observed)
-    found = smoothed(alone, None, STEP_M)
-    expected = kalman(observed, [STEP_M**2 + 0.1**2 / 6] * (len(observed) - 1))
-    assert (found.mean[:, 0] - expected).abs().max() < 0.05
-    error, before = ((p.mean[:, 0] - truth).square().mean().sqrt() for p in (found, alone))
-    assert error < 0.6 * before
-    assert found.weight.sum(dim=1).allclose(torch.ones(len(observed), dtype=torch.float64))
-
-
-def test_the_time_between_observations_widens_the_step():
-    _, observed = walk(n=30)
-    time = torch.arange(30.0, dtype=torch.float64).square() / 10
-    found = smoothed(gaussian(line(), observed), time, STEP_M)
-    expected = kalman(observed, ((STEP_M * time.diff()) ** 2 + 0.1**2 / 6).tolist())
+    found = smoothed(alone, time, STEP_M)
+    step = STEP_M * (time.diff() if is_timed else torch.ones(len(observed) - 1))
+    expected = kalman(observed, (step**2 + 0.1**2 / 6).tolist())
     inside = expected[:, None].sub(torch.tensor([0.0, 30.0])).abs().amin(dim=1) > 5  # away from the ends of the line
-    assert (found.mean[:, 0] - expected)[inside].abs().max() < 0.1
+    assert (found.mean[:, 0] - expected)[inside].abs().max() < (0.1 if is_timed else 0.05)
+    error, before = ((p.mean[:, 0] - truth).square().mean().sqrt() for p in (found, alone))
+    assert is_timed or error < 0.6 * before
+    assert found.weight.sum(dim=1).allclose(torch.ones(len(observed), dtype=torch.float64))
 
 
 def test_products_in_chunks_are_the_same(monkeypatch):

@@ -101,14 +101,6 @@ def test_standard_deviations_follow_updates_and_another_kernel(built_in_room, na
     assert 0.7 < covered(found.mean, found.std, test.spectrum).mean() < 0.9
 
 
-def test_standard_deviations_on_another_grid_are_those_of_the_nearest_directions(built_in_room):
-    train, test = built_in_room
-    model = make_model("coarray").fit(train)
-    own, fine = (model.predict(test.position, grid).std for grid in (None, AngularGrid.hemisphere(30, 120)))
-    assert fine.shape == (len(test), 30, 120)
-    torch.testing.assert_close(fine[:, 1::2, ::2], own)
-
-
 def test_a_fit_like_another_keeps_its_number_of_primitives(room):
     first, some = fit(room, n_primitives=24), room.subset(torch.arange(30))
     records = []

@@ -10,7 +10,7 @@ import torch
 from rooms import built_in_walls, mirror_room
 
 from augment.turbo.artifacts import save_model
-from swiftwrf import AngularGrid, InputError, MatchedField, Spectra, load, simulated_room
+from swiftwrf import AngularGrid, InputError, MatchedField, Spectra, simulated_room
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data import PropagationPaths
 from swiftwrf.data.store import Store
@@ -21,6 +21,7 @@ from swiftwrf.models.geometry.channels import Channels, coherence, field, source
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.geometry.furniture import Furniture
 from swiftwrf.models.geometry.images import PlaneSet, images
+from swiftwrf.testing import check_saved
 from tasks.aoa.room import furniture_panels
 
 WALLS = built_in_walls(0.9)
@@ -129,7 +130,7 @@ def test_a_voxel_attenuates_the_direct_path_by_its_length_in_it():
     assert float(inside.max()) > 0.2
 
 
-def test_furniture_is_found_where_it_stands_and_explains_new_channels(furnished_room, tmp_path):
+def test_furniture_is_found_where_it_stands_and_explains_new_channels(furnished_room):
     train, test, room = furnished_room
     walls = GeometryModel.of_planes(train, WALLS)
     channels = walls.channels(test)
@@ -144,8 +145,7 @@ def test_furniture_is_found_where_it_stands_and_explains_new_channels(furnished_
     i, j, k = centre.tolist()
     assert room.furniture.absorption[i, j, k] > 10 * room.furniture.absorption.median()
     assert room.furniture.crossed_m.min() == 0  # what no path crosses is unknown
-    room.save(tmp_path / "room.safetensors")
-    assert torch.equal(load(tmp_path / "room.safetensors").channel(test.position), room.channel(test.position))
+    check_saved(room, lambda loaded: loaded.channel(test.position))
 
 
 def test_walls_reflect_alike_where_no_path_determines_their_reflectivity():
@@ -158,7 +158,7 @@ def test_walls_reflect_alike_where_no_path_determines_their_reflectivity():
     assert found.reflectivity.mean() == pytest.approx(0.5, abs=0.1)
 
 
-def test_a_reflecting_surface_is_found_where_it_is(tmp_path):
+def test_a_reflecting_surface_is_found_where_it_is():
     lamp = Plane((0.0, 0.0, 1.0), 2.2, 0.9)
     data, walls = measured(1.0, n=120, surfaces=(lamp,))
     room = fitted(walls, data.subset(torch.arange(100)))
@@ -168,8 +168,7 @@ def test_a_reflecting_surface_is_found_where_it_is(tmp_path):
     channels = room.channels(data.subset(torch.arange(100, 120)))
     missing = 1 - channels.coherence(room.reflectors, room.gains(channels.scene))
     assert float(missing.median()) < 0.1
-    room.save(tmp_path / "room.safetensors")
-    assert torch.equal(load(tmp_path / "room.safetensors").channel(data.position[:5]), room.channel(data.position[:5]))
+    check_saved(room, lambda loaded: loaded.channel(data.position[:5]))
 
 
 def test_furniture_is_drawn_by_height_and_hatched_where_it_is_unknown(tmp_path):
@@ -213,16 +212,14 @@ def test_phases_of_channels_have_no_alias_and_those_of_packets_are_the_signal():
 
 
 @pytest.mark.parametrize("furnished_room", ["transmitter"], indirect=True)
-def test_positions_are_located_by_noisy_packets_through_furniture(furnished_room, tmp_path):
+def test_positions_are_located_by_noisy_packets_through_furniture(furnished_room):
     train, test, room = furnished_room
     cells = {"n_best": 15, "n_background": 8, "n_split": 8, "spacing": 0.3, "max_cells": 4000}
     locator = MatchedField(**cells, n_rounds=2, n_calibration=12).fit(train, room=room)
     posterior = locator.locate(test)
     error = (posterior.median - test.position).norm(dim=1)
     assert float(error.median()) < 0.5 * test.array.wavelength
-    locator.save(tmp_path / "locator.safetensors")
-    again = load(tmp_path / "locator.safetensors").locate(test.channel)
-    assert torch.equal(again.log_weight, posterior.log_weight)
+    check_saved(locator, lambda loaded: loaded.locate(test.channel).log_weight)
     with pytest.raises(InputError, match="was fitted to channels"):
         locator.locate(test.spectrum)
 

@@ -1,7 +1,7 @@
 """Rooms in closed form found again, conclusions on what is not identifiable, samples, state."""
 
 from copy import copy
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -420,16 +420,7 @@ def test_the_same_seed_finds_the_same_room(noisy):
 def test_json_and_images_describe_the_room(room):
     content = room.to_json()
     assert set(content) == {"planes", "order", "score_held_out", "unexplained"}
-    assert set(content["planes"][0]) == {
-        "normal",
-        "offset_m",
-        "gain",
-        "std_mm",
-        "probability",
-        "rival_m",
-        "certain",
-        "dielectric",
-    }
+    assert set(content["planes"][0]) == {*(field.name for field in fields(Plane)), "certain"}
     position, gain, order = room.image_sources()
     assert len(position) == len(gain) == len(order) == 25
     assert torch.equal(position[0], room.fixed_position)
@@ -601,25 +592,6 @@ def test_a_room_of_the_same_spectra_is_reused_and_of_others_refined(noisy, room,
         assert refined.to_json() != room.to_json()
     with pytest.raises(InputError, match="cannot reuse the structure"):
         GeometryModel().fit(few, like=NearestModel().fit(few))
-
-
-def test_spectra_are_differentiable_in_the_position_of_a_receiver():
-    data = simulated_room(n=40, moving="receiver", grid=GRID)
-    walls = [Plane((1.0, 0.0, 0.0), 6.0, -0.5), Plane((0.0, 0.0, -1.0), 0.0, -0.5)]
-    room = GeometryModel.of_planes(data, walls)
-    hybrid = HybridModel().fit(data, like=room)
-    assert hybrid.mixing_weight > 0
-    assert hybrid.process.value.shape[1]
-    position = data.position[:3] + 0.02
-    for model in (room, hybrid):
-        weight = torch.rand(3, *data.grid.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        at = position.clone().requires_grad_()
-        (model.predict(at).mean * weight).sum().backward()
-        for axis in range(3):
-            step = torch.zeros(3, dtype=torch.float64)
-            step[axis] = 1e-4
-            ends = [(model.synthesize(position + sign * step) * weight).sum((1, 2)) for sign in (1, -1)]
-            torch.testing.assert_close(at.grad[:, axis], (ends[0] - ends[1]) / 2e-4, rtol=0.02, atol=1.0)
 
 
 def test_spectra_and_their_gradient_are_finite_where_both_ends_meet():

@@ -1,13 +1,12 @@
 """A model is applied to measurements of the link that it was fitted to, and to no other."""
 
 from dataclasses import replace
-from unittest import mock
 
 import pytest
 import torch
-from rooms import mirror_room
+from rooms import floor_channels
+from small import COARSE, COARSEST, small
 from small import FLOOR as FLOOR_PLANE
-from small import few_kernels, short_path_gains
 
 from swiftwrf import (
     FieldModel,
@@ -24,10 +23,11 @@ from swiftwrf import (
     predict,
     rssi_room,
 )
-from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
+from swiftwrf.array.planar import PlanarArray
 from swiftwrf.contrib.online import Follower, score
 from swiftwrf.models.geometry import HybridModel
 
+pytestmark = pytest.mark.usefixtures("without_furniture")
 FLOOR = rssi_room(n=100)
 QUARTER = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
 OTHER_LINKS = {
@@ -53,7 +53,7 @@ def given_room(data):
 @pytest.fixture(scope="module")
 def models(room):
     known = given_room(room)
-    with short_path_gains(), few_kernels():
+    with small("path gains", "kernels"):
         closed_form = [make_model(name).fit(room) for name in ("gp", "coarray")]
         return [*closed_form, known, HybridModel().fit(room, like=known)]
 
@@ -87,24 +87,12 @@ def test_a_structure_of_another_link_is_refused(room, says, change):
 
 @pytest.fixture(scope="module")
 def channels():
-    """Spectra of the channels of one plane at five subcarriers, which rise in frequency."""
-    base = mirror_room({}, moving="transmitter", n=40)
-    carrier = LIGHT_SPEED / base.array.wavelength
-    frequency = carrier + 1e6 * torch.tensor([-20.0, -9, 1, 8, 20], dtype=torch.float64)
-    return replace(base, channel=given_room(base).channel(base.position, frequency), frequency_hz=frequency)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def without_furniture():
-    """Its search takes most of the time of a fit to channels, and has tests of its own."""
-    with mock.patch.object(GeometryModel, "_furnish"):
-        yield
+    return floor_channels()
 
 
 @pytest.fixture(scope="module")
 def locator(channels):
-    small = {"spacing": 1.0, "max_cells": 500, "n_best": 20, "n_background": 10, "n_split": 4, "n_rounds": 2}
-    return MatchedField(**small).fit(channels.subset(range(30)), room=given_room(channels))
+    return MatchedField(**COARSE).fit(channels.subset(range(30)), room=given_room(channels))
 
 
 @pytest.fixture
@@ -185,13 +173,13 @@ def test_rows_at_other_receivers_are_refused(short_fits, tmp_path, predictor):
 def test_unknown_positions_of_receivers_are_not_compared(tmp_path):
     unlocated = Rssi(FLOOR.rssi_dbm, FLOOR.transmitter_position, receiver_names=FLOOR.receiver_names)
     model = RssiModel().fit(unlocated)
-    assert not model.slope.any()
-    assert not model.directivity.any()
+    assert not model.path_loss.slope.any()
+    assert not model.posterior.feature[..., 2:].any()  # nor directivity
     model.save(tmp_path / "model")
     again = load(tmp_path / "model")
     assert again.receiver_position.isnan().all()
     new = replace(FLOOR.subset(torch.arange(5)), index=torch.arange(100, 105))
-    torch.testing.assert_close(again.update(new).level, model.update(new).level)
+    torch.testing.assert_close(again.update(new).path_loss.level, model.update(new).path_loss.level)
 
 
 @pytest.mark.parametrize(
@@ -200,10 +188,7 @@ def test_unknown_positions_of_receivers_are_not_compared(tmp_path):
         (make_model("coarray"), "_set_spread"),
         (RssiModel(), "_set_posterior"),
         (RssiLocator(n_cells=50), "_calibrate"),
-        (
-            MatchedField(spacing=4.0, max_cells=100, n_best=10, n_background=5, n_split=2, n_calibration=10),
-            "_calibrate",
-        ),
+        (MatchedField(**COARSEST), "_calibrate"),
     ],
     ids=lambda value: type(value).__name__,
 )

@@ -16,7 +16,6 @@ from test_not_detected import RECEIVER, survey
 
 from swiftwrf import PairModel, Rssi, RssiModel, rssi_room
 from swiftwrf.gp import Kernel
-from swiftwrf.rssi import coverage
 from swiftwrf.rssi.coverage import Coverage, at_least, reach
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.path_loss import log_distance
@@ -33,15 +32,14 @@ def at_least_by_enumeration(probability, number):
 
 @pytest.mark.parametrize("correlation", [0.0, 0.1, 0.6])
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_receivers_above_a_threshold_are_an_integral_over_the_factor_of_the_scan(number, correlation, monkeypatch):
-    monkeypatch.setattr(coverage, "CORRELATION", correlation)
+def test_receivers_above_a_threshold_are_an_integral_over_the_factor_of_the_scan(number, correlation):
     score = norm.ppf(DETECTED * norm.sf(-75, MEAN, STD))
 
     def integrand(factor):
         given = norm.cdf((score + math.sqrt(correlation) * factor) / math.sqrt(1 - correlation))
         return norm.pdf(factor) * at_least_by_enumeration(given, number)
 
-    found = at_least(number, *map(torch.tensor, (MEAN, STD, DETECTED)), -75.0)
+    found = at_least(number, *map(torch.tensor, (MEAN, STD, DETECTED)), -75.0, correlation)
     assert float(found) == pytest.approx(quad(integrand, -8, 8)[0], abs=1e-4)
 
 

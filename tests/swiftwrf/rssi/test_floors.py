@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 
-import swiftwrf
 from swiftwrf import InputError, PairModel, Rssi, RssiModel
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.data.coordinates import Floors
 from swiftwrf.rssi import estimate_floor_attenuation
+from swiftwrf.testing import check_predictor
 
 FLOOR_DB, STOREY_M, SIDE_M = 15.0, 3.5, 30.0
 RECEIVERS = {
@@ -121,15 +120,9 @@ def test_predictors_take_the_floor_into_account(name):
     assert name in ("mean", "knn") or error[0] < 3.0
 
 
-@pytest.mark.parametrize("model", [RssiModel, PairModel])
-def test_the_attenuation_is_saved(model, tmp_path):
-    data = rssi(building(n=90))
-    fitted = model().fit(data)
-    assert fitted.attenuation.db == pytest.approx(FLOOR_DB, abs=1.5)
-    fitted.save(tmp_path / "model.safetensors")
-    loaded = swiftwrf.load(tmp_path / "model.safetensors")
-    assert loaded.attenuation == fitted.attenuation
-    found, expected = (some.predict(data.transmitter_position).mean for some in (loaded, fitted))
-    torch.testing.assert_close(found, expected)
-    again = model().fit(replace(data, floors=None))
-    assert again.attenuation is None
+@pytest.mark.parametrize("kind", [RssiModel, PairModel])
+def test_the_attenuation_is_a_part_of_the_model_and_of_its_file(kind):
+    data, model = rssi(building(n=90)), kind()
+    check_predictor(model, data)
+    assert model.attenuation.db == pytest.approx(FLOOR_DB, abs=1.5)
+    assert kind().fit(replace(data, floors=None)).attenuation is None

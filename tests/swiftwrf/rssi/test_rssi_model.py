@@ -1,5 +1,6 @@
 """The RSSI model: its regression against slow definitions, its intervals, its files, and awkward data."""
 
+import math
 from dataclasses import replace
 from functools import partial
 from unittest import mock
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import minimize
+from small import only
 
 from swiftwrf import InputError, PairModel, Rssi, RssiLocator, RssiModel, fit_rssi, rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
@@ -16,19 +18,18 @@ from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import Kernel
 from swiftwrf.rssi import RssiConfig, RssiPaperModel, compare
-from swiftwrf.rssi.head import Head, HeadTable, mean_magnitude, render
-from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, harmonics, log_distance
-from swiftwrf.rssi.regression import DIRECTIVITY_STD_DB, RssiPosterior, fit_receiver
-from swiftwrf.rssi.training import RssiTraining, bin_locations, mixing_weights
+from swiftwrf.rssi.head import Head, Heads, mean_magnitude, render
+from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, log_distance
+from swiftwrf.rssi.regression import RssiPosterior, fit_receiver, regressors
+from swiftwrf.rssi.training import Bins, RssiTraining
 
 KERNEL = Kernel(4.0, 1.0, matern12_weight=0.6, noise=1.0)
 FIELD_DB, NOISE_DB, PATH_LOSS_STD_DB = 3.0, 2.0, 30.0
 CPU, FIRST = torch.device("cpu"), 0
 
 
-def test_errors_by_the_number_of_training_rows(monkeypatch, tmp_path):
-    kept = {name: RSSI_PREDICTORS[name] for name in ("swiftwrf", "mean", "knn")}
-    monkeypatch.setattr(RSSI_PREDICTORS, "_registered", kept)
+@only(RSSI_PREDICTORS, "swiftwrf", "mean", "knn")
+def test_errors_by_the_number_of_training_rows(tmp_path):
     room = rssi_room(n=200, seed=1)
     asked = []
     whole, found = compare(room, receivers=["6"]), compare(room, receivers=["6"], fewer=(0.01, 0.25, 0.5)).by_rows
@@ -80,9 +81,9 @@ def training_of(data, n_primitives=50):
         rssi=data.rssi_dbm,
         count=torch.ones(n, r, dtype=torch.float64),
         kernel=KERNEL,
-        rendered=render([Head(n_primitives, 0).requires_grad_(False) for _ in data.receiver_names]),
+        heads=Heads.alike(n_primitives, seed=0),
         path_loss=PathLosses(
-            own=path_loss,
+            each=path_loss,
             shared=path_loss,
             root=PATH_LOSS_STD_DB * torch.eye(2).double().repeat(r, 1, 1),
             variance=torch.full((r,), FIELD_DB**2 + NOISE_DB**2).double(),
@@ -93,19 +94,16 @@ def training_of(data, n_primitives=50):
         limit=torch.full((n, r), torch.nan).double(),
         field_db=torch.full((r,), FIELD_DB, dtype=torch.float64),
         noise_db=torch.full((r,), NOISE_DB, dtype=torch.float64),
-        baselines=PathLoss(*(values.expand(3, -1) for values in path_loss)),
-        baseline_held_out=torch.zeros(3, n, r, dtype=torch.float64),
     )
 
 
 def posterior(training, found):
     """The posterior of one receiver's fit."""
     tensors = {name: value[None] for name, value in found.items() if name not in ("covariance", "held_out")}
-    variances = {"field_db": training.field_db, "noise_db": training.noise_db}
-    measured, table = (~training.rssi.isnan()).T.double(), HeadTable(training.rendered)
-    rest = {"anchor": training.position, "measured": measured, **variances}
-    heads = {"receiver": training.receiver, "kernel": training.kernel, "table": table, "huber": 1.345}
-    return RssiPosterior(**heads, **tensors, **rest)
+    shared = {
+        name: getattr(training, name) for name in ("kernel", "heads", "receiver", "position", "field_db", "noise_db")
+    }
+    return RssiPosterior(huber=1.345, measured=(~training.rssi.isnan()).T.double(), **shared, **tensors)
 
 
 # --- the regression -------------------------------------------------------------------------------------------------
@@ -120,18 +118,17 @@ def test_solution_is_the_maximum_of_the_posterior():
     training, config = training_of(data), RssiConfig()
     found = posterior(training, fit_receiver(FIRST, training, config, CPU))
 
-    rendered = training.rendered.double()
+    rendered = training.heads.rendered.double()
     gram = KERNEL(training.position, training.position)
     root = torch.linalg.cholesky(gram + 1e-10 * torch.eye(40, dtype=torch.float64))
     distance = log_distance(training.position, training.receiver)[:, 0]
-    bearing = harmonics(training.position, training.receiver)[:, 0]
+    linear = regressors(training.position, training.receiver, training.path_loss.root)[0]
 
     def predicted(parameters):
-        level, slope = PATH_LOSS_STD_DB * parameters[0], PATH_LOSS_STD_DB * parameters[1]
         latent = FIELD_DB * root @ parameters[10:]
-        path_loss = training.path_loss.shared.level[0] + level + (training.path_loss.shared.slope[0] + slope) * distance
+        path_loss = training.path_loss.shared.level[0] + training.path_loss.shared.slope[0] * distance
         head = mean_magnitude(rendered, latent[:, None]) - mean_magnitude(rendered, torch.zeros(1, 1).double())
-        return path_loss + DIRECTIVITY_STD_DB * bearing @ parameters[2:10] + head[:, 0]
+        return path_loss + linear @ parameters[:10] + head[:, 0]
 
     def objective(x):
         parameters = torch.tensor(x, requires_grad=True)
@@ -143,10 +140,9 @@ def test_solution_is_the_maximum_of_the_posterior():
 
     options = {"maxiter": 5000, "maxfun": 9000, "ftol": 1e-14}
     best = minimize(objective, np.zeros(50), jac=True, method="L-BFGS-B", options=options)
-    level, slope = found.path_loss[0]
-    mine = level + slope * distance + bearing @ found.directivity[0]
-    mine = mine + found.table(gram @ found.coefficient)[0][:, 0]
-    torch.testing.assert_close(mine, predicted(torch.tensor(best.x)), atol=0.06, rtol=0)
+    torch.testing.assert_close(
+        found.at(training.position, gram)[0][:, 0], predicted(torch.tensor(best.x)), atol=0.06, rtol=0
+    )
 
 
 def test_held_out_is_a_fit_without_the_fold():
@@ -158,51 +154,25 @@ def test_held_out_is_a_fit_without_the_fold():
         out = training.fold == number
         rest = replace(training, rssi=torch.where(out[:, None], torch.nan, training.rssi))
         alone = posterior(training, fit_receiver(FIRST, rest, gentle, CPU))
-        level, slope = alone.path_loss[0]
-        distance = log_distance(training.position, training.receiver)[:, 0]
-        expected = level + slope * distance
-        expected = expected + harmonics(training.position, training.receiver)[:, 0] @ alone.directivity[0]
+        expected = alone.at(training.position, KERNEL(training.position, training.position))[0][:, 0]
         torch.testing.assert_close(whole[out], expected[out], atol=1e-5, rtol=0)
 
 
 def test_table_is_the_head():
     rendered = render([Head(50, seed).requires_grad_(False) for seed in (0, 1)])
     latent = torch.linspace(-30, 30, 200)[:, None].expand(-1, 2).contiguous()
-    value, slope = HeadTable(rendered)(latent)
+    value, slope = Heads(rendered)(latent)
     change = mean_magnitude(rendered, latent) - mean_magnitude(rendered, torch.zeros(1, 2))
     torch.testing.assert_close(value, change, atol=2e-3, rtol=0)
-    assert HeadTable(rendered)(torch.zeros(1, 2))[1].sub(1).abs().max() < 0.01  # 1 dB of the field is 1 dB of RSSI
+    assert Heads(rendered)(torch.zeros(1, 2))[1].sub(1).abs().max() < 0.01  # 1 dB of the field is 1 dB of RSSI
     assert (slope.diff(dim=0) > -1e-3).all()  # convex
-
-
-def test_mixing_weights_find_the_mixture():
-    generator = torch.Generator().manual_seed(0)
-    predictors = torch.randn(4, 3000, 2, generator=generator, dtype=torch.float64)
-    measured = 0.7 * predictors[1] + 0.3 * predictors[3] + 0.1 * torch.randn(3000, 2, generator=generator)
-    measured[::50] = torch.nan
-    measured[1::50] += 40.0  # outliers that squares would follow
-    weight = mixing_weights(predictors, measured, shrinkage=0.0)
-    torch.testing.assert_close(weight, torch.tensor([0.0, 0.7, 0.0, 0.3]).double(), atol=0.03, rtol=0)
-    assert float(weight.sum()) == pytest.approx(1)
-
-
-def test_shrinkage_keeps_the_first_of_equal_predictors():
-    generator = torch.Generator().manual_seed(0)
-    measured = torch.randn(40, 2, generator=generator, dtype=torch.float64)
-    noise = torch.randn(3, 40, 2, generator=generator, dtype=torch.float64)
-    free = mixing_weights(measured + noise, measured, shrinkage=0.0)
-    shrunk = mixing_weights(measured + noise, measured)
-    assert free[0] < shrunk[0] < 1
-    assert mixing_weights(measured + noise, measured, shrinkage=1e4)[0] > 0.999
-    better = torch.stack([measured + 5 * noise[0], measured + 0.1 * noise[1], measured + 5 * noise[2]])
-    assert mixing_weights(better, measured)[1] > 0.8
 
 
 # --- the model -------------------------------------------------------------------------------------------------------
 
 
 def test_errors_at_held_out_rows_are_those_of_the_model_and_of_the_receivers_means():
-    """RSSI that no place explains: the penalty on the weights costs more than the field gains. On a floor it gains."""
+    """RSSI that no place explains: the mean of a receiver is better than its path loss. On a floor the model is."""
     generator = np.random.default_rng(2)
     position = np.column_stack([generator.uniform(0, 10, (40, 2)), np.ones(40)])
     noise = Rssi(
@@ -226,19 +196,12 @@ def test_primitives_are_for_a_field():
 def test_paper_head_learns_without_a_path_loss_model():
     train, test = with_field().columns([0]).split("random")
     model = RssiPaperModel(steps=200).fit(train)
-    assert not model.slope.any()
+    assert not model.path_loss.slope.any()
     found, mean = (
         (predicted - test.rssi_dbm).abs().median()
         for predicted in (model.predict(test.transmitter_position).mean, train.rssi_dbm.mean(dim=0))
     )
     assert found < 0.5 * mean
-
-
-def test_all_receivers_share_the_mixing_weights_of_the_pool():
-    pool = rssi_room(n=150)
-    among, alone = (RssiModel(validation="block").fit(d, pool=pool).mixing_weight for d in (pool, pool.columns([5])))
-    torch.testing.assert_close(alone, among)
-    assert 0 < float(among[0]) <= 1
 
 
 @pytest.mark.parametrize("split", ["random", "block"])
@@ -256,11 +219,14 @@ def test_interval_has_its_nominal_coverage(split):
 
 
 def test_far_away_the_prediction_is_the_path_loss_model():
+    """Directivity is equal in one direction, and nearly 0 on average over all."""
     model = fit_rssi(with_field())
-    far = torch.tensor([[4000.0, 0, 0]], dtype=torch.float64)
-    bearing = torch.einsum("brh,rh->br", harmonics(far, model.receiver).float(), model.directivity)
-    path_loss = (model.level + model.slope * log_distance(far, model.receiver)).float() + bearing
-    torch.testing.assert_close(model.predict(far).mean, path_loss, atol=1e-3, rtol=0)
+    direction = torch.nn.functional.normalize(torch.randn(2000, 3, generator=torch.Generator().manual_seed(0)).double())
+    near, far = (model.predict(metres * direction).mean for metres in (4e5, 8e5))
+    decades = model.path_loss.slope.float() * math.log10(2)
+    torch.testing.assert_close(far - near, decades.expand_as(far), atol=2e-3, rtol=0)
+    path_loss = model.path_loss.level + model.path_loss.slope * math.log10(4e5)
+    torch.testing.assert_close(near.mean(dim=0), path_loss.float(), atol=0.1, rtol=0)
 
 
 @pytest.mark.parametrize("make", [RssiModel, PairModel])
@@ -282,14 +248,14 @@ def test_same_data_same_model_and_any_batch(monkeypatch):
 def test_many_rows_are_averaged_by_location():
     data = path_loss_only(n=4000)
     data.rssi_dbm[::7, 1] = torch.nan
-    position, rssi, count, bin_of_row = bin_locations(data, 1500)
-    assert 1200 < len(position) <= 1500
-    assert int(count.sum()) == int((~data.rssi_dbm.isnan()).sum())
-    first = int(bin_of_row[0])
-    own = data.subset((bin_of_row == first).nonzero()[:, 0])
-    torch.testing.assert_close(position[first], own.transmitter_position.mean(dim=0))
-    torch.testing.assert_close(rssi[first], own.rssi_dbm.nanmean(dim=0), equal_nan=True)
-    assert torch.equal(bin_locations(data, 4000)[0], data.transmitter_position)
+    bins, alone = (Bins.of(data, RssiConfig(max_locations=n)) for n in (1500, 4000))
+    assert 1200 < len(bins.position) <= 1500
+    assert int(bins.count.sum()) == int((~data.rssi_dbm.isnan()).sum())
+    first = int(bins.bin_of_row[0])
+    rows = data.subset((bins.bin_of_row == first).nonzero()[:, 0])
+    torch.testing.assert_close(bins.position[first] + bins.centre, rows.transmitter_position.mean(dim=0))
+    torch.testing.assert_close(bins.rssi[first], rows.rssi_dbm.nanmean(dim=0), equal_nan=True)
+    torch.testing.assert_close(alone.position + alone.centre, data.transmitter_position)
 
 
 @pytest.mark.parametrize("make", [RssiModel, partial(RssiPaperModel, steps=5)], ids=["quick", "paper"])
@@ -303,16 +269,6 @@ def test_a_receiver_does_not_depend_on_the_others(make):
         torch.testing.assert_close(both(among)[:, :, -1:], both(alone), atol=1e-3, rtol=0)
 
 
-@pytest.mark.parametrize("name", [name for name in RSSI_PREDICTORS if name != "nerf2"])
-def test_names_of_receivers_change_nothing(name):
-    """Their alphabetical order is another, too."""
-    room = rssi_room(n=60)
-    renamed = replace(room, receiver_names=tuple(f"z{99 - number} é" for number in range(12)))
-    found = [RSSI_PREDICTORS[name]().fit(data).predict(room.transmitter_position + 0.3) for data in (room, renamed)]
-    torch.testing.assert_close(found[1].mean, found[0].mean)
-    assert found[0].std is None or torch.equal(found[1].std, found[0].std)
-
-
 def test_names_of_receivers_change_nothing_in_training_and_locating():
     room = rssi_room(n=60).receivers(["1", "2", "3"])
     renamed = replace(room, receiver_names=("c", "a", "b"))
@@ -320,25 +276,6 @@ def test_names_of_receivers_change_nothing_in_training_and_locating():
     torch.testing.assert_close(learnt[1], learnt[0])
     located = [RssiLocator(n_cells=100).fit(data).locate(room.rssi_dbm[:5]).median for data in (room, renamed)]
     torch.testing.assert_close(located[1], located[0])
-
-
-def test_gradients_are_those_of_finite_differences_in_metres():
-    model = fit_rssi(with_field())
-    position = torch.tensor([[5.0, 5.0, 0.5], [2.0, 7.0, 0.4]], dtype=torch.float64, requires_grad=True)
-    prediction = model.predict(position)
-    for values in (prediction.mean, prediction.std):
-        (gradient,) = torch.autograd.grad(values.sum(), position, retain_graph=True)
-        for axis in range(3):
-            step = 0.02 * torch.eye(3, dtype=torch.float64)[axis]
-            ends = [both(model.predict(position.detach() + sign * step)) for sign in (1, -1)]
-            difference = (ends[0] - ends[1])[0 if values is prediction.mean else 1].sum(dim=1) / 0.04
-            torch.testing.assert_close(gradient[:, axis], difference.double(), atol=0.05, rtol=0.02)
-    assert not model.predict(position.detach()).mean.requires_grad
-    with torch.no_grad():
-        assert not model.predict(position).mean.requires_grad
-
-
-# --- files -----------------------------------------------------------------------------------------------------------
 
 
 # --- awkward data ----------------------------------------------------------------------------------
@@ -372,20 +309,13 @@ def with_rare(data, n_rare=60):
     )
 
 
-def test_receivers_that_were_detected_a_few_times_choose_nothing(monkeypatch):
+@only(RSSI_PREDICTORS, "swiftwrf")
+def test_receivers_that_were_detected_a_few_times_choose_nothing():
     data = replace(with_field(), receiver_position=torch.full((3, 3), torch.nan))
-    monkeypatch.setattr(RSSI_PREDICTORS, "_registered", {"swiftwrf": RSSI_PREDICTORS["swiftwrf"]})
     expected, found = compare(data), compare(with_rare(data))
     assert found.errors.predicted_dbm.tolist() == expected.errors.predicted_dbm.tolist()
     alone, among = fit_rssi(data), fit_rssi(with_rare(data))
     assert among.kernel == alone.kernel
-    assert among.mixing_weight.sub(alone.mixing_weight).abs().max() < 0.05
-
-
-def test_predictions_far_away_are_finite_and_those_of_no_position_empty():
-    model = fit_rssi(path_loss_only())
-    assert both(model.predict(torch.tensor([[1e8, 0.0, 0.0]]))).isfinite().all()
-    assert model.predict(torch.empty(0, 3)).mean.shape == (0, 3)
 
 
 def test_another_kernel_keeps_the_intervals_of_rows_in_bins():

@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 import torch
 from quick import command, sketched
+from small import only, small
 
 import swiftwrf
 from swiftwrf import InputError, PairModel, Rssi, load_rssi
@@ -188,17 +189,16 @@ def test_known_places_have_their_own_path_loss():
     torch.testing.assert_close(away, model.path_loss.shared[:1])
 
 
-def test_whole_run_at_new_places(tmp_path, monkeypatch):
-    kept = ("mri_pooled", "pairs", "knn_pairs")
-    monkeypatch.setattr(RSSI_PREDICTORS, "_registered", {name: RSSI_PREDICTORS[name] for name in kept})
-    monkeypatch.setattr("swiftwrf.rssi.maps.CELLS", 8)
+@small("maps")
+@only(RSSI_PREDICTORS, "mri_pooled", "pairs", "knn_pairs")
+def test_whole_run_at_new_places(tmp_path):
     links(n_places=10, rows=15).to_csv(tmp_path / "links.csv", index=False)
     where = ("--data", tmp_path / "links.csv", "--rx", "all", "--split", "place", "--out", tmp_path / "run")
     with sketched():
         assert command("rssi", *where) == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["model"] == "pairs"
-    assert set(metrics["overall"]) == set(kept)
+    assert set(metrics["overall"]) == {"mri_pooled", "pairs", "knn_pairs"}
     errors = pd.read_csv(tmp_path / "run" / "errors.csv")
     assert set(errors.receiver) == {name for name, e in metrics["receivers"].items() if e["pairs"]["abs_error_db"]["n"]}
     assert errors.receiver.nunique() == 2

@@ -34,7 +34,6 @@ from swiftwrf.models import FIELD_MODELS
 from swiftwrf.models.geometry import model as geometry
 from tasks.aoa import experiment
 from tasks.aoa.records import palette
-from tasks.aoa.room import cross_validation_sentences
 from tasks.labels import colour
 
 
@@ -358,22 +357,6 @@ def test_turbo_learning_helps_if_the_whole_interval_of_the_rule_is_below_zero(mo
     assert given["recommended_n_synthetic"] > 0  # every number gains
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "said"),
-    [
-        (-0.4, -0.1, "Turbo learning helps here: use --extra 300"),
-        (-0.4, 0.1, "The change is not significant"),
-        (0.1, 0.4, "Turbo learning harms here"),
-    ],
-)
-def test_the_report_says_that_turbo_learning_helps_if_its_whole_interval_is_below_zero(low, high, said):
-    rule = {"median_deg": 2.0, "change": (low + high) / 2, "low": low, "high": high}
-    values = {"n_held_out": 9, "stand_in": "kernel_regression", "measured_only_deg": 3.0, "helps": high < 0}
-    values |= {"gains": [{"n_synthetic": 300, **rule}], "rule": rule, "recommended_n_synthetic": 300}
-    (sentence,) = cross_validation_sentences(SimpleNamespace(mix={"cross_validation": {"gp": values}}))
-    assert said in sentence
-
-
 def test_the_interval_of_cross_validation_is_that_of_the_rule(monkeypatch, room):
     """Errors without any gain on average: the best number of each fold is chance, and other folds do not confirm it."""
     generator = np.random.default_rng(1)
@@ -413,7 +396,6 @@ def test_whole_run(small, registered, tmp_path):
     more = ("--extra", 20, "--suggest", 4)
     assert run("--mix", 0.5, "--synthesizer", "coarray", "idw", *more, "--out", out) == 0
     metrics = json.loads((out / "metrics.json").read_text(), parse_constant=lambda name: pytest.fail(name))
-    assert [metrics[name] for name in ("task", "data", "split", "seed")] == ["aoa", "simulated-room", "random", 0]
     mix, turbo = metrics["mixes"]["0.5"], "network, measured + synthetic + extra (coarray)"
     methods = mix["methods"]
     synthetic = {f"measured + synthetic{more} ({name})" for name in ("coarray", "idw") for more in ("", " + extra")}
@@ -433,9 +415,6 @@ def test_whole_run(small, registered, tmp_path):
     assert set(own.estimator) == {"aann_kernel"}
     assert set(own.training) == {"measured + synthetic + extra"}
     assert set(own.synthesizer) == {"coarray"}
-    median = own.great_circle_deg.median()
-    assert methods[turbo]["great_circle_deg"]["median"] == pytest.approx(median)
-    assert methods[turbo]["great_circle_deg"]["low"] <= median
     truth = np.degrees(small.label[own["index"].tolist()].numpy())
     np.testing.assert_allclose(own[["truth_azimuth_deg", "truth_elevation_deg"]], truth, rtol=1e-9)
 
@@ -449,9 +428,6 @@ def test_whole_run(small, registered, tmp_path):
     assert "Where to measure next" in html
     assert "<dt>northern</dt><dd>Always due north</dd>" in html
     assert colour(palette([Condition("northern", "measured")]), "northern") == colour({}, "northern")
-    assert "What to do next" in html
-    assert "What this does not show" in html
-    assert "<svg" in html
     assert not [line for line in html.splitlines() if 'src="http' in line or 'href="http' in line]
     assert load(out / "coarray-mix0.5.safetensors").synthesize(small.position[:2]).shape == (2, 10, 40)
     assert not list(tmp_path.glob("*.partial"))

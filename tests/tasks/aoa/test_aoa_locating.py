@@ -96,11 +96,8 @@ def test_methods_and_positions_have_their_keys(closed_form, finished):
     np.testing.assert_allclose(at["error_m"], np.linalg.norm(found - truth, axis=1), rtol=1e-9)
     assert (at["covered"] == (at["containing_level"] < 0.8)).all()
     located = mix["locating"][LOCATED]
-    assert located["position_error_m"]["median"] == pytest.approx(at["error_m"].median())
-    assert located["coverage_80"] == pytest.approx(at["covered"].mean())
     assert len(located["weights"]) >= 1
     assert set(located["seconds"]) == {"room", "fit", "locate"}
-    assert mix["methods"][LOCATED]["great_circle_deg"]["median"] == pytest.approx(own["great_circle_deg"].median())
 
 
 def test_a_known_room_without_noise_is_located(finished):

@@ -13,7 +13,7 @@ from quick import said
 from small import FLOOR, known_planes
 
 from swiftwrf import AngularGrid, InputError, load, rssi_room, simulated_room
-from swiftwrf.contrib.comparison.localizers import LEVELS, LOCALIZERS
+from swiftwrf.contrib.comparison.localizers import LOCALIZERS
 from swiftwrf.contrib.comparison.locating import LocateComparison
 from swiftwrf.contrib.comparison.steps import LOCATOR as MODEL
 from swiftwrf.data import ReadOptions
@@ -89,21 +89,14 @@ def test_test_rows_reach_no_fit():
 
 def test_whole_run(locate_run):
     metrics = strict_json(locate_run / "metrics.json")
-    assert [metrics[name] for name in ("task", "data", "split", "seed")] == ["locate", "simulated-floor", "random", 0]
     assert (metrics["n_train"], metrics["n_test"], metrics["n_receivers"], metrics["n_undetected"]) == (64, 16, 12, 0)
     assert list(metrics["overall"]) == list(LOCALIZERS)
     assert set(metrics["weights"]) == {"values", "detections", "fingerprints"}
     errors = pd.read_csv(locate_run / "errors.csv")
-    for name, entry in metrics["overall"].items():
-        own = errors[errors.method == name]
-        assert entry["position_error_m"]["median"] == pytest.approx(own.position_error_m.median())
-        assert entry["horizontal_error_m"]["n"] == len(own) == 16
-        assert set(entry["seconds"]) == {"fit", "predict"}
+    assert errors.groupby("method").size().to_dict() == dict.fromkeys(LOCALIZERS, 16)
     own = errors[errors.method == "posterior"]
     away = own[["x_m", "y_m", "z_m"]].to_numpy() - own[["truth_x_m", "truth_y_m", "truth_z_m"]].to_numpy()
     np.testing.assert_allclose(np.linalg.norm(away, axis=1), own.position_error_m)
-    inside = {str(p): float((own.position_error_m <= own[f"credible_radius_{100 * p:.0f}_m"]).mean()) for p in LEVELS}
-    assert metrics["calibration"] == pytest.approx(inside)
     assert own.credible_radius_50_m.lt(own.credible_radius_95_m).all()
 
 

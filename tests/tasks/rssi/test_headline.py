@@ -15,7 +15,7 @@ from scipy.spatial.distance import cdist
 from scipy.stats import norm
 
 from swiftwrf import load, rssi_room
-from swiftwrf.rssi.coverage import CORRELATION, reach
+from swiftwrf.rssi.coverage import reach
 from tasks.view.rssi import MapSelection
 from tasks.view.sources import open_source
 
@@ -43,11 +43,11 @@ def building(tmp_path_factory):
 
 
 def probability(mean, std):
-    """Probability that one of the receivers (R,) is above -75 dBm."""
+    """Probability that one of the receivers (R,), whose errors have the correlation 0.2, is above -75 dBm."""
     score = norm.ppf(norm.sf(-75, mean, std))
 
     def none(factor):
-        return norm.pdf(factor) * norm.sf((score + np.sqrt(CORRELATION) * factor) / np.sqrt(1 - CORRELATION)).prod()
+        return norm.pdf(factor) * norm.sf((score + np.sqrt(0.2) * factor) / np.sqrt(0.8)).prod()
 
     return 1 - quad(none, -8, 8)[0]
 

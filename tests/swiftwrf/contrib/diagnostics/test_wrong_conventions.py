@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from samples import FACING_X, snapshots, write_deepmimo
+from samples import FACING_X, snapshots
 from scipy.spatial.transform import Rotation
 
-from swiftwrf import AngularGrid, InputError, load_spectra, rssi_room
+from swiftwrf import AngularGrid, rssi_room
 from swiftwrf.contrib.diagnostics.inspection import inspect
 from swiftwrf.contrib.diagnostics.path_loss import check_path_loss
 from swiftwrf.data import Rssi
@@ -106,36 +106,6 @@ def test_inspection_names_a_sign_of_not_heard_that_is_not_known():
     rssi = ROOM.rssi_dbm.clone()
     rssi[torch.rand(rssi.shape, generator=torch.Generator().manual_seed(0)) < 0.3] = torch.nan
     assert "does it mean not detected" in warnings(replace(ROOM, rssi_dbm=rssi.nan_to_num(-127.0)))
-
-
-def _deepmimo(**changes):
-    return lambda folder: load_spectra(write_deepmimo(folder, **changes), grid=GRID)
-
-
-REFUSED = {
-    "radians for degrees": (
-        _deepmimo(aoa_el=lambda a: np.deg2rad(a["aoa_el"]), aoa_az=lambda a: np.deg2rad(a["aoa_az"])),
-        "look like radians",
-    ),
-    "angles of departure": (
-        _deepmimo(aoa_el=lambda a: 180 - a["aoa_el"], aoa_az=lambda a: a["aoa_az"] + 180),
-        "directions of propagation",
-    ),
-    "x and y swapped": (
-        _deepmimo(rx_pos=lambda a: a["rx_pos"][:, [1, 0, 2]], tx_pos=lambda a: a["tx_pos"][:, [1, 0, 2]]),
-        "x and y are swapped",
-    ),
-    "azimuth clockwise": (_deepmimo(aoa_az=lambda a: -a["aoa_az"]), "turns clockwise"),
-    "positions in millimetres": (_deepmimo(rx_pos=lambda a: 1000 * a["rx_pos"]), "not in metres"),
-    "delays in nanoseconds": (_deepmimo(delay=lambda a: 1e9 * a["delay"]), "not in metres or delays not in seconds"),
-}
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_reader_refuses_it(name, tmp_path):
-    read, says = REFUSED[name]
-    with pytest.raises(InputError, match=says):
-        read(tmp_path / "a")
 
 
 def test_a_rotation_is_told_from_the_axes_of_the_array():

@@ -1,7 +1,5 @@
 """DeepMIMO v4 folders: conventions of angles and phases, and what is refused."""
 
-import json
-
 import numpy as np
 import pytest
 import torch
@@ -103,31 +101,3 @@ def test_one_of_several_pairs(tmp_path):
     with pytest.raises(InputError, match=r"2 pairs.*station"):
         load_spectra(folder)
     assert len(load_spectra(folder, station=2, grid=GRID)) == 30
-
-
-def _params(text):
-    return lambda folder: (folder / "params.json").write_text(text)
-
-
-def _array(name, values):
-    return lambda folder: np.savez(folder / f"{name}_t000_tx000_r001.npz", **{name: values})
-
-
-@pytest.mark.parametrize(
-    ("spoil", "says"),
-    [
-        (lambda f: (f / "params.json").unlink(), "params.json"),
-        (_params("{}"), "rt_params"),
-        (_params(json.dumps({"rt_params": {"frequency": 2.4}})), "carrier in Hz"),
-        (lambda f: (f / "phase_t000_tx000_r001.npz").unlink(), "phase_t000_tx000_r001.npz is missing"),
-        (_array("phase", np.zeros((3, 25))), "all have shape"),
-        (_array("rx_pos", np.zeros((3, 3))), "rx_pos of pair"),
-        (_array("rx_pos", np.full((30, 3), np.nan)), "must be finite"),
-        (_array("power", np.full((30, 25), np.nan)), "no receiver with a path"),
-    ],
-)
-def test_refuses(tmp_path, spoil, says):
-    folder = write_deepmimo(tmp_path / "a")
-    spoil(folder)
-    with pytest.raises(InputError, match=says):
-        load_spectra(folder)

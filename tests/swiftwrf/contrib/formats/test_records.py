@@ -1,7 +1,5 @@
 """DICHASUS and ESPARGOS: records without TensorFlow, arrays seen from the front, offsets, and what is refused."""
 
-import json
-
 import numpy as np
 import pytest
 import torch
@@ -98,58 +96,3 @@ def test_dichasus_by_direction_hangs_upright(tmp_path):
     right_is_y = torch.tensor([[0, 1, 0], [0, 0, 1], [1, 0, 0]]).double()  # seen from the front
     torch.testing.assert_close(data.rotation.T, right_is_y, rtol=0, atol=1e-12)
     assert data.array.element.tolist() == pytest.approx(np.array([[-0.03, 0.03], [0.03, 0.03], [-0.03, -0.03]]))
-
-
-def _antennas(**changes):
-    usual = {"location": [0, 0, 1], "direction": [1, 0, 0], "spacingX": 0.06, "spacingY": 0.06, "assignments": [[0, 1]]}
-    return {"antennas": [{k: v for k, v in (usual | changes).items() if v is not None}]}
-
-
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
-        (_antennas() | {"frequency": None}, "frequency must be a number"),
-        (_antennas() | {"frequency": 2.4}, "carrier in Hz"),
-        (_antennas(location=[0, 0]), "location"),
-        (_antennas(spacingX=60, spacingY=60), "is the spacing in metres"),
-        (_antennas(spacingX=None), "spacingX"),
-        (_antennas(direction=None), "direction"),
-        (_antennas(direction=[0, 0, 1]), "lies along up"),
-        (_antennas(rightvector=[1, 0, 0], upvector=[1, 0, 0.1]), "right angles"),
-        (_antennas(assignments=[[0, 1], [2]]), "equal length"),
-        (_antennas(assignments=[[0, 0]]), "each once"),
-        (_antennas(assignments=[[0, 99]]), "not what the data set has"),
-    ],
-)
-def test_refuses_descriptions(tmp_path, changes, says):
-    with pytest.raises(InputError, match=says):
-        load_snapshots(write_dichasus(tmp_path / "hall", **changes))
-
-
-def _records(**arrays):
-    return lambda folder: write_records(folder / "walk.tfrecords", [arrays])
-
-
-def _offsets(**content):
-    return lambda folder: (folder / "reftx-offsets-walk.json").write_text(json.dumps(content))
-
-
-CSI = np.ones((1, 2, 4, 3), np.complex64)
-SPOILT = {  # with the message of the refusal
-    "cut off": (lambda f: (f / "walk.tfrecords").write_bytes((f / "walk.tfrecords").read_bytes()[:-10]), "record 24"),
-    "other bytes": (lambda f: (f / "walk.tfrecords").write_bytes(b"\xff" * 100), "no TFRecord file"),
-    "another shape": (_records(csi=np.ones((2, 4, 3), np.float32), pos=np.zeros(3)), "not what the data set has"),
-    "no positions": (_records(csi=CSI), "'pos'"),
-    "no description": (lambda f: (f / "metadata.json").unlink(), "no JSON with antennas"),
-    "offsets of other antennas": (_offsets(cpo=[0.0], sto=[0.0]), "offsets of 1"),
-    "offsets of text": (_offsets(cpo=["a"], sto=[0.0]), "cpo and sto"),
-}
-
-
-@pytest.mark.parametrize("name", SPOILT)
-def test_refuses_files(tmp_path, name):
-    of_offsets, (spoil, says) = name.startswith("offsets"), SPOILT[name]
-    folder = write_dichasus(tmp_path / "hall", offsets=True) if of_offsets else write_espargos(tmp_path / "lab")
-    spoil(folder)
-    with pytest.raises(InputError, match=says):
-        load_snapshots(folder, station=1 if of_offsets else None)
