@@ -107,14 +107,14 @@ class PathWaves:
 
 
 def channels_beside(room: GeometryModel, position: Tensor, away: Tensor, frequency: Tensor) -> Tensor:
-    """Return channels at positions beside others, by the lengths of the paths to first order and gains that do not change.
+    """Return channels near positions, with path lengths to first order in the distance and gains that do not change.
 
     This takes a small part of the time of `PathWaves`, and suffices to choose candidates.
 
     Args:
         room: Room with S images.
         position: Positions, float64 (m, 3) [m].
-        away: Vectors from each of them to C positions beside it, float64 (C, 3) [m].
+        away: Vectors from each of them to C positions near it, float64 (C, 3) [m].
         frequency: Frequencies relative to the carrier, (F,).
 
     Returns:

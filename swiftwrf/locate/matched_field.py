@@ -63,8 +63,8 @@ class MatchedField(Locator):
     Three likelihoods of spectra are pooled: co-array numbers predicted by constant path gains, by position-dependent path
     gains, and element phases under uncertain path gains. Those of channels are: channels under uncertain and under constant
     path gains, and co-array numbers predicted by constant path gains and measured channels nearby. Covariances, weights and
-    the radii of credible regions come from held-out positions. Weights maximise the posterior density there. For each fold
-    the room is refined, not searched, without it.
+    the radii of credible regions come from held-out positions. Weights maximise the posterior density there. The room is
+    searched in all spectra, and refined without each fold.
 
     Args:
         config: Options as one object. Defaults to `MatchedFieldConfig()`.
@@ -125,11 +125,11 @@ class MatchedField(Locator):
         if room is not None and room.room is None:
             raise InputError(f"{with_article(room.kind)} has no room to locate by; fit geometry or hybrid")
         seed, position = self.config.seed, train.position
-        own = GeometryModel(seed=seed).fit(train, like=room, progress=progress)
-        train = own.link.aligned(train)
+        model = GeometryModel(seed=seed).fit(train, like=room, progress=progress)
+        train = model.link.aligned(train)
         fold = folds(position, "random", seed)
         kind = SpectrumLikelihoods if train.channel is None else ChannelLikelihoods
-        features, (*parts, self.likelihoods) = kind.fit(train, own, fold, seed)
+        features, (*parts, self.likelihoods) = kind.fit(train, model, fold, seed)
         held_out = ((Region(position[kept]), position[out]) for out, kept in each_fold(fold))
         self.region = region or Region(position, outside=outside_mass(held_out))
         self._prepare()
@@ -148,17 +148,17 @@ class MatchedField(Locator):
     def _held_out(
         self, position: Tensor, features: SpectrumFeatures, fold: Tensor, parts: Sequence[Likelihoods]
     ) -> Iterator[HeldOut]:
-        """Yield some spectra of each fold with their likelihoods by the other folds."""
-        (some,) = subsample(torch.arange(len(position)), rows=self.config.n_calibration)
-        for rows, _ in each_fold(fold, some):
+        """Yield at most `n_calibration` spectra, evenly chosen, by folds, with their likelihoods by the other folds."""
+        (chosen,) = subsample(torch.arange(len(position)), rows=self.config.n_calibration)
+        for rows, _ in each_fold(fold, chosen):
             likelihoods, observed = parts[int(fold[rows[0]])], features.subset(rows)
             at_truth = likelihoods(position[rows][:, None], observed, self.weight)[..., 0]
             cells, values = zip(*self._searched(observed, likelihoods), strict=True)
-            at, volume = (torch.cat([getattr(part, name) for part in cells]) for name in ("position", "log_volume"))
+            at, volume = (torch.cat([getattr(batch, name) for batch in cells]) for name in ("position", "log_volume"))
             yield HeldOut(position[rows], at_truth, at, torch.cat(values, dim=1).double(), volume)
 
     def _searched(self, observed: SpectrumFeatures, likelihoods: Likelihoods) -> Iterator[tuple[Cells, Tensor]]:
-        """Yield cells (b, m) and log-likelihoods (k, b, m) of some observations at a time."""
+        """Yield cells (b, m) and log-likelihoods (k, b, m) of 16 observations at a time."""
         generator = torch.Generator().manual_seed(self.config.seed)
         config = self.config
         for rows in torch.arange(len(observed)).split(16):  # likelihoods at all cells: 26 MB at most, of channels 205
@@ -197,9 +197,11 @@ class MatchedField(Locator):
             spectrum = self.room.link.aligned(spectrum)
         observed = self.likelihoods.features(spectrum, self.config.seed)
         parts = self._searched(observed, self.likelihoods)
-        found = Posterior.cat([self._posterior(cells.position, values, cells.log_volume) for cells, values in parts])
+        posterior = Posterior.cat(
+            [self._posterior(cells.position, values, cells.log_volume) for cells, values in parts]
+        )
         # within half a wavelength the field changes too little for a second mode
-        return replace(found, mode_width_m=self.room.array.wavelength / 2)
+        return replace(posterior, mode_width_m=self.room.array.wavelength / 2)
 
     @property
     def _resolution_m(self) -> float:
