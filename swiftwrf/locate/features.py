@@ -97,7 +97,7 @@ class PathWaves:
     @classmethod
     def at(cls, room: GeometryModel, position: Tensor, frequency: Tensor = CARRIER) -> PathWaves:
         """Compute the waves at positions (m, 3) [m] and frequencies (F,) relative to the carrier."""
-        scene = room.scene(position)
+        scene = room.link_at(position)
         return cls(position, waves(room.reflectors, scene, frequency), room.gains(scene), frequency)
 
     @cached_property
@@ -123,7 +123,7 @@ def channels_beside(room: GeometryModel, position: Tensor, away: Tensor, frequen
     here = PathWaves.at(room, position, frequency)
 
     def rays(at: Tensor) -> Tensor:
-        scene = room.scene(at)
+        scene = room.link_at(at)
         return sources(room.reflectors, scene) - scene.receiver
 
     ray = rays(position)

@@ -243,7 +243,8 @@ class Posterior(Displayed):
             vectors: Unit vector towards each candidate, as `position`: (n, m, 3) or (1, m, 3).
         """
         median = _geometric_median(vectors.expand(len(self), -1, -1), self.weight, 1e-4)
-        return median / median.norm(dim=1, keepdim=True).clamp_min(1e-12)
+        unit: Tensor = median / median.norm(dim=1, keepdim=True).clamp_min(1e-12)
+        return unit
 
     @property
     def ambiguous(self) -> Tensor:

@@ -235,7 +235,7 @@ class PathLikelihood(PhaseLikelihood):
 
     def __init__(self, room: GeometryModel, log_variance: Tensor) -> None:
         super().__init__(room, log_variance)
-        scene = room.scene(room.region()[:1])
+        scene = room.link_at(room.region()[:1])
         length = (sources(room.reflectors, scene) - scene.receiver).norm(dim=-1)[:, 0]
         self._detour_rad = scene.wavenumber * float((length - length[0]).square().mean().sqrt())
         self._over_element, self._basis = torch.linalg.eigh(self._isotropic)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from swiftwrf.models.geometry.images import PhaseObservations, PlaneSet, images, visibility
+from swiftwrf.models.geometry.images import LinkAt, PlaneSet, images, visibility
 
 
 def coherence(observed: Tensor, predicted: Tensor) -> Tensor:
@@ -29,7 +29,7 @@ def field(gain: Tensor, wave: Tensor) -> Tensor:
     return total
 
 
-def waves(planes: PlaneSet, scene: PhaseObservations, frequency: Tensor) -> Tensor:
+def waves(planes: PlaneSet, scene: LinkAt, frequency: Tensor) -> Tensor:
     """Return the waves of the direct path and of each image, complex64 (n, 1 + S, F, K).
 
     Args:
@@ -44,7 +44,7 @@ def waves(planes: PlaneSet, scene: PhaseObservations, frequency: Tensor) -> Tens
     return (scene.waves(sources(planes, scene), frequency) * there[..., None, None]).transpose(0, 1)
 
 
-def sources(planes: PlaneSet, scene: PhaseObservations) -> Tensor:
+def sources(planes: PlaneSet, scene: LinkAt) -> Tensor:
     """Return the transmitter and its images in the planes of one room, float64 (1 + S, n or 1, 3) [m]."""
     direct = scene.transmitter[None]
     return torch.cat([direct, images(scene, planes)[0]]) if planes.sequence else direct
@@ -60,7 +60,7 @@ class Channels:
         frequency: Their frequencies relative to the carrier, (F,).
     """
 
-    scene: PhaseObservations
+    scene: LinkAt
     value: Tensor
     frequency: Tensor
 

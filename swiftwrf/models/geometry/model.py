@@ -22,7 +22,7 @@ from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, bounding_box
 from swiftwrf.models.geometry.channels import Channels, field, waves
 from swiftwrf.models.geometry.fit import GeometryConfig, refine_room, search_room, update_room
 from swiftwrf.models.geometry.furniture import Furniture, find_furniture, fit_furniture, orders
-from swiftwrf.models.geometry.images import PhaseObservations, PlaneSet, Sequence, images, mirror
+from swiftwrf.models.geometry.images import LinkAt, PhaseObservations, PlaneSet, Sequence, images, mirror
 from swiftwrf.models.geometry.planes import Plane, RoomEstimate, plane_set, refine
 from swiftwrf.models.link import Link, Linked
 from swiftwrf.positions import check_positions
@@ -134,7 +134,7 @@ class GeometryModel(Linked, FieldModel):
         rows = kept_snapshots(data.channel.shape[1])
         carrier = LIGHT_SPEED / self.array.wavelength
         frequency = torch.ones(len(rows)).double() if data.frequency_hz is None else data.frequency_hz[rows] / carrier
-        return Channels(self.scene(data.position), unit_power(data.channel[:, rows]), frequency)
+        return Channels(self.link_at(data.position), unit_power(data.channel[:, rows]), frequency)
 
     def _update(self, new: Spectra) -> None:
         if self.planes:
@@ -194,13 +194,13 @@ class GeometryModel(Linked, FieldModel):
             >>> model.channel(room.position[:3], torch.tensor([2.40e9, 2.42e9])).shape
             torch.Size([3, 2, 16])
         """
-        scene = self.scene(position)
+        scene = self.link_at(position)
         ratio = torch.ones(1) if frequency_hz is None else frequency_hz * self.array.wavelength / LIGHT_SPEED
         found = field(self.gains(scene), waves(self.reflectors, scene, ratio))
         return found[:, 0] if frequency_hz is None else found
 
-    def gains(self, scene: PhaseObservations) -> Tensor:
-        """Return the gains of the direct path and of each image at the positions of a scene, float32 (n, 1 + S)."""
+    def gains(self, scene: LinkAt) -> Tensor:
+        """Return the gains of the direct path and of each image at positions, float32 (n, 1 + S)."""
         room = self.reflectors
         if self.furniture is not None:
             return self.furniture.gains(room, scene)
@@ -232,7 +232,7 @@ class GeometryModel(Linked, FieldModel):
             >>> model.paths(room.position[0]).reflections.tolist()
             [(), (0,)]
         """
-        scene, room = self.scene(check_positions(position, "position", (3,))[None]), self.reflectors
+        scene, room = self.link_at(check_positions(position, "position", (3,))[None]), self.reflectors
         gain = free = self.gains(scene)[0]
         if self.furniture is not None:
             nothing = torch.zeros_like(self.furniture.absorption)
@@ -248,10 +248,9 @@ class GeometryModel(Linked, FieldModel):
         found = pd.DataFrame(rows, columns=["reflections", "length_m", "level_db", "hidden_db", "points"])
         return found.sort_values("level_db", ascending=False, ignore_index=True)
 
-    def scene(self, position: Tensor) -> PhaseObservations:
-        """Return the link at positions (n, 3) [m], without observations."""
-        nothing = torch.ones(len(position), len(self.array.element), dtype=torch.complex64)
-        return PhaseObservations.of(position, self.fixed_position, self.moving, self.array, self.rotation, nothing)
+    def link_at(self, position: Tensor) -> LinkAt:
+        """Return the link at positions of the moving end (n, 3) [m]."""
+        return LinkAt.of(position, self.link)
 
     def tensors(self) -> PlaneSet:
         """Return the planes as tensors."""
@@ -268,7 +267,7 @@ class GeometryModel(Linked, FieldModel):
         room = self.tensors()
         if not room.sequence:
             return at, strength, order
-        link = replace(self.scene(at), transmitter=at)
+        link = replace(self.link_at(at), transmitter=at)
         found, reflections = images(link, room)[0, :, 0], torch.tensor([len(s) for s in room.sequence])
         return torch.cat([at, found]), torch.cat([strength, room.image_gain[0]]), torch.cat([order, reflections])
 
@@ -292,7 +291,7 @@ class GeometryModel(Linked, FieldModel):
             self.furniture.check(len(self.planes))
 
 
-def _points(scene: PhaseObservations, room: PlaneSet, sequence: Sequence) -> Tensor | None:
+def _points(scene: LinkAt, room: PlaneSet, sequence: Sequence) -> Tensor | None:
     """Return the ends and the places of reflection of one path at the only position of a scene, (2 + D, 3), if it exists."""
     normal, offset = room.normal[0], room.offset[0]
     for planes in orders((sequence,), tuple(map(tuple, normal.tolist())))[0].tolist():

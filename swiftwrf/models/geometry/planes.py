@@ -13,6 +13,7 @@ from torch import Tensor
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.errors import InputError
 from swiftwrf.models.geometry.images import (
+    LinkAt,
     PhaseObservations,
     PlaneSet,
     Sequence,
@@ -125,7 +126,7 @@ def plane_set(planes: list[Plane], order: int) -> PlaneSet:
     return PlaneSet(normal, offset, torch.tensor([[p.gain for p in planes]]), order, dielectric=dielectric)
 
 
-def phase_jacobian(scene: PhaseObservations, planes: PlaneSet, movement: Tensor) -> tuple[Tensor, Tensor]:
+def phase_jacobian(scene: LinkAt, planes: PlaneSet, movement: Tensor) -> tuple[Tensor, Tensor]:
     """Return the field h with the direct wave, complex64 (K, B, n), and the derivatives of its phase, (K, B, Q P, n).
 
     The Q parameters of each plane are offset [m], gain and, if planes tilt, two rotation angles of the normal [rad]. A
@@ -137,7 +138,7 @@ def phase_jacobian(scene: PhaseObservations, planes: PlaneSet, movement: Tensor)
     where e_k . u is the phase at element k. So the derivatives are sums over images of a vector times dx.
 
     Args:
-        scene: Observed phases.
+        scene: Positions.
         planes: Planes of B rooms.
         movement: `image_jacobian` of the planes.
     """
@@ -167,7 +168,7 @@ def _over_images(values: Tensor, weights: Tensor) -> Tensor:
     return torch.einsum("kbsn,brsn->kbrn", values, weights)
 
 
-def _log_gain_slope(planes: PlaneSet, scene: PhaseObservations) -> Tensor:
+def _log_gain_slope(planes: PlaneSet, scene: LinkAt) -> Tensor:
     """Return the derivatives of the logarithms of the images' gains with respect to those of planes, (B, P, S, n or 1)."""
     count, gain = reflections(planes.sequence, planes.gain.shape[1])[..., None], planes.gain[..., None, None]
     here = gain * planes.plane_factor(scene)

@@ -19,18 +19,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from swiftwrf.models.geometry.images import SIDES, PhaseObservations, PlaneSet, field, phase_period_m, sequences
+from swiftwrf.models.geometry.images import SIDES, LinkAt, PhaseObservations, PlaneSet, field, phase_period_m, sequences
 from swiftwrf.models.geometry.planes import refine_all
 from swiftwrf.runtime.threads import parallel_map
 
 SIGNS = torch.tensor(
     [[-1, -1, -1, -1, -1, -1], [-1, -1, -1, -1, 1, 1], [1, 1, 1, 1, 1, 1]]
 )  # of the gains: one material, vertical fields (walls turn them round, floor and ceiling do not), anything else
-USUAL_GAIN, WEAK_GAIN = 0.7, 0.3  # modulus of a gain that is not known yet, and of a plane that is hidden at times
-MAX_SCORE_RATIO = 0.997  # of the scores after and before a move that counts
 PERFECT_SCORE = 2e-6  # needs no further moves
 N_STARTS = 2 * len(SIGNS)  # of a search
-MAX_START_RATIO = 1.4  # of a start's score and the best one, beyond which the start is given up
 Alternatives = list[list[tuple[float, float]]]  # offset [m] and gain, for each side
 MAX_ALTERNATIVES = {2: 99, 3: 7, 4: 4}  # of each side, by the number of sides that move at once
 SEARCH_ORDER = 2  # reflections of an image while planes move together
@@ -39,8 +36,6 @@ N_RESCORED = 8  # times as many combinations as are wanted are scored again at m
 MAX_MOVES = 20
 N_HORIZONTAL_NORMALS = 90  # of upright walls
 N_SPHERE_NORMALS = 1200  # in all directions
-FURTHER_GAIN = 0.7  # modulus of the gain that planes of any orientation are tried with
-MIN_DISTANCE_RAD, DISTANCE_STEP_RAD = 0.5, 0.6  # of the scanned offsets beyond both ends, in phase
 
 
 @dataclass(frozen=True)
@@ -58,7 +53,7 @@ class SteeringResponses:
 
     @classmethod
     def of(
-        cls, scene: PhaseObservations, normal: Tensor, offset: list[Tensor], gain: list[Tensor], order: int = 2
+        cls, scene: LinkAt, normal: Tensor, offset: list[Tensor], gain: list[Tensor], order: int = 2
     ) -> SteeringResponses:
         """Return the waves of planes with normals (P, 3) at offsets (A,) [m] with gains (A,); none are double at order 1."""
         single = [
@@ -162,10 +157,10 @@ class Search:
         scene: Observed phases at the positions of the search.
         reach: Distance beyond the region of both ends up to which planes are searched [m].
         signs: Signs of the gains on the six sides (6,).
-        usual: Modulus of a gain that is not known yet.
+        usual: Modulus of a gain that is not known yet. Not studied.
     """
 
-    def __init__(self, scene: PhaseObservations, reach: float, signs: Tensor, usual: float = USUAL_GAIN) -> None:
+    def __init__(self, scene: PhaseObservations, reach: float, signs: Tensor, usual: float = 0.7) -> None:
         self.scene, self.reach, self.signs = scene, reach, signs
         self.usual: list[float] = (usual * signs).tolist()
         both = torch.cat([scene.transmitter, scene.receiver])
@@ -298,12 +293,15 @@ class Search:
             found.append([(o, gain) for o in steps if o == offset or o >= self.near[side]])
         return found
 
-    def improve(self, room: PlaneSet) -> PlaneSet:
-        """Return the room after moves of several planes at a time, with second-order images, until no move is better."""
+    def improve(self, room: PlaneSet, *, ratio: float = 0.997) -> PlaneSet:
+        """Return the room after moves of several planes at a time, with second-order images, until no move is better.
+
+        A move is better if it multiplies the score by less than `ratio` (not studied).
+        """
         best = self.refined([replace(room, order=SEARCH_ORDER)])[0]
         for _ in range(MAX_MOVES):
             for tried in self._trials(best):
-                if float(tried.score) < MAX_SCORE_RATIO * float(best.score):
+                if float(tried.score) < ratio * float(best.score):
                     best = tried
                     break
             else:
@@ -323,7 +321,7 @@ class Search:
 
 
 def find_rooms(
-    scene: PhaseObservations, reach: float, width: int, tick: Callable[[], object]
+    scene: PhaseObservations, reach: float, width: int, tick: Callable[[], object], *, max_ratio: float = 1.4
 ) -> list[tuple[Tensor, PlaneSet]]:
     """Return the best room of each of SIGNS with the signs of its gains, the best first.
 
@@ -334,6 +332,7 @@ def find_rooms(
         reach: Distance beyond the region of both ends up to which planes are searched [m].
         width: Width of the beam search.
         tick: Called after each of the N_STARTS starts.
+        max_ratio: Ratio of the scores of a start and of the best room beyond which the start is given up. Not studied.
     """
     nothing = PlaneSet.on_sides({}, score=float(scene.score(scene.direct)))
     if float(nothing.score) < PERFECT_SCORE:
@@ -345,7 +344,7 @@ def find_rooms(
     found: dict[Search, PlaneSet] = {}
     for start, search in sorted(starts, key=lambda s: float(s[0].score)):
         lowest = min((float(room.score) for room in found.values()), default=math.inf)
-        if not found or PERFECT_SCORE < float(start.score) < MAX_START_RATIO * lowest:
+        if not found or PERFECT_SCORE < float(start.score) < max_ratio * lowest:
             room = search.improve(start)
             if search not in found or room.score < found[search].score:
                 found[search] = room
@@ -354,7 +353,7 @@ def find_rooms(
     return [
         (search.signs, room)
         for search, room in best
-        if float(room.score) < max(PERFECT_SCORE, MAX_START_RATIO * float(best[0][1].score))
+        if float(room.score) < max(PERFECT_SCORE, max_ratio * float(best[0][1].score))
     ]
 
 
@@ -368,7 +367,16 @@ def directions() -> Tensor:
     return torch.cat([upright, torch.stack([flat * turn.cos(), flat * turn.sin(), z], dim=1)])
 
 
-def oblique_planes(scene: PhaseObservations, base: Tensor, reach: float, top: int) -> list[PlaneSet]:
+def oblique_planes(
+    scene: PhaseObservations,
+    base: Tensor,
+    reach: float,
+    top: int,
+    *,
+    usual: float = 0.7,
+    nearest_rad: float = 0.5,
+    step_rad: float = 0.6,
+) -> list[PlaneSet]:
     """Return the best further planes of any orientation by single reflections, each as a room of its own, the best first.
 
     Args:
@@ -376,13 +384,16 @@ def oblique_planes(scene: PhaseObservations, base: Tensor, reach: float, top: in
         base: Field of the known planes (n, 2 K, 1).
         reach: Distance beyond the region of both ends up to which planes are scanned [m].
         top: Number of planes.
+        usual: Modulus of the gain that planes are tried with, as in `Search`.
+        nearest_rad: Smallest distance of the planes from both ends, in phase [rad]. Not studied.
+        step_rad: Step of the scanned distances, in phase [rad]. Not studied.
     """
     both = torch.cat([scene.transmitter, scene.receiver])
     # positions close together, whose waves stay in phase over a few degrees of tilt
     rows = (scene.moving - scene.moving.mean(0)).norm(dim=1).argsort()[:24]
     near, base = scene.subset(rows), base[rows]
-    farthest = max(reach * scene.wavenumber, MIN_DISTANCE_RAD)
-    distance = torch.arange(MIN_DISTANCE_RAD, farthest, DISTANCE_STEP_RAD, dtype=torch.float64) / scene.wavenumber
+    farthest = max(reach * scene.wavenumber, nearest_rad)
+    distance = torch.arange(nearest_rad, farthest, step_rad, dtype=torch.float64) / scene.wavenumber
     if not len(distance):
         return []
 
@@ -390,10 +401,10 @@ def oblique_planes(scene: PhaseObservations, base: Tensor, reach: float, top: in
         found = []
         offset = (both @ normal.T).amax(0)[:, None] + distance
         planes = normal.repeat_interleave(len(distance), dim=0)[:, None], offset.reshape(-1, 1)
-        wave = FURTHER_GAIN * field(near, PlaneSet(*planes, torch.ones(offset.numel(), 1), only=((0,),)))
+        wave = usual * field(near, PlaneSet(*planes, torch.ones(offset.numel(), 1), only=((0,),)))
         for sign in (-1.0, 1.0):
             best = near.score(base + sign * wave).view_as(offset).min(1)
-            at, gain = offset.gather(1, best.indices[:, None]), torch.full((1, 1), FURTHER_GAIN * sign)
+            at, gain = offset.gather(1, best.indices[:, None]), torch.full((1, 1), usual * sign)
             found += [
                 PlaneSet(n[None, None], o[None], gain, score=v[None])
                 for v, n, o in zip(best.values, normal, at, strict=True)
