@@ -277,15 +277,15 @@ def locate(experiment: Experiment, folder: Path, subset: MeasuredSubset, room: R
         return {"refused": str(error)}
     fitted = time.perf_counter()
     parts = [located(locator, test.subset(rows)) for rows in torch.arange(len(test)).split(BATCH_SPECTRA)]
-    found = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+    columns = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
     ended = time.perf_counter()
     if subset.repeat == 0:
         locator.save(model_file(folder, LOCATOR, subset.key))
-        save_located(folder / f"located-mix{subset.key}.npz", locator, measured, test, found["position"])
+        save_located(folder / f"located-mix{subset.key}.npz", locator, measured, test, columns["position"])
     seconds = {"room": room["seconds"], "fit": fitted - began, "locate": ended - fitted}
     return {
-        "estimate": found.pop("estimate"),
-        "located": found | {"weights": locator.weight, "seconds": seconds},
+        "estimate": columns.pop("estimate"),
+        "located": columns | {"weights": locator.weight, "seconds": seconds},
         "seconds": {"train": seconds["room"] + seconds["fit"], "estimate": seconds["locate"]},
         "history": [],
         "counts": Mixed.measured(measured).counts,

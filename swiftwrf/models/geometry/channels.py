@@ -14,8 +14,8 @@ def coherence(observed: Tensor, predicted: Tensor) -> Tensor:
     """Return |x^H h|^2 / (|x|^2 |h|^2) of channels (n, F, K), with an unknown phase of each of the F snapshots, (n,)."""
     match = (observed.conj() * predicted).sum(-1).abs().square().sum(-1)
     power = (observed.abs().square().sum(-1) * predicted.abs().square().sum(-1)).sum(-1)
-    found: Tensor = match / power.clamp_min(1e-30)
-    return found
+    value: Tensor = match / power.clamp_min(1e-30)
+    return value
 
 
 def ends(number: int) -> list[int]:

@@ -151,15 +151,15 @@ def update_room(room: RoomEstimate, new: Spectra, config: GeometryConfig) -> Roo
     Raises:
         InputError: As `search_room`.
     """
-    found = refine_room(room, new, config)
-    weight = room.covariance @ torch.linalg.pinv(room.covariance + found.covariance, hermitian=True)
-    old, own = (plane_set(r.planes, r.order) for r in (room, found))
+    latest = refine_room(room, new, config)
+    weight = room.covariance @ torch.linalg.pinv(room.covariance + latest.covariance, hermitian=True)
+    old, own = (plane_set(r.planes, r.order) for r in (room, latest))
     offset = old.offset[0] + weight @ (own.offset - old.offset)[0]
     gain = old.gain[0] + weight.diagonal().float() * (own.gain - old.gain)[0]
     remaining = room.covariance - weight @ room.covariance
     ratio = (remaining.diagonal() / room.covariance.diagonal()).nan_to_num(1.0)  # 0 / 0 for planes without uncertainty
     scale = ratio.clamp(0, 1).sqrt()
-    both = [(p.probability, f.probability) for p, f in zip(room.planes, found.planes, strict=True)]
+    both = [(p.probability, f.probability) for p, f in zip(room.planes, latest.planes, strict=True)]
     probability = [p * q / (p * q + (1 - p) * (1 - q)) for p, q in both]
     values = zip(room.planes, offset.tolist(), gain.tolist(), scale.tolist(), probability, strict=True)
     planes = [replace(p, offset_m=o, gain=g, std_mm=s * p.std_mm, probability=q) for p, o, g, s, q in values]
@@ -236,8 +236,8 @@ def _nearest(frequency_hz: Tensor, array: PlanarArray) -> int:
 
 def _held_out(rooms: list[PlaneSet], splits: Splits, steps: int = 4) -> list[Tensor]:
     """Return each room's coherence at held-out positions (n,), with offsets and gains refined on the other positions."""
-    found = [[room.coherence(held) for room in refine_all(kept, rooms, steps)] for kept, held in splits]
-    return [torch.cat(parts) for parts in zip(*found, strict=True)]
+    coherence = [[room.coherence(held) for room in refine_all(kept, rooms, steps)] for kept, held in splits]
+    return [torch.cat(parts) for parts in zip(*coherence, strict=True)]
 
 
 def _pruned(room: PlaneSet, scene: PhaseObservations, splits: Splits, config: GeometryConfig) -> PlaneSet:

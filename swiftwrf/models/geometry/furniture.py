@@ -133,8 +133,8 @@ class Furniture:
         padded = _padded(self.absorption)
 
         def transmission(group: _Crossings) -> Tensor:
-            found = padded.index_select(0, group.voxel.flatten()).view(group.voxel.shape)
-            return (-found.sum(-1) * group.step_m).exp()
+            absorption = padded.index_select(0, group.voxel.flatten()).view(group.voxel.shape)
+            return (-absorption.sum(-1) * group.step_m).exp()
 
         return _gains(self._crossings(planes, scene), _factor(planes, scene), transmission, self.reflectivity)
 
@@ -205,9 +205,9 @@ class Furniture:
         for depth in range(order.shape[2], 0, -1):
             plane = order[..., depth - 1]
             n, ray = normal[:, None, plane], source[depth].float()[:, None] - point
-            share = (away[plane] - (point * n).sum(0)) / (ray * n).sum(0)
-            exists = exists & (share > 0) & (share < 1)
-            point, along = point + share * ray, along + share * (1 - along)
+            fraction = (away[plane] - (point * n).sum(0)) / (ray * n).sum(0)
+            exists = exists & (fraction > 0) & (fraction < 1)
+            point, along = point + fraction * ray, along + fraction * (1 - along)
             hits.append((point, along, plane))
         best = exists.byte().argmax(-1, keepdim=True)  # (n, S, 1): of the orders of one image at most one exists
 
@@ -316,7 +316,7 @@ def orders(sequence: tuple[Sequence, ...], normal: tuple[tuple[float, ...], ...]
     """
     n = torch.tensor(normal, dtype=torch.float64).reshape(-1, 3)
     cosine = (n @ n.T).abs()
-    found = []
+    rows = []
     for first in sequence:
         orders, new = {first}, [first]
         while new:
@@ -326,9 +326,9 @@ def orders(sequence: tuple[Sequence, ...], normal: tuple[tuple[float, ...], ...]
             ]
             new += [other for other in swapped if other not in orders]
             orders |= {*swapped}
-        found.append([first, *sorted(orders - {first})])
-    most = max(map(len, found))
-    return torch.tensor([orders + orders[:1] * (most - len(orders)) for orders in found], dtype=torch.int64)
+        rows.append([first, *sorted(orders - {first})])
+    most = max(map(len, rows))
+    return torch.tensor([orders + orders[:1] * (most - len(orders)) for orders in rows], dtype=torch.int64)
 
 
 def fit_furniture(planes: PlaneSet, measured: Channels, start: Furniture) -> Furniture:

@@ -81,11 +81,11 @@ class PlaneSet:
     @property
     def image_gain(self) -> Tensor:
         """Product of the gains along each sequence, (B, S)."""
-        tree, last, found = tree_of(self.sequence), torch.ones(len(self.gain), 1), []
+        tree, last, levels = tree_of(self.sequence), torch.ones(len(self.gain), 1), []
         for parent, plane in tree.levels:
             last = last[:, parent] * self.gain[:, plane]
-            found.append(last)
-        return torch.cat(found, dim=1)[:, tree.rows]
+            levels.append(last)
+        return torch.cat(levels, dim=1)[:, tree.rows]
 
     def angular_factor(self, scene: LinkAt) -> Tensor:
         """Return the gain of each image at the positions of a scene, divided by `image_gain`, (B, S, n or 1)."""
@@ -296,8 +296,8 @@ def sequences(normal: Tensor, order: int) -> list[Sequence]:
     """
     cosine = (normal @ normal.T).tolist()
     planes = range(len(normal))
-    found: list[Sequence] = [(i,) for i in planes]
-    last = found
+    every: list[Sequence] = [(i,) for i in planes]
+    last = every
     for _ in range(order - 1):
         last = [
             (*s, i)
@@ -306,8 +306,8 @@ def sequences(normal: Tensor, order: int) -> list[Sequence]:
             and i != s[-1]
             and not (abs(cosine[s[-1]][i]) < MAX_COSINE and i < s[-1])
         ]
-        found = found + last
-    return found
+        every = every + last
+    return every
 
 
 @dataclass(frozen=True)
@@ -382,11 +382,11 @@ def images(scene: LinkAt, planes: PlaneSet) -> Tensor:
     """Return the image positions, float64 (B, S, n or 1, 3) [m]."""
     normal, offset, tree = planes.normal, planes.offset, tree_of(planes.sequence)
     # the origin and the ends of the unit vectors are mirrored, and positions follow by one product
-    last, found = FRAME[:, None, None].expand(-1, len(normal), 1, -1), []
+    last, levels = FRAME[:, None, None].expand(-1, len(normal), 1, -1), []
     for parent, plane in tree.levels:
         last = mirror(last[:, :, parent], normal[:, plane].movedim(-1, 0)[..., None], offset[:, plane, None])
-        found.append(last)
-    origin, ends = torch.cat(found, dim=2)[:, :, tree.rows].split([1, 3], dim=-1)
+        levels.append(last)
+    origin, ends = torch.cat(levels, dim=2)[:, :, tree.rows].split([1, 3], dim=-1)
     position: Tensor = origin + (ends - origin) @ scene.transmitter.T
     return position.movedim(0, -1)
 
@@ -434,7 +434,7 @@ def visibility(scene: LinkAt, planes: PlaneSet) -> Tensor:
             last = [s[-1] for s in begun]
             n, o = normal[:, last, None], offset[:, last, None]
             towards = images(scene, replace(planes, only=begun)) - point
-            share = (o - (point * n).sum(-1)) / (towards * n).sum(-1)
-            there[:, rows] *= ((share > 0) & (share < 1)).float()
-            point = point + share[..., None] * towards
+            fraction = (o - (point * n).sum(-1)) / (towards * n).sum(-1)
+            there[:, rows] *= ((fraction > 0) & (fraction < 1)).float()
+            point = point + fraction[..., None] * towards
     return there

@@ -144,8 +144,8 @@ class GeometryModel(Linked, FieldModel):
     def refined_on(self, scene: PhaseObservations) -> Self:
         """Return the room with offsets and gains refined on the observed phases of some spectra, without a search."""
         model, new = copy(self), refine(scene, self.tensors())
-        found = zip(self.planes, new.offset[0].tolist(), new.gain[0].tolist(), strict=True)
-        model.estimate = replace(self.estimate, planes=[replace(p, offset_m=o, gain=g) for p, o, g in found])
+        refined = zip(self.planes, new.offset[0].tolist(), new.gain[0].tolist(), strict=True)
+        model.estimate = replace(self.estimate, planes=[replace(p, offset_m=o, gain=g) for p, o, g in refined])
         return model
 
     def with_order(self, order: int) -> Self:
@@ -196,8 +196,8 @@ class GeometryModel(Linked, FieldModel):
         """
         scene = self.link_at(position)
         ratio = torch.ones(1) if frequency_hz is None else frequency_hz * self.array.wavelength / LIGHT_SPEED
-        found = field(self.gains(scene), waves(self.reflectors, scene, ratio))
-        return found[:, 0] if frequency_hz is None else found
+        channel = field(self.gains(scene), waves(self.reflectors, scene, ratio))
+        return channel[:, 0] if frequency_hz is None else channel
 
     def gains(self, scene: LinkAt) -> Tensor:
         """Return the gains of the direct path and of each image at positions, float32 (n, 1 + S)."""
@@ -245,8 +245,8 @@ class GeometryModel(Linked, FieldModel):
                 level, hidden = (20 * math.log10(max(abs(float(x[number])), 1e-9)) for x in (gain, free))
                 spread = 20 * math.log10(direct / length)
                 rows.append((sequence, length, level + spread, hidden - level, points.numpy()))
-        found = pd.DataFrame(rows, columns=["reflections", "length_m", "level_db", "hidden_db", "points"])
-        return found.sort_values("level_db", ascending=False, ignore_index=True)
+        table = pd.DataFrame(rows, columns=["reflections", "length_m", "level_db", "hidden_db", "points"])
+        return table.sort_values("level_db", ascending=False, ignore_index=True)
 
     def link_at(self, position: Tensor) -> LinkAt:
         """Return the link at positions of the moving end (n, 3) [m]."""
@@ -268,8 +268,8 @@ class GeometryModel(Linked, FieldModel):
         if not room.sequence:
             return at, strength, order
         link = replace(self.link_at(at), transmitter=at)
-        found, reflections = images(link, room)[0, :, 0], torch.tensor([len(s) for s in room.sequence])
-        return torch.cat([at, found]), torch.cat([strength, room.image_gain[0]]), torch.cat([order, reflections])
+        mirrored, reflections = images(link, room)[0, :, 0], torch.tensor([len(s) for s in room.sequence])
+        return torch.cat([at, mirrored]), torch.cat([strength, room.image_gain[0]]), torch.cat([order, reflections])
 
     def to_json(self) -> dict[str, Any]:
         """Return the room as plain values, see `RoomEstimate.to_json`, and the `Furniture`, if there is any."""
@@ -300,10 +300,10 @@ def _points(scene: LinkAt, room: PlaneSet, sequence: Sequence) -> Tensor | None:
             image.append(mirror(image[-1], normal[plane], offset[plane]))
         for plane in reversed(planes):
             towards = image.pop() - points[-1]
-            share = float((offset[plane] - points[-1] @ normal[plane]) / (towards @ normal[plane]))
-            if not 0 < share < 1:
+            fraction = float((offset[plane] - points[-1] @ normal[plane]) / (towards @ normal[plane]))
+            if not 0 < fraction < 1:
                 break
-            points.append(points[-1] + share * towards)
+            points.append(points[-1] + fraction * towards)
         else:
             return torch.stack([scene.transmitter[0], *reversed(points)])
     return None

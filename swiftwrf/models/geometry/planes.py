@@ -192,7 +192,7 @@ def image_jacobian(planes: PlaneSet, transmitter: Tensor, tilt: bool = False) ->
     (rooms, count), turns = offset.shape, 2 if tilt else 0
     across = torch.linalg.svd(normal[:, :, None]).Vh[:, :, 1:].permute(3, 2, 0, 1)  # (3, 2, B, P)
     point = transmitter.T[:, None, None].expand(-1, rooms, 1, -1)
-    last, found = point.new_zeros(3, rooms, 1, count, 1 + turns, len(transmitter) if tilt else 1), []
+    last, levels = point.new_zeros(3, rooms, 1, count, 1 + turns, len(transmitter) if tilt else 1), []
     for parent, plane in tree.levels:
         n, o, point = normal[:, plane].movedim(-1, 0)[..., None], offset[:, plane, None], point[:, :, parent]
         last = mirror(last[:, :, parent], n[..., None, None], o.new_zeros(()))  # as points in planes through the origin
@@ -202,8 +202,8 @@ def image_jacobian(planes: PlaneSet, transmitter: Tensor, tilt: bool = False) ->
             turn = across[:, q, :, plane, None]
             last[:, :, rows, plane, 1 + q] -= 2 * ((point * turn).sum(0) * n + ((point * n).sum(0) - o) * turn)
         point = mirror(point, n, o)
-        found.append(last)
-    return torch.cat(found, dim=2)[:, :, tree.rows].permute(0, 1, 4, 3, 2, 5).flatten(2, 3).float()
+        levels.append(last)
+    return torch.cat(levels, dim=2)[:, :, tree.rows].permute(0, 1, 4, 3, 2, 5).flatten(2, 3).float()
 
 
 def normal_equations(
@@ -286,7 +286,7 @@ def refine(
 
 def refine_all(scene: PhaseObservations, rooms: list[PlaneSet], steps: int = 10, **options: Any) -> list[PlaneSet]:
     """Return single rooms, each as by `refine`. Rooms with the same sequences are computed together."""
-    found = list(rooms)
+    refined = list(rooms)
     groups: dict[tuple[Sequence, ...], list[int]] = {}
     for number, room in enumerate(rooms):
         groups.setdefault(room.sequence, []).append(number)
@@ -298,8 +298,8 @@ def refine_all(scene: PhaseObservations, rooms: list[PlaneSet], steps: int = 10,
         together = refine(scene, start, steps, **options)
         parts = (t.split(1) for t in (together.normal, together.offset, together.gain, together.score))
         for number, n, o, g, score in zip(numbers, *parts, strict=True):
-            found[number] = replace(rooms[number], normal=n, offset=o, gain=g, score=score)
-    return found
+            refined[number] = replace(rooms[number], normal=n, offset=o, gain=g, score=score)
+    return refined
 
 
 def offset_covariance(scene: PhaseObservations, room: PlaneSet) -> Tensor:

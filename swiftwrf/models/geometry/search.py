@@ -126,13 +126,13 @@ class SteeringResponses:
             rows_of = ([self.double[i, j].index_select(2, left[i]) for i in pairs[j]] for j in crossed)
             between = torch.cat([torch.stack(waves).sum(0) for waves in rows_of], dim=-1)
             chosen = torch.cat([functional.one_hot(right[j - half], size[j]).T for j in crossed]).float()
-        found = []
+        scores = []
         for rows in torch.arange(left.shape[1]).split(max(1, 1000 // right.shape[1])):
             total = stay.expand(-1, -1, left.shape[1])[:, :, rows, None] + move[:, :, None]
             if crossed:
                 total += between[:, :, rows] @ chosen
-            found.append(scene.score(total.flatten(2)))
-        return torch.cat(found).reshape(size)
+            scores.append(scene.score(total.flatten(2)))
+        return torch.cat(scores).reshape(size)
 
     def _among(self, planes: range, rows: Tensor) -> Tensor:
         """Return the fields (n, 2 K, C) of some neighbouring planes alone, at the offset numbers (P, C)."""
@@ -142,6 +142,27 @@ class SteeringResponses:
             if i in planes and j in planes
         }
         return SteeringResponses(self.single[planes.start : planes.stop], double).of_choices(list(rows))
+
+
+Scored = tuple[
+    PhaseObservations, Tensor, SteeringResponses
+]  # positions, field of what stays there, and what is combined
+
+
+def best_combinations(few: Scored, more: Scored, most: int) -> list[tuple[float, tuple[int, ...]]]:
+    """Return the scores of the best combinations of offsets, the best first, and their numbers for each plane.
+
+    All combinations are scored at few positions, and the best `N_RESCORED` times `most` of them at more positions.
+    """
+    scene, base, responses = few
+    score = responses.scores(scene, base)
+    best = score.flatten().argsort()[: N_RESCORED * most].numpy()
+    number = [torch.from_numpy(n) for n in np.unravel_index(best, score.shape)]  # torch's own loads its compiler
+    scene, base, responses = more
+    score = scene.score(base + responses.of_choices(number))
+    kept = score.argsort()[:most]
+    rows = torch.stack([n[kept] for n in number], dim=1).tolist()
+    return list(zip(score[kept].tolist(), map(tuple, rows), strict=True))
 
 
 def _combinations(size: list[int]) -> Tensor:
@@ -207,8 +228,8 @@ class Search:
 
     def refined(self, rooms: list[PlaneSet], steps: int = 6) -> list[PlaneSet]:
         """Return the rooms after Levenberg-Marquardt steps with gains of fixed signs, the best first."""
-        found = refine_all(self.scene, rooms, steps, signs=self.signs, limit=2 * self.step)
-        return sorted(found, key=lambda room: float(room.score))
+        moved = refine_all(self.scene, rooms, steps, signs=self.signs, limit=2 * self.step)
+        return sorted(moved, key=lambda room: float(room.score))
 
     def beam(self, width: int, order: int) -> PlaneSet:
         """Return the best room of a beam search that adds one plane at a time."""
@@ -256,42 +277,35 @@ class Search:
         return SteeringResponses.of(self.scene, SIDES, offset, gain, SEARCH_ORDER)
 
     def moves(self, alternatives: Alternatives, responses: SteeringResponses, k: int, keep: int) -> list[PlaneSet]:
-        """Return the best rooms in which k sides take other alternatives, of which `MAX_ALTERNATIVES` are tried.
-
-        All combinations are scored at few positions, and the best of them at all.
-        """
+        """Return the best rooms in which k sides take other alternatives, of which `MAX_ALTERNATIVES` are tried."""
         few, few_responses = self.scene.subset(self._screened), responses.subset(self._screened)
-        pool: list[tuple[float, tuple[int, ...]]] = []
+        choices: set[tuple[float, tuple[int, ...]]] = set()
         for which in itertools.combinations(range(6), k):
             base, moving = few_responses.moved(few.direct, which)
-            screened = moving.first(MAX_ALTERNATIVES.get(k)).scores(few, base)
-            best = screened.flatten().argsort()[: N_RESCORED * keep].numpy()
-            number = np.unravel_index(best, screened.shape)
-            base, moving = responses.moved(self.scene.direct, which)
-            value = self.scene.score(base + moving.of_choices([torch.from_numpy(n) for n in number]))
-            for index in value.argsort()[:keep].tolist():
-                choice = [0] * 6
-                for i, at in zip(which, number, strict=True):
-                    choice[i] = int(at[index])
-                pool.append((float(value[index]), tuple(choice)))
+            at_few = few, base, moving.first(MAX_ALTERNATIVES.get(k))
+            for score, number in best_combinations(
+                at_few, (self.scene, *responses.moved(self.scene.direct, which)), keep
+            ):
+                choice = dict(zip(which, number, strict=True))
+                choices.add((score, tuple(choice.get(side, 0) for side in range(6))))
         rooms = []
-        for value_, choice_ in sorted(set(pool))[:keep]:
-            picked = {i: alternatives[i][c] for i, c in enumerate(choice_) if alternatives[i][c][1] != 0}
-            rooms.append(PlaneSet.on_sides(picked, SEARCH_ORDER, value_))
+        for score, numbers in sorted(choices)[:keep]:
+            picked = {i: alternatives[i][c] for i, c in enumerate(numbers) if alternatives[i][c][1] != 0}
+            rooms.append(PlaneSet.on_sides(picked, SEARCH_ORDER, score))
         return rooms
 
     def aliases(self, room: PlaneSet) -> Alternatives:
         """Return (offset, gain) of each side's present plane, wherever it is, and of its aliases up to two periods away."""
-        found, planes = [], room.by_side()
+        aliases, planes = [], room.by_side()
         for side in range(6):
             if side not in planes:
-                found.append([(0.0, 0.0)])
+                aliases.append([(0.0, 0.0)])
                 continue
             offset, gain = planes[side]
             period = phase_period_m(self.scene, PlaneSet.on_sides({side: (offset, gain)}), 0)
             steps = [offset + m * period for m in (0, -1, 1, -2, 2)]
-            found.append([(o, gain) for o in steps if o == offset or o >= self.near[side]])
-        return found
+            aliases.append([(o, gain) for o in steps if o == offset or o >= self.near[side]])
+        return aliases
 
     def improve(self, room: PlaneSet, *, ratio: float = 0.997) -> PlaneSet:
         """Return the room after moves of several planes at a time, with second-order images, until no move is better.
@@ -341,15 +355,15 @@ def find_rooms(
     searched = list(itertools.product((SEARCH_ORDER, 1), searches))
     rooms = parallel_map(lambda item: item[1].beam(width, item[0]), searched)
     starts = [(room, search) for room, (_, search) in zip(rooms, searched, strict=True)]
-    found: dict[Search, PlaneSet] = {}
+    improved: dict[Search, PlaneSet] = {}
     for start, search in sorted(starts, key=lambda s: float(s[0].score)):
-        lowest = min((float(room.score) for room in found.values()), default=math.inf)
-        if not found or PERFECT_SCORE < float(start.score) < max_ratio * lowest:
+        lowest = min((float(room.score) for room in improved.values()), default=math.inf)
+        if not improved or PERFECT_SCORE < float(start.score) < max_ratio * lowest:
             room = search.improve(start)
-            if search not in found or room.score < found[search].score:
-                found[search] = room
+            if search not in improved or room.score < improved[search].score:
+                improved[search] = room
         tick()
-    best = sorted(found.items(), key=lambda item: float(item[1].score))
+    best = sorted(improved.items(), key=lambda item: float(item[1].score))
     return [
         (search.signs, room)
         for search, room in best
@@ -398,18 +412,18 @@ def oblique_planes(
         return []
 
     def of_normals(normal: Tensor) -> list[PlaneSet]:
-        found = []
+        candidates = []
         offset = (both @ normal.T).amax(0)[:, None] + distance
         planes = normal.repeat_interleave(len(distance), dim=0)[:, None], offset.reshape(-1, 1)
         wave = usual * field(near, PlaneSet(*planes, torch.ones(offset.numel(), 1), only=((0,),)))
         for sign in (-1.0, 1.0):
             best = near.score(base + sign * wave).view_as(offset).min(1)
             at, gain = offset.gather(1, best.indices[:, None]), torch.full((1, 1), usual * sign)
-            found += [
+            candidates += [
                 PlaneSet(n[None, None], o[None], gain, score=v[None])
                 for v, n, o in zip(best.values, normal, at, strict=True)
             ]
-        return found
+        return candidates
 
-    found = itertools.chain.from_iterable(parallel_map(of_normals, directions().split(4)))
-    return sorted(found, key=lambda plane: float(plane.score))[:top]
+    every = itertools.chain.from_iterable(parallel_map(of_normals, directions().split(4)))
+    return sorted(every, key=lambda plane: float(plane.score))[:top]

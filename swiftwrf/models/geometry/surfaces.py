@@ -9,6 +9,7 @@ The gain is estimated in cells of the surface by matched filtering at half of th
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 
@@ -75,21 +76,15 @@ def find_surfaces(
 
     def scanned(axis: int) -> list[tuple[float, int, float]]:
         first, last = float(low[axis]) - margin[2 * axis], float(high[axis]) + margin[2 * axis + 1]
-        offset = torch.arange(first, last, step, dtype=torch.float64)
-        offset = offset[(offset - residual.fixed[axis]).abs().argsort()[:MAX_OFFSETS].sort().values]
-        parts = [residual.improvement(axis, some)[0].mean(-1).amax(0) for some in offset.split(BATCH)]
-        value = torch.cat(parts)
-        top = (value[1:-1] > value[:-2]) & (value[1:-1] >= value[2:]) & (value[1:-1] > 0)
-        rows = top.nonzero()[:, 0] + 1
-        return [(v, axis, o) for v, o in zip(value[rows].tolist(), offset[rows].tolist(), strict=True)]
+        return residual.maxima(axis, torch.arange(first, last, step, dtype=torch.float64))
 
-    starts = sorted((s for some in parallel_map(scanned, range(3)) for s in some), reverse=True)[:MAX_STARTS]
-    found: list[Plane] = []
+    starts = sorted(itertools.chain(*parallel_map(scanned, range(3))), reverse=True)[:MAX_STARTS]
+    surfaces: list[Plane] = []
     strongest = 0.0
     usual = float(planes.gain[0].sign().sum()) >= 0
     factor = torch.tensor([[1.0 if usual else rarity], [rarity if usual else 1.0]])  # of either sign
     fine = torch.linspace(-step, step, 9, dtype=torch.float64)
-    while starts and len(found) < MAX_SURFACES:
+    while starts and len(surfaces) < MAX_SURFACES:
         tried = []
         for _, axis, at in starts:
             improvement = residual.improvement(axis, at + fine, planes)[0]
@@ -107,9 +102,9 @@ def find_surfaces(
         residual = residual.without(axis, at, sign, planes)
         side = math.copysign(1.0, at - float(residual.fixed[axis]))
         normal = [side * float(other == axis) for other in range(3)]
-        found.append(Plane((normal[0], normal[1], normal[2]), side * at, (start_gain, -start_gain)[sign]))
+        surfaces.append(Plane((normal[0], normal[1], normal[2]), side * at, (start_gain, -start_gain)[sign]))
         starts = [(v, a, o) for v, a, o, _ in tried if a != axis or abs(o - at) > 2 * step]
-    return found
+    return surfaces
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,6 +201,14 @@ class _Residual:
         added = torch.tensor([1.0, -1.0])[:, None, None] * gains(torch.ones_like(half))
         total = (added[..., None, None] * whole).unflatten(2, (count, n)).sum(2)
         return improvement.unflatten(2, (count, n)).sum(2), total
+
+    def maxima(self, axis: int, offset: Tensor) -> list[tuple[float, int, float]]:
+        """Return improvement, axis and offset of local maxima over offsets [m], those nearest to the fixed end."""
+        offset = offset[(offset - self.fixed[axis]).abs().argsort()[:MAX_OFFSETS].sort().values]
+        value = torch.cat([self.improvement(axis, batch)[0].mean(-1).amax(0) for batch in offset.split(BATCH)])
+        top = (value[1:-1] > value[:-2]) & (value[1:-1] >= value[2:]) & (value[1:-1] > 0)
+        rows = top.nonzero()[:, 0] + 1
+        return [(v, axis, o) for v, o in zip(value[rows].tolist(), offset[rows].tolist(), strict=True)]
 
     def without(self, axis: int, offset: float, sign: int, planes: PlaneSet) -> _Residual:
         """Return the residual after a surface."""

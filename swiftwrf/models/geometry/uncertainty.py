@@ -14,7 +14,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -31,7 +30,7 @@ from swiftwrf.models.geometry.planes import (
     refine_all,
     sign_alternatives,
 )
-from swiftwrf.models.geometry.search import N_RESCORED, SIGNS, SteeringResponses
+from swiftwrf.models.geometry.search import SIGNS, SteeringResponses, best_combinations
 from swiftwrf.runtime.threads import parallel_map
 
 MIN_PROBABILITY = 1e-6  # of a plane
@@ -240,8 +239,8 @@ def _alias_offsets(scene: LinkAt, room: PlaneSet, plane: int) -> dict[int, float
     for number in range(-2 * MAX_PERIODS, 2 * MAX_PERIODS + 1):
         above = int(torch.searchsorted(half_periods, float(number)))
         if number and 0 < above < len(grid):
-            share = (number - half_periods[above - 1]) / (half_periods[above] - half_periods[above - 1])
-            offsets[number] = float(grid[above - 1] + share * (grid[above] - grid[above - 1]))
+            fraction = (number - half_periods[above - 1]) / (half_periods[above] - half_periods[above - 1])
+            offsets[number] = float(grid[above - 1] + fraction * (grid[above] - grid[above - 1]))
     return offsets
 
 
@@ -262,19 +261,14 @@ class _AlternativeTable:
         return replace(self.before, offset=offset, gain=self.before.gain * (-1.0) ** torch.tensor(choice))
 
     def best(self, half_periods: list[list[int]], most: int) -> dict[HalfPeriods, float]:
-        """Return the best combinations of the given half periods of the planes, with their scores.
-
-        All combinations are scored at few positions, and the best of them at more.
-        """
+        """Return the best combinations of the given half periods of the planes, with their scores."""
         rows = [
             torch.tensor([list(p).index(h) for h in some]) for p, some in zip(self.offsets, half_periods, strict=True)
         ]
-        (first, scene), (few, waves) = self.scenes, self.waves
-        score = few.at(rows).scores(first, first.direct)
-        best = score.flatten().argsort()[: N_RESCORED * most].numpy()
-        number = [torch.from_numpy(n) for n in np.unravel_index(best, score.shape)]  # torch's own loads its compiler
-        score = scene.score(scene.direct + waves.of_choices([r[n] for r, n in zip(rows, number, strict=True)]))
-        kept = score.argsort()[:most]
-        choices = torch.stack([n[kept] for n in number], dim=1).tolist()
-        best_choices = [tuple(some[k] for some, k in zip(half_periods, choice, strict=True)) for choice in choices]
-        return dict(zip(best_choices, score[kept].tolist(), strict=True))
+        few, more = (
+            (scene, scene.direct, waves.at(rows)) for scene, waves in zip(self.scenes, self.waves, strict=True)
+        )
+        return {
+            tuple(some[n] for some, n in zip(half_periods, number, strict=True)): score
+            for score, number in best_combinations(few, more, most)
+        }
