@@ -117,6 +117,8 @@ class _Learning:
     ) -> None:
         self.experiment, self.subset, self.steps, self.result = experiment, subset, steps, result
         self.conditions: list[Condition] = []
+        self.located = Condition(LOCATOR, "measured", "", 0, subset.measured_fraction, subset.repeat)
+        self.choice = f"choice-{subset}"  # name of the step that compares field models
         self.held_out: list[str] = []  # names of the steps with errors on held-out spectra
         self.fast = [name for name in experiment.named if not experiment.model_type(name).slow]
         self.compares = bool(self.fast or not experiment.named)
@@ -149,19 +151,9 @@ class _Learning:
         yield
         self.collect(compared, names)
 
-    @property
-    def choice(self) -> str:
-        """Name of the step that compares field models."""
-        return f"choice-{self.subset}"
-
     def synthesis(self, name: str) -> str:
         """Return the name of the step in which a field model predicts spectra."""
         return f"synthesis_{name}-{self.subset}"
-
-    @property
-    def located(self) -> Condition:
-        """Condition of matched-field processing."""
-        return Condition(LOCATOR, "measured", "", 0, self.subset.measured_fraction, self.subset.repeat)
 
     def train(
         self,

@@ -20,7 +20,7 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.beamforming import unit_power
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.gp import GaussianProcess
-from swiftwrf.models.geometry.channels import field, sources, waves
+from swiftwrf.models.geometry.channels import sources, superposed, waves
 from swiftwrf.models.geometry.model import GeometryModel, kept_snapshots
 from swiftwrf.models.geometry.path_gains import PathGains
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation, coarray_numbers, retrieve_phases
@@ -103,7 +103,7 @@ class PathWaves:
     @cached_property
     def channel(self) -> Tensor:
         """Channel of each element by the room's path gains, complex64 (m, F, K)."""
-        return field(self.gain, self.wave)
+        return superposed(self.gain, self.wave)
 
 
 def channels_beside(room: GeometryModel, position: Tensor, away: Tensor, frequency: Tensor) -> Tensor:

@@ -23,7 +23,7 @@ def ends(number: int) -> list[int]:
     return sorted({0, number - 1})
 
 
-def field(gain: Tensor, wave: Tensor) -> Tensor:
+def superposed(gain: Tensor, wave: Tensor) -> Tensor:
     """Return the sums of waves (n, 1 + S, F, K) with gains (n, 1 + S), complex64 (n, F, K)."""
     total: Tensor = (gain.to(wave.dtype)[:, None] @ wave.flatten(2))[:, 0].unflatten(1, wave.shape[2:])
     return total
@@ -70,4 +70,4 @@ class Channels:
 
     def coherence(self, planes: PlaneSet, gain: Tensor) -> Tensor:
         """Return the coherence with the field of gains (n, 1 + S) at each position, (n,)."""
-        return coherence(self.value, field(gain, waves(planes, self.scene, self.frequency)))
+        return coherence(self.value, superposed(gain, waves(planes, self.scene, self.frequency)))

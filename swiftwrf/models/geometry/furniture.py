@@ -30,7 +30,7 @@ from torch.nn.functional import softplus
 
 from swiftwrf.data.splits import each_fold
 from swiftwrf.errors import InputError
-from swiftwrf.models.geometry.channels import Channels, coherence, field, waves
+from swiftwrf.models.geometry.channels import Channels, coherence, superposed, waves
 from swiftwrf.models.geometry.images import MAX_COSINE, LinkAt, PlaneSet, Sequence, mirror
 from swiftwrf.models.geometry.planes import Plane, log_advantage, log_explained, plane_set, robust_advantage
 from swiftwrf.models.geometry.surfaces import find_surfaces
@@ -364,7 +364,7 @@ def fit_furniture(planes: PlaneSet, measured: Channels, start: Furniture) -> Fur
             penalty = penalty + start.voxel_m * _variation(cells)
             # a wall reflects alike everywhere unless channels need another gain, another surface nowhere
             penalty = penalty + area * ((cells - usual[number]).abs() if is_wall[number] else cells).sum()
-        loss = 1 - coherence(observed, field(gain, wave)).mean() + start.penalty * penalty
+        loss = 1 - coherence(observed, superposed(gain, wave)).mean() + start.penalty * penalty
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

@@ -19,7 +19,7 @@ from swiftwrf.data.spectra import Spectra, fingerprint
 from swiftwrf.data.splits import folds
 from swiftwrf.errors import InputError
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, bounding_box
-from swiftwrf.models.geometry.channels import Channels, field, waves
+from swiftwrf.models.geometry.channels import Channels, superposed, waves
 from swiftwrf.models.geometry.fit import GeometryConfig, refine_room, search_room, update_room
 from swiftwrf.models.geometry.furniture import Furniture, find_furniture, fit_furniture, orders
 from swiftwrf.models.geometry.images import LinkAt, PhaseObservations, PlaneSet, Sequence, images, mirror
@@ -196,7 +196,7 @@ class GeometryModel(Linked, FieldModel):
         """
         scene = self.link_at(position)
         ratio = torch.ones(1) if frequency_hz is None else frequency_hz * self.array.wavelength / LIGHT_SPEED
-        channel = field(self.gains(scene), waves(self.reflectors, scene, ratio))
+        channel = superposed(self.gains(scene), waves(self.reflectors, scene, ratio))
         return channel[:, 0] if frequency_hz is None else channel
 
     def gains(self, scene: LinkAt) -> Tensor:

@@ -117,26 +117,26 @@ def fit_path_gains(
 ) -> PathGains:
     """Fit path gains around several samples of their prior to the observed phases."""
     prior, (wave, gain) = PRIORS[name], paths(geometry, scene)
-    root = torch.linalg.cholesky(kernel.covariance(scene.moving.double())).float()
+    factor = torch.linalg.cholesky(kernel.covariance(scene.moving.double())).float()
     shape = len(scene), 8, gain.shape[1], 2  # eight fields, whose spectra are averaged
     sample = prior.sample_std * torch.randn(shape, generator=torch.Generator().manual_seed(0))
-    gradient, normal = posterior_gradient(scene, wave, gain, root, sample, prior), sample.clone()
+    gradient, normal = posterior_gradient(scene, wave, gain, factor, sample, prior), sample.clone()
     optimiser = torch.optim.Adam([normal], lr=0.2, fused=True)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, prior.steps)
     for _ in range(prior.steps):
         normal.grad = gradient(normal)
         optimiser.step()
         schedule.step()
-    value = root @ (torch.tensor(prior.std) * normal).flatten(1)
+    value = factor @ (torch.tensor(prior.std) * normal).flatten(1)
     return PathGains(GaussianProcess(kernel, scene.moving.double(), value, exact=True), normal.shape[2], name)
 
 
 def posterior_gradient(
-    scene: PhaseObservations, wave: Tensor, gain: Tensor, root: Tensor, sample: Tensor, prior: GainPrior
+    scene: PhaseObservations, wave: Tensor, gain: Tensor, factor: Tensor, sample: Tensor, prior: GainPrior
 ) -> Callable[[Tensor], Tensor]:
     """Return the gradient of the negative logarithm of the posterior density of path gains, around samples of the prior.
 
-    Gains are a_i = gain_i + std (root @ z)_i with standard normal variables z (n, F, S, 2). Up to a constant it is
+    Gains are a_i = gain_i + std (factor @ z)_i with standard normal variables z (n, F, S, 2). Up to a constant it is
 
         sum_s (1 - c_s) / missing_scale + |z - sample|^2 / 2,    c_s = max_x |sum_k conj(x_sk) u_sk|^2 / K^2,
 
@@ -147,7 +147,7 @@ def posterior_gradient(
         scene: Observed phases at n positions.
         wave: Waves of the paths, complex64 (n, S, K).
         gain: Gains of the paths (n, S) without those differences.
-        root: Cholesky factor of the kernel matrix, lower triangle, (n, n).
+        factor: Cholesky factor of the kernel matrix, lower triangle, (n, n).
         sample: Samples of the prior (n, F, S, 2).
         prior: Prior of the gains.
     """
@@ -155,12 +155,12 @@ def posterior_gradient(
     std = torch.tensor(prior.std).expand(sample.shape[1:]).contiguous()
     scale = 2 / (prior.missing_scale * wave.shape[-1] ** 2)
 
-    def times_root(values: Tensor, transposed: bool = False) -> Tensor:  # half the operations of a full matrix
-        product = strmm(1.0, root.numpy().T, values.flatten(1).numpy().T, side=1, trans_a=transposed)
+    def times_factor(values: Tensor, transposed: bool = False) -> Tensor:  # half the operations of a full matrix
+        product = strmm(1.0, factor.numpy().T, values.flatten(1).numpy().T, side=1, trans_a=transposed)
         return torch.from_numpy(product.T).view_as(values)
 
     def gradient(normal: Tensor) -> Tensor:
-        field = without + torch.view_as_complex(std * times_root(normal)) @ wave
+        field = without + torch.view_as_complex(std * times_factor(normal)) @ wave
         unit = field.sgn()
         match = unit @ conjugate.mT
         better = match.abs().argmax(-1, keepdim=True)
@@ -168,7 +168,7 @@ def posterior_gradient(
         across = (match.gather(2, better).conj() * nearer * unit).imag
         slope = scale * across / field.abs().clamp_min_(1e-30)  # a phase needs no modulus
         by_gain = torch.complex(-slope * unit.imag, slope * unit.real) @ wave.mH
-        return times_root(std * torch.view_as_real(by_gain), transposed=True) + (normal - sample)
+        return times_factor(std * torch.view_as_real(by_gain), transposed=True) + (normal - sample)
 
     return gradient
 

@@ -235,16 +235,16 @@ class Search:
         """Return the best room of a beam search that adds one plane at a time."""
         rooms = [PlaneSet.on_sides({}, order, float(self.scene.score(self.scene.direct)))]
         for _ in SIDES:
-            pool: dict[tuple[tuple[int, int], ...], PlaneSet] = {}
+            wider: dict[tuple[tuple[int, int], ...], PlaneSet] = {}
             for room in rooms:
                 planes = room.by_side()
                 for side in set(range(6)) - set(planes):
                     for score, offset in self.minima(room, side, 4):
                         new = PlaneSet.on_sides({**planes, side: (offset, self.usual[side])}, order, score)
-                        pool.setdefault(self.key(new), new)
-            if not pool:  # no side left has a minimum within reach
+                        wider.setdefault(self.key(new), new)
+            if not wider:  # no side left has a minimum within reach
                 break
-            best = sorted(pool.values(), key=lambda room: float(room.score))[: 3 * width]
+            best = sorted(wider.values(), key=lambda room: float(room.score))[: 3 * width]
             distinct: dict[tuple[tuple[int, int], ...], PlaneSet] = {}
             for room in self.refined(best, 3):  # moves refine these rooms further
                 distinct.setdefault(self.key(room), room)

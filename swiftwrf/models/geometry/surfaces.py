@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from swiftwrf.gp import subsample
-from swiftwrf.models.geometry.channels import Channels, ends, field, waves
+from swiftwrf.models.geometry.channels import Channels, ends, superposed, waves
 from swiftwrf.models.geometry.images import PlaneSet, mirror
 from swiftwrf.models.geometry.planes import Plane
 from swiftwrf.runtime.threads import parallel_map
@@ -70,7 +70,7 @@ def find_surfaces(
     measured = replace(measured, value=measured.value[:, ends(count)], frequency=measured.frequency[ends(count)])
     scene = measured.scene
     wavelength = math.tau / scene.wavenumber
-    residual = _Residual.of(measured, field(gain, waves(planes, scene, measured.frequency)), low, high)
+    residual = _Residual.of(measured, superposed(gain, waves(planes, scene, measured.frequency)), low, high)
     step = STEP * wavelength
     margin = [margin_wavelengths * wavelength if side in planes.by_side() else open_margin_m for side in range(6)]
 

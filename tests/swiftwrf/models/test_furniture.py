@@ -17,7 +17,7 @@ from swiftwrf.data.store import Store
 from swiftwrf.locate.features import PathWaves, SpectrumFeatures, channels_beside
 from swiftwrf.locate.spectrum_likelihood import SCALES, PathLikelihood
 from swiftwrf.models.geometry import GeometryModel, Plane, furniture
-from swiftwrf.models.geometry.channels import Channels, coherence, field, sources, waves
+from swiftwrf.models.geometry.channels import Channels, coherence, sources, superposed, waves
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.geometry.furniture import Furniture
 from swiftwrf.models.geometry.images import PlaneSet, images
@@ -88,7 +88,7 @@ def test_paths_through_voxels_are_those_of_the_image_sources(moving):
     scene, planes = room.link_at(data.position), room.tensors()
     gain = furnished(room, 0.0).gains(planes, scene)
     assert torch.allclose(gain, room.gains(scene), atol=1e-5)
-    channel = field(gain, waves(planes, scene, torch.ones(1)))[:, 0]
+    channel = superposed(gain, waves(planes, scene, torch.ones(1)))[:, 0]
     assert torch.allclose(channel, planes.channel(scene), atol=1e-4)
 
 
@@ -153,7 +153,7 @@ def test_walls_reflect_alike_where_no_path_determines_their_reflectivity():
     data = mirror_room({}, n=20)
     room = GeometryModel.of_planes(data, built_in_walls(0.5))
     scene, start = room.link_at(data.position), replace(furnished(room, 0.0), penalty=1e-2)
-    channel = field(room.gains(scene), waves(room.tensors(), scene, torch.ones(1)))
+    channel = superposed(room.gains(scene), waves(room.tensors(), scene, torch.ones(1)))
     found = furniture.fit_furniture(room.tensors(), Channels(scene, channel, torch.ones(1)), start)
     assert found.reflectivity.mean() == pytest.approx(0.5, abs=0.1)
 
