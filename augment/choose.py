@@ -134,15 +134,7 @@ def choose_model(
         ['idw', 'nearest']
     """
     check_training(measured)
-    types: dict[str, FieldModel | type[FieldModel]] = {}
-    for model in candidates(measured) if models is None else models:
-        field_model = model_type(model, options.get("preset", "quick")) if isinstance(model, str) else model
-        name = model if isinstance(model, str) else model.name
-        if types.setdefault(name, field_model) is not field_model:
-            raise InputError(f"two candidates have the name {name!r}; give one of them another `name`")
-    for option in options:
-        if not any(field_model.supported({option: options[option]}) for field_model in types.values()):
-            raise InputError(f"none of the candidates {', '.join(types)} has an option {option!r}; leave it out")
+    types = _by_name(candidates(measured) if models is None else models, options)
     fold, every_blind = blind_folds(measured, validation, seed)
     if not every_blind:
         raise InputError(
@@ -151,37 +143,75 @@ def choose_model(
     options |= {"validation": validation, "seed": seed}
     searched = [[model] for model in structures] or [list[tuple[FieldModel, float]]() for _ in every_blind]
     psnr_db: dict[str, float] = {}
-    found: dict[str, list[Fold]] = {}
+    scored: dict[str, list[Fold]] = {}
     seconds: dict[str, float] = {}
     left_out: dict[str, str] = {}
     for name, field_model in types.items():
-        scored, score, spent = [], [], 0.0
         try:
             unfitted = field_model(**field_model.supported(options)) if isinstance(field_model, type) else field_model
-            for blind, fitted in zip(every_blind, searched, strict=True):
-                structure = None
-                if unfitted.searches:
-                    structure, searching = _structure(unfitted, measured.subset(without(fold, *blind)), fitted, device)
-                    spent += searching
-                for number in blind:
-                    train, test = held_out(measured, fold, (number,))
-                    began = time.perf_counter()
-                    model = copy(unfitted)
-                    model.fit(train, like=structure, device=device)
-                    predicted = synthesized(model, test.position)
-                    spent += time.perf_counter() - began
-                    scored.append(Fold(model, train, test))
-                    score.append(psnr(predicted, test.spectrum))
+            parts = zip(every_blind, searched, strict=True)
+            psnr_db[name], scored[name], seconds[name] = _cross_validated(unfitted, measured, fold, parts, device)
         except (InputError, FitError) as error:
             left_out[name] = str(error)
-            continue
-        psnr_db[name] = float(trim_mean(torch.cat(score).numpy(), 0.1))  # of the highest and of the lowest
-        found[name], seconds[name] = scored, spent
     if not psnr_db:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
         raise InputError(f"no field model can be fitted to {len(measured)} spectra of {measured.name} ({reasons})")
     best = max(psnr_db, key=lambda name: psnr_db[name])
-    return ModelChoice(best, psnr_db, seconds, found, left_out)
+    return ModelChoice(best, psnr_db, seconds, scored, left_out)
+
+
+def _by_name(
+    models: Iterable[str | FieldModel | type[FieldModel]], options: dict[str, Any]
+) -> dict[str, FieldModel | type[FieldModel]]:
+    """Return candidates by name.
+
+    Raises:
+        InputError: Two candidates of one name, or an option that none of them has.
+    """
+    types: dict[str, FieldModel | type[FieldModel]] = {}
+    for model in models:
+        field_model = model_type(model, options.get("preset", "quick")) if isinstance(model, str) else model
+        name = model if isinstance(model, str) else model.name
+        if types.setdefault(name, field_model) is not field_model:
+            raise InputError(f"two candidates have the name {name!r}; give one of them another `name`")
+    for option in options:
+        if not any(field_model.supported({option: options[option]}) for field_model in types.values()):
+            raise InputError(f"none of the candidates {', '.join(types)} has an option {option!r}; leave it out")
+    return types
+
+
+def _cross_validated(
+    unfitted: FieldModel,
+    measured: Spectra,
+    fold: Tensor,
+    parts: Iterable[tuple[tuple[int, ...], list[tuple[FieldModel, float]]]],
+    device: torch.device | str,
+) -> tuple[float, list[Fold], float]:
+    """Return the trimmed mean PSNR [dB] of a candidate over held-out spectra, its scored folds, and the seconds.
+
+    Args:
+        unfitted: Candidate, which stays as it is.
+        measured: Measured spectra.
+        fold: Fold of each spectrum, (n,).
+        parts: Folds that one search leaves out, and the models that were fitted without them.
+        device: Device to compute on.
+    """
+    scored, psnr_db, seconds = [], [], 0.0
+    for blind, fitted in parts:
+        structure = None
+        if unfitted.searches:
+            structure, searching = _structure(unfitted, measured.subset(without(fold, *blind)), fitted, device)
+            seconds += searching
+        for number in blind:
+            train, test = held_out(measured, fold, (number,))
+            began = time.perf_counter()
+            model = copy(unfitted)
+            model.fit(train, like=structure, device=device)
+            predicted = synthesized(model, test.position)
+            seconds += time.perf_counter() - began
+            scored.append(Fold(model, train, test))
+            psnr_db.append(psnr(predicted, test.spectrum))
+    return float(trim_mean(torch.cat(psnr_db).numpy(), 0.1)), scored, seconds  # without the highest and lowest tenth
 
 
 def held_out(measured: Spectra, fold: Tensor, numbers: tuple[int, ...], most: int = 1000) -> tuple[Spectra, Spectra]:

@@ -32,8 +32,8 @@ class Suggestion:
 
     Example:
         >>> import swiftwrf
-        >>> found = suggest(swiftwrf.simulated_room(n=20), 3)
-        >>> bool((found.variance.diff() <= 0).all())
+        >>> suggestion = suggest(swiftwrf.simulated_room(n=20), 3)
+        >>> bool((suggestion.variance.diff() <= 0).all())
         True
     """
 

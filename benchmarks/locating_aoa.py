@@ -54,7 +54,7 @@ from swiftwrf.data.spectra import array_spectra
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import GaussianProcess, choose_kernel
 from swiftwrf.metrics import LEVEL, angle_errors
-from swiftwrf.models.geometry.channels import coherence, field, waves
+from swiftwrf.models.geometry.channels import coherence, superposed, waves
 
 KERNEL = "kernel_regression"
 MAX_DELAY_S = 100e-9  # of a packet
@@ -233,7 +233,7 @@ def channel_scores(room: GeometryModel, measured: Spectra, test: Spectra, seed: 
     walls.furniture = None
     for name, model in {"planes": walls, "furniture": room}.items():
         at_known, at_test = (
-            field(model.gains(part.scene), waves(model.reflectors, part.scene, part.frequency))
+            superposed(model.gains(part.scene), waves(model.reflectors, part.scene, part.frequency))
             for part in (known, truth)
         )
         factor = (at_known.conj() * known.value).sum() / at_known.abs().square().sum()

@@ -67,8 +67,8 @@ def predict(
             f"a walk smooths positions, and {with_article(getattr(model, 'kind', 'model'))} locates nothing"
         )
     if isinstance(model, FieldModel | RssiPredictor):
-        found: Prediction = model.predict(new)
-        return found
+        prediction: Prediction = model.predict(new)
+        return prediction
     if isinstance(model, RssiLocator):
         if not isinstance(new, Rssi):
             raise InputError(f"an RSSI locator takes Rssi, got {type(new).__name__}")
@@ -107,19 +107,19 @@ def _positions_of_rssi(locator: RssiLocator, data: Rssi, track: float | None, tr
 
 
 def _positions_of_spectra(locator: MatchedField, store: Store, known: Spectra | None, track: float | None) -> Columns:
-    found: list[Tensor] = []
+    directions: list[Tensor] = []
     index = torch.arange(len(store)) if known is None else known.index
     rows = torch.arange(len(store)).split(BATCH_ROWS)
-    posteriors: Iterable[Posterior] = (locator.locate(store[some] if known is None else known[some]) for some in rows)
+    posteriors: Iterable[Posterior] = (locator.locate(store[part] if known is None else known[part]) for part in rows)
     if track is not None:
         posteriors = _tracked(posteriors, index.double(), track)
 
     def with_direction(posterior: Posterior) -> Posterior:
-        found.append(locator.direction(posterior))
+        directions.append(locator.direction(posterior))
         return posterior
 
     columns = _located(map(with_direction, posteriors), index, None if known is None else known.position)
-    return columns | _directions(torch.cat(found), known)
+    return columns | _directions(torch.cat(directions), known)
 
 
 def _positions_of_stations(locator: MatchedField, data: Stations, track: float | None, truth: bool) -> Columns:
@@ -173,16 +173,16 @@ def _tracked(posteriors: Iterable[Posterior], time: Tensor, speed_m_s: float) ->
     parts: list[Posterior] = []
     for part in posteriors:
         parts.append(part)
-        if sum(some.log_weight.numel() for some in parts) > MAX_TRACKED:
+        if sum(each.log_weight.numel() for each in parts) > MAX_TRACKED:
             most = MAX_TRACKED // part.log_weight.shape[1]
             raise InputError(
                 f"a walk has at most {most} rows with this locator; split it, or fit the locator with fewer cells"
             )
-    whole = smoothed(Posterior.cat(parts), time, speed_m_s)
-    for start in range(0, len(whole), BATCH_ROWS):
+    walk = smoothed(Posterior.cat(parts), time, speed_m_s)
+    for start in range(0, len(walk), BATCH_ROWS):
         rows = slice(start, start + BATCH_ROWS)
-        position = whole.position if len(whole.position) == 1 else whole.position[rows]
-        yield replace(whole, position=position, log_weight=whole.log_weight[rows])
+        position = walk.position if len(walk.position) == 1 else walk.position[rows]
+        yield replace(walk, position=position, log_weight=walk.log_weight[rows])
 
 
 def _located(

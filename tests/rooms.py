@@ -15,8 +15,9 @@ from swiftwrf.data.simulated import ShoeboxRoom
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.store import Store
 from swiftwrf.models.geometry import GeometryModel
-from swiftwrf.models.geometry.images import SIDES, PhaseObservations, PlaneSet
+from swiftwrf.models.geometry.images import SIDES, LinkAt, PlaneSet
 from swiftwrf.models.geometry.planes import Plane
+from swiftwrf.models.link import Link
 
 Normal = tuple[float, float, float]
 GRID = AngularGrid.hemisphere(10, 40)
@@ -53,7 +54,7 @@ def mirror_room(
     position = least + (most - least) * torch.rand(n, 3, dtype=torch.float64, generator=generator)
     fixed = torch.tensor([2.6, 2.2, 2.4 if moving == "receiver" else 0.3], dtype=torch.float64)
     rotation = torch.eye(3, dtype=torch.float64)
-    scene = PhaseObservations.of(position, fixed, moving, array, rotation, torch.ones(n, len(array.element)))
+    scene = LinkAt.of(position, Link(moving, fixed, rotation, array))
     channel = scene.wave(scene.transmitter)
     if planes:
         normal = torch.tensor(list(planes), dtype=torch.float64)

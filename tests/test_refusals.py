@@ -40,11 +40,11 @@ from swiftwrf import (
     simulated_room,
 )
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.array.subspace import esprit
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.contrib.comparison.rssi import compared, make_predictor
 from swiftwrf.contrib.online import Follower, prequential
 from swiftwrf.contrib.raytraced import Tracing
+from swiftwrf.contrib.subspace import esprit
 from swiftwrf.data.simulated import ShoeboxRoom
 from swiftwrf.data.splits import folds
 from swiftwrf.data.store import Store

@@ -89,8 +89,8 @@ class Estimator(Configured, ABC):
     def estimate(self, data: Spectra) -> Tensor:
         """Return azimuth and elevation (n, 2) [rad] of measurements."""
         name, batches = f"directions of {type(self).__name__}", data.store.batches()
-        found = [to_directions(name, self.predict(part), len(part)) for part in batches]
-        return torch.cat(found) if found else torch.empty(0, 2, dtype=torch.float64)
+        parts = [to_directions(name, self.predict(part), len(part)) for part in batches]
+        return torch.cat(parts) if parts else torch.empty(0, 2, dtype=torch.float64)
 
     @classmethod
     def lacking(cls, data: Spectra) -> str:

@@ -101,8 +101,8 @@ class NadarayaWatson:
         Raises:
             InputError: It has.
         """
-        if (found := (self.known.shape[1], self.dual.shape[1])) != (n_features, n_values):
-            raise InputError(f"a regression of {n_features} features and {n_values} values has {found}")
+        if (size := (self.known.shape[1], self.dual.shape[1])) != (n_features, n_values):
+            raise InputError(f"a regression of {n_features} features and {n_values} values has {size}")
 
 
 def choose(distance: NDArray[Any], target: NDArray[Any], seed: int) -> tuple[float, float]:

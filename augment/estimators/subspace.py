@@ -12,7 +12,7 @@ from augment.estimators.base import ESTIMATORS, Estimator
 from swiftwrf import InputError, Spectra
 from swiftwrf.array.angles import to_angles
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.array.subspace import esprit, joint_music, maximum_likelihood, music
+from swiftwrf.contrib.subspace import esprit, joint_music, maximum_likelihood, music
 
 MIN_SNAPSHOTS = 2  # of one position: with one snapshot all methods are the peak of its spectrum
 

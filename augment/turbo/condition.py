@@ -132,8 +132,9 @@ def headline(conditions: Iterable[Condition]) -> Condition:
 def reference_of(conditions: Mapping[str, Condition], error: Mapping[str, float]) -> str:
     """Return the method with the smallest error among the estimators that are trained on measured spectra alone.
 
-    A gain by synthetic spectra is relative to it. It is chosen by its error on test spectra, which favours it: the gain is
-    not overestimated. Matched-field processing is left out, because it is no regression from spectra to directions.
+    A gain by synthetic spectra is relative to it. It is chosen by its error on test spectra. That favours the reference, so
+    the gain by synthetic spectra is never overstated. Matched-field processing is left out, because it is no regression from
+    spectra to directions.
 
     Example:
         >>> conditions = {c.method: c for c in (Condition("peak", "measured"), Condition("kernel_regression", "measured"))}
@@ -147,32 +148,35 @@ def reference_of(conditions: Mapping[str, Condition], error: Mapping[str, float]
 def pooled(results: list[tuple[Condition, Value]], auto: bool) -> list[tuple[Condition, Value]]:
     """Return results such that every condition with synthetic spectra has all repeats.
 
-    A repeat stands for a user, who chooses a field model and the number of extra positions by cross-validation. Where
-    repeats chose differently, the choices of all repeats become one condition. The network is trained with extra positions
-    or without them, other estimators both ways.
+    A repeat stands for a user, who chooses a field model and the number of extra positions by cross-validation. The network
+    is trained with extra positions or without them, other estimators both ways. The result that stands for a repeat is the
+    one with extra positions, or the only one.
 
-    With `auto` the repeats choose their field model, and their choices become one condition, "measured + synthetic (auto)".
-    Otherwise a condition with extra positions contains the result without them of those repeats that were advised against
-    them.
+    | repeats | result with synthetic spectra | becomes |
+    |---|---|---|
+    | chose alike | each | the same condition |
+    | chose differently, `auto` | that stands for its repeat | "measured + synthetic (auto)" |
+    | chose differently, else | without extra positions, in all repeats | the same condition |
+    | chose differently, else | that stands for its repeat, if one has extra positions | the condition with extra positions |
     """
     trainings: dict[str, dict[int, set[tuple[str, str]]]] = {}
     for condition, _ in results:
         if condition.is_turbo:
             repeats = trainings.setdefault(condition.estimator, {})
             repeats.setdefault(condition.repeat, set()).add((condition.synthesizer, condition.training))
-    found: list[tuple[Condition, Value]] = []
+    complete: list[tuple[Condition, Value]] = []
     for condition, value in results:
         repeats = trainings.get(condition.estimator, {})
         if not condition.is_turbo or len({frozenset(names) for names in repeats.values()}) == 1:
-            found.append((condition, value))
+            complete.append((condition, value))
             continue
         most: Training = "measured + synthetic + extra"
         extra, own_way = (condition.synthesizer, most), (condition.synthesizer, condition.training)
         stands_for_repeat = own_way == extra or extra not in repeats[condition.repeat]
         if auto and stands_for_repeat:
-            found.append((replace(condition, training="measured + synthetic", synthesizer=AUTO), value))
+            complete.append((replace(condition, training="measured + synthetic", synthesizer=AUTO), value))
         if not auto and own_way != extra and all(own_way in others for others in repeats.values()):
-            found.append((condition, value))
+            complete.append((condition, value))
         if not auto and stands_for_repeat and any(extra in others for others in repeats.values()):
-            found.append((replace(condition, training=most), value))
-    return found
+            complete.append((replace(condition, training=most), value))
+    return complete

@@ -144,15 +144,15 @@ class Experiment:
         """Return the training sets with spectra of a field model, and their numbers of extra synthetic positions."""
         # by default only where held-out measured spectra gain from extra positions
         wanted = self.extra is not None or bool(validation and validation["recommended_n_synthetic"])
-        found: list[tuple[Training, int]] = [("measured + synthetic", 0)]
+        trainings: list[tuple[Training, int]] = [("measured + synthetic", 0)]
         if wanted and self.n_synthetic:
-            found.append(("measured + synthetic + extra", self.n_synthetic))
-        return found
+            trainings.append(("measured + synthetic + extra", self.n_synthetic))
+        return trainings
 
     def model_type(self, name: str) -> type[FieldModel]:
         """Return the type of a field model by its name."""
-        found: type[FieldModel] = type(self.own_models[name]) if name in self.own_models else FIELD_MODELS[name]
-        return found
+        kind: type[FieldModel] = type(self.own_models[name]) if name in self.own_models else FIELD_MODELS[name]
+        return kind
 
     def make_model(self, name: str, repeat: int, preset: Preset = "quick") -> FieldModel:
         """Return a field model that is not fitted."""

@@ -14,7 +14,7 @@ from augment.choose import candidates
 from augment.cross_validation import LOCATOR, STAND_IN
 from augment.estimators import Estimator
 from augment.positions import Count
-from augment.turbo.condition import CHOSEN, LOCATED, NETWORKS, Condition, MeasuredSubset, Training
+from augment.turbo.condition import CHOSEN, LOCATED, NETWORKS, Condition, MeasuredSubset, Row, Training
 from augment.turbo.experiment import ROOM_MODEL, Experiment
 from augment.turbo.results import TurboResult
 from augment.turbo.stages import compare, evaluate, find_room, hold_out, locate, synthesize
@@ -93,7 +93,10 @@ def learn(experiment: Experiment, keep: Memo, executor: Executor | None = None) 
     """Return the result of each measured fraction. Measured subsets are computed side by side."""
     steps = Steps(experiment, keep, executor)
     results = {fraction: TurboResult(experiment, fraction, keep) for fraction in experiment.fractions}
-    subsets = [_learn(experiment, one, steps, results[one.measured_fraction]) for one in experiment.subsets]
+    subsets = [
+        _Learning(experiment, subset, steps, results[subset.measured_fraction]).phases()
+        for subset in experiment.subsets
+    ]
     for _ in zip_longest(*subsets):
         pass
     for result in results.values():
@@ -106,114 +109,158 @@ def learn(experiment: Experiment, keep: Memo, executor: Executor | None = None) 
     return list(results.values())
 
 
-def _learn(
-    experiment: Experiment, subset: MeasuredSubset, steps: Steps[Experiment], result: TurboResult
-) -> Iterator[None]:
-    """Add the results of a measured subset. Yield before each wait for values, so that other subsets start their steps."""
+class _Learning:
+    """Steps of one measured subset."""
+
+    def __init__(
+        self, experiment: Experiment, subset: MeasuredSubset, steps: Steps[Experiment], result: TurboResult
+    ) -> None:
+        self.experiment, self.subset, self.steps, self.result = experiment, subset, steps, result
+        self.conditions: list[Condition] = []
+        self.located = Condition(LOCATOR, "measured", "", 0, subset.measured_fraction, subset.repeat)
+        self.choice = f"choice-{subset}"  # name of the step that compares field models
+        self.held_out: list[str] = []  # names of the steps with errors on held-out spectra
+        self.fast = [name for name in experiment.named if not experiment.model_type(name).slow]
+        self.compares = bool(self.fast or not experiment.named)
+        self.searches = ROOM_MODEL in experiment.candidates
+        self.parts = experiment.parts(subset) if subset.repeat == 0 else []
+        # the subset without the folds that a search for a room leaves out
+        self.blind = self.parts if self.searches else []
+        compared = [*experiment.candidates, *(self.fast or candidates(experiment.train))]
+        if self.compares and any(map(experiment.finds_room, compared)):
+            self.blind = [replace(subset, without=folds) for folds in experiment.blind_folds(subset)[1]]
+
+    def phases(self) -> Iterator[None]:
+        """Start all steps, and add their values to the result.
+
+        Yield before each wait for values, so that other subsets start their steps.
+        """
+        self.begin()
+        yield
+        self.use_rooms()
+        yield
+        compared = self.steps[self.choice] if self.compares else {}
+        names = self.experiment.named or [compared["choice"]["name"]]
+        validation = compared.get("cross_validation", {})
+        trainings = {name: self.experiment.trainings(validation.get(name)) for name in names}
+        self.predict(trainings)
+        yield
+        for name in names:
+            self.steps[self.synthesis(name)]
+            self.train_turbo(name, trainings[name])
+        yield
+        self.collect(compared, names)
+
+    def synthesis(self, name: str) -> str:
+        """Return the name of the step in which a field model predicts spectra."""
+        return f"synthesis_{name}-{self.subset}"
 
     def train(
-        estimator: str, training: Training = "measured", extra: int = 0, synthesizer: str = "", *, saved: bool = False
+        self,
+        estimator: str,
+        training: Training = "measured",
+        extra: int = 0,
+        synthesizer: str = "",
+        *,
+        saved: bool = False,
     ) -> Condition:
+        """Start the training of an estimator, which is saved in the first repeat."""
+        subset = self.subset
         condition = Condition(estimator, training, synthesizer, extra, subset.measured_fraction, subset.repeat)
         saved_as = None
         if saved and subset.repeat == 0:
             saved_as = condition.name if condition.is_turbo else f"{condition.name}-measured"
-            result.files[condition.method] = saved_as
+            self.result.files[condition.method] = saved_as
         # trainings on synthetic spectra begin last and take longest
-        steps.start(condition.result_name, condition.method, evaluate, condition, saved_as, first=condition.is_turbo)
+        self.steps.start(
+            condition.result_name, condition.method, evaluate, condition, saved_as, first=condition.is_turbo
+        )
         return condition
 
-    def hold(conditions: list[Condition], with_room: bool = False) -> None:
-        if parts:
-            rooms = [steps[room_of(part)] for part in parts if with_room]
-            # the training of the paper's network takes too long to be repeated
-            repeated = [one for one in conditions if not (one.is_network and experiment.preset == "paper")]
-            name, title = f"held_out_{conditions[0].result_name}", f"held-out spectra, {conditions[0].training_set}"
-            first = conditions[0].is_turbo
-            held_out.append(steps.start(name, title, hold_out, subset, repeated, rooms, first=first))
+    def hold(self, conditions: list[Condition], with_room: bool = False) -> None:
+        """Start the comparison of conditions on held-out spectra."""
+        if not self.parts:
+            return
+        rooms = [self.steps[self.room_of(part)] for part in self.parts if with_room]
+        # the training of the paper's network takes too long to be repeated
+        repeated = [one for one in conditions if not (one.is_network and self.experiment.preset == "paper")]
+        first = conditions[0]
+        name, title = f"held_out_{first.result_name}", f"held-out spectra, {first.training_set}"
+        self.held_out.append(
+            self.steps.start(name, title, hold_out, self.subset, repeated, rooms, first=first.is_turbo)
+        )
 
-    # from the measured spectra alone: the room is found, with and without held-out folds, and references are trained
-    fast = [name for name in experiment.named if not experiment.model_type(name).slow]
-    is_compared = bool(fast or not experiment.named)
-    searches = ROOM_MODEL in experiment.candidates
-    compared_models = [*experiment.candidates, *(fast or candidates(experiment.train))]
-    parts = experiment.parts(subset) if subset.repeat == 0 else []
-    blind = parts if searches else []
-    if is_compared and any(map(experiment.finds_room, compared_models)):
-        blind = [replace(subset, without=some) for some in experiment.blind_folds(subset)[1]]
+    def find(self, subset: MeasuredSubset | None = None) -> str:
+        """Start the search for the room in the measured spectra, or in those of a subset of them; return its name."""
+        subset = subset or self.subset
+        return self.steps.start(f"room-{subset}", "finding the room", find_room, subset, first=True)
 
-    def find(some: MeasuredSubset = subset) -> str:
-        return steps.start(f"room-{some}", "finding the room", find_room, some, first=True)
+    def room_of(self, part: MeasuredSubset) -> str:
+        """Return the name of a search without the spectra that a part holds out."""
+        return self.find(next(blind for blind in self.blind if set(part.without) <= set(blind.without)))
 
-    def room_of(part: MeasuredSubset) -> str:
-        return find(next(some for some in blind if set(part.without) <= set(some.without)))
+    def begin(self) -> None:
+        """From the measured spectra alone: find the room, with and without held-out folds, and train references."""
+        for part in self.blind:
+            self.find(part)
+        if self.searches:
+            self.find()
+        experiment = self.experiment
+        usable = [name for name in experiment.evaluated if name not in experiment.lacking]
+        self.conditions = [self.train(name, saved=name == STAND_IN) for name in usable]
+        self.full = [self.train(name, "all measured") for name in experiment.trainable]
+        self.hold(self.conditions)
 
-    for part in blind:
-        find(part)
-    if searches:
-        find()
-    conditions = [
-        train(name, saved=name == STAND_IN) for name in experiment.evaluated if name not in experiment.lacking
-    ]
-    full = [train(name, "all measured") for name in experiment.trainable]
-    held_out: list[str] = []
-    hold(conditions)
+    def use_rooms(self) -> None:
+        """Compare field models, and locate held-out spectra and test spectra by the room."""
+        if self.compares:
+            rooms = [self.steps[self.find(part)] for part in self.blind]
+            self.steps.start(self.choice, "comparing field models", compare, self.subset, self.fast, rooms, first=True)
+        if self.searches and all(self.steps[self.room_of(part)].get("planes") for part in self.parts):
+            self.hold([self.located], with_room=True)
+        if self.searches and (room := self.steps[self.find()]).get("planes"):
+            self.steps.start(self.located.result_name, LOCATED, locate, self.subset, room)
 
-    yield
-    # field models are compared; held-out spectra and test spectra are located by the room
-    choice = f"choice-{subset}"
-    if is_compared:
-        found = [steps[find(part)] for part in blind]
-        steps.start(choice, "comparing field models", compare, subset, fast, found, first=True)
-    located = Condition(LOCATOR, "measured", "", 0, subset.measured_fraction, subset.repeat)
-    if searches and all(steps[room_of(part)].get("planes") for part in parts):
-        hold([located], with_room=True)
-    if searches and steps[find()].get("planes"):
-        steps.start(located.result_name, LOCATED, locate, subset, steps[find()])
+    def predict(self, trainings: dict[str, list[tuple[Training, int]]]) -> None:
+        """Predict spectra by the field models that were asked for or chosen, and by others for comparison."""
+        self.models = dict.fromkeys((*trainings, *self.experiment.candidates))
+        for name in sorted(self.models, key=self.experiment.finds_room):
+            room = self.steps[self.find()] if self.experiment.finds_room(name) else None
+            extra = trainings[name][-1][1] if name in trainings else None
+            title = f"synthesizing spectra by {name}"
+            self.steps.start(
+                self.synthesis(name), title, synthesize, self.subset, name, extra, room, first=name in trainings
+            )
 
-    yield
-    # the field models that were asked for or chosen, and others for comparison, predict spectra
-    compared = steps[choice] if is_compared else {}
-    names = experiment.named or [compared["choice"]["name"]]
-    trainings = {name: experiment.trainings(compared.get("cross_validation", {}).get(name)) for name in names}
-    models = dict.fromkeys((*names, *experiment.candidates))
-    for name in sorted(models, key=experiment.finds_room):
-        room = None
-        if experiment.finds_room(name):
-            room = steps[find()]
-        extra = trainings[name][-1][1] if name in names else None
-        title = f"synthesizing spectra by {name}"
-        steps.start(f"synthesis_{name}-{subset}", title, synthesize, subset, name, extra, room, first=name in names)
-
-    yield
-    # estimators are trained on measured and synthetic spectra
-    kept = (*NETWORKS.values(), STAND_IN)
-    for name in names:
-        steps[f"synthesis_{name}-{subset}"]
+    def train_turbo(self, name: str, trainings: list[tuple[Training, int]]) -> None:
+        """Train estimators on measured spectra and on synthetic ones of a field model."""
+        experiment, kept = self.experiment, (*NETWORKS.values(), STAND_IN)
         turbo: list[Condition] = []
-        for training, extra in trainings[name]:
-            is_last = (training, extra) == trainings[name][-1]
+        for training, extra in trainings:
+            is_last = (training, extra) == trainings[-1]
             turbo += [
-                train(one, training, extra, name, saved=is_last and experiment.is_first(name) and one in kept)
+                self.train(one, training, extra, name, saved=is_last and experiment.is_first(name) and one in kept)
                 for one in experiment.trainable
                 if is_last or one not in NETWORKS.values()  # whose training takes most of the time
             ]
-        conditions += turbo
+        self.conditions += turbo
         if not experiment.model_type(name).slow:
-            hold(turbo, experiment.finds_room(name))
+            self.hold(turbo, experiment.finds_room(name))
 
-    yield
-    for name in models:
-        result.add_synthesis(subset, name, name in names, steps[f"synthesis_{name}-{subset}"])
-    for condition in conditions:
-        result.add(condition, steps[condition.result_name])
-    if searches:
-        room = steps[find()]
-        refused = {"refused": room.get("refused", "no plane explains the spectra")}
-        result.add(located, steps[located.result_name] if room.get("planes") else refused)
-    for condition in full:
-        result.add(condition, steps[condition.result_name])
-    if subset.repeat == 0:
-        result.compared = compared
-    for name in held_out:
-        result.held_out |= steps[name]["errors"]
+    def collect(self, compared: Row, names: list[str]) -> None:
+        """Add the values of all steps to the result."""
+        steps, result = self.steps, self.result
+        for name in self.models:
+            result.add_synthesis(self.subset, name, name in names, steps[self.synthesis(name)])
+        for condition in self.conditions:
+            result.add(condition, steps[condition.result_name])
+        if self.searches:
+            room = steps[self.find()]
+            refused = {"refused": room.get("refused", "no plane explains the spectra")}
+            result.add(self.located, steps[self.located.result_name] if room.get("planes") else refused)
+        for condition in self.full:
+            result.add(condition, steps[condition.result_name])
+        if self.subset.repeat == 0:
+            result.compared = compared
+        for name in self.held_out:
+            result.held_out |= steps[name]["errors"]

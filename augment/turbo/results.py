@@ -143,18 +143,18 @@ class TurboResult(Result):
         """A row for each condition that locates and each test spectrum: truth, estimate, error and radius."""
         test, tables = self.experiment.test, [DataFrame()]
         for condition, value in self.evaluated:
-            if (found := value.get("located")) is None:
+            if (located := value.get("located")) is None:
                 continue
-            estimate = torch.tensor(found["position"], dtype=torch.float64)
+            estimate = torch.tensor(located["position"], dtype=torch.float64)
             columns: Row = dict(self._rows)
             for name, at in (("truth", test.position), ("estimate", estimate)):
                 columns |= {f"{name}_{axis}_m": at[:, number] for number, axis in enumerate("xyz")}
             columns |= {
                 "error_m": (estimate - test.position).norm(dim=1),
-                "credible_radius_80_m": found["radius"],
-                "covered": np.array(found["level"]) < LEVEL,
-                "containing_level": found["level"],
-                "ambiguous": found["ambiguous"],
+                "credible_radius_80_m": located["radius"],
+                "covered": np.array(located["level"]) < LEVEL,
+                "containing_level": located["level"],
+                "ambiguous": located["ambiguous"],
             }
             tables.append(DataFrame(condition.columns | columns))
         return concat(tables, ignore_index=True)
@@ -213,8 +213,8 @@ class TurboResult(Result):
     @property
     def choice(self) -> Row | None:
         """Choice of the estimator by cross-validation; `choice["name"]` is its method. None if nothing was compared."""
-        found: Row | None = self.metrics["estimator_choice"]
-        return found
+        choice: Row | None = self.metrics["estimator_choice"]
+        return choice
 
     @cached_property
     def best(self) -> Estimator | MatchedField | None:
@@ -222,9 +222,9 @@ class TurboResult(Result):
         if self.choice is None:
             return None
         if self.choice["file"]:
-            found = load(self.folder / self.choice["file"])
-            assert isinstance(found, Estimator | MatchedField)
-            return found
+            saved = load(self.folder / self.choice["file"])
+            assert isinstance(saved, Estimator | MatchedField)
+            return saved
         assert self.chosen is not None
         (own, _), experiment = self.chosen, self.experiment
         estimator = experiment.make_estimator(own.estimator, 0)
@@ -254,9 +254,9 @@ class TurboResult(Result):
         """
         conditions = conditions_of(self.metrics["methods"])
         rows: list[Row] = []
-        for method, found in self.metrics["methods"].items():
-            error = found["great_circle_deg"]
-            change = found["changes"].get(conditions[method].measured_only.method)
+        for method, entry in self.metrics["methods"].items():
+            error = entry["great_circle_deg"]
+            change = entry["changes"].get(conditions[method].measured_only.method)
             row: Row = {name: error[name] for name in ("median", "low", "high", "p90")}
             if change is not None:
                 columns = {"change": "change", "change_low": "low", "change_high": "high"}
@@ -342,12 +342,12 @@ class TurboResult(Result):
         conditions = {condition.method: condition for condition, _ in reversed(self.pooled)}  # of the first repeat
         times = DataFrame([c.columns | value["seconds"] for c, value in self.pooled])
         seconds = averaged(times, "method", ("train", "estimate"))
-        found = summaries(self.errors, "method", ANGLES)
+        errors = summaries(self.errors, "method", ANGLES)
         reference = reference_of(
-            conditions, {name: entry["great_circle_deg"]["median"] for name, entry in found.items()}
+            conditions, {name: entry["great_circle_deg"]["median"] for name, entry in errors.items()}
         )
         metrics = {}
-        for method, entry in found.items():
+        for method, entry in errors.items():
             condition = conditions[method]
             others = dict.fromkeys((condition.measured_only.method, reference)) if condition.is_turbo else ()
             changes = {other: self._change(other, method) for other in others if other in conditions}
@@ -358,8 +358,8 @@ class TurboResult(Result):
         own = [(condition, value["located"]) for condition, value in self.evaluated if "located" in value]
         if not own:
             return {}
-        weights = {condition.method: found["weights"] for condition, found in reversed(own)}  # of the first repeat
-        times = DataFrame([c.columns | found["seconds"] for c, found in own])
+        weights = {condition.method: located["weights"] for condition, located in reversed(own)}  # of the first repeat
+        times = DataFrame([c.columns | located["seconds"] for c, located in own])
         seconds = averaged(times, "method", ("room", "fit", "locate"))
         shares = averaged(self.positions, "method", ("covered", "ambiguous"))
         return {

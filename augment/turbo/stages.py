@@ -24,6 +24,7 @@ from swiftwrf.contrib.comparison.steps import STEPS
 from swiftwrf.data.store import Store
 from swiftwrf.locate import MatchedField, MatchedFieldConfig, Posterior
 from swiftwrf.metrics import LEVEL, l1, psnr, ssim
+from swiftwrf.models import FieldModel
 from swiftwrf.models.base import synthesized
 from swiftwrf.runtime.checkpoint import Saved, read, write
 
@@ -198,20 +199,33 @@ def synthesize(
         "synthesize": tested - fitted,
         "draw": time.perf_counter() - fitted,
     }
-    pairs = zip(Store(test).batches(), experiment.test.store.batches(), strict=True)
-    scored = [[function(*pair) for function in SCORE.values()] for pair in pairs]
-    scores = {key: torch.cat(batches) for key, batches in zip(SCORE, zip(*scored, strict=True), strict=True)}
+    scores = _scores(Store(test), experiment.test.store)
     if trains:
         write(folder / _file(synthesis), KIND, tensors, {})
         if subset.repeat == 0:
             save_model(model, subset.key, measured, folder)
             if experiment.is_first(name):
-                std = None
-                if model.predict(experiment.test.position[:1]).std is not None:
-                    std = _as_bytes_at(experiment.test.position, lambda at: cast(Tensor, model.predict(at).std))
-                file = folder / f"examples-mix{subset.key}.npz"
-                save_examples(file, name, experiment.test, test, scores["psnr_db"], std)
+                _save_examples(
+                    experiment, folder / f"examples-mix{subset.key}.npz", model, name, test, scores["psnr_db"]
+                )
     return {"history": records, "seconds": seconds, "scores": scores}
+
+
+def _scores(predicted: Store, measured: Store) -> dict[str, Tensor]:
+    """Return the scores (n,) of predicted spectra by name."""
+    pairs = zip(predicted.batches(), measured.batches(), strict=True)
+    scored = [[function(*pair) for function in SCORE.values()] for pair in pairs]
+    return {key: torch.cat(batches) for key, batches in zip(SCORE, zip(*scored, strict=True), strict=True)}
+
+
+def _save_examples(
+    experiment: Experiment, file: Path, model: FieldModel, name: str, predicted: Tensor, psnr_db: Tensor
+) -> None:
+    """Save measured and predicted test spectra, with the standard deviations of a model that has some."""
+    std = None
+    if model.predict(experiment.test.position[:1]).std is not None:
+        std = _as_bytes_at(experiment.test.position, lambda at: cast(Tensor, model.predict(at).std))
+    save_examples(file, name, experiment.test, predicted, psnr_db, std)
 
 
 def _as_bytes_at(position: Tensor, predict: Callable[[Tensor], Tensor]) -> Tensor:
@@ -263,15 +277,15 @@ def locate(experiment: Experiment, folder: Path, subset: MeasuredSubset, room: R
         return {"refused": str(error)}
     fitted = time.perf_counter()
     parts = [located(locator, test.subset(rows)) for rows in torch.arange(len(test)).split(BATCH_SPECTRA)]
-    found = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+    columns = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
     ended = time.perf_counter()
     if subset.repeat == 0:
         locator.save(model_file(folder, LOCATOR, subset.key))
-        save_located(folder / f"located-mix{subset.key}.npz", locator, measured, test, found["position"])
+        save_located(folder / f"located-mix{subset.key}.npz", locator, measured, test, columns["position"])
     seconds = {"room": room["seconds"], "fit": fitted - began, "locate": ended - fitted}
     return {
-        "estimate": found.pop("estimate"),
-        "located": found | {"weights": locator.weight, "seconds": seconds},
+        "estimate": columns.pop("estimate"),
+        "located": columns | {"weights": locator.weight, "seconds": seconds},
         "seconds": {"train": seconds["room"] + seconds["fit"], "estimate": seconds["locate"]},
         "history": [],
         "counts": Mixed.measured(measured).counts,

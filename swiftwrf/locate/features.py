@@ -20,7 +20,7 @@ from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.beamforming import unit_power
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.gp import GaussianProcess
-from swiftwrf.models.geometry.channels import field, sources, waves
+from swiftwrf.models.geometry.channels import sources, superposed, waves
 from swiftwrf.models.geometry.model import GeometryModel, kept_snapshots
 from swiftwrf.models.geometry.path_gains import PathGains
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation, coarray_numbers, retrieve_phases
@@ -97,24 +97,24 @@ class PathWaves:
     @classmethod
     def at(cls, room: GeometryModel, position: Tensor, frequency: Tensor = CARRIER) -> PathWaves:
         """Compute the waves at positions (m, 3) [m] and frequencies (F,) relative to the carrier."""
-        scene = room.scene(position)
+        scene = room.link_at(position)
         return cls(position, waves(room.reflectors, scene, frequency), room.gains(scene), frequency)
 
     @cached_property
     def channel(self) -> Tensor:
         """Channel of each element by the room's path gains, complex64 (m, F, K)."""
-        return field(self.gain, self.wave)
+        return superposed(self.gain, self.wave)
 
 
 def channels_beside(room: GeometryModel, position: Tensor, away: Tensor, frequency: Tensor) -> Tensor:
-    """Return channels at positions beside others, by the lengths of the paths to first order and gains that do not change.
+    """Return channels near positions, with path lengths to first order in the distance and gains that do not change.
 
     This takes a small part of the time of `PathWaves`, and suffices to choose candidates.
 
     Args:
         room: Room with S images.
         position: Positions, float64 (m, 3) [m].
-        away: Vectors from each of them to C positions beside it, float64 (C, 3) [m].
+        away: Vectors from each of them to C positions near it, float64 (C, 3) [m].
         frequency: Frequencies relative to the carrier, (F,).
 
     Returns:
@@ -123,7 +123,7 @@ def channels_beside(room: GeometryModel, position: Tensor, away: Tensor, frequen
     here = PathWaves.at(room, position, frequency)
 
     def rays(at: Tensor) -> Tensor:
-        scene = room.scene(at)
+        scene = room.link_at(at)
         return sources(room.reflectors, scene) - scene.receiver
 
     ray = rays(position)

@@ -50,9 +50,9 @@ from swiftwrf.runtime.threads import parallel_map
 from swiftwrf.runtime.validation import PositiveInt
 
 CHANNEL_CELLS = 8  # times as many first cells for channels, which are not computed at each of them
-CHANNEL_PARTS = 4  # along each edge of a cell with paths of its own
+CHANNEL_PARTS = 4  # along each edge of a cell with paths of its own; not studied
 MIN_FLOOR = 1e-4  # of missing coherence, by rounding
-MIN_VARIANCE = 1e-6  # of the errors of co-array numbers, relative to their mean square
+MIN_VARIANCE = 1e-6  # of the errors of co-array numbers, relative to their mean square, by rounding
 BATCH_CANDIDATES = 2048  # whose waves are computed together: as many as a processor's cache holds
 BATCH_CELLS = 256  # the same with parts
 MAX_KEPT_NUMBERS = 2**25  # co-array numbers of channels at all cells: 134 MB
@@ -122,7 +122,7 @@ class Likelihoods(ABC):
         def of_batch(rows: Tensor) -> Tensor:
             waves, target = PathWaves.at(self.room, at[rows], self.frequency), observed.subset(owner[rows])
             none = torch.zeros(len(rows))
-            return torch.stack([part(waves, target) if share > 0 else none for part, share in counted])
+            return torch.stack([part(waves, target) if factor > 0 else none for part, factor in counted])
 
         batches = torch.arange(n * m).split(BATCH_CANDIDATES // len(self.frequency))
         return torch.cat(parallel_map(of_batch, batches), dim=1).reshape(len(counted), n, m)
@@ -166,24 +166,24 @@ class SpectrumLikelihoods(Likelihoods):
 
         def fitted(kept: Tensor) -> tuple[GeometryModel, PathGains, PhaseLikelihood]:
             phases = scene.subset(torch.isin(rows, kept).nonzero()[:, 0])
-            own = room.refined_on(phases)
-            likelihood = PhaseLikelihood.fit([(own, PathWaves.at(own, train.position[kept]), features.subset(kept))])
-            return own, fit_path_gains(own, phases, kernel, prior), likelihood
+            refined = room.refined_on(phases)
+            waves = PathWaves.at(refined, train.position[kept])
+            likelihood = PhaseLikelihood.fit([(refined, waves, features.subset(kept))])
+            return refined, fit_path_gains(refined, phases, kernel, prior), likelihood
 
         outs, kept = _held_out_and_kept(fold)
         fits = parallel_map(fitted, kept)
         residual = torch.empty(2, *features.coarray.shape)
-        for out, (own, gains, _) in zip(outs, fits[:-1], strict=True):
-            waves, observed = PathWaves.at(own, train.position[out]), features.coarray[out]
-            residual[:, out] = torch.stack(
-                [predict(waves)[0] - observed for predict in gain_features(own.array, gains)]
-            )
+        for out, (refined, gains, _) in zip(outs, fits[:-1], strict=True):
+            waves, observed = PathWaves.at(refined, train.position[out]), features.coarray[out]
+            for row, predict in enumerate(gain_features(refined.array, gains)):
+                residual[row, out] = predict(waves)[0] - observed
         floor = MIN_VARIANCE * float(features.coarray.square().mean())
-        found = []
-        for known, (own, gains, phases) in zip(kept, fits, strict=True):
+        likelihoods = []
+        for known, (refined, gains, phases) in zip(kept, fits, strict=True):
             constant, varying = (Student.fit(part[known], floor) for part in residual)
-            found.append(cls(own, CARRIER, phases.log_variance, gains, (constant, varying)))
-        return features, found
+            likelihoods.append(cls(refined, CARRIER, phases.log_variance, gains, (constant, varying)))
+        return features, likelihoods
 
     def features(self, data: Numbers | Spectra, seed: int) -> SpectrumFeatures:
         values, grid = data.spectrum if isinstance(data, Spectra) else data, self.room.grid
@@ -198,11 +198,11 @@ class SpectrumLikelihoods(Likelihoods):
 
         def whitened(position: Tensor) -> list[Tensor]:
             waves = PathWaves.at(self.room, position)
-            return [own.predict(waves)[0] @ own.distribution.whitening for own in likelihoods]
+            return [part.predict(waves)[0] @ part.distribution.whitening for part in likelihoods]
 
-        parts = zip(*parallel_map(whitened, cells.position.split(BATCH_CANDIDATES)), strict=True)
-        ones = torch.ones(len(cells.position))
-        return cells, [own.screen(torch.cat(part), ones) for own, part in zip(likelihoods, parts, strict=True)]
+        numbers = zip(*parallel_map(whitened, cells.position.split(BATCH_CANDIDATES)), strict=True)
+        std = torch.ones(len(cells.position))
+        return cells, [part.screen(torch.cat(batches), std) for part, batches in zip(likelihoods, numbers, strict=True)]
 
     def check(self) -> None:
         super().check()

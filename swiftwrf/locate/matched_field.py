@@ -95,8 +95,8 @@ class MatchedField(Locator):
     Three likelihoods of spectra are pooled: co-array numbers predicted by constant path gains, by position-dependent path
     gains, and element phases under uncertain path gains. Those of channels are: channels under uncertain and under constant
     path gains, and co-array numbers predicted by constant path gains and measured channels nearby. Covariances, weights and
-    the radii of credible regions come from held-out positions. Weights maximise the posterior density there. For each fold
-    the room is refined, not searched, without it.
+    the radii of credible regions come from held-out positions. Weights maximise the posterior density there. The room is
+    searched in all spectra, and refined without each fold.
 
     The likelihoods of several stations are pooled in the same way, so a station with a poor room has small weights. A
     transmission need not have been received by all stations.
@@ -217,9 +217,9 @@ class MatchedField(Locator):
     def _held_out(
         self, position: Tensor, observed: Observed, fold: Tensor, fitted: Sequence[Mapping[int, Likelihoods]]
     ) -> Iterator[HeldOut]:
-        """Yield some transmissions of each fold with their likelihoods by the other folds."""
-        (some,) = subsample(torch.arange(len(position)), rows=self.config.n_calibration)
-        for rows, _ in each_fold(fold, some):
+        """Yield at most `n_calibration` transmissions, by folds, with their likelihoods by the other folds."""
+        (chosen,) = subsample(torch.arange(len(position)), rows=self.config.n_calibration)
+        for rows, _ in each_fold(fold, chosen):
             number, part = int(fold[rows[0]]), observed.subset(rows)
             likelihoods = [parts.get(number, parts[ALL]) for parts in fitted]  # a station may have none of the fold
             at_truth = self._values(likelihoods, position[rows][:, None], part)[..., 0]
@@ -239,7 +239,7 @@ class MatchedField(Locator):
         return torch.cat(found)
 
     def _searched(self, observed: Observed, likelihoods: Sequence[Likelihoods]) -> Iterator[tuple[Cells, Tensor]]:
-        """Yield cells (b, m) and log-likelihoods (k, b, m) of some transmissions at a time."""
+        """Yield cells (b, m) and log-likelihoods (k, b, m) of 16 transmissions at a time."""
         generator = torch.Generator().manual_seed(self.config.seed)
         config = self.config
         for rows in torch.arange(len(observed)).split(16):  # likelihoods at all cells: 26 MB at most, of channels 205
@@ -288,9 +288,11 @@ class MatchedField(Locator):
                 features.append(None)
         observed = Observed(row, features)
         parts = self._searched(observed, self.likelihoods)
-        found = Posterior.cat([self._posterior(cells.position, values, cells.log_volume) for cells, values in parts])
+        posterior = Posterior.cat(
+            [self._posterior(cells.position, values, cells.log_volume) for cells, values in parts]
+        )
         # within half a wavelength the field changes too little for a second mode
-        return replace(found, mode_width_m=max(each.room.array.wavelength for each in self.likelihoods) / 2)
+        return replace(posterior, mode_width_m=max(each.room.array.wavelength for each in self.likelihoods) / 2)
 
     def _by_station(self, spectrum: Numbers | Spectra | Stations) -> Mapping[str, tuple[Tensor, Numbers | Spectra]]:
         """Return the rows that stations of this locator received, and their spectra, by station.

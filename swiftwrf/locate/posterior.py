@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Annotated, Self
 
 import numpy as np
@@ -23,11 +24,9 @@ from swiftwrf.positions import nearest
 from swiftwrf.runtime.validation import checked
 
 PLAN_PIXELS = 80  # of a posterior in plan, along its longer side
-JUMP = 1e-3  # prior probability of a displacement that does not depend on the distance, for each step
 CHUNK = 2**22  # pairs of candidates whose distances are computed together
 MAX_KEPT_PAIRS = 4096**2  # pairs of shared candidates whose distances are kept from step to step
 MAX_PAIRS = 20_000**2  # pairs of candidates of two consecutive observations
-RIDGE = 1e-3  # of the weights: keeps those that the data do not determine near their start
 PoolWeights = Annotated[Tensor, "float64 k", Ge(0), Le(1e3)]
 Inflation = Annotated[float, Ge(0), Lt(math.inf)]
 
@@ -195,18 +194,17 @@ class Posterior(Displayed):
         at = self.position.expand(len(self), -1, -1)
         return at[torch.arange(len(self)), self.log_weight.argmax(dim=1)]
 
-    @property
+    @cached_property
     def median(self) -> Tensor:
         """Geometric median, which minimises the expected distance, (n, 3) [m] (E. Weiszfeld, Tohoku Math. J. 43, 1937).
 
         With floors it is that of the candidates on the most probable floor.
         """
-        own, start = self.weight, self.mean
+        position, weight = self.position.expand(len(self), -1, -1), self.weight
         if self.floors is not None:
-            own = own * (self._floor_number == self.floor_probability.argmax(dim=1, keepdim=True))
-            own = own / own.sum(dim=1, keepdim=True)
-            start = torch.einsum("nm,nmk->nk", own, self.position.expand(len(self), -1, -1))
-        return _geometric_median(self.position.expand(len(self), -1, -1), own, start, self.resolution_m)
+            weight = weight * (self._floor_number == self.floor_probability.argmax(dim=1, keepdim=True))
+            weight = weight / weight.sum(dim=1, keepdim=True)
+        return _geometric_median(position, weight, self.resolution_m)
 
     @property
     def _floor_number(self) -> Tensor:
@@ -252,10 +250,8 @@ class Posterior(Displayed):
         Args:
             vectors: Unit vector towards each candidate, as `position`: (n, m, 3) or (1, m, 3).
         """
-        vectors = vectors.expand(len(self), -1, -1)
-        start = torch.einsum("nm,nmk->nk", self.weight, vectors)
-        found = _geometric_median(vectors, self.weight, start, 1e-4)
-        unit: Tensor = found / found.norm(dim=1, keepdim=True).clamp_min(1e-12)
+        median = _geometric_median(vectors.expand(len(self), -1, -1), self.weight, 1e-4)
+        unit: Tensor = median / median.norm(dim=1, keepdim=True).clamp_min(1e-12)
         return unit
 
     @property
@@ -279,14 +275,13 @@ class Posterior(Displayed):
         return radius
 
 
-def _geometric_median(point: Tensor, weight: Tensor, start: Tensor, smallest: float) -> Tensor:
-    """Return the weighted geometric median (n, k) of points (n, m, k), from a start (n, k)."""
-    found = start
+def _geometric_median(point: Tensor, weight: Tensor, smallest: float) -> Tensor:
+    """Return the geometric median (n, k) of points (n, m, k) with weights that sum to 1, from their mean."""
+    median = torch.einsum("nm,nmk->nk", weight, point)
     for _ in range(30):
-        away = (point - found[:, None]).norm(dim=2).clamp_min(max(smallest / 4, 1e-9))
-        pull = weight / away
-        found = torch.einsum("nm,nmk->nk", pull, point) / pull.sum(dim=1, keepdim=True)
-    return found
+        pull = weight / (point - median[:, None]).norm(dim=2).clamp_min(max(smallest / 4, 1e-9))
+        median = torch.einsum("nm,nmk->nk", pull, point) / pull.sum(dim=1, keepdim=True)
+    return median
 
 
 def normalised(log_mass: Tensor) -> Tensor:
@@ -301,7 +296,7 @@ def normalised(log_mass: Tensor) -> Tensor:
     return log_mass - total
 
 
-def pooled_weights(at_truth: Tensor, at_candidates: Tensor, log_volume: Tensor) -> Tensor:
+def pooled_weights(at_truth: Tensor, at_candidates: Tensor, log_volume: Tensor, *, ridge: float = 1e-3) -> Tensor:
     """Return the weights of a log-linear pool that maximise the posterior density at held-out true positions.
 
         log p(x | y) = sum_k w_k l_k(x, y) - log sum_j V_j exp(sum_k w_k l_k(x_j, y)),    w_k >= 0
@@ -314,6 +309,7 @@ def pooled_weights(at_truth: Tensor, at_candidates: Tensor, log_volume: Tensor) 
         at_truth: Log-likelihoods at the true positions, (k, n).
         at_candidates: Log-likelihoods at the candidates of each observation, (k, n, m).
         log_volume: Logarithms of the candidates' prior masses, (n, m).
+        ridge: Factor of the squared weights in the objective. It bounds weights that the data do not determine. Not studied.
 
     Returns:
         Weights, float64 (k,).
@@ -328,15 +324,15 @@ def pooled_weights(at_truth: Tensor, at_candidates: Tensor, log_volume: Tensor) 
     def loss(values: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         weight = torch.from_numpy(values)
         log_mass = torch.einsum("k,knm->nm", weight, candidates) + volume
-        total = log_mass.logsumexp(dim=1, keepdim=True)
-        expected = torch.einsum("nm,knm->kn", (log_mass - total).exp(), candidates)
-        density = torch.einsum("k,kn->n", weight, truth) - total[:, 0]
-        gradient = (truth - expected).mean(dim=1) - 2 * RIDGE * weight
-        return float(RIDGE * weight.square().sum() - density.mean()), -gradient.numpy()
+        log_total = log_mass.logsumexp(dim=1, keepdim=True)
+        expected = torch.einsum("nm,knm->kn", (log_mass - log_total).exp(), candidates)
+        density = torch.einsum("k,kn->n", weight, truth) - log_total[:, 0]
+        gradient = (truth - expected).mean(dim=1) - 2 * ridge * weight
+        return float(ridge * weight.square().sum() - density.mean()), -gradient.numpy()
 
-    first = np.full(len(at_truth), 0.3 / len(at_truth))
-    found = minimize(loss, first, jac=True, method="L-BFGS-B", bounds=[(0, None)] * len(first))
-    return torch.from_numpy(found.x)
+    first = np.full(len(at_truth), 0.3 / len(at_truth))  # a concave objective has one optimum, wherever a search starts
+    optimum = minimize(loss, first, jac=True, method="L-BFGS-B", bounds=[(0, None)] * len(first))
+    return torch.from_numpy(optimum.x)
 
 
 @dataclass(frozen=True, eq=False)
@@ -382,18 +378,18 @@ def calibrated_pool(
     for part in held_out:
         weight = weights([other for other in held_out if other is not part] or held_out)
         log_mass = torch.einsum("k,knm->nm", weight, part.at_candidates) + part.log_volume
-        found = Posterior(part.position, normalised(log_mass), resolution_m, floors=floors)
-        errors.append((found.median - part.truth).norm(dim=1))
-        score.append(errors[-1] / found.credible_radius(LEVEL).clamp_min(1e-9))
+        posterior = Posterior(part.position, normalised(log_mass), resolution_m, floors=floors)
+        errors.append((posterior.median - part.truth).norm(dim=1))
+        score.append(errors[-1] / posterior.credible_radius(LEVEL).clamp_min(1e-9))
     place = places(torch.cat([part.truth for part in held_out]))
     return weights(held_out), interval_factor(torch.cat(score), place), torch.cat(errors)
 
 
-def smoothed(posterior: Posterior, time: Tensor | None, speed_m_s: float) -> Posterior:
+def smoothed(posterior: Posterior, time: Tensor | None, speed_m_s: float, *, jump: float = 1e-3) -> Posterior:
     """Return the posterior of each observation given all observations of a walk.
 
     The motion prior is a random walk: the displacement between consecutive observations is Gaussian along each axis, with
-    standard deviation `speed_m_s` times the time between them, and uniform with a probability of 0.001. The candidates'
+    standard deviation `speed_m_s` times the time between them, and uniform with the probability `jump`. The candidates'
     resolution adds to the variance. The forward-backward recursion is exact on the candidates (L. Rabiner, Proc. IEEE 77,
     1989). A single observation keeps its posterior.
 
@@ -401,6 +397,7 @@ def smoothed(posterior: Posterior, time: Tensor | None, speed_m_s: float) -> Pos
         posterior: Posteriors of n independent observations in the order of the walk, on m candidates each.
         time: Time of each observation, which does not decrease, (n,) [s]. None stands for one observation a second.
         speed_m_s: Typical speed, above 0 [m/s].
+        jump: Prior probability, for each step, of a displacement that does not depend on the distance. Not studied.
 
     Raises:
         InputError: A speed or times that are not as above, or more than 20,000 candidates.
@@ -424,7 +421,7 @@ def smoothed(posterior: Posterior, time: Tensor | None, speed_m_s: float) -> Pos
     std = (speed_m_s * time.diff()).square().add(posterior.resolution_m**2 / 6).sqrt().clamp_min(1e-6).tolist()
     # the error of the distances is that of float32 relative to the region, not to the origin of the coordinates
     position = (posterior.position - posterior.position.reshape(-1, 3).mean(dim=0)).float().expand(n, -1, -1)
-    own = posterior.log_weight
+    alone = posterior.log_weight
     # distances between candidates that all observations share are computed once
     shared = _square(position[0], position[0]) if len(posterior.position) == 1 and m * m <= MAX_KEPT_PAIRS else None
 
@@ -437,16 +434,16 @@ def smoothed(posterior: Posterior, time: Tensor | None, speed_m_s: float) -> Pos
             density = (square * (-0.5 / std**2)).exp_()
             moved[rows] = density @ mass.float()
             total += float(density.sum(dtype=torch.float64))
-        floor = JUMP * max(total / m**2, 1e-30) * mass.sum()
-        return ((1 - JUMP) * moved.double() + floor).log()
+        floor = jump * max(total / m**2, 1e-30) * mass.sum()
+        return ((1 - jump) * moved.double() + floor).log()
 
-    before, after = torch.zeros_like(own), torch.zeros_like(own)
+    before, after = torch.zeros_like(alone), torch.zeros_like(alone)
     for i in range(1, n):
-        before[i] = step(position[i], position[i - 1], std[i - 1], own[i - 1] + before[i - 1])
+        before[i] = step(position[i], position[i - 1], std[i - 1], alone[i - 1] + before[i - 1])
     for i in range(n - 2, -1, -1):
-        after[i] = step(position[i], position[i + 1], std[i], own[i + 1] + after[i + 1])
+        after[i] = step(position[i], position[i + 1], std[i], alone[i + 1] + after[i + 1])
     # the inflation belongs to posteriors of single observations
-    return replace(posterior, log_weight=normalised(own + before + after), inflation=1.0)
+    return replace(posterior, log_weight=normalised(alone + before + after), inflation=1.0)
 
 
 def _square(to: Tensor, start: Tensor) -> Tensor:

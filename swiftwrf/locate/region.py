@@ -139,14 +139,13 @@ class Region:
         """
         if self.floors is None:
             return self._covering(count)
-        found = self._covering(count)
-        share = float(self.is_near(found.position).double().mean())
-        found = self._covering(min(round(count / max(share, 0.01)), MAX_CELLS))
-        near = self.is_near(found.position)
+        near_fraction = float(self.is_near(self._covering(count).position).double().mean())
+        cells = self._covering(min(round(count / max(near_fraction, 0.01)), MAX_CELLS))
+        near = self.is_near(cells.position)
         others = (~near).nonzero()[:, 0]
         others = others[:: max(1, 10 * len(others) // count)]
         kept = torch.cat([near.nonzero()[:, 0], others]).sort().values
-        return Cells(found.position[kept], self.log_mass(found.position[kept]), found.edge, found.level[kept])
+        return Cells(cells.position[kept], self.log_mass(cells.position[kept]), cells.edge, cells.level[kept])
 
     def _covering(self, count: int) -> Cells:
         """Return about `count` cells of equal size that cover the box."""
@@ -190,7 +189,8 @@ def outside_mass(held_out: Iterable[tuple[Region, Tensor]]) -> float:
 def best_cells(cells: Cells, misfit: Tensor, most: int, others: int, generator: torch.Generator) -> Cells:
     """Return, for each observation, the cells of smallest misfit and a sample that represents all others.
 
-    The misfit (n, m) is any decreasing function of the likelihood. Of `others` cells, each has a share of the volume left.
+    The misfit (n, m) is any decreasing function of the likelihood. The `others` random cells stand for all cells that are
+    left out. Each carries an equal part of their prior mass.
     """
     n, m = misfit.shape
     most = min(most, m)
@@ -203,8 +203,8 @@ def best_cells(cells: Cells, misfit: Tensor, most: int, others: int, generator: 
     # a cell that is among the best already stands for nothing else
     is_best = torch.zeros(n, m, dtype=torch.bool).scatter_(1, best, True).gather(1, drawn)
     kept = (~is_best).sum(dim=1, keepdim=True).clamp_min(1)
-    share = math.log(left) - kept.double().log()
-    extra = (cells.log_volume[drawn] + share).masked_fill(is_best, -torch.inf)
+    factor = math.log(left) - kept.double().log()
+    extra = (cells.log_volume[drawn] + factor).masked_fill(is_best, -torch.inf)
     return Cells(
         torch.cat([position, cells.position[drawn]], dim=1),
         torch.cat([volume, extra], dim=1),

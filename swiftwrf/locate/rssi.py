@@ -94,10 +94,13 @@ class RssiLocator(Locator):
     """radio maps of the receivers, set by `fit`"""
     likelihoods: Annotated[RssiLikelihoods, "r=model.r"]
     """likelihoods that are pooled, set by `fit`"""
-    receiver_names: tuple[str, ...]
-    """names of the receivers, set by `fit`"""
     held_out_m: dict[str, float]
     """mean errors [m] of the posterior and of the mean training position at held-out rows, set by `fit`, not saved"""
+
+    @property
+    def receiver_names(self) -> tuple[str, ...]:
+        """Names of the receivers."""
+        return self.model.receiver_names
 
     @all_or_nothing
     @checked
@@ -119,7 +122,6 @@ class RssiLocator(Locator):
         config = self.config
         if model is not None:
             train = model.aligned(train)
-        self.receiver_names = train.receiver_names
         self.model = model or self._radio_maps(train)
         known = train.transmitter_position
         fold = folds(known, config.validation, config.seed, session=train.session)
@@ -132,8 +134,7 @@ class RssiLocator(Locator):
             outside_mass((part.region, part.position) for part in parts),
         )
         self.region = replace(prior, floors=train.floors)
-        self.cells = self.region.cells(config.n_cells)
-        self._maps = maps_at(self.model, self.cells.position)
+        self._prepare()
         curve = Detection.estimate(train.transmitter_position, train.rssi_dbm)
         limit = torch.zeros(len(self.receiver_names)).double() if curve is None else curve.limit
         self.likelihoods = self._fitted(parts, fingerprints, limit)
@@ -165,17 +166,17 @@ class RssiLocator(Locator):
         out = out[torch.randperm(len(out), generator=generator)[: MAX_HELD_OUT // FOLDS]]
         rssi, position, known = train.rssi_dbm[out], train.transmitter_position[out], train.subset(kept)
         model = self._radio_maps(known)
-        found = Fingerprints.of(known, fingerprints.metric, fingerprints.k)
+        others = Fingerprints.of(known, fingerprints.metric, fingerprints.k)
         region = Region(known.transmitter_position, floors=train.floors)
-        return _Part(rssi, position, region, model, maps_at(model, position), found, found.votes(rssi))
+        return _Part(rssi, position, region, model, maps_at(model, position), others, others.votes(rssi))
 
     def _held_out(self, part: _Part, parts: list[_Part], limit: Tensor) -> HeldOut:
         """Return some rows of a part with their likelihoods, whose distributions are those of the other parts."""
         likelihoods = self._fitted([other for other in parts if other is not part], part.fingerprints, limit)
-        some, cells = slice(-(-self.config.n_calibration // len(parts))), self.cells.position
-        rssi, at, (mean, std) = part.rssi[some], part.position[some], part.maps
+        rows, cells = slice(-(-self.config.n_calibration // len(parts))), self.cells.position
+        rssi, at, (mean, std) = part.rssi[rows], part.position[rows], part.maps
         values = likelihoods(cells, maps_at(part.model, cells), rssi)
-        at_truth = likelihoods(at, (mean[some], std[some]), rssi).diagonal(dim1=1, dim2=2)
+        at_truth = likelihoods(at, (mean[rows], std[rows]), rssi).diagonal(dim1=1, dim2=2)
         prior = replace(part.region, margin=self.region.margin, outside=self.region.outside)
         return HeldOut(at, at_truth, cells[None], values, prior.log_mass(cells).expand(len(rssi), -1))
 
@@ -225,7 +226,9 @@ class RssiLocator(Locator):
             return f"{type(self).__name__}(not fitted)"
         return f"{type(self).__name__}(fitted, {len(self.receiver_names)} receivers, {len(self.cells.position)} cells)"
 
-    def _restored(self) -> None:
-        self.receiver_names = self.model.receiver_names
+    def _prepare(self) -> None:
+        """Compute the cells of the region and the radio maps there."""
         self.cells = self.region.cells(self.config.n_cells)
         self._maps = maps_at(self.model, self.cells.position)
+
+    _restored = _prepare

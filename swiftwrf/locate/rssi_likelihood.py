@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated, Literal, Self, get_args
@@ -25,24 +26,19 @@ from swiftwrf.locate.spectrum_likelihood import DEGREES, student_log_density
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime.validation import PositiveFloat, PositiveInt
 
-COMMON_DB = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
-SCALES = (0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
 MAX_DETECTIONS = 200_000  # that determine the likelihood of detections
-MISSES = (0.003, 0.01, 0.03, 0.1, 0.2, 0.4)
-NEIGHBOUR_COUNTS = (1, 2, 3, 4, 5, 7, 9, 12, 16, 20)
 Metric = Literal["sorensen", "manhattan", "euclidean"]
 METRICS: tuple[Metric, ...] = get_args(Metric)  # the first one unless another has a significantly lower error
 MAX_HELD_OUT = 1000  # rows that choose the settings
-SMALLEST_DISTANCE = 1e-3  # of fingerprints, whose inverse is a weight
 Votes = tuple[Tensor, Tensor, Tensor]  # each floor's part of the weights, its mean position, and the estimate
 Maps = tuple[Tensor, Tensor]  # predicted RSSI and its standard deviation at m positions, float32 (m, R) [dBm], [dB]
 
 
-def maps_at(model: RssiModel, position: Numbers) -> Maps:
-    """Return the radio maps of a model at positions (m, 3) [m]."""
+def maps_at(model: RssiModel, position: Numbers, *, smallest_db: float = 0.5) -> Maps:
+    """Return the radio maps of a model at positions (m, 3) [m], with a smallest standard deviation [dB] (not studied)."""
     prediction = model.predict(position)
     assert prediction.std is not None
-    return prediction.mean.float(), prediction.std.float().clamp_min(0.5)
+    return prediction.mean.float(), prediction.std.float().clamp_min(smallest_db)
 
 
 @dataclass(frozen=True)
@@ -60,14 +56,28 @@ class ValueLikelihood:
     degrees: PositiveFloat
 
     @classmethod
-    def fit(cls, maps: Maps, rssi: Tensor) -> ValueLikelihood:
-        """Fit to the maps (n, R) and RSSI (n, R) [dBm], nan where not detected, of held-out rows by maximum likelihood."""
+    def fit(
+        cls,
+        maps: Maps,
+        rssi: Tensor,
+        *,
+        common_db: Sequence[float] = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0),
+        scales: Sequence[float] = (0.7, 0.85, 1.0, 1.2, 1.5, 2.0),
+    ) -> ValueLikelihood:
+        """Fit to held-out rows by maximum likelihood among a grid of values.
+
+        Args:
+            maps: Radio maps at the rows, (n, R).
+            rssi: RSSI (n, R) [dBm], nan where not detected.
+            common_db: Standard deviations of the offset that are compared [dB]. Not studied.
+            scales: Factors of the standard deviations of the maps that are compared. Not studied.
+        """
         weight = (~rssi.isnan()).double() / maps[1].double().square()
         error = (rssi - maps[0].double()).nan_to_num()
         sums = weight.sum(dim=1), (weight * error).sum(dim=1), (weight * error.square()).sum(dim=1)
         count = (weight > 0).sum(dim=1).double()
-        choices = (cls(*values) for values in itertools.product(COMMON_DB, SCALES, DEGREES))
-        return max(choices, key=lambda found: float(found._log_density(*sums, count).sum()))
+        choices = (cls(*values) for values in itertools.product(common_db, scales, DEGREES))
+        return max(choices, key=lambda choice: float(choice._log_density(*sums, count).sum()))
 
     def log_likelihood(self, maps: Maps, rssi: Tensor) -> Tensor:
         """Return log-likelihoods (n, m) of RSSI (n, R) [dBm] at candidates with radio maps (m, R)."""
@@ -137,8 +147,8 @@ class DetectionLikelihood:
             return -float(torch.where(d, chance.log(), (-chance).log1p()).mean())
 
         start = np.array([float(m.quantile(0.1)), 1.5, -2.0])
-        found = cls._of(minimize(loss, start, method="Nelder-Mead", options={"maxiter": 300}).x)
-        return replace(found, threshold=found.threshold + limit)
+        fitted = cls._of(minimize(loss, start, method="Nelder-Mead", options={"maxiter": 300}).x)
+        return replace(fitted, threshold=fitted.threshold + limit)
 
     @classmethod
     def _of(cls, raw: NDArray[np.float64]) -> DetectionLikelihood:
@@ -190,8 +200,18 @@ class Fingerprints:
         return cls(train.transmitter_position, train.rssi_dbm.float(), train.floors, metric, k)
 
     @classmethod
-    def fit(cls, train: Rssi, fold: Tensor, seed: int = 0) -> Self:
-        """Return fingerprints with the metric and k of the lowest mean error at rows of held-out folds (n,).
+    def fit(
+        cls, train: Rssi, fold: Tensor, seed: int = 0, *, counts: Sequence[int] = (1, 2, 3, 4, 5, 7, 9, 12, 16, 20)
+    ) -> Self:
+        """Return fingerprints with the metric and k of the lowest mean error at rows of held-out folds.
+
+        Another metric than Sorensen's must be better by two standard errors.
+
+        Args:
+            train: Training rows.
+            fold: Fold of each row, (n,).
+            seed: Seed of the choice of at most 1000 rows.
+            counts: Numbers of places k that are compared. Not studied.
 
         Raises:
             InputError: All rows with a detection are in one fold.
@@ -207,14 +227,14 @@ class Fingerprints:
         parts = list(each_fold(fold, order[:MAX_HELD_OUT].sort().values))
         errors: dict[tuple[Metric, int], Tensor] = {}
         fewest = min(int(places(train.transmitter_position[kept]).max()) + 1 for _, kept in parts)
-        counts = [k for k in NEIGHBOUR_COUNTS if k <= fewest]
+        counts = [k for k in counts if k <= fewest]
         for metric in METRICS:
             error = []
             for out, kept in parts:
-                found = cls.of(train.subset(kept), metric)
-                near = found.nearest(train.rssi_dbm[out], counts[-1])
+                others = cls.of(train.subset(kept), metric)
+                near = others.nearest(train.rssi_dbm[out], counts[-1])
                 truth = train.transmitter_position[out]
-                error.append(torch.stack([(found.vote(near, k)[2] - truth).norm(dim=1) for k in counts]))
+                error.append(torch.stack([(others.vote(near, k)[2] - truth).norm(dim=1) for k in counts]))
             errors |= {(metric, k): e for k, e in zip(counts, torch.cat(error, dim=1), strict=True)}
         usual, best = (
             min(names, key=lambda name: float(errors[name].mean()))
@@ -246,7 +266,7 @@ class Fingerprints:
         """Return the distances (m, k) of the k most similar places to rows of RSSI (m, R) [dBm], and their numbers."""
         place, number = self._places
         known, total = self._known
-        found = []
+        neighbours = []
         for row in self._excess(rssi):
             detected = row.nonzero()[:, 0]
             if self.metric == "euclidean":
@@ -257,10 +277,10 @@ class Fingerprints:
                 apart = apart / both.clamp_min(1e-9) if self.metric == "sorensen" else apart
             least = torch.full((len(place),), torch.inf).scatter_reduce(0, number, apart, "amin")
             nearest, order = least.sort(stable=True)
-            found.append((nearest[:k], order[:k]))
-        if not found:
+            neighbours.append((nearest[:k], order[:k]))
+        if not neighbours:
             return rssi.new_zeros(0, k), number.new_zeros(0, k)
-        distances, numbers = zip(*found, strict=True)
+        distances, numbers = zip(*neighbours, strict=True)
         return torch.stack(distances), torch.stack(numbers)
 
     def floor(self, position: Tensor) -> Tensor:
@@ -269,20 +289,21 @@ class Fingerprints:
             return torch.zeros(len(position), dtype=torch.int64)
         return self.floors.number(position)
 
-    def vote(self, near: tuple[Tensor, Tensor], k: int) -> Votes:
+    def vote(self, near: tuple[Tensor, Tensor], k: int, *, smallest_distance: float = 1e-3) -> Votes:
         """Return each floor's part of the weights (m, F), its mean position (m, F, 3) [m] and the estimate (m, 3) [m].
 
         Args:
             near: Distances and numbers of places, as of `nearest`.
             k: Number of places that vote, with the inverse distance as weight.
+            smallest_distance: Distance that equal fingerprints count as, so that their weights are finite.
         """
         position = self._places[0][near[1][:, :k]]
-        weight = 1 / near[0][:, :k].double().clamp_min(SMALLEST_DISTANCE)
+        weight = 1 / near[0][:, :k].double().clamp_min(smallest_distance)
         number = self.floor(position.reshape(-1, 3)).reshape(position.shape[:2])
         floor = torch.arange(1 if self.floors is None else len(self.floors.names))
-        own = weight[..., None] * (number[..., None] == floor)
-        total = own.sum(dim=1)
-        mean = torch.einsum("mkf,mkc->mfc", own, position) / total[..., None].clamp_min(1e-12)
+        of_floor = weight[..., None] * (number[..., None] == floor)
+        total = of_floor.sum(dim=1)
+        mean = torch.einsum("mkf,mkc->mfc", of_floor, position) / total[..., None].clamp_min(1e-12)
         best = total.argmax(dim=1)
         return total / total.sum(dim=1, keepdim=True), mean, mean[torch.arange(len(mean)), best]
 
@@ -311,18 +332,35 @@ class FingerprintLikelihood:
     degrees: PositiveFloat = 4.0
 
     @classmethod
-    def fit(cls, fingerprints: Fingerprints, votes: Votes, truth: Tensor, smallest_m: float) -> FingerprintLikelihood:
-        """Fit to the votes of n held-out rows and their positions (n, 3) [m], with a smallest scale."""
+    def fit(
+        cls,
+        fingerprints: Fingerprints,
+        votes: Votes,
+        truth: Tensor,
+        smallest_m: float,
+        *,
+        misses: Sequence[float] = (0.003, 0.01, 0.03, 0.1, 0.2, 0.4),
+    ) -> FingerprintLikelihood:
+        """Fit to the votes of held-out rows.
+
+        Args:
+            fingerprints: Training rows.
+            votes: Votes of n held-out rows.
+            truth: Their positions (n, 3) [m].
+            smallest_m: Smallest scale [m].
+            misses: Probabilities that the vote misses the floor, of which the most likely one is taken. Not studied.
+        """
         part = votes[0]
-        rows, own = torch.arange(len(truth)), fingerprints.floor(truth)
-        right = part[rows, own]
-        error = (_with_estimate(votes)[rows, own] - truth)[(right > 0) | (right == 0).all()]
+        rows, floor = torch.arange(len(truth)), fingerprints.floor(truth)
+        right = part[rows, floor]
+        error = (_with_estimate(votes)[rows, floor] - truth)[(right > 0) | (right == 0).all()]
+        # a Student variable of 4 degrees of freedom is within 0.94 scales with a probability of 0.6
         scale = (error.abs().quantile(0.6, dim=0).square() + smallest_m**2).sqrt()
 
         def density(miss: float) -> float:
             return float(((1 - miss) * right + miss / part.shape[1]).log().mean())
 
-        return cls(fingerprints, scale, max(MISSES, key=density))
+        return cls(fingerprints, scale, max(misses, key=density))
 
     def log_likelihood(self, position: Tensor, rssi: Tensor) -> Tensor:
         """Return log-likelihoods (n, m) of candidate positions (m, 3) [m]."""

@@ -28,10 +28,8 @@ from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.runtime.threads import parallel_map
 from swiftwrf.runtime.validation import PositiveFloat
 
-DEGREES = (3.0, 5.0, 10.0, 30.0, math.inf)  # degrees of freedom of Student distributions that are compared
-SHRINKAGES = (0.05, 0.1, 0.2, 0.4, 0.7)  # of scale matrices to multiples of the identity, that are compared
-N_ALIGNED = 3  # iterations of the phases of snapshots and the expected field
-SCALES = (0.1, 1.0, 10.0)  # of the variances of path gains and scattering at a position
+DEGREES = (3.0, 5.0, 10.0, 30.0, math.inf)  # degrees of freedom of Student distributions that are compared; not studied
+SCALES = (0.1, 1.0, 10.0)  # of the variances of path gains and scattering at a position; not studied
 BOUNDS = (-10.0, 6.0)  # of the logarithms of variances: products of four of them stay within float32
 
 Likelihood = Callable[[PathWaves, SpectrumFeatures], Tensor]
@@ -67,9 +65,15 @@ class Student:
     degrees: PositiveFloat
 
     @classmethod
-    def fit(cls, residual: Tensor, floor: float) -> Self:
-        """Fit to residuals (n, F) and a smallest variance, with shrinkage and degrees of the highest held-out density."""
-        residual, shrinkage = residual.double(), torch.tensor(SHRINKAGES, dtype=torch.float64)
+    def fit(cls, residual: Tensor, floor: float, *, shrinkages: Sequence[float] = (0.05, 0.1, 0.2, 0.4, 0.7)) -> Self:
+        """Fit the distribution with the shrinkage and degrees of freedom of the highest held-out density.
+
+        Args:
+            residual: Residuals (n, F).
+            floor: Smallest variance.
+            shrinkages: Weights of the identity in the scale matrix that are compared. Not studied.
+        """
+        residual, shrinkage = residual.double(), torch.tensor(shrinkages, dtype=torch.float64)
         fold = torch.arange(len(residual)) % 5
         density = torch.zeros(len(DEGREES), len(shrinkage), dtype=torch.float64)
         for (row, degrees), (out, kept) in itertools.product(enumerate(DEGREES), each_fold(fold)):
@@ -91,9 +95,9 @@ class Student:
 
     def log_likelihood(self, residual: Tensor) -> Tensor:
         """Return the log-likelihoods (n,) of residuals (n, F), float64."""
-        root = torch.linalg.cholesky(self.scale)
-        white = torch.linalg.solve_triangular(root, residual.T, upper=False)
-        density: Tensor = self.log_density(white.square().sum(dim=0)) - root.diagonal().log().sum()
+        factor = torch.linalg.cholesky(self.scale)
+        white = torch.linalg.solve_triangular(factor, residual.T, upper=False)
+        density: Tensor = self.log_density(white.square().sum(dim=0)) - factor.diagonal().log().sum()
         return density
 
 
@@ -163,12 +167,12 @@ class PhaseLikelihood:
 
     def __init__(self, room: GeometryModel, log_variance: Tensor) -> None:
         self.log_variance = log_variance
-        found, value = room.reflectors, log_variance.exp()
+        reflectors, value = room.reflectors, log_variance.exp()
         direct, plane, (order, self._diffuse, self._floor) = value[0], value[1:-3], value[-3:].unbind()
-        second = found.gain[0].square() + plane
+        second = reflectors.gain[0].square() + plane
         images = [
             plane[planes[0]] if len(planes) == 1 else order * torch.stack([second[i] for i in planes]).prod()
-            for planes in found.sequence
+            for planes in reflectors.sequence
         ]
         self._variance = torch.stack([direct, *images])
         element = room.array.element.double()
@@ -176,11 +180,13 @@ class PhaseLikelihood:
         self._isotropic = torch.sinc(2 * torch.cdist(element, element) / room.array.wavelength).to(torch.complex64)
 
     @classmethod
-    def fit(cls, parts: Sequence[tuple[GeometryModel, PathWaves, SpectrumFeatures]]) -> Self:
+    def fit(cls, parts: Sequence[tuple[GeometryModel, PathWaves, SpectrumFeatures]], *, penalty: float = 0.01) -> Self:
         """Fit the variances by the marginal likelihood of observations at known positions.
 
         Args:
             parts: Rooms, waves of each room at the positions, and observations there. The result is that of the first room.
+            penalty: Factor of the mean squared logarithm of the variances. It keeps those that the data do not determine
+                near 1. Not studied.
         """
         room = parts[0][0]
         start = np.array([-3.0, *[-2.0] * room.reflectors.gain.shape[1], 0.0, -2.0, -2.0])
@@ -188,15 +194,14 @@ class PhaseLikelihood:
         @torch.enable_grad()
         def loss(values: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
             raw = torch.from_numpy(values).float().requires_grad_()
-            # the penalty keeps variances that the data do not determine near 1
-            density = torch.cat([cls(own, raw)(waves, observed) for own, waves, observed in parts])
-            total = 0.01 * raw.square().mean() - density.mean()
+            density = torch.cat([cls(each, raw)(waves, observed) for each, waves, observed in parts])
+            total = penalty * raw.square().mean() - density.mean()
             (gradient,) = torch.autograd.grad(total, raw)
             return float(total.detach()), gradient.double().numpy()
 
         bounds = [BOUNDS] * len(start)
-        found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 20})
-        return cls(room, torch.from_numpy(found.x).float())
+        optimum = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 20})
+        return cls(room, torch.from_numpy(optimum.x).float())
 
     def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
         """Return log-likelihoods (m,) of m observations at m candidates, up to a constant of each observation."""
@@ -209,28 +214,28 @@ class PhaseLikelihood:
         rest = self._diffuse * self._isotropic + self._floor * torch.eye(wave.shape[2])
         spread = (spread + rest * power[:, None, None]) / total[:, None, None]
         mean = mean / total.sqrt()[:, None]
-        root = torch.linalg.cholesky(spread)
-        white = torch.linalg.solve_triangular(root, torch.cat([mean[:, :, None], phases.mT], dim=2), upper=False)
+        factor = torch.linalg.cholesky(spread)
+        white = torch.linalg.solve_triangular(factor, torch.cat([mean[:, :, None], phases.mT], dim=2), upper=False)
         m, x = white[..., :1], white[..., 1:]
         match = 2 * (m.conj() * x).sum(dim=1).abs()
         misfit = x.abs().square().sum(dim=1) + m.abs().square().sum(dim=1)
         density = match + torch.special.i0e(match).log() - misfit
-        total_density: Tensor = density.logsumexp(dim=1) - 2 * root.diagonal(dim1=1, dim2=2).real.log().sum(dim=1)
+        total_density: Tensor = density.logsumexp(dim=1) - 2 * factor.diagonal(dim1=1, dim2=2).real.log().sum(dim=1)
         return total_density
 
 
 class PathLikelihood(PhaseLikelihood):
     """Marginal likelihood of channels at all frequencies under uncertain path gains, as `PhaseLikelihood` of phases.
 
-    A path has one gain at all frequencies. So has scattering, along paths that are longer than the direct one as those of
-    the images are. A room explains some positions much worse than others, so the variances of gains and scattering have a
+    A path has one gain at all frequencies. Scattered waves keep their gain over frequency, too. Their delays spread as those
+    of the images. A room explains some positions much worse than others, so the variances of gains and scattering have a
     common factor at each position, one of `SCALES`. The phase of each snapshot is unknown, and so is a delay of the packet.
     It is estimated relative to the expected field, given all snapshots.
     """
 
     def __init__(self, room: GeometryModel, log_variance: Tensor) -> None:
         super().__init__(room, log_variance)
-        scene = room.scene(room.region()[:1])
+        scene = room.link_at(room.region()[:1])
         length = (sources(room.reflectors, scene) - scene.receiver).norm(dim=-1)[:, 0]
         self._detour_rad = scene.wavenumber * float((length - length[0]).square().mean().sqrt())
         self._over_element, self._basis = torch.linalg.eigh(self._isotropic)
@@ -268,14 +273,14 @@ class _Whitened:
         mean: Expected channels (m, F, K).
         wave: Waves of the paths (m, 1 + S, F K).
         std: Standard deviations of their gains (m, 1 + S).
-        root: Cholesky factors of I + s s^H, (m, 1 + S, 1 + S), with the waves s of one standard deviation.
+        factor: Cholesky factors of I + s s^H, (m, 1 + S, 1 + S), with the waves s of one standard deviation.
     """
 
     whitening: Tensor
     mean: Tensor
     wave: Tensor
     std: Tensor
-    root: Tensor
+    factor: Tensor
 
     @classmethod
     def of(cls, mean: Tensor, paths: tuple[Tensor, Tensor], variance: Tensor, scattered: Tensor, floor: Tensor) -> Self:
@@ -298,20 +303,23 @@ class _Whitened:
         return cls(whitening, mean * amount[..., None] * whitening, wave, std, torch.linalg.cholesky(gram))
 
     def _along(self, values: Tensor) -> Tensor:
-        """Return L^-1 s v^*, (m, 1 + S, 1), of values v (m, F, K), with the root L and the waves s."""
+        """Return L^-1 s v^*, (m, 1 + S, 1), of values v (m, F, K), with the Cholesky factor L and the waves s."""
         match = self.std[..., None] * (self.wave @ values.flatten(1).conj()[..., None])
-        found: Tensor = torch.linalg.solve_triangular(self.root, match, upper=False)
-        return found
+        along: Tensor = torch.linalg.solve_triangular(self.factor, match, upper=False)
+        return along
 
-    def phases(self, x: Tensor) -> Tensor:
-        """Return the phasors (m, F, 1) by which the snapshots of channels x (m, F, K) agree with the expected field."""
+    def phases(self, x: Tensor, *, steps: int = 3) -> Tensor:
+        """Return the phasors (m, F, 1) by which the snapshots of channels x (m, F, K) agree with the expected field.
+
+        Phases and the field that is expected given the channels follow from each other in three steps (not studied).
+        """
         x = x * self.whitening
-        expected, own, total = self.mean, self._along(self.mean), torch.ones_like(x[..., :1])
-        for number in range(N_ALIGNED):
+        expected, along_mean, total = self.mean, self._along(self.mean), torch.ones_like(x[..., :1])
+        for number in range(steps):
             phase = (x.conj() * expected).sum(-1, keepdim=True).sgn().detach()
             x, total = x * phase, total * phase
-            if number < N_ALIGNED - 1:
-                change = torch.linalg.solve_triangular(self.root.mH, self._along(x) - own, upper=True)
+            if number < steps - 1:
+                change = torch.linalg.solve_triangular(self.factor.mH, self._along(x) - along_mean, upper=True)
                 change = (change * self.std[..., None]).mH @ self.wave
                 expected = self.mean + change[:, 0].view_as(self.mean)
         return total
@@ -319,15 +327,15 @@ class _Whitened:
     def log_density(self, x: Tensor) -> Tensor:
         """Return the log-densities of channels x (m, F, K) with an unknown common phase, up to a constant, (m,)."""
         m, x = self.mean, x * self.whitening
-        own, other = self._along(m), self._along(x)
+        along_m, along_x = self._along(m), self._along(x)
 
         def product(a: Tensor, b: Tensor, along_a: Tensor, along_b: Tensor) -> Tensor:
-            whole: Tensor = (a.conj() * b).sum((1, 2)) - (along_a * along_b.conj()).sum((1, 2))
-            return whole
+            value: Tensor = (a.conj() * b).sum((1, 2)) - (along_a * along_b.conj()).sum((1, 2))
+            return value
 
-        match = 2 * product(m, x, own, other).abs()
-        misfit = product(x, x, other, other).real + product(m, m, own, own).real
-        volume = self.root.diagonal(dim1=1, dim2=2).real.log().sum(1) - self.whitening.log().expand(x.shape[1:]).sum()
+        match = 2 * product(m, x, along_m, along_x).abs()
+        misfit = product(x, x, along_x, along_x).real + product(m, m, along_m, along_m).real
+        volume = self.factor.diagonal(dim1=1, dim2=2).real.log().sum(1) - self.whitening.log().expand(x.shape[1:]).sum()
         density: Tensor = match + torch.special.i0e(match).log() - misfit - 2 * volume
         return density
 
@@ -364,18 +372,18 @@ class ChannelLikelihood:
         """
 
         def log_likelihood(observed: SpectrumFeatures) -> Tensor:
-            whole = observed.channel
-            assert whole is not None
-            channel = whole[:, ends(whole.shape[1])].movedim(1, 0)  # (F, n, K)
-            own = channel.abs().square().sum(dim=2).T
+            every = observed.channel
+            assert every is not None
+            channel = every[:, ends(every.shape[1])].movedim(1, 0)  # (F, n, K)
+            observed_power = channel.abs().square().sum(dim=2).T
             # conj(x) h is the real numbers x . h and (j x) . h, whose squares are summed faster than those of complex ones
             parts = torch.view_as_real(torch.cat([channel, 1j * channel], dim=1)).flatten(2)
 
-            def at(some: Tensor) -> Tensor:
-                waves = torch.view_as_real(some).flatten(2)
+            def at(cells: Tensor) -> Tensor:
+                waves = torch.view_as_real(cells).flatten(2)
                 match = (parts @ waves.mT).square_().unflatten(1, (2, -1)).sum(dim=(0, 1))
                 power = waves.square().sum(dim=2).expand(len(channel), -1)
-                return self.log_density(match / (own @ power).clamp_min(1e-30), whole)
+                return self.log_density(match / (observed_power @ power).clamp_min(1e-30), every)
 
             return torch.cat(parallel_map(at, predicted), dim=1)
 

@@ -380,9 +380,7 @@ class Follower:
 def unexplained(room: GeometryModel, spectra: Spectra) -> Tensor:
     """Return the missing coherence of the phases of each spectrum and of the paths of a room, float64 (n,)."""
     channel, _ = retrieve_phases(correlations(spectra), room.array, room.config.seed)
-    scene = PhaseObservations.of(
-        spectra.position, room.fixed_position, room.moving, room.array, room.rotation, channel.to(torch.complex64)
-    )
+    scene = PhaseObservations.of_phases(spectra.position, room.link, channel)
     return (1 - room.tensors().coherence(scene) + MIN_MISSING).double()
 
 

@@ -7,15 +7,15 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from swiftwrf.models.geometry.images import PhaseObservations, PlaneSet, images, visibility
+from swiftwrf.models.geometry.images import LinkAt, PlaneSet, images, visibility
 
 
 def coherence(observed: Tensor, predicted: Tensor) -> Tensor:
     """Return |x^H h|^2 / (|x|^2 |h|^2) of channels (n, F, K), with an unknown phase of each of the F snapshots, (n,)."""
     match = (observed.conj() * predicted).sum(-1).abs().square().sum(-1)
     power = (observed.abs().square().sum(-1) * predicted.abs().square().sum(-1)).sum(-1)
-    found: Tensor = match / power.clamp_min(1e-30)
-    return found
+    value: Tensor = match / power.clamp_min(1e-30)
+    return value
 
 
 def ends(number: int) -> list[int]:
@@ -23,13 +23,13 @@ def ends(number: int) -> list[int]:
     return sorted({0, number - 1})
 
 
-def field(gain: Tensor, wave: Tensor) -> Tensor:
+def superposed(gain: Tensor, wave: Tensor) -> Tensor:
     """Return the sums of waves (n, 1 + S, F, K) with gains (n, 1 + S), complex64 (n, F, K)."""
     total: Tensor = (gain.to(wave.dtype)[:, None] @ wave.flatten(2))[:, 0].unflatten(1, wave.shape[2:])
     return total
 
 
-def waves(planes: PlaneSet, scene: PhaseObservations, frequency: Tensor) -> Tensor:
+def waves(planes: PlaneSet, scene: LinkAt, frequency: Tensor) -> Tensor:
     """Return the waves of the direct path and of each image, complex64 (n, 1 + S, F, K).
 
     Args:
@@ -44,7 +44,7 @@ def waves(planes: PlaneSet, scene: PhaseObservations, frequency: Tensor) -> Tens
     return (scene.waves(sources(planes, scene), frequency) * there[..., None, None]).transpose(0, 1)
 
 
-def sources(planes: PlaneSet, scene: PhaseObservations) -> Tensor:
+def sources(planes: PlaneSet, scene: LinkAt) -> Tensor:
     """Return the transmitter and its images in the planes of one room, float64 (1 + S, n or 1, 3) [m]."""
     direct = scene.transmitter[None]
     return torch.cat([direct, images(scene, planes)[0]]) if planes.sequence else direct
@@ -60,7 +60,7 @@ class Channels:
         frequency: Their frequencies relative to the carrier, (F,).
     """
 
-    scene: PhaseObservations
+    scene: LinkAt
     value: Tensor
     frequency: Tensor
 
@@ -70,4 +70,4 @@ class Channels:
 
     def coherence(self, planes: PlaneSet, gain: Tensor) -> Tensor:
         """Return the coherence with the field of gains (n, 1 + S) at each position, (n,)."""
-        return coherence(self.value, field(gain, waves(planes, self.scene, self.frequency)))
+        return coherence(self.value, superposed(gain, waves(planes, self.scene, self.frequency)))

@@ -36,19 +36,19 @@ from swiftwrf.models.geometry.search import (
     N_STARTS,
     PERFECT_SCORE,
     SIGNS,
-    WEAK_GAIN,
     Search,
     find_rooms,
     oblique_planes,
 )
 from swiftwrf.models.geometry.uncertainty import assess, conclusion, phase_alternatives
+from swiftwrf.models.link import Link
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, configuration
 
-FURTHER_SIGNIFICANCE = 4.0  # standard errors for a plane of any orientation, of which far more are tried
-DIELECTRIC_GAIN = 0.4  # modulus at normal incidence that a fit starts from: a relative permittivity of 5.4
-N_FINAL = 400  # positions of the last moves of a search; fewer do not separate planes from aliases in furnished rooms
+N_FINAL = (
+    400  # positions of the last moves, by the study in docs/development/architecture.md; fewer do not separate aliases
+)
 
 
 Splits = list[tuple[PhaseObservations, PhaseObservations]]  # kept and held-out positions
@@ -176,15 +176,15 @@ def update_room(room: RoomEstimate, new: Spectra, config: GeometryConfig) -> Roo
     Raises:
         InputError: As `search_room`.
     """
-    found = refine_room(room, new, config)
-    weight = room.covariance @ torch.linalg.pinv(room.covariance + found.covariance, hermitian=True)
-    old, own = (plane_set(r.planes, r.order) for r in (room, found))
+    latest = refine_room(room, new, config)
+    weight = room.covariance @ torch.linalg.pinv(room.covariance + latest.covariance, hermitian=True)
+    old, own = (plane_set(r.planes, r.order) for r in (room, latest))
     offset = old.offset[0] + weight @ (own.offset - old.offset)[0]
     gain = old.gain[0] + weight.diagonal().float() * (own.gain - old.gain)[0]
     remaining = room.covariance - weight @ room.covariance
     ratio = (remaining.diagonal() / room.covariance.diagonal()).nan_to_num(1.0)  # 0 / 0 for planes without uncertainty
     scale = ratio.clamp(0, 1).sqrt()
-    both = [(p.probability, f.probability) for p, f in zip(room.planes, found.planes, strict=True)]
+    both = [(p.probability, f.probability) for p, f in zip(room.planes, latest.planes, strict=True)]
     probability = [p * q / (p * q + (1 - p) * (1 - q)) for p, q in both]
     values = zip(room.planes, offset.tolist(), gain.tolist(), scale.tolist(), probability, strict=True)
     planes = [replace(p, offset_m=o, gain=g, std_mm=s * p.std_mm, probability=q) for p, o, g, s, q in values]
@@ -220,27 +220,22 @@ def observe(train: Spectra, config: GeometryConfig | None = None) -> tuple[Phase
     config = config or GeometryConfig()
     train, rows = _evenly(train, config.max_spectra)
     assert train.array is not None
-    assert train.rotation is not None
-    assert train.fixed_position is not None
+    link = Link.from_spectra(train)
     if len(train.position.unique(dim=0)) < MIN_TRAINING:
         raise InputError(f"the positions of {train.name} are fewer than {MIN_TRAINING} different ones")
     if train.channel is not None:
-        array, phases = train.array, carrier_phases(train.channel, train.frequency_hz, train.array)
+        phases = carrier_phases(train.channel, train.frequency_hz, train.array)
         if train.frequency_hz is not None:
-            frequency = train.frequency_hz[_nearest(train.frequency_hz, array)]
-            array = PlanarArray(array.element, LIGHT_SPEED / float(frequency))
-        described = train.fixed_position, train.moving, array, train.rotation
-        return PhaseObservations.of(train.position, *described, phases, retrieved=False), rows
+            frequency = train.frequency_hz[_nearest(train.frequency_hz, train.array)]
+            link = replace(link, array=PlanarArray(train.array.element, LIGHT_SPEED / float(frequency)))
+        return PhaseObservations.of_phases(train.position, link, phases, retrieved=False), rows
     channel, error = retrieve_phases(correlations(train), train.array, config.seed)
     solved = (error < 0.1).nonzero()[:, 0]  # relative error of the autocorrelation
     if len(solved) < max(MIN_TRAINING, len(train) / 2):
         raise InputError(
             f"only {len(solved)} of {len(train)} spectra of {train.name} fit its array; check its geometry and carrier"
         )
-    scene = PhaseObservations.of(
-        train.position[solved], train.fixed_position, train.moving, train.array, train.rotation, channel[solved]
-    )
-    return scene, rows[solved]
+    return PhaseObservations.of_phases(train.position[solved], link, channel[solved]), rows[solved]
 
 
 def carrier_phases(channel: Tensor, frequency_hz: Tensor | None, array: PlanarArray) -> Tensor:
@@ -266,8 +261,8 @@ def _nearest(frequency_hz: Tensor, array: PlanarArray) -> int:
 
 def _held_out(rooms: list[PlaneSet], splits: Splits, steps: int = 4) -> list[Tensor]:
     """Return each room's coherence at held-out positions (n,), with offsets and gains refined on the other positions."""
-    found = [[room.coherence(held) for room in refine_all(kept, rooms, steps)] for kept, held in splits]
-    return [torch.cat(parts) for parts in zip(*found, strict=True)]
+    coherence = [[room.coherence(held) for room in refine_all(kept, rooms, steps)] for kept, held in splits]
+    return [torch.cat(parts) for parts in zip(*coherence, strict=True)]
 
 
 def _pruned(room: PlaneSet, scene: PhaseObservations, splits: Splits, config: GeometryConfig) -> PlaneSet:
@@ -307,25 +302,37 @@ def _with_weak_planes(
     splits: Splits,
     signs: Tensor,
     config: GeometryConfig,
+    *,
+    gain: float = 0.3,
 ) -> PlaneSet:
     """Add weak planes on sides without a plane, searched with some positions and kept if they are significant.
 
-    The search assumes strong planes. At the offset of one that is hidden from most positions its score is worse.
+    A plane that is hidden from most positions makes the score worse even at its true offset with the usual gain. So gains of
+    a smaller modulus are tried apart (its value is not studied).
     """
     planes, known = room.by_side(), signs.clone()
     if not 0 < len(planes) < len(signs) or room.score_at(some) < MIN_MISSING:
         return room
-    for side, (_, gain) in planes.items():
-        known[side] = math.copysign(1, gain)
-    search = Search(some, config.search_distance_m, known, usual=WEAK_GAIN)
-    found = refine(scene, search.improve(PlaneSet.on_sides(planes)))
-    return _pruned(_without_aliases(found, scene, config), scene, splits, config)
+    for side, (_, strong) in planes.items():
+        known[side] = math.copysign(1, strong)
+    search = Search(some, config.search_distance_m, known, usual=gain)
+    wider = refine(scene, search.improve(PlaneSet.on_sides(planes)))
+    return _pruned(_without_aliases(wider, scene, config), scene, splits, config)
 
 
 def _with_further_planes(
-    room: PlaneSet, scene: PhaseObservations, some: PhaseObservations, splits: Splits, config: GeometryConfig
+    room: PlaneSet,
+    scene: PhaseObservations,
+    some: PhaseObservations,
+    splits: Splits,
+    config: GeometryConfig,
+    *,
+    significance: float = 4.0,
 ) -> PlaneSet:
-    """Add planes of any orientation, searched with some positions, as long as they are significant."""
+    """Add planes of any orientation, searched with some positions, as long as they are significant.
+
+    Far more planes are tried than on the six sides, so they need more standard errors (their number is not studied).
+    """
     for _ in range(config.max_extra_planes):
         if room.score_at(some) < PERFECT_SCORE:
             break
@@ -338,10 +345,10 @@ def _with_further_planes(
         wider = [r for other in wider[:2] for r in (other, *sign_alternatives(scene, other))]
         best = min(refine_all(some, wider, 20, tilt=True), key=lambda r: r.score_at(some))
         best = refine(scene, best, 15, tilt=True)
-        if advantage(best.coherence(scene), room.coherence(scene)) < FURTHER_SIGNIFICANCE:
+        if advantage(best.coherence(scene), room.coherence(scene)) < significance:
             break
         best = _pruned(best, scene, splits, config)
-        if advantage(*_held_out([best, room], splits)) < FURTHER_SIGNIFICANCE:
+        if advantage(*_held_out([best, room], splits)) < significance:
             break
         room = best
     return room
@@ -360,21 +367,24 @@ def _with_order(room: PlaneSet, splits: Splits, config: GeometryConfig) -> Plane
     return best
 
 
-def with_dielectrics(room: PlaneSet, scene: PhaseObservations, splits: Splits, config: GeometryConfig) -> PlaneSet:
+def with_dielectrics(
+    room: PlaneSet, scene: PhaseObservations, splits: Splits, config: GeometryConfig, *, start_gain: float = 0.4
+) -> PlaneSet:
     """Make all planes dielectrics if this explains held-out positions significantly better than constant gains.
 
-    Floor and ceiling have gains of both signs: negative, as those of walls, at grazing incidence, otherwise positive. A
-    constant negative gain leads to an offset half a phase period away. Such planes are tried on either side, too.
+    At grazing incidence a dielectric floor reflects with the sign of a wall, near the normal with the other one. A constant
+    gain of the wrong sign leads to an offset half a phase period away, so both sides are tried.
 
     Args:
         room: Planes of constant gain.
         scene: Observed phases.
         splits: Kept and held-out positions.
         config: Options, of which the significance counts.
+        start_gain: Modulus at normal incidence that a fit starts from, that of a relative permittivity of 5.4.
     """
     signs = 2 * SIDES[:, 2].square().float() - 1
     sign = signs[room.side]
-    gain = sign * room.gain.abs().clamp_min(DIELECTRIC_GAIN)
+    gain = sign * room.gain.abs().clamp_min(start_gain)
     dielectric = torch.ones(room.gain.shape[1], dtype=torch.bool)
     best = refine(scene, replace(room, gain=gain, dielectric=dielectric), signs=signs)
     for plane in (sign * room.gain < 0)[0].nonzero()[:, 0].tolist():
@@ -382,7 +392,7 @@ def with_dielectrics(room: PlaneSet, scene: PhaseObservations, splits: Splits, c
         for half_period in (-0.5, 0.5):
             offset, gain = best.offset.clone(), best.gain.clone()
             offset[0, plane] = room.offset[0, plane] + half_period * phase_period_m(scene, room, plane)
-            gain[0, plane] = sign[0, plane] * DIELECTRIC_GAIN
+            gain[0, plane] = sign[0, plane] * start_gain
             tried.append(replace(best, offset=offset, gain=gain))
         best = min(refine_all(scene, tried, signs=signs), key=lambda r: float(r.score))
     return best if advantage(*_held_out([best, room], splits, 8)) > config.significance else room

@@ -30,8 +30,8 @@ from torch.nn.functional import softplus
 
 from swiftwrf.data.splits import each_fold
 from swiftwrf.errors import InputError
-from swiftwrf.models.geometry.channels import Channels, coherence, field, waves
-from swiftwrf.models.geometry.images import MAX_COSINE, PhaseObservations, PlaneSet, Sequence, mirror
+from swiftwrf.models.geometry.channels import Channels, coherence, superposed, waves
+from swiftwrf.models.geometry.images import MAX_COSINE, LinkAt, PlaneSet, Sequence, mirror
 from swiftwrf.models.geometry.planes import Plane, log_advantage, log_explained, plane_set, robust_advantage
 from swiftwrf.models.geometry.surfaces import find_surfaces
 from swiftwrf.plotting import Axes, corners_of, hatch, plan_map
@@ -41,10 +41,8 @@ Floats = NDArray[np.float64]
 MAX_VOXELS = 50_000
 MIN_SHOWN_DB = 1.0  # absorption [dB/m] of a voxel in JSON: less differs little from empty space
 N_STEPS = 150  # of Adam
-# edge of a voxel [wavelengths] and weight of the penalty
+# edge of a voxel [wavelengths] and weight of the penalty, of which held-out channels choose
 SETTINGS = ((2.0, 1e-3), (1.0, 1e-3), (2.0, 3e-3), (2.0, 3e-4))
-SIGNIFICANCE = 2.5  # standard errors by which furniture must explain held-out channels better
-SURFACE_SIGNIFICANCE = 2.5  # the same of each surface
 MAX_CHOICE = 200  # positions that choose the settings
 MIN_HELD_OUT = 60  # positions in the folds that are held out to choose, if there are as many; all folds decide
 
@@ -125,7 +123,7 @@ class Furniture:
             ],
         }
 
-    def gains(self, planes: PlaneSet, scene: PhaseObservations) -> Tensor:
+    def gains(self, planes: PlaneSet, scene: LinkAt) -> Tensor:
         """Return the gains of the direct path and of each image at the positions of a scene, float32 (n, 1 + S).
 
         Args:
@@ -135,8 +133,8 @@ class Furniture:
         padded = _padded(self.absorption)
 
         def transmission(group: _Crossings) -> Tensor:
-            found = padded.index_select(0, group.voxel.flatten()).view(group.voxel.shape)
-            return (-found.sum(-1) * group.step_m).exp()
+            absorption = padded.index_select(0, group.voxel.flatten()).view(group.voxel.shape)
+            return (-absorption.sum(-1) * group.step_m).exp()
 
         return _gains(self._crossings(planes, scene), _factor(planes, scene), transmission, self.reflectivity)
 
@@ -178,28 +176,25 @@ class Furniture:
         hatch(ax, x, y, np.isnan(values))
         return ax
 
-    def _crossings(self, planes: PlaneSet, scene: PhaseObservations) -> list[_Crossings]:
+    def _crossings(self, planes: PlaneSet, scene: LinkAt) -> list[_Crossings]:
         sequence: list[Sequence] = [(), *planes.sequence]
         groups: dict[int, list[int]] = {}
         for row, s in enumerate(sequence):
             groups.setdefault(len(s), []).append(row)
         return [self._crossed(planes, scene, [sequence[row] for row in rows], rows) for rows in groups.values()]
 
-    def _crossed(
-        self, planes: PlaneSet, scene: PhaseObservations, sequence: list[Sequence], rows_of: list[int]
-    ) -> _Crossings:
+    def _crossed(self, planes: PlaneSet, scene: LinkAt, sequence: list[Sequence], rows_of: list[int]) -> _Crossings:
         """Follow the paths of images with equally many reflections from the moving end to the fixed end.
 
         A path is straight towards its image. Samples of it beyond a reflection are mirrored back into the room.
         """
-        fixed = scene.receiver if scene.end == "transmitter" else scene.transmitter
         order = orders(tuple(sequence), tuple(map(tuple, planes.normal[0].tolist())))  # (S, Q, D)
         if scene.end == "transmitter":
             order = order.flip(-1)
         # coordinates come first, in voxels from the corner of the layer of empty ones around the grid
         normal, away = planes.normal[0].T, (planes.offset[0] - planes.normal[0] @ self.low) / self.voxel_m
         away = away + planes.normal[0].sum(dim=1)
-        source = [((fixed[0] - self.low) / self.voxel_m + 1)[:, None, None].expand(-1, *order.shape[:2])]
+        source = [((scene.fixed - self.low) / self.voxel_m + 1)[:, None, None].expand(-1, *order.shape[:2])]
         for plane in order.unbind(-1):
             source.append(mirror(source[-1], normal[:, plane], away[plane]))
         normal, away = normal.float(), away.float()
@@ -210,9 +205,9 @@ class Furniture:
         for depth in range(order.shape[2], 0, -1):
             plane = order[..., depth - 1]
             n, ray = normal[:, None, plane], source[depth].float()[:, None] - point
-            share = (away[plane] - (point * n).sum(0)) / (ray * n).sum(0)
-            exists = exists & (share > 0) & (share < 1)
-            point, along = point + share * ray, along + share * (1 - along)
+            fraction = (away[plane] - (point * n).sum(0)) / (ray * n).sum(0)
+            exists = exists & (fraction > 0) & (fraction < 1)
+            point, along = point + fraction * ray, along + fraction * (1 - along)
             hits.append((point, along, plane))
         best = exists.byte().argmax(-1, keepdim=True)  # (n, S, 1): of the orders of one image at most one exists
 
@@ -292,7 +287,7 @@ def _gains(
     return torch.cat(gain, dim=1)[:, order] * factor
 
 
-def _factor(planes: PlaneSet, scene: PhaseObservations) -> Tensor:
+def _factor(planes: PlaneSet, scene: LinkAt) -> Tensor:
     """Return the gains of all paths of reflectivity 1 without absorption, (n or 1, 1 + S)."""
     if not planes.sequence:
         return torch.ones(1, 1)
@@ -321,7 +316,7 @@ def orders(sequence: tuple[Sequence, ...], normal: tuple[tuple[float, ...], ...]
     """
     n = torch.tensor(normal, dtype=torch.float64).reshape(-1, 3)
     cosine = (n @ n.T).abs()
-    found = []
+    rows = []
     for first in sequence:
         orders, new = {first}, [first]
         while new:
@@ -331,9 +326,9 @@ def orders(sequence: tuple[Sequence, ...], normal: tuple[tuple[float, ...], ...]
             ]
             new += [other for other in swapped if other not in orders]
             orders |= {*swapped}
-        found.append([first, *sorted(orders - {first})])
-    most = max(map(len, found))
-    return torch.tensor([orders + orders[:1] * (most - len(orders)) for orders in found], dtype=torch.int64)
+        rows.append([first, *sorted(orders - {first})])
+    most = max(map(len, rows))
+    return torch.tensor([orders + orders[:1] * (most - len(orders)) for orders in rows], dtype=torch.int64)
 
 
 def fit_furniture(planes: PlaneSet, measured: Channels, start: Furniture) -> Furniture:
@@ -369,7 +364,7 @@ def fit_furniture(planes: PlaneSet, measured: Channels, start: Furniture) -> Fur
             penalty = penalty + start.voxel_m * _variation(cells)
             # a wall reflects alike everywhere unless channels need another gain, another surface nowhere
             penalty = penalty + area * ((cells - usual[number]).abs() if is_wall[number] else cells).sum()
-        loss = 1 - coherence(observed, field(gain, wave)).mean() + start.penalty * penalty
+        loss = 1 - coherence(observed, superposed(gain, wave)).mean() + start.penalty * penalty
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -384,7 +379,7 @@ def fit_furniture(planes: PlaneSet, measured: Channels, start: Furniture) -> Fur
 
 @single_thread()
 def find_furniture(
-    planes: PlaneSet, free: Tensor, measured: Channels, corners: Tensor, fold: Tensor
+    planes: PlaneSet, free: Tensor, measured: Channels, corners: Tensor, fold: Tensor, *, significance: float = 2.5
 ) -> Furniture | None:
     """Estimate what stands in a room; None if it does not explain held-out channels better than planes alone.
 
@@ -394,9 +389,41 @@ def find_furniture(
         measured: Measured channels.
         corners: Points (m, 3) [m] that the voxels surround, besides the measured positions.
         fold: Fold of each position.
+        significance: Standard errors by which furniture must explain held-out channels better than planes alone, and each
+            surface better than the room without it. As `GeometryConfig.significance`, not studied apart.
     """
+    low, high, empty = _empty(planes, measured, corners)
+    rows = measured.scene.few_rows(MAX_CHOICE)
+    held_out = _HeldOut(planes, measured.subset(rows), [(kept, out) for out, kept in each_fold(fold[rows])])
+    few = max(2, math.ceil(MIN_HELD_OUT * len(held_out.splits) / len(rows)))
+    fits = [held_out.fits(start, slice(few)) for start in empty]
+    best = max(range(len(empty)), key=lambda row: float(log_explained(held_out.coherence(fits[row])).mean()))
+    with_furniture = held_out.coherence(fits[best] + held_out.fits(empty[best], slice(few, None)))
+    out = torch.cat([out for _, out in held_out.splits])
+    alone = held_out.measured.subset(out).coherence(planes, free[rows][out])
+    is_furnished = robust_advantage(with_furniture, alone) > significance
+    # without furniture a strong penalty is best, but leaves too much in the residual to find walls that are hidden at times
+    start = empty[best if is_furnished else 0]
+    furniture = fit_furniture(planes, measured, start)
+    surfaces = find_surfaces(planes, furniture.gains(planes, measured.scene), measured, low, high)
+    if surfaces:
+        wider, n = start.with_surfaces(surfaces), planes.gain.shape[1]
+        fitted = held_out.fits(wider)
+        every = held_out.coherence(fitted)
+        without = [
+            held_out.coherence([fit.with_reflectivity(n + row, 0.0) for fit in fitted]) for row in range(len(surfaces))
+        ]
+        kept = [s for s, other in zip(surfaces, without, strict=True) if log_advantage(every, other) > significance]
+        if kept and min(log_advantage(every, other) for other in (with_furniture, alone)) > significance:
+            wider = start.with_surfaces(kept)
+            return fit_furniture(wider.joined(planes), measured, wider)
+    return furniture if is_furnished else None
+
+
+def _empty(planes: PlaneSet, measured: Channels, corners: Tensor) -> tuple[Tensor, Tensor, list[Furniture]]:
+    """Return two opposite corners (3,) [m] of the region of the voxels, and the empty voxels of each of `SETTINGS`."""
     wavelength = math.tau / measured.scene.wavenumber
-    region = torch.cat([corners, measured.scene.moving, measured.scene.transmitter, measured.scene.receiver])
+    region = torch.cat([corners, measured.scene.moving, measured.scene.fixed[None]])
     low, high = region.amin(0) - wavelength, region.amax(0) + wavelength
     smallest = float((high - low).prod() / MAX_VOXELS) ** (1 / 3)
     empty = []
@@ -405,47 +432,39 @@ def find_furniture(
         shape = ((high - low) / voxel).ceil().int().tolist()
         cells = torch.ones(planes.gain.shape[1], math.prod(shape) // min(shape))
         empty.append(Furniture(low, voxel, torch.zeros(shape), cells, torch.zeros(shape), penalty))
-    some = torch.linspace(0, len(fold) - 1, min(MAX_CHOICE, len(fold))).long()
-    chosen, fold = measured.subset(some), fold[some]
-    splits = [(kept, out) for out, kept in each_fold(fold)]
-    few = max(2, math.ceil(MIN_HELD_OUT * len(splits) / len(fold)))
+    return low, high, empty
 
-    def fitted(task: tuple[Furniture, tuple[Tensor, Tensor]]) -> Furniture:
-        start, (kept, _) = task
-        return fit_furniture(start.joined(planes), chosen.subset(kept), start)
 
-    def coherences(furniture: list[Furniture]) -> Tensor:
-        """Return the coherence at positions of the first folds of furniture that is fitted without each of these folds."""
-        found = []
-        for each, (_, held) in zip(furniture, splits, strict=False):
-            test, both = chosen.subset(held), each.joined(planes)
-            found.append(test.coherence(both, each.gains(both, test.scene)))
-        return torch.cat(found)
+@dataclass(frozen=True, eq=False)
+class _HeldOut:
+    """Fits of furniture without each fold of measured channels, and their coherence with these.
 
-    fits = [parallel_map(fitted, [(start, split) for split in splits[:few]]) for start in empty]
-    best = max(range(len(empty)), key=lambda row: float(log_explained(coherences(fits[row])).mean()))
-    with_furniture = coherences(fits[best] + parallel_map(fitted, [(empty[best], split) for split in splits[few:]]))
-    held = torch.cat([held for _, held in splits])
-    alone = chosen.subset(held).coherence(planes, free[some][held])
-    is_furnished = robust_advantage(with_furniture, alone) > SIGNIFICANCE
-    # without furniture a strong penalty is best, but leaves too much in the residual to find walls that are hidden at times
-    best = best if is_furnished else 0
-    found = fit_furniture(planes, measured, empty[best])
-    surfaces = find_surfaces(planes, found.gains(planes, measured.scene), measured, low, high)
-    if surfaces:
-        wider, n = empty[best].with_surfaces(surfaces), planes.gain.shape[1]
-        wider_fits = parallel_map(fitted, [(wider, split) for split in splits])
-        whole = coherences(wider_fits)
-        kept = [
-            surface
-            for row, surface in enumerate(surfaces)
-            if log_advantage(whole, coherences([fit.with_reflectivity(n + row, 0.0) for fit in wider_fits]))
-            > SURFACE_SIGNIFICANCE
-        ]
-        if kept and min(log_advantage(whole, other) for other in (with_furniture, alone)) > SIGNIFICANCE:
-            wider = empty[best].with_surfaces(kept)
-            return fit_furniture(wider.joined(planes), measured, wider)
-    return found if is_furnished else None
+    Args:
+        planes: Planes of one room.
+        measured: Measured channels.
+        splits: Rows that are kept and held out, for each fold.
+    """
+
+    planes: PlaneSet
+    measured: Channels
+    splits: list[tuple[Tensor, Tensor]]
+
+    def fits(self, start: Furniture, number: slice = slice(None)) -> list[Furniture]:
+        """Return furniture with the voxels, penalty and surfaces of `start`, fitted without each of some folds."""
+        joined = start.joined(self.planes)
+
+        def fitted(split: tuple[Tensor, Tensor]) -> Furniture:
+            return fit_furniture(joined, self.measured.subset(split[0]), start)
+
+        return parallel_map(fitted, self.splits[number])
+
+    def coherence(self, fits: list[Furniture]) -> Tensor:
+        """Return the coherence at the positions of the first folds, given the fits without each of these."""
+        parts = []
+        for fit, (_, out) in zip(fits, self.splits, strict=False):
+            test, joined = self.measured.subset(out), fit.joined(self.planes)
+            parts.append(test.coherence(joined, fit.gains(joined, test.scene)))
+        return torch.cat(parts)
 
 
 def _variation(values: Tensor) -> Tensor:

@@ -14,12 +14,13 @@ import itertools
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import Self
 
 import torch
 from torch import Tensor
 
-from swiftwrf.array.planar import PlanarArray
 from swiftwrf.choices import Moving
+from swiftwrf.models.link import Link
 
 MAX_COSINE = 0.02  # of two planes that count as perpendicular; above 1 - MAX_COSINE**2 they count as parallel
 N_POSITIONS = 36  # that many rooms are scored at
@@ -80,19 +81,19 @@ class PlaneSet:
     @property
     def image_gain(self) -> Tensor:
         """Product of the gains along each sequence, (B, S)."""
-        tree, last, found = tree_of(self.sequence), torch.ones(len(self.gain), 1), []
+        tree, last, levels = tree_of(self.sequence), torch.ones(len(self.gain), 1), []
         for parent, plane in tree.levels:
             last = last[:, parent] * self.gain[:, plane]
-            found.append(last)
-        return torch.cat(found, dim=1)[:, tree.rows]
+            levels.append(last)
+        return torch.cat(levels, dim=1)[:, tree.rows]
 
-    def angular_factor(self, scene: PhaseObservations) -> Tensor:
+    def angular_factor(self, scene: LinkAt) -> Tensor:
         """Return the gain of each image at the positions of a scene, divided by `image_gain`, (B, S, n or 1)."""
         if self.dielectric is None:
             return torch.ones(1, len(self.sequence), 1)
         return (self.plane_factor(scene) ** reflections(self.sequence, self.gain.shape[1])[..., None]).prod(1)
 
-    def plane_factor(self, scene: PhaseObservations) -> Tensor:
+    def plane_factor(self, scene: LinkAt) -> Tensor:
         """Return the gain of each plane on the path of each image, divided by `gain`, (B, P, S, n or 1).
 
         The ray of the image determines the angles at all planes if these are parallel or perpendicular.
@@ -123,11 +124,11 @@ class PlaneSet:
             dielectric = torch.nn.functional.pad(dielectric, (0, other.gain.shape[1]))
         return replace(self, normal=normal, offset=offset, gain=gain, dielectric=dielectric)
 
-    def field(self, scene: PhaseObservations) -> Tensor:
+    def field(self, scene: LinkAt) -> Tensor:
         """Return the field with the direct wave at the positions of a scene, (n, 2 K, B)."""
         return scene.direct + field(scene, self)
 
-    def channel(self, scene: PhaseObservations) -> Tensor:
+    def channel(self, scene: LinkAt) -> Tensor:
         """Return the channel of one room at each element, complex64 (n, K)."""
         real, imaginary = self.field(scene)[..., 0].chunk(2, dim=1)
         return torch.complex(real, imaginary)
@@ -142,17 +143,14 @@ class PlaneSet:
 
 
 @dataclass(frozen=True, eq=False)
-class PhaseObservations:
-    """A link at n positions and the observed phases of its channel.
+class LinkAt:
+    """The ends of a link at n positions of the moving one, and the waves between them.
 
     Args:
         transmitter, receiver: Positions, float64 (n, 3), of the fixed end (1, 3) [m].
         end: The end that moves.
         element: Phase of a wave from unit vector u at each element is element @ u, float32 (K, 3) [rad].
         wavenumber: Wavenumber [rad / m].
-        channel: Observed phases, complex64 (n, T, K) of unit modulus. Of spectra T is 2: the channel and its alternative,
-            the conjugate observed by an array rotated by half a turn. Spectra cannot distinguish them if each element has an
-            opposite one. Of measured channels T is 1.
     """
 
     transmitter: Tensor
@@ -160,42 +158,21 @@ class PhaseObservations:
     end: Moving
     element: Tensor
     wavenumber: float
-    channel: Tensor
 
     @classmethod
-    def of(
-        cls,
-        position: Tensor,
-        fixed: Tensor,
-        moving: Moving,
-        array: PlanarArray,
-        rotation: Tensor,
-        channel: Tensor,
-        retrieved: bool = True,
-    ) -> PhaseObservations:
-        """Return the link of a moving end (n, 3) [m] and a fixed end (3,) [m].
-
-        Args:
-            position: Positions of the moving end (n, 3) [m].
-            fixed: Position of the fixed end (3,) [m].
-            moving: The end that moves.
-            array: Array at the receiver.
-            rotation: Matrix that rotates array into world coordinates, (3, 3).
-            channel: Phasors of the elements, complex (n, K) of modulus 1.
-            retrieved: True for phases from spectra, which have an alternative; False for those of measured channels.
-        """
+    def of(cls, position: Tensor, link: Link, **values: Tensor) -> Self:
+        """Return a link with array and fixed end at positions of the moving end (n, 3) [m], and what was observed there."""
+        assert link.fixed_position is not None
+        assert link.array is not None
+        assert link.rotation is not None
+        fixed, wavenumber = link.fixed_position, 2 * math.pi / link.array.wavelength
         away = position - fixed
         size = away.abs().amax(dim=1, keepdim=True)
         farthest = fixed + MAX_DISTANCE_M * (away / size.clamp_min(MAX_DISTANCE_M))
         position = torch.where(size > MAX_DISTANCE_M, farthest, position)
-        transmitter, receiver = (position, fixed[None]) if moving == "transmitter" else (fixed[None], position)
-        wavenumber = 2 * math.pi / array.wavelength
-        element = wavenumber * array.element.double() @ rotation[:, :2].T.double()
-        opposite = array.opposite if retrieved else None
-        found = [channel] if opposite is None else [channel, channel.conj()[:, opposite]]
-        return cls(
-            transmitter, receiver, moving, element.float(), wavenumber, torch.stack(found, dim=1).to(torch.complex64)
-        )
+        ends = (position, fixed[None]) if link.moving == "transmitter" else (fixed[None], position)
+        element = wavenumber * link.array.element.double() @ link.rotation[:, :2].T.double()
+        return cls(*ends, link.moving, element.float(), wavenumber, **values)
 
     def __len__(self) -> int:
         return len(self.moving)
@@ -205,21 +182,21 @@ class PhaseObservations:
         """Positions of the end that moves, (n, 3) [m]."""
         return self.transmitter if self.end == "transmitter" else self.receiver
 
-    def subset(self, rows: Tensor) -> PhaseObservations:
+    @property
+    def fixed(self) -> Tensor:
+        """Position of the fixed end, (3,) [m]."""
+        return (self.receiver if self.end == "transmitter" else self.transmitter)[0]
+
+    def subset(self, rows: Tensor) -> Self:
         """Return the given positions."""
         moving = self.moving[rows]
-        ends = (moving, self.receiver) if self.end == "transmitter" else (self.transmitter, moving)
-        return replace(self, transmitter=ends[0], receiver=ends[1], channel=self.channel[rows])
-
-    def few(self, most: int = N_POSITIONS) -> PhaseObservations:
-        """Return at most `most` of the positions, evenly chosen, to score many rooms at."""
-        return self.subset(self.few_rows(most))
+        return replace(self, transmitter=moving) if self.end == "transmitter" else replace(self, receiver=moving)
 
     def few_rows(self, most: int) -> Tensor:
         """Return the numbers of at most `most` of the positions, evenly chosen."""
         return torch.linspace(0, len(self) - 1, min(most, len(self))).long()
 
-    def around(self, origin: Tensor) -> PhaseObservations:
+    def around(self, origin: Tensor) -> Self:
         """Return the link in coordinates from an origin (3,) [m], rounded to a thousandth of a radian of phase.
 
         Without rounding, near ties of a search would depend on the origin of the world coordinates.
@@ -236,11 +213,11 @@ class PhaseObservations:
 
     def waves(self, source: Tensor, frequency: Tensor) -> Tensor:
         """Return the waves of `wave` at frequencies (F,) relative to the carrier, complex64 (S, n, F, K)."""
-        found = []
+        waves = []
         for ratio in frequency.tolist():
             at = replace(self, element=self.element * ratio, wavenumber=self.wavenumber * ratio)
-            found += [at.wave(source).expand(-1, len(self), -1)]
-        return torch.stack(found, dim=2)
+            waves += [at.wave(source).expand(-1, len(self), -1)]
+        return torch.stack(waves, dim=2)
 
     def wave(self, source: Tensor) -> Tensor:
         """Return the wave exp(-j k d) / d of sources (..., n or 1, 3) [m] at each element, complex64 (..., n, K)."""
@@ -257,6 +234,41 @@ class PhaseObservations:
         length = ray.square().sum(0).clamp_min(1e-12).sqrt()
         phase = (self.element @ (ray / length).flatten(1)).reshape(len(self.element), *length.shape)
         return phase - self.wavenumber * length, length
+
+
+@dataclass(frozen=True, eq=False)
+class PhaseObservations(LinkAt):
+    """A link and the observed phases of its channel.
+
+    Args:
+        channel: Observed phases, complex64 (n, T, K) of unit modulus. Of spectra T is 2: the channel and its alternative,
+            the conjugate observed by an array rotated by half a turn. Spectra cannot distinguish them if each element has an
+            opposite one. Of measured channels T is 1.
+    """
+
+    channel: Tensor
+
+    @classmethod
+    def of_phases(cls, position: Tensor, link: Link, channel: Tensor, retrieved: bool = True) -> Self:
+        """Return the observations at positions of the moving end.
+
+        Args:
+            position: Positions of the moving end (n, 3) [m].
+            link: Link with array, rotation and fixed end.
+            channel: Phasors of the elements, complex (n, K) of modulus 1.
+            retrieved: True for phases from spectra, which have an alternative. False for those of measured channels.
+        """
+        assert link.array is not None
+        opposite = link.array.opposite if retrieved else None
+        observed = [channel] if opposite is None else [channel, channel.conj()[:, opposite]]
+        return cls.of(position, link, channel=torch.stack(observed, dim=1).to(torch.complex64))
+
+    def subset(self, rows: Tensor) -> Self:
+        return replace(super().subset(rows), channel=self.channel[rows])
+
+    def few(self, most: int = N_POSITIONS) -> Self:
+        """Return at most `most` of the positions, evenly chosen, to score many rooms at."""
+        return self.subset(self.few_rows(most))
 
     def coherence(self, field: Tensor) -> Tensor:
         """Return |x^H h|^2 / K^2 of the observed phases and those of a field (n, 2 K, B), (n, B), in [0, 1].
@@ -284,8 +296,8 @@ def sequences(normal: Tensor, order: int) -> list[Sequence]:
     """
     cosine = (normal @ normal.T).tolist()
     planes = range(len(normal))
-    found: list[Sequence] = [(i,) for i in planes]
-    last = found
+    every: list[Sequence] = [(i,) for i in planes]
+    last = every
     for _ in range(order - 1):
         last = [
             (*s, i)
@@ -294,8 +306,8 @@ def sequences(normal: Tensor, order: int) -> list[Sequence]:
             and i != s[-1]
             and not (abs(cosine[s[-1]][i]) < MAX_COSINE and i < s[-1])
         ]
-        found = found + last
-    return found
+        every = every + last
+    return every
 
 
 @dataclass(frozen=True)
@@ -366,27 +378,27 @@ def mirror(source: Tensor, normal: Tensor, offset: Tensor) -> Tensor:
     return source - 2 * ((source * normal).sum(0) - offset) * normal
 
 
-def images(scene: PhaseObservations, planes: PlaneSet) -> Tensor:
+def images(scene: LinkAt, planes: PlaneSet) -> Tensor:
     """Return the image positions, float64 (B, S, n or 1, 3) [m]."""
     normal, offset, tree = planes.normal, planes.offset, tree_of(planes.sequence)
     # the origin and the ends of the unit vectors are mirrored, and positions follow by one product
-    last, found = FRAME[:, None, None].expand(-1, len(normal), 1, -1), []
+    last, levels = FRAME[:, None, None].expand(-1, len(normal), 1, -1), []
     for parent, plane in tree.levels:
         last = mirror(last[:, :, parent], normal[:, plane].movedim(-1, 0)[..., None], offset[:, plane, None])
-        found.append(last)
-    origin, ends = torch.cat(found, dim=2)[:, :, tree.rows].split([1, 3], dim=-1)
+        levels.append(last)
+    origin, ends = torch.cat(levels, dim=2)[:, :, tree.rows].split([1, 3], dim=-1)
     position: Tensor = origin + (ends - origin) @ scene.transmitter.T
     return position.movedim(0, -1)
 
 
-def phase_period_m(scene: PhaseObservations, room: PlaneSet, plane: int) -> float:
+def phase_period_m(scene: LinkAt, room: PlaneSet, plane: int) -> float:
     """Return the movement [m] of a plane of one room that changes its phase by 2 pi on average."""
     ray = images(scene, replace(room, only=((plane,),)))[0, 0] - scene.receiver
     cosine = float((ray @ room.normal[0, plane] / ray.norm(dim=-1)).abs().mean().clamp_min(0.3))
     return math.pi / (scene.wavenumber * cosine)
 
 
-def field(scene: PhaseObservations, planes: PlaneSet) -> Tensor:
+def field(scene: LinkAt, planes: PlaneSet) -> Tensor:
     """Return the sum of the waves of the images, without the direct wave, (n, 2 K, B)."""
     if not planes.sequence:
         return torch.zeros(len(scene), 2 * len(scene.element), len(planes.offset))
@@ -402,7 +414,7 @@ def field(scene: PhaseObservations, planes: PlaneSet) -> Tensor:
     return total.permute(2, 0, 1, 3).flatten(1, 2)
 
 
-def visibility(scene: PhaseObservations, planes: PlaneSet) -> Tensor:
+def visibility(scene: LinkAt, planes: PlaneSet) -> Tensor:
     """Return 1 where the path of each image exists, else 0, float32 (B, S, n or 1).
 
     Between parallel or perpendicular planes all paths exist, because the region is inside of all planes. Other paths are
@@ -422,7 +434,7 @@ def visibility(scene: PhaseObservations, planes: PlaneSet) -> Tensor:
             last = [s[-1] for s in begun]
             n, o = normal[:, last, None], offset[:, last, None]
             towards = images(scene, replace(planes, only=begun)) - point
-            share = (o - (point * n).sum(-1)) / (towards * n).sum(-1)
-            there[:, rows] *= ((share > 0) & (share < 1)).float()
-            point = point + share[..., None] * towards
+            fraction = (o - (point * n).sum(-1)) / (towards * n).sum(-1)
+            there[:, rows] *= ((fraction > 0) & (fraction < 1)).float()
+            point = point + fraction[..., None] * towards
     return there

@@ -19,10 +19,10 @@ from swiftwrf.data.spectra import Spectra, fingerprint
 from swiftwrf.data.splits import folds
 from swiftwrf.errors import InputError
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, bounding_box
-from swiftwrf.models.geometry.channels import Channels, field, waves
+from swiftwrf.models.geometry.channels import Channels, superposed, waves
 from swiftwrf.models.geometry.fit import GeometryConfig, refine_room, search_room, update_room
 from swiftwrf.models.geometry.furniture import Furniture, find_furniture, fit_furniture, orders
-from swiftwrf.models.geometry.images import PhaseObservations, PlaneSet, Sequence, images, mirror
+from swiftwrf.models.geometry.images import LinkAt, PhaseObservations, PlaneSet, Sequence, images, mirror
 from swiftwrf.models.geometry.planes import Plane, RoomEstimate, plane_set, refine
 from swiftwrf.models.link import Link, Linked
 from swiftwrf.positions import check_positions
@@ -134,7 +134,7 @@ class GeometryModel(Linked, FieldModel):
         rows = kept_snapshots(data.channel.shape[1])
         carrier = LIGHT_SPEED / self.array.wavelength
         frequency = torch.ones(len(rows)).double() if data.frequency_hz is None else data.frequency_hz[rows] / carrier
-        return Channels(self.scene(data.position), unit_power(data.channel[:, rows]), frequency)
+        return Channels(self.link_at(data.position), unit_power(data.channel[:, rows]), frequency)
 
     def _update(self, new: Spectra) -> None:
         if self.planes:
@@ -144,8 +144,8 @@ class GeometryModel(Linked, FieldModel):
     def refined_on(self, scene: PhaseObservations) -> Self:
         """Return the room with offsets and gains refined on the observed phases of some spectra, without a search."""
         model, new = copy(self), refine(scene, self.tensors())
-        found = zip(self.planes, new.offset[0].tolist(), new.gain[0].tolist(), strict=True)
-        model.estimate = replace(self.estimate, planes=[replace(p, offset_m=o, gain=g) for p, o, g in found])
+        refined = zip(self.planes, new.offset[0].tolist(), new.gain[0].tolist(), strict=True)
+        model.estimate = replace(self.estimate, planes=[replace(p, offset_m=o, gain=g) for p, o, g in refined])
         return model
 
     def with_order(self, order: int) -> Self:
@@ -194,13 +194,13 @@ class GeometryModel(Linked, FieldModel):
             >>> model.channel(room.position[:3], torch.tensor([2.40e9, 2.42e9])).shape
             torch.Size([3, 2, 16])
         """
-        scene = self.scene(position)
+        scene = self.link_at(position)
         ratio = torch.ones(1) if frequency_hz is None else frequency_hz * self.array.wavelength / LIGHT_SPEED
-        found = field(self.gains(scene), waves(self.reflectors, scene, ratio))
-        return found[:, 0] if frequency_hz is None else found
+        channel = superposed(self.gains(scene), waves(self.reflectors, scene, ratio))
+        return channel[:, 0] if frequency_hz is None else channel
 
-    def gains(self, scene: PhaseObservations) -> Tensor:
-        """Return the gains of the direct path and of each image at the positions of a scene, float32 (n, 1 + S)."""
+    def gains(self, scene: LinkAt) -> Tensor:
+        """Return the gains of the direct path and of each image at positions, float32 (n, 1 + S)."""
         room = self.reflectors
         if self.furniture is not None:
             return self.furniture.gains(room, scene)
@@ -232,7 +232,7 @@ class GeometryModel(Linked, FieldModel):
             >>> model.paths(room.position[0]).reflections.tolist()
             [(), (0,)]
         """
-        scene, room = self.scene(check_positions(position, "position", (3,))[None]), self.reflectors
+        scene, room = self.link_at(check_positions(position, "position", (3,))[None]), self.reflectors
         gain = free = self.gains(scene)[0]
         if self.furniture is not None:
             nothing = torch.zeros_like(self.furniture.absorption)
@@ -245,13 +245,12 @@ class GeometryModel(Linked, FieldModel):
                 level, hidden = (20 * math.log10(max(abs(float(x[number])), 1e-9)) for x in (gain, free))
                 spread = 20 * math.log10(direct / length)
                 rows.append((sequence, length, level + spread, hidden - level, points.numpy()))
-        found = pd.DataFrame(rows, columns=["reflections", "length_m", "level_db", "hidden_db", "points"])
-        return found.sort_values("level_db", ascending=False, ignore_index=True)
+        table = pd.DataFrame(rows, columns=["reflections", "length_m", "level_db", "hidden_db", "points"])
+        return table.sort_values("level_db", ascending=False, ignore_index=True)
 
-    def scene(self, position: Tensor) -> PhaseObservations:
-        """Return the link at positions (n, 3) [m], without observations."""
-        nothing = torch.ones(len(position), len(self.array.element), dtype=torch.complex64)
-        return PhaseObservations.of(position, self.fixed_position, self.moving, self.array, self.rotation, nothing)
+    def link_at(self, position: Tensor) -> LinkAt:
+        """Return the link at positions of the moving end (n, 3) [m]."""
+        return LinkAt.of(position, self.link)
 
     def tensors(self) -> PlaneSet:
         """Return the planes as tensors."""
@@ -268,9 +267,9 @@ class GeometryModel(Linked, FieldModel):
         room = self.tensors()
         if not room.sequence:
             return at, strength, order
-        link = replace(self.scene(at), transmitter=at)
-        found, reflections = images(link, room)[0, :, 0], torch.tensor([len(s) for s in room.sequence])
-        return torch.cat([at, found]), torch.cat([strength, room.image_gain[0]]), torch.cat([order, reflections])
+        link = replace(self.link_at(at), transmitter=at)
+        mirrored, reflections = images(link, room)[0, :, 0], torch.tensor([len(s) for s in room.sequence])
+        return torch.cat([at, mirrored]), torch.cat([strength, room.image_gain[0]]), torch.cat([order, reflections])
 
     def to_json(self) -> dict[str, Any]:
         """Return the room as plain values, see `RoomEstimate.to_json`, and the `Furniture`, if there is any."""
@@ -292,7 +291,7 @@ class GeometryModel(Linked, FieldModel):
             self.furniture.check(len(self.planes))
 
 
-def _points(scene: PhaseObservations, room: PlaneSet, sequence: Sequence) -> Tensor | None:
+def _points(scene: LinkAt, room: PlaneSet, sequence: Sequence) -> Tensor | None:
     """Return the ends and the places of reflection of one path at the only position of a scene, (2 + D, 3), if it exists."""
     normal, offset = room.normal[0], room.offset[0]
     for planes in orders((sequence,), tuple(map(tuple, normal.tolist())))[0].tolist():
@@ -301,10 +300,10 @@ def _points(scene: PhaseObservations, room: PlaneSet, sequence: Sequence) -> Ten
             image.append(mirror(image[-1], normal[plane], offset[plane]))
         for plane in reversed(planes):
             towards = image.pop() - points[-1]
-            share = float((offset[plane] - points[-1] @ normal[plane]) / (towards @ normal[plane]))
-            if not 0 < share < 1:
+            fraction = float((offset[plane] - points[-1] @ normal[plane]) / (towards @ normal[plane]))
+            if not 0 < fraction < 1:
                 break
-            points.append(points[-1] + share * towards)
+            points.append(points[-1] + fraction * towards)
         else:
             return torch.stack([scene.transmitter[0], *reversed(points)])
     return None

@@ -25,7 +25,7 @@ from swiftwrf.data.splits import each_fold
 from swiftwrf.errors import InputError
 from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.models.geometry.channels import waves
-from swiftwrf.models.geometry.images import PhaseObservations
+from swiftwrf.models.geometry.images import LinkAt, PhaseObservations
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.phase_retrieval import autocorrelation
 from swiftwrf.models.geometry.planes import advantage
@@ -34,7 +34,7 @@ from swiftwrf.runtime.validation import PositiveInt
 
 MAX_CHOICE = 200  # spectra that choose the prior
 MIN_ERROR = 1e-6  # of squared co-array numbers, by rounding
-HIGHEST_ORDER, MAX_PATHS = 3, 100  # of the image sources that may be added to those of the room
+MAX_PATHS = 100  # of a room with image sources of a higher order, whose time grows with their number
 
 PriorName = Literal["loose", "tight"]
 
@@ -47,7 +47,7 @@ class GainPrior:
         std: Standard deviation of a gain about that of its planes, in phase and in quadrature.
         sample_std: Standard deviation of the samples around which fields are fitted, relative to the prior. Samples of the
             whole prior explain held-out spectra worse.
-        missing_scale: Twice the expected missing coherence of a spectrum.
+        missing_scale: Scale s of the misfit: a spectrum adds (1 - coherence) / s to the negative log posterior.
         steps: Number of Adam steps.
     """
 
@@ -96,7 +96,7 @@ class PathGains:
 
     def channel(self, geometry: GeometryModel, position: Tensor) -> Tensor:
         """Return the channel of each element in each of F fields at positions (n, 3) [m], complex64 (n, F, K)."""
-        wave, gain = paths(geometry, geometry.scene(position))
+        wave, gain = paths(geometry, geometry.link_at(position))
         return (gain[:, None] + self.change(position)) @ wave
 
     def change(self, position: Tensor) -> Tensor:
@@ -105,7 +105,7 @@ class PathGains:
         return torch.view_as_complex(change)
 
 
-def paths(geometry: GeometryModel, scene: PhaseObservations) -> tuple[Tensor, Tensor]:
+def paths(geometry: GeometryModel, scene: LinkAt) -> tuple[Tensor, Tensor]:
     """Return the waves of the direct path and of each image, complex64 (n, 1 + S, K), and their gains, (n, 1 + S)."""
     wave = waves(geometry.reflectors, scene, torch.ones(1))[:, :, 0]
     return wave, geometry.gains(scene)
@@ -117,26 +117,26 @@ def fit_path_gains(
 ) -> PathGains:
     """Fit path gains around several samples of their prior to the observed phases."""
     prior, (wave, gain) = PRIORS[name], paths(geometry, scene)
-    root = torch.linalg.cholesky(kernel.covariance(scene.moving.double())).float()
+    factor = torch.linalg.cholesky(kernel.covariance(scene.moving.double())).float()
     shape = len(scene), 8, gain.shape[1], 2  # eight fields, whose spectra are averaged
     sample = prior.sample_std * torch.randn(shape, generator=torch.Generator().manual_seed(0))
-    gradient, normal = posterior_gradient(scene, wave, gain, root, sample, prior), sample.clone()
+    gradient, normal = posterior_gradient(scene, wave, gain, factor, sample, prior), sample.clone()
     optimiser = torch.optim.Adam([normal], lr=0.2, fused=True)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, prior.steps)
     for _ in range(prior.steps):
         normal.grad = gradient(normal)
         optimiser.step()
         schedule.step()
-    value = root @ (torch.tensor(prior.std) * normal).flatten(1)
+    value = factor @ (torch.tensor(prior.std) * normal).flatten(1)
     return PathGains(GaussianProcess(kernel, scene.moving.double(), value, exact=True), normal.shape[2], name)
 
 
 def posterior_gradient(
-    scene: PhaseObservations, wave: Tensor, gain: Tensor, root: Tensor, sample: Tensor, prior: GainPrior
+    scene: PhaseObservations, wave: Tensor, gain: Tensor, factor: Tensor, sample: Tensor, prior: GainPrior
 ) -> Callable[[Tensor], Tensor]:
     """Return the gradient of the negative logarithm of the posterior density of path gains, around samples of the prior.
 
-    Gains are a_i = gain_i + std (root @ z)_i with standard normal variables z (n, F, S, 2). Up to a constant it is
+    Gains are a_i = gain_i + std (factor @ z)_i with standard normal variables z (n, F, S, 2). Up to a constant it is
 
         sum_s (1 - c_s) / missing_scale + |z - sample|^2 / 2,    c_s = max_x |sum_k conj(x_sk) u_sk|^2 / K^2,
 
@@ -147,7 +147,7 @@ def posterior_gradient(
         scene: Observed phases at n positions.
         wave: Waves of the paths, complex64 (n, S, K).
         gain: Gains of the paths (n, S) without those differences.
-        root: Cholesky factor of the kernel matrix, lower triangle, (n, n).
+        factor: Cholesky factor of the kernel matrix, lower triangle, (n, n).
         sample: Samples of the prior (n, F, S, 2).
         prior: Prior of the gains.
     """
@@ -155,12 +155,12 @@ def posterior_gradient(
     std = torch.tensor(prior.std).expand(sample.shape[1:]).contiguous()
     scale = 2 / (prior.missing_scale * wave.shape[-1] ** 2)
 
-    def times_root(values: Tensor, transposed: bool = False) -> Tensor:  # half the operations of a full matrix
-        product = strmm(1.0, root.numpy().T, values.flatten(1).numpy().T, side=1, trans_a=transposed)
+    def times_factor(values: Tensor, transposed: bool = False) -> Tensor:  # half the operations of a full matrix
+        product = strmm(1.0, factor.numpy().T, values.flatten(1).numpy().T, side=1, trans_a=transposed)
         return torch.from_numpy(product.T).view_as(values)
 
     def gradient(normal: Tensor) -> Tensor:
-        field = without + torch.view_as_complex(std * times_root(normal)) @ wave
+        field = without + torch.view_as_complex(std * times_factor(normal)) @ wave
         unit = field.sgn()
         match = unit @ conjugate.mT
         better = match.abs().argmax(-1, keepdim=True)
@@ -168,14 +168,14 @@ def posterior_gradient(
         across = (match.gather(2, better).conj() * nearer * unit).imag
         slope = scale * across / field.abs().clamp_min_(1e-30)  # a phase needs no modulus
         by_gain = torch.complex(-slope * unit.imag, slope * unit.real) @ wave.mH
-        return times_root(std * torch.view_as_real(by_gain), transposed=True) + (normal - sample)
+        return times_factor(std * torch.view_as_real(by_gain), transposed=True) + (normal - sample)
 
     return gradient
 
 
 @single_thread()
 def choose_prior(
-    geometry: GeometryModel, scene: PhaseObservations, fold: Tensor
+    geometry: GeometryModel, scene: PhaseObservations, fold: Tensor, *, highest_order: int = 3, behind: float = 3.0
 ) -> tuple[GeometryModel, PriorName, dict[int, PathGains]]:
     """Choose the order of the image sources and the prior that predict held-out spectra best.
 
@@ -183,6 +183,8 @@ def choose_prior(
         geometry: Room with planes.
         scene: Observed phases at n positions, of which at most 200 are used.
         fold: Fold of each position, (n,).
+        highest_order: Order of the image sources that are tried besides those of the room. Not studied.
+        behind: Standard errors behind the best candidate at which one is given up before all folds. Not studied.
 
     Returns:
         Room, perhaps with image sources of a higher order; the name of the prior; and the path gains fitted without each
@@ -193,8 +195,8 @@ def choose_prior(
     scene, fold = scene.subset(some), fold[some]
     kernel = kernel_of(scene.moving)
     candidates: list[tuple[GeometryModel, PriorName]] = [(geometry, name) for name in PRIORS]
-    further = geometry.with_order(HIGHEST_ORDER)
-    if geometry.order < HIGHEST_ORDER and len(further.reflectors.sequence) < MAX_PATHS:
+    further = geometry.with_order(highest_order)
+    if geometry.order < highest_order and len(further.reflectors.sequence) < MAX_PATHS:
         candidates.append((further, "tight"))
     error: list[list[Tensor]] = [[] for _ in candidates]
     fits: list[dict[int, PathGains]] = [{} for _ in candidates]
@@ -211,8 +213,8 @@ def choose_prior(
             error[row].append(_error(gains, candidates[row][0], held))
         so_far = {row: torch.cat(error[row]) for row in left}
         best = min(left, key=lambda row: float(so_far[row].mean()))
-        # three standard errors behind is given up; one held-out position has no standard error, and gives nothing up
-        left = [row for row in left if row == best or not advantage(so_far[row], so_far[best]) >= 3.0]
+        # one held-out position has no standard error, and gives nothing up
+        left = [row for row in left if row == best or not advantage(so_far[row], so_far[best]) >= behind]
         if len(left) == 1:
             break
     return *candidates[best], fits[best] if complete else {}

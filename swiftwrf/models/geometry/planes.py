@@ -13,6 +13,7 @@ from torch import Tensor
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.errors import InputError
 from swiftwrf.models.geometry.images import (
+    LinkAt,
     PhaseObservations,
     PlaneSet,
     Sequence,
@@ -125,7 +126,7 @@ def plane_set(planes: list[Plane], order: int) -> PlaneSet:
     return PlaneSet(normal, offset, torch.tensor([[p.gain for p in planes]]), order, dielectric=dielectric)
 
 
-def phase_jacobian(scene: PhaseObservations, planes: PlaneSet, movement: Tensor) -> tuple[Tensor, Tensor]:
+def phase_jacobian(scene: LinkAt, planes: PlaneSet, movement: Tensor) -> tuple[Tensor, Tensor]:
     """Return the field h with the direct wave, complex64 (K, B, n), and the derivatives of its phase, (K, B, Q P, n).
 
     The Q parameters of each plane are offset [m], gain and, if planes tilt, two rotation angles of the normal [rad]. A
@@ -137,7 +138,7 @@ def phase_jacobian(scene: PhaseObservations, planes: PlaneSet, movement: Tensor)
     where e_k . u is the phase at element k. So the derivatives are sums over images of a vector times dx.
 
     Args:
-        scene: Observed phases.
+        scene: Positions.
         planes: Planes of B rooms.
         movement: `image_jacobian` of the planes.
     """
@@ -167,7 +168,7 @@ def _over_images(values: Tensor, weights: Tensor) -> Tensor:
     return torch.einsum("kbsn,brsn->kbrn", values, weights)
 
 
-def _log_gain_slope(planes: PlaneSet, scene: PhaseObservations) -> Tensor:
+def _log_gain_slope(planes: PlaneSet, scene: LinkAt) -> Tensor:
     """Return the derivatives of the logarithms of the images' gains with respect to those of planes, (B, P, S, n or 1)."""
     count, gain = reflections(planes.sequence, planes.gain.shape[1])[..., None], planes.gain[..., None, None]
     here = gain * planes.plane_factor(scene)
@@ -191,7 +192,7 @@ def image_jacobian(planes: PlaneSet, transmitter: Tensor, tilt: bool = False) ->
     (rooms, count), turns = offset.shape, 2 if tilt else 0
     across = torch.linalg.svd(normal[:, :, None]).Vh[:, :, 1:].permute(3, 2, 0, 1)  # (3, 2, B, P)
     point = transmitter.T[:, None, None].expand(-1, rooms, 1, -1)
-    last, found = point.new_zeros(3, rooms, 1, count, 1 + turns, len(transmitter) if tilt else 1), []
+    last, levels = point.new_zeros(3, rooms, 1, count, 1 + turns, len(transmitter) if tilt else 1), []
     for parent, plane in tree.levels:
         n, o, point = normal[:, plane].movedim(-1, 0)[..., None], offset[:, plane, None], point[:, :, parent]
         last = mirror(last[:, :, parent], n[..., None, None], o.new_zeros(()))  # as points in planes through the origin
@@ -201,8 +202,8 @@ def image_jacobian(planes: PlaneSet, transmitter: Tensor, tilt: bool = False) ->
             turn = across[:, q, :, plane, None]
             last[:, :, rows, plane, 1 + q] -= 2 * ((point * turn).sum(0) * n + ((point * n).sum(0) - o) * turn)
         point = mirror(point, n, o)
-        found.append(last)
-    return torch.cat(found, dim=2)[:, :, tree.rows].permute(0, 1, 4, 3, 2, 5).flatten(2, 3).float()
+        levels.append(last)
+    return torch.cat(levels, dim=2)[:, :, tree.rows].permute(0, 1, 4, 3, 2, 5).flatten(2, 3).float()
 
 
 def normal_equations(
@@ -285,7 +286,7 @@ def refine(
 
 def refine_all(scene: PhaseObservations, rooms: list[PlaneSet], steps: int = 10, **options: Any) -> list[PlaneSet]:
     """Return single rooms, each as by `refine`. Rooms with the same sequences are computed together."""
-    found = list(rooms)
+    refined = list(rooms)
     groups: dict[tuple[Sequence, ...], list[int]] = {}
     for number, room in enumerate(rooms):
         groups.setdefault(room.sequence, []).append(number)
@@ -297,8 +298,8 @@ def refine_all(scene: PhaseObservations, rooms: list[PlaneSet], steps: int = 10,
         together = refine(scene, start, steps, **options)
         parts = (t.split(1) for t in (together.normal, together.offset, together.gain, together.score))
         for number, n, o, g, score in zip(numbers, *parts, strict=True):
-            found[number] = replace(rooms[number], normal=n, offset=o, gain=g, score=score)
-    return found
+            refined[number] = replace(rooms[number], normal=n, offset=o, gain=g, score=score)
+    return refined
 
 
 def offset_covariance(scene: PhaseObservations, room: PlaneSet) -> Tensor:

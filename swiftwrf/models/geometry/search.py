@@ -19,18 +19,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from swiftwrf.models.geometry.images import SIDES, PhaseObservations, PlaneSet, field, phase_period_m, sequences
+from swiftwrf.models.geometry.images import SIDES, LinkAt, PhaseObservations, PlaneSet, field, phase_period_m, sequences
 from swiftwrf.models.geometry.planes import refine_all
 from swiftwrf.runtime.threads import parallel_map
 
 SIGNS = torch.tensor(
     [[-1, -1, -1, -1, -1, -1], [-1, -1, -1, -1, 1, 1], [1, 1, 1, 1, 1, 1]]
 )  # of the gains: one material, vertical fields (walls turn them round, floor and ceiling do not), anything else
-USUAL_GAIN, WEAK_GAIN = 0.7, 0.3  # modulus of a gain that is not known yet, and of a plane that is hidden at times
-MAX_SCORE_RATIO = 0.997  # of the scores after and before a move that counts
 PERFECT_SCORE = 2e-6  # needs no further moves
 N_STARTS = 2 * len(SIGNS)  # of a search
-MAX_START_RATIO = 1.4  # of a start's score and the best one, beyond which the start is given up
 Alternatives = list[list[tuple[float, float]]]  # offset [m] and gain, for each side
 MAX_ALTERNATIVES = {2: 99, 3: 7, 4: 4}  # of each side, by the number of sides that move at once
 SEARCH_ORDER = 2  # reflections of an image while planes move together
@@ -39,8 +36,6 @@ N_RESCORED = 8  # times as many combinations as are wanted are scored again at m
 MAX_MOVES = 20
 N_HORIZONTAL_NORMALS = 90  # of upright walls
 N_SPHERE_NORMALS = 1200  # in all directions
-FURTHER_GAIN = 0.7  # modulus of the gain that planes of any orientation are tried with
-MIN_DISTANCE_RAD, DISTANCE_STEP_RAD = 0.5, 0.6  # of the scanned offsets beyond both ends, in phase
 
 
 @dataclass(frozen=True)
@@ -58,7 +53,7 @@ class SteeringResponses:
 
     @classmethod
     def of(
-        cls, scene: PhaseObservations, normal: Tensor, offset: list[Tensor], gain: list[Tensor], order: int = 2
+        cls, scene: LinkAt, normal: Tensor, offset: list[Tensor], gain: list[Tensor], order: int = 2
     ) -> SteeringResponses:
         """Return the waves of planes with normals (P, 3) at offsets (A,) [m] with gains (A,); none are double at order 1."""
         single = [
@@ -131,13 +126,13 @@ class SteeringResponses:
             rows_of = ([self.double[i, j].index_select(2, left[i]) for i in pairs[j]] for j in crossed)
             between = torch.cat([torch.stack(waves).sum(0) for waves in rows_of], dim=-1)
             chosen = torch.cat([functional.one_hot(right[j - half], size[j]).T for j in crossed]).float()
-        found = []
+        scores = []
         for rows in torch.arange(left.shape[1]).split(max(1, 1000 // right.shape[1])):
             total = stay.expand(-1, -1, left.shape[1])[:, :, rows, None] + move[:, :, None]
             if crossed:
                 total += between[:, :, rows] @ chosen
-            found.append(scene.score(total.flatten(2)))
-        return torch.cat(found).reshape(size)
+            scores.append(scene.score(total.flatten(2)))
+        return torch.cat(scores).reshape(size)
 
     def _among(self, planes: range, rows: Tensor) -> Tensor:
         """Return the fields (n, 2 K, C) of some neighbouring planes alone, at the offset numbers (P, C)."""
@@ -147,6 +142,27 @@ class SteeringResponses:
             if i in planes and j in planes
         }
         return SteeringResponses(self.single[planes.start : planes.stop], double).of_choices(list(rows))
+
+
+Scored = tuple[
+    PhaseObservations, Tensor, SteeringResponses
+]  # positions, field of what stays there, and what is combined
+
+
+def best_combinations(few: Scored, more: Scored, most: int) -> list[tuple[float, tuple[int, ...]]]:
+    """Return the scores of the best combinations of offsets, the best first, and their numbers for each plane.
+
+    All combinations are scored at few positions, and the best `N_RESCORED` times `most` of them at more positions.
+    """
+    scene, base, responses = few
+    score = responses.scores(scene, base)
+    best = score.flatten().argsort()[: N_RESCORED * most].numpy()
+    number = [torch.from_numpy(n) for n in np.unravel_index(best, score.shape)]  # torch's own loads its compiler
+    scene, base, responses = more
+    score = scene.score(base + responses.of_choices(number))
+    kept = score.argsort()[:most]
+    rows = torch.stack([n[kept] for n in number], dim=1).tolist()
+    return list(zip(score[kept].tolist(), map(tuple, rows), strict=True))
 
 
 def _combinations(size: list[int]) -> Tensor:
@@ -162,10 +178,10 @@ class Search:
         scene: Observed phases at the positions of the search.
         reach: Distance beyond the region of both ends up to which planes are searched [m].
         signs: Signs of the gains on the six sides (6,).
-        usual: Modulus of a gain that is not known yet.
+        usual: Modulus of a gain that is not known yet. Not studied.
     """
 
-    def __init__(self, scene: PhaseObservations, reach: float, signs: Tensor, usual: float = USUAL_GAIN) -> None:
+    def __init__(self, scene: PhaseObservations, reach: float, signs: Tensor, usual: float = 0.7) -> None:
         self.scene, self.reach, self.signs = scene, reach, signs
         self.usual: list[float] = (usual * signs).tolist()
         both = torch.cat([scene.transmitter, scene.receiver])
@@ -212,23 +228,23 @@ class Search:
 
     def refined(self, rooms: list[PlaneSet], steps: int = 6) -> list[PlaneSet]:
         """Return the rooms after Levenberg-Marquardt steps with gains of fixed signs, the best first."""
-        found = refine_all(self.scene, rooms, steps, signs=self.signs, limit=2 * self.step)
-        return sorted(found, key=lambda room: float(room.score))
+        moved = refine_all(self.scene, rooms, steps, signs=self.signs, limit=2 * self.step)
+        return sorted(moved, key=lambda room: float(room.score))
 
     def beam(self, width: int, order: int) -> PlaneSet:
         """Return the best room of a beam search that adds one plane at a time."""
         rooms = [PlaneSet.on_sides({}, order, float(self.scene.score(self.scene.direct)))]
         for _ in SIDES:
-            pool: dict[tuple[tuple[int, int], ...], PlaneSet] = {}
+            wider: dict[tuple[tuple[int, int], ...], PlaneSet] = {}
             for room in rooms:
                 planes = room.by_side()
                 for side in set(range(6)) - set(planes):
                     for score, offset in self.minima(room, side, 4):
                         new = PlaneSet.on_sides({**planes, side: (offset, self.usual[side])}, order, score)
-                        pool.setdefault(self.key(new), new)
-            if not pool:  # no side left has a minimum within reach
+                        wider.setdefault(self.key(new), new)
+            if not wider:  # no side left has a minimum within reach
                 break
-            best = sorted(pool.values(), key=lambda room: float(room.score))[: 3 * width]
+            best = sorted(wider.values(), key=lambda room: float(room.score))[: 3 * width]
             distinct: dict[tuple[tuple[int, int], ...], PlaneSet] = {}
             for room in self.refined(best, 3):  # moves refine these rooms further
                 distinct.setdefault(self.key(room), room)
@@ -261,49 +277,45 @@ class Search:
         return SteeringResponses.of(self.scene, SIDES, offset, gain, SEARCH_ORDER)
 
     def moves(self, alternatives: Alternatives, responses: SteeringResponses, k: int, keep: int) -> list[PlaneSet]:
-        """Return the best rooms in which k sides take other alternatives, of which `MAX_ALTERNATIVES` are tried.
-
-        All combinations are scored at few positions, and the best of them at all.
-        """
+        """Return the best rooms in which k sides take other alternatives, of which `MAX_ALTERNATIVES` are tried."""
         few, few_responses = self.scene.subset(self._screened), responses.subset(self._screened)
-        pool: list[tuple[float, tuple[int, ...]]] = []
+        choices: set[tuple[float, tuple[int, ...]]] = set()
         for which in itertools.combinations(range(6), k):
             base, moving = few_responses.moved(few.direct, which)
-            screened = moving.first(MAX_ALTERNATIVES.get(k)).scores(few, base)
-            best = screened.flatten().argsort()[: N_RESCORED * keep].numpy()
-            number = np.unravel_index(best, screened.shape)
-            base, moving = responses.moved(self.scene.direct, which)
-            value = self.scene.score(base + moving.of_choices([torch.from_numpy(n) for n in number]))
-            for index in value.argsort()[:keep].tolist():
-                choice = [0] * 6
-                for i, at in zip(which, number, strict=True):
-                    choice[i] = int(at[index])
-                pool.append((float(value[index]), tuple(choice)))
+            at_few = few, base, moving.first(MAX_ALTERNATIVES.get(k))
+            for score, number in best_combinations(
+                at_few, (self.scene, *responses.moved(self.scene.direct, which)), keep
+            ):
+                choice = dict(zip(which, number, strict=True))
+                choices.add((score, tuple(choice.get(side, 0) for side in range(6))))
         rooms = []
-        for value_, choice_ in sorted(set(pool))[:keep]:
-            picked = {i: alternatives[i][c] for i, c in enumerate(choice_) if alternatives[i][c][1] != 0}
-            rooms.append(PlaneSet.on_sides(picked, SEARCH_ORDER, value_))
+        for score, numbers in sorted(choices)[:keep]:
+            picked = {i: alternatives[i][c] for i, c in enumerate(numbers) if alternatives[i][c][1] != 0}
+            rooms.append(PlaneSet.on_sides(picked, SEARCH_ORDER, score))
         return rooms
 
     def aliases(self, room: PlaneSet) -> Alternatives:
         """Return (offset, gain) of each side's present plane, wherever it is, and of its aliases up to two periods away."""
-        found, planes = [], room.by_side()
+        aliases, planes = [], room.by_side()
         for side in range(6):
             if side not in planes:
-                found.append([(0.0, 0.0)])
+                aliases.append([(0.0, 0.0)])
                 continue
             offset, gain = planes[side]
             period = phase_period_m(self.scene, PlaneSet.on_sides({side: (offset, gain)}), 0)
             steps = [offset + m * period for m in (0, -1, 1, -2, 2)]
-            found.append([(o, gain) for o in steps if o == offset or o >= self.near[side]])
-        return found
+            aliases.append([(o, gain) for o in steps if o == offset or o >= self.near[side]])
+        return aliases
 
-    def improve(self, room: PlaneSet) -> PlaneSet:
-        """Return the room after moves of several planes at a time, with second-order images, until no move is better."""
+    def improve(self, room: PlaneSet, *, ratio: float = 0.997) -> PlaneSet:
+        """Return the room after moves of several planes at a time, with second-order images, until no move is better.
+
+        A move is better if it multiplies the score by less than `ratio` (not studied).
+        """
         best = self.refined([replace(room, order=SEARCH_ORDER)])[0]
         for _ in range(MAX_MOVES):
             for tried in self._trials(best):
-                if float(tried.score) < MAX_SCORE_RATIO * float(best.score):
+                if float(tried.score) < ratio * float(best.score):
                     best = tried
                     break
             else:
@@ -323,7 +335,7 @@ class Search:
 
 
 def find_rooms(
-    scene: PhaseObservations, reach: float, width: int, tick: Callable[[], object]
+    scene: PhaseObservations, reach: float, width: int, tick: Callable[[], object], *, max_ratio: float = 1.4
 ) -> list[tuple[Tensor, PlaneSet]]:
     """Return the best room of each of SIGNS with the signs of its gains, the best first.
 
@@ -334,6 +346,7 @@ def find_rooms(
         reach: Distance beyond the region of both ends up to which planes are searched [m].
         width: Width of the beam search.
         tick: Called after each of the N_STARTS starts.
+        max_ratio: Ratio of the scores of a start and of the best room beyond which the start is given up. Not studied.
     """
     nothing = PlaneSet.on_sides({}, score=float(scene.score(scene.direct)))
     if float(nothing.score) < PERFECT_SCORE:
@@ -342,19 +355,19 @@ def find_rooms(
     searched = list(itertools.product((SEARCH_ORDER, 1), searches))
     rooms = parallel_map(lambda item: item[1].beam(width, item[0]), searched)
     starts = [(room, search) for room, (_, search) in zip(rooms, searched, strict=True)]
-    found: dict[Search, PlaneSet] = {}
+    improved: dict[Search, PlaneSet] = {}
     for start, search in sorted(starts, key=lambda s: float(s[0].score)):
-        lowest = min((float(room.score) for room in found.values()), default=math.inf)
-        if not found or PERFECT_SCORE < float(start.score) < MAX_START_RATIO * lowest:
+        lowest = min((float(room.score) for room in improved.values()), default=math.inf)
+        if not improved or PERFECT_SCORE < float(start.score) < max_ratio * lowest:
             room = search.improve(start)
-            if search not in found or room.score < found[search].score:
-                found[search] = room
+            if search not in improved or room.score < improved[search].score:
+                improved[search] = room
         tick()
-    best = sorted(found.items(), key=lambda item: float(item[1].score))
+    best = sorted(improved.items(), key=lambda item: float(item[1].score))
     return [
         (search.signs, room)
         for search, room in best
-        if float(room.score) < max(PERFECT_SCORE, MAX_START_RATIO * float(best[0][1].score))
+        if float(room.score) < max(PERFECT_SCORE, max_ratio * float(best[0][1].score))
     ]
 
 
@@ -368,7 +381,16 @@ def directions() -> Tensor:
     return torch.cat([upright, torch.stack([flat * turn.cos(), flat * turn.sin(), z], dim=1)])
 
 
-def oblique_planes(scene: PhaseObservations, base: Tensor, reach: float, top: int) -> list[PlaneSet]:
+def oblique_planes(
+    scene: PhaseObservations,
+    base: Tensor,
+    reach: float,
+    top: int,
+    *,
+    usual: float = 0.7,
+    nearest_rad: float = 0.5,
+    step_rad: float = 0.6,
+) -> list[PlaneSet]:
     """Return the best further planes of any orientation by single reflections, each as a room of its own, the best first.
 
     Args:
@@ -376,29 +398,32 @@ def oblique_planes(scene: PhaseObservations, base: Tensor, reach: float, top: in
         base: Field of the known planes (n, 2 K, 1).
         reach: Distance beyond the region of both ends up to which planes are scanned [m].
         top: Number of planes.
+        usual: Modulus of the gain that planes are tried with, as in `Search`.
+        nearest_rad: Smallest distance of the planes from both ends, in phase [rad]. Not studied.
+        step_rad: Step of the scanned distances, in phase [rad]. Not studied.
     """
     both = torch.cat([scene.transmitter, scene.receiver])
     # positions close together, whose waves stay in phase over a few degrees of tilt
     rows = (scene.moving - scene.moving.mean(0)).norm(dim=1).argsort()[:24]
     near, base = scene.subset(rows), base[rows]
-    farthest = max(reach * scene.wavenumber, MIN_DISTANCE_RAD)
-    distance = torch.arange(MIN_DISTANCE_RAD, farthest, DISTANCE_STEP_RAD, dtype=torch.float64) / scene.wavenumber
+    farthest = max(reach * scene.wavenumber, nearest_rad)
+    distance = torch.arange(nearest_rad, farthest, step_rad, dtype=torch.float64) / scene.wavenumber
     if not len(distance):
         return []
 
     def of_normals(normal: Tensor) -> list[PlaneSet]:
-        found = []
+        candidates = []
         offset = (both @ normal.T).amax(0)[:, None] + distance
         planes = normal.repeat_interleave(len(distance), dim=0)[:, None], offset.reshape(-1, 1)
-        wave = FURTHER_GAIN * field(near, PlaneSet(*planes, torch.ones(offset.numel(), 1), only=((0,),)))
+        wave = usual * field(near, PlaneSet(*planes, torch.ones(offset.numel(), 1), only=((0,),)))
         for sign in (-1.0, 1.0):
             best = near.score(base + sign * wave).view_as(offset).min(1)
-            at, gain = offset.gather(1, best.indices[:, None]), torch.full((1, 1), FURTHER_GAIN * sign)
-            found += [
+            at, gain = offset.gather(1, best.indices[:, None]), torch.full((1, 1), usual * sign)
+            candidates += [
                 PlaneSet(n[None, None], o[None], gain, score=v[None])
                 for v, n, o in zip(best.values, normal, at, strict=True)
             ]
-        return found
+        return candidates
 
-    found = itertools.chain.from_iterable(parallel_map(of_normals, directions().split(4)))
-    return sorted(found, key=lambda plane: float(plane.score))[:top]
+    every = itertools.chain.from_iterable(parallel_map(of_normals, directions().split(4)))
+    return sorted(every, key=lambda plane: float(plane.score))[:top]

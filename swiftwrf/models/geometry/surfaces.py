@@ -9,6 +9,7 @@ The gain is estimated in cells of the surface by matched filtering at half of th
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 
@@ -16,19 +17,13 @@ import torch
 from torch import Tensor
 
 from swiftwrf.gp import subsample
-from swiftwrf.models.geometry.channels import Channels, ends, field, waves
+from swiftwrf.models.geometry.channels import Channels, ends, superposed, waves
 from swiftwrf.models.geometry.images import PlaneSet, mirror
 from swiftwrf.models.geometry.planes import Plane
 from swiftwrf.runtime.threads import parallel_map
 
 MAX_SURFACES = 8
 MAX_STARTS = 40  # local maxima that are followed
-SIGNIFICANCE = 1.0  # standard errors of the improvement; little, because held-out positions decide
-START_GAIN = 0.12
-RARITY = 1.2  # factor by which a sign that most planes do not have must explain more; a small shift may imitate it
-SIDE_LOBE = 0.05  # of the strongest improvement: less may be left of a surface that is modelled imperfectly
-MARGIN = 2.0  # wavelengths beyond the voxels
-OPEN_MARGIN_M = 3.0  # the same on a side without a plane, whose wall may be one that is hidden from most positions
 STEP = 1 / 12  # of the offsets of the scan, in wavelengths
 CELL, MAX_CELLS = 4.0, 12  # least edge of a cell in wavelengths, and cells along each side of the region
 MAX_OFFSETS = 4000  # along each axis, those nearest to the fixed end
@@ -36,7 +31,20 @@ MAX_CHANNELS = 10_000  # positions times elements by which surfaces are searched
 BATCH = 16  # offsets whose waves stay in a processor's cache
 
 
-def find_surfaces(planes: PlaneSet, gain: Tensor, measured: Channels, low: Tensor, high: Tensor) -> list[Plane]:
+def find_surfaces(
+    planes: PlaneSet,
+    gain: Tensor,
+    measured: Channels,
+    low: Tensor,
+    high: Tensor,
+    *,
+    significance: float = 1.0,
+    start_gain: float = 0.12,
+    rarity: float = 1.2,
+    side_lobe: float = 0.05,
+    margin_wavelengths: float = 2.0,
+    open_margin_m: float = 3.0,
+) -> list[Plane]:
     """Return surfaces along the axes that explain the residual of measured channels, the best first.
 
     Args:
@@ -45,6 +53,16 @@ def find_surfaces(planes: PlaneSet, gain: Tensor, measured: Channels, low: Tenso
         measured: Measured channels.
         low: Lower corner of the region with furniture, (3,) [m].
         high: Opposite corner (3,) [m].
+        significance: Standard errors of the improvement that a surface needs. Low: held-out positions decide later.
+        start_gain: Modulus of the gain that the fit of a surface starts from.
+        rarity: Factor by which a surface whose sign differs from that of most planes must explain more, because a small
+            shift of a plane looks like it.
+        side_lobe: Fraction of the strongest improvement below which the search ends: as much may be left of a surface that
+            is modelled imperfectly.
+        margin_wavelengths: Distance beyond the region up to which surfaces are searched.
+        open_margin_m: The same distance [m] on a side without a plane, where a wall may be hidden from most positions.
+
+    The values of these options are not studied.
     """
     n, count, n_elements = measured.value.shape
     (rows,) = subsample(torch.arange(n), rows=max(1, MAX_CHANNELS // n_elements))
@@ -52,47 +70,41 @@ def find_surfaces(planes: PlaneSet, gain: Tensor, measured: Channels, low: Tenso
     measured = replace(measured, value=measured.value[:, ends(count)], frequency=measured.frequency[ends(count)])
     scene = measured.scene
     wavelength = math.tau / scene.wavenumber
-    residual = _Residual.of(measured, field(gain, waves(planes, scene, measured.frequency)), low, high)
+    residual = _Residual.of(measured, superposed(gain, waves(planes, scene, measured.frequency)), low, high)
     step = STEP * wavelength
-    margin = [MARGIN * wavelength if side in planes.by_side() else OPEN_MARGIN_M for side in range(6)]
+    margin = [margin_wavelengths * wavelength if side in planes.by_side() else open_margin_m for side in range(6)]
 
     def scanned(axis: int) -> list[tuple[float, int, float]]:
         first, last = float(low[axis]) - margin[2 * axis], float(high[axis]) + margin[2 * axis + 1]
-        offset = torch.arange(first, last, step, dtype=torch.float64)
-        offset = offset[(offset - residual.fixed[axis]).abs().argsort()[:MAX_OFFSETS].sort().values]
-        parts = [residual.improvement(axis, some)[0].mean(-1).amax(0) for some in offset.split(BATCH)]
-        value = torch.cat(parts)
-        top = (value[1:-1] > value[:-2]) & (value[1:-1] >= value[2:]) & (value[1:-1] > 0)
-        rows = top.nonzero()[:, 0] + 1
-        return [(v, axis, o) for v, o in zip(value[rows].tolist(), offset[rows].tolist(), strict=True)]
+        return residual.maxima(axis, torch.arange(first, last, step, dtype=torch.float64))
 
-    starts = sorted((s for some in parallel_map(scanned, range(3)) for s in some), reverse=True)[:MAX_STARTS]
-    found: list[Plane] = []
+    starts = sorted(itertools.chain(*parallel_map(scanned, range(3))), reverse=True)[:MAX_STARTS]
+    surfaces: list[Plane] = []
     strongest = 0.0
     usual = float(planes.gain[0].sign().sum()) >= 0
-    rarity = torch.tensor([[1.0 if usual else RARITY], [RARITY if usual else 1.0]])  # of either sign
+    factor = torch.tensor([[1.0 if usual else rarity], [rarity if usual else 1.0]])  # of either sign
     fine = torch.linspace(-step, step, 9, dtype=torch.float64)
-    while starts and len(found) < MAX_SURFACES:
+    while starts and len(surfaces) < MAX_SURFACES:
         tried = []
         for _, axis, at in starts:
             improvement = residual.improvement(axis, at + fine, planes)[0]
-            sign, row = divmod(int((improvement.mean(-1) / rarity).argmax()), len(fine))
+            sign, row = divmod(int((improvement.mean(-1) / factor).argmax()), len(fine))
             each = improvement[sign, row]
             error = float(each.std()) / math.sqrt(len(each))
-            if float(each.mean()) > SIGNIFICANCE * error > 0:
-                tried.append((float(each.mean() / rarity[sign]), axis, at + float(fine[row]), sign))
+            if float(each.mean()) > significance * error > 0:
+                tried.append((float(each.mean() / factor[sign]), axis, at + float(fine[row]), sign))
         if not tried:
             break
         value, axis, at, sign = max(tried)
         strongest = max(value, strongest)
-        if value < SIDE_LOBE * strongest:
+        if value < side_lobe * strongest:
             break
         residual = residual.without(axis, at, sign, planes)
         side = math.copysign(1.0, at - float(residual.fixed[axis]))
         normal = [side * float(other == axis) for other in range(3)]
-        found.append(Plane((normal[0], normal[1], normal[2]), side * at, (START_GAIN, -START_GAIN)[sign]))
+        surfaces.append(Plane((normal[0], normal[1], normal[2]), side * at, (start_gain, -start_gain)[sign]))
         starts = [(v, a, o) for v, a, o, _ in tried if a != axis or abs(o - at) > 2 * step]
-    return found
+    return surfaces
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,8 +135,7 @@ class _Residual:
     @property
     def fixed(self) -> Tensor:
         """Position of the fixed end, (3,) [m]."""
-        scene = self.measured.scene
-        return (scene.receiver if scene.end == "transmitter" else scene.transmitter)[0]
+        return self.measured.scene.fixed
 
     def _waves(self, axis: int, offset: Tensor, planes: PlaneSet | None) -> tuple[Tensor, Tensor]:
         """Return the waves of surfaces at offsets (B,) [m], (B, C n, F, K), and the cell of each reflection, (B, C n).
@@ -190,6 +201,14 @@ class _Residual:
         added = torch.tensor([1.0, -1.0])[:, None, None] * gains(torch.ones_like(half))
         total = (added[..., None, None] * whole).unflatten(2, (count, n)).sum(2)
         return improvement.unflatten(2, (count, n)).sum(2), total
+
+    def maxima(self, axis: int, offset: Tensor) -> list[tuple[float, int, float]]:
+        """Return improvement, axis and offset of local maxima over offsets [m], those nearest to the fixed end."""
+        offset = offset[(offset - self.fixed[axis]).abs().argsort()[:MAX_OFFSETS].sort().values]
+        value = torch.cat([self.improvement(axis, batch)[0].mean(-1).amax(0) for batch in offset.split(BATCH)])
+        top = (value[1:-1] > value[:-2]) & (value[1:-1] >= value[2:]) & (value[1:-1] > 0)
+        rows = top.nonzero()[:, 0] + 1
+        return [(v, axis, o) for v, o in zip(value[rows].tolist(), offset[rows].tolist(), strict=True)]
 
     def without(self, axis: int, offset: float, sign: int, planes: PlaneSet) -> _Residual:
         """Return the residual after a surface."""

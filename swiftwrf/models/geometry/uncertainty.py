@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.models.geometry.images import PhaseObservations, PlaneSet, field, images, phase_period_m
+from swiftwrf.models.geometry.images import LinkAt, PhaseObservations, PlaneSet, field, images, phase_period_m
 from swiftwrf.models.geometry.planes import (
     Plane,
     RoomEstimate,
@@ -30,14 +30,11 @@ from swiftwrf.models.geometry.planes import (
     refine_all,
     sign_alternatives,
 )
-from swiftwrf.models.geometry.search import N_RESCORED, SIGNS, SteeringResponses
+from swiftwrf.models.geometry.search import SIGNS, SteeringResponses, best_combinations
 from swiftwrf.runtime.threads import parallel_map
 
 MIN_PROBABILITY = 1e-6  # of a plane
 MIN_RIVAL = 0.01  # of an alternative that is named
-SIGN_ODDS = 0.6  # prior of a sign other than usual, by the study in docs/development/architecture.md
-MIN_SPREAD_RAD = 0.8  # of phase: positions with less spread in any direction count as flat
-CARRIER_SCALES = (0.95, 0.97, 0.98, 0.99, 1.01, 1.02, 1.03, 1.05)  # of alternative carriers
 MAX_PERIODS = 4  # to either side
 N_FIRST, N_NEXT = 6, 18  # positions that all combinations of aliases are scored at, and the best of them
 N_WHOLE = 32  # combinations of whole periods around which half periods are tried
@@ -45,7 +42,15 @@ N_COARSE, N_FINE = 24, 8  # rooms that are refined with some positions, and with
 HalfPeriods = tuple[int, ...]  # by which each plane is moved
 
 
-def assess(train: Spectra, scene: PhaseObservations, room: PlaneSet, score: float, searched: bool) -> RoomEstimate:
+def assess(
+    train: Spectra,
+    scene: PhaseObservations,
+    room: PlaneSet,
+    score: float,
+    searched: bool,
+    *,
+    systematic_wavelengths: float = 0.02,
+) -> RoomEstimate:
     """Return the planes of a room with their standard deviations, probabilities and strongest alternatives.
 
     Args:
@@ -55,6 +60,8 @@ def assess(train: Spectra, scene: PhaseObservations, room: PlaneSet, score: floa
         score: Score at held-out positions.
         searched: True to take the most probable room, also of those in which several planes move. False for planes that
             stay, compared with rooms in which one of them moves.
+        systematic_wavelengths: Standard deviation of an offset by paths that the room lacks, if no power is explained. Not
+            studied.
     """
     assert train.array is not None
     n_planes = room.normal.shape[1]
@@ -71,7 +78,8 @@ def assess(train: Spectra, scene: PhaseObservations, room: PlaneSet, score: floa
         nothing = torch.zeros(0, 0, dtype=torch.float64)
         return RoomEstimate([], room.order, score, unexplained, "no plane explains the spectra", nothing)
     covariance = offset_covariance(scene, room)
-    systematic = 0.02 * train.array.wavelength * math.sqrt(max(unexplained, 0))  # unmodelled paths are no noise
+    # paths that the room lacks are no noise
+    systematic = systematic_wavelengths * train.array.wavelength * math.sqrt(max(unexplained, 0))
     covariance = covariance + systematic**2 * torch.eye(n_planes, dtype=torch.float64)
     std = covariance.diagonal().clamp_min(0).sqrt()
     reason = _flat(scene) or _other_carrier(scene, room)
@@ -102,18 +110,21 @@ def conclusion(planes: list[Plane]) -> str:
     return f"{len(planes)} planes, {sum(plane.certain for plane in planes)} of them identifiable"
 
 
-def _modes(scene: PhaseObservations, rooms: list[PlaneSet], period: Tensor) -> tuple[list[PlaneSet], Tensor]:
+def _modes(
+    scene: PhaseObservations, rooms: list[PlaneSet], period: Tensor, *, sign_odds: float = 0.6
+) -> tuple[list[PlaneSet], Tensor]:
     """Return the rooms that differ by more than a quarter period (P,) [m] in any plane, and their probabilities (J,).
 
-    Of rooms that differ by less, the one that explains the spectra best counts.
+    Of rooms that differ by less, the one that explains the spectra best counts. Each gain with a sign other than usual
+    multiplies the prior probability by `sign_odds`, by the study in docs/development/architecture.md.
     """
-    found: list[PlaneSet] = []
+    modes: list[PlaneSet] = []
     for room in sorted(rooms, key=lambda room: -float(log_explained(room.coherence(scene)).mean())):
-        if all(bool(((room.offset - mode.offset).abs() > period / 4).any()) for mode in found):
-            found.append(room)
-    deviating = [int((r.gain.sign() != SIGNS[:, r.side[0]]).sum(1).min()) for r in found]
-    explained = torch.stack([log_explained(room.coherence(scene)) for room in found])
-    return found, mode_probabilities(explained, math.log(SIGN_ODDS) * torch.tensor(deviating, dtype=torch.float64))
+        if all(bool(((room.offset - mode.offset).abs() > period / 4).any()) for mode in modes):
+            modes.append(room)
+    deviating = [int((r.gain.sign() != SIGNS[:, r.side[0]]).sum(1).min()) for r in modes]
+    explained = torch.stack([log_explained(room.coherence(scene)) for room in modes])
+    return modes, mode_probabilities(explained, math.log(sign_odds) * torch.tensor(deviating, dtype=torch.float64))
 
 
 def mode_probabilities(explained: Tensor, log_prior: Tensor) -> Tensor:
@@ -154,25 +165,34 @@ def _beside(scene: PhaseObservations, room: PlaneSet, plane: int) -> list[PlaneS
     return refine_all(scene, [replace(room, offset=moved), *sign_alternatives(scene, room, plane)], 5)
 
 
-def _flat(scene: PhaseObservations) -> str:
-    """Return the reason if the positions lie on a line or in a plane, which leaves the room ambiguous, else nothing."""
+def _flat(scene: LinkAt, *, min_spread_rad: float = 0.8) -> str:
+    """Return the reason if the positions lie on a line or in a plane, which leaves the room ambiguous, else nothing.
+
+    Positions are flat in a direction along which their phase spreads by less than `min_spread_rad` (not studied).
+    """
     extent = torch.linalg.svdvals(scene.moving - scene.moving.mean(0)) / math.sqrt(len(scene))
-    if float(extent[2]) * scene.wavenumber > MIN_SPREAD_RAD:
+    if float(extent[2]) * scene.wavenumber > min_spread_rad:
         return ""
-    shape = "a line" if float(extent[1]) * scene.wavenumber <= MIN_SPREAD_RAD else "a plane"
+    shape = "a line" if float(extent[1]) * scene.wavenumber <= min_spread_rad else "a plane"
     return f"; the positions lie on {shape}, from where many rooms look alike"
 
 
-def _other_carrier(scene: PhaseObservations, room: PlaneSet, significance: float = 3.0) -> str:
-    """Return the reason if another carrier explains the spectra significantly better, else nothing."""
+def _other_carrier(
+    scene: PhaseObservations,
+    room: PlaneSet,
+    *,
+    significance: float = 3.0,
+    scales: Sequence[float] = (0.95, 0.97, 0.98, 0.99, 1.01, 1.02, 1.03, 1.05),
+) -> str:
+    """Return the reason if another carrier explains the spectra significantly better, else nothing (values not studied)."""
     here = room.coherence(scene)
 
     def lead(scale: float) -> float:
         other = replace(scene, wavenumber=scale * scene.wavenumber)
         return advantage(refine(other, room, 6).coherence(other), here)
 
-    for scale, found in zip(CARRIER_SCALES, parallel_map(lead, CARRIER_SCALES), strict=True):
-        if found > significance:
+    for scale, ahead in zip(scales, parallel_map(lead, scales), strict=True):
+        if ahead > significance:
             return f"; a carrier {100 * (scale - 1):+.0f} % from the given one explains the spectra better"
     return ""
 
@@ -198,7 +218,7 @@ def phase_alternatives(scene: PhaseObservations, room: PlaneSet) -> list[PlaneSe
     return sorted(refine_all(scene, rooms[:N_FINE], 12), key=lambda r: float(r.score))
 
 
-def _alias_offsets(scene: PhaseObservations, room: PlaneSet, plane: int) -> dict[int, float]:
+def _alias_offsets(scene: LinkAt, room: PlaneSet, plane: int) -> dict[int, float]:
     """Return the offsets [m] at which the mean phase of a plane's wave differs by half periods, by their number."""
     here = float(room.offset[0, plane])
     if plane >= 6:  # a plane for each side of a room
@@ -219,8 +239,8 @@ def _alias_offsets(scene: PhaseObservations, room: PlaneSet, plane: int) -> dict
     for number in range(-2 * MAX_PERIODS, 2 * MAX_PERIODS + 1):
         above = int(torch.searchsorted(half_periods, float(number)))
         if number and 0 < above < len(grid):
-            share = (number - half_periods[above - 1]) / (half_periods[above] - half_periods[above - 1])
-            offsets[number] = float(grid[above - 1] + share * (grid[above] - grid[above - 1]))
+            fraction = (number - half_periods[above - 1]) / (half_periods[above] - half_periods[above - 1])
+            offsets[number] = float(grid[above - 1] + fraction * (grid[above] - grid[above - 1]))
     return offsets
 
 
@@ -241,19 +261,14 @@ class _AlternativeTable:
         return replace(self.before, offset=offset, gain=self.before.gain * (-1.0) ** torch.tensor(choice))
 
     def best(self, half_periods: list[list[int]], most: int) -> dict[HalfPeriods, float]:
-        """Return the best combinations of the given half periods of the planes, with their scores.
-
-        All combinations are scored at few positions, and the best of them at more.
-        """
+        """Return the best combinations of the given half periods of the planes, with their scores."""
         rows = [
             torch.tensor([list(p).index(h) for h in some]) for p, some in zip(self.offsets, half_periods, strict=True)
         ]
-        (first, scene), (few, waves) = self.scenes, self.waves
-        score = few.at(rows).scores(first, first.direct)
-        best = score.flatten().argsort()[: N_RESCORED * most].numpy()
-        number = [torch.from_numpy(n) for n in np.unravel_index(best, score.shape)]  # torch's own loads its compiler
-        score = scene.score(scene.direct + waves.of_choices([r[n] for r, n in zip(rows, number, strict=True)]))
-        kept = score.argsort()[:most]
-        choices = torch.stack([n[kept] for n in number], dim=1).tolist()
-        best_choices = [tuple(some[k] for some, k in zip(half_periods, choice, strict=True)) for choice in choices]
-        return dict(zip(best_choices, score[kept].tolist(), strict=True))
+        few, more = (
+            (scene, scene.direct, waves.at(rows)) for scene, waves in zip(self.scenes, self.waves, strict=True)
+        )
+        return {
+            tuple(some[n] for some, n in zip(half_periods, number, strict=True)): score
+            for score, number in best_combinations(few, more, most)
+        }

@@ -42,7 +42,7 @@ def test_a_dielectric_reflects_a_vertically_polarised_wave_by_fresnels_equations
     """The field is reflected as a vector: perpendicular and parallel to the plane of incidence."""
     data = mirror_room({}, moving=moving, n=20, **REGION)
     room = GeometryModel.of_planes(data, [plane])
-    scene, planes = room.scene(data.position), room.tensors()
+    scene, planes = room.link_at(data.position), room.tensors()
     normal = planes.normal[0, 0]
     after = torch.nn.functional.normalize(scene.receiver - images(scene, planes)[0, 0], dim=1)
     before = after - 2 * (after @ normal)[:, None] * normal
@@ -67,7 +67,7 @@ def test_a_dielectric_reflects_a_vertically_polarised_wave_by_fresnels_equations
 def test_derivatives_by_the_gains_of_dielectrics_are_differences_of_the_field():
     data, step = mirror_room({}, n=10, **REGION), 1e-2
     room = GeometryModel.of_planes(data, WALLS)
-    scene, planes = room.scene(data.position), room.tensors()
+    scene, planes = room.link_at(data.position), room.tensors()
     _, jacobian = phase_jacobian(scene, planes, image_jacobian(planes, scene.transmitter))
     for plane in range(len(WALLS)):
         change = step * torch.nn.functional.one_hot(torch.tensor(plane), len(WALLS))
@@ -111,7 +111,7 @@ def test_paths_have_the_gain_of_their_angle():
     varying, constant = (
         GeometryModel.of_planes(data, [replace(WALLS[5], dielectric=dielectric)]) for dielectric in (True, False)
     )
-    gain = varying.gains(varying.scene(data.position))[:, 1]
+    gain = varying.gains(varying.link_at(data.position))[:, 1]
     flat = int(gain.abs().argmin())
     level = [room.paths(data.position[flat]).set_index("reflections").level_db[(0,)] for room in (varying, constant)]
     assert level[1] - level[0] == pytest.approx(-20 * float((gain[flat].abs() / GAIN).log10()), abs=1e-3)

@@ -17,7 +17,7 @@ from swiftwrf.data.store import Store
 from swiftwrf.locate.features import PathWaves, SpectrumFeatures, channels_beside
 from swiftwrf.locate.spectrum_likelihood import SCALES, PathLikelihood
 from swiftwrf.models.geometry import GeometryModel, Plane, furniture
-from swiftwrf.models.geometry.channels import Channels, coherence, field, sources, waves
+from swiftwrf.models.geometry.channels import Channels, coherence, sources, superposed, waves
 from swiftwrf.models.geometry.fit import observe
 from swiftwrf.models.geometry.furniture import Furniture
 from swiftwrf.models.geometry.images import PlaneSet, images
@@ -86,10 +86,10 @@ def test_paths_through_voxels_are_those_of_the_image_sources(moving):
     """Without furniture the gains are those of the planes, and the waves sum up to the channel of the planes."""
     data = simulated_room(n=12, seed=2, grid=AngularGrid.hemisphere(8, 32), moving=moving)
     room = GeometryModel.of_planes(data, WALLS, order=3)
-    scene, planes = room.scene(data.position), room.tensors()
+    scene, planes = room.link_at(data.position), room.tensors()
     gain = furnished(room, 0.0).gains(planes, scene)
     assert torch.allclose(gain, room.gains(scene), atol=1e-5)
-    channel = field(gain, waves(planes, scene, torch.ones(1)))[:, 0]
+    channel = superposed(gain, waves(planes, scene, torch.ones(1)))[:, 0]
     assert torch.allclose(channel, planes.channel(scene), atol=1e-4)
 
 
@@ -98,7 +98,7 @@ def test_paths_of_a_position_are_straight_between_reflections_and_name_what_hide
     data, room = measured(4.0, moving, n=20)
     room.furniture = furnished(room, 4.0)
     found = room.paths(data.position[0])
-    scene = room.scene(data.position[:1])
+    scene = room.link_at(data.position[:1])
     image = torch.cat([scene.transmitter[None], images(scene, room.tensors())[0]])[:, 0]
     lengths = dict(zip([(), *room.tensors().sequence], (image - scene.receiver).norm(dim=1).tolist(), strict=True))
     assert len(found) == len(lengths), "all paths of a cuboid exist"
@@ -119,7 +119,7 @@ def test_paths_of_a_position_are_straight_between_reflections_and_name_what_hide
 def test_a_voxel_attenuates_the_direct_path_by_its_length_in_it():
     data = mirror_room({}, moving="transmitter", n=12)
     room = GeometryModel.of_planes(data, [])
-    scene = room.scene(data.position)
+    scene = room.link_at(data.position)
     start, ray = data.position, data.fixed_position - data.position
     at = (torch.arange(20_000, dtype=torch.float64) + 0.5)[:, None, None] / 20_000
     x = start + at * ray
@@ -152,8 +152,8 @@ def test_walls_reflect_alike_where_no_path_determines_their_reflectivity():
     """A strong penalty does not pull walls of gain 0.5 to perfect mirrors."""
     data = mirror_room({}, n=20)
     room = GeometryModel.of_planes(data, built_in_walls(0.5))
-    scene, start = room.scene(data.position), replace(furnished(room, 0.0), penalty=1e-2)
-    channel = field(room.gains(scene), waves(room.tensors(), scene, torch.ones(1)))
+    scene, start = room.link_at(data.position), replace(furnished(room, 0.0), penalty=1e-2)
+    channel = superposed(room.gains(scene), waves(room.tensors(), scene, torch.ones(1)))
     found = furniture.fit_furniture(room.tensors(), Channels(scene, channel, torch.ones(1)), start)
     assert found.reflectivity.mean() == pytest.approx(0.5, abs=0.1)
 
@@ -267,7 +267,7 @@ def test_the_likelihood_of_channels_is_a_normal_distribution_that_no_delay_or_ph
     known, (_, diffuse, floor) = at.channel, log_variance[-3:].exp().double()
     wave, mean, variance = at.wave.flatten(2).cdouble(), known.flatten(1).cdouble(), likelihood._variance.double()
     x = mean / mean.abs().square().mean(1, keepdim=True).sqrt()
-    scene = walls.scene(walls.region()[:1])
+    scene = walls.link_at(walls.region()[:1])
     length = (sources(walls.reflectors, scene) - scene.receiver).norm(dim=-1)[:, 0]
     detour = (length - length[0]).square().mean().sqrt() * scene.wavenumber
     over_frequency = (-(detour * (frequency[:, None] - frequency)).square() / 2).exp()

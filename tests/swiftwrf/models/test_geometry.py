@@ -33,6 +33,7 @@ from swiftwrf.models.geometry.phase_retrieval import autocorrelation, correlatio
 from swiftwrf.models.geometry.planes import image_jacobian, offset_covariance, phase_jacobian, refine, refine_all
 from swiftwrf.models.geometry.search import N_SPHERE_NORMALS, SIGNS, SteeringResponses
 from swiftwrf.models.geometry.uncertainty import _AlternativeTable, assess, mode_probabilities, phase_alternatives
+from swiftwrf.models.link import Link
 from swiftwrf.models.neighbours import NearestModel
 
 QUICK = GeometryConfig(search_distance_m=2.0, beam_width=2)
@@ -136,7 +137,8 @@ def test_fields_and_scores_of_many_rooms_are_those_of_the_definition(moving):
     for array in (ARRAY, scattered):
         data = mirror_room({}, moving=moving, n=10)
         observed = torch.randn(10, 16, generator=generator, dtype=torch.complex64)
-        scene = PhaseObservations.of(data.position, data.fixed_position, moving, array, data.rotation, observed.sgn())
+        link = replace(Link.from_spectra(data), array=array)
+        scene = PhaseObservations.of_phases(data.position, link, observed.sgn())
         rooms = PlaneSet(SIDES[[0, 1, 3]].expand(9, 3, 3), offset, gain)
         expected = torch.zeros(9, 10, 16, dtype=torch.complex128)
         for sequence in ((), *rooms.sequence):

@@ -12,7 +12,7 @@ from augment.estimators import make_estimator
 from swiftwrf import InputError, load_spectra
 from swiftwrf.array.angles import angular_distance
 from swiftwrf.array.planar import PlanarArray
-from swiftwrf.array.subspace import esprit, joint_music, maximum_likelihood, music
+from swiftwrf.contrib.subspace import esprit, joint_music, maximum_likelihood, music
 from swiftwrf.metrics import angle_errors
 
 SQUARE = PlanarArray.square(4, 2.4e9)
