@@ -10,35 +10,35 @@ alone.
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import each_fold, folds
+from swiftwrf.data.store import Store
 from swiftwrf.errors import InputError
-from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel, leave_folds_out, principal_components
+from swiftwrf.gp import Kernel, choose_kernel, leave_folds_out
 from swiftwrf.metrics import psnr
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel
 from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.path_gains import PathGains, choose_prior, fit_path_gains, kernel_of
 from swiftwrf.models.geometry.planes import advantage
-from swiftwrf.models.process import ProcessModel
+from swiftwrf.models.interpolator import Interpolator
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import Fraction
 
-MAX_COMPONENTS = 64  # principal components of the residual spectra
 MAX_PIXELS = 4000  # of a spectrum, to choose kernel and mixing weight
 MAX_SPECTRA = 10_000  # the fit computes all their inner products
 
 
-class HybridModel(ProcessModel):
+class HybridModel(Interpolator):
     """Geometry with position-dependent path gains, and a Gaussian process on the residual.
 
-    An update adds to the residual, and components to it while there are fewer than 64. Room, path gains and mixing weight
+    An update adds to the residual. Room, path gains and mixing weight
     stay as fitted.
 
     Example:
@@ -55,15 +55,11 @@ class HybridModel(ProcessModel):
     searches = True
     batch = 256
 
-    saved = "_room path_gains mixing_weight component"
+    saved = "_room path_gains mixing_weight"
     path_gains: PathGains | None
     """gains of the paths; None if they are constant"""
     mixing_weight: Fraction
     """weight of the geometric part, 0 to 1"""
-    process: GaussianProcess
-    """process of the k component scores of the residual"""
-    component: Annotated[Tensor, "float32 1+process.k pixels"]
-    """mean residual spectrum, then its components"""
     _room: GeometryModel
 
     @classmethod
@@ -87,26 +83,16 @@ class HybridModel(ProcessModel):
     @single_thread()
     def _fit_residual(self, train: Spectra, like: HybridModel | None) -> None:
         fold = folds(train.position, self.config.validation, self.config.seed)
-        known = self._fit_path_gains(train, fold, like).flatten(1)
-        seen = train.spectrum.flatten(1)
-        stride = max(1, seen.shape[1] // MAX_PIXELS) | 1
-        some, some_known = seen[:, ::stride], known[:, ::stride]
-        kernel = choose_kernel(train.position, (some - 0.7 * some_known)[:, None], fold)  # a usual mixing weight
+        known, seen = self._fit_path_gains(train, fold, like), train.spectrum
+        stride = max(1, math.prod(train.grid.shape) // MAX_PIXELS) | 1
+        some, some_known = seen.flatten(1)[:, ::stride], known.flatten(1)[:, ::stride]
+        kernel = choose_kernel(train.position, some - 0.7 * some_known, fold)  # a usual mixing weight
         self.mixing_weight, gains = _mixing_weight(train.position, some, some_known, fold, kernel)
-        score = torch.zeros(len(train), 0)
-        self.component = torch.zeros(1, seen.shape[1])
-        if gains:
-            mean, score, component = principal_components(seen - self.mixing_weight * known, MAX_COMPONENTS)
-            self.component = torch.cat([mean[None], component])
-        else:
-            self.mixing_weight = 1.0
-        self.process = GaussianProcess(kernel, train.position, score.float(), exact=True)
-        mean, component = self.component[0], self.component[1:]
-
-        def spectrum(held_out: Tensor, rows: Tensor) -> Tensor:
-            return (mean + held_out @ component + self.mixing_weight * known[rows]).reshape(-1, *self.grid.shape)
-
-        self._set_spread(train, fold, lambda rows: score[rows], spectrum)
+        if not gains:
+            self.mixing_weight, seen = 1.0, known
+        paths = self.mixing_weight * known
+        self.component = self._fit_process(train.position, Store(seen - paths), fold, kernel)
+        self._fit_spread(train, fold, paths)
 
     def _fit_path_gains(self, train: Spectra, fold: Tensor, like: HybridModel | None) -> Tensor:
         """Fit the path gains; return the spectra (n, H, W) that the paths predict with each fold held out from the gains."""
@@ -136,31 +122,9 @@ class HybridModel(ProcessModel):
         self.path_gains = fit_path_gains(self.room, scene, kernel, prior)
         return known
 
-    def _update(self, new: Spectra) -> None:
-        self._extend(self._residual(new))
-        super()._update(new)
-
-    def _values(self, new: Spectra) -> Tensor:
-        component = self.component[1:]
-        return self._residual(new) @ component.T / component.square().sum(1)
-
-    def _weighted_values(self) -> Tensor:
-        weighted: Tensor = self.process.value * self.component[1:].norm(dim=1)
-        return weighted
-
     def _residual(self, new: Spectra) -> Tensor:
-        """Return the residuals (k, pixels) of the paths and of the mean residual."""
         paths = torch.cat([self._paths(part) for part in new.position.split(self.batch)])
-        return (new.store[:] - self.mixing_weight * paths).flatten(1) - self.component[0]
-
-    def _extend(self, residual: Tensor) -> None:
-        """Add orthogonal components that residuals (k, pixels) need; they are 0 at all earlier training positions."""
-        unit = nn.functional.normalize(self.component[1:], dim=1)
-        rest = residual - (residual @ unit.T) @ unit
-        n = min(MAX_COMPONENTS - len(unit), len(rest))
-        _, size, direction = torch.linalg.svd(rest, full_matrices=False)
-        added = direction[:n][size[:n] > 1e-3 * residual.norm()]  # smaller ones are noise
-        self.process, self.component = self.process.widened(len(added)), torch.cat([self.component, added])
+        return super()._residual(new) - self.mixing_weight * paths
 
     def _paths(self, position: Tensor) -> Tensor:
         """Return the spectra (b, H, W) that the paths predict at a batch of positions (b, 3) [m]."""
@@ -169,18 +133,15 @@ class HybridModel(ProcessModel):
         return self.room.array.spectrum(channel, self.grid)
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
-        mean = (self.component[0] + self.process.mean(position) @ self.component[1:]).reshape(-1, *self.grid.shape)
-        if self.mixing_weight:
-            mean = mean + self.mixing_weight * self._paths(position)
-        return mean, self._std(position, grid) if with_std else None
+        mean, std = super()._predict(position, grid, with_std)
+        return mean + self.mixing_weight * self._paths(position) if self.mixing_weight else mean, std
 
     def _restored(self) -> None:
         super()._restored()
-        sizes = math.prod(self.grid.shape), 1 + len(self.room.reflectors.sequence)
-        found = self.component.shape[1], sizes[1] if self.path_gains is None else self.path_gains.n_paths
-        if self.room.grid != self.grid or found != sizes:
+        n_paths = 1 + len(self.room.reflectors.sequence)
+        if self.room.grid != self.grid or (self.path_gains is not None and self.path_gains.n_paths != n_paths):
             raise InputError(
-                f"grid and room have {sizes[0]} pixels and {sizes[1]} paths, the components and gains {found}"
+                f"the room has {n_paths} paths on a grid of {self.room.grid.shape}, gains or components others"
             )
 
 

@@ -10,10 +10,10 @@ from swiftwrf.gp import (
     GaussianProcess,
     Kernel,
     choose_kernel,
-    choose_rank,
     held_out_errors,
     leave_folds_out,
     most_informative,
+    principal_components,
     subsample,
 )
 from swiftwrf.gp.choice import MAX_LOCAL_ROWS, _local_errors
@@ -68,7 +68,11 @@ def test_rank_counts_what_matters(generator):
     noisy = smooth + 1e-3 * torch.randn(smooth.shape, generator=generator)
     for spectrum in (smooth, noisy):
         kernel = choose_kernel(position, spectrum, fold % 5)
-        assert 25 <= choose_rank(position, spectrum, fold, kernel) <= 30
+        component = principal_components(position, spectrum, fold, kernel, omitted=5e-4)
+        assert 26 <= len(component) <= 31
+        gram = component[1:].flatten(1) @ component[1:].flatten(1).T
+        torch.testing.assert_close(gram, gram.diagonal().diag(), atol=1e-3, rtol=0)
+        assert len(principal_components(position, spectrum, fold, kernel, most=8)) == 9
 
 
 @pytest.mark.parametrize("n_folds", [5, 40], ids=["a fifth", "one"])
