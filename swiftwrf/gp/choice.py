@@ -8,7 +8,7 @@ Learning", 2006, chapters 2 and 5).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -26,7 +26,9 @@ MIN_VARIANCE = 1e-6  # fraction of the variance below which a principal componen
 
 
 @single_thread()
-def choose_kernel(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> Kernel:
+def choose_kernel(
+    position: Tensor, spectrum: Tensor | Store, fold: Tensor, noises: Sequence[float] = (1e-3, 1e-2, 1e-1)
+) -> Kernel:
     """Return the candidate with the highest mean logarithm of 1 / MSE over held-out spectra.
 
     Among more than 400 spectra, 200 are held out, and each is predicted from its nearest neighbours in other folds. A
@@ -36,6 +38,7 @@ def choose_kernel(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> K
         position: Positions of the training spectra (n, 3) [m].
         spectrum: Training spectra (n, H, W).
         fold: Number of the group that each is held out with, (n,).
+        noises: Candidates of the noise variance. Not studied.
 
     Example:
         >>> import swiftwrf
@@ -49,16 +52,16 @@ def choose_kernel(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> K
     def score(kernel: Kernel) -> float:
         return -float(evaluate(kernel).clamp_min(MIN_ERROR).log().sum())
 
-    return max(candidates(position, (1e-3, 1e-2, 1e-1)), key=score)
+    return max(candidates(position, noises), key=score)
 
 
 def _held_out_errors(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> Callable[[Kernel], Tensor]:
     """Return the function from a kernel to the squared errors (n,) of all spectra, each predicted without its fold."""
-    gram, apart = inner_products(spectrum[:]), distance(position.double(), position.double())
+    gram, separation = inner_products(spectrum[:]), distance(position.double(), position.double())
     groups = [out for out, _ in each_fold(fold)]
 
     def evaluate(kernel: Kernel) -> Tensor:
-        precision = torch.linalg.inv(kernel.at(apart) + kernel.noise * torch.eye(len(apart)))
+        precision = torch.linalg.inv(kernel.at(separation) + kernel.noise * torch.eye(len(separation)))
         # weights of all rows in the error of each row: 1 of the row itself, negative ones of those that predict it
         weight = torch.cat([held_out_errors(precision, precision, out) for out in groups])
         return ((weight @ gram) * weight).sum(1)
@@ -70,11 +73,11 @@ def _local_errors(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> C
     """Return the function from a kernel to the squared errors of some spectra, each predicted from its neighbours."""
     position = position.double()
     (out,) = subsample(torch.arange(len(position)), rows=MAX_LOCAL_ROWS)
-    near, weights = leave_folds_out_locally(position, fold, out)
+    neighbours, weights = leave_folds_out_locally(position, fold, out)
     mean = subsample(spectrum)[0].flatten(1).mean(dim=0)
-    rows = torch.cat([out[:, None], near], dim=1)
-    flat = (spectrum[some].flatten(1) - mean for some in rows)
-    gram = torch.stack([some @ some.T for some in flat]).double() / len(mean)
+    rows = torch.cat([out[:, None], neighbours], dim=1)
+    changes = (spectrum[group].flatten(1) - mean for group in rows)
+    gram = torch.stack([change @ change.T for change in changes]).double() / len(mean)
 
     def evaluate(kernel: Kernel) -> Tensor:
         weight, _ = weights(kernel)
@@ -177,8 +180,8 @@ def subsample(*tensors: Tensor | Store, rows: int = MAX_ROWS) -> list[Tensor]:
         [tensor([ 0, 49, 99])]
     """
     n = len(tensors[0])
-    some = torch.linspace(0, n - 1, rows).long() if n > rows else slice(None)
-    return [t[some] for t in tensors]
+    chosen = torch.linspace(0, n - 1, rows).long() if n > rows else slice(None)
+    return [t[chosen] for t in tensors]
 
 
 def inner_products(spectrum: Tensor) -> Tensor:

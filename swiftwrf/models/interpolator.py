@@ -106,7 +106,8 @@ class Interpolator(FieldModel):
 
     def _decode(self, score: Tensor, grid: AngularGrid) -> Tensor:
         """Return the spectra (b, H, W) of component scores (b, K) on a grid, not clipped."""
-        return self.component[0] + torch.tensordot(score, self.component[1:], dims=1)
+        change: Tensor = torch.tensordot(score, self.component[1:], dims=1)
+        return self.component[0] + change
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         if not with_std:

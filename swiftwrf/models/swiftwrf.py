@@ -32,11 +32,6 @@ from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
 
-SIZES = (16, 32, 64, 128, 256, 512)  # numbers of primitives that a fit compares
-MIN_GAIN = 0.004  # relative reduction of the loss that counts, 0.04 dB
-RIDGE = 1e-6  # regularisation relative to a kernel's mean square, against large weights of opposite sign
-MAX_ROWS = 1000  # spectra that fit the shapes and compare sizes; more do not change the choice
-MARGIN = 0.5  # spacings by which the first means lie below the horizon
 CUTOFF = 1e-4  # kernel values below count as 0
 MAX_CACHED_VALUES = 2**26  # float32 kernel values that one grid caches: 256 MiB
 
@@ -107,7 +102,7 @@ class SwiftWRF(Interpolator):
             fold = folds(train.position, self.config.validation, self.config.seed)
             component = self._fit_process(train.position, work.store, fold)
             self.component = Store(component).coarsen(work.grid.n_azimuth // small.grid.n_azimuth)[:]
-            out, score, _ = self._held_out(fold, MAX_ROWS)
+            out, score = self._held_out(fold, rows=1000)[:2]
             measured = small.store[out]
 
             def loss(n: int) -> float:
@@ -121,7 +116,7 @@ class SwiftWRF(Interpolator):
                 return value
 
             if n == "auto":
-                n = smallest(loss, SIZES)
+                n = smallest(loss)
             self.mean, self.cholesky = _shapes(self.component, n, small.grid, 60)
             self.weight = _weights(kernels(self.mean, self.cholesky, work.grid, CUTOFF), component)
             self._cache = {}
@@ -199,38 +194,36 @@ def fit(train: Spectra, *, device: torch.device | str = "cpu", progress: bool = 
     return SwiftWRF(**options).fit(train, device=device, progress=progress)
 
 
-def smallest(loss: Callable[[int], float], sizes: tuple[int, ...]) -> int:
-    """Return the smallest size whose loss is within 0.4 % of the lowest loss.
+def smallest(
+    loss: Callable[[int], float], sizes: tuple[int, ...] = (16, 32, 64, 128, 256, 512), min_gain: float = 0.004
+) -> int:
+    """Return the smallest size whose loss is as low as the lowest one.
 
-    Sizes are tried in order until one reduces the loss by less than 0.4 %, so the search costs about as much as its last
-    fits.
+    Sizes are tried in order until one reduces the loss too little, so the search costs about as much as its last fits.
 
     Args:
-        loss: Held-out loss of a fit of a size.
+        loss: Held-out loss of a fit of a size, of any sign.
         sizes: Sizes, ascending.
+        min_gain: Relative reduction of the loss that counts. Not studied.
     """
-    found: dict[int, float] = {}
+    losses: dict[int, float] = {}
     for size in sizes:
-        lowest = min(found.values(), default=math.inf)
-        found[size] = loss(size)
-        if lowest <= _level(found[size]):
+        lowest = min(losses.values(), default=math.inf)
+        losses[size] = loss(size)
+        if lowest <= losses[size] + min_gain * abs(losses[size]):
             break
-    limit = _level(min(found.values()))
-    return next(size for size, value in found.items() if value <= limit)
+    lowest = min(losses.values())
+    return next(size for size, value in losses.items() if value <= lowest + min_gain * abs(lowest))
 
 
-def _level(loss: float) -> float:
-    """Return the largest loss that counts as equal to a loss of any sign."""
-    return loss + MIN_GAIN * abs(loss)
-
-
-def _shapes(target: Tensor, n: int, grid: AngularGrid, steps: int) -> tuple[Tensor, Tensor]:
+def _shapes(target: Tensor, n: int, grid: AngularGrid, steps: int, margin: float = 0.5) -> tuple[Tensor, Tensor]:
     """Return means (n, 2) and Cholesky factors (n, 3) [rad] of n primitives that represent spectra (k, H, W) best.
 
-    The means start on a Fibonacci lattice over the hemisphere and a little below the horizon, as wide as their spacing.
+    The means start on a Fibonacci lattice over the hemisphere and `margin` spacings below the horizon, as wide as their
+    spacing. The margin was not studied.
     """
     spacing = math.sqrt(2 * math.pi / n)
-    height = 1 - (torch.arange(n) + 0.5) / n * (1 + MARGIN * spacing)
+    height = 1 - (torch.arange(n) + 0.5) / n * (1 + margin * spacing)
     elevation, azimuth = torch.asin(height), torch.arange(n) * math.pi * (3 - math.sqrt(5)) % (2 * math.pi)
     wide = spacing / elevation.cos().clamp_min(spacing / (2 * math.pi))
     mean = torch.stack([azimuth, elevation], dim=1)
@@ -254,10 +247,12 @@ def _shapes(target: Tensor, n: int, grid: AngularGrid, steps: int) -> tuple[Tens
     return mean.detach(), constrained(raw.detach(), floor)
 
 
-def _fill(mean: Tensor, raw: Tensor, residual: Tensor, grid: AngularGrid) -> None:
-    """Move some primitives, made narrow, to the peaks of the residual energy (H, W)."""
-    width = 1.5 * torch.tensor([grid.azimuth_step, grid.elevation_step])  # 1.5 pixels
-    for n in range(0, len(mean), 16):  # one in 16 starts at the largest residual
+def _fill(
+    mean: Tensor, raw: Tensor, residual: Tensor, grid: AngularGrid, one_in: int = 16, pixels: float = 1.5
+) -> None:
+    """Move one primitive in 16, 1.5 pixels wide, to each peak of the residual energy (H, W). Neither number was studied."""
+    width = pixels * torch.tensor([grid.azimuth_step, grid.elevation_step])
+    for n in range(0, len(mean), one_in):
         row, column = divmod(int(residual.argmax()), residual.shape[1])
         mean[n] = torch.stack([grid.azimuth[column], grid.elevation[row]]).float()
         raw[n, ::2] = width.log()
@@ -265,11 +260,14 @@ def _fill(mean: Tensor, raw: Tensor, residual: Tensor, grid: AngularGrid) -> Non
         residual = residual * (1 - taken).square()
 
 
-def _weights(function: Tensor, spectrum: Tensor) -> Tensor:
-    """Return the least-squares weights (k, n) of spectra (k, H, W) on kernels (n, H, W)."""
+def _weights(function: Tensor, spectrum: Tensor, ridge: float = 1e-6) -> Tensor:
+    """Return the least-squares weights (k, n) of spectra (k, H, W) on kernels (n, H, W).
+
+    The regularisation, relative to the mean square of a kernel, prevents large weights of opposite sign. Not studied.
+    """
     flat = function.flatten(1).double()
     gram = flat @ flat.T
-    gram += RIDGE * gram.diagonal().mean() * torch.eye(len(gram), dtype=gram.dtype)
+    gram += ridge * gram.diagonal().mean() * torch.eye(len(gram), dtype=gram.dtype)
     weight: Tensor = torch.linalg.solve(gram, flat @ spectrum.flatten(1).double().T).T.float()
     return weight
 

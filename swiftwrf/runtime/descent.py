@@ -22,7 +22,6 @@ Record = dict[str, Any]  # one evaluation of a fit
 KIND = "fit state"
 Model = TypeVar("Model", bound=nn.Module)
 
-MAX_GROWTH = 1.1  # of the loss of a fit that is not refused: steps have different spectra, and a few improve little
 SAVED_VALUES = {"step": int, "seconds": float, "first_loss": float, "last_loss": float}  # attributes in a checkpoint
 
 
@@ -122,6 +121,7 @@ class Descent(ABC, Generic[Model]):
         checkpoint: Path | None = None,
         on_record: Callable[[Record], None] | None = None,
         progress: bool = False,
+        max_growth: float = 1.1,
         **_: Any,
     ) -> Model:
         """Take all steps and return the model with averaged parameters, without gradients.
@@ -131,10 +131,12 @@ class Descent(ABC, Generic[Model]):
             checkpoint: File for the state at each evaluation. If it exists, the run continues from it.
             on_record: Called at each evaluation; at first with the records of the checkpoint.
             progress: Show a progress bar on a terminal.
+            max_growth: Largest ratio of the last loss to the first one in a fit that is not refused. Above 1, because steps
+                have different spectra. Not studied.
 
         Raises:
             InputError: The checkpoint is damaged or belongs to another fit.
-            FitError: The mean loss before the last evaluation is a tenth above that before the first.
+            FitError: The mean loss before the last evaluation is above `max_growth` times that before the first.
         """
         records: list[Record] = []
         send = on_record or (lambda record: None)
@@ -168,7 +170,7 @@ class Descent(ABC, Generic[Model]):
                     tensors, header = self._state()
                     files.write(checkpoint, KIND, tensors, header | {"fingerprint": owner, "records": records})
                 send(records[-1])
-        if self.last_loss > MAX_GROWTH * self.first_loss:  # also if the checkpoint is that of a completed run
+        if self.last_loss > max_growth * self.first_loss:  # also if the checkpoint is that of a completed run
             raise FitError(
                 f"the fit ended with a loss of {self.last_loss:.3g}, worse than the {self.first_loss:.3g} it began with; "
                 f"{self._advice()}"

@@ -31,15 +31,13 @@ from swiftwrf.models.interpolator import Interpolator
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import Fraction
 
-MAX_PIXELS = 4000  # of a spectrum, to choose kernel and mixing weight
-MAX_SPECTRA = 10_000  # the fit computes all their inner products
+MAX_SPECTRA = 10_000  # the fit inverts their covariance
 
 
 class HybridModel(Interpolator):
     """Geometry with position-dependent path gains, and a Gaussian process on the residual.
 
-    An update adds to the residual. Room, path gains and mixing weight
-    stay as fitted.
+    An update adds to the residual. Room, path gains and mixing weight stay as fitted.
 
     Example:
         >>> import swiftwrf
@@ -74,53 +72,68 @@ class HybridModel(Interpolator):
     def _fit(self, train: Spectra, *, like: FieldModel | None = None, progress: bool = False, **_: Any) -> None:
         if len(train) > MAX_SPECTRA:
             raise InputError(
-                f"hybrid is fitted to all inner products of its spectra, at most {MAX_SPECTRA} of them, not {len(train)}; "
+                f"hybrid inverts the covariance of its spectra, at most {MAX_SPECTRA} of them, not {len(train)}; "
                 "take geometry, coarray or swiftwrf, or fewer spectra"
             )
         self._room = GeometryModel(self.config).fit(train, like=like, progress=progress)
         self._fit_residual(train, like if isinstance(like, HybridModel) else None)
 
     @single_thread()
-    def _fit_residual(self, train: Spectra, like: HybridModel | None) -> None:
+    def _fit_residual(
+        self, train: Spectra, like: HybridModel | None, usual_weight: float = 0.7, pixels: int = 4000
+    ) -> None:
+        """Choose kernel and mixing weight, and fit the process to the residuals of the paths.
+
+        Args:
+            train: Training spectra.
+            like: Model whose path gains are fitted to the training spectra.
+            usual_weight: Mixing weight of the residuals that choose the kernel. Not studied.
+            pixels: Number of pixels, about, that choose kernel and mixing weight. Not studied.
+        """
         fold = folds(train.position, self.config.validation, self.config.seed)
-        known, seen = self._fit_path_gains(train, fold, like), train.spectrum
-        stride = max(1, math.prod(train.grid.shape) // MAX_PIXELS) | 1
-        some, some_known = seen.flatten(1)[:, ::stride], known.flatten(1)[:, ::stride]
-        kernel = choose_kernel(train.position, some - 0.7 * some_known, fold)  # a usual mixing weight
-        self.mixing_weight, gains = _mixing_weight(train.position, some, some_known, fold, kernel)
-        if not gains:
-            self.mixing_weight, seen = 1.0, known
-        paths = self.mixing_weight * known
-        self.component = self._fit_process(train.position, Store(seen - paths), fold, kernel)
+        predicted, measured = self._fit_path_gains(train, fold, like), train.spectrum
+        stride = max(1, math.prod(train.grid.shape) // pixels) | 1
+        sparse = measured.flatten(1)[:, ::stride], predicted.flatten(1)[:, ::stride]
+        kernel = choose_kernel(train.position, sparse[0] - usual_weight * sparse[1], fold)
+        self.mixing_weight, is_better = _mixing_weight(train.position, *sparse, fold, kernel)
+        if not is_better:  # the paths alone, without a residual
+            self.mixing_weight, measured = 1.0, predicted
+        paths = self.mixing_weight * predicted
+        self.component = self._fit_process(train.position, Store(measured - paths), fold, kernel)
         self._fit_spread(train, fold, paths)
 
-    def _fit_path_gains(self, train: Spectra, fold: Tensor, like: HybridModel | None) -> Tensor:
-        """Fit the path gains; return the spectra (n, H, W) that the paths predict with each fold held out from the gains."""
+    def _fit_path_gains(
+        self, train: Spectra, fold: Tensor, like: HybridModel | None, least_advantage: float = 1.0
+    ) -> Tensor:
+        """Fit the path gains, and return the spectra (n, H, W) of the paths with each fold held out from the gains.
+
+        Gains are constant if their PSNR at held-out spectra is `least_advantage` standard errors higher. Not studied.
+        """
         self.path_gains = None
         if not self.room.planes or (like and not like.path_gains):
             return self.room.synthesize(train.position)
         scene, rows = observe(train, self.config)
-        found = self.room
+        room = self.room
         if like and like.path_gains:
             kernel, prior, fits = like.path_gains.process.kernel, like.path_gains.prior, dict[int, PathGains]()
-            self._room = found.with_order(like.room.order)
+            self._room = room.with_order(like.room.order)
         else:
             kernel = kernel_of(scene.moving)
-            self._room, prior, fits = choose_prior(found, scene, fold[rows])
-        known = torch.empty(len(train), *train.grid.shape)
+            self._room, prior, fits = choose_prior(room, scene, fold[rows])
+        predicted = torch.empty(len(train), *train.grid.shape)
         for out, _ in each_fold(fold):  # including spectra without observed phases
             number = int(fold[out[0]])
             kept = scene.subset((fold[rows] != number).nonzero()[:, 0])
             self.path_gains = fits.get(number) or fit_path_gains(self.room, kept, kernel, prior)
             for part in out.split(self.batch):
-                known[part] = self._paths(train.position[part])
+                predicted[part] = self._paths(train.position[part])
         if not like:
-            constant, seen = found.synthesize(train.position), train.spectrum
-            if advantage(psnr(constant, seen), psnr(known, seen)) > 1.0:  # standard errors
-                self._room, self.path_gains = found, None
+            constant, measured = room.synthesize(train.position), train.spectrum
+            if advantage(psnr(constant, measured), psnr(predicted, measured)) > least_advantage:
+                self._room, self.path_gains = room, None
                 return constant
         self.path_gains = fit_path_gains(self.room, scene, kernel, prior)
-        return known
+        return predicted
 
     def _residual(self, new: Spectra) -> Tensor:
         paths = torch.cat([self._paths(part) for part in new.position.split(self.batch)])
@@ -145,17 +158,21 @@ class HybridModel(Interpolator):
             )
 
 
-def _mixing_weight(position: Tensor, seen: Tensor, known: Tensor, fold: Tensor, kernel: Kernel) -> tuple[float, bool]:
-    """Return the least-squares weight, 0 to 1, of `known` (n, pixels) where `seen` is held out from the process.
+def _mixing_weight(
+    position: Tensor, measured: Tensor, predicted: Tensor, fold: Tensor, kernel: Kernel
+) -> tuple[float, bool]:
+    """Return the least-squares weight, 0 to 1, of spectra of the paths (n, pixels) at spectra held out from the process.
 
-    Also return whether weight and process together predict better than `known` alone, by the mean log squared error.
+    Also return whether the weighted paths and the process together have a smaller mean log squared error than the paths
+    alone.
     """
-    missed, sharp = torch.empty_like(seen), torch.empty_like(known)
+    missed, sharp = torch.empty_like(measured), torch.empty_like(predicted)
     for out, kept, weight, _ in leave_folds_out(kernel, position, fold):
-        for x, left in ((seen, missed), (known, sharp)):
+        for x, left in ((measured, missed), (predicted, sharp)):
             mean = x[kept].mean(0)
             left[out] = x[out] - mean - weight.float() @ (x[kept] - mean)
     power = float(sharp.square().sum())
-    share = min(1.0, max(0.0, float((missed * sharp).sum()) / power)) if power > 0 else 0.0
-    both, alone = ((x.square().mean(1) + 1e-9).log().mean() for x in (missed - share * sharp, seen - known))
-    return share, bool(both < alone)
+    mixing = min(1.0, max(0.0, float((missed * sharp).sum()) / power)) if power > 0 else 0.0
+    errors = missed - mixing * sharp, measured - predicted
+    both, alone = ((x.square().mean(1) + 1e-9).log().mean() for x in errors)
+    return mixing, bool(both < alone)
