@@ -64,6 +64,7 @@ class CoarrayModel(Linked, Interpolator):
     requires = (ARRAY,)
     any_grid = True
     batch = 32  # spectra that stay in the processor's cache
+    grows = False
     max_components = 64  # the time of a prediction grows with their square
 
     saved = "offset form"

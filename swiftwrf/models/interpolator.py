@@ -20,7 +20,7 @@ from __future__ import annotations
 from typing import Annotated, Any, ClassVar, Self
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
@@ -36,8 +36,8 @@ from swiftwrf.runtime.threads import single_thread
 class Interpolator(FieldModel):
     """Base class of field models that a Gaussian process of component scores interpolates between the training positions.
 
-    An update adds scores to the process. Kernel, noise, mean spectrum and spread stay as fitted. New spectra add components
-    if these are pixels. `with_chosen_kernel` chooses kernel and noise again.
+    An update adds scores to the process, and components that new spectra need. Kernel, noise, mean spectrum and spread stay
+    as fitted. `with_chosen_kernel` chooses kernel and noise again.
     """
 
     updates = True
@@ -45,6 +45,9 @@ class Interpolator(FieldModel):
     """largest number of components"""
     omitted: ClassVar[float] = 1e-4
     """variance of the omitted components relative to the squared error at held-out positions"""
+
+    grows: ClassVar[bool] = True
+    """whether an update adds the components that new spectra need"""
 
     saved = "process component spread"
     process: GaussianProcess
@@ -175,27 +178,28 @@ class Interpolator(FieldModel):
         factor = self.grid.n_azimuth // self.component.shape[2]
         return new.store.coarsen(factor)[:].to(self.component) - self.component[0]
 
+    def _scores(self, residual: Tensor) -> Tensor:
+        """Return the scores (k, K) of residuals (k, pixels) by least squares; components may depend on one another."""
+        flat = self.component[1:].flatten(1)
+        return (residual @ flat.T).double() @ torch.linalg.pinv((flat @ flat.T).double(), hermitian=True)
+
     def _update(self, new: Spectra) -> None:
         residual = self._residual(new).flatten(1)
-        if not self.any_grid:
+        if self.grows:
             self._extend(residual)
-        component = self.component[1:].flatten(1)
-        inverse = torch.linalg.pinv((component @ component.T).double(), hermitian=True)  # some may not be independent
-        score = (residual @ component.T).double() @ inverse
-        self.process = self.process.updated(new.position.to(self.process.known), score)
+        self.process = self.process.updated(new.position.to(self.process.known), self._scores(residual))
 
     def _extend(self, residual: Tensor, least: float = 1e-3) -> None:
-        """Add orthogonal components that residuals (k, pixels) need; their scores are 0 at all earlier training positions.
+        """Add components that residuals (k, pixels) need; their scores are 0 at all earlier training positions.
 
         Args:
             residual: Differences from the mean spectrum.
             least: Size of a component, relative to the residuals, below which it is noise. Not studied.
         """
-        unit = nn.functional.normalize(self.component[1:].flatten(1), dim=1)
-        rest = residual - (residual @ unit.T) @ unit
-        n = min(self.max_components - len(unit), len(rest))
+        rest = residual - self._scores(residual).to(residual) @ self.component[1:].flatten(1)
+        n = min(self.max_components + 1 - len(self.component), len(rest))
         _, size, direction = torch.linalg.svd(rest, full_matrices=False)
-        added = direction[:n][size[:n] > least * residual.norm()].unflatten(1, self.grid.shape)
+        added = direction[:n][size[:n] > least * residual.norm()].unflatten(1, self.component.shape[1:])
         self.process, self.component = self.process.widened(len(added)), torch.cat([self.component, added])
 
     def _forget(self, rows: Tensor) -> None:
