@@ -45,7 +45,6 @@ class Interpolator(FieldModel):
     """largest number of components"""
     omitted: ClassVar[float] = 1e-4
     """variance of the omitted components relative to the squared error at held-out positions"""
-
     grows: ClassVar[bool] = True
     """whether an update adds the components that new spectra need"""
 
@@ -73,7 +72,10 @@ class Interpolator(FieldModel):
         return component
 
     def _held_out(self, fold: Tensor, rows: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Return numbers of at most some training spectra, and their scores (m, K) and variances (m,) without their fold."""
+        """Return numbers of training spectra, at most `rows`, and their predicted scores and variances without their fold.
+
+        Shapes are (m,), (m, K) and (m,).
+        """
         process, (chosen,) = self.process, subsample(torch.arange(len(fold)), rows=rows)
         parts = [
             (out, weight @ process.value[others], variance)
