@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -21,7 +21,7 @@ from swiftwrf.data.spectra import Spectra, fingerprint
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import spectrum_loss
 from swiftwrf.models.base import CPU, FieldConfig, FieldModel
-from swiftwrf.models.mlp import SkipMLP, encode
+from swiftwrf.models.mlp import SkipMLP, draw_parameters, encode
 from swiftwrf.models.primitives import Primitives
 from swiftwrf.positions import frame, normalise
 from swiftwrf.rasterize import prepare, rasterize_magnitude
@@ -158,10 +158,7 @@ class DeformableGaussians(nn.Module):
         self.primitives = Primitives(n, grid, bounded=True, generator=generator)
         self.layers = SkipMLP(2 * (2 * MEAN_BANDS + 1) + 3 * (2 * POSITION_BANDS + 1), WIDTH, DEPTH, range(2, DEPTH, 2))
         self.output = nn.Linear(WIDTH, sum(OFFSETS))
-        for layer in self.layers:  # torch's default, sampled from the given generator
-            bound = 1 / math.sqrt(cast(nn.Linear, layer).in_features)
-            for parameter in layer.parameters():
-                nn.init.uniform_(parameter, -bound, bound, generator=generator)
+        draw_parameters(self.layers, generator)
         nn.init.zeros_(self.output.weight)
         nn.init.zeros_(self.output.bias)
 

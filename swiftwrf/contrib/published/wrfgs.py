@@ -39,11 +39,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from swiftwrf.array.angles import AngularGrid, to_angles
-from swiftwrf.contrib.published.base import Config, Count, Depth, TrainedModel, Training, draw_parameters
+from swiftwrf.contrib.published.base import Config, Count, Depth, TrainedModel, Training
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.metrics import spectrum_loss
 from swiftwrf.models.base import FIXED_END
-from swiftwrf.models.mlp import SkipMLP, encode
+from swiftwrf.models.mlp import SkipMLP, draw_parameters, encode
 from swiftwrf.models.primitives import MAX_WIDTH_RAD, min_width
 from swiftwrf.rasterize import rasterize_magnitude
 from swiftwrf.runtime.checkpoint import Header
