@@ -183,7 +183,8 @@ class Interpolator(FieldModel):
     def _scores(self, residual: Tensor) -> Tensor:
         """Return the scores (k, K) of residuals (k, pixels) by least squares; components may depend on one another."""
         flat = self.component[1:].flatten(1)
-        return (residual @ flat.T).double() @ torch.linalg.pinv((flat @ flat.T).double(), hermitian=True)
+        inverse: Tensor = torch.linalg.pinv((flat @ flat.T).double(), hermitian=True)
+        return (residual @ flat.T).double() @ inverse
 
     def _update(self, new: Spectra) -> None:
         residual = self._residual(new).flatten(1)
