@@ -17,6 +17,7 @@ that 80 % of their pixels are inside their 80 % intervals.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import Annotated, Any, ClassVar, Self
 
 import torch
@@ -109,10 +110,9 @@ class Interpolator(FieldModel):
         spread = (total / (len(out) + shrinkage)).sqrt().clamp_min(1e-6)
         self.spread = spread * interval_factor(relative / (HALF_WIDTH * spread), places(train.position)[out])
 
+    @abstractmethod
     def _decode(self, score: Tensor, grid: AngularGrid) -> Tensor:
         """Return the spectra (b, H, W) of component scores (b, K) on a grid, not clipped."""
-        change: Tensor = torch.tensordot(score, self.component[1:], dims=1)
-        return self.component[0] + change
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         if not with_std:
@@ -180,30 +180,27 @@ class Interpolator(FieldModel):
         factor = self.grid.n_azimuth // self.component.shape[2]
         return new.store.coarsen(factor)[:].to(self.component) - self.component[0]
 
-    def _scores(self, residual: Tensor) -> Tensor:
-        """Return the scores (k, K) of residuals (k, pixels) by least squares; components may depend on one another."""
-        flat = self.component[1:].flatten(1)
-        inverse: Tensor = torch.linalg.pinv((flat @ flat.T).double(), hermitian=True)
-        return (residual @ flat.T).double() @ inverse
-
-    def _update(self, new: Spectra) -> None:
-        residual = self._residual(new).flatten(1)
-        if self.grows:
-            self._extend(residual)
-        self.process = self.process.updated(new.position.to(self.process.known), self._scores(residual))
-
-    def _extend(self, residual: Tensor, least: float = 1e-3) -> None:
-        """Add components that residuals (k, pixels) need; their scores are 0 at all earlier training positions.
+    def _update(self, new: Spectra, ridge: float = 1e-6, least: float = 1e-3) -> None:
+        """Add spectra, and components that their residuals need. Scores of these are 0 at all earlier training positions.
 
         Args:
-            residual: Differences from the mean spectrum.
-            least: Size of a component, relative to the residuals, below which it is noise. Not studied.
+            new: Spectra.
+            ridge: Relative regularisation of the scores, because averaged components may depend on one another.
+            least: Size of an added component, relative to the residuals, below which it is noise. Not studied.
         """
-        rest = residual - self._scores(residual).to(residual) @ self.component[1:].flatten(1)
-        n = min(self.max_components + 1 - len(self.component), len(rest))
-        _, size, direction = torch.linalg.svd(rest, full_matrices=False)
-        added = direction[:n][size[:n] > least * residual.norm()].unflatten(1, self.component.shape[1:])
-        self.process, self.component = self.process.widened(len(added)), torch.cat([self.component, added])
+        residual, component = self._residual(new).flatten(1), self.component[1:].flatten(1)
+        gram = (component @ component.T).double()
+        gram.diagonal().mul_(1 + ridge)
+        score = torch.linalg.solve(gram, (component @ residual.T).double()).T
+        if self.grows:
+            rest = residual - score.to(residual) @ component
+            n = min(self.max_components - len(component), len(rest))
+            _, size, direction = torch.linalg.svd(rest, full_matrices=False)
+            added = direction[:n][size[:n] > least * residual.norm()]
+            score = torch.cat([score, (rest @ added.T).double()], dim=1)
+            self.component = torch.cat([self.component, added.unflatten(1, self.component.shape[1:])])
+            self.process = self.process.widened(len(added))
+        self.process = self.process.updated(new.position.to(self.process.known), score)
 
     def _forget(self, rows: Tensor) -> None:
         n = len(self.process.known)
@@ -238,3 +235,7 @@ class GPModel(Interpolator):
 
     name = "gp"
     kind = "pixel Gaussian process"
+
+    def _decode(self, score: Tensor, grid: AngularGrid) -> Tensor:
+        change: Tensor = torch.tensordot(score, self.component[1:], dims=1)
+        return self.component[0] + change

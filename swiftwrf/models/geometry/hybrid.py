@@ -27,14 +27,14 @@ from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.path_gains import PathGains, choose_prior, fit_path_gains, kernel_of
 from swiftwrf.models.geometry.planes import advantage
-from swiftwrf.models.interpolator import Interpolator
+from swiftwrf.models.interpolator import GPModel
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import Fraction
 
 MAX_SPECTRA = 10_000  # the fit inverts their covariance
 
 
-class HybridModel(Interpolator):
+class HybridModel(GPModel):
     """Geometry with position-dependent path gains, and a Gaussian process on the residual.
 
     An update adds to the residual. Room, path gains and mixing weight stay as fitted.
