@@ -180,7 +180,7 @@ class Interpolator(FieldModel):
         factor = self.grid.n_azimuth // self.component.shape[2]
         return new.store.coarsen(factor)[:].to(self.component) - self.component[0]
 
-    def _update(self, new: Spectra, ridge: float = 1e-6, least: float = 1e-3) -> None:
+    def _update(self, new: Spectra, *, ridge: float = 1e-6, least: float = 1e-3) -> None:
         """Add spectra, and components that their residuals need. Scores of these are 0 at all earlier training positions.
 
         Args:

@@ -169,9 +169,9 @@ class SwiftWRF(Interpolator):
             self._cache = dict([*self._cache.items()][-1:]) | {grid: known}
         return known
 
-    def _update(self, new: Spectra) -> None:
+    def _update(self, new: Spectra, **options: float) -> None:
         n = len(self.component)
-        super()._update(new)
+        super()._update(new, **options)
         grid = new.coarsen(self.grid.n_azimuth // self.component.shape[2]).grid
         added = _weights(kernels(self.mean, self.cholesky, grid, CUTOFF), self.component[n:])
         self.weight = torch.cat([self.weight, added])
