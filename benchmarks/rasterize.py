@@ -166,7 +166,7 @@ def model_of(n: int, grid: AngularGrid, device: torch.device) -> SwiftWRF:
     known, value = positions(200).double(), torch.randn(200, RANK, generator=generator, dtype=torch.float64)
     model.grid, model.bounds = grid, torch.tensor([[0.0] * 3, [1.0] * 3], dtype=torch.float64)
     model.mean, model.cholesky, model.spread = mean[0], cholesky, torch.ones(grid.shape)
-    model.weight = torch.randn(1 + RANK, n, generator=generator)
+    model.weight, model.component = torch.randn(1 + RANK, n, generator=generator), torch.zeros(1 + RANK, *grid.shape)
     model.process = GaussianProcess(Kernel(), known, value)
     model._move(device)
     return model

@@ -21,7 +21,7 @@ FIELD_MODELS: Registry[Any] = Registry(
         "geometry": "swiftwrf.models.geometry:GeometryModel",
         "hybrid": "swiftwrf.models.geometry:HybridModel",
         "nearest": "swiftwrf.models.neighbours:NearestModel",
-        "gp": "swiftwrf.models.gp:GPModel",
+        "gp": "swiftwrf.models.interpolator:GPModel",
         "idw": "swiftwrf.models.neighbours:IDWModel",
         "raytrace": "swiftwrf.contrib.raytraced.model:RaytraceModel",
         "swiftwrf": "swiftwrf.models.swiftwrf:SwiftWRF",

@@ -8,7 +8,7 @@ Learning", 2006, chapters 2 and 5).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -22,11 +22,13 @@ from swiftwrf.runtime.threads import single_thread
 MIN_ERROR = 1e-12  # squared error, for logarithms
 MAX_ROWS = 400  # spectra that choose; a candidate costs their number cubed
 MAX_LOCAL_ROWS = 200  # spectra that are held out among more, each predicted from its neighbours
-MIN_VARIANCE = 1e-6  # fraction of the variance below which a principal component is left out
+MIN_VARIANCE = 1e-6  # fraction of the variance below which a principal component is rounding
 
 
 @single_thread()
-def choose_kernel(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> Kernel:
+def choose_kernel(
+    position: Tensor, spectrum: Tensor | Store, fold: Tensor, noises: Sequence[float] = (1e-3, 1e-2, 1e-1)
+) -> Kernel:
     """Return the candidate with the highest mean logarithm of 1 / MSE over held-out spectra.
 
     Among more than 400 spectra, 200 are held out, and each is predicted from its nearest neighbours in other folds. A
@@ -36,6 +38,7 @@ def choose_kernel(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> K
         position: Positions of the training spectra (n, 3) [m].
         spectrum: Training spectra (n, H, W).
         fold: Number of the group that each is held out with, (n,).
+        noises: Candidates of the noise variance. Not studied.
 
     Example:
         >>> import swiftwrf
@@ -49,16 +52,16 @@ def choose_kernel(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> K
     def score(kernel: Kernel) -> float:
         return -float(evaluate(kernel).clamp_min(MIN_ERROR).log().sum())
 
-    return max(candidates(position, (1e-3, 1e-2, 1e-1)), key=score)
+    return max(candidates(position, noises), key=score)
 
 
 def _held_out_errors(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> Callable[[Kernel], Tensor]:
     """Return the function from a kernel to the squared errors (n,) of all spectra, each predicted without its fold."""
-    gram, apart = inner_products(spectrum[:]), distance(position.double(), position.double())
+    gram, separation = inner_products(spectrum[:]), distance(position.double(), position.double())
     groups = [out for out, _ in each_fold(fold)]
 
     def evaluate(kernel: Kernel) -> Tensor:
-        precision = torch.linalg.inv(kernel.at(apart) + kernel.noise * torch.eye(len(apart)))
+        precision = torch.linalg.inv(kernel.at(separation) + kernel.noise * torch.eye(len(separation)))
         # weights of all rows in the error of each row: 1 of the row itself, negative ones of those that predict it
         weight = torch.cat([held_out_errors(precision, precision, out) for out in groups])
         return ((weight @ gram) * weight).sum(1)
@@ -70,11 +73,11 @@ def _local_errors(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> C
     """Return the function from a kernel to the squared errors of some spectra, each predicted from its neighbours."""
     position = position.double()
     (out,) = subsample(torch.arange(len(position)), rows=MAX_LOCAL_ROWS)
-    near, weights = leave_folds_out_locally(position, fold, out)
+    neighbours, weights = leave_folds_out_locally(position, fold, out)
     mean = subsample(spectrum)[0].flatten(1).mean(dim=0)
-    rows = torch.cat([out[:, None], near], dim=1)
-    flat = (spectrum[some].flatten(1) - mean for some in rows)
-    gram = torch.stack([some @ some.T for some in flat]).double() / len(mean)
+    rows = torch.cat([out[:, None], neighbours], dim=1)
+    changes = (spectrum[group].flatten(1) - mean for group in rows)
+    gram = torch.stack([change @ change.T for change in changes]).double() / len(mean)
 
     def evaluate(kernel: Kernel) -> Tensor:
         weight, _ = weights(kernel)
@@ -85,23 +88,46 @@ def _local_errors(position: Tensor, spectrum: Tensor | Store, fold: Tensor) -> C
 
 
 @single_thread()
-def choose_rank(position: Tensor, spectrum: Tensor | Store, fold: Tensor, kernel: Kernel) -> int:
-    """Return the number of principal components whose omitted variance is negligible beside the error at held-out positions.
+def principal_components(
+    position: Tensor,
+    spectrum: Tensor | Store,
+    fold: Tensor,
+    kernel: Kernel,
+    omitted: float = 1e-4,
+    most: int = MAX_ROWS,
+    rows: int = 1000,
+) -> Tensor:
+    """Return the mean spectrum and those principal components that matter beside the errors at held-out positions.
 
-    The arguments are those of `choose_kernel`, and the kernel that it chose.
+    Args:
+        position: As `choose_kernel`.
+        spectrum: As `choose_kernel`.
+        fold: As `choose_kernel`.
+        kernel: Kernel that it chose.
+        omitted: Variance of all omitted components, relative to the mean squared error at held-out positions.
+        most: Maximum number of components.
+        rows: Maximum number of spectra, evenly chosen, that determine the components. Not studied.
+
+    Returns:
+        Mean and K components, the least one first, float32 (1 + K, H, W). Components are orthogonal, and as long as the
+        standard deviation along them.
 
     Example:
         >>> import swiftwrf
         >>> data = swiftwrf.simulated_room(n=40, grid=swiftwrf.AngularGrid.hemisphere(6, 12))
         >>> fold = torch.arange(40) % 5
-        >>> 1 <= choose_rank(data.position, data.store, fold, choose_kernel(data.position, data.store, fold)) <= 40
-        True
+        >>> principal_components(data.position, data.store, fold, Kernel(), most=8).shape
+        torch.Size([9, 6, 12])
     """
-    position, spectrum, fold = subsample(position, spectrum, fold)
-    error = _held_out_errors(position, spectrum, fold)(kernel).sum()
-    variance = torch.linalg.eigvalsh(inner_products(spectrum)).clamp_min(0)  # ascending
-    left_out = variance.cumsum(0).flip(0)  # by 0, 1, ... components
-    return int((left_out > 5e-4 * error).sum())  # the rest is negligible beside it
+    error = _held_out_errors(*subsample(position, spectrum, fold))(kernel).mean()
+    (chosen,) = subsample(spectrum, rows=rows)
+    mean = chosen.mean(dim=0)
+    change = (chosen - mean).flatten(1)
+    value, vector = torch.linalg.eigh((change @ change.T).double() / len(change))  # ascending
+    matters = value.clamp_min(0).cumsum(0) > omitted * error * change.shape[1]
+    kept = (matters & (value > MIN_VARIANCE * value.sum())).nonzero()[-most:, 0]
+    component = (vector[:, kept] / len(change) ** 0.5).T.to(change) @ change
+    return torch.cat([mean[None], component.unflatten(1, mean.shape)]).float()
 
 
 @single_thread()
@@ -154,8 +180,8 @@ def subsample(*tensors: Tensor | Store, rows: int = MAX_ROWS) -> list[Tensor]:
         [tensor([ 0, 49, 99])]
     """
     n = len(tensors[0])
-    some = torch.linspace(0, n - 1, rows).long() if n > rows else slice(None)
-    return [t[some] for t in tensors]
+    chosen = torch.linspace(0, n - 1, rows).long() if n > rows else slice(None)
+    return [t[chosen] for t in tensors]
 
 
 def inner_products(spectrum: Tensor) -> Tensor:
@@ -169,60 +195,3 @@ def inner_products(spectrum: Tensor) -> Tensor:
     flat = spectrum.flatten(1)
     flat = flat - flat.mean(dim=0, dtype=torch.float64)  # the largest tensor in memory
     return flat @ flat.T / flat.shape[1]
-
-
-def principal_components(
-    rows: Tensor | Callable[[], Iterable[Tensor]], rank: int, min_variance: float = MIN_VARIANCE
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the largest principal components of rows.
-
-    The components of a tensor follow from the inner products of its rows. Those of batches follow from a random sketch of
-    the covariance after one power iteration (N. Halko, P. G. Martinsson and J. A. Tropp, "Finding structure with
-    randomness", SIAM Review 53, 2011, algorithms 4.3 and 5.1), whose time grows with the number of rows.
-
-    Args:
-        rows: Rows (n, P), float32, or a function that yields them in order by the batch, equal at each of three calls.
-        rank: Maximum number of components.
-        min_variance: Fraction of the variance below which a component is left out.
-
-    Returns:
-        Mean (P,), scores (n, K), float64 and each column of length 1, and components (K, P), the least component first. Rows
-        are nearly mean + score @ component.
-
-    Example:
-        >>> rows = torch.outer(torch.arange(5.0), torch.ones(8))
-        >>> mean, score, component = principal_components(rows, rank=3)
-        >>> component.shape, (mean + score.float() @ component)[:, 0].round().tolist()
-        (torch.Size([1, 8]), [0.0, 1.0, 2.0, 3.0, 4.0])
-    """
-    if not isinstance(rows, Tensor):
-        return _sketched(rows, rank, min_variance)
-    mean = rows.mean(dim=0)
-    change = rows - mean
-    value, vector = torch.linalg.eigh((change @ change.T).double())
-    kept = (value > min_variance * value.sum()).nonzero()[:, 0]
-    vector = vector[:, kept[max(len(kept) - rank, 0) :]]
-    return mean, vector, vector.T.float() @ change
-
-
-def _sketched(batches: Callable[[], Iterable[Tensor]], rank: int, min_variance: float) -> tuple[Tensor, Tensor, Tensor]:
-    total, n = torch.zeros((), dtype=torch.float64), 0
-    for batch in batches():
-        total, n = total + batch.sum(dim=0, dtype=torch.float64), n + len(batch)
-    mean = (total / n).float()
-    width = min(rank + 16, len(mean))  # more directions are more exact
-    random = torch.randn(len(mean), width, generator=torch.Generator().manual_seed(0))
-    sketch = torch.zeros(len(mean), width, dtype=torch.float64)
-    variance = 0.0
-    for batch in batches():
-        change = batch - mean
-        sketch += (change.T @ (change @ random)).double()
-        variance += float(change.square().sum(dtype=torch.float64))
-    span = torch.linalg.qr(sketch).Q.float()
-    score = torch.cat([(batch - mean) @ span for batch in batches()]).double()
-    value, vector = torch.linalg.eigh(score.T @ score)
-    kept = (value > min_variance * variance).nonzero()[:, 0]
-    kept = kept[max(len(kept) - rank, 0) :]
-    scale = value[kept].sqrt()
-    component = (vector[:, kept] * scale).T.float() @ span.T
-    return mean, score @ vector[:, kept] / scale, component

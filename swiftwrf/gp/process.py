@@ -122,7 +122,7 @@ class GaussianProcess:
     Args:
         kernel: Kernel with its noise.
         known: Positions of the values (n, 3).
-        value: Values (n, K), in the precision of the posterior mean. Defaults to none, for weights and variances alone.
+        value: Values (n, K), in the precision of the posterior mean. Defaults to none, for variances alone.
         exact: Whether every prediction conditions on all positions. Defaults to n <= 2000.
         correlation: Correlation of the field at the time of each value with the present field, (n,), from above 0 to 1,
             ascending. Defaults to 1. Between two values of correlations a <= b it is a / b (autoregressive in time).
@@ -213,18 +213,6 @@ class GaussianProcess:
             mean: Tensor = self._cross(position).to(self.coefficient) @ self.coefficient
             return mean
         return self.mean_and_variance(position)[0]
-
-    def weights(self, position: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the posterior mean at positions (m, 3) as a linear function of the values.
-
-        Returns:
-            Row numbers (m, k) of the values that count at each position, and their weights, float64 (m, k).
-        """
-        if self.is_exact:
-            weight = torch.cholesky_solve(self._cross(position).T, self._factor).T
-            return torch.arange(len(self.known)).expand_as(weight), weight
-        number, weight, _ = self._local(position)
-        return number, weight
 
     def variance(self, position: Tensor) -> Tensor:
         """Return the posterior variance, without noise, at positions (m, 3), relative to k(0) = 1, float64 (m,)."""

@@ -74,7 +74,7 @@ class Updatable:
         return new.subset(~known) if n_known else new
 
     def _digests_without(self, rows: Tensor, n: int) -> Tensor:
-        """Return the digests without those of some rows by their numbers among n, of which the last have a digest."""
+        """Return the digests without those of rows, given by their numbers among n rows. The last of these have digests."""
         return self.row_digests[~torch.isin(torch.arange(-len(self.row_digests), 0), rows - n)]
 
 
@@ -236,13 +236,13 @@ class FieldModel(Updatable, Saved, Displayed):
         return self._predicted(position, grid, with_std=False).mean
 
     def _predicted(self, position: Numbers, grid: AngularGrid | None, with_std: bool) -> Prediction:
-        """Predict some positions at a time, with gradients only where something requires them."""
+        """Predict a batch of positions at a time, with gradients only where a position or parameter requires them."""
         grid, position = self._checked_grid(grid), check_positions(position).to(self.device)
         batch = self._batch_on(position.device)
 
-        def evaluate(some: Tensor) -> tuple[Tensor, Tensor | None]:
-            mean, std = self._predict(some, grid, with_std)
-            shape = len(some), *grid.shape
+        def evaluate(part: Tensor) -> tuple[Tensor, Tensor | None]:
+            mean, std = self._predict(part, grid, with_std)
+            shape = len(part), *grid.shape
             mean = check_predicted(self, mean, shape).float().clamp(0, 1)
             # images of 8 bits, in which spectra are stored, have steps of 1 / 255
             return mean, None if std is None else check_predicted(self, std, shape).float().clamp_min(1 / 255)
@@ -250,10 +250,10 @@ class FieldModel(Updatable, Saved, Displayed):
         differentiable = position.requires_grad or any(tensor.requires_grad for tensor in self.parameters())
         with torch.set_grad_enabled(torch.is_grad_enabled() and differentiable):
             if torch.is_grad_enabled() or len(position) <= batch:
-                means, stds = zip(*(evaluate(some) for some in position.split(batch)), strict=True)
+                means, stds = zip(*(evaluate(part) for part in position.split(batch)), strict=True)
                 mean = means[0] if len(means) == 1 else torch.cat(means)
                 std = None if stds[0] is None else torch.cat(stds)
-            else:  # into one tensor, since the parts beside it would double the memory
+            else:  # into one tensor, because a list of parts would double the memory
                 mean, std = torch.empty(len(position), *grid.shape, device=position.device), None
                 for start in range(0, len(position), batch):
                     rows = slice(start, start + batch)
@@ -357,7 +357,7 @@ class FieldModel(Updatable, Saved, Displayed):
 
     @property
     def room(self) -> Any:
-        """`GeometryModel` of the room that the model found or uses; None for models without one."""
+        """`GeometryModel` of the room that the model estimates or uses; None for models without one."""
         return None
 
     @property
@@ -385,7 +385,7 @@ class FieldModel(Updatable, Saved, Displayed):
     @property
     def device(self) -> torch.device:
         """Device of the fitted tensors."""
-        return next((tensor.device for tensor in self.parameters()), torch.device("cpu"))
+        return next((tensor.device for tensor in self.parameters()), CPU)
 
     def _batch_on(self, device: torch.device) -> int:
         """Return the number of positions evaluated at a time on a device."""
@@ -453,8 +453,8 @@ def check_predicted(model: object, value: Tensor, shape: tuple[int, ...]) -> Ten
     """Return what a model predicts unchanged; refuse all but finite numbers in a floating-point tensor of this shape."""
     name = type(model).__name__
     if not isinstance(value, Tensor) or not value.is_floating_point() or value.shape != shape:
-        found = f"{value.dtype} {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
-        raise InputError(f"{name} must predict a floating-point tensor of shape {shape}, got {found}")
+        got = f"{value.dtype} {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+        raise InputError(f"{name} must predict a floating-point tensor of shape {shape}, got {got}")
     if not bool(value.detach().sum().isfinite()):
         raise InputError(f"{name} predicts values that are not finite; if its parameters overflow, fit it again")
     return value
@@ -487,5 +487,5 @@ def make_model(name: str, preset: Preset = "quick", **options: Any) -> FieldMode
 
 def model_type(name: str, preset: Preset = "quick") -> type[FieldModel]:
     """Return the field model of a name; with "paper", the one that has the published settings."""
-    found: type[FieldModel] = FIELD_MODELS[PUBLISHED.get(name, name) if preset == "paper" else name]
-    return found
+    model: type[FieldModel] = FIELD_MODELS[PUBLISHED.get(name, name) if preset == "paper" else name]
+    return model

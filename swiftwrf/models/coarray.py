@@ -8,12 +8,12 @@ spectrum is exactly 49 real coefficients at any resolution: a constant and, for 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import lru_cache
 from typing import Annotated, Any
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.planar import PlanarArray, basis, differences
@@ -21,14 +21,10 @@ from swiftwrf.data.spectra import Spectra, coarsening
 from swiftwrf.data.splits import folds
 from swiftwrf.data.store import Store
 from swiftwrf.errors import InputError
-from swiftwrf.gp import GaussianProcess, choose_kernel, principal_components
 from swiftwrf.models.base import ARRAY
+from swiftwrf.models.interpolator import Interpolator
 from swiftwrf.models.link import Linked
-from swiftwrf.models.process import ProcessModel
 from swiftwrf.runtime.threads import single_thread
-
-MAX_COMPONENTS = 64  # principal components of the training magnitudes
-MAX_EXACT_ROWS = 2000  # spectra whose principal components are computed in memory
 
 
 @lru_cache(maxsize=4)
@@ -49,7 +45,7 @@ def _offset(flat: Tensor, functions: Tensor, inverse: Tensor) -> Tensor:
     return least.clamp_min(0)[:, None]
 
 
-class CoarrayModel(Linked, ProcessModel):
+class CoarrayModel(Linked, Interpolator):
     """A Gaussian process in the linear space of the squared spectra that the array can produce.
 
     The process predicts the mean magnitude between the positions; its square, projected, gives the co-array coefficients. A
@@ -68,78 +64,37 @@ class CoarrayModel(Linked, ProcessModel):
     requires = (ARRAY,)
     any_grid = True
     batch = 32  # spectra that stay in the processor's cache
+    grows = False
+    max_components = 64  # the time of a prediction grows with their square
 
-    process: GaussianProcess
-    """process of the K component scores and the offset"""
-    saved = "offset form component"
-    offset: Annotated[Tensor, "float32 1"]
-    """mean offset that stretching removed from a spectrum"""
-    form: Annotated[Tensor, "float32 c process.k process.k"]
-    """quadratic form from K scores, after a 1, to coefficients, (1 + 2 P, K + 1, K + 1)"""
-    component: Annotated[Tensor, "float32 process.k h w"]
-    """mean magnitude and its components, averaged to few pixels, (1 + K, h, w)"""
+    saved = "offset form"
+    offset: Annotated[Tensor, "float32 1+process.k"]
+    """offset that stretching removed from the mean spectrum, then its change with each component"""
+    form: Annotated[Tensor, "float32 c 1+process.k 1+process.k"]
+    """quadratic form from K scores, after a 1, to coefficients, (1 + 2 P, 1 + K, 1 + K)"""
 
     @single_thread()
     def _fit(self, train: Spectra, **_: Any) -> None:
-        array = self.array
-        functions = basis(array, train.grid, torch.float32)
-        inverse = _inverse(array, train.grid).float()
-        parts = list(train.store.parts())
-        offset = torch.cat([_offset(train.store[rows].flatten(1), functions, inverse) for rows in parts])
-
-        def batches() -> Iterator[Tensor]:
-            return (train.store[rows].flatten(1) + offset[rows] for rows in parts)
-
-        few = len(train) <= MAX_EXACT_ROWS
-        mean, score, component = principal_components(torch.cat(list(batches())) if few else batches, MAX_COMPONENTS)
-        basis_magnitude = torch.cat([mean[None], component])
-        self.form = _quadratic_form(basis_magnitude, inverse)
-        self.component = _coarse(Store(basis_magnitude.unflatten(1, train.grid.shape)))
         fold = folds(train.position, self.config.validation, self.config.seed)
-        kernel = choose_kernel(train.position, train.store, fold)
-        target = torch.cat([score, (offset - offset.mean()).double()], dim=1)
-        self.process = GaussianProcess(kernel, train.position, target)
-        self.offset = offset.mean()[None]
-        value = self.process.value
-        self._set_spread(train, fold, lambda rows: value[rows], lambda score, _: self._spectra(score, self.grid))
+        component = self._fit_process(train.position, train.store, fold)
+        functions, inverse = basis(self.array, train.grid, torch.float32), _inverse(self.array, train.grid).float()
+        offset = torch.cat([_offset(part.flatten(1), functions, inverse) for part in train.store.batches()])
+        score = functional.pad(self.process.value.float(), (1, 0), value=1.0)
+        self.offset = torch.linalg.lstsq(score, offset, driver="gelsd").solution[:, 0]
+        self.form = _quadratic_form(component.flatten(1) + self.offset[:, None], inverse)
+        self.component = Store(component).coarsen(coarsening(train.grid.shape, 90))[:]  # beams are far wider
+        self._fit_spread(train, fold)
 
-    def _values(self, new: Spectra) -> Tensor:
-        functions, inverse = basis(self.array, self.grid, torch.float32), _inverse(self.array, self.grid).float()
-        spectrum = new.store[:]
-        offset = _offset(spectrum.flatten(1), functions, inverse)
-        component = self.component[1:].flatten(1).double()
-        change = (_coarse(Store(spectrum + offset[..., None])) - self.component[0]).flatten(1).double()
-        score = torch.linalg.solve(component @ component.T, component @ change.T).T
-        return torch.cat([score, (offset - self.offset).double()], dim=1)
-
-    def _weighted_values(self) -> Tensor:
-        weighted: Tensor = self.process.value[:, :-1] * self.component[1:].flatten(1).norm(dim=1)
-        return weighted
-
-    def _spectra(self, score: Tensor, grid: AngularGrid) -> Tensor:
-        """Return the spectra (b, H, W) of component scores with an offset (b, K + 1)."""
-        one = torch.cat([torch.ones_like(score[:, :1]), score[:, :-1]], dim=1)
+    def _decode(self, score: Tensor, grid: AngularGrid) -> Tensor:
+        one = functional.pad(score, (1, 0), value=1.0)
         coefficient = torch.einsum("nk,ckl,nl->nc", one, self.form, one)
         spectrum = (coefficient @ basis(self.array, grid, torch.float32)).clamp_(min=0).sqrt_()
-        if bool(self.offset > 0):
-            spectrum = spectrum - (self.offset + score[:, -1:])
-        return spectrum.reshape(-1, *grid.shape)
-
-    def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
-        mean = self._spectra(self.process.mean(position).float(), grid)
-        return mean, self._std(position, grid) if with_std else None
+        return (spectrum - (one @ self.offset)[:, None]).reshape(-1, *grid.shape)
 
     def _restored(self) -> None:
         super()._restored()
-        shape = 1 + 2 * len(differences(self.array)), *_coarse(Store(torch.zeros(1, *self.grid.shape))).shape[1:]
-        if (len(self.form), *self.component.shape[1:]) != shape:
-            raise InputError(f"the array and grid have {shape[0]} coefficients and components of {shape[1:]} pixels")
-
-
-def _coarse(spectra: Store) -> Tensor:
-    """Return spectra averaged to few pixels, (n, h, w)."""
-    factor = coarsening(spectra.shape[1:], 90)  # the beams of an array are far wider
-    return spectra.coarsen(factor)[:]
+        if len(self.form) != (count := 1 + 2 * len(differences(self.array))):
+            raise InputError(f"the array has {count} coefficients, the file {len(self.form)}")
 
 
 def _quadratic_form(component: Tensor, inverse: Tensor) -> Tensor:

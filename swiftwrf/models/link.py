@@ -12,9 +12,6 @@ from swiftwrf.choices import Moving
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.errors import InputError
 
-ROTATION_TOLERANCE = 1e-4  # between the matrices of one orientation
-FREQUENCY_TOLERANCE = 1e-6  # between frequencies, relative to them
-
 
 @dataclass(frozen=True, eq=False)
 class Link:
@@ -62,21 +59,21 @@ class Link:
             order = given.argsort(stable=True)[known.argsort(stable=True).argsort()]
             if bool((given != (given := given[order])).any()):
                 data = replace(data, channel=data.channel[:, order], frequency_hz=given)
-        own, other = self.array, data.array
-        array = own or other
+        fitted, new = self.array, data.array
+        array = fitted or new
         length = 1e-3 * array.wavelength if array else 1e-3
         compared = {
             f"moving end ({data.moving}, not {self.moving})": data.moving != self.moving,
             "position of the fixed end": _differ(self.fixed_position, data.fixed_position, length),
-            "orientation of the array": _differ(self.rotation, data.rotation, ROTATION_TOLERANCE),
-            "arrangement of the elements": own and other and _differ(own.element, other.element, length),
-            "carrier": own and other and abs(own.wavelength - other.wavelength) > length,
-            "set of frequencies": known is not None and _differ(known, given, FREQUENCY_TOLERANCE * float(known.max())),
+            "orientation of the array": _differ(self.rotation, data.rotation, 1e-4),
+            "arrangement of the elements": fitted and new and _differ(fitted.element, new.element, length),
+            "carrier": fitted and new and abs(fitted.wavelength - new.wavelength) > length,
+            "set of frequencies": known is not None and _differ(known, given, 1e-6 * float(known.max())),
         }
-        if found := [what for what, differs in compared.items() if differs]:
+        if different := [what for what, differs in compared.items() if differs]:
             raise InputError(
-                f"{data.name} was measured over another link than the training spectra, with another {', '.join(found)}; "
-                "give spectra of the same link or fit another model"
+                f"{data.name} was measured over another link than the training spectra, with another "
+                f"{', '.join(different)}; give spectra of the same link or fit another model"
             )
         return data
 

@@ -47,3 +47,12 @@ class SkipMLP(nn.ModuleList):
         for i, layer in enumerate(self):
             h = torch.relu(layer(torch.cat([h, x], dim=-1) if i in self.skips else h))
         return h
+
+
+def draw_parameters(model: nn.Module, generator: torch.Generator) -> None:
+    """Initialise weights and biases of all layers uniformly within 1 / sqrt(inputs), torch's default."""
+    for layer in model.modules():
+        if isinstance(layer, nn.Linear | nn.Conv2d | nn.ConvTranspose2d):
+            inputs, _ = nn.init._calculate_fan_in_and_fan_out(layer.weight)
+            for parameter in layer.parameters(recurse=False):
+                nn.init.uniform_(parameter, -1 / math.sqrt(inputs), 1 / math.sqrt(inputs), generator=generator)

@@ -20,7 +20,6 @@ from swiftwrf.models.base import FieldModel
 from swiftwrf.positions import distance, nearest
 from swiftwrf.runtime.validation import PositiveInt
 
-MIN_DISTANCE_M = 1e-9
 MAX_CHOICE_SPECTRA = 2000  # that choose the number of neighbours
 
 
@@ -107,20 +106,21 @@ class IDWModel(MemoryModel):
 def _held_out_loss(k: int, position: Tensor, gram: Tensor, fold: Tensor) -> float:
     loss = 0.0
     for out, kept in each_fold(fold):
-        near, share = weights(position[out], position[kept], k)
+        neighbour, value = weights(position[out], position[kept], k)
         weight = -torch.eye(len(fold), dtype=gram.dtype)[out]  # predicted minus held-out spectra
-        weight.scatter_(1, kept[near], share.to(gram.dtype))
+        weight.scatter_(1, kept[neighbour], value.to(gram.dtype))
         loss += float(((weight @ gram) * weight).sum())
     return loss
 
 
-def weights(position: Tensor, known: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """Return the indices of the k nearest known positions and their weights, (n, k); a known position gets all its weight.
+def weights(position: Tensor, known: Tensor, k: int, min_distance: float = 1e-9) -> tuple[Tensor, Tensor]:
+    """Return the indices of the k nearest known positions and their weights, (n, k).
 
-    Differentiable in `position` (n, 3) [m].
+    At a known position its own weight is 1. Differentiable in `position` (n, 3) [m]. `min_distance` [m] prevents a division
+    by 0.
     """
-    apart, number = nearest(position, known, k)
+    separation, number = nearest(position, known, k)
     if position.requires_grad:  # the search for neighbours is not differentiable, their distances are
-        apart = distance(position[:, None], known[number])[:, 0]
-    inverse = 1 / apart.clamp_min(MIN_DISTANCE_M)
+        separation = distance(position[:, None], known[number])[:, 0]
+    inverse = 1 / separation.clamp_min(min_distance)
     return number, (inverse / inverse.sum(dim=1, keepdim=True)).float()

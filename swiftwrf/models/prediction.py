@@ -114,7 +114,7 @@ class Prediction(Labelled, Displayed):
                x_m  y_m  z_m receiver  predicted_dbm  std_db
             0  0.0  0.0  0.0     hall          -60.0     2.0
         """
-        position, mean = self._place(), self.mean.detach().cpu()
+        position, mean = self._located(), self.mean.detach().cpu()
         if self.grid is not None:
             azimuth, elevation = self.grid.peak_direction(mean).rad2deg().T.numpy()
             peak = {
@@ -129,26 +129,27 @@ class Prediction(Labelled, Displayed):
         return table.assign(**values, **std)
 
     def coordinates(self) -> Arrays:
-        own: Arrays = {"receiver": (("receiver",), np.array(self.receiver_names, dtype=np.str_))}
+        values: Arrays = {"receiver": (("receiver",), np.array(self.receiver_names, dtype=np.str_))}
         if self.grid is not None:
-            own = direction_coordinates(self.grid)
-        return position_coordinates(self._place()) | own
+            values = direction_coordinates(self.grid)
+        return position_coordinates(self._located()) | values
 
     def variables(self) -> Arrays:
         name, dimensions, unit = ("spectrum", DIRECTION, "1") if self.grid else ("rssi", ("receiver",), "dBm")
-        found: Arrays = {name: (("position", *dimensions), self.mean.detach().cpu().numpy(), {"units": unit})}
+        values: Arrays = {name: (("position", *dimensions), self.mean.detach().cpu().numpy(), {"units": unit})}
         if self.std is not None:
             std = self.std.detach().cpu().numpy()
-            found["std"] = (("position", *dimensions), std, {"units": "1" if self.grid else "dB"})
-        return found
+            values["std"] = (("position", *dimensions), std, {"units": "1" if self.grid else "dB"})
+        return values
 
-    def _place(self) -> NDArray[np.float64]:
+    def _located(self) -> NDArray[np.float64]:
+        """Return the positions (n, 3) [m] of values whose direction or receiver is known."""
         if self.position is None or (self.grid is None and not self.receiver_names):
             raise InputError(
                 "this prediction lacks positions, or directions or receivers of its values; take that of a model's predict"
             )
-        place: NDArray[np.float64] = self.position.detach().cpu().double().numpy()
-        return place
+        position: NDArray[np.float64] = self.position.detach().cpu().double().numpy()
+        return position
 
 
 def _positions(position: NDArray[np.float64]) -> pd.DataFrame:

@@ -11,27 +11,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import torch
 from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.data.splits import folds, places
-from swiftwrf.gp import (
-    GaussianProcess,
-    Kernel,
-    choose_kernel,
-    choose_rank,
-    leave_folds_out,
-    principal_components,
-    subsample,
-)
+from swiftwrf.data.splits import folds
+from swiftwrf.data.store import Store
+from swiftwrf.gp import GaussianProcess
 from swiftwrf.metrics import spectrum_loss
 from swiftwrf.models.base import CPU, FieldConfig, FieldModel
+from swiftwrf.models.interpolator import Interpolator
 from swiftwrf.models.primitives import constrained, min_width
-from swiftwrf.models.process import ProcessModel
 from swiftwrf.rasterize import rasterize_magnitude
 from swiftwrf.rasterize.reference import kernels
 from swiftwrf.runtime.descent import Record
@@ -39,12 +32,6 @@ from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, configuration
 
-SIZES = (16, 32, 64, 128, 256, 512)  # numbers of primitives that a fit compares
-MIN_GAIN = 0.004  # relative reduction of the loss that counts, 0.04 dB
-RIDGE = 1e-6  # regularisation relative to a kernel's mean square, against large weights of opposite sign
-MAX_ROWS = 1000  # spectra that fit the shapes and compare sizes; more do not change the choice
-MIN_VARIANCE = 1e-9  # fraction of the variance below which a principal component is rounding
-MARGIN = 0.5  # spacings by which the first means lie below the horizon
 CUTOFF = 1e-4  # kernel values below count as 0
 MAX_CACHED_VALUES = 2**26  # float32 kernel values that one grid caches: 256 MiB
 
@@ -64,7 +51,7 @@ class SwiftWRFConfig(FieldConfig):
     """fit to spectra averaged down to at most this number of columns; 0 fits to all pixels"""
 
 
-class SwiftWRF(ProcessModel):
+class SwiftWRF(Interpolator):
     """2D Gaussians whose weights follow a Gaussian process of the position, fitted by regression.
 
     The Gaussians are those of M. Liu et al., 2025; `SwiftWRFPaper` fits them by gradient descent, as the paper does. One
@@ -84,6 +71,7 @@ class SwiftWRF(ProcessModel):
     config_type = SwiftWRFConfig
     searches = True
     any_grid = True
+    omitted = 5e-4  # 1e-4 takes more time without smaller errors
 
     saved = "mean cholesky weight"
     mean: Annotated[Tensor, "float32 n 2"]
@@ -92,8 +80,7 @@ class SwiftWRF(ProcessModel):
     """Cholesky factors l1, l2, l3 of each primitive [rad]"""
     weight: Annotated[Tensor, "float32 1+process.k n"]
     """weights of the primitives in the mean spectrum, then in each component"""
-    process: GaussianProcess
-    """process of the K component scores"""
+    _cache: dict[AngularGrid, Tensor]
 
     def _fit(
         self,
@@ -105,70 +92,57 @@ class SwiftWRF(ProcessModel):
         progress: bool = False,
         **_: Any,
     ) -> None:
-        config, work = self.config, train.at_most(self.config.max_azimuths)
-        fold = folds(work.position, config.validation, config.seed)
-        kernel = choose_kernel(work.position, work.store, fold)
-        if config.validation == "random":
-            fold = places(work.position, 2)  # leaving one place out costs a regression no more than five folds
-        rank = choose_rank(work.position, work.store, fold, kernel)
-        (rows,) = subsample(torch.arange(len(work)), rows=MAX_ROWS)
-        some, own = work.subset(rows).in_memory(), fold[rows]
-        small = some.at_most(90).in_memory()  # the beams of an array are far wider
-        n, record = config.n_primitives, on_record or (lambda record: None)
+        n, record = self.config.n_primitives, on_record or (lambda record: None)
         if n == "auto" and isinstance(like, SwiftWRF):
             n = len(like.mean)
         with progress_bar(progress) as bar, single_thread():
             task = bar.add_task("swiftwrf", total=None)
-            target = torch.cat(_components(small, rank))
+            work = train.at_most(self.config.max_azimuths)
+            small = work.at_most(90)  # the beams of an array are far wider
+            fold = folds(train.position, self.config.validation, self.config.seed)
+            component = self._fit_process(train.position, work.store, fold)
+            self.component = Store(component).coarsen(work.grid.n_azimuth // small.grid.n_azimuth)[:]
+            out, score = self._held_out(fold, rows=1000)[:2]
+            measured = small.store[out]
 
             def loss(n: int) -> float:
                 bar.update(task, description=f"swiftwrf, {n} primitives")
-                function = kernels(*_shapes(target, n, small.grid, 8), small.grid, CUTOFF)  # few steps rank alike
-                found = float(spectrum_loss(_held_out(small, function, kernel, own), small.spectrum))
-                record({"stage": "search", "n_primitives": n, "validation": found})
-                return found
+                shapes = _shapes(self.component, n, small.grid, 8)  # few steps rank alike
+                function = kernels(*shapes, small.grid, CUTOFF)
+                weight = _weights(function, self.component)
+                held_out = _render(weight[0] + score @ weight[1:], function).clamp(0, 1)
+                value = float(spectrum_loss(held_out, measured))
+                record({"stage": "search", "n_primitives": n, "validation": value})
+                return value
 
             if n == "auto":
-                n = smallest(loss, SIZES)
-            self.mean, self.cholesky = _shapes(target, n, small.grid, 60)
-            self._regress(work, some, kernel, rank)
-            function = kernels(self.mean, self.cholesky, self.grid, CUTOFF)
-
-            def spectrum(score: Tensor, _: Tensor) -> Tensor:
-                return _render(self.weight[0] + score @ self.weight[1:], function)
-
-            self._set_spread(train, fold, lambda rows: self.process.value[rows], spectrum)
+                n = smallest(loss)
+            self.mean, self.cholesky = _shapes(self.component, n, small.grid, 60)
+            self.weight = _weights(kernels(self.mean, self.cholesky, work.grid, CUTOFF), component)
+            self._cache = {}
+            self._fit_spread(train, fold)
         record({"stage": "final", "n_primitives": n})
         self._move(device)
 
-    def _regress(self, train: Spectra, some: Spectra, kernel: Kernel, rank: int) -> None:
-        """Fit weights to some of the training spectra, and the process to all of them."""
-        function = kernels(self.mean, self.cholesky, train.grid, CUTOFF)
-        mean, component = _components(some, rank)
-        self.weight = _weights(function, torch.cat([mean, component]))
-        flat = component.flatten(1)
-        score = torch.cat([(part - mean).flatten(1) @ flat.T for part in train.store.batches()])
-        self.process = GaussianProcess(kernel, train.position, (score / flat.square().sum(dim=1)).double())
-
     def _move(self, device: torch.device) -> None:
         """Move the fitted tensors to a device, and start an empty cache."""
-        self.mean, self.cholesky, self.weight = (x.to(device) for x in self.parameters())
-        self.spread = self.spread.to(device)
+        for name in ("mean", "cholesky", "weight", "component", "spread"):
+            setattr(self, name, getattr(self, name).to(device))
         if device.type != "cpu":
             known, value = self.process.known.to(device), self.process.value.to(device)
             self.process = GaussianProcess(self.process.kernel, known, value)
-        self._bases: dict[AngularGrid, Basis] = {}
+        self._cache = {}
 
     def parameters(self) -> tuple[Tensor, Tensor, Tensor]:
         return self.mean, self.cholesky, self.weight
 
     def primitives(self, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return mean, cholesky and weight at positions (n, 3) [m], the arguments of `swiftwrf.rasterize`."""
-        real = self.weight[0] + self.process.mean(self._process_position(position)).float() @ self.weight[1:]
-        return self.mean.expand(len(real), -1, -1), self.cholesky, torch.stack([real, torch.zeros_like(real)], dim=-1)
+        return self._primitives(self.process.mean(position.to(self.process.known)).float())
 
-    def _process_position(self, position: Tensor) -> Tensor:
-        return position.to(self.device)
+    def _primitives(self, score: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        real = self.weight[0] + score @ self.weight[1:]
+        return self.mean.expand(len(real), -1, -1), self.cholesky, torch.stack([real, torch.zeros_like(real)], dim=-1)
 
     def _batch_on(self, device: torch.device) -> int:
         """Return more positions on a GPU, which takes as long to start the kernels of 64 as to compute them."""
@@ -176,50 +150,35 @@ class SwiftWRF(ProcessModel):
             return self.batch
         return max(self.batch, min(4096, 2**24 // len(self.mean)))
 
-    def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
-        mean, cholesky, weight = self.primitives(position)
+    def _decode(self, score: Tensor, grid: AngularGrid) -> Tensor:
+        mean, cholesky, weight = self._primitives(score)
         learns = any(tensor.requires_grad for tensor in self.parameters())
         # a GPU renders kernels faster than it multiplies cached ones
-        if position.is_cuda or learns or len(self.mean) * math.prod(grid.shape) > MAX_CACHED_VALUES:
-            spectrum = rasterize_magnitude(mean, cholesky, weight, grid, cutoff=CUTOFF)
-        else:
-            spectrum = (weight[..., 0] @ self._basis(grid).kernel).abs().reshape(-1, *grid.shape)
-        return spectrum, self._std(position, grid) if with_std else None
+        if score.is_cuda or learns or len(self.mean) * math.prod(grid.shape) > MAX_CACHED_VALUES:
+            return rasterize_magnitude(mean, cholesky, weight, grid, cutoff=CUTOFF)
+        return _render(weight[..., 0], self._kernels_on(grid)).abs()
 
     @torch.inference_mode(False)  # a cached tensor must also serve calls with gradients
     @torch.no_grad()
-    def _basis(self, grid: AngularGrid) -> Basis:
-        """Return what all predictions on a grid share, from the cache if it is there."""
-        if known := self._bases.get(grid):
-            return known
-        kernel = kernels(self.mean, self.cholesky, grid, CUTOFF).flatten(1)
-        component = self.weight[1:] @ kernel
-        dual = torch.linalg.pinv(component.double() @ component.double().T, hermitian=True) @ component.double()
-        basis = Basis(kernel, self.weight[0] @ kernel, dual.float())
-        if kernel.numel() <= MAX_CACHED_VALUES:  # a new dictionary, because other threads read the old one
-            self._bases = dict([*self._bases.items()][-1:]) | {grid: basis}
-        return basis
+    def _kernels_on(self, grid: AngularGrid) -> Tensor:
+        """Return the kernels of the primitives on a grid, (N, H, W), those of the last two grids from the cache."""
+        known = self._cache.get(grid)
+        if known is None:
+            known = kernels(self.mean, self.cholesky, grid, CUTOFF)
+            # a new dictionary, because other threads read the old one
+            self._cache = dict([*self._cache.items()][-1:]) | {grid: known}
+        return known
 
-    def _values(self, new: Spectra) -> Tensor:
-        work = new.at_most(self.config.max_azimuths)
-        basis = self._basis(work.grid)
-        return (work.store[:].flatten(1).to(self.device) - basis.mean) @ basis.dual.T
-
-    def _weighted_values(self) -> Tensor:
-        weighted: Tensor = self.process.value / self._basis(self.grid).dual.norm(dim=1)  # of orthogonal components
-        return weighted.cpu()
+    def _update(self, new: Spectra, **options: float) -> None:
+        n = len(self.component)
+        super()._update(new, **options)
+        grid = new.coarsen(self.grid.n_azimuth // self.component.shape[2]).grid
+        added = _weights(kernels(self.mean, self.cholesky, grid, CUTOFF), self.component[n:])
+        self.weight = torch.cat([self.weight, added])
 
     def _restored(self) -> None:
         super()._restored()
-        self._move(torch.device("cpu"))
-
-
-class Basis(NamedTuple):
-    """Tensors that all predictions on one grid share."""
-
-    kernel: Tensor  # of each primitive, (N, pixels)
-    mean: Tensor  # spectrum, (pixels,)
-    dual: Tensor  # projections of a change of the spectrum onto the scores, (K, pixels)
+        self._cache = {}
 
 
 def fit(train: Spectra, *, device: torch.device | str = "cpu", progress: bool = False, **options: Any) -> SwiftWRF:
@@ -242,62 +201,36 @@ def fit(train: Spectra, *, device: torch.device | str = "cpu", progress: bool = 
     return SwiftWRF(**options).fit(train, device=device, progress=progress)
 
 
-def smallest(loss: Callable[[int], float], sizes: tuple[int, ...]) -> int:
-    """Return the smallest size whose loss is within 0.4 % of the lowest loss.
+def smallest(
+    loss: Callable[[int], float], sizes: tuple[int, ...] = (16, 32, 64, 128, 256, 512), min_gain: float = 0.004
+) -> int:
+    """Return the smallest size whose loss is as low as the lowest one.
 
-    Sizes are tried in order until one reduces the loss by less than 0.4 %, so the search costs about as much as its last
-    fits.
+    Sizes are tried in order until one reduces the loss too little, so the search costs about as much as its last fits.
 
     Args:
-        loss: Held-out loss of a fit of a size.
+        loss: Held-out loss of a fit of a size, of any sign.
         sizes: Sizes, ascending.
+        min_gain: Relative reduction of the loss that counts. Not studied.
     """
-    found: dict[int, float] = {}
+    losses: dict[int, float] = {}
     for size in sizes:
-        lowest = min(found.values(), default=math.inf)
-        found[size] = loss(size)
-        if lowest <= _level(found[size]):
+        lowest = min(losses.values(), default=math.inf)
+        losses[size] = loss(size)
+        if lowest <= losses[size] + min_gain * abs(losses[size]):
             break
-    limit = _level(min(found.values()))
-    return next(size for size, value in found.items() if value <= limit)
+    lowest = min(losses.values())
+    return next(size for size, value in losses.items() if value <= lowest + min_gain * abs(lowest))
 
 
-def _level(loss: float) -> float:
-    """Return the largest loss that counts as equal to a loss of any sign."""
-    return loss + MIN_GAIN * abs(loss)
-
-
-def _components(spectra: Spectra, rank: int) -> tuple[Tensor, Tensor]:
-    """Return mean (1, H, W) and principal components (K, H, W) of spectra, scaled by their standard deviations."""
-    mean, _, component = principal_components(spectra.spectrum.flatten(1), rank, MIN_VARIANCE)
-    whole = torch.cat([mean[None], component / math.sqrt(len(spectra))]).reshape(-1, *spectra.grid.shape)
-    return whole[:1], whole[1:]
-
-
-def _held_out(spectra: Spectra, function: Tensor, kernel: Kernel, fold: Tensor) -> Tensor:
-    """Return held-out predictions (n, H, W) of spectra.
-
-    Args:
-        spectra: Spectra.
-        function: Kernels of the primitives on their grid, (N, H, W).
-        kernel: Kernel of the process of the weights.
-        fold: Number of the group that each spectrum is held out with, (n,).
-    """
-    weight = _weights(function, spectra.spectrum)
-    mean, predicted = weight.mean(dim=0), torch.empty_like(weight)
-    change = (weight - mean).double()
-    for out, kept, share, _ in leave_folds_out(kernel, spectra.position, fold):
-        predicted[out] = (share @ change[kept]).to(weight)
-    return _render(mean + predicted, function).clamp(0, 1)
-
-
-def _shapes(target: Tensor, n: int, grid: AngularGrid, steps: int) -> tuple[Tensor, Tensor]:
+def _shapes(target: Tensor, n: int, grid: AngularGrid, steps: int, margin: float = 0.5) -> tuple[Tensor, Tensor]:
     """Return means (n, 2) and Cholesky factors (n, 3) [rad] of n primitives that represent spectra (k, H, W) best.
 
-    The means start on a Fibonacci lattice over the hemisphere and a little below the horizon, as wide as their spacing.
+    The means start on a Fibonacci lattice over the hemisphere and `margin` spacings below the horizon, as wide as their
+    spacing. The margin was not studied.
     """
     spacing = math.sqrt(2 * math.pi / n)
-    height = 1 - (torch.arange(n) + 0.5) / n * (1 + MARGIN * spacing)
+    height = 1 - (torch.arange(n) + 0.5) / n * (1 + margin * spacing)
     elevation, azimuth = torch.asin(height), torch.arange(n) * math.pi * (3 - math.sqrt(5)) % (2 * math.pi)
     wide = spacing / elevation.cos().clamp_min(spacing / (2 * math.pi))
     mean = torch.stack([azimuth, elevation], dim=1)
@@ -321,10 +254,12 @@ def _shapes(target: Tensor, n: int, grid: AngularGrid, steps: int) -> tuple[Tens
     return mean.detach(), constrained(raw.detach(), floor)
 
 
-def _fill(mean: Tensor, raw: Tensor, residual: Tensor, grid: AngularGrid) -> None:
-    """Move some primitives, made narrow, to the peaks of the residual energy (H, W)."""
-    width = 1.5 * torch.tensor([grid.azimuth_step, grid.elevation_step])  # 1.5 pixels
-    for n in range(0, len(mean), 16):  # one in 16 starts at the largest residual
+def _fill(
+    mean: Tensor, raw: Tensor, residual: Tensor, grid: AngularGrid, one_in: int = 16, pixels: float = 1.5
+) -> None:
+    """Move one primitive in 16, 1.5 pixels wide, to each peak of the residual energy (H, W). Neither number was studied."""
+    width = pixels * torch.tensor([grid.azimuth_step, grid.elevation_step])
+    for n in range(0, len(mean), one_in):
         row, column = divmod(int(residual.argmax()), residual.shape[1])
         mean[n] = torch.stack([grid.azimuth[column], grid.elevation[row]]).float()
         raw[n, ::2] = width.log()
@@ -332,11 +267,14 @@ def _fill(mean: Tensor, raw: Tensor, residual: Tensor, grid: AngularGrid) -> Non
         residual = residual * (1 - taken).square()
 
 
-def _weights(function: Tensor, spectrum: Tensor) -> Tensor:
-    """Return the least-squares weights (k, n) of spectra (k, H, W) on kernels (n, H, W)."""
+def _weights(function: Tensor, spectrum: Tensor, ridge: float = 1e-6) -> Tensor:
+    """Return the least-squares weights (k, n) of spectra (k, H, W) on kernels (n, H, W).
+
+    The regularisation, relative to the mean square of a kernel, prevents large weights of opposite sign. Not studied.
+    """
     flat = function.flatten(1).double()
     gram = flat @ flat.T
-    gram += RIDGE * gram.diagonal().mean() * torch.eye(len(gram), dtype=gram.dtype)
+    gram += ridge * gram.diagonal().mean() * torch.eye(len(gram), dtype=gram.dtype)
     weight: Tensor = torch.linalg.solve(gram, flat @ spectrum.flatten(1).double().T).T.float()
     return weight
 

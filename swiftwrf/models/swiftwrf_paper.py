@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -21,7 +21,7 @@ from swiftwrf.data.spectra import Spectra, fingerprint
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import spectrum_loss
 from swiftwrf.models.base import CPU, FieldConfig, FieldModel
-from swiftwrf.models.mlp import SkipMLP, encode
+from swiftwrf.models.mlp import SkipMLP, draw_parameters, encode
 from swiftwrf.models.primitives import Primitives
 from swiftwrf.positions import centre_and_half_side, normalise
 from swiftwrf.rasterize import prepare, rasterize_magnitude
@@ -38,7 +38,6 @@ from swiftwrf.runtime.validation import (
 MEAN_BANDS, POSITION_BANDS = 10, 6  # frequency bands of the paper's encodings
 WIDTH, DEPTH = 156, 8  # size of the paper's network
 OFFSETS = (2, 2, 1)  # numbers of offsets of mean, response and attenuation for each primitive
-CUTOFF = 1e-4  # kernel values below count as 0
 
 
 @configuration
@@ -117,12 +116,12 @@ class SwiftWRFPaper(FieldModel):
         return self.field.parameters()
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
-        return rasterize_magnitude(*self.primitives(position), grid, cutoff=CUTOFF), None
+        return rasterize_magnitude(*self.primitives(position), grid), None
 
     def primitives(self, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return mean, cholesky and weight at positions (n, 3) [m], the arguments of `swiftwrf.rasterize`."""
-        found: tuple[Tensor, Tensor, Tensor] = self.field(self.field.normalise(position.to(self.device)))
-        return found
+        primitives: tuple[Tensor, Tensor, Tensor] = self.field(self.field.normalise(position.to(self.device)))
+        return primitives
 
     def blank(self, saved: Mapping[str, Tensor]) -> DeformableGaussians:
         n, centre, scale = len(saved["primitives.mean"]), torch.zeros(3).double(), torch.ones(()).double()
@@ -159,10 +158,7 @@ class DeformableGaussians(nn.Module):
         self.primitives = Primitives(n, grid, bounded=True, generator=generator)
         self.layers = SkipMLP(2 * (2 * MEAN_BANDS + 1) + 3 * (2 * POSITION_BANDS + 1), WIDTH, DEPTH, range(2, DEPTH, 2))
         self.output = nn.Linear(WIDTH, sum(OFFSETS))
-        for layer in self.layers:  # torch's default, sampled from the given generator
-            bound = 1 / math.sqrt(cast(nn.Linear, layer).in_features)
-            for parameter in layer.parameters():
-                nn.init.uniform_(parameter, -bound, bound, generator=generator)
+        draw_parameters(self.layers, generator)
         nn.init.zeros_(self.output.weight)
         nn.init.zeros_(self.output.bias)
 
@@ -244,7 +240,7 @@ class Optimisation(Descent[DeformableGaussians]):
         rows, deform = self.rows[self.step], self.step >= self.coarse_steps
         position = self.position[rows] + self.smoothing() * self.noise[self.step]
         mean, cholesky, weight = self.model(position, deform=deform)
-        rendered = rasterize_magnitude(mean, cholesky, weight, self.grid, cutoff=CUTOFF)
+        rendered = rasterize_magnitude(mean, cholesky, weight, self.grid)
         return spectrum_loss(rendered, self.spectrum[rows], self.config.ssim_weight)
 
     def record(self, loss: Tensor) -> Record:

@@ -37,8 +37,6 @@ class Descent(ABC, Generic[Model]):
         averaging: Decay of the weight of earlier parameters at each step; 0 takes the last parameters.
         clip: Maximum norm of the gradient.
         betas, weight_decay: Options of Adam.
-        max_growth: A fit is refused if its loss ends above this multiple of the first one. It exceeds 1, because steps have
-            different spectra, and a few steps improve little (not studied).
     """
 
     def __init__(
@@ -53,10 +51,9 @@ class Descent(ABC, Generic[Model]):
         clip: float = 1.0,
         betas: tuple[float, float] = (0.9, 0.99),
         weight_decay: float = 0.0,
-        max_growth: float = 1.1,
     ) -> None:
         self.name, self.model, self.steps, self.check_every = name, model, steps, check_every
-        self.averaging, self.clip, self.max_growth = averaging, clip, max_growth
+        self.averaging, self.clip = averaging, clip
         self.optimiser = torch.optim.Adam(groups, betas=betas, weight_decay=weight_decay)
         self.average = self.averaged()
         self.step, self.seconds = 0, 0.0
@@ -124,6 +121,7 @@ class Descent(ABC, Generic[Model]):
         checkpoint: Path | None = None,
         on_record: Callable[[Record], None] | None = None,
         progress: bool = False,
+        max_growth: float = 1.1,
         **_: Any,
     ) -> Model:
         """Take all steps and return the model with averaged parameters, without gradients.
@@ -133,10 +131,12 @@ class Descent(ABC, Generic[Model]):
             checkpoint: File for the state at each evaluation. If it exists, the run continues from it.
             on_record: Called at each evaluation; at first with the records of the checkpoint.
             progress: Show a progress bar on a terminal.
+            max_growth: Largest ratio of the last loss to the first one in a fit that is not refused. Above 1, because steps
+                have different spectra. Not studied.
 
         Raises:
             InputError: The checkpoint is damaged or belongs to another fit.
-            FitError: The mean loss before the last evaluation is a tenth above that before the first.
+            FitError: The mean loss before the last evaluation is above `max_growth` times that before the first.
         """
         records: list[Record] = []
         send = on_record or (lambda record: None)
@@ -170,7 +170,7 @@ class Descent(ABC, Generic[Model]):
                     tensors, header = self._state()
                     files.write(checkpoint, KIND, tensors, header | {"fingerprint": owner, "records": records})
                 send(records[-1])
-        if self.last_loss > self.max_growth * self.first_loss:  # also if the checkpoint is that of a completed run
+        if self.last_loss > max_growth * self.first_loss:  # also if the checkpoint is that of a completed run
             raise FitError(
                 f"the fit ended with a loss of {self.last_loss:.3g}, worse than the {self.first_loss:.3g} it began with; "
                 f"{self._advice()}"

@@ -22,8 +22,8 @@ from swiftwrf.models.base import FieldModel
 from swiftwrf.models.geometry.images import PhaseObservations
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.phase_retrieval import correlations, retrieve_phases
+from swiftwrf.models.interpolator import Interpolator
 from swiftwrf.models.link import Link
-from swiftwrf.models.process import ProcessModel
 from swiftwrf.positions import nearest
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.runtime.validation import checked
@@ -35,7 +35,7 @@ MIN_MISSING = 3e-3  # missing coherence that counts as none, phases of 3 degrees
 FalseAlarmRate = Annotated[float, Gt(0), Lt(1)]  # false alarms a measurement, over all regions and receivers together
 
 
-def adapted(before: ProcessModel, after: Spectra) -> tuple[ProcessModel, float]:
+def adapted(before: Interpolator, after: Spectra) -> tuple[Interpolator, float]:
     """Return a model that has learnt spectra after a change, and the chosen correlation of the fields before and after it.
 
     The correlation is that with the highest mean PSNR of held-out spectra after the change. With 1, all spectra count alike.
@@ -56,7 +56,7 @@ def adapted(before: ProcessModel, after: Spectra) -> tuple[ProcessModel, float]:
     """
     parts = torch.arange(len(after)) % min(N_FOLDS, len(after))
 
-    def held_out(model: ProcessModel) -> float:
+    def held_out(model: Interpolator) -> float:
         scores = []
         for out, kept in each_fold(parts) if len(after) > 1 else ():
             held = after.subset(out)
@@ -132,7 +132,7 @@ class Monitor:
         reference = None
         if isinstance(train, Spectra):
             train = model.aligned(train)
-            if isinstance(model, ProcessModel):  # each fifth is predicted without itself
+            if isinstance(model, Interpolator):  # each fifth is predicted without itself
                 known = model.region()
                 if known.shape != train.position.shape or not torch.allclose(known, train.position, rtol=0, atol=1e-3):
                     raise InputError(
@@ -304,11 +304,11 @@ class Follower:
             notices.append(f"{since}; fit it again, also if an obstacle appeared")
         notices += self._learn(new)
         self.count += 1
-        if isinstance(new, Spectra) and isinstance(self.model, ProcessModel):
+        if isinstance(new, Spectra) and isinstance(self.model, Interpolator):
             self._recent = [*self._recent, new][-500:]
             if alarms:
                 correlation = self._adapt(self.model, alarms[0])
-        if correlation is None and isinstance(self.model, ProcessModel | RssiModel):
+        if correlation is None and isinstance(self.model, Interpolator | RssiModel):
             self._unjudged.append((new, scores))
             notices += self._choose_kernel(self.model)
         return Step(scores, tuple(words), correlation, "; ".join(notices))
@@ -329,9 +329,9 @@ class Follower:
         self.waiting = None
         return notices
 
-    def _choose_kernel(self, model: ProcessModel | RssiModel) -> list[str]:
+    def _choose_kernel(self, model: Interpolator | RssiModel) -> list[str]:
         """Choose the kernel again if enough measurements are new; return a notice if another one predicts better."""
-        count, n = len(self._unjudged), len(model.process.known if isinstance(model, ProcessModel) else model.region())
+        count, n = len(self._unjudged), len(model.process.known if isinstance(model, Interpolator) else model.region())
         if count < max(30, 0.1 * (n - count)) or n - count < MIN_TRAINING:
             return []
         last, self._unjudged = self._unjudged, []
@@ -353,7 +353,7 @@ class Follower:
         change = f"{lengths}, noise {old.noise:.2g} -> {new.noise:.2g}"
         return [f"kernel chosen again after {self.count} measurements: {change}"]
 
-    def _adapt(self, model: ProcessModel, alarm: Alarm) -> float:
+    def _adapt(self, model: Interpolator, alarm: Alarm) -> float:
         """Adapt the model to a change, and calibrate the test with the next measurements."""
         n, learnt = min(alarm.at - alarm.since + 1, len(self._recent)), len(model.process.known)
         after = joined(self._recent[-n:])

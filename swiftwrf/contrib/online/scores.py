@@ -18,7 +18,7 @@ from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.metrics import LEVEL
 from swiftwrf.models.base import FieldModel
-from swiftwrf.models.process import ProcessModel
+from swiftwrf.models.interpolator import Interpolator
 from swiftwrf.rssi.base import RssiPredictor
 from swiftwrf.runtime.validation import PositiveInt, checked
 
@@ -87,7 +87,7 @@ def score(model: FieldModel | RssiPredictor, new: Spectra | Rssi) -> Scores:
         predicted = model.predict(position)
         miss = measured - predicted.mean
         error = miss.square().mean(dim=(1, 2)).sqrt().double()
-        expected = model.expected_error(position) if isinstance(model, ProcessModel) else torch.ones_like(error)
+        expected = model.expected_error(position) if isinstance(model, Interpolator) else torch.ones_like(error)
         innovation = (error / expected)[:, None]
     covered = torch.full_like(miss, torch.nan)
     if predicted.std is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
@@ -150,12 +149,3 @@ class TrainedModel(Linked, FieldModel):
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
         return self.render(self.network, position, grid), None
-
-
-def draw_parameters(model: nn.Module, generator: torch.Generator) -> None:
-    """Initialise weights and biases of all layers uniformly within 1 / sqrt(inputs), torch's default."""
-    for layer in model.modules():
-        if isinstance(layer, nn.Linear | nn.Conv2d | nn.ConvTranspose2d):
-            inputs, _ = nn.init._calculate_fan_in_and_fan_out(layer.weight)
-            for parameter in layer.parameters(recurse=False):
-                nn.init.uniform_(parameter, -1 / math.sqrt(inputs), 1 / math.sqrt(inputs), generator=generator)

@@ -34,10 +34,10 @@ from torch.func import functional_call
 from torch.nn import functional
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.contrib.published.base import Config, Count, TrainedModel, Training, draw_parameters
+from swiftwrf.contrib.published.base import Config, Count, TrainedModel, Training
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.errors import InputError
-from swiftwrf.models.mlp import encode
+from swiftwrf.models.mlp import draw_parameters, encode
 from swiftwrf.runtime.validation import NonNegativeFloat, PositiveFloat, PositiveInt, configuration
 
 MIN_HALVED_PIXELS = 4  # rows or columns that are still halved

@@ -39,11 +39,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from swiftwrf.array.angles import AngularGrid
-from swiftwrf.contrib.published.base import Config, Count, Depth, TrainedModel, Training, draw_parameters
+from swiftwrf.contrib.published.base import Config, Count, Depth, TrainedModel, Training
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.models.base import CPU, FIXED_END, check_predicted
-from swiftwrf.models.mlp import SkipMLP, encode
+from swiftwrf.models.mlp import SkipMLP, draw_parameters, encode
 from swiftwrf.positions import centre_and_half_side, normalise
 from swiftwrf.rssi.base import RssiPredictor
 from swiftwrf.runtime.checkpoint import Saved

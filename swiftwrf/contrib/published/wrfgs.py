@@ -39,11 +39,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from swiftwrf.array.angles import AngularGrid, to_angles
-from swiftwrf.contrib.published.base import Config, Count, Depth, TrainedModel, Training, draw_parameters
+from swiftwrf.contrib.published.base import Config, Count, Depth, TrainedModel, Training
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.metrics import spectrum_loss
 from swiftwrf.models.base import FIXED_END
-from swiftwrf.models.mlp import SkipMLP, encode
+from swiftwrf.models.mlp import SkipMLP, draw_parameters, encode
 from swiftwrf.models.primitives import MAX_WIDTH_RAD, min_width
 from swiftwrf.rasterize import rasterize_magnitude
 from swiftwrf.runtime.checkpoint import Header
@@ -51,7 +51,6 @@ from swiftwrf.runtime.validation import NonNegativeInt, PositiveFloat, PositiveI
 
 SHAPES = ("log_scale", "quaternion", "opacity")  # of the Gaussians, in the order of the optimiser's first groups
 FIRST_OPACITY = 0.1
-CUTOFF = 1e-4
 MIN_DISTANCE_M = 1e-3  # between a Gaussian and the array
 # densification: steps at which Gaussians are doubled and removed, and opacities reset
 GROW_FROM, GROW_UNTIL, GROW_EVERY, RESET_EVERY = 500, 15_000, 100, 3_000
@@ -180,7 +179,7 @@ class WrfGs(TrainedModel):
         signal = network["signal"](network["features"](x))[..., 0].abs()
         amplitude = gaussians["path_loss"] * torch.sigmoid(gaussians["opacity"]) * signal
         weight = torch.stack([amplitude, torch.zeros_like(amplitude)], dim=-1)
-        return rasterize_magnitude(mean.expand_as(weight), cholesky, weight, grid, cutoff=CUTOFF)
+        return rasterize_magnitude(mean.expand_as(weight), cholesky, weight, grid)
 
 
 def on_sphere(mean: Tensor, factor: Tensor, blur: Tensor) -> tuple[Tensor, Tensor]:

@@ -10,36 +10,34 @@ alone.
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.data.spectra import Spectra
 from swiftwrf.data.splits import each_fold, folds
+from swiftwrf.data.store import Store
 from swiftwrf.errors import InputError
-from swiftwrf.gp import GaussianProcess, Kernel, choose_kernel, leave_folds_out, principal_components
+from swiftwrf.gp import Kernel, choose_kernel, leave_folds_out
 from swiftwrf.metrics import psnr
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel
 from swiftwrf.models.geometry.fit import GeometryConfig, observe
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.models.geometry.path_gains import PathGains, choose_prior, fit_path_gains, kernel_of
 from swiftwrf.models.geometry.planes import advantage
-from swiftwrf.models.process import ProcessModel
+from swiftwrf.models.interpolator import GPModel
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import Fraction
 
-MAX_COMPONENTS = 64  # principal components of the residual spectra
-MAX_PIXELS = 4000  # of a spectrum, to choose kernel and mixing weight
-MAX_SPECTRA = 10_000  # the fit computes all their inner products
+MAX_SPECTRA = 10_000  # the fit inverts their covariance
 
 
-class HybridModel(ProcessModel):
+class HybridModel(GPModel):
     """Geometry with position-dependent path gains, and a Gaussian process on the residual.
 
-    An update adds to the residual, and components to it while there are fewer than 64. Room, path gains and mixing weight
-    stay as fitted.
+    An update adds to the residual. Room, path gains and mixing weight stay as fitted.
 
     Example:
         >>> import swiftwrf
@@ -55,15 +53,11 @@ class HybridModel(ProcessModel):
     searches = True
     batch = 256
 
-    saved = "_room path_gains mixing_weight component"
+    saved = "_room path_gains mixing_weight"
     path_gains: PathGains | None
     """gains of the paths; None if they are constant"""
     mixing_weight: Fraction
     """weight of the geometric part, 0 to 1"""
-    process: GaussianProcess
-    """process of the k component scores of the residual"""
-    component: Annotated[Tensor, "float32 1+process.k pixels"]
-    """mean residual spectrum, then its components"""
     _room: GeometryModel
 
     @classmethod
@@ -78,89 +72,72 @@ class HybridModel(ProcessModel):
     def _fit(self, train: Spectra, *, like: FieldModel | None = None, progress: bool = False, **_: Any) -> None:
         if len(train) > MAX_SPECTRA:
             raise InputError(
-                f"hybrid is fitted to all inner products of its spectra, at most {MAX_SPECTRA} of them, not {len(train)}; "
+                f"hybrid inverts the covariance of its spectra, at most {MAX_SPECTRA} of them, not {len(train)}; "
                 "take geometry, coarray or swiftwrf, or fewer spectra"
             )
         self._room = GeometryModel(self.config).fit(train, like=like, progress=progress)
         self._fit_residual(train, like if isinstance(like, HybridModel) else None)
 
     @single_thread()
-    def _fit_residual(self, train: Spectra, like: HybridModel | None) -> None:
+    def _fit_residual(
+        self, train: Spectra, like: HybridModel | None, usual_weight: float = 0.7, pixels: int = 4000
+    ) -> None:
+        """Choose kernel and mixing weight, and fit the process to the residuals of the paths.
+
+        Args:
+            train: Training spectra.
+            like: Model whose path gains are fitted to the training spectra.
+            usual_weight: Mixing weight of the residuals that choose the kernel. Not studied.
+            pixels: Number of pixels, about, that choose kernel and mixing weight. Not studied.
+        """
         fold = folds(train.position, self.config.validation, self.config.seed)
-        known = self._fit_path_gains(train, fold, like).flatten(1)
-        seen = train.spectrum.flatten(1)
-        stride = max(1, seen.shape[1] // MAX_PIXELS) | 1
-        some, some_known = seen[:, ::stride], known[:, ::stride]
-        kernel = choose_kernel(train.position, (some - 0.7 * some_known)[:, None], fold)  # a usual mixing weight
-        self.mixing_weight, gains = _mixing_weight(train.position, some, some_known, fold, kernel)
-        score = torch.zeros(len(train), 0)
-        self.component = torch.zeros(1, seen.shape[1])
-        if gains:
-            mean, score, component = principal_components(seen - self.mixing_weight * known, MAX_COMPONENTS)
-            self.component = torch.cat([mean[None], component])
-        else:
-            self.mixing_weight = 1.0
-        self.process = GaussianProcess(kernel, train.position, score.float(), exact=True)
-        mean, component = self.component[0], self.component[1:]
+        predicted, measured = self._fit_path_gains(train, fold, like), train.spectrum
+        stride = max(1, math.prod(train.grid.shape) // pixels) | 1
+        sparse = measured.flatten(1)[:, ::stride], predicted.flatten(1)[:, ::stride]
+        kernel = choose_kernel(train.position, sparse[0] - usual_weight * sparse[1], fold)
+        self.mixing_weight, is_better = _mixing_weight(train.position, *sparse, fold, kernel)
+        if not is_better:  # the paths alone, without a residual
+            self.mixing_weight, measured = 1.0, predicted
+        paths = self.mixing_weight * predicted
+        self.component = self._fit_process(train.position, Store(measured - paths), fold, kernel)
+        self._fit_spread(train, fold, paths)
 
-        def spectrum(held_out: Tensor, rows: Tensor) -> Tensor:
-            return (mean + held_out @ component + self.mixing_weight * known[rows]).reshape(-1, *self.grid.shape)
+    def _fit_path_gains(
+        self, train: Spectra, fold: Tensor, like: HybridModel | None, least_advantage: float = 1.0
+    ) -> Tensor:
+        """Fit the path gains, and return the spectra (n, H, W) of the paths with each fold held out from the gains.
 
-        self._set_spread(train, fold, lambda rows: score[rows], spectrum)
-
-    def _fit_path_gains(self, train: Spectra, fold: Tensor, like: HybridModel | None) -> Tensor:
-        """Fit the path gains; return the spectra (n, H, W) that the paths predict with each fold held out from the gains."""
+        Gains are constant if their PSNR at held-out spectra is `least_advantage` standard errors higher. Not studied.
+        """
         self.path_gains = None
         if not self.room.planes or (like and not like.path_gains):
             return self.room.synthesize(train.position)
         scene, rows = observe(train, self.config)
-        found = self.room
+        room = self.room
         if like and like.path_gains:
             kernel, prior, fits = like.path_gains.process.kernel, like.path_gains.prior, dict[int, PathGains]()
-            self._room = found.with_order(like.room.order)
+            self._room = room.with_order(like.room.order)
         else:
             kernel = kernel_of(scene.moving)
-            self._room, prior, fits = choose_prior(found, scene, fold[rows])
-        known = torch.empty(len(train), *train.grid.shape)
+            self._room, prior, fits = choose_prior(room, scene, fold[rows])
+        predicted = torch.empty(len(train), *train.grid.shape)
         for out, _ in each_fold(fold):  # including spectra without observed phases
             number = int(fold[out[0]])
             kept = scene.subset((fold[rows] != number).nonzero()[:, 0])
             self.path_gains = fits.get(number) or fit_path_gains(self.room, kept, kernel, prior)
             for part in out.split(self.batch):
-                known[part] = self._paths(train.position[part])
+                predicted[part] = self._paths(train.position[part])
         if not like:
-            constant, seen = found.synthesize(train.position), train.spectrum
-            if advantage(psnr(constant, seen), psnr(known, seen)) > 1.0:  # standard errors
-                self._room, self.path_gains = found, None
+            constant, measured = room.synthesize(train.position), train.spectrum
+            if advantage(psnr(constant, measured), psnr(predicted, measured)) > least_advantage:
+                self._room, self.path_gains = room, None
                 return constant
         self.path_gains = fit_path_gains(self.room, scene, kernel, prior)
-        return known
-
-    def _update(self, new: Spectra) -> None:
-        self._extend(self._residual(new))
-        super()._update(new)
-
-    def _values(self, new: Spectra) -> Tensor:
-        component = self.component[1:]
-        return self._residual(new) @ component.T / component.square().sum(1)
-
-    def _weighted_values(self) -> Tensor:
-        weighted: Tensor = self.process.value * self.component[1:].norm(dim=1)
-        return weighted
+        return predicted
 
     def _residual(self, new: Spectra) -> Tensor:
-        """Return the residuals (k, pixels) of the paths and of the mean residual."""
         paths = torch.cat([self._paths(part) for part in new.position.split(self.batch)])
-        return (new.store[:] - self.mixing_weight * paths).flatten(1) - self.component[0]
-
-    def _extend(self, residual: Tensor) -> None:
-        """Add orthogonal components that residuals (k, pixels) need; they are 0 at all earlier training positions."""
-        unit = nn.functional.normalize(self.component[1:], dim=1)
-        rest = residual - (residual @ unit.T) @ unit
-        n = min(MAX_COMPONENTS - len(unit), len(rest))
-        _, size, direction = torch.linalg.svd(rest, full_matrices=False)
-        added = direction[:n][size[:n] > 1e-3 * residual.norm()]  # smaller ones are noise
-        self.process, self.component = self.process.widened(len(added)), torch.cat([self.component, added])
+        return super()._residual(new) - self.mixing_weight * paths
 
     def _paths(self, position: Tensor) -> Tensor:
         """Return the spectra (b, H, W) that the paths predict at a batch of positions (b, 3) [m]."""
@@ -169,32 +146,33 @@ class HybridModel(ProcessModel):
         return self.room.array.spectrum(channel, self.grid)
 
     def _predict(self, position: Tensor, grid: AngularGrid, with_std: bool) -> tuple[Tensor, Tensor | None]:
-        mean = (self.component[0] + self.process.mean(position) @ self.component[1:]).reshape(-1, *self.grid.shape)
-        if self.mixing_weight:
-            mean = mean + self.mixing_weight * self._paths(position)
-        return mean, self._std(position, grid) if with_std else None
+        mean, std = super()._predict(position, grid, with_std)
+        return mean + self.mixing_weight * self._paths(position) if self.mixing_weight else mean, std
 
     def _restored(self) -> None:
         super()._restored()
-        sizes = math.prod(self.grid.shape), 1 + len(self.room.reflectors.sequence)
-        found = self.component.shape[1], sizes[1] if self.path_gains is None else self.path_gains.n_paths
-        if self.room.grid != self.grid or found != sizes:
+        n_paths = 1 + len(self.room.reflectors.sequence)
+        if self.room.grid != self.grid or (self.path_gains is not None and self.path_gains.n_paths != n_paths):
             raise InputError(
-                f"grid and room have {sizes[0]} pixels and {sizes[1]} paths, the components and gains {found}"
+                f"the room has {n_paths} paths on a grid of {self.room.grid.shape}, gains or components others"
             )
 
 
-def _mixing_weight(position: Tensor, seen: Tensor, known: Tensor, fold: Tensor, kernel: Kernel) -> tuple[float, bool]:
-    """Return the least-squares weight, 0 to 1, of `known` (n, pixels) where `seen` is held out from the process.
+def _mixing_weight(
+    position: Tensor, measured: Tensor, predicted: Tensor, fold: Tensor, kernel: Kernel
+) -> tuple[float, bool]:
+    """Return the least-squares weight, 0 to 1, of spectra of the paths (n, pixels) at spectra held out from the process.
 
-    Also return whether weight and process together predict better than `known` alone, by the mean log squared error.
+    Also return whether the weighted paths and the process together have a smaller mean log squared error than the paths
+    alone.
     """
-    missed, sharp = torch.empty_like(seen), torch.empty_like(known)
+    missed, sharp = torch.empty_like(measured), torch.empty_like(predicted)
     for out, kept, weight, _ in leave_folds_out(kernel, position, fold):
-        for x, left in ((seen, missed), (known, sharp)):
+        for x, left in ((measured, missed), (predicted, sharp)):
             mean = x[kept].mean(0)
             left[out] = x[out] - mean - weight.float() @ (x[kept] - mean)
     power = float(sharp.square().sum())
-    share = min(1.0, max(0.0, float((missed * sharp).sum()) / power)) if power > 0 else 0.0
-    both, alone = ((x.square().mean(1) + 1e-9).log().mean() for x in (missed - share * sharp, seen - known))
-    return share, bool(both < alone)
+    mixing = min(1.0, max(0.0, float((missed * sharp).sum()) / power)) if power > 0 else 0.0
+    errors = missed - mixing * sharp, measured - predicted
+    both, alone = ((x.square().mean(1) + 1e-9).log().mean() for x in errors)
+    return mixing, bool(both < alone)

@@ -16,9 +16,9 @@ from swiftwrf.data import store
 from swiftwrf.data.formats import nerf2
 from swiftwrf.data.spectra import check_training, fingerprint
 from swiftwrf.data.store import Store, stored
-from swiftwrf.gp import principal_components, process
+from swiftwrf.gp import Kernel, principal_components, process
 from swiftwrf.metrics import psnr
-from swiftwrf.models import coarray, make_model, neighbours
+from swiftwrf.models import make_model, neighbours
 from swiftwrf.models.geometry import HybridModel, hybrid
 from swiftwrf.positions import distance, nearest
 from swiftwrf.runtime.durable import cache_folder
@@ -194,17 +194,14 @@ def test_what_is_not_finite_is_found_in_any_batch(cache):
         check_training(data)
 
 
-def test_sketched_components_are_the_exact_ones(generator):
+def test_components_of_some_spectra_represent_all(generator):
+    position, fold = torch.rand(200, 3, generator=generator, dtype=torch.float64), torch.arange(200) % 5
     low = torch.randn(200, 12, generator=generator) * torch.logspace(1, -1, 12)
-    rows = low @ torch.randn(12, 150, generator=generator) + 0.3
-    mean, score, component = principal_components(lambda: rows.split(64), rank=8, min_variance=1e-6)
-    left = rows - rows.mean(dim=0)
-    u, s, v = torch.linalg.svd(left, full_matrices=False)
-    best = (u[:, :8] * s[:8]) @ v[:8]
-    torch.testing.assert_close(mean, rows.mean(dim=0))
-    torch.testing.assert_close(score.float() @ component, best, atol=2e-3, rtol=1e-3)
-    torch.testing.assert_close(score.T @ score, torch.eye(8).double(), atol=1e-6, rtol=0)
-    assert len(principal_components(lambda: rows.split(64), rank=64, min_variance=1e-6)[2]) == 12
+    spectrum = (low @ torch.randn(12, 150, generator=generator) + 0.3).reshape(200, 10, 15)
+    component = principal_components(position, spectrum, fold, Kernel(), omitted=1e-9, rows=60).flatten(1)
+    assert len(component) == 13
+    change, basis = spectrum.flatten(1) - component[0], torch.linalg.qr(component[1:].T).Q
+    torch.testing.assert_close(change @ basis @ basis.T, change, atol=1e-3, rtol=1e-3)
 
 
 def test_the_tree_finds_the_nearest(generator):
@@ -223,7 +220,6 @@ def exact(monkeypatch):
     def to(n):
         for module, name in (
             (process, "MAX_EXACT"),
-            (coarray, "MAX_EXACT_ROWS"),
             (neighbours, "MAX_CHOICE_SPECTRA"),
             (positions, "MIN_TREE_POSITIONS"),
         ):

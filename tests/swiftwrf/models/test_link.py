@@ -144,7 +144,7 @@ def test_a_locator_refuses_measurements_of_another_link(channels, locator, says,
 
 def test_what_spectra_do_not_describe_is_not_compared(room, models):
     bare = replace(room, rotation=None, fixed_position=None, index=torch.arange(40, 80))
-    assert len(models[0].update(bare).position) == 2 * len(room)
+    assert len(models[0].update(bare).process.known) == 2 * len(room)
     with pytest.raises(InputError, match="geometry needs the fixed end"):
         models[2].update(bare)
     assert models[0].fixed_end is not None
@@ -185,7 +185,7 @@ def test_unknown_positions_of_receivers_are_not_compared(tmp_path):
 @pytest.mark.parametrize(
     ("model", "last_step"),
     [
-        (make_model("coarray"), "_set_spread"),
+        (make_model("coarray"), "_fit_spread"),
         (RssiModel(), "_set_posterior"),
         (RssiLocator(n_cells=50), "_calibrate"),
         (MatchedField(**COARSEST), "_calibrate"),

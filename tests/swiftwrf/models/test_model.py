@@ -75,7 +75,7 @@ def test_the_cache_is_bounded(room, model, monkeypatch):
         rasterized = rasterize_magnitude(*model.primitives(room.position[:2]), grid).clamp(0, 1)
         torch.testing.assert_close(found.mean, rasterized, atol=2e-5, rtol=0)
         assert found.std.shape == found.mean.shape
-    assert [grid.n_azimuth for grid in model._bases] == [50, 60]
+    assert [grid.n_azimuth for grid in model._cache] == [50, 60]
 
 
 def test_a_scene_of_one_spectrum_is_saved_and_loaded(room):

@@ -12,14 +12,14 @@ from torch.nn import functional
 
 from swiftwrf import AngularGrid, FitError, InputError, Spectra, load, make_model, rssi_room, simulated_room
 from swiftwrf.contrib.published import NeRF2Rssi, wrfgs
-from swiftwrf.contrib.published.base import Training, draw_parameters
+from swiftwrf.contrib.published.base import Training
 from swiftwrf.contrib.published.generative import DcganConfig, VaeConfig, double, halve, stages
 from swiftwrf.contrib.published.nerf2 import FIRST_PHASE, PATH_GAIN, Field, NeRF2Config, integrate, received
 from swiftwrf.contrib.published.wrfgs import WrfGsConfig, on_sphere
 from swiftwrf.data.store import Store
 from swiftwrf.metrics import psnr
 from swiftwrf.models import FIELD_MODELS
-from swiftwrf.models.mlp import encode
+from swiftwrf.models.mlp import draw_parameters, encode
 from swiftwrf.models.swiftwrf_paper import SwiftWRFPaperConfig
 from swiftwrf.rasterize import rasterize_magnitude
 
