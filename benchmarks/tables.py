@@ -8,6 +8,7 @@ import warnings
 from typing import Any
 
 import aoa_tables
+import constant_tables
 import field_tables
 import rssi_tables
 import speed_tables
@@ -204,7 +205,7 @@ def rooms() -> str:
     return markdown(["`--room`", "scene"], [[f"`{name}`", meaning] for name, meaning in ROOMS.items()])
 
 
-MODULES = (aoa_tables, field_tables, rssi_tables, speed_tables)
+MODULES = (aoa_tables, constant_tables, field_tables, rssi_tables, speed_tables)
 FILES = ("README.md", *sorted(file.relative_to(ROOT).as_posix() for file in (ROOT / "docs").rglob("*.md")))
 
 

@@ -28,7 +28,7 @@ from swiftwrf.models.base import FieldModel
 from swiftwrf.models.geometry import GeometryModel
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, all_or_nothing, checked, configuration
 
-MIN_SPECTRA = 15
+MIN_SPECTRA = 15  # of a station: three in each of five folds
 
 
 @configuration

@@ -29,7 +29,7 @@ from swiftwrf.errors import CONTENT_ERRORS, InputError
 from swiftwrf.runtime.durable import write_bytes
 from swiftwrf.runtime.validation import RANGES, Configured, check_value, checked, hints_of
 
-FORMAT = 2
+FORMAT = 2  # of files, which is raised when earlier ones cannot be read
 Header = dict[str, Any]  # values that JSON can store
 
 

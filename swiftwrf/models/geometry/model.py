@@ -29,7 +29,7 @@ from swiftwrf.positions import check_positions
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import checked
 
-MAX_SNAPSHOTS = 8
+MAX_SNAPSHOTS = 8  # of a measurement, which furniture and locating use; more take time in proportion
 
 
 def kept_snapshots(number: int) -> Tensor:

@@ -22,7 +22,7 @@ from swiftwrf.models.geometry.images import PlaneSet, mirror
 from swiftwrf.models.geometry.planes import Plane
 from swiftwrf.runtime.threads import parallel_map
 
-MAX_SURFACES = 8
+MAX_SURFACES = 8  # of furniture; each adds images of the order of the room
 MAX_STARTS = 40  # local maxima that are followed
 STEP = 1 / 12  # of the offsets of the scan, in wavelengths
 CELL, MAX_CELLS = 4.0, 12  # least edge of a cell in wavelengths, and cells along each side of the region
