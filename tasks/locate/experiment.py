@@ -8,13 +8,14 @@ from augment.suggest import suggest_positions
 from swiftwrf import Rssi, rssi_room
 from swiftwrf.contrib.comparison.locating import compare
 from swiftwrf.data.coordinates import degree_columns
+from swiftwrf.data.formats import RSSI_FORMATS
 from tasks.configs import LocateConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
 from tasks.locate.page import SUGGESTED, page
 from tasks.page.page import finish
 from tasks.page.shared import write_suggestion
-from tasks.source import measured_rssi
+from tasks.source import reading
 from tasks.terminal import console, terminal
 from tasks.workers import connected, workers_of
 
@@ -26,10 +27,10 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
         InputError: Data or options that do not exist or do not fit together.
     """
     device = choose_device("cpu")
-    data = measurements(config)
+    data, reference = measurements(config)
     for note in data.notes:
         console.print(f"{data.name}: {note}")
-    label = f"rx{'_'.join(config.rx)}-s{config.seed}"
+    label = f"rx{'_'.join(config.receivers)}-s{config.seed}"
     described = "{median:.2f} m".format_map
     with (
         connected(config.scheduler, device) as cluster,
@@ -41,7 +42,7 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
                 split=config.split,
                 seed=config.seed,
                 n_cells=config.cells,
-                reference=config.table.reference,
+                reference=reference,
                 keep=directory,
                 executor=workers,
             )
@@ -58,11 +59,12 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
         finish(directory, result.recorded(), page)
 
 
-def measurements(config: LocateConfig) -> Rssi:
-    """Return the RSSI of a run at the receivers that are asked for.
+def measurements(config: LocateConfig) -> tuple[Rssi, str | None]:
+    """Return the RSSI of a run at the receivers that are asked for, and the reference of its groups.
 
     Raises:
         InputError: The data cannot be read, or have no such receiver.
     """
-    measured = measured_rssi(config.data, config.table)
-    return (rssi_room(seed=config.seed) if measured is None else measured).receivers(config.rx)
+    how = None if config.data is None else reading(config, config.data)
+    data: Rssi = rssi_room(seed=config.seed) if how is None else how.read(RSSI_FORMATS)
+    return data.receivers(config.receivers), how.reference if how else None

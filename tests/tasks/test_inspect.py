@@ -41,7 +41,9 @@ def test_snapshots(tmp_path, capsys):
     assert "needs no calibration" in text
     html = (tmp_path / "page" / "report.html").read_text()
     assert html.count("<figcaption>") == 3
-    assert "source --grid 24 96" in html  # the next command reads the files in the same way
+    assert (tmp_path / "source" / "reading.yaml").read_text() == "grid:\n- 24\n- 96\n"
+    assert quick.run("convert", tmp_path / "source", tmp_path / "own") == 0  # reads the files in the same way
+    assert "120 spectra of 24 x 96 pixels" in capsys.readouterr().out
     assert all(finding["text"][:20] in html for finding in content["findings"])
 
 

@@ -362,7 +362,8 @@ def test_notes_and_a_split_that_tests_look_up_are_in_every_report(tmp_path, task
     assert re.search(r"This split tests look-up: [5-9]\d% of the test rows", first)
     assert f"-107 counts as not detected: {2 * filled.sum()} of 240 cells" in first
     if task == "rssi":
-        assert quick.run(task, *source, "--filler", "none", "--out", tmp_path / "kept") == 0
+        (tmp_path / "walk" / "reading.yaml").write_text("filler: none")
+        assert quick.run(task, *source, "--out", tmp_path / "kept") == 0
         assert "counts as not detected" not in (tmp_path / "kept" / "report.html").read_text()
         assert quick.run("inspect", tmp_path / "walk", "--out", tmp_path / "inspect") == 0
         assert "Split random tests look-up" in capsys.readouterr().out
@@ -457,7 +458,9 @@ def test_a_run_with_offsets(tmp_path, capsys):
     """Measured values stay those of the table, predictions are of each row's group, and the locator knows the offsets."""
     floor = Floor.made(7, n=60)
     column, truth = grouped_tables(floor, "devices", tmp_path)
-    source = ("--rx", "all", "--data", tmp_path / "walk.csv", "--offset-by", f"{column}=galaxy")
+    reading = tmp_path / "walk.csv.reading.yaml"
+    reading.write_text(f"offset_by: {column}=galaxy")
+    source = ("--rx", "all", "--data", tmp_path / "walk.csv")
     assert quick.run("rssi", *source, "--out", tmp_path / "rssi") == 0
     notes = json.loads((tmp_path / "rssi" / "metrics.json").read_text())["notes"]
     assert any(f"offsets of {column} relative to galaxy" in note for note in notes)
@@ -466,7 +469,8 @@ def test_a_run_with_offsets(tmp_path, capsys):
     table = pd.read_csv(tmp_path / "walk.csv")
     assert predicted["measured"].isin(table[NAMES].to_numpy().ravel()).all()
     assert load(tmp_path / "rssi" / "model.safetensors").offsets.reference == "galaxy"
-    assert quick.run("rssi", *source[:-1], "nowhere", "--out", tmp_path / "other") == 2
+    reading.write_text("offset_by: nowhere")
+    assert quick.run("rssi", *source, "--out", tmp_path / "other") == 2
     assert "no column 'nowhere' for offsets" in capsys.readouterr().err
     data = load_rssi(tmp_path / "walk.csv", offset_by=column)
     known = estimate_offsets(data, "pixel")

@@ -22,7 +22,7 @@ from swiftwrf.runtime.steps import LOCATOR as MODEL
 from tasks.locate.page import answer
 from tasks.predict import read_rssi
 from tasks.records import Records
-from tasks.source import aligned
+from tasks.source import Reading, aligned
 
 GRID = AngularGrid.hemisphere(8, 32)
 
@@ -188,9 +188,9 @@ def test_a_table_without_positions(tmp_path):
     assert (len(data), len(data.receiver_names), is_known) == (20, 12, False)
     long = pd.DataFrame({"receiver": ["a", "b", "a"], "time": [1, 1, 2], "rssi": [-50, -60, -55]})
     long.to_csv(tmp_path / "b.csv", index=False)
-    data, is_known = read_rssi(str(tmp_path / "b.csv"), ReadOptions())
+    data, is_known = read_rssi(Reading(str(tmp_path / "b.csv")))
     assert (len(data), is_known) == (2, False)
-    assert read_rssi(str(write_rssi(tmp_path / "c.csv", rssi_room(n=20))), ReadOptions())[1]
+    assert read_rssi(Reading(str(write_rssi(tmp_path / "c.csv", rssi_room(n=20)))))[1]
 
 
 def test_other_rows_are_refused(locate_run, tmp_path, capsys):
@@ -198,8 +198,9 @@ def test_other_rows_are_refused(locate_run, tmp_path, capsys):
     others = write_rssi(tmp_path / "a.csv", replace(data, receiver_names=tuple("abcdefghijkl")))
     assert quick.command("predict", locate_run / MODEL, others, "--out", out) == 2
     assert "has other receivers (a, b" in said(capsys)
-    assert quick.command("predict", locate_run / MODEL, others, "--every", 2, "--out", out) == 2
-    assert "--every is for reading spectra" in said(capsys)
+    (tmp_path / "a.csv.reading.yaml").write_text("every: 2")
+    assert quick.command("predict", locate_run / MODEL, others, "--out", out) == 2
+    assert "a.csv.reading.yaml states every, but" in said(capsys)
     assert not out.exists()
 
 
