@@ -153,7 +153,7 @@ def _options(config: type[Any]) -> dict[str, str]:
         warnings.simplefilter("ignore", DeprecationWarning)
         actions = tyro.extras.get_parser(config)._actions
     return {
-        f"--{action.option_strings[0].lstrip('-').rpartition('.')[2]}": " ".join(str(action.help).split()).replace(
+        f"--{action.option_strings[-1].lstrip('-').rpartition('.')[2]}": " ".join(str(action.help).split()).replace(
             "%%", "%"
         )
         for action in actions
