@@ -15,7 +15,6 @@ from small import FLOOR, known_planes
 from swiftwrf import AngularGrid, InputError, load, rssi_room, simulated_room
 from swiftwrf.contrib.comparison.localizers import LEVELS, LOCALIZERS
 from swiftwrf.contrib.comparison.locating import LocateComparison
-from swiftwrf.data import ReadOptions
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.locate import MatchedField
 from swiftwrf.runtime.steps import LOCATOR as MODEL
@@ -184,7 +183,7 @@ def test_receivers_of_the_model_are_found_by_name(locate_run, capsys):
 
 
 def test_a_table_without_positions(tmp_path):
-    data, is_known = read_rssi(str(write_rssi(tmp_path / "a.csv", rssi_room(n=20), located=False)), ReadOptions())
+    data, is_known = read_rssi(Reading(str(write_rssi(tmp_path / "a.csv", rssi_room(n=20), located=False))))
     assert (len(data), len(data.receiver_names), is_known) == (20, 12, False)
     long = pd.DataFrame({"receiver": ["a", "b", "a"], "time": [1, 1, 2], "rssi": [-50, -60, -55]})
     long.to_csv(tmp_path / "b.csv", index=False)
