@@ -21,7 +21,7 @@ from swiftwrf.contrib.datasets import catalogue
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from tasks import configs, labels
 from tasks.command import COMMANDS
-from tasks.options import General, SpectraSource, TableSource, meanings
+from tasks.options import General, ReadingOptions, meanings
 
 
 def random_rooms() -> str:
@@ -165,7 +165,7 @@ def read_options() -> str:
     """Return the options of reading, and the formats that take them."""
     readers = {"spectra": SPECTRA_FORMATS, "snapshots": SNAPSHOT_FORMATS, "rssi": RSSI_FORMATS}
     rows = []
-    for name, meaning in {**_options(SpectraSource), **_options(TableSource)}.items():
+    for name, meaning in _options(ReadingOptions).items():
         field = name.removeprefix("--").replace("-", "_")
         formats = dict.fromkeys(one for found in readers.values() for one in found if field in found[one].takes)
         rows.append([f"`{name}`", ", ".join(formats), meaning])
@@ -174,7 +174,7 @@ def read_options() -> str:
 
 def commands() -> str:
     """Return all options of the commands but those of reading, with the commands that have them."""
-    reading = {*_options(SpectraSource), *_options(TableSource)}
+    reading = _options(ReadingOptions)
     found: dict[tuple[str, str], list[str]] = {}
     for command, (config, _) in COMMANDS.items():
         for name, meaning in _options(getattr(configs, config)).items():

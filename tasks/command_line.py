@@ -27,9 +27,7 @@ from tasks.options import (
     General,
     Options,
     ReadingConfig,
-    SpectraSource,
-    TableSource,
-    check_option,
+    ReadingOptions,
 )
 from tasks.terminal import terminal
 
@@ -119,7 +117,7 @@ def execute(program: str, config_type: type[Config], task: Callable[[Config], No
 
 def _reading_options(words: Sequence[str]) -> list[str]:
     """Return the options of reading among the words of a command line or a sentence."""
-    known = {option.name for group in (SpectraSource, TableSource) for option in fields(group)}
+    known = {option.name for option in fields(ReadingOptions)}
     names = [re.split("[^a-z-]", word.lstrip("(").removeprefix("--"))[0] for word in words if "--" in word[:3]]
     return [name for name in names if name.replace("-", "_") in known]
 
@@ -247,18 +245,15 @@ def file_options(file: Path, option: str = "config") -> dict[str, Any]:
     return {str(name): value for name, value in content.items()}
 
 
-def reading_options(file: Path) -> tuple[SpectraSource, TableSource]:
+def reading_options(file: Path) -> ReadingOptions:
     """Return the options of reading in a file.
 
     Raises:
         InputError: No such file, or one that holds anything else.
     """
     saved = file_options(file, "read")
-    spectra, table = (from_names(kind, saved, file) for kind in (SpectraSource, TableSource))
+    found: ReadingOptions = from_names(ReadingOptions, saved, file)
     for name in saved:
         raise InputError(f"{file} names {name!a}, which is no option of reading; swiftwrf inspect --help lists them")
-    for group in (spectra, table):
-        for option in fields(group):
-            check_option(option.name, getattr(group, option.name), Any)
-        group.check()
-    return spectra, table
+    found.check()
+    return found

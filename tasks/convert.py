@@ -25,7 +25,7 @@ from swiftwrf.runtime.durable import replacing, write_json
 from tasks.configs import FILES, MAP_FILES, ConvertConfig
 from tasks.directory import check_new_file, kept_model, new_directory
 from tasks.environment import command, invocation
-from tasks.options import SpectraSource, TableSource, by_name
+from tasks.options import by_name
 from tasks.page.maps import colour_image
 from tasks.records import CONFIG, rounded, write_table
 from tasks.source import reading
@@ -67,7 +67,7 @@ def _write_new_file(config: ConvertConfig, model: RssiModel | None) -> None:
         raise InputError(
             f"--receivers, --cell and --height are for maps of RSSI models, but {config.source} holds measurements"
         )
-    if model is not None and (config.spectra, config.table) != (SpectraSource(), TableSource()):
+    if model is not None and config.reading.given:
         raise InputError(f"{config.source} is a model; options of reading are for measurements")
     check_new_file(out, FILES)
     if model is None:
@@ -96,7 +96,8 @@ def _write_directory(config: ConvertConfig) -> None:
             written = f"{len(spectra)} spectra of {spectra.grid.shape[0]} x {spectra.grid.shape[1]} pixels"
         record = {
             "command": invocation("convert"),
-            "options": by_name(config) | {name: str(value) for name, value in how.options.given.items()},
+            "options": by_name(config),
+            "read_as": {name: str(value) for name, value in how.options.given.items()},
             "source_sha256": data.source,
             "notes": data.notes,
             "calibration": found.to_json() if found else None,

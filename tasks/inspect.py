@@ -25,7 +25,7 @@ from swiftwrf.runtime.durable import write_json, write_text
 from tasks.configs import InspectConfig
 from tasks.directory import new_directory
 from tasks.environment import command, stamp
-from tasks.options import READING, beside, stated
+from tasks.options import READING, beside
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table, write_page
 from tasks.source import Reading, reading
@@ -70,11 +70,9 @@ def _kept(config: InspectConfig, how: Reading, folder: Path, out: Path) -> list[
     Returns:
         Words of a command that reads the data with these options: none where it finds them beside the data.
     """
-    chosen = {name: value for group in (config.spectra, config.table) for name, value in stated(group).items()}
-    if not chosen:
+    if not config.reading.given:
         return [] if config.read is None else ["--read", config.read]
-    text = yaml.safe_dump(chosen, sort_keys=False)
-    file = beside(Path(how.source))
+    text, file = yaml.safe_dump(config.reading.given, sort_keys=False), beside(Path(how.source))
     try:
         write_text(file, text)
     except OSError:  # of data that belong to others

@@ -108,32 +108,23 @@ class Options:
         Raises:
             InputError: Empty text, control characters, or a number that is not finite or outside its declared range.
         """
-        groups: list[Any] = [value for value in vars(self).values() if is_dataclass(value)]
-        for group in (self, *groups):
-            hints = get_type_hints(type(group), include_extras=True)
-            for option in fields(group):
-                if not is_dataclass(value := getattr(group, option.name)):
-                    check_option(option.name, value, hints[option.name])
-        for group in groups:
-            group.check()
-
-
-def check_option(name: str, given: Any, hint: Any) -> None:
-    """Refuse a value that its option does not take.
-
-    Raises:
-        InputError: Empty text, control characters, or a number that is not finite or outside its declared range.
-    """
-    flag = f"--{name.replace('_', '-')}"
-    for value in given if isinstance(given, tuple) else (given,):
-        if value == "":
-            raise InputError(f"{flag} is empty; give it a value or leave it out")
-        if isinstance(value, str) and any(category(letter) in ("Cc", "Cs") for letter in value):
-            raise InputError(f"{flag} {value!a} holds control characters or is not UTF-8; give it another value")
-        if isinstance(value, float) and not math.isfinite(value):
-            raise InputError(f"{flag} takes finite numbers, got {value}")
-    if given is not None:
-        check_value(flag, given, _without_none(hint))
+        hints = get_type_hints(type(self), include_extras=True)
+        for option in fields(self):
+            given, flag = getattr(self, option.name), f"--{option.name.replace('_', '-')}"
+            if isinstance(given, Options):
+                given.check()
+                continue
+            for value in given if isinstance(given, tuple) else (given,):
+                if value == "":
+                    raise InputError(f"{flag} is empty; give it a value or leave it out")
+                if isinstance(value, str) and any(category(letter) in ("Cc", "Cs") for letter in value):
+                    raise InputError(
+                        f"{flag} {value!a} holds control characters or is not UTF-8; give it another value"
+                    )
+                if isinstance(value, float) and not math.isfinite(value):
+                    raise InputError(f"{flag} takes finite numbers, got {value}")
+            if given is not None:
+                check_value(flag, given, _without_none(hints[option.name]))
 
 
 def choice(
@@ -164,8 +155,8 @@ def pairs(option: str, texts: tuple[str, ...], role: str) -> dict[str, str] | No
 
 
 @options
-class SpectraSource:
-    """Options of reading or computing spectra."""
+class ReadingOptions(Options):
+    """What the files of measurements leave open."""
 
     array: tuple[int, float, float] | tuple[int, int, float, float] | None = None
     """array of the spectra if the data do not describe it, or for which spectra of ray paths are computed: elements a side,
@@ -192,33 +183,6 @@ class SpectraSource:
     """leave out these elements of the array, counted from 0"""
     round_trip: bool = False
     """phases of array snapshots are those of the way there and back, as of RFID and backscatter"""
-
-    def check(self) -> None:
-        """Refuse options that are wrong whatever the data.
-
-        Raises:
-            InputError: An unknown beamformer, an array that is none, or arrays without names.
-        """
-        pairs("arrays", self.arrays, "csi")
-        if self.beamformer is not None and self.beamformer not in labels.BEAMFORMERS:
-            raise InputError(f"unknown beamformer {self.beamformer!r}; choose from {', '.join(labels.BEAMFORMERS)}")
-        if self.array is not None:
-            *sides, spacing, frequency = self.array
-            rows, columns = (int(side) for side in (sides[0], sides[-1]))
-            if not (1 <= min(rows, columns) <= max(rows, columns) <= MAX_SIDE and max(rows, columns) >= 2):
-                raise InputError(f"--array takes 2 to {MAX_SIDE} elements a side, got {rows} x {columns}")
-            if min(spacing, frequency) <= 0:
-                raise InputError(
-                    f"--array takes a spacing [m] and a carrier [Hz] above 0, got {spacing:g} and {frequency:g}"
-                )
-        if self.grid is not None and min(self.grid) < 2:
-            raise InputError(f"--grid takes numbers of elevations and azimuths, each at least 2, got {self.grid}")
-
-
-@options
-class TableSource:
-    """Options of reading RSSI."""
-
     columns: tuple[str, ...] = ()
     """names of columns of a survey table that are not recognised: x=NAME y=NAME receiver=NAME rssi=NAME
     floor=NAME ... (several with rssi='WAP*')"""
@@ -245,12 +209,39 @@ class TableSource:
     """column of a survey table with groups of rows, e.g. devices, whose constant offsets are estimated; COLUMN=VALUE makes
     that group the reference of maps (default: the most frequent one)"""
 
+    @property
+    def given(self) -> dict[str, Any]:
+        """Options that are not the defaults, as values of a YAML file by name.
+
+        Example:
+            >>> ReadingOptions(grid=(15, 60), drop_null=True).given
+            {'grid': [15, 60], 'drop_null': True}
+        """
+        values = {option.name: getattr(self, option.name) for option in fields(self)}
+        given = {option.name: values[option.name] for option in fields(self) if values[option.name] != option.default}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in given.items()}
+
     def check(self) -> None:
         """Refuse options that are wrong whatever the data.
 
         Raises:
-            InputError: A column without a name, or named twice, or too many columns of positions.
+            InputError: An unknown beamformer, an array that is none, or a name that is missing or given twice.
         """
+        super().check()
+        pairs("arrays", self.arrays, "csi")
+        if self.beamformer is not None and self.beamformer not in labels.BEAMFORMERS:
+            raise InputError(f"unknown beamformer {self.beamformer!r}; choose from {', '.join(labels.BEAMFORMERS)}")
+        if self.array is not None:
+            *sides, spacing, frequency = self.array
+            rows, columns = (int(side) for side in (sides[0], sides[-1]))
+            if not (1 <= min(rows, columns) <= max(rows, columns) <= MAX_SIDE and max(rows, columns) >= 2):
+                raise InputError(f"--array takes 2 to {MAX_SIDE} elements a side, got {rows} x {columns}")
+            if min(spacing, frequency) <= 0:
+                raise InputError(
+                    f"--array takes a spacing [m] and a carrier [Hz] above 0, got {spacing:g} and {frequency:g}"
+                )
+        if self.grid is not None and min(self.grid) < 2:
+            raise InputError(f"--grid takes numbers of elevations and azimuths, each at least 2, got {self.grid}")
         pairs("columns", self.columns, "x")
         if len(self.transmitter) > 3:
             raise InputError(f"--transmitter takes 1 to 3 columns, got {' '.join(self.transmitter)}")
@@ -282,20 +273,7 @@ class FindingConfig(ReadingConfig):
     """Options of a command that finds out how measurements are to be read."""
 
     _: KW_ONLY
-    spectra: SpectraSource = SpectraSource()
-    table: TableSource = TableSource()
-
-
-def stated(group: SpectraSource | TableSource) -> dict[str, Any]:
-    """Return the options of reading that are given, as values of a YAML file by name.
-
-    Example:
-        >>> stated(SpectraSource(grid=(15, 60), drop_null=True))
-        {'grid': [15, 60], 'drop_null': True}
-    """
-    values = {option.name: (getattr(group, option.name), option.default) for option in fields(group)}
-    chosen = {name: value for name, (value, default) in values.items() if value != default}
-    return {name: list(value) if isinstance(value, tuple) else value for name, value in chosen.items()}
+    reading: ReadingOptions = ReadingOptions()
 
 
 def beside(source: Path) -> Path:

@@ -22,13 +22,11 @@ from tasks.configs import PredictConfig
 from tasks.convert import write_file
 from tasks.directory import check_new_file, kept_model
 from tasks.environment import stamp
-from tasks.options import SpectraSource, TableSource, by_name
 from tasks.records import CONFIG, Records, Row, rounded, write_table
 from tasks.source import Reading, aligned, is_table, observed_spectra, reading, with_groups
 from tasks.terminal import console, terminal
 
 PLAN = ("scale", "y_down", "up")  # options of reading a table of positions
-SPECTRA, TABLE = by_name(SpectraSource()), by_name(TableSource())  # those of spectra, and of RSSI
 MEDIANS = {"great_circle_deg": "degrees", "position_error_m": "m"}  # columns of errors and their units
 
 
@@ -46,10 +44,9 @@ def run(config: PredictConfig) -> None:
     at_positions = isinstance(model, FieldModel | RssiPredictor)
     check_new_file(out, (".csv", ".mat") if at_positions else (".csv",), "--out ")
     how = reading(config, config.source)
-    taken = PLAN if at_positions else TABLE if isinstance(model, RssiLocator) else SPECTRA
-    for name in how.options.given:
-        if name not in taken:
-            raise InputError(f"{how.file} states {name}, but {file} holds {with_article(model.kind)}; leave it out")
+    for name in how.options.given if at_positions else ():
+        if name not in PLAN:
+            raise InputError(f"{how.file} states {name}, which does not apply to positions; leave it out")
     if how.note:
         console.print(how.note)
     if isinstance(model, FieldModel | RssiPredictor):

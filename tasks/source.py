@@ -20,19 +20,18 @@ from swiftwrf.contrib.datasets import DATA_SETS, fetch
 from swiftwrf.data.archives import array_header, read_rows
 from swiftwrf.data.files import TABLES, read_table, sha256
 from swiftwrf.data.formats import SNAPSHOT_FORMATS, SPECTRA_FORMATS, ReadOptions, read
-from swiftwrf.data.formats.base import Data, Format
+from swiftwrf.data.formats.base import Format
 from swiftwrf.data.receivers import spelled_as
 from swiftwrf.data.rssi import Offsets
 from swiftwrf.data.store import Store
 from swiftwrf.errors import listed
 from swiftwrf.runtime.registry import Registry
-from tasks.command_line import file_options, reading_options
+from tasks.command_line import reading_options
 from tasks.options import (
     READING,
     FindingConfig,
     ReadingConfig,
-    SpectraSource,
-    TableSource,
+    ReadingOptions,
     beside,
     by_name,
     pairs,
@@ -50,6 +49,7 @@ class Reading:
     options: ReadOptions = field(default_factory=ReadOptions)
     reference: str | None = None  # group of RSSI whose offset is 0, None for the most frequent one
     file: Path | None = None  # that states it
+    note: str = ""  # on this file
 
     def read(self, *registries: Registry[Format[Any]]) -> Any:
         """Return the measurements, with a note on the file that states how they are read, and its digest.
@@ -57,28 +57,15 @@ class Reading:
         Raises:
             InputError: As `swiftwrf.data.formats.read`.
         """
-        return self.noted(read(self.source, self.options, *registries))
+        data = read(self.source, self.options, *registries)
+        if self.file is None:
+            return data
+        return replace(data, notes=(*data.notes, self.note), source={**data.source, READING: sha256(self.file)})
 
     def spectra(self) -> Spectra:
         """Return the spectra, or those of array snapshots; see `read`."""
         found: Spectra = self.options.spectra_of(self.read(SPECTRA_FORMATS, SNAPSHOT_FORMATS))
         return found
-
-    def noted(self, data: Data) -> Data:
-        """Return measurements with the note and the digest of the file."""
-        if self.file is None:
-            return data
-        return replace(data, notes=(*data.notes, self.note), source={**data.source, READING: sha256(self.file)})
-
-    @property
-    def note(self) -> str:
-        """The file and what it states, empty without one."""
-        stated = {} if self.file is None else file_options(self.file)
-        return (
-            f"read as {self.file} states: {', '.join(f'{name} {value}' for name, value in stated.items())}"
-            if stated
-            else ""
-        )
 
     def using(self, **options: Any) -> Reading:
         """Return a reading with other options."""
@@ -94,34 +81,30 @@ def reading(config: ReadingConfig, source: str) -> Reading:
         InputError: A data set that cannot be downloaded, or a file of options that cannot be read.
     """
     source = located(source)
-    spectra, table, file = SpectraSource(), TableSource(), None if config.read is None else Path(config.read)
-    if isinstance(config, FindingConfig):
-        spectra, table = config.spectra, config.table
-    if (spectra, table) == (SpectraSource(), TableSource()):
-        file = file or next(filter(isfile, [beside(Path(source))]), None)
-        if file is not None:
-            spectra, table = reading_options(file)
-    elif file is not None:
+    given = config.reading if isinstance(config, FindingConfig) else ReadingOptions()
+    if config.read is not None and given.given:
         raise InputError("--read and options of reading exclude each other; leave out one")
-    column, _, reference = (table.offset_by or "").partition("=")
-    options = ReadOptions(
-        **by_name(spectra)
-        | by_name(table)
-        | {
-            "array": _array(spectra),
-            "arrays": pairs("arrays", spectra.arrays, "csi"),
-            "columns": pairs("columns", table.columns, "x"),
-            "filler": () if table.filler == "none" else table.filler or None,
-            "offset_by": column or None,
-        }
-    )
-    return Reading(source, options, reference or None, file)
+    file, note = Path(config.read) if config.read else None, ""
+    if file is None and not given.given and isfile(beside(Path(source))):
+        file = beside(Path(source))
+    if file is not None:
+        given = reading_options(file)
+        note = f"read as {file} states: {', '.join(f'{name} {value}' for name, value in given.given.items())}"
+    column, _, reference = (given.offset_by or "").partition("=")
+    options = by_name(given) | {
+        "array": _array(given.array),
+        "arrays": pairs("arrays", given.arrays, "csi"),
+        "columns": pairs("columns", given.columns, "x"),
+        "filler": () if given.filler == "none" else given.filler or None,
+        "offset_by": column or None,
+    }
+    return Reading(source, ReadOptions(**options), reference or None, file, note)
 
 
-def _array(spectra: SpectraSource) -> PlanarArray | None:
-    if spectra.array is None:
+def _array(stated: tuple[float, ...] | None) -> PlanarArray | None:
+    if stated is None:
         return None
-    *sides, spacing, frequency = spectra.array
+    *sides, spacing, frequency = stated
     rows, columns = (int(side) for side in (sides[0], sides[-1]))
     if rows == columns:
         return PlanarArray.square(rows, frequency, spacing)

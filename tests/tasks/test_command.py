@@ -200,7 +200,11 @@ LINES = [
     ("predict", ("{estimator}", "{spectra}", "--out", "{file}"), "exists already"),
     ("predict", ("{estimator}", "{spectra}", "--out", "no/out.csv"), "no directory"),
     ("predict", ("{estimator}", "{spectra}", "--read", "{seventh}", "--out", "out.csv"), "every does not apply"),
-    ("predict", ("{field_model}", "{survey}", "--read", "{seventh}", "--out", "b.csv"), "yaml states every, but"),
+    (
+        "predict",
+        ("{field_model}", "{survey}", "--read", "{seventh}", "--out", "b.csv"),
+        "yaml states every, which does not apply to positions",
+    ),
     ("predict", ("{field_model}", "{survey}", "--track", 1, "--out", "b.csv"), "locates nothing"),
     ("update", ("m", "table.csv", "--out", "x", "--follow", "--json"), "--follow prints JSON lines"),
     ("update", ("m", "table.csv", "--out", "x", "--false-alarm-rate", 2), "--false-alarm-rate must be"),

@@ -60,8 +60,8 @@ def test_a_yaml_file_holds_options_and_positional_arguments(tmp_path):
     file = tmp_path / "inspect.yaml"
     file.write_text("source: DIR\nevery: 3\nround_trip: true\ncolumns: [x=a, y=b]\nout: null\narray: [4, 0.1, 915e6]\n")
     found = parse(InspectConfig, [], "inspect", file_options(file))
-    assert (found.source, found.out, found.table.columns) == ("DIR", None, ("x=a", "y=b"))
-    assert (found.spectra.every, found.spectra.round_trip, found.spectra.array) == (3, True, (4, 0.1, 915e6))
+    assert (found.source, found.out, found.reading.columns) == ("DIR", None, ("x=a", "y=b"))
+    assert (found.reading.every, found.reading.round_trip, found.reading.array) == (3, True, (4, 0.1, 915e6))
     assert parse(InspectConfig, ["OTHER"], "inspect", file_options(file)).source == "OTHER"
 
 
@@ -131,7 +131,7 @@ def test_the_configuration_of_a_run_with_out_starts_another_run(tmp_path):
 
 @pytest.mark.parametrize("words", [("--filler", "-100", "100"), ("--filler=none",), ("--y-down",)])
 def test_options_of_reading_are_those_of_inspect_and_other_commands_say_so(words):
-    parsed = executed(InspectConfig, "x", *words)[0].table
+    parsed = executed(InspectConfig, "x", *words)[0].reading
     assert parsed.filler in ((-100.0, 100.0), "none", ())
     name = words[0].partition("=")[0]
     sentence = f"{name} is no option of this command; give {name} to swiftwrf inspect, .* by --read FILE.yaml"
