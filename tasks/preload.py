@@ -48,7 +48,7 @@ def preload(modules: Sequence[str]) -> None:
     if SERVED and modules and several:
         from multiprocessing import forkserver
 
-        forkserver.set_forkserver_preload(["tasks.server", *modules])
+        forkserver.set_forkserver_preload(["tasks.no_garbage", *modules])
         forkserver.ensure_running()
         _is_served = True
 
