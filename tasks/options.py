@@ -156,7 +156,7 @@ def pairs(option: str, texts: tuple[str, ...], role: str) -> dict[str, str] | No
 
 @options
 class ReadingOptions(Options):
-    """What the files of measurements leave open."""
+    """Options of reading: what the files of measurements leave open."""
 
     array: tuple[int, float, float] | tuple[int, int, float, float] | None = None
     """array of the spectra if the data do not describe it, or for which spectra of ray paths are computed: elements a side,

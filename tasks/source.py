@@ -43,7 +43,7 @@ ROWS_A_READ = 1024  # of an array that is read
 
 @dataclass(frozen=True)
 class Reading:
-    """How the files of one source are read."""
+    """Source of measurements, and the options that its files are read with."""
 
     source: str  # folder or file
     options: ReadOptions = field(default_factory=ReadOptions)
