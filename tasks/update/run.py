@@ -13,7 +13,7 @@ from swiftwrf import FieldModel, InputError, Rssi, Spectra, load
 from swiftwrf.contrib.online import Follower
 from swiftwrf.data import ReadOptions
 from swiftwrf.data.files import sha256
-from swiftwrf.data.formats import RSSI_FORMATS
+from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.errors import one_line, with_article
 from swiftwrf.models.base import ALREADY_LEARNT
 from swiftwrf.rssi import RssiModel
@@ -185,4 +185,5 @@ def _read(config: UpdateConfig, source: str, model: FieldModel | RssiModel) -> S
         console.print(how.note)
     if isinstance(model, RssiModel):
         return model.aligned(aligned(with_groups(how, model.offsets).read(RSSI_FORMATS), model, ignore_others=True))
-    return model.aligned(how.using(grid=model.grid).spectra())
+    data = how.read(SPECTRA_FORMATS, SNAPSHOT_FORMATS)
+    return model.aligned(how.using(grid=model.grid).options.spectra_of(data))
