@@ -1,7 +1,7 @@
 """Processes of a run that begin with the libraries loaded.
 
-A server loads them once, in 3.4 s of a processor, while the run itself reads its data. Every process is a fork of that server:
-it begins in 0.02 s and holds 160 MB, most of them shared. A process of loky loads the libraries itself: 4.8 s and 510 MB each.
+A server loads them once, in 3.4 s of a processor, while the run itself reads its data. Every process is a fork of it, which
+begins in 0.02 s and holds 160 MB, most of them shared. A process of loky loads the libraries itself: 4.8 s and 510 MB.
 """
 
 from __future__ import annotations
