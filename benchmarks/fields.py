@@ -433,7 +433,7 @@ def estimate_angles(config: Config, folder: Path) -> None:
     for name, synthesizers in (("aoa", closed_form), ("aoa_by_gradient", by_gradient)):
         out, stopped = work / name, work / f"{name}.partial"
         if synthesizers and not out.exists():
-            given: Row = {"synthesizer": synthesizers, "extra": 0, "repeats": config.repeats, "out": str(out)}
+            given: Row = {"models": synthesizers, "extra": 0, "repeats": config.repeats, "out": str(out)}
             task = AoaConfig(FRACTIONS, str(folder), scheduler=config.scheduler, **given)
             set_threads(os.cpu_count() or 1)  # the run has a process for each
             run_aoa(task, stopped if stopped.exists() else None)

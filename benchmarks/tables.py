@@ -23,7 +23,7 @@ from swiftwrf.contrib.raytraced.names import ROOMS
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from tasks import configs, labels
 from tasks.command import COMMANDS
-from tasks.options import OffsetSource, SpectraSource
+from tasks.options import General, ReadingOptions, meanings
 
 
 def random_rooms() -> str:
@@ -155,7 +155,7 @@ def _options(config: type[Any]) -> dict[str, str]:
         warnings.simplefilter("ignore", DeprecationWarning)
         actions = tyro.extras.get_parser(config)._actions
     return {
-        f"--{action.option_strings[0].lstrip('-').rpartition('.')[2]}": " ".join(str(action.help).split()).replace(
+        f"--{action.option_strings[-1].lstrip('-').rpartition('.')[2]}": " ".join(str(action.help).split()).replace(
             "%%", "%"
         )
         for action in actions
@@ -167,7 +167,7 @@ def read_options() -> str:
     """Return the options of reading, and the formats that take them."""
     readers = {"spectra": SPECTRA_FORMATS, "snapshots": SNAPSHOT_FORMATS, "rssi": RSSI_FORMATS}
     rows = []
-    for name, meaning in {**_options(SpectraSource), **_options(OffsetSource)}.items():
+    for name, meaning in _options(ReadingOptions).items():
         field = name.removeprefix("--").replace("-", "_")
         formats = dict.fromkeys(one for found in readers.values() for one in found if field in found[one].takes)
         rows.append([f"`{name}`", ", ".join(formats), meaning])
@@ -176,12 +176,13 @@ def read_options() -> str:
 
 def commands() -> str:
     """Return all options of the commands but those of reading, with the commands that have them."""
-    reading = {*_options(SpectraSource), *_options(OffsetSource)}
+    reading = _options(ReadingOptions)
     found: dict[tuple[str, str], list[str]] = {}
     for command, (config, _) in COMMANDS.items():
         for name, meaning in _options(getattr(configs, config)).items():
             if name not in reading:
                 found.setdefault((name, meaning), []).append(f"`{command}`")
+    found |= {(name, meaning): ["all"] for name, meaning in meanings(General).items()}
     rows = [[f"`{name}`", ", ".join(names), meaning] for (name, meaning), names in sorted(found.items())]
     return markdown(["option", "commands", "meaning"], rows)
 

@@ -57,12 +57,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name in ("-h", "--help"):
         from tasks import configs
         from tasks.command_line import without_reader
+        from tasks.options import General, meanings
 
         try:
             print("usage: swiftwrf COMMAND [OPTIONS]\n")
             for name, command in COMMANDS.items():
                 summary, *_ = getattr(configs, command.options).__doc__.splitlines()
                 print(f"  {name:<9} {summary}")
+            print("\noptions of all commands:\n")
+            for option, meaning in meanings(General).items():
+                print(f"  {option:<9} {meaning}")
             print("\noptions of a command: swiftwrf COMMAND --help", flush=True)
         except BrokenPipeError:
             return without_reader()

@@ -5,8 +5,9 @@ from __future__ import annotations
 import errno
 import inspect
 import os
+import re
 import sys
-from argparse import ArgumentError, ArgumentParser
+from argparse import ArgumentError, ArgumentParser, BooleanOptionalAction
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import MISSING, fields, is_dataclass
@@ -15,15 +16,24 @@ from typing import Any, TypeVar, get_type_hints
 
 import tyro
 import yaml
-from tyro.constructors import ConstructorRegistry, PrimitiveTypeInfo
 
 from swiftwrf.errors import FitError, InputError, one_line
 from swiftwrf.runtime.plain import TypedLoader, read_json
-from tasks.options import Answered, Options
+from swiftwrf.runtime.validation import check_value
+from tasks.options import (
+    ALIASES,
+    READING,
+    FindingConfig,
+    General,
+    Options,
+    ReadingConfig,
+    ReadingOptions,
+)
 from tasks.terminal import terminal
 
 Config = TypeVar("Config", bound=Options)
 STYLE = (tyro.conf.OmitArgPrefixes, tyro.conf.PositionalMetavarFromFieldName, tyro.conf.DisallowNone)
+HOW_TO_READ = "give --{} to swiftwrf inspect, which writes it beside the data, or in a file by --read FILE.yaml"
 MAX_CONFIG_BYTES = 2**20
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 BROKEN_PIPE = 141  # exit code that shells show for a process ended by SIGPIPE
@@ -87,33 +97,59 @@ def execute(program: str, config_type: type[Config], task: Callable[[Config], No
     Raises:
         InputError: Wrong options, or the error of the task.
     """
-    file = file_of_options(arguments)
-    saved = None if file is None else file_options(Path(file))
-    config = parse(config_type, arguments, program, saved, file)
+    general, own, saved = split(arguments)
+    finds = issubclass(config_type, FindingConfig) or not issubclass(config_type, ReadingConfig)
+    for name in [] if finds else _reading_options(own):
+        raise InputError(f"--{name} is no option of this command; {HOW_TO_READ.format(name)}")
+    config = parse(config_type, own, program, saved, general.config)
     config.check()
-    with terminal.of(getattr(config, "output", Answered()), config.verbose):
-        task(config)
+    if general.open and not config_type.opens:
+        raise InputError("this command writes no report; leave out --open")
+    try:
+        with terminal.of(general):
+            task(config)
+    except InputError as error:
+        names = [] if finds else _reading_options(str(error).split())
+        if not names or READING in str(error):
+            raise
+        raise InputError(f"{error}; {HOW_TO_READ.format(names[0])}") from error
 
 
-def file_of_options(arguments: Sequence[str]) -> str | None:
-    """Return the value of --config on a command line, None without one.
+def _reading_options(words: Sequence[str]) -> list[str]:
+    """Return the options of reading among the words of a command line or a sentence."""
+    known = {option.name for option in fields(ReadingOptions)}
+    names = [re.split("[^a-z-]", word.lstrip("(").removeprefix("--"))[0] for word in words if "--" in word[:3]]
+    return [name for name in names if name.replace("-", "_") in known]
+
+
+def split(arguments: Sequence[str]) -> tuple[General, list[str], dict[str, Any]]:
+    """Return the general options of a command line, its other words, and the options by name in the file of --config.
 
     Raises:
-        InputError: It is given twice or lacks its value.
+        InputError: A general option that is given twice or lacks its value, or a file that cannot be read.
 
     Example:
-        >>> file_of_options(["--seed", "7", "--config=options.yaml"])
-        'options.yaml'
+        >>> split(["--seed", "7", "--json"])
+        (General(config=None, verbose=False, quiet=False, json=True, open=False), ['--seed', '7'], {})
     """
     parser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument("--config", action="append", default=[])
+    flags = [option.name for option in fields(General) if option.name != "config"]
+    for name in flags:
+        parser.add_argument(f"--{name}", action=BooleanOptionalAction)
     try:
-        files = parser.parse_known_args(arguments)[0].config
+        given, own = parser.parse_known_args(arguments)
     except ArgumentError as error:
         raise InputError(f"{error.argument_name}: {error.message}; --help shows its use") from None
-    if len(files) > 1:
-        raise InputError(f"--config is given twice: {' and '.join(files)}; give one")
-    return files[0] if files else None
+    if len(given.config) > 1:
+        raise InputError(f"--config is given twice: {' and '.join(given.config)}; give one")
+    file = given.config[0] if given.config else None
+    saved = {} if file is None else file_options(Path(file))
+    values = {name: saved.pop(name, False) for name in flags}
+    values |= {name: value for name in flags if (value := getattr(given, name)) is not None}
+    for name, value in values.items():
+        check_value(f"{file}: {name}", value, bool)
+    return General(file, **values), own, saved
 
 
 def parse(
@@ -127,63 +163,69 @@ def parse(
 
     Args:
         config_type: Dataclass of the options. Its docstring is the description in the help.
-        arguments: Options of the command line.
+        arguments: Options of the command line, without general ones.
         program: Name of the command in the help.
         saved: Values of `file_options` or of a run by name, in place of the defaults.
         origin: File or directory of the saved values, for messages.
 
     Raises:
-        InputError: A saved value that is not of its option's type, or an unknown name.
+        InputError: A saved value that its option does not take, or an unknown name.
         SystemExit: Help, or options that do not exist or cannot be read.
     """
-    left = dict(saved or {})
-    defaults = _defaults(config_type, left, origin)
+    left = {ALIASES.get(name, name): value for name, value in (saved or {}).items()}
+    defaults = from_names(config_type, left, origin)
     for name in left:
         raise InputError(f"{origin} names {name!a}, which is no option of this command; --help lists them")
     # a flag that a file sets needs its negation on the command line
     style = STYLE if saved else (*STYLE, tyro.conf.FlagCreatePairsOff)
-    description = inspect.cleandoc(config_type.__doc__ or "")
+    general = ", ".join(f"--{option.name}" for option in fields(General))
+    description = f"{inspect.cleandoc(config_type.__doc__ or '')}\n\nGeneral options, see swiftwrf --help: {general}"
     found: Config = tyro.cli(
         config_type, prog=program, description=description, args=arguments, default=defaults, config=style
     )
     return found
 
 
-def _defaults(kind: type[Any], saved: dict[str, Any], origin: object) -> Any:
+def from_names(kind: type[Any], saved: dict[str, Any], origin: object) -> Any:
     """Return options with the values that are taken from `saved`, and the others as they are by default.
+
+    Required options that are missing are `tyro.MISSING`, which the command line replaces.
 
     Raises:
         InputError: A value that its option does not take.
+
+    Example:
+        >>> from_names(General, {"json": True}, "options.yaml").json
+        True
     """
-    made, hints = object.__new__(kind), get_type_hints(kind, include_extras=True)  # required ones may be missing
+    values, hints = {}, get_type_hints(kind, include_extras=True)
     for option in fields(kind):
-        default = tyro.MISSING if option.default is MISSING else option.default
-        if is_dataclass(default):
-            default = _defaults(type(default), saved, origin)
+        if is_dataclass(option.default):
+            values[option.name] = from_names(type(option.default), saved, origin)
         elif (value := saved.pop(option.name, None)) is not None:
-            default = _typed(option.name, value, hints[option.name], origin)
-        object.__setattr__(made, option.name, default)
-    return made
+            values[option.name] = _typed(f"{origin}: {option.name}", value, hints[option.name])
+        elif option.default is MISSING:
+            values[option.name] = tyro.MISSING
+    return kind(**values)
 
 
-def _typed(name: str, value: Any, hint: Any, origin: object) -> Any:
-    """Return a saved value in the type of its option, read like the words of a command line.
+def _typed(name: str, value: Any, hint: Any) -> Any:
+    """Return a value of a file as its option has it: lists are tuples, one value is a list of it, and numbers are texts.
 
     Raises:
         InputError: The option does not take it.
     """
-    items = value if isinstance(value, list) else [value]
-    spec: Any = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(hint, set()))
-    is_fitting = spec.nargs == "*" or len(items) in (spec.nargs if isinstance(spec.nargs, tuple) else (spec.nargs,))
-    try:
-        if not is_fitting or any(isinstance(item, dict | list) for item in items):
-            raise ValueError
-        return spec.instance_from_str([str(item) for item in items])
-    except ValueError:
-        raise InputError(f"{origin}: {name} takes {spec.metavar}, got {value!a}") from None
+    items = tuple(value) if isinstance(value, list) else (value,)
+    texts = tuple(str(item) if type(item) in (int, float) else item for item in items)
+    for form in (items, texts) if isinstance(value, list) else (value, *texts, items, texts):
+        with suppress(InputError):
+            check_value(name, form, hint)
+            return form
+    check_value(name, value, hint)
+    return value
 
 
-def file_options(file: Path) -> dict[str, Any]:
+def file_options(file: Path, option: str = "config") -> dict[str, Any]:
     """Return the options of a file by name. The config.json of a run holds them under `config`; its `out` is taken.
 
     Raises:
@@ -195,9 +237,23 @@ def file_options(file: Path) -> dict[str, Any]:
         text = file.read_text(encoding="utf-8-sig")
         content = read_json(text) if file.suffix == ".json" else yaml.load(text, Loader=TypedLoader)
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
-        raise InputError(f"--config {file} cannot be read ({error})") from None
+        raise InputError(f"--{option} {file} cannot be read ({error})") from None
     if isinstance(content, dict) and isinstance(content.get("config"), dict):
         content = content["config"] | {"out": None}
     if not isinstance(content, dict):
-        raise InputError(f"--config {file} must hold options by name, got {type(content).__name__}")
+        raise InputError(f"--{option} {file} must hold options by name, got {type(content).__name__}")
     return {str(name): value for name, value in content.items()}
+
+
+def reading_options(file: Path) -> ReadingOptions:
+    """Return the options of reading in a file.
+
+    Raises:
+        InputError: No such file, or one that holds anything else.
+    """
+    saved = file_options(file, "read")
+    found: ReadingOptions = from_names(ReadingOptions, saved, file)
+    for name in saved:
+        raise InputError(f"{file} names {name!a}, which is no option of reading; swiftwrf inspect --help lists them")
+    found.check()
+    return found

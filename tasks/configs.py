@@ -14,29 +14,16 @@ from swiftwrf.contrib.raytraced.names import RAYTRACE, ROOMS, SCENE_FILE, check_
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.validation import Fraction, NonNegativeInt, PositiveFloat, PositiveInt, Preset
 from tasks import labels
-from tasks.options import (
-    SEEDS,
-    Answered,
-    OffsetSource,
-    Options,
-    Output,
-    Seed,
-    SpectraSource,
-    TableSource,
-    choice,
-    given,
-    options,
-)
+from tasks.options import SEEDS, FindingConfig, Options, ReadingConfig, Seed, choice, options
 from tasks.records import CONFIG, PARTIAL, Row, read_json
 
 MAP_FILES = (".tif", ".geojson", ".png")  # suffixes of files that hold a map only
 FILES = (".csv", ".mat", *MAP_FILES)  # other names are directories
 TABLE_SUFFIX = ".csv"  # suffix of a followed table; other followed files are JSON lines
-OF_ROWS = ("columns", "filler", "coordinates", "scale", "y_down", "up")  # options that a followed table takes
 
 
 @options
-class AoaConfig(Options):
+class AoaConfig(ReadingConfig):
     """Estimate angles of arrival with few measured spectra, and report the errors.
 
     Turbo learning is compared with its references and baselines. Without --data the built-in simulated room is used.
@@ -45,24 +32,25 @@ class AoaConfig(Options):
     Example: swiftwrf aoa --mix 0.3 --data DIR --split block
     """
 
-    mix: tuple[float, ...] = ()
+    measured: tuple[float, ...] = ()
     """measured fractions in (0, 1]: 0.3 keeps 30 % of the training spectra and synthesizes the others. Required, except with
     --preset paper"""
     data: str | None = None
     """folder or file of spectra, ray paths or array snapshots, or name of a public data set, see docs/formats.md"""
     split: str = "random"
     """a split that comes with the data, or a seeded one: random or block"""
-    synthesizer: Annotated[
+    models: Annotated[
         tuple[str, ...],
         choice(
             f"field models of the synthetic spectra; {AUTO} chooses the one that predicts held-out measured spectra best",
             FIELD_MODELS,
             labels.FIELD_MODELS,
             AUTO,
+            "--synthesizer",
         ),
     ] = (AUTO,)
     scene: str | None = None
-    """room of swiftwrf scenes or Mitsuba scene (FILE.xml) for --synthesizer raytrace, in the coordinates of the data
+    """room of swiftwrf scenes or Mitsuba scene (FILE.xml) for --models raytrace, in the coordinates of the data
     (default: the room that it estimates from the spectra)"""
     extra: NonNegativeInt | None = None
     """number of extra synthetic positions in the region of the measured ones (default: 3000 if cross-validation on the
@@ -86,39 +74,34 @@ class AoaConfig(Options):
     """directory of the run; must not exist (default: a new one under runs/aoa)"""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """device to compute on"""
-    output: Output = Output()
-    spectra: SpectraSource = SpectraSource()
 
     def __post_init__(self) -> None:
         if self.preset == "paper":
             # the paper's training sets contain synthetic spectra at the withheld positions alone
-            object.__setattr__(self, "mix", self.mix or (0.1, 0.3, 0.5, 0.7))
+            object.__setattr__(self, "measured", self.measured or (0.1, 0.3, 0.5, 0.7))
             object.__setattr__(self, "extra", self.extra or 0)
 
     def check(self) -> None:
         super().check()
-        if not self.synthesizer:
-            raise InputError("--synthesizer takes at least one name")
-        if AUTO in self.synthesizer and len(self.synthesizer) > 1:
-            raise InputError(f"--synthesizer takes {AUTO} or names, not both: {' '.join(self.synthesizer)}")
-        for name in self.synthesizer:
+        if not self.models:
+            raise InputError("--models takes at least one name")
+        if AUTO in self.models and len(self.models) > 1:
+            raise InputError(f"--models takes {AUTO} or names, not both: {' '.join(self.models)}")
+        for name in self.models:
             if name != AUTO:
                 FIELD_MODELS.check(name)
         if self.scene is not None:
-            if RAYTRACE not in self.synthesizer:
-                raise InputError(
-                    f"--scene is for synthesizer {RAYTRACE}; add it to --synthesizer, or leave --scene out"
-                )
+            if RAYTRACE not in self.models:
+                raise InputError(f"--scene is for the model {RAYTRACE}; add it to --models, or leave --scene out")
             check_scene(self.scene, "--scene ")
         if self.moving is not None and self.data is not None:
             raise InputError("--moving is for the built-in room; with --data the data determine which end moves")
-        given_mix = " ".join(map(fraction_key, self.mix))
-        if not self.mix or not all(0 < fraction <= 1 for fraction in self.mix):
-            raise InputError(f"--mix takes measured fractions in (0, 1], got {given_mix or 'none'}")
-        if len(set(self.mix)) < len(self.mix):
-            raise InputError(f"--mix names a fraction twice: {given_mix}")
-        if self.data is None and (names := given(self.spectra)):
-            raise InputError(f"--{next(iter(names))} is an option of the reader; give it with --data")
+        given_mix = " ".join(map(fraction_key, self.measured))
+        if not self.measured or not all(0 < fraction <= 1 for fraction in self.measured):
+            raise InputError(f"--measured takes measured fractions in (0, 1], got {given_mix or 'none'}")
+        if len(set(self.measured)) < len(self.measured):
+            raise InputError(f"--measured names a fraction twice: {given_mix}")
+        self.check_read()
         if self.processes is not None and self.scheduler is not None:
             raise InputError("--processes and --scheduler exclude each other; leave out one")
         if self.seed + self.repeats > SEEDS:
@@ -126,7 +109,7 @@ class AoaConfig(Options):
 
 
 @options
-class RssiTaskConfig(Options):
+class RssiTaskConfig(ReadingConfig):
     """Predict RSSI maps of receivers, and report the errors.
 
     Without --data the built-in simulated floor is used. swiftwrf resume DIR.partial continues an interrupted run.
@@ -134,7 +117,7 @@ class RssiTaskConfig(Options):
     Example: swiftwrf rssi --rx 6 --data DIR
     """
 
-    rx: tuple[str, ...]
+    receivers: tuple[str, ...]
     """receivers: names, numbers counted from 1, or all"""
     data: str | None = None
     """survey table (CSV, Parquet, JSON, GPX, KML), folder with tx_pos.csv, gateway_rssi.csv and gateway_position.yml (NeRF2
@@ -163,14 +146,12 @@ class RssiTaskConfig(Options):
     """directory of the run; must not exist (default: a new one under runs/rssi)"""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """where to compute; RSSI models are small, so auto is the CPU"""
-    output: Output = Output()
-    table: OffsetSource = OffsetSource()
 
     def check(self) -> None:
         super().check()
         for name in self.also:
             RSSI_PREDICTORS.check(name)
-        self.table.check_used(self.data)
+        self.check_read()
         if self.floor_plan is None and self.floor_extent is not None:
             raise InputError("--floor-extent needs --floor-plan FILE")
         if self.floor_extent is not None:
@@ -182,7 +163,7 @@ class RssiTaskConfig(Options):
 
 
 @options
-class LocateConfig(Options):
+class LocateConfig(ReadingConfig):
     """Locate transmitters from RSSI, or from the spectra of several antenna arrays, and report the errors.
 
     Without --data the built-in simulated floor is used, with --stations 3 an office with arrays on three walls.
@@ -194,7 +175,7 @@ class LocateConfig(Options):
     data: str | None = None
     """survey table (CSV, Parquet, JSON, GPX, KML), folder in NeRF2 layout, folder with a folder of spectra or snapshots for
     each array, or name of a public data set"""
-    rx: tuple[str, ...] = ("all",)
+    receivers: tuple[str, ...] = ("all",)
     """receivers: names, numbers counted from 1, or all"""
     split: str = "random"
     """a split that comes with the data, or a seeded one: random or block"""
@@ -210,20 +191,18 @@ class LocateConfig(Options):
     """seed of everything random"""
     out: str | None = None
     """directory of the run (default: a new one under runs/locate); must not exist"""
-    output: Output = Output()
-    table: OffsetSource = OffsetSource()
 
     def check(self) -> None:
         super().check()
-        self.table.check_used(self.data)
+        self.check_read()
         if self.stations and self.data is not None:
             raise InputError("--stations is for the built-in office; with --data the data determine the stations")
-        if self.stations and (self.rx != ("all",) or self.suggest):
-            raise InputError("--rx and --suggest are for RSSI; leave them out with --stations")
+        if self.stations and (self.receivers != ("all",) or self.suggest):
+            raise InputError("--receivers and --suggest are for RSSI; leave them out with --stations")
 
 
 @options
-class PredictConfig(Options):
+class PredictConfig(ReadingConfig):
     """Apply a saved model to new measurements or positions, and write a table.
 
     An estimator gives the directions of spectra, and a locator the positions of transmitters. A field model gives spectra,
@@ -234,6 +213,7 @@ class PredictConfig(Options):
     Example: swiftwrf predict runs/rssi/first/model.safetensors positions.csv --out predicted.csv
     """
 
+    opens = False
     model: Annotated[str, tyro.conf.Positional]
     """file of a model, or directory of a run: then the estimator that cross-validation chose, the locator or the RSSI
     model"""
@@ -247,9 +227,6 @@ class PredictConfig(Options):
     """leave out receivers in SOURCE that the locator does not have (default: refuse them)"""
     out: str | None = None
     """table to write; of a field or RSSI model also .mat; must not exist (default: a new predicted-TIME.csv)"""
-    output: Answered = Answered()
-    spectra: SpectraSource = SpectraSource()
-    table: TableSource = TableSource()
 
 
 @options
@@ -263,11 +240,10 @@ class ReportConfig(Options):
     """directories of the runs"""
     out: str | None = None
     """directory of the report; must not exist (default: a new one under runs/report)"""
-    output: Output = Output()
 
 
 @options
-class InspectConfig(Options):
+class InspectConfig(FindingConfig):
     """Inspect measurements: counts, extents, frames, calibration, suspicious columns.
 
     Example: swiftwrf inspect DIR
@@ -277,13 +253,10 @@ class InspectConfig(Options):
     """folder or file of measurements, or name of a public data set"""
     out: str | None = None
     """directory of the page; must not exist (default: a new one under runs/inspect)"""
-    output: Output = Output()
-    spectra: SpectraSource = SpectraSource()
-    table: TableSource = TableSource()
 
 
 @options
-class ConvertConfig(Options):
+class ConvertConfig(FindingConfig):
     """Convert measurements and RSSI maps to the toolkit's layout or to files.
 
     SOURCE is measurements of any known format (see docs/formats.md), the directory of a run of rssi or locate,
@@ -294,6 +267,7 @@ class ConvertConfig(Options):
     Example: swiftwrf convert runs/rssi/first map.tif
     """
 
+    opens = False
     source: Annotated[str, tyro.conf.Positional]
     """folder or file of measurements, name of a public data set, directory of a run, or saved RSSI
     model"""
@@ -309,15 +283,12 @@ class ConvertConfig(Options):
     """seed of that split"""
     deepmimo: bool = False
     """write ray paths (paths.npz) as a folder of DeepMIMO v4"""
-    rx: tuple[str, ...] = ()
+    receivers: tuple[str, ...] = ()
     """receivers of the map, names or numbers counted from 1 (default: all); a .png shows the strongest of them"""
     cell: PositiveFloat | None = None
     """edge of the map's cells [m] (default: 1/120 of the longer side)"""
     height: float | None = None
     """height of the transmitter on the map [m] (default: the median of the training positions)"""
-    output: Answered = Answered()
-    spectra: SpectraSource = SpectraSource()
-    table: OffsetSource = OffsetSource()
 
     @property
     def suffix(self) -> str:
@@ -336,7 +307,7 @@ class ConvertConfig(Options):
 
 
 @options
-class UpdateConfig(Options):
+class UpdateConfig(ReadingConfig):
     """Update a fitted model with new measurements, and detect changes.
 
     Each measurement is predicted before the model learns it, and tested for a change.
@@ -362,20 +333,11 @@ class UpdateConfig(Options):
     """false alarms a measurement"""
     follow: bool = False
     """take measurements line by line as they come, and print a line for each"""
-    output: Output = Output()
-    spectra: SpectraSource = SpectraSource()
-    table: TableSource = TableSource()
 
     def check(self) -> None:
         super().check()
         if self.follow and self.source != "-" and not self.source.lower().endswith((".ndjson", ".jsonl", TABLE_SUFFIX)):
             raise InputError(f"--follow takes .ndjson or .jsonl or {TABLE_SUFFIX} files or -, got {self.source}")
-        if self.follow and (self.output.open or self.output.json):
-            raise InputError("--follow prints JSON lines and writes no page; leave out --open and --json")
-        taken = OF_ROWS if self.source.lower().endswith(TABLE_SUFFIX) else ()
-        for name in given(self.spectra) | given(self.table) if self.follow and self.data is None else ():
-            if name.replace("-", "_") not in taken:
-                raise InputError(f"--{name} is no option of a followed source; leave it out")
 
 
 @options
@@ -391,7 +353,6 @@ class ResumeConfig(Options):
     """address of a Dask scheduler whose workers compute the steps (extra: cluster)"""
     processes: PositiveInt | None = None
     """processes of this machine that compute the steps of aoa (default: one a thread, at most 4; one on a GPU)"""
-    output: Output = Output()
 
     def check(self) -> None:
         super().check()
@@ -453,7 +414,6 @@ class ScenesConfig(Options):
     """region of the moving end: opposite corners x y z x y z [m] (default: that of the room)"""
     seed: Seed = 0
     """seed of positions, rays and scattered phases"""
-    output: Output = Output()
 
     def check(self) -> None:
         super().check()
@@ -487,5 +447,3 @@ class ViewConfig(Options):
     host: str = "127.0.0.1"
     """address to listen on; with an address of the network, others can see the page and change the floor plan, without a
     password"""
-    open: bool = False
-    """open the page in the browser"""

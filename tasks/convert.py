@@ -15,7 +15,7 @@ from swiftwrf.contrib.formats.deepmimo import write_deepmimo
 from swiftwrf.contrib.map_files import write_geojson, write_geotiff, write_world_file
 from swiftwrf.data import Rssi, Snapshots, Spectra
 from swiftwrf.data.dataset import Labelled
-from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
+from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.data.formats.paths import read_paths
 from swiftwrf.data.writing import write_mat, write_rssi, write_spectra
 from swiftwrf.errors import with_article
@@ -27,12 +27,13 @@ from swiftwrf.runtime.durable import replacing, write_json
 from tasks.configs import FILES, MAP_FILES, ConvertConfig
 from tasks.directory import check_new_file, kept_model, new_directory
 from tasks.environment import command, invocation
-from tasks.options import plain
+from tasks.options import by_name
 from tasks.page.maps import colour_image
 from tasks.records import CONFIG, rounded, write_table
-from tasks.source import located, reading
+from tasks.source import reading
 from tasks.terminal import console, terminal
 
+FORMATS = (SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS)
 WORLD_FILE = ".pgw"  # suffix beside a .png
 
 
@@ -64,37 +65,31 @@ def _write_new_file(config: ConvertConfig, model: RssiModel | None) -> None:
         raise InputError(
             f"{config.source} is a model, of which files are written: {', '.join(FILES)}; got {config.out}"
         )
-    if model is None and (config.rx or config.cell is not None or config.height is not None):
+    if model is None and (config.receivers or config.cell is not None or config.height is not None):
         raise InputError(
-            f"--rx, --cell and --height are for maps of RSSI models, but {config.source} holds measurements"
+            f"--receivers, --cell and --height are for maps of RSSI models, but {config.source} holds measurements"
         )
-    if model is not None and (options := reading(config.spectra, config.table).given):
-        raise InputError(f"{config.source} is a model; --{next(iter(options)).replace('_', '-')} is for measurements")
+    if model is not None and config.reading.given:
+        raise InputError(f"{config.source} is a model; options of reading are for measurements")
     check_new_file(out, FILES)
     if model is None:
-        _answer(config, write_file(reading(config.spectra, config.table).spectra_of(_read(config)), out))
+        how = reading(config, config.source)
+        _answer(config, write_file(how.options.spectra_of(how.read(*FORMATS)), out))
     else:
         found = RssiMap.predict(model, config.cell, config.height)
-        _answer(config, write_file(found.receivers(config.rx) if config.rx else found, out))
-
-
-def _read(config: ConvertConfig) -> Spectra | Snapshots | Rssi:
-    data: Spectra | Snapshots | Rssi = read(
-        located(config.source), reading(config.spectra, config.table), SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS
-    )
-    return data
+        _answer(config, write_file(found.receivers(config.receivers) if config.receivers else found, out))
 
 
 def _write_directory(config: ConvertConfig) -> None:
-    options = reading(config.spectra, config.table)
+    how = reading(config, config.source)
     with new_directory(Path(config.out), "a directory") as folder:
-        data = _read(config)
+        data = how.read(*FORMATS)
         found = None
         if config.calibrate:
             data, found = _calibrated(data, config)
         for note in data.notes:
             console.print(f"{data.name}: {note}")
-        spectra = options.spectra_of(data)
+        spectra = how.options.spectra_of(data)
         if isinstance(spectra, Rssi):
             write_rssi(spectra, folder)
             written = f"{len(spectra)} rows of RSSI at {len(spectra.receiver_names)} receivers"
@@ -103,7 +98,8 @@ def _write_directory(config: ConvertConfig) -> None:
             written = f"{len(spectra)} spectra of {spectra.grid.shape[0]} x {spectra.grid.shape[1]} pixels"
         record = {
             "command": invocation("convert"),
-            "options": plain(config),
+            "options": by_name(config),
+            "read_as": {name: str(value) for name, value in how.options.given.items()},
             "source_sha256": data.source,
             "notes": data.notes,
             "calibration": found.to_json() if found else None,

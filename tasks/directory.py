@@ -24,7 +24,7 @@ from swiftwrf.runtime.digest import digest
 from swiftwrf.runtime.durable import rename, strict, write_json
 from swiftwrf.runtime.threads import set_threads
 from tasks.environment import environment, invocation, now, number_of_processes, stamp
-from tasks.options import plain
+from tasks.options import by_name
 from tasks.records import CONFIG, ENVIRONMENT, METRICS, PARTIAL, Row, read_json
 from tasks.terminal import terminal
 
@@ -225,7 +225,7 @@ class Run(Memo):
     ) -> None:
         self.processes = number_of_processes(device, processes)
         set_threads(max(1, torch.get_num_threads() // self.processes))
-        values = strict(plain(config))
+        values = strict(by_name(config))
         self._environment = environment(device, source, self.processes) | {"config_sha256": digest(values)}
         self.write_json(ENVIRONMENT, self._environment)
         self.write_json(CONFIG, {"task": task, "command": invocation(task), "config": values})

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
+import yaml
 from matplotlib.patches import Circle
 from pandas import DataFrame
 from torch import Tensor
@@ -16,19 +17,19 @@ from swiftwrf.array.angles import angular_distance, to_direction
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.contrib.diagnostics.inspection import Findings, inspect, propose_offsets
 from swiftwrf.data import Rssi, Snapshots, Spectra
-from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
+from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.errors import InputError
 from swiftwrf.positions import nearest
 from swiftwrf.rssi import fit_path_loss, log_distance
-from swiftwrf.runtime.durable import write_json
+from swiftwrf.runtime.durable import write_json, write_text
 from tasks.configs import InspectConfig
 from tasks.directory import new_directory
 from tasks.environment import command, stamp
-from tasks.options import given
+from tasks.options import READING, beside
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table, write_page
-from tasks.source import located, reading
-from tasks.terminal import NextStep, terminal
+from tasks.source import Reading, reading
+from tasks.terminal import NextStep, console, terminal
 
 AXES = ("#cf4a4a", "#2a9165", "#3a7fd5")  # colours of x, y and normal
 DOTS, NONE = "#3a7fd5", "#7f8794"  # with line of sight, without
@@ -42,15 +43,15 @@ def run(config: InspectConfig) -> None:
     Raises:
         InputError: Measurements that cannot be read.
     """
-    source, options = located(config.source), reading(config.spectra, config.table)
+    how = reading(config, config.source)
     out = Path(config.out) if config.out else Path("runs") / "inspect" / stamp()
     with new_directory(out, "an inspection") as folder:
-        data = read(source, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS)
+        data = how.read(SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS)
         kind = "RSSI" if isinstance(data, Rssi) else "array snapshots" if isinstance(data, Snapshots) else "spectra"
-        findings = inspect(data, grid=options.grid, beamformer=options.beamformer or PHASE)
+        findings = inspect(data, grid=how.options.grid, beamformer=how.options.beamformer or PHASE)
         for column in data.labels if isinstance(data, Rssi) else ():
             with suppress(InputError):  # the toolkit's own layout has the names of these columns alone
-                propose_offsets(read(source, replace(options, offset_by=column), RSSI_FORMATS), findings)
+                propose_offsets(how.using(offset_by=column).read(RSSI_FORMATS), findings)
         content = {
             "source": config.source,
             "kind": kind,
@@ -58,20 +59,40 @@ def run(config: InspectConfig) -> None:
             "numbers": findings.numbers,
         }
         write_json(folder / "inspect.json", content)
-        write_page(folder, page(findings, kind, config))
+        read_as = _kept(config, how, folder, out)
+        write_page(folder, page(findings, kind, config, read_as))
     terminal.page(content, f"{config.source}: {kind}\n{findings}", out / "report.html")
 
 
-def page(findings: Findings, kind: str, config: InspectConfig) -> Page:
-    """Return the page: findings and figures of what was read."""
+def _kept(config: InspectConfig, how: Reading, folder: Path, out: Path) -> list[str]:
+    """Write the options of reading of the command line beside the data, or else into the page's folder.
+
+    Returns:
+        Words of a command that reads the data with these options: none where it finds them beside the data.
+    """
+    if not config.reading.given:
+        return [] if config.read is None else ["--read", config.read]
+    text, file = yaml.safe_dump(config.reading.given, sort_keys=False), beside(Path(how.source))
+    try:
+        write_text(file, text)
+    except OSError:  # of data that belong to others
+        write_text(folder / READING, text)
+        console.print(f"options of reading, for --read: {out / READING}")
+        return ["--read", str(out / READING)]
+    console.print(f"options of reading, which all commands find there: {file}")
+    return []
+
+
+def page(findings: Findings, kind: str, config: InspectConfig, read_as: Sequence[str] = ()) -> Page:
+    """Return the page: findings and figures of what was read, and commands with the words that read it alike."""
     data, warnings = findings.data, findings.warnings
     rows = [[level, text] for level, text in findings.sentences]
     table = Table(["level", "finding"], rows, strong=frozenset(["warning"]), long=True)
     if isinstance(data, Rssi):
-        position, task, options = data.transmitter_position, ("rssi", "--rx", "all"), given(config.table)
+        position, task = data.transmitter_position, ("rssi", "--rx", "all")
         plots = [_floor(data), *([_against_distance(data)] if data.located else [])]
     else:
-        position, task, options = data.position, ("aoa", "--mix", "0.3"), given(config.spectra)
+        position, task = data.position, ("aoa", "--mix", "0.3")
         plots = [_plan(data), _directions(data), *([_neighbours(data)] if len(data) > 1 else [])]
     extent = " x ".join(f"{side:.2f}" for side in (position.amax(dim=0) - position.amin(dim=0)).tolist())
     numbers = [
@@ -79,7 +100,6 @@ def page(findings: Findings, kind: str, config: InspectConfig) -> Page:
         Number(str(len(data)), f"measurements, read as {kind}"),
         Number(f"{extent} m", "extent of the positions, x by y by z"),
     ]
-    read_as = [word for words in options.values() for word in words]
     again = NextStep("Correct the warnings and inspect again", command("inspect", config.source, *read_as))
     steps = [*([again] if warnings else []), NextStep("Go on", command(*task, "--data", config.source, *read_as))]
     conclusion = ["Nothing looks wrong. Errors that the files alone do not reveal remain possible."]

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, fields, is_dataclass
+from os.path import isdir  # unlike Path.is_dir, it is False for names that are too long
+from pathlib import Path
 from types import NoneType
-from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, dataclass_transform, get_args, get_type_hints
 from unicodedata import category
 
 import tyro
@@ -18,6 +20,9 @@ from swiftwrf.runtime.registry import Registry
 from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, check_value
 from tasks import labels
 
+# other spellings of options, on the command line and in files of options
+ALIASES = {"mix": "measured", "synthesizer": "models", "rx": "receivers"}
+READING = "reading.yaml"  # name of the file beside measurements that states how to read them
 SEEDS = 2**32  # number of seeds that the generators of scikit-learn and NumPy accept
 Seed = Annotated[int, Ge(0), Lt(SEEDS)]
 MAX_SIDE = 32  # elements: spectra of 32 x 32 elements have 7,938 independent numbers
@@ -32,7 +37,8 @@ def options(cls: Class) -> Class:
     for option in parse_from_object(cls).params:
         hint, text = hints[option.arg_name], " ".join((option.description or "").split())
         if not any(hasattr(extra, "help_behavior_hint") for extra in get_args(hint)):
-            hint = Annotated[hint, tyro.conf.arg(help=text, help_behavior_hint=_default)]
+            others = [f"--{other}" for other, name in ALIASES.items() if name == option.arg_name]
+            hint = Annotated[hint, tyro.conf.arg(help=text, help_behavior_hint=_default, aliases=others or None)]
         cls.__annotations__[option.arg_name] = hint
     dataclass(frozen=True)(cls)
     return cls
@@ -50,17 +56,39 @@ def _without_none(hint: Any) -> Any:
 
 
 def by_name(config: Any) -> dict[str, Any]:
-    """Return the options of a command, those of its groups included.
+    """Return the options of a command as plain values by name, those of its groups included.
 
     Example:
-        >>> by_name(Output(json=True))
-        {'quiet': False, 'json': True, 'open': False}
+        >>> by_name(General(json=True))
+        {'config': None, 'verbose': False, 'quiet': False, 'json': True, 'open': False}
     """
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for option in fields(config):
         value = getattr(config, option.name)
-        found |= by_name(value) if is_dataclass(value) else {option.name: value}
-    return found
+        values |= by_name(value) if is_dataclass(value) else {option.name: value}
+    return values
+
+
+def meanings(config_type: type[Any]) -> dict[str, str]:
+    """Return the help of each option that a class declares, by its name on the command line."""
+    params = parse_from_object(config_type).params
+    return {f"--{one.arg_name.replace('_', '-')}": " ".join((one.description or "").split()) for one in params}
+
+
+@dataclass(frozen=True)
+class General:
+    """Options that every command has. They change no result."""
+
+    config: str | None = None
+    """FILE.yaml or FILE.json with options by name, e.g. the config.json of a run; options of the command line win"""
+    verbose: bool = False
+    """print what is read and computed, with times"""
+    quiet: bool = False
+    """print the answer only, no progress and no notes"""
+    json: bool = False
+    """print the answer as one JSON object, and nothing else"""
+    open: bool = False
+    """open the report or page of the command in the browser"""
 
 
 @options
@@ -71,11 +99,8 @@ class Options:
     wrong value is refused at once.
     """
 
+    opens: ClassVar[bool] = True  # whether --open has something to show
     _: KW_ONLY
-    config: str | None = None
-    """FILE.yaml or FILE.json with options by name, e.g. the config.json of a run; options of the command line win"""
-    verbose: bool = False
-    """print what is read and computed, with times"""
 
     def check(self) -> None:
         """Refuse options that are wrong whatever the data. Subclasses extend it.
@@ -83,8 +108,12 @@ class Options:
         Raises:
             InputError: Empty text, control characters, or a number that is not finite or outside its declared range.
         """
-        for name, given in by_name(self).items():
-            flag = f"--{name.replace('_', '-')}"
+        hints = get_type_hints(type(self), include_extras=True)
+        for option in fields(self):
+            given, flag = getattr(self, option.name), f"--{option.name.replace('_', '-')}"
+            if isinstance(given, Options):
+                given.check()
+                continue
             for value in given if isinstance(given, tuple) else (given,):
                 if value == "":
                     raise InputError(f"{flag} is empty; give it a value or leave it out")
@@ -94,54 +123,21 @@ class Options:
                     )
                 if isinstance(value, float) and not math.isfinite(value):
                     raise InputError(f"{flag} takes finite numbers, got {value}")
-        groups = [value for value in vars(self).values() if is_dataclass(value)]
-        for group in (self, *groups):
-            hints = get_type_hints(type(group), include_extras=True)
-            for option in fields(group):
-                if (value := getattr(group, option.name)) is not None:
-                    check_value(f"--{option.name.replace('_', '-')}", value, _without_none(hints[option.name]))
-        for group in groups:
-            if isinstance(group, SpectraSource | TableSource):
-                group.check()
+            if given is not None:
+                check_value(flag, given, _without_none(hints[option.name]))
 
 
-@options
-class Answered:
-    """Output of a command."""
-
-    quiet: bool = False
-    """print the answer only, no progress and no notes"""
-    json: bool = False
-    """print the answer as one JSON object, and nothing else"""
-
-
-@options
-class Output(Answered):
-    """Output and report of a command."""
-
-    open: bool = False
-    """open the report in the browser at the end"""
-
-
-PASSING = ("config", "verbose", *(option.name for option in fields(Output)))  # options that change no result
-
-
-def plain(config: Any) -> dict[str, Any]:
-    """Return the options of a command as plain values by name, without those of what it shows."""
-    return {name: value for name, value in by_name(config).items() if name not in PASSING}
-
-
-def choice(meaning: str, registry: Registry[Any] | None, known: Mapping[str, labels.Label], default: str) -> Any:
+def choice(
+    meaning: str, registry: Registry[Any] | None, known: Mapping[str, labels.Label], default: str, *aliases: str
+) -> Any:
     """Return the annotation of an option that takes names of a registry, or of `known`. Its help lists the names."""
 
     def entries(_: str) -> str:
-        if registry is None:
-            found = {name: label.meaning for name, label in known.items()}
-        else:
-            found = labels.meanings(registry, known)
-        return f"{'; '.join(f'{name}: {meaning}' for name, meaning in found.items())} (default: {default})"
+        names = {name: label.meaning for name, label in known.items()}
+        names = names if registry is None else labels.meanings(registry, known)
+        return f"{'; '.join(f'{name}: {meaning}' for name, meaning in names.items())} (default: {default})"
 
-    return tyro.conf.arg(help=f"{meaning}:", help_behavior_hint=entries)
+    return tyro.conf.arg(help=f"{meaning}:", help_behavior_hint=entries, aliases=aliases or None)
 
 
 def pairs(option: str, texts: tuple[str, ...], role: str) -> dict[str, str] | None:
@@ -159,8 +155,8 @@ def pairs(option: str, texts: tuple[str, ...], role: str) -> dict[str, str] | No
 
 
 @options
-class SpectraSource:
-    """Options of reading or computing spectra."""
+class ReadingOptions(Options):
+    """Options of reading: what the files of measurements leave open."""
 
     array: tuple[int, float, float] | tuple[int, int, float, float] | None = None
     """array of the spectra if the data do not describe it, or for which spectra of ray paths are computed: elements a side,
@@ -187,33 +183,6 @@ class SpectraSource:
     """leave out these elements of the array, counted from 0"""
     round_trip: bool = False
     """phases of array snapshots are those of the way there and back, as of RFID and backscatter"""
-
-    def check(self) -> None:
-        """Refuse options that are wrong whatever the data.
-
-        Raises:
-            InputError: An unknown beamformer, an array that is none, or arrays without names.
-        """
-        pairs("arrays", self.arrays, "csi")
-        if self.beamformer is not None and self.beamformer not in labels.BEAMFORMERS:
-            raise InputError(f"unknown beamformer {self.beamformer!r}; choose from {', '.join(labels.BEAMFORMERS)}")
-        if self.array is not None:
-            *sides, spacing, frequency = self.array
-            rows, columns = (int(side) for side in (sides[0], sides[-1]))
-            if not (1 <= min(rows, columns) <= max(rows, columns) <= MAX_SIDE and max(rows, columns) >= 2):
-                raise InputError(f"--array takes 2 to {MAX_SIDE} elements a side, got {rows} x {columns}")
-            if min(spacing, frequency) <= 0:
-                raise InputError(
-                    f"--array takes a spacing [m] and a carrier [Hz] above 0, got {spacing:g} and {frequency:g}"
-                )
-        if self.grid is not None and min(self.grid) < 2:
-            raise InputError(f"--grid takes numbers of elevations and azimuths, each at least 2, got {self.grid}")
-
-
-@options
-class TableSource:
-    """Options of reading RSSI."""
-
     columns: tuple[str, ...] = ()
     """names of columns of a survey table that are not recognised: x=NAME y=NAME receiver=NAME rssi=NAME
     floor=NAME ... (several with rssi='WAP*')"""
@@ -236,57 +205,82 @@ class TableSource:
     """axis of a survey table that points up: y as in ARCore, ARKit and Unity"""
     window: PositiveFloat | None = None
     """join packets of several receivers in windows of this length [s] to one row each, by their means"""
-
-    def check(self) -> None:
-        """Refuse options that are wrong whatever the data.
-
-        Raises:
-            InputError: A column without a name, or named twice, or too many columns of positions.
-        """
-        pairs("columns", self.columns, "x")
-        if len(self.transmitter) > 3:
-            raise InputError(f"--transmitter takes 1 to 3 columns, got {' '.join(self.transmitter)}")
-
-
-@options
-class OffsetSource(TableSource):
-    """Options of reading RSSI of several devices or channels."""
-
     offset_by: str | None = None
     """column of a survey table with groups of rows, e.g. devices, whose constant offsets are estimated; COLUMN=VALUE makes
     that group the reference of maps (default: the most frequent one)"""
 
     @property
-    def reference(self) -> str | None:
-        """Group whose offset is 0, None for the most frequent one."""
-        return None if self.offset_by is None else self.offset_by.partition("=")[2] or None
+    def given(self) -> dict[str, Any]:
+        """Options that are not the defaults, as values of a YAML file by name.
+
+        Example:
+            >>> ReadingOptions(grid=(15, 60), drop_null=True).given
+            {'grid': [15, 60], 'drop_null': True}
+        """
+        values = {option.name: getattr(self, option.name) for option in fields(self)}
+        given = {option.name: values[option.name] for option in fields(self) if values[option.name] != option.default}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in given.items()}
 
     def check(self) -> None:
+        """Refuse options that are wrong whatever the data.
+
+        Raises:
+            InputError: An unknown beamformer, an array that is none, or a name that is missing or given twice.
+        """
         super().check()
+        pairs("arrays", self.arrays, "csi")
+        if self.beamformer is not None and self.beamformer not in labels.BEAMFORMERS:
+            raise InputError(f"unknown beamformer {self.beamformer!r}; choose from {', '.join(labels.BEAMFORMERS)}")
+        if self.array is not None:
+            *sides, spacing, frequency = self.array
+            rows, columns = (int(side) for side in (sides[0], sides[-1]))
+            if not (1 <= min(rows, columns) <= max(rows, columns) <= MAX_SIDE and max(rows, columns) >= 2):
+                raise InputError(f"--array takes 2 to {MAX_SIDE} elements a side, got {rows} x {columns}")
+            if min(spacing, frequency) <= 0:
+                raise InputError(
+                    f"--array takes a spacing [m] and a carrier [Hz] above 0, got {spacing:g} and {frequency:g}"
+                )
+        if self.grid is not None and min(self.grid) < 2:
+            raise InputError(f"--grid takes numbers of elevations and azimuths, each at least 2, got {self.grid}")
+        pairs("columns", self.columns, "x")
+        if len(self.transmitter) > 3:
+            raise InputError(f"--transmitter takes 1 to 3 columns, got {' '.join(self.transmitter)}")
         if self.offset_by is not None and self.offset_by.startswith("="):
             raise InputError(f"--offset-by takes COLUMN or COLUMN=VALUE, got {self.offset_by!r}")
 
-    def check_used(self, data: str | None) -> None:
-        """Refuse options of reading RSSI without measured data.
+
+@options
+class ReadingConfig(Options):
+    """Options of a command that reads measurements."""
+
+    _: KW_ONLY
+    read: str | None = None
+    """FILE.yaml with options of reading, which swiftwrf inspect writes (default: reading.yaml beside the data, if there is
+    one)"""
+
+    def check_read(self) -> None:
+        """Refuse a file of reading options without measurements.
 
         Raises:
-            InputError: Such an option, but no data.
+            InputError: --read, but no --data.
         """
-        if data is None and (names := given(self)):
-            raise InputError(f"--{next(iter(names))} is for measured RSSI; give it with --data")
+        if self.read is not None and getattr(self, "data", None) is None:
+            raise InputError("--read states how --data is read; give both")
 
 
-def given(group: Any) -> dict[str, list[str]]:
-    """Return the options of a group that are set, as words of a command line by name.
+@options
+class FindingConfig(ReadingConfig):
+    """Options of a command that finds out how measurements are to be read."""
+
+    _: KW_ONLY
+    reading: ReadingOptions = ReadingOptions()
+
+
+def beside(source: Path) -> Path:
+    """Return the file beside measurements that holds their options of reading.
 
     Example:
-        >>> given(SpectraSource(every=2, drop_null=True))
-        {'every': ['--every', '2'], 'drop-null': ['--drop-null']}
+        >>> beside(Path("walk.csv"))
+        PosixPath('walk.csv.reading.yaml')
     """
-    found = {}
-    for option in fields(group):
-        if (value := getattr(group, option.name)) != option.default:
-            name = option.name.replace("_", "-")
-            words = [] if value is True else value if isinstance(value, tuple) else [value]
-            found[name] = [f"--{name}", *map(str, words)]
-    return found
+    return source / READING if isdir(source) else source.with_name(f"{source.name}.{READING}")

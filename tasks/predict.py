@@ -9,10 +9,9 @@ from pandas import DataFrame
 
 from augment.estimators import Estimator
 from swiftwrf import FieldModel, InputError, Prediction, Rssi, load, predict
-from swiftwrf.data import ReadOptions
 from swiftwrf.data.coordinates import PlanFrame
 from swiftwrf.data.files import read_table
-from swiftwrf.data.formats import RSSI_FORMATS, read
+from swiftwrf.data.formats import RSSI_FORMATS
 from swiftwrf.data.formats.stations import read_stations
 from swiftwrf.data.receivers import read_places
 from swiftwrf.data.survey import has_positions
@@ -24,11 +23,11 @@ from tasks.configs import PredictConfig
 from tasks.convert import write_file
 from tasks.directory import check_new_file, kept_model
 from tasks.environment import stamp
-from tasks.options import given
 from tasks.records import CONFIG, Records, Row, rounded, write_table
-from tasks.source import aligned, is_table, located, observed_spectra, reading, with_groups
+from tasks.source import Reading, aligned, is_table, observed_spectra, reading, with_groups
 from tasks.terminal import console, terminal
 
+PLAN = ("scale", "y_down", "up")  # options of reading a table of positions
 MEDIANS = {"great_circle_deg": "degrees", "position_error_m": "m"}  # columns of errors and their units
 
 
@@ -45,32 +44,33 @@ def run(config: PredictConfig) -> None:
     model = load(file)
     at_positions = isinstance(model, FieldModel | RssiPredictor)
     check_new_file(out, (".csv", ".mat") if at_positions else (".csv",), "--out ")
-    for kinds, options in (("RSSI", config.table), ("spectra", config.spectra)):
-        is_read = not at_positions and isinstance(model, RssiLocator) == (kinds == "RSSI")
-        if not is_read and (unused := given(options)):
-            raise InputError(
-                f"--{next(iter(unused))} is for reading {kinds}, and {file} holds {with_article(model.kind)}"
-            )
+    how = reading(config, config.source)
+    for name in how.options.given if at_positions else ():
+        if name not in PLAN:
+            raise InputError(f"{how.file} states {name}, which does not apply to positions; leave it out")
+    if how.note:
+        console.print(how.note)
     if isinstance(model, FieldModel | RssiPredictor):
         origin, floors = None, None
         if isinstance(model, RssiPredictor):
             origin, floors = model.origin, model.attenuation and model.attenuation.floors
-        frame = PlanFrame(config.table.scale, config.table.y_down, config.table.up)
-        prediction = predict(model, read_places(Path(config.source), origin, frame, floors), track=config.track)
+        frame = PlanFrame(**{name: getattr(how.options, name) for name in PLAN})
+        prediction = predict(model, read_places(Path(how.source), origin, frame, floors), track=config.track)
         assert isinstance(prediction, Prediction)
         terminal.page({"table": str(out)}, f"{write_file(prediction, out)}: {out}")
         return
     if isinstance(model, RssiLocator):
-        data, is_known = measured_at(model, config)
+        data, is_known = read_rssi(with_groups(how, model.model.offsets))
+        data = aligned(data, model.model, config.ignore_receivers)
         if silent := int((~data.detected.any(dim=1)).sum()):
             console.print(f"{data.name}: rows that no receiver detected are left out: {silent}")
         table = predict(model, data, track=config.track, truth=is_known)
     elif isinstance(model, MatchedField) and len(model.stations) > 1:
-        data_of_all = read_stations(Path(located(config.source)), reading(config.spectra, config.table))
+        data_of_all = read_stations(Path(how.source), how.options)
         table = predict(model, data_of_all, track=config.track)
     elif isinstance(model, MatchedField | Estimator):
         kind = "locator" if isinstance(model, MatchedField) else "estimator"
-        store, known = observed_spectra(config.source, reading(config.spectra, config.table), model.grid, kind)
+        store, known = observed_spectra(how, model.grid, kind)
         table = predict(model, store if known is None else known, track=config.track)
     else:
         raise InputError(
@@ -106,29 +106,19 @@ def saved_file(model: Path) -> Path:
     return chosen
 
 
-def measured_at(locator: RssiLocator, config: PredictConfig) -> tuple[Rssi, bool]:
-    """Return the RSSI of a source at the receivers of a locator, and True if its positions are known.
-
-    Raises:
-        InputError: RSSI that cannot be read, or receivers that the locator does not have.
-    """
-    options = with_groups(reading(config.spectra, config.table), config.source, locator.model.offsets)
-    data, is_known = read_rssi(config.source, options)
-    return aligned(data, locator.model, config.ignore_receivers), is_known
-
-
-def read_rssi(source: str, options: ReadOptions) -> tuple[Rssi, bool]:
+def read_rssi(how: Reading) -> tuple[Rssi, bool]:
     """Read RSSI, and return it with True if its positions are known. A survey table may have none.
 
     Raises:
         InputError: RSSI that cannot be read.
     """
-    if is_table(source):
-        file = Path(source)
+    options = how.options
+    if is_table(how.source):
+        file = Path(how.source)
         frame = read_table(file)
         if not has_positions(frame, options.columns or {}):
             somewhere = frame.assign(x=0.0, y=0.0, z=0.0)
             names = ("columns", "filler", "offset_by", "pool_by", "window")
             data = Rssi.from_frame(somewhere, **{name: getattr(options, name) for name in names}, name=file.stem)
             return data, False
-    return read(located(source), options, RSSI_FORMATS), True
+    return how.read(RSSI_FORMATS), True

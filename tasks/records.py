@@ -198,10 +198,10 @@ class Records:
         self._arrays: dict[str, dict[str, NDArray[Any]]] = {}
 
     @classmethod
-    def of(cls, result: Recorded, config: Row, environment: Row) -> Records:
-        """Return the records that a run with this result, `CONFIG` and `ENVIRONMENT` would have."""
+    def of(cls, result: Recorded, config: Row) -> Records:
+        """Return the records that a run with this result and `CONFIG` would have, without its environment."""
         run = cls(result.folder or Path(os.devnull), strict(result.metrics))
-        run.config, run.environment = config, environment
+        run.config = config
         run._tables, run._arrays = dict(result.tables), {name: dict(part) for name, part in result.arrays.items()}
         return run
 

@@ -10,18 +10,19 @@ from swiftwrf import InputError
 from swiftwrf.contrib.comparison.base import Recorded
 from swiftwrf.runtime.checkpoint import refusing
 from swiftwrf.runtime.durable import write_text
-from tasks.aoa.page import page as aoa
+from tasks.aoa import page as aoa
 from tasks.configs import ReportConfig
 from tasks.directory import check_new_file, new_directory
 from tasks.environment import choose_device, environment, stamp
-from tasks.locate.page import page as locate
+from tasks.locate import page as locate
 from tasks.page.page import REPORT, rendered, write_page
 from tasks.records import Records
-from tasks.rssi.page import page as rssi
+from tasks.rssi import page as rssi
 from tasks.terminal import Answer, terminal
 
 CALLS = {"aoa": "augment.turbo_learning", "rssi": "swiftwrf.rssi.compare", "locate": "swiftwrf.locate.compare"}
-PAGES = {"aoa": aoa, "rssi": rssi, "locate": locate}
+PAGES = {"aoa": aoa.page, "rssi": rssi.page, "locate": locate.page}
+ANSWERS = {"aoa": aoa.answer_of, "rssi": rssi.answer, "locate": locate.answer}
 
 
 def run(config: ReportConfig) -> None:
@@ -33,22 +34,24 @@ def run(config: ReportConfig) -> None:
 
 
 def write(result: Recorded, file: Path | None) -> Answer | None:
-    """Return the answer of a result of the library, and write its report into an HTML file, without a directory of a run.
+    """Return the answer of a result of the library, or write its report into an HTML file, without a directory of a run.
 
     Args:
         result: Content of the files of a run with it.
-        file: New file. None for the answer alone.
+        file: New file. None for the answer.
 
     Raises:
         InputError: The file is no .html, exists already, or its folder does not.
     """
     if file is not None:
         check_new_file(file, (".html", ".htm"))
-    task, here = result.metrics["task"], environment(choose_device("cpu"), dict(result.source))
-    page = PAGES[task]([Records.of(result, {"command": CALLS[task]}, here)])
-    if file is not None:
-        write_text(file, rendered(replace(page, alone=True))[0])
-    return page.answer
+    task: str = result.metrics["task"]
+    records = Records.of(result, {"command": CALLS[task]})
+    if file is None:
+        return ANSWERS[task](records)
+    records.environment = environment(choose_device("cpu"), dict(result.source))
+    write_text(file, rendered(replace(PAGES[task]([records]), alone=True))[0])
+    return None
 
 
 def merge(folders: list[Path], out: Path) -> None:

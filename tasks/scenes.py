@@ -17,7 +17,7 @@ from swiftwrf.runtime.durable import write_json
 from tasks.configs import ScenesConfig
 from tasks.directory import new_directory
 from tasks.environment import invocation
-from tasks.options import plain
+from tasks.options import by_name
 from tasks.page import figures
 from tasks.terminal import console, terminal
 
@@ -52,7 +52,7 @@ def run(config: ScenesConfig) -> None:
         each = float(paths.count.double().mean())
         record = {
             "command": invocation("scenes"),
-            "options": plain(config),
+            "options": by_name(config),
             "source_sha256": {Path(config.room).name: sha256(Path(config.room))} if room is None else {},
             "fixed": fixed.tolist(),
             "region": region.tolist(),

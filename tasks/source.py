@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from os.path import isfile  # unlike Path.is_file, it is False for names that are too long
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,37 +18,93 @@ from swiftwrf import AngularGrid, InputError, Rssi, RssiModel, Spectra
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.contrib.datasets import DATA_SETS, fetch
 from swiftwrf.data.archives import array_header, read_rows
-from swiftwrf.data.files import TABLES, read_table
-from swiftwrf.data.formats import RSSI_FORMATS, ReadOptions, read, read_spectra
+from swiftwrf.data.files import TABLES, read_table, sha256
+from swiftwrf.data.formats import SNAPSHOT_FORMATS, SPECTRA_FORMATS, ReadOptions, read
+from swiftwrf.data.formats.base import Format
 from swiftwrf.data.receivers import spelled_as
 from swiftwrf.data.rssi import Offsets
 from swiftwrf.data.store import Store
 from swiftwrf.errors import listed
-from tasks.options import OffsetSource, SpectraSource, TableSource, by_name, pairs
+from swiftwrf.runtime.registry import Registry
+from tasks.command_line import reading_options
+from tasks.options import (
+    READING,
+    FindingConfig,
+    ReadingConfig,
+    ReadingOptions,
+    beside,
+    by_name,
+    pairs,
+)
 from tasks.terminal import console
 
 ROWS_A_READ = 1024  # of an array that is read
 
 
-def reading(spectra: SpectraSource, table: TableSource) -> ReadOptions:
-    """Return the options of a command line for reading."""
-    options = by_name(spectra) | by_name(table)
-    return ReadOptions(
-        **options
-        | {
-            "array": _array(spectra),
-            "arrays": pairs("arrays", spectra.arrays, "csi"),
-            "columns": pairs("columns", table.columns, "x"),
-            "filler": () if table.filler == "none" else table.filler or None,
-            "offset_by": (options.get("offset_by") or "").partition("=")[0] or None,
-        }
-    )
+@dataclass(frozen=True)
+class Reading:
+    """Source of measurements, and the options that its files are read with."""
+
+    source: str  # folder or file
+    options: ReadOptions = field(default_factory=ReadOptions)
+    reference: str | None = None  # group of RSSI whose offset is 0, None for the most frequent one
+    file: Path | None = None  # that states it
+    note: str = ""  # on this file
+
+    def read(self, *registries: Registry[Format[Any]]) -> Any:
+        """Return the measurements, with a note on the file that states how they are read, and its digest.
+
+        Raises:
+            InputError: As `swiftwrf.data.formats.read`.
+        """
+        data = read(self.source, self.options, *registries)
+        if self.file is None:
+            return data
+        return replace(data, notes=(*data.notes, self.note), source={**data.source, READING: sha256(self.file)})
+
+    def spectra(self) -> Spectra:
+        """Return the spectra, or those of array snapshots; see `read`."""
+        found: Spectra = self.options.spectra_of(self.read(SPECTRA_FORMATS, SNAPSHOT_FORMATS))
+        return found
+
+    def using(self, **options: Any) -> Reading:
+        """Return a reading with other options."""
+        return replace(self, options=replace(self.options, **options))
 
 
-def _array(spectra: SpectraSource) -> PlanarArray | None:
-    if spectra.array is None:
+def reading(config: ReadingConfig, source: str) -> Reading:
+    """Return how a source is read: as options of the command line state, or --read, or the file beside it.
+
+    A name of a public data set becomes its folder, if there is no such file.
+
+    Raises:
+        InputError: A data set that cannot be downloaded, or a file of options that cannot be read.
+    """
+    source = located(source)
+    given = config.reading if isinstance(config, FindingConfig) else ReadingOptions()
+    if config.read is not None and given.given:
+        raise InputError("--read and options of reading exclude each other; leave out one")
+    file, note = Path(config.read) if config.read else None, ""
+    if file is None and not given.given and isfile(beside(Path(source))):
+        file = beside(Path(source))
+    if file is not None:
+        given = reading_options(file)
+        note = f"read as {file} states: {', '.join(f'{name} {value}' for name, value in given.given.items())}"
+    column, _, reference = (given.offset_by or "").partition("=")
+    options = by_name(given) | {
+        "array": _array(given.array),
+        "arrays": pairs("arrays", given.arrays, "csi"),
+        "columns": pairs("columns", given.columns, "x"),
+        "filler": () if given.filler == "none" else given.filler or None,
+        "offset_by": column or None,
+    }
+    return Reading(source, ReadOptions(**options), reference or None, file, note)
+
+
+def _array(stated: tuple[float, ...] | None) -> PlanarArray | None:
+    if stated is None:
         return None
-    *sides, spacing, frequency = spectra.array
+    *sides, spacing, frequency = stated
     rows, columns = (int(side) for side in (sides[0], sides[-1]))
     if rows == columns:
         return PlanarArray.square(rows, frequency, spacing)
@@ -58,11 +116,10 @@ def is_table(source: str) -> bool:
     return os.path.isfile(source) and Path(source).suffix.lower() in TABLES
 
 
-def with_groups(options: ReadOptions, source: str, offsets: Offsets | None) -> ReadOptions:
-    """Return options that read the groups whose offsets a model knows, if the source is a table with their column."""
-    if offsets is None or not is_table(source) or offsets.column not in read_table(Path(source)).columns:
-        return options
-    return replace(options, offset_by=offsets.column)
+def with_groups(how: Reading, offsets: Offsets | None) -> Reading:
+    """Return a reading of the groups whose offsets a model knows, if the source is a table with their column."""
+    known = offsets is not None and is_table(how.source) and offsets.column in read_table(Path(how.source)).columns
+    return how.using(offset_by=offsets.column if known else None)  # type: ignore[union-attr]
 
 
 def located(source: str) -> str:
@@ -78,28 +135,16 @@ def located(source: str) -> str:
     return str(fetch(source))
 
 
-def measured_rssi(data: str | None, table: TableSource) -> Rssi | None:
-    """Return the RSSI of an experiment in a folder or file, None without one.
-
-    Raises:
-        InputError: RSSI that cannot be read.
-    """
-    if data is None:
-        return None
-    found: Rssi = read(located(data), reading(SpectraSource(), table), RSSI_FORMATS)
-    return found
-
-
-def offset_notes(data: Rssi, table: OffsetSource) -> list[str]:
+def offset_notes(data: Rssi) -> list[str]:
     """Return a note on columns that may distinguish devices or channels and are not used, or none."""
-    if table.offset_by is not None or not data.labels:
+    if data.groups is not None or not data.labels:
         return []
     return [
-        f"rows differ in {listed(data.labels)}; if swiftwrf inspect finds offsets between them, give --offset-by COLUMN"
+        f"rows differ in {listed(data.labels)}; if swiftwrf inspect finds offsets between them, give it --offset-by COLUMN"
     ]
 
 
-def observed_spectra(source: str, options: ReadOptions, grid: AngularGrid, model: str) -> tuple[Store, Spectra | None]:
+def observed_spectra(how: Reading, grid: AngularGrid, model: str) -> tuple[Store, Spectra | None]:
     """Read the spectra that a fitted model is applied to: measurements of any format, or a .npy file.
 
     Returns:
@@ -108,11 +153,11 @@ def observed_spectra(source: str, options: ReadOptions, grid: AngularGrid, model
     Raises:
         InputError: Spectra that cannot be read, or on another grid.
     """
-    known = None
+    known, source = None, how.source
     if not source.endswith(".npy"):
-        known = read_spectra(located(source), options)
-    elif options.given:
-        raise InputError(f"{source} holds spectra as they are; --{next(iter(options.given))} does not apply")
+        known = how.spectra()
+    elif how.options.given:
+        raise InputError(f"{source} holds spectra as they are; {next(iter(how.options.given))} does not apply")
     store = Store(_read_array(Path(source))) if known is None else known.store
     if store.shape[1:] != grid.shape:
         shape, its = (" x ".join(map(str, s)) for s in (store.shape[1:], grid.shape))

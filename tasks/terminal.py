@@ -21,7 +21,7 @@ from rich.text import Text
 
 from swiftwrf.runtime.durable import strict
 from swiftwrf.runtime.progress import forwarding
-from tasks.options import Answered, Output
+from tasks.options import General
 
 if TYPE_CHECKING:  # which imports torch
     from swiftwrf.contrib.comparison.errors import ErrorSummary
@@ -117,29 +117,30 @@ class Terminal:
 
     Attributes:
         console: Where notes and progress go. It is silent with `--quiet` and `--json`.
+        options: General options of the command.
     """
 
     def __init__(self) -> None:
         self.console = Console(stderr=True, highlight=False, soft_wrap=True)
-        self._output = Answered()
+        self.options = General()
         self._progress: Progress | None = None
         self._done = self._expected = 0
         self._steps: dict[str, tuple[str, int, float]] = {}  # those computed now: title, number, time of the beginning
 
     @contextmanager
-    def of(self, output: Answered, verbose: bool = False) -> Iterator[None]:
+    def of(self, options: General) -> Iterator[None]:
         """Show what the options ask for, during the context; with `verbose` also the messages of `logging`."""
-        self._output = output
-        self.console.quiet = self._output.quiet or self._output.json
+        self.options = options
+        self.console.quiet = options.quiet or options.json
         handler = RichHandler(console=self.console, show_path=False)
-        loggers = [logging.getLogger(name) for name in LOGGERS] if verbose else []
+        loggers = [logging.getLogger(name) for name in LOGGERS] if options.verbose else []
         for each in loggers:
             each.addHandler(handler)
             each.setLevel(logging.DEBUG)
         try:
             yield
         finally:
-            self._output, self.console.quiet = Answered(), False
+            self.options, self.console.quiet = General(), False
             for each in loggers:
                 each.removeHandler(handler)
                 each.setLevel(logging.NOTSET)
@@ -205,7 +206,7 @@ class Terminal:
         self._print(values, page, *filter(None, [text]))
 
     def _print(self, values: Mapping[str, Any], page: Path | None, *parts: str | Table) -> None:
-        if self._output.json:
+        if self.options.json:
             report = {"report": str(page)} if page else {}
             print(json.dumps(strict({**values, **report}), allow_nan=False))
         else:
@@ -215,7 +216,7 @@ class Terminal:
                 out.print(part, markup=False)
             if page is not None:
                 out.print(f"report: {page}", markup=False)
-        if page is not None and isinstance(self._output, Output) and self._output.open:
+        if page is not None and self.options.open:
             webbrowser.open(page.resolve().as_uri())
 
 

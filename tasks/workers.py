@@ -36,6 +36,7 @@ from tasks.preload import begin, process_context, without_main
 from tasks.terminal import console
 
 CONNECT_S = 5  # until a scheduler has answered
+RESTART_S = 20  # until workers that compute a stopped run have ended
 WORKERS_S = 30  # until workers have come, at the start and after all have gone
 MAX_SECONDS_TO_END = 10.0  # from the signal to the end of a process
 CONTINUE = "go on with swiftwrf resume DIR.partial here, with --scheduler ADDRESS on a cluster"
@@ -232,9 +233,17 @@ def connected(address: str | None, device: torch.device) -> Iterator[Workers | N
     def hold(thing: object) -> Any:
         return client.submit(bytes, cloudpickle.dumps(thing), pure=False)
 
+    def stop() -> None:  # a computation that is cancelled goes on, and calls of the next run wait for it
+        with suppress(Exception):  # the scheduler is gone, or a worker has no nanny to restart it
+            computing = [worker for worker, keys in client.processing().items() if client.futures.keys() & keys]
+            client.restart_workers(computing, timeout=RESTART_S, raise_for_error=False)
+
     try:
         slots(InputError(f"the Dask scheduler at {address} has no workers; start some: `dask worker {address}`"))
         yield Workers(client.get_executor(pure=False), hold, slots, device)
+    except KeyboardInterrupt:
+        stop()
+        raise
     except CancelledError:
         raise lost from None
     except KilledWorker:

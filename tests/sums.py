@@ -68,7 +68,7 @@ def results(folder, given, processes=1, cluster=None, resume=None, act=lambda: N
         act()
         return ""
 
-    config = AoaConfig(mix=(0.5,), out=str(folder))
+    config = AoaConfig(measured=(0.5,), out=str(folder))
     with Run("aoa", "", config, torch.device("cpu"), {}, resume, processes, show) as run:
         with workers_of(run, cluster) as workers:
             steps = Steps(10, run, workers)

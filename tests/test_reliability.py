@@ -284,7 +284,7 @@ def test_a_receiver_may_have_any_name(tmp_path, monkeypatch):
     with quick.quick(drawn=True):
         renamed = replace(floor, receiver_names=(*names, *floor.receiver_names[len(names) :]))
         monkeypatch.setattr(rssi, "rssi_room", lambda seed: renamed)
-        config = rssi.RssiTaskConfig(rx=names, out=str(tmp_path / "run"))
+        config = rssi.RssiTaskConfig(receivers=names, out=str(tmp_path / "run"))
         rssi.run(config)
     written = pd.read_csv(tmp_path / "run" / "errors.csv", dtype=str, keep_default_na=False)["receiver"]
     assert {name.removeprefix("'") for name in written} == set(names)

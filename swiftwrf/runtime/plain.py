@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from typing import Any
 
@@ -43,3 +44,8 @@ class TextLoader(_EachNameOnce, yaml.BaseLoader):
 
 class TypedLoader(_EachNameOnce, yaml.SafeLoader):
     """Loader of YAML with numbers, dates and true or false in place of texts that state them."""
+
+
+# 915e6, which PyYAML takes for a text without a point and a sign
+_EXPONENT = re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$")
+TypedLoader.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT, list("-+0123456789"))

@@ -14,18 +14,16 @@ from swiftwrf import Spectra, make_model, simulated_room
 from swiftwrf.contrib.raytraced import sionna
 from swiftwrf.contrib.raytraced.names import RAYTRACE
 from swiftwrf.data.files import sha256
-from swiftwrf.data.formats import read_spectra
 from swiftwrf.metrics import angle_errors
 from swiftwrf.models import FieldModel
 from tasks.aoa.page import page
 from tasks.configs import AoaConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
-from tasks.options import TableSource
 from tasks.page.page import finish
 from tasks.page.shared import write_suggestion
 from tasks.records import Row
-from tasks.source import located, reading
+from tasks.source import reading
 from tasks.terminal import console, terminal
 from tasks.workers import connected, workers_of
 
@@ -38,7 +36,7 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
         FitError: A fit diverged, or the connection to the cluster was lost.
     """
     device = choose_device(config.device)
-    models, source = list[str | FieldModel](config.synthesizer), {}
+    models, source = list[str | FieldModel](config.models), {}
     if RAYTRACE in models:
         sionna()  # refuses before anything is computed
         if config.scene is not None:
@@ -53,7 +51,7 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
     experiment = Experiment(
         train,
         test,
-        config.mix,
+        config.measured,
         models,
         extra=config.extra,
         preset=config.preset,
@@ -62,7 +60,7 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
         device=device,
         split=config.split,
     )
-    label = f"mix{'_'.join(map(fraction_key, config.mix))}-s{config.seed}"
+    label = f"mix{'_'.join(map(fraction_key, config.measured))}-s{config.seed}"
 
     def described(value: Row) -> str:
         if "estimate" not in value:
@@ -79,7 +77,7 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
             results = learn(experiment, run, workers)
         for sentence in dict.fromkeys(sentence for result in results for sentence in result.left_out):
             console.print(sentence)
-        for subset in experiment.subsets[: len(config.mix)] if config.suggest else ():
+        for subset in experiment.subsets[: len(config.measured)] if config.suggest else ():
             measured, _ = experiment.withhold(subset)
             found = suggest(measured, config.suggest, config.seed)
             write_suggestion(run.path(f"suggested-mix{subset.key}"), measured.position, found.position, found.variance)
@@ -94,4 +92,4 @@ def measurements(config: AoaConfig) -> Spectra:
     """
     if config.data is None:
         return simulated_room(seed=config.seed, moving=config.moving or "transmitter")
-    return read_spectra(located(config.data), reading(config.spectra, TableSource()))
+    return reading(config, config.data).spectra()

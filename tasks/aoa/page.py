@@ -177,6 +177,11 @@ def answer(fraction: FractionRecords) -> Answer:
     return Answer("deg", methods, chosen, conclusion(fraction), steps(fraction), shown)
 
 
+def answer_of(run: Records) -> Answer:
+    """Return the answer of a run."""
+    return joined({fraction: answer(fraction) for fraction in FractionRecords.of(run)})
+
+
 def joined(of_fractions: Mapping[FractionRecords, Answer]) -> Answer:
     """Return the answer of a run, whose methods of several measured fractions have the fraction in their names."""
     if len(of_fractions) == 1:

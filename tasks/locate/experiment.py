@@ -9,7 +9,7 @@ from swiftwrf import Rssi, Stations, rssi_room, simulated_stations
 from swiftwrf.contrib.comparison.locating import LocateComparison, PositionComparison, compare
 from swiftwrf.contrib.comparison.stations import compare_stations
 from swiftwrf.data.coordinates import degree_columns
-from swiftwrf.data.formats import ReadOptions
+from swiftwrf.data.formats import RSSI_FORMATS
 from swiftwrf.data.formats.stations import read_stations, station_names
 from tasks.configs import LocateConfig
 from tasks.directory import Run
@@ -18,7 +18,7 @@ from tasks.locate.page import SUGGESTED, page
 from tasks.page.page import finish
 from tasks.page.shared import write_suggestion
 from tasks.records import Row
-from tasks.source import located, measured_rssi
+from tasks.source import reading
 from tasks.terminal import console, terminal
 from tasks.workers import connected, workers_of
 
@@ -30,10 +30,10 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
         InputError: Data or options that do not exist or do not fit together.
     """
     device = choose_device("cpu")
-    data = measurements(config)
+    data, reference = measurements(config)
     for note in data.notes:
         console.print(f"{data.name}: {note}")
-    label = f"{'stations' if isinstance(data, Stations) else 'rx' + '_'.join(config.rx)}-s{config.seed}"
+    label = f"{'stations' if isinstance(data, Stations) else 'rx' + '_'.join(config.receivers)}-s{config.seed}"
     with (
         connected(config.scheduler, device) as cluster,
         Run("locate", label, config, device, data.source, resume, described=_described) as directory,
@@ -43,7 +43,7 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
             if isinstance(data, Stations):
                 result: PositionComparison = compare_stations(data, **common)
             else:
-                result = compare(data, n_cells=config.cells, reference=config.table.reference, **common)
+                result = compare(data, n_cells=config.cells, reference=reference, **common)
         if isinstance(result, LocateComparison):
             _conclude(result, config, directory)
         finish(directory, result.recorded(), page)
@@ -68,15 +68,19 @@ def _conclude(result: LocateComparison, config: LocateConfig, directory: Run) ->
         write_suggestion(directory.path(SUGGESTED), measured, found.position, found.variance, degrees)
 
 
-def measurements(config: LocateConfig) -> Rssi | Stations:
+def measurements(config: LocateConfig) -> tuple[Rssi | Stations, str | None]:
     """Return the RSSI of a run at the receivers that are asked for, or the spectra of several stations.
+
+    Returns:
+        Measurements, and the reference of the groups of RSSI.
 
     Raises:
         InputError: The data cannot be read, or have no such receiver.
     """
     if config.stations:
-        return simulated_stations(stations=config.stations, seed=config.seed)
-    if config.data is not None and (path := Path(located(config.data))).exists() and station_names(path):
-        return read_stations(path, ReadOptions())
-    measured = measured_rssi(config.data, config.table)
-    return (rssi_room(seed=config.seed) if measured is None else measured).receivers(config.rx)
+        return simulated_stations(stations=config.stations, seed=config.seed), None
+    how = None if config.data is None else reading(config, config.data)
+    if how is not None and station_names(Path(how.source), how.options):
+        return read_stations(Path(how.source), how.options), None
+    data: Rssi = rssi_room(seed=config.seed) if how is None else how.read(RSSI_FORMATS)
+    return data.receivers(config.receivers), how.reference if how else None

@@ -7,6 +7,7 @@ from pathlib import Path
 from swiftwrf import InputError, Rssi, rssi_room
 from swiftwrf.contrib.comparison.rssi import compare, compared
 from swiftwrf.data.files import sha256
+from swiftwrf.data.formats import RSSI_FORMATS
 from tasks.configs import RssiTaskConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
@@ -14,7 +15,7 @@ from tasks.page.maps import FloorPlan, read_pixels
 from tasks.page.page import finish
 from tasks.records import Row
 from tasks.rssi.page import page
-from tasks.source import measured_rssi, offset_notes
+from tasks.source import offset_notes, reading
 from tasks.terminal import console, terminal
 from tasks.workers import connected, workers_of
 
@@ -28,15 +29,15 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         InputError: A configuration that the data cannot meet or that contradicts itself.
     """
     device = choose_device("cpu" if config.device == "auto" else config.device)
-    measured = measured_rssi(config.data, config.table)
-    whole = rssi_room(seed=config.seed) if measured is None else measured
-    data = whole.receivers(config.rx)
+    how = None if config.data is None else reading(config, config.data)
+    whole: Rssi = rssi_room(seed=config.seed) if how is None else how.read(RSSI_FORMATS)
+    data = whole.receivers(config.receivers)
     plan = _read_floor_plan(config, data)
     for note in data.notes:
         console.print(f"{data.name}: {note}")
     for reason in compared(data, config.also)[1].values():
         console.print(f"left out: {reason}")
-    label = f"rx{'_'.join(config.rx)}-s{config.seed}"
+    label = f"rx{'_'.join(config.receivers)}-s{config.seed}"
     source = data.source | ({"floor plan": sha256(Path(config.floor_plan))} if config.floor_plan else {})
 
     def described(value: Row) -> str:
@@ -49,14 +50,14 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         with workers_of(directory, cluster) as workers, terminal.progress():
             result = compare(
                 whole,
-                receivers=config.rx,
+                receivers=config.receivers,
                 split=config.split,
                 seed=config.seed,
                 also=config.also,
                 preset=config.preset,
                 not_detected=config.not_detected,
                 validation=config.validation,
-                reference=config.table.reference,
+                reference=how.reference if how else None,
                 fewer=FEWER,
                 device=device,
                 keep=directory,
@@ -69,7 +70,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
             console.print(f"{data.name}: {detection.note(data.receiver_names)}")
         if plan is not None:
             plan.save(directory.folder)
-        finish(directory, result.recorded(), page, offset_notes(data, config.table))
+        finish(directory, result.recorded(), page, offset_notes(data))
 
 
 def _read_floor_plan(config: RssiTaskConfig, data: Rssi) -> FloorPlan | None:

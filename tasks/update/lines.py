@@ -17,6 +17,7 @@ import torch
 
 from swiftwrf import FieldModel, InputError, Rssi, Spectra
 from swiftwrf.contrib.online import Step
+from swiftwrf.data import ReadOptions
 from swiftwrf.data.cells import text_of
 from swiftwrf.data.columns import column_of
 from swiftwrf.data.coordinates import Floors
@@ -27,9 +28,16 @@ from swiftwrf.metrics import LEVEL
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime.durable import strict
 from swiftwrf.runtime.plain import read_json
-from tasks.configs import OF_ROWS, TABLE_SUFFIX, UpdateConfig
-from tasks.source import reading
+from tasks.configs import TABLE_SUFFIX
 
+OF_ROWS = (
+    "columns",
+    "filler",
+    "coordinates",
+    "scale",
+    "y_down",
+    "up",
+)  # options of reading that a followed table takes
 POLL_S = 0.2  # between two looks at a file that grows
 CHUNK_BYTES = 2**20
 KNOWN_BYTES = 2**16  # before the end of a file that are compared to detect that it was rewritten
@@ -126,7 +134,7 @@ def _growing(path: Path, file: BinaryIO) -> Iterator[bytes]:
                 is_replaced = not os.path.samestat(path.stat(), os.fstat(file.fileno()))
 
 
-def measurement(line: Line, config: UpdateConfig, model: FieldModel | RssiModel, left_out: set[str]) -> Rssi | Spectra:
+def measurement(line: Line, options: ReadOptions, model: FieldModel | RssiModel, left_out: set[str]) -> Rssi | Spectra:
     """Return the measurement in a line, of the kind that the model predicts.
 
     Receivers that the model does not have are added to `left_out`.
@@ -140,7 +148,7 @@ def measurement(line: Line, config: UpdateConfig, model: FieldModel | RssiModel,
         index = torch.tensor([line.number - 1 - bool(line.header)])  # as of the rows of the whole file
         if line.header:
             assert isinstance(model, RssiModel)
-            return _of_row(text, config, model, left_out).derived(index=index)
+            return _of_row(text, options, model, left_out).derived(index=index)
         content = read_json(text)
         position, value = [list(map(_number, content["position"]))], content[needed]
         if isinstance(model, RssiModel):
@@ -161,9 +169,9 @@ def _number(value: object) -> float:
     return float(value)
 
 
-def _of_row(text: str, config: UpdateConfig, model: RssiModel, left_out: set[str]) -> Rssi:
+def _of_row(text: str, options: ReadOptions, model: RssiModel, left_out: set[str]) -> Rssi:
     """Return the measurement in a table of one row."""
-    options, table, offsets = reading(config.spectra, config.table), table_of("the table", text), model.offsets
+    table, offsets = table_of("the table", text), model.offsets
     of_rows = {name: getattr(options, name) for name in OF_ROWS}
     if offsets is not None and offsets.column in table.columns:
         of_rows["offset_by"] = offsets.column

@@ -6,30 +6,29 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from swiftwrf import FieldModel, InputError, Rssi, Spectra, load
 from swiftwrf.contrib.comparison.steps import MODEL, check_unchanged
 from swiftwrf.contrib.online import Follower
-from swiftwrf.data import ReadOptions, Snapshots
+from swiftwrf.data import ReadOptions
 from swiftwrf.data.files import sha256
-from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS, read
+from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.errors import one_line, with_article
 from swiftwrf.models.base import ALREADY_LEARNT
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime import checkpoint
 from swiftwrf.runtime.durable import write_json
-from tasks.configs import UpdateConfig
+from tasks.configs import TABLE_SUFFIX, UpdateConfig
 from tasks.directory import Claim, begun, new_directory
 from tasks.environment import environment, invocation
-from tasks.options import plain
+from tasks.options import by_name
 from tasks.page.page import write_page
 from tasks.records import CONFIG, ENVIRONMENT, read_json
-from tasks.source import aligned, located, reading, with_groups
+from tasks.source import aligned, reading, with_groups
 from tasks.terminal import console, terminal
-from tasks.update.lines import answer, check_source, lines, measurement
+from tasks.update.lines import OF_ROWS, answer, check_source, lines, measurement
 from tasks.update.record import SUMMARY, Record, page
 
 WAITING = "waiting"  # tensor of the spectra that a geometry has not learnt yet
@@ -46,8 +45,7 @@ def run(config: UpdateConfig) -> None:
         return
     with new_directory(Path(config.out), "an update") as folder:
         model = _model(config.model)
-        options = reading(config.spectra, config.table)
-        new, train = _read(config.source, options, model), _training(config, options, model)
+        new, train = _read(config, config.source, model), _training(config, model)
         if n_known := int((known := model.is_learnt(new)).sum()):
             said = f"{new.name}: {n_known} of {len(new)} rows {ALREADY_LEARNT}"
             if n_known == len(new):
@@ -72,10 +70,21 @@ def run(config: UpdateConfig) -> None:
 
 def follow(config: UpdateConfig) -> None:
     """Record each line, replace the model, then print the answer: what was answered is learnt, whatever ends the run."""
+    if terminal.options.open or terminal.options.json:
+        raise InputError("--follow prints JSON lines and writes no page; leave out --open and --json")
+    options, taken = ReadOptions(), tuple[str, ...]()
+    if config.source != "-":
+        options, taken = (
+            reading(config, config.source).options,
+            OF_ROWS if config.source.lower().endswith(TABLE_SUFFIX) else (),
+        )
+    for name in options.given if config.read is None or config.data is None else ():
+        if name not in taken:
+            raise InputError(f"{name} is no option of reading a followed source; leave it out")
     digests = {"model": sha256(Path(config.model))}
     model, rate = _model(config.model), config.false_alarm_rate
     check_source(config.source, model)
-    if (train := _training(config, reading(config.spectra, config.table), model)) is not None:
+    if (train := _training(config, model)) is not None:
         digests |= train.source
     with _followed(Path(config.out), digests) as folder:
         file = folder / MODEL
@@ -89,7 +98,7 @@ def follow(config: UpdateConfig) -> None:
         for line in lines(config.source, *place):
             before = follower.model
             try:
-                new = before.aligned(measurement(line, config, before, left_out))  # type: ignore[arg-type]  # of the model's kind
+                new = before.aligned(measurement(line, options, before, left_out))  # type: ignore[arg-type]  # of the model's kind
                 step = follower.step(new)
             except InputError as error:  # one bad line does not end a run of days
                 console.print(f"error: {error}", markup=False, soft_wrap=True)
@@ -149,7 +158,7 @@ def _save(follower: Follower, file: Path, end: int = 0, digest: str = "") -> Non
 
 
 def _write_config(config: UpdateConfig, folder: Path) -> None:
-    write_json(folder / CONFIG, {"task": "update", "command": invocation("update"), "config": plain(config)})
+    write_json(folder / CONFIG, {"task": "update", "command": invocation("update"), "config": by_name(config)})
 
 
 def _unit(model: FieldModel | RssiModel) -> str:
@@ -165,17 +174,16 @@ def _model(path: str) -> FieldModel | RssiModel:
     )
 
 
-def _training(config: UpdateConfig, options: ReadOptions, model: FieldModel | RssiModel) -> Spectra | Rssi | None:
-    return None if config.data is None else _read(config.data, options, model)
+def _training(config: UpdateConfig, model: FieldModel | RssiModel) -> Spectra | Rssi | None:
+    return None if config.data is None else _read(config, config.data, model)
 
 
-def _read(source: str, options: ReadOptions, model: FieldModel | RssiModel) -> Spectra | Rssi:
+def _read(config: UpdateConfig, source: str, model: FieldModel | RssiModel) -> Spectra | Rssi:
     """Return measurements of the kind that a model predicts, of a folder, file or public data set."""
-    source = located(source)
+    how = reading(config, source)
+    if how.note:
+        console.print(how.note)
     if isinstance(model, RssiModel):
-        rssi: Any = read(source, with_groups(options, source, model.offsets), RSSI_FORMATS)
-        return model.aligned(aligned(rssi, model, ignore_others=True))
-    data: Any = read(source, options, SPECTRA_FORMATS, SNAPSHOT_FORMATS)
-    return model.aligned(
-        data.spectra(model.grid, options.beamformer or "phase") if isinstance(data, Snapshots) else data
-    )
+        return model.aligned(aligned(with_groups(how, model.offsets).read(RSSI_FORMATS), model, ignore_others=True))
+    data = how.read(SPECTRA_FORMATS, SNAPSHOT_FORMATS)
+    return model.aligned(how.using(grid=model.grid).options.spectra_of(data))

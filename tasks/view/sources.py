@@ -27,6 +27,7 @@ from tasks.command_line import parse
 from tasks.configs import AoaConfig, LocateConfig, ViewConfig
 from tasks.locate.experiment import measurements as rssi_of
 from tasks.records import CONFIG, ENVIRONMENT, Row, read_json
+from tasks.terminal import terminal
 from tasks.update.record import FollowedView
 from tasks.view.locating import RssiLocating
 from tasks.view.rssi import RssiView, rows_of_model, rows_of_run
@@ -52,7 +53,7 @@ def run(config: ViewConfig) -> None:
     port = free_port(config.host, config.port)
     view = open_source(Path(config.source))
     page: Any = {SpectraView: SpectraPage, RssiView: RssiPage, FollowedView: FollowedPage}[type(view)]
-    serve(view.title, lambda: page(view), config.host, port, config.open)
+    serve(view.title, lambda: page(view), config.host, port, terminal.options.open)
 
 
 def open_source(source: Path) -> SpectraView | RssiView | FollowedView:
@@ -131,7 +132,7 @@ def _aoa_run(folder: Path, content: Row) -> SpectraView:
             notes = list(data.notes)
         except InputError as error:
             notes = [f"The measured spectra are not shown: {error}."]
-        for fraction in config.mix:
+        for fraction in config.measured:
             key, in_training = fraction_key(fraction), None
             if data is not None and train is not None:
                 measured, _ = withhold(train, fraction, config.seed)
@@ -145,7 +146,7 @@ def _aoa_run(folder: Path, content: Row) -> SpectraView:
                 title = f"{name}, {100 * fraction:g}% measured"
                 models.append(LoadedModel(title, model, planes, in_training, locator_file))
     if not models:
-        raise InputError(f"{folder} holds no model; run swiftwrf aoa with a --synthesizer that can be saved")
+        raise InputError(f"{folder} holds no model; run swiftwrf aoa with --models that can be saved")
     return SpectraView(folder.name, models, data, notes)
 
 
@@ -165,7 +166,7 @@ def _locate_run(folder: Path, content: Row) -> RssiView | SpectraView:
     with refusing(f"the records in {folder} are not those of a run"):
         config = parse(LocateConfig, [], "tasks.view", content["config"], folder)
         try:
-            data = rssi_of(config)
+            data, _ = rssi_of(config)
             assert isinstance(data, Rssi)
             train = _training_part(folder, config, data)
             locating = RssiLocating(locator, data, torch.isin(data.index, train.index))

@@ -18,8 +18,8 @@ from quick import TASKS
 from fuzz.mutate import mutated
 from swiftwrf import InputError
 from swiftwrf.runtime.validation import check_value
-from tasks.command_line import _defaults, execute
-from tasks.options import by_name
+from tasks.command_line import execute, from_names
+from tasks.options import General, ReadingOptions, by_name
 
 VALUES = [
     "", "0", "1", "-1", "0.5", "1.5", "nan", "inf", "-inf", "1e400", "1e-320", "4294967296", "99999999999999999999",
@@ -27,8 +27,9 @@ VALUES = [
     "/", "/dev/null", "/proc/1/mem", "tcp://127.0.0.1:1", "tls://127.0.0.1:1", "none", "auto", "cpu", "paper", "True",
     "[1]", "{}", "nearest", "swiftwrf", "receiver", "*",
 ]  # fmt: skip
+EVERYWHERE = by_name(General()) | by_name(ReadingOptions())  # not every command takes them
 OPTIONS = {
-    task: [f"--{name.replace('_', '-')}" for name in by_name(_defaults(config, {}, ""))]
+    task: [f"--{name.replace('_', '-')}" for name in by_name(from_names(config, {}, "")) | EVERYWHERE]
     for task, (config, _) in TASKS.items()
 }
 REQUIRED_OPTIONS = {

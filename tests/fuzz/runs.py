@@ -37,7 +37,7 @@ from swiftwrf.runtime.durable import write_json
 from tasks.aoa.room import in_plan
 from tasks.command import run_command
 from tasks.configs import AoaConfig, LocateConfig
-from tasks.options import plain
+from tasks.options import by_name
 from tasks.page.maps import FloorPlan
 from tasks.update import lines
 from tasks.update.record import TABLE, FollowedView, Record, snapshot
@@ -51,7 +51,7 @@ ERROR = "error: "
 def run_of_locate(folder: Path) -> None:
     train, _ = rssi_room(n=60).split()
     RssiLocator(n_cells=200).fit(train).save(folder / "locator.safetensors")
-    write_json(folder / "config.json", {"task": "locate", "config": plain(LocateConfig(data="gone.csv"))})
+    write_json(folder / "config.json", {"task": "locate", "config": by_name(LocateConfig(data="gone.csv"))})
     write_json(folder / "environment.json", {"input_sha256": {}})
 
 
@@ -69,7 +69,7 @@ def run_of_aoa(folder: Path) -> None:
     model = fit(simulated_room(n=20, grid=AngularGrid.hemisphere(4, 8)), n_primitives=3)
     model.save(folder / "swiftwrf-mix1.safetensors")
     write_json(folder / "geometry-mix1.json", {"planes": [Plane((1.0, 0.0, 0.0), 6.0, -0.5, 1.0, 0.95, 6.1).to_json()]})
-    write_json(folder / "config.json", {"task": "aoa", "config": plain(AoaConfig(mix=(1.0,), data="gone"))})
+    write_json(folder / "config.json", {"task": "aoa", "config": by_name(AoaConfig(measured=(1.0,), data="gone"))})
     write_json(folder / "environment.json", {"input_sha256": {}})
 
 

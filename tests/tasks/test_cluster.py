@@ -12,7 +12,7 @@ import dask
 import pytest
 import torch
 from quick import run, said
-from sums import STEPS, Sum, add, kill, kill_once, results
+from sums import STEPS, Sum, add, kill, kill_once, results, sleep
 from test_rssi_model import with_field
 
 from swiftwrf import FitError, InputError, fit_rssi
@@ -112,6 +112,20 @@ def test_a_step_that_ends_every_worker_ends_in_a_sentence(local, tmp_path, monke
         connected(local.scheduler_address, CPU) as cluster,
     ):
         results(tmp_path / "run", [Sum(1, function=kill)], cluster=cluster)
+
+
+def test_the_next_run_does_not_wait_for_the_steps_of_a_stopped_one(local, tmp_path):
+    def stop():
+        raise KeyboardInterrupt
+
+    def processes():
+        with distributed.Client(local.scheduler_address) as client:
+            return set(client.run(os.getpid).values())
+
+    before = processes()
+    with pytest.raises(KeyboardInterrupt), connected(local.scheduler_address, CPU) as cluster:
+        results(tmp_path / "run", [Sum(1), Sum(2, function=sleep)], cluster=cluster, act=stop)
+    assert before - processes()  # a new worker is in the place of the one that slept
 
 
 def test_workers_that_never_come_or_go_for_good(tmp_path, monkeypatch):

@@ -75,7 +75,7 @@ def test_a_file_called_tasks_in_the_working_directory(tmp_path):
     (tmp_path / "tasks.py").write_text("raise SystemExit('the wrong module')")
     done = started(tmp_path, "rssi", "--rx", "")
     assert done.returncode == 2
-    assert done.stderr == "error: --rx is empty; give it a value or leave it out\n"
+    assert done.stderr == "error: --receivers is empty; give it a value or leave it out\n"
 
 
 @pytest.mark.parametrize(
@@ -114,14 +114,14 @@ without_gpu = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a G
 LINES = [
     ("aoa", ("--mix", 0.5, "--data", ""), "--data is empty"),
     ("rssi", ("--rx", "1", "--data", ""), "--data is empty"),
-    ("rssi", ("--rx", ""), "--rx is empty"),
+    ("rssi", ("--rx", ""), "--receivers is empty"),
     ("aoa", ("--mix", 0.5, "--seed", -1), "--seed must be"),
     ("aoa", ("--mix", 0.5, "--seed", 2**32), "--seed must be"),
     ("rssi", ("--rx", "1", "--seed", -1), "--seed must be"),
     ("aoa", ("--mix", 0.5, "--seed", 2**32 - 1, "--repeats", 2), "--seed"),
-    ("aoa", ("--mix", 0.5, "--synthesizer"), "--synthesizer"),
-    ("aoa", ("--mix", 0.5, "--array", 4, 0.16, "nan"), "finite"),
-    ("aoa", ("--mix", 0.5, "--array", 100000, 0.16, 1e9), "--array"),
+    ("aoa", ("--mix", 0.5, "--synthesizer"), "--models"),
+    ("inspect", ("x", "--array", 4, 0.16, "nan"), "finite"),
+    ("inspect", ("x", "--array", 100000, 0.16, 1e9), "--array"),
     ("aoa", ("--mix", "nan"), "finite"),
     ("aoa", ("--seed", 1), "got none"),
     ("aoa", ("--mix", 0), "in (0, 1]"),
@@ -150,20 +150,22 @@ LINES = [
     ("rssi", ("--rx", "1", "--out", "link"), "link exists already"),
     ("report", ("{file}", "--out", "link"), "no finished run"),
     ("predict", ("{file}", "{file}", "--out", "link"), "link exists already"),
-    ("locate", ("--columns", "x=a"), "give it with --data"),
-    ("rssi", ("--rx", 1, "--columns", "x=a"), "give it with --data"),
-    ("locate", ("--data", "x", "--offset-by", "=phone"), "takes COLUMN or COLUMN=VALUE"),
+    ("locate", ("--columns", "x=a"), "--columns is no option of this command; give --columns to swiftwrf inspect"),
+    ("rssi", ("--rx", 1, "--read", "x.yaml"), "--read states how --data is read; give both"),
+    ("rssi", ("--rx", 1, "--data", "{survey}", "--read", "x.yaml"), "--read x.yaml cannot be read"),
+    ("inspect", ("x", "--offset-by", "=phone"), "takes COLUMN or COLUMN=VALUE"),
+    ("inspect", ("{survey}", "--every", 2, "--read", "x.yaml"), "exclude each other"),
+    ("predict", ("{file}", "{file}", "--open"), "writes no report"),
     ("locate", ("--scheduler", "tcp://127.0.0.1:1"), "no Dask scheduler"),
     ("predict", ("{file}", "{file}", "--out", "{file}-new.csv"), "not a readable safetensors file"),
     ("report", ("{file}",), "no finished run"),
     ("report", ("--out", "{file}/x"), "no runs"),
     ("inspect", ("/nowhere", "--out", "page"), "is not a folder or file"),
-    ("aoa", ("--mix", 0.5, "--synthesizer", "nearest", "--scene", "office"), "--scene is for synthesizer raytrace"),
+    ("aoa", ("--mix", 0.5, "--synthesizer", "nearest", "--scene", "office"), "--scene is for the model raytrace"),
     ("aoa", ("--mix", 0.5, "--synthesizer", "raytrace", "--scene", "kitchen"), "unknown room 'kitchen'"),
     ("aoa", ("--mix", 0.5, "--synthesizer", "raytrace", "--scene", "none.xml"), "--scene none.xml does not exist"),
-    ("aoa", ("--mix", 0.5, "--array", 4, 0.164, 915e6), "give it with --data"),
-    ("aoa", (*COARRAY, "--data", "{bare}"), "give it with --array"),
-    ("aoa", (*COARRAY, "--data", "{bare}", "--array", 1, 0.16, 915e6), "2 to 32 elements a side"),
+    ("aoa", (*COARRAY, "--data", "{bare}"), "give it with --array; give --array to swiftwrf inspect"),
+    ("aoa", (*COARRAY, "--data", "{bare}", "--read", "{one_element}"), "2 to 32 elements a side"),
     pytest.param("aoa", ("--mix", 0.5, "--device", "cuda"), "NVIDIA GPU", marks=without_gpu),
     ("locate", ("--suggest", 501), "--suggest must be a whole number at least 0 and at most 500"),
     ("resume", (".",), "no interrupted run"),
@@ -197,14 +199,17 @@ LINES = [
     ("predict", ("{estimator}", "none.npy", "--out", "out.csv"), "is missing"),
     ("predict", ("{estimator}", "{spectra}", "--out", "{file}"), "exists already"),
     ("predict", ("{estimator}", "{spectra}", "--out", "no/out.csv"), "no directory"),
-    ("predict", ("{estimator}", "{spectra}", "--every", 7, "--out", "out.csv"), "--every does not apply"),
-    ("predict", ("{field_model}", "{survey}", "--grid", 4, 8, "--out", "b.csv"), "--grid is for reading spectra"),
+    ("predict", ("{estimator}", "{spectra}", "--read", "{seventh}", "--out", "out.csv"), "every does not apply"),
+    (
+        "predict",
+        ("{field_model}", "{survey}", "--read", "{seventh}", "--out", "b.csv"),
+        "yaml states every, which does not apply to positions",
+    ),
     ("predict", ("{field_model}", "{survey}", "--track", 1, "--out", "b.csv"), "locates nothing"),
     ("update", ("m", "table.csv", "--out", "x", "--follow", "--json"), "--follow prints JSON lines"),
     ("update", ("m", "table.csv", "--out", "x", "--false-alarm-rate", 2), "--false-alarm-rate must be"),
     ("update", ("m", "table.csv", "--out", "x", "--follow", "--open"), "--follow prints JSON lines"),
-    ("update", (*FOLLOWED, "--window", 1), "--window is no option of a followed source"),
-    ("update", (*FOLLOWED, "--y-down", "--every", 2), "--every is no option of a followed source"),
+    ("update", (*FOLLOWED, "--read", "{seventh}"), "every is no option of reading a followed source"),
 ]
 
 
@@ -215,6 +220,9 @@ def sources(tmp_path_factory):
     place = {name: folder / name for name in ("file", "snapshots", "room", "bare")}
     place |= {"spectra": folder / "spectra.npy", "other": folder / "other.partial"}
     place["file"].touch()
+    for name, text in (("seventh", "every: 7"), ("one_element", "array: [1, 0.16, 915e6]")):
+        place[name] = folder / f"{name}.yaml"
+        place[name].write_text(text)
     write_snapshots(place["snapshots"])
     place["survey"] = write_survey(folder / "survey")
     room = simulated_room(n=20, grid=AngularGrid.hemisphere(8, 32))

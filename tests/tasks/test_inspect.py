@@ -14,9 +14,12 @@ from test_rssi_model import path_loss_only
 
 from swiftwrf import AngularGrid, rssi_room, simulated_room
 from swiftwrf.contrib.diagnostics.inspection import Findings, inspect
+from swiftwrf.data.formats import SNAPSHOT_FORMATS
 from swiftwrf.data.writing import write_spectra
-from tasks.configs import InspectConfig
+from tasks.configs import AoaConfig, InspectConfig
 from tasks.inspect import page
+from tasks.options import ReadingOptions
+from tasks.source import reading
 
 
 def run(*arguments):
@@ -41,8 +44,33 @@ def test_snapshots(tmp_path, capsys):
     assert "needs no calibration" in text
     html = (tmp_path / "page" / "report.html").read_text()
     assert html.count("<figcaption>") == 3
-    assert "source --grid 24 96" in html  # the next command reads the files in the same way
+    assert (tmp_path / "source" / "reading.yaml").read_text() == "grid:\n- 24\n- 96\n"
+    assert quick.run("convert", tmp_path / "source", tmp_path / "own") == 0  # reads the files in the same way
+    assert "120 spectra of 24 x 96 pixels" in capsys.readouterr().out
     assert all(finding["text"][:20] in html for finding in content["findings"])
+
+
+def test_options_of_reading_come_from_the_command_line_or_read_or_the_file_beside_the_data(tmp_path):
+    write_snapshots(tmp_path / "source")
+    (tmp_path / "source" / "reading.yaml").write_text("every: 2")
+    (tmp_path / "other.yaml").write_text("every: 3\ndrop_elements: [0]")
+    told = [
+        (AoaConfig(measured=(0.5,)), 60, "source/reading.yaml states: every 2"),
+        (AoaConfig(measured=(0.5,), read=str(tmp_path / "other.yaml")), 40, "states: every 3, drop_elements [0]"),
+        (InspectConfig("source", reading=ReadingOptions(every=4)), 30, ""),
+    ]
+    for config, n, note in told:
+        data = reading(config, str(tmp_path / "source")).read(SNAPSHOT_FORMATS)
+        assert (len(data), "reading.yaml" in data.source) == (n, bool(note))
+        assert note in data.notes[-1] if note else not any("states" in one for one in data.notes)
+
+
+def test_options_of_reading_that_cannot_be_written_beside_the_data_are_in_the_folder_of_the_page(tmp_path, capsys):
+    write_snapshots(tmp_path / "source")
+    (tmp_path / "source" / "reading.yaml").mkdir()
+    assert run(tmp_path / "source", "--every", 40, "--out", tmp_path / "page") == 0
+    assert (tmp_path / "page" / "reading.yaml").read_text() == "every: 40\n"
+    assert f"--read {tmp_path / 'page' / 'reading.yaml'}" in (tmp_path / "page" / "report.html").read_text()
 
 
 def test_a_single_position(tmp_path, capsys):

@@ -15,11 +15,12 @@ from swiftwrf.runtime.digest import digest
 from swiftwrf.runtime.durable import strict
 from tasks import configs
 from tasks.command import COMMANDS, main
-from tasks.command_line import _defaults, command_line, execute, file_options, parse
+from tasks.command_line import command_line, execute, file_options, from_names, parse
 from tasks.configs import AoaConfig, InspectConfig, ReportConfig, RssiTaskConfig
-from tasks.options import OffsetSource, Output, by_name, plain
+from tasks.options import by_name
+from tasks.terminal import terminal
 
-SOURCE = ("--data", "x", "--array", "4", "2", "0.06", "2.4e9", "--drop-null")
+SOURCE = ("--data", "x", "--read", "reading.yaml")
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -34,34 +35,33 @@ def test_help_has_groups_names_examples_and_one_default_an_option(name, capsys, 
     assert "default: None" not in text
     assert f"Example: swiftwrf {name} " in text
     config_type = getattr(configs, COMMANDS[name].options)
-    listed = [match[1] for option in options if (match := re.match(r"--([a-z-]+)", option))]
-    assert {"config", "verbose"} <= {*listed}
+    assert "General options, see swiftwrf --help: --config, --verbose, --quiet, --json, --open" in text
     groups = [option.name for option in fields(config_type) if is_dataclass(option.default)]
     places = [text.index(f" {group} options ") for group in groups]
     assert places == sorted(places)
-    for name in by_name(_defaults(config_type, {}, "")):
-        assert name.replace("_", "-") in listed or name.upper() in text.splitlines()[0]
+    for name in by_name(from_names(config_type, {}, "")):
+        assert f"--{name.replace('_', '-')}" in text or name.upper() in text.splitlines()[0]
 
 
 def test_a_run_is_repeated_from_its_configuration_and_the_command_line_wins(tmp_path):
     first = parse(AoaConfig, ["--mix", "0.1", "0.3", "--seed", "7", *SOURCE], "aoa")
-    (tmp_path / "config.json").write_text(json.dumps({"task": "aoa", "config": plain(first)}))
+    (tmp_path / "config.json").write_text(json.dumps({"task": "aoa", "config": by_name(first)}))
     assert parse(AoaConfig, [], "aoa", file_options(tmp_path / "config.json")) == first
     for given in (("--mix", "0.5"), ("--mix=0.5",)):
         again = parse(AoaConfig, given, "aoa", file_options(tmp_path / "config.json"))
-        assert plain(again) == plain(first) | {"mix": (0.5,)}
+        assert by_name(again) == by_name(first) | {"measured": (0.5,)}
     options = ["--rx", "1", "a b", "--floor-plan", "p", "--floor-extent", "-1", "2", "0", "1"]
     rssi = parse(RssiTaskConfig, options, "rssi")
-    (tmp_path / "rssi.json").write_text(json.dumps(plain(rssi)))
+    (tmp_path / "rssi.json").write_text(json.dumps(by_name(rssi)))
     assert parse(RssiTaskConfig, [], "rssi", file_options(tmp_path / "rssi.json")) == rssi
 
 
 def test_a_yaml_file_holds_options_and_positional_arguments(tmp_path):
     file = tmp_path / "inspect.yaml"
-    file.write_text("source: DIR\nevery: 3\nround_trip: true\ncolumns: [x=a, y=b]\nout: null\n")
+    file.write_text("source: DIR\nevery: 3\nround_trip: true\ncolumns: [x=a, y=b]\nout: null\narray: [4, 0.1, 915e6]\n")
     found = parse(InspectConfig, [], "inspect", file_options(file))
-    assert (found.source, found.out, found.table.columns) == ("DIR", None, ("x=a", "y=b"))
-    assert (found.spectra.every, found.spectra.round_trip) == (3, True)
+    assert (found.source, found.out, found.reading.columns) == ("DIR", None, ("x=a", "y=b"))
+    assert (found.reading.every, found.reading.round_trip, found.reading.array) == (3, True, (4, 0.1, 915e6))
     assert parse(InspectConfig, ["OTHER"], "inspect", file_options(file)).source == "OTHER"
 
 
@@ -74,12 +74,12 @@ def test_a_yaml_file_holds_options_and_positional_arguments(tmp_path):
         ("#" * 2**20 + "\n", "at most 1048576 bytes"),
         ("- 0.3", "must hold options by name, got list"),
         ("mixx: 0.3", "names 'mixx', which is no option of this command; --help lists them"),
-        ("mix: [0.3]\nseed: many\n", "o.yaml: seed takes INT, got 'many'"),
-        ("seed: [1, 2]\n", "seed takes INT"),
-        ("array: [4, 0.1]\n", "array takes"),
-        ("preset: large\n", "preset takes"),
-        ("a: &a [x, x]\nsynthesizer: [*a, *a]\n", "synthesizer takes"),
-        ("synthesizer: [[x]]\n", "synthesizer takes"),
+        ("mix: [0.3]\nseed: many\n", "o.yaml: seed must be a whole number at least 0 .*, got 'many'"),
+        ("seed: [1, 2]\n", "seed must be"),
+        ("every: 2\n", "names 'every', which is no option of this command"),
+        ("preset: large\n", "preset must be 'quick' or 'paper', got 'large'"),
+        ("a: &a [x, x]\nsynthesizer: [*a, *a]\n", "models must be a tuple of a text"),
+        ("models: [[x]]\n", "models must be"),
     ],
 )
 def test_a_file_of_options_is_checked_as_a_command_line(tmp_path, content, sentence):
@@ -90,10 +90,10 @@ def test_a_file_of_options_is_checked_as_a_command_line(tmp_path, content, sente
 
 
 def executed(config_type, *arguments):
-    """Return the configuration with which a command line runs its task."""
+    """Return the configuration with which a command line runs its task, and the general options."""
     found = []
-    execute("tasks.rssi", config_type, found.append, [*map(str, arguments)])
-    return found[0]
+    execute("tasks.rssi", config_type, lambda config: found.extend([config, terminal.options]), [*map(str, arguments)])
+    return found
 
 
 @pytest.mark.parametrize(
@@ -102,12 +102,12 @@ def executed(config_type, *arguments):
         (
             {"seed": 5, "split": "block", "rx": [1, "a b"]},
             ("--seed", 6),
-            {"seed": 6, "split": "block", "rx": ("1", "a b")},
+            {"seed": 6, "split": "block", "receivers": ("1", "a b")},
         ),
-        ({"rx": [1], "json": True}, (), {"output": Output(json=True)}),
-        ({"rx": [1], "json": True}, ("--no-json",), {"output": Output(json=False)}),
+        ({"receivers": 1, "json": True}, (), {"json": True}),
+        ({"rx": [1], "json": True}, ("--no-json", "--quiet"), {"json": False, "quiet": True}),
         *(
-            ({"rx": texts}, (), {"rx": tuple(texts), "out": None})  # values of a file are no flags
+            ({"rx": texts}, (), {"receivers": tuple(texts), "out": None})  # values of a file are no flags
             for texts in (["--out", "X"], ["--help"], ["--config=x"], ["-1"])
         ),
     ],
@@ -115,18 +115,28 @@ def executed(config_type, *arguments):
 @pytest.mark.parametrize("form", [lambda file: ("--config", file), lambda file: (f"--config={file}",)])
 def test_a_file_of_options_is_given_in_both_forms_and_the_command_line_wins(tmp_path, content, options, expected, form):
     (tmp_path / "opts.yaml").write_text(yaml.safe_dump(content))
-    found = vars(executed(RssiTaskConfig, *form(tmp_path / "opts.yaml"), *options))
+    config, general = executed(RssiTaskConfig, *form(tmp_path / "opts.yaml"), *options)
+    found = vars(config) | vars(general)
     assert {name: found[name] for name in expected} == expected
 
 
 def test_the_configuration_of_a_run_with_out_starts_another_run(tmp_path):
-    options = {"table": OffsetSource(filler="none"), "output": Output(json=True)}
-    values = plain(RssiTaskConfig(("1",), out=str(tmp_path), data="x", **options))
+    values = by_name(RssiTaskConfig(("1",), out=str(tmp_path), data="x", read="reading.yaml"))
     (tmp_path / "config.json").write_text(json.dumps({"task": "rssi", "config": values}))
-    found = executed(RssiTaskConfig, "--config", tmp_path / "config.json")
-    assert plain(found) == values | {"out": None}
-    again = executed(RssiTaskConfig, "--config", tmp_path / "config.json", "--filler", -100, 100, "--out", "other")
-    assert (again.table.filler, again.out) == ((-100.0, 100.0), "other")
+    found, _ = executed(RssiTaskConfig, "--config", tmp_path / "config.json")
+    assert by_name(found) == values | {"out": None}
+    again, general = executed(RssiTaskConfig, "--config", tmp_path / "config.json", "--json", "--out", "other")
+    assert (again.out, general.json) == ("other", True)
+
+
+@pytest.mark.parametrize("words", [("--filler", "-100", "100"), ("--filler=none",), ("--y-down",)])
+def test_options_of_reading_are_those_of_inspect_and_other_commands_say_so(words):
+    parsed = executed(InspectConfig, "x", *words)[0].reading
+    assert parsed.filler in ((-100.0, 100.0), "none", ())
+    name = words[0].partition("=")[0]
+    sentence = f"{name} is no option of this command; give {name} to swiftwrf inspect, .* by --read FILE.yaml"
+    with pytest.raises(InputError, match=sentence):
+        executed(RssiTaskConfig, "--rx", "1", "--data", "x", *words)
 
 
 @pytest.mark.parametrize(
@@ -156,7 +166,7 @@ def test_an_option_given_twice_in_a_file_is_refused(tmp_path, name, text):
 def test_resume_changes_no_result(tmp_path, given, capsys):
     folder = tmp_path / "x.partial"
     folder.mkdir()
-    values = plain(RssiTaskConfig(("1",), scheduler="tcp://old:1"))
+    values = by_name(RssiTaskConfig(("1",), scheduler="tcp://old:1"))
     (folder / "config.json").write_text(json.dumps({"task": "rssi", "config": values}))
     (folder / "environment.json").write_text(json.dumps({"config_sha256": digest(strict(values))}))
     with mock.patch("tasks.resume.run_task") as task:
@@ -165,7 +175,7 @@ def test_resume_changes_no_result(tmp_path, given, capsys):
         with pytest.raises(SystemExit, match="2"):
             main(["resume", str(folder), *given])
     first, second = [call.args for call in task.call_args_list]
-    assert (first[0], plain(first[1]), first[2]) == ("rssi", values | {"scheduler": None}, folder)
+    assert (first[0], by_name(first[1]), first[2]) == ("rssi", values | {"scheduler": None}, folder)
     assert second[1].scheduler == "tcp://new:1"
     assert f"Unrecognized options: {given[0]}" in " ".join(capsys.readouterr().err.replace("│", "").split())
 

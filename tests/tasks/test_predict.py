@@ -132,7 +132,7 @@ def test_errors_are_those_of_known_directions(finished, small, tmp_path, capsys,
     two = small.subset(torch.arange(2))
     without_pose = Spectra(two.spectrum, two.position, grid=GRID)
     for data in (two, without_pose):
-        monkeypatch.setattr("tasks.source.read_spectra", lambda *_, data=data, **options: data)
+        monkeypatch.setattr("tasks.source.Reading.spectra", lambda _, data=data: data)
         (tmp_path / "out.csv").unlink(missing_ok=True)
         assert run("predict", estimator, tmp_path, "--json", "--out", tmp_path / "out.csv") == 0
         answer, table = json.loads(capsys.readouterr().out), pd.read_csv(tmp_path / "out.csv")
@@ -140,7 +140,7 @@ def test_errors_are_those_of_known_directions(finished, small, tmp_path, capsys,
             assert answer["median_great_circle_deg"] == pytest.approx(table["great_circle_deg"].mean(), abs=1e-3)
     assert (set(answer), list(table)) == ({"n", "table"}, ["index", "azimuth_deg", "elevation_deg"])
     shifted = Spectra(two.spectrum, two.position, grid=replace(GRID, azimuth_start=0.1))
-    monkeypatch.setattr("tasks.source.read_spectra", lambda *_, **options: shifted)
+    monkeypatch.setattr("tasks.source.Reading.spectra", lambda _: shifted)
     assert run("predict", estimator, tmp_path, "--out", tmp_path / "no.csv") == 2
     assert "as many directions as the estimator was trained on, but others" in said(capsys)
 

@@ -109,7 +109,7 @@ class Own(int): pass
 
 print("once")
 for context in (10, Own(10)):
-    config = AoaConfig(mix=(0.5,), out=sys.argv[1] + type(context).__name__)
+    config = AoaConfig(measured=(0.5,), out=sys.argv[1] + type(context).__name__)
     with Run("aoa", "", config, torch.device("cpu"), {}, None, 2) as run, workers_of(run, None) as two:
         steps = Steps(context, run, two)
         names = [steps.start(f"sum-{number}", "", add, number) for number in (1, 2)]
@@ -129,7 +129,7 @@ def test_a_script_without_main_guard_runs_once_and_its_errors_are_those_that_hap
 @pytest.mark.parametrize(("now", "asked", "processes"), [(4, None, 2), (1, None, 1), (4, 1, 1)])
 def test_a_resumed_run_has_the_processes_of_now_with_the_threads_of_its_beginning(tmp_path, now, asked, processes):
     file = tmp_path / "run.partial" / "environment.json"
-    start = partial(Run, "aoa", "", AoaConfig(mix=(0.5,), out=str(tmp_path / "run")), torch.device("cpu"), {})
+    start = partial(Run, "aoa", "", AoaConfig(measured=(0.5,), out=str(tmp_path / "run")), torch.device("cpu"), {})
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(8)

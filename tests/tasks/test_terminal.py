@@ -17,7 +17,7 @@ from samples import write_survey
 
 from swiftwrf.runtime.progress import progress
 from tasks.command import run_command
-from tasks.options import Output
+from tasks.options import General
 from tasks.terminal import Answer, Method, NextStep, Terminal, _Line, terminal
 
 COLUMNS = {"dB": "abs_error_db", "m": "position_error_m"}
@@ -54,7 +54,7 @@ def test_the_short_table_has_seven_rows_with_the_chosen_the_best_and_those_asked
 
 def test_json_is_one_object_and_nothing_else(tmp_path, capsys, found):
     shown = Terminal()
-    with shown.of(Output(json=True)):
+    with shown.of(General(json=True)):
         shown.console.print("a note")
         with shown.progress():
             shown.begin("gp", "gp")
@@ -71,7 +71,7 @@ def test_open_shows_the_report_in_the_browser(tmp_path, monkeypatch, found):
     opened = []
     monkeypatch.setattr("tasks.terminal.webbrowser.open", opened.append)
     shown = Terminal()
-    with shown.of(Output(open=True)):
+    with shown.of(General(open=True)):
         shown.answer(found, tmp_path / "report.html")
     assert opened == [(tmp_path / "report.html").as_uri()]
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import cache
 
 import pytest
+import quick
 import small
 import torch
 from hypothesis import given, settings
@@ -15,6 +16,7 @@ from swiftwrf import AngularGrid, InputError, RssiModel, load, make_model
 from swiftwrf.contrib.online import Follower
 from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.simulated import rssi_room, simulated_room
+from swiftwrf.data.writing import write_spectra
 from swiftwrf.gp import GaussianProcess, Kernel
 from swiftwrf.rssi import FloorAttenuation
 from swiftwrf.runtime import checkpoint
@@ -283,3 +285,11 @@ def test_a_file_without_digests_recognises_what_it_learns_from_now_on(tmp_path):
     model = load(tmp_path / "model").update(data()[N:])
     assert model.is_learnt(data()).tolist() == [False] * N + [True] * M
     assert model.forget(torch.tensor([0, N])).is_learnt(data()).tolist() == [False] * (N + 1) + [True] * (M - 1)
+
+
+def test_spectra_of_a_folder_are_learnt(tmp_path, capsys):
+    fitted("gp").save(tmp_path / "model.safetensors")
+    (tmp_path / "new").mkdir()
+    write_spectra(data().subset(torch.arange(N, N + M)), tmp_path / "new")
+    assert quick.run("update", tmp_path / "model.safetensors", tmp_path / "new", "--out", tmp_path / "updated") == 0
+    assert f"{M} measurements learnt" in capsys.readouterr().out

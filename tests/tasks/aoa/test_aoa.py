@@ -509,11 +509,12 @@ def test_cross_validation_is_that_of_each_field_model(small):
     assert (numbers, data.trainings(None)[-1][1]) == ({0: 0, 300: 3000}, 0)
 
 
-def test_coarray_takes_the_array_from_the_command_line(small, tmp_path):
+def test_coarray_takes_the_array_from_the_file_beside_the_data(small, tmp_path):
     (tmp_path / "data").mkdir()
     write_spectra(replace(small, array=None), tmp_path / "data")
-    turbo = ("--mix", 0.5, "--synthesizer", "coarray", "--data", tmp_path / "data", "--out", tmp_path / "run")
-    assert quick.run("aoa", *turbo, "--extra", 0, "--array", 4, 0.164, 915e6) == 0
+    (tmp_path / "data" / "reading.yaml").write_text("array: [4, 0.164, 915e6]")
+    turbo = ("--measured", 0.5, "--models", "coarray", "--data", tmp_path / "data", "--out", tmp_path / "run")
+    assert quick.run("aoa", *turbo, "--extra", 0) == 0
     model = load(tmp_path / "run" / "coarray-mix0.5.safetensors")
     assert model.synthesize(small.position[:2]).shape == (2, 10, 40)
 

@@ -16,13 +16,12 @@ from swiftwrf import AngularGrid, InputError, load, rssi_room, simulated_room
 from swiftwrf.contrib.comparison.localizers import LOCALIZERS
 from swiftwrf.contrib.comparison.locating import LocateComparison
 from swiftwrf.contrib.comparison.steps import LOCATOR as MODEL
-from swiftwrf.data import ReadOptions
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.locate import MatchedField
 from tasks.locate.page import answer
 from tasks.predict import read_rssi
 from tasks.records import Records
-from tasks.source import aligned
+from tasks.source import Reading, aligned
 
 GRID = AngularGrid.hemisphere(8, 32)
 
@@ -177,13 +176,13 @@ def test_receivers_of_the_model_are_found_by_name(locate_run, capsys):
 
 
 def test_a_table_without_positions(tmp_path):
-    data, is_known = read_rssi(str(write_rssi(tmp_path / "a.csv", rssi_room(n=20), located=False)), ReadOptions())
+    data, is_known = read_rssi(Reading(str(write_rssi(tmp_path / "a.csv", rssi_room(n=20), located=False))))
     assert (len(data), len(data.receiver_names), is_known) == (20, 12, False)
     long = pd.DataFrame({"receiver": ["a", "b", "a"], "time": [1, 1, 2], "rssi": [-50, -60, -55]})
     long.to_csv(tmp_path / "b.csv", index=False)
-    data, is_known = read_rssi(str(tmp_path / "b.csv"), ReadOptions())
+    data, is_known = read_rssi(Reading(str(tmp_path / "b.csv")))
     assert (len(data), is_known) == (2, False)
-    assert read_rssi(str(write_rssi(tmp_path / "c.csv", rssi_room(n=20))), ReadOptions())[1]
+    assert read_rssi(Reading(str(write_rssi(tmp_path / "c.csv", rssi_room(n=20)))))[1]
 
 
 def test_other_rows_are_refused(locate_run, tmp_path, capsys):
@@ -191,8 +190,9 @@ def test_other_rows_are_refused(locate_run, tmp_path, capsys):
     others = write_rssi(tmp_path / "a.csv", replace(data, receiver_names=tuple("abcdefghijkl")))
     assert quick.command("predict", locate_run / MODEL, others, "--out", out) == 2
     assert "has other receivers (a, b" in said(capsys)
-    assert quick.command("predict", locate_run / MODEL, others, "--every", 2, "--out", out) == 2
-    assert "--every is for reading spectra" in said(capsys)
+    (tmp_path / "a.csv.reading.yaml").write_text("every: 2")
+    assert quick.command("predict", locate_run / MODEL, others, "--out", out) == 2
+    assert "takes no every" in said(capsys)
     assert not out.exists()
 
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+from shutil import copytree
 
 import numpy as np
 import pandas as pd
@@ -41,7 +42,9 @@ def folder(tmp_path_factory):
     order = np.random.default_rng(1).permutation(120)
     for part, rows in (("train", order[:96]), ("test", order[96:])):
         (folder / "walk" / f"{part}_index.txt").write_text("\n".join(map(str, rows)))
-    source = ("--rx", "all", "--data", folder / "walk", "--offset-by", "Device=galaxy")
+    copytree(folder / "walk", folder / "unread")
+    (folder / "walk" / "reading.yaml").write_text("offset_by: Device=galaxy")
+    source = ("--rx", "all", "--data", folder / "walk")
     assert quick.run("rssi", *source, "--out", folder / "rssi") == 0
     return folder
 
@@ -75,7 +78,7 @@ def test_what_a_run_of_locate_and_an_inspection_note(folder, capsys):
     assert quick.run("locate", *where, "--out", folder / "locate") == 0
     assert_noted((folder / "locate" / "report.html").read_text())
     capsys.readouterr()
-    assert quick.run("inspect", folder / "walk", "--out", folder / "inspection") == 0
+    assert quick.run("inspect", folder / "unread", "--out", folder / "inspection") == 0
     printed = capsys.readouterr().out
     assert "Split random tests look-up" in printed
     assert "--offset-by Device" in printed
@@ -84,7 +87,8 @@ def test_what_a_run_of_locate_and_an_inspection_note(folder, capsys):
     plain.to_csv(folder / "plain.csv", index=False)
     assert quick.run("inspect", folder / "plain.csv", "--out", folder / "other") == 0
     assert "--offset-by" not in capsys.readouterr().out  # of columns without offsets
-    assert quick.run("rssi", *where[:4], "--offset-by", "Device=nowhere", "--out", folder / "none") == 2
+    (folder / "nowhere.yaml").write_text("offset_by: Device=nowhere")
+    assert quick.run("rssi", *where[:4], "--read", folder / "nowhere.yaml", "--out", folder / "none") == 2
     assert "nowhere" in quick.said(capsys)
 
 

@@ -34,7 +34,7 @@ from swiftwrf.rssi.coverage import reach
 from swiftwrf.rssi.maps import RssiMap
 from tasks.configs import LocateConfig
 from tasks.convert import saved_model
-from tasks.options import plain
+from tasks.options import by_name
 from tasks.page.maps import FloorPlan, colour_image
 from tasks.update.record import Record, snapshot
 from tasks.view import charts, spectra
@@ -393,7 +393,7 @@ def test_view_of_a_run_of_locate(located_floor, tmp_path):
     folder.mkdir()
     locator.save(folder / "locator.safetensors")
     read = load_rssi(tmp_path / "survey.csv")
-    config = {"task": "locate", "config": plain(LocateConfig(data=str(tmp_path / "survey.csv")))}
+    config = {"task": "locate", "config": by_name(LocateConfig(data=str(tmp_path / "survey.csv")))}
     (folder / "config.json").write_text(json.dumps(config))
     (folder / "environment.json").write_text(json.dumps({"input_sha256": dict(read.source)}))
     view = open_source(folder)
