@@ -10,10 +10,12 @@ from augment import suggest
 from augment.choices import fraction_key
 from augment.turbo.experiment import Experiment
 from augment.turbo.learning import learn
-from swiftwrf import Spectra, make_model, simulated_room
+from swiftwrf import InputError, Spectra, make_model, simulated_room
 from swiftwrf.contrib.raytraced import sionna
 from swiftwrf.contrib.raytraced.names import RAYTRACE
 from swiftwrf.data.files import sha256
+from swiftwrf.data.formats.stations import station_names
+from swiftwrf.errors import listed
 from swiftwrf.metrics import angle_errors
 from swiftwrf.models import FieldModel
 from tasks.aoa.page import page
@@ -88,8 +90,16 @@ def measurements(config: AoaConfig) -> Spectra:
     """Return the spectra of a run.
 
     Raises:
-        InputError: The data cannot be read.
+        InputError: The data cannot be read, or are those of several stations.
     """
     if config.data is None:
         return simulated_room(seed=config.seed, moving=config.moving or "transmitter")
-    return reading(config, config.data).spectra()
+    how = reading(config, config.data)
+    folder = Path(how.source)
+    if how.options.station is None and len(names := station_names(folder, how.options)) > 1:
+        one = f"--data {folder / names[0]}" if (folder / names[0]).is_dir() else "station: 1 in a file for --read"
+        raise InputError(
+            f"{folder} has several stations ({listed(names)}); swiftwrf locate --data {folder} estimates positions, and "
+            f"directions at each, by all of them. For one station give {one}"
+        )
+    return how.spectra()
