@@ -112,6 +112,21 @@ def locating_spectra() -> str:
     return markdown(["scene", "measured", "random choices", "position [m]", "80 % regions hold"], rows)
 
 
+def stations() -> str:
+    """Return position errors by several stations, by the best single one, and of the baselines, medians over the draws."""
+    rows = []
+    for name in ("stations", "stations_rooms"):
+        for scene, entry in load(name).get("scenes", {}).items():
+            found, n = entry["median"], len(entry["draws"])
+            methods = {"best": found["best_station_m"], **found["position_m"]}
+            kinds = ("best", "knn", "triangulation", "triangulation_matched", "posterior")
+            cells = [f"{methods[kind]['median']:.3f} / {methods[kind]['p90']:.2f}" for kind in kinds]
+            rows.append([scene, str(n), *cells, f"{found['coverage_80']:.0%}", f"{found['locate_ratio']:.1f}"])
+    heads = ["scene", "random choices", "best single array [m]", "nearest spectra of all [m]", "triangulation of peaks [m]"]
+    heads += ["triangulation of matched fields [m]", "all three arrays [m]", "80 % regions hold", "time of one array"]
+    return markdown(heads, rows)
+
+
 def best_other(row: dict[str, Any]) -> tuple[str, float]:
     """Return the estimator of smallest median error beside matched-field processing, and this error [deg]."""
     ending = "_angle_deg"
