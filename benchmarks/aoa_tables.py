@@ -122,7 +122,13 @@ def stations() -> str:
             kinds = ("best", "knn", "triangulation", "triangulation_matched", "posterior")
             cells = [f"{methods[kind]['median']:.3f} / {methods[kind]['p90']:.2f}" for kind in kinds]
             rows.append([scene, str(n), *cells, f"{found['coverage_80']:.0%}", f"{found['locate_ratio']:.1f}"])
-    heads = ["scene", "random choices", "best single array [m]", "nearest spectra of all [m]", "triangulation of peaks [m]"]
+    heads = [
+        "scene",
+        "random choices",
+        "best single array [m]",
+        "nearest spectra of all [m]",
+        "triangulation of peaks [m]",
+    ]
     heads += ["triangulation of matched fields [m]", "all three arrays [m]", "80 % regions hold", "time of one array"]
     return markdown(heads, rows)
 

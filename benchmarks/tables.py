@@ -154,13 +154,14 @@ def _options(config: type[Any]) -> dict[str, str]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         actions = tyro.extras.get_parser(config)._actions
-    return {
-        f"--{action.option_strings[-1].lstrip('-').rpartition('.')[2]}": " ".join(str(action.help).split()).replace(
-            "%%", "%"
-        )
-        for action in actions
-        if action.option_strings and action.option_strings[0].startswith("--")
-    }
+    found = {}
+    for action in actions:
+        # of a flag, the option that sets it
+        names = [name for name in action.option_strings if name.startswith("--") and not name.startswith("--no-")]
+        if names:
+            name = names[-1].lstrip("-").rpartition(".")[2]
+            found[f"--{name}"] = " ".join(str(action.help).split()).replace("%%", "%")
+    return found
 
 
 def read_options() -> str:

@@ -204,8 +204,8 @@ def solve(
 def _site(mean: Tensor, variance: Tensor, limit: Tensor, noise: Tensor, censored: tuple[float, float]) -> Tensor:
     """Return precision and precision times value, (2, n), that match the likelihood of empty cells; 0 if not concave.
 
-    With the derivatives d and e < 0 of the log-likelihood by the mean m of a power of variance v, the precision is
-    -e / (1 + e v), and precision times value is (d - m e) / (1 + e v).
+    The log-likelihood has the derivatives d and e < 0 by the mean m of a power of variance v. The precision is
+    -e / (1 + e v). Precision times value is (d - m e) / (1 + e v).
 
     Args:
         mean: Mean of each power by all others (n,) [dB].

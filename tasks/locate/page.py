@@ -62,7 +62,6 @@ def page(runs: list[Records]) -> Page:
     sections = [
         sections_of("Where was it?", runs, lambda run: _posteriors(run, several=len(runs) > 1)),
         sections_of("Errors", runs, lambda run: _errors(run, answers[run]), labels.meanings(LOCALIZERS)),
-        sections_of("Directions at each station", runs, _directions),
         sections_of("How sure is it?", runs, lambda run: Section("", plots=[_calibration(run)])),
         limits(runs[0], *(LIMITS if runs[0].metrics["received_by"] == "receiver" else LIMITS_OF_STATIONS)),
     ]
@@ -91,7 +90,7 @@ def _summary(run: Records, found: Answer) -> Summary:
 
 def _errors(run: Records, found: Answer) -> Section:
     n_undetected = run.metrics.get("n_undetected", 0)
-    return errors_section(
+    section = errors_section(
         found,
         run.table("errors")[COLUMNS],
         COLOURS,
@@ -101,12 +100,13 @@ def _errors(run: Records, found: Answer) -> Section:
         "test places.",
         paragraphs=[f"Test rows that no receiver detected are left out: {n_undetected}."] if n_undetected else [],
     )
+    if run.metrics["received_by"] == "station":
+        section.parts.append(_directions(run))
+    return section
 
 
-def _directions(run: Records) -> Section | None:
-    """Return the angular errors at each station, None for data without arrays."""
-    if run.metrics["received_by"] != "station":
-        return None
+def _directions(run: Records) -> Section:
+    """Return the angular errors at each station."""
     table = run.table("directions")
     rows = [
         [str(name), str(count), *(f"{value:.2f}" for value in values)]
@@ -116,7 +116,7 @@ def _directions(run: Records) -> Section | None:
     text = (
         "Median angular errors of the direction of the transmitter. A position found by all stations determines each."
     )
-    return Section("", paragraphs=[text], tables=[Table(heads, rows)])
+    return Section("Directions at each station", paragraphs=[text], tables=[Table(heads, rows)])
 
 
 def _suggestion(run: Records) -> Section | None:

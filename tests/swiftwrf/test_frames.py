@@ -352,6 +352,7 @@ OF_CHANNELS = {
 }
 # they hold or return rows as these are given, positions, or whether data have what a model needs
 OF_NO_FRAME = {
+    swiftwrf.Stations,
     augment.choose.Fold,
     rssi.RssiComparison,
     locate.LocateComparison,

@@ -158,7 +158,7 @@ def of_locate():
     radius = torch.tensor([[1.05, 3.05, 9.05]]).expand(100, 3)
     values["posterior"] |= {"radius": radius, "ambiguous": torch.arange(100) < 10, "weights": {"values": 0.5}}
     options = {"split": "random", "n_cells": 300, "seed": 0}
-    return LocateComparison(test.subset(torch.arange(40)), test, values, options, 3, Rings())
+    return LocateComparison(test.subset(torch.arange(40)), test, values, options, locator=Rings(), n_undetected=3)
 
 
 @pytest.fixture(scope="module")

@@ -149,7 +149,7 @@ def features(data: Stations, max_azimuths: int = 60) -> NDArray[np.float64]:
     Example:
         >>> import swiftwrf
         >>> features(swiftwrf.simulated_stations(n=10, stations=2)).shape
-        (10, 7200)
+        (10, 1800)
     """
     parts = []
     for name in data.names:

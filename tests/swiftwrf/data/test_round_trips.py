@@ -1,4 +1,4 @@
-"""What is written is read back: samples of every format from the toolkit's own layout, and any measurements."""
+"""Written data are read back: samples of every format from the toolkit's own layout, and any measurements."""
 
 import zipfile
 from dataclasses import fields, replace

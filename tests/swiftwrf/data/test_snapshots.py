@@ -84,7 +84,7 @@ def test_an_array_is_turned_by_its_normal_and_its_upper_side(tmp_path):
 
 def test_what_does_not_apply_is_refused(tmp_path):
     folder = write_snapshots(tmp_path / "a")
-    with pytest.raises(InputError, match="takes no station"):
+    with pytest.raises(InputError, match="holds one array; leave station out"):
         load_spectra(folder, station=1)
     with pytest.raises(InputError, match="unknown beamformer"):
         load_spectra(folder, beamformer="music")

@@ -306,7 +306,7 @@ def test_spectra_at_one_position_are_held_out_together():
     train = simulated_room(n=24, seed=3, grid=AngularGrid.hemisphere(15, 60))
     twice = train.subset(torch.arange(len(train)).repeat_interleave(2))
     room = GeometryModel.of_planes(train, ROOM)
-    once, repeated = (MatchedField(**COARSEST).fit(some, room=room).likelihoods for some in (train, twice))
+    once, repeated = (MatchedField(**COARSEST).fit(some, room=room).likelihoods[0] for some in (train, twice))
     # errors of path gains that follow the position, which a spectrum at the same position would lower
     assert repeated.coarray[1].scale.trace() == pytest.approx(float(once.coarray[1].scale.trace()), rel=0.1)
 
@@ -316,8 +316,8 @@ def test_spectra_at_one_position_are_held_out_together():
     [
         ("weight", -1.0, "weight must be at least 0"),
         ("weight", 1e30, "weight must be at most 1000"),
-        ("likelihoods.gains.process.value", 3.4e38, "no candidate position has a finite likelihood"),
-        ("likelihoods.coarray.0.scale", -1.0, "of no distribution"),
+        ("likelihoods.0.gains.process.value", 3.4e38, "no candidate position has a finite likelihood"),
+        ("likelihoods.0.coarray.0.scale", -1.0, "of no distribution"),
     ],
 )
 def test_a_locator_whose_numbers_overflow_is_refused(closed_form, name, value, says):

@@ -171,7 +171,7 @@ class TestTriangulation:
         assert found.allclose(data.position, atol=1e-4)
 
     def test_least_squares(self):
-        """As numpy's solution of the stacked equations of all lines."""
+        """The result is numpy's solution of the stacked equations of all lines."""
         data = simulated_stations(n=5, stations=3, grid=GRID)
         origin, line = bearings(data, peak_directions(data))
         start = torch.tensor([4.0, 3.0, 1.0])

@@ -186,7 +186,7 @@ def test_unknown_positions_of_receivers_are_not_compared(tmp_path):
     ("model", "last_step"),
     [
         (make_model("coarray"), "_fit_spread"),
-        (RssiModel(), "_set_posterior"),
+        (RssiModel(), "_calibrate"),
         (RssiLocator(n_cells=50), "_calibrate"),
         (MatchedField(**COARSEST), "_calibrate"),
     ],

@@ -191,9 +191,9 @@ def test_the_summary_begins_with_the_estimator_that_cross_validation_chose(aoa_r
 
 def test_the_preset_of_the_paper_has_its_fractions_and_no_further_positions():
     paper = AoaConfig(preset="paper")
-    assert (paper.mix, paper.extra) == ((0.1, 0.3, 0.5, 0.7), 0)
+    assert (paper.measured, paper.extra) == ((0.1, 0.3, 0.5, 0.7), 0)
     given = AoaConfig(measured=(0.2,), preset="paper", extra=9)
-    assert (given.mix, given.extra) == ((0.2,), 9)
+    assert (given.measured, given.extra) == ((0.2,), 9)
     assert AoaConfig(measured=(0.3,)).extra is None
 
 

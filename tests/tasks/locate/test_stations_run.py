@@ -1,4 +1,4 @@
-"""A comparison by several stations: what it says is what its estimates and the truth give."""
+"""A comparison by several stations: its numbers are those of its estimates and the truth."""
 
 import json
 
