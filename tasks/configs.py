@@ -9,7 +9,7 @@ import tyro
 from annotated_types import Ge, Gt, Le, Lt
 
 from augment.choices import AUTO, MAX_SUGGESTIONS, fraction_key
-from swiftwrf.choices import CARRIERS_HZ, FIELD_MODELS, RSSI_PREDICTORS, Moving, NotDetected
+from swiftwrf.choices import CARRIERS_HZ, FIELD_MODELS, RSSI_PREDICTORS, CalibrationPart, Moving, NotDetected
 from swiftwrf.contrib.raytraced.names import RAYTRACE, ROOMS, SCENE_FILE, check_scene
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.validation import Fraction, NonNegativeInt, PositiveFloat, PositiveInt, Preset
@@ -300,9 +300,9 @@ class ConvertConfig(Options):
     out: Annotated[str, tyro.conf.Positional]
     """directory to write, or file: .csv, .mat, and of RSSI maps .tif (GeoTIFF), .geojson, .png (with a world file); must
     not exist"""
-    calibrate: bool = False
-    """whether to estimate the elements' phases and the array's orientation from the training positions of array snapshots,
-    and to correct them"""
+    calibrate: tuple[CalibrationPart, ...] | None = None
+    """estimate these from the training positions of array snapshots, and correct them: phases of the elements, orientation
+    and position of the array (without a word: phases orientation)"""
     split: str | None = None
     """with --calibrate: split whose training part is used (default: random); it is written beside the spectra"""
     seed: Seed = 0
@@ -327,11 +327,11 @@ class ConvertConfig(Options):
 
     def check(self) -> None:
         super().check()
-        if (self.split is not None or self.seed) and not self.calibrate:
+        if (self.split is not None or self.seed) and self.calibrate is None:
             raise InputError("--split and --seed are of the calibration; give --calibrate, too")
         if self.deepmimo and self.suffix:
             raise InputError(f"--deepmimo writes a folder; give a directory instead of {self.out}")
-        if self.calibrate and (self.suffix or self.deepmimo):
+        if self.calibrate is not None and (self.suffix or self.deepmimo):
             raise InputError("--calibrate writes a directory in the toolkit's own layout; give another OUT")
 
 

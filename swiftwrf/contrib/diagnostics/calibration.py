@@ -12,8 +12,9 @@ phases. Positions without a clear direct path lose their weight.
 
 Standard errors come from a block jackknife over neighbourhoods, because multipath errors of neighbouring positions are
 correlated (J. W. Tukey, Ann. Math. Statist. 29, 1958). They do not include bias from a reflection common to all positions,
-e.g. the floor, which can be one to two standard errors. What the data do not determine is refused: the rotation of a linear
-array about its axis, any rotation if all positions lie in a narrow cone, or a shift if all of them are far away.
+e.g. the floor, which can be one to two standard errors, and of a position five. What the data do not determine is refused:
+the rotation of a linear array about its axis, any rotation if all positions lie in a narrow cone, or a shift if all of them
+are far away.
 """
 
 from __future__ import annotations
@@ -153,7 +154,9 @@ def calibrate(train: Snapshots, estimate: Sequence[CalibrationPart] = PHASES_AND
     free = torch.tensor(
         [False, *["phases" in estimate] * (k - 1), *["orientation" in estimate] * 3, *["position" in estimate] * 3]
     )
-    problem = _Problem(seen.array, *pose, free, seen.position, received, strongest)
+    # in the simulated office, weights that are not sharp lower the errors of single parts and of positions by 3 to 33 %
+    sharp = {*estimate} == {*PHASES_AND_ORIENTATION}
+    problem = _Problem(seen.array, *pose, free, seen.position, received, strongest, sharp)
     start, near = problem.scan(), float(seen.away.norm(dim=1).min()) < seen.array.far_field_m
     waves = [problem, replace(problem, curved=True)] if near else [problem]
     fits = [(each, each.descend(start)) for each in waves]
@@ -247,7 +250,8 @@ class _Problem:
     """Covariances of the phases at positions (n, 3) of the transmitter, and the declared pose of the array.
 
     Covariances (n, K, K) have the principal eigenvectors (n, K). Of K phases, a rotation vector and a shift, `free` (K + 6,)
-    are estimated. Waves are plane, or spheres if `curved`.
+    are estimated. Waves are plane, or spheres if `curved`. Sharp weights favour positions with little reflected power. Errors
+    are smaller where noise dominates, but reflections in phase with the direct path bias them.
     """
 
     array: PlanarArray
@@ -257,6 +261,7 @@ class _Problem:
     position: Tensor
     covariance: Tensor
     strongest: Tensor
+    sharp: bool
     curved: bool = False
 
     def subset(self, rows: Tensor) -> _Problem:
@@ -311,8 +316,10 @@ class _Problem:
         jacobian = jacobian - jacobian.mean(dim=1, keepdim=True)  # the phase of the whole is free
         residual = residual - residual.mean(dim=1, keepdim=True)
         share = self.shares(found)
-        # phases err in proportion to the fraction 1 - share of the power that does not arrive along the direct path
-        weight = (share / CLEAR_SHARE).clamp(0, 1) ** 4 / (1.02 - share) ** 2
+        weight = (share / CLEAR_SHARE).clamp(0, 1) ** 4
+        if self.sharp:
+            # phases err in proportion to the fraction 1 - share of the power that does not arrive along the direct path
+            weight = weight / (1.02 - share) ** 2
         weighted = weight[:, None, None] * jacobian
         return torch.einsum("nkp,nkq->pq", weighted, jacobian), torch.einsum("nkp,nk->p", weighted, residual)
 
@@ -344,7 +351,8 @@ class _Problem:
             slope = direction - functional.normalize(away[:, None] - element, dim=-1)
         else:
             slope = (element - direction * (direction @ element.T).mT) / distance
-        return math.tau / self.array.wavelength * slope
+        gradient: Tensor = math.tau / self.array.wavelength * slope
+        return gradient
 
     def standard_errors(self, found: _Found) -> _Found:
         """Return the jackknife standard errors, infinite where something is not identifiable."""
