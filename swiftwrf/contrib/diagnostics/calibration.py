@@ -250,8 +250,8 @@ class _Problem:
     """Covariances of the phases at positions (n, 3) of the transmitter, and the declared pose of the array.
 
     Covariances (n, K, K) have the principal eigenvectors (n, K). Of K phases, a rotation vector and a shift, `free` (K + 6,)
-    are estimated. Waves are plane, or spheres if `curved`. Sharp weights favour positions with little reflected power. Errors
-    are smaller where noise dominates, but reflections in phase with the direct path bias them.
+    are estimated. Waves are plane, or spheres if `curved`. Sharp weights fall with the power of reflections. They are better
+    against noise, but reflections in phase with the direct path bias them.
     """
 
     array: PlanarArray
