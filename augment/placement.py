@@ -14,6 +14,7 @@ from augment.choices import MAX_STATIONS
 from swiftwrf import ArrayPose, InputError, MatchedField
 from swiftwrf.locate.matched_field import MatchedFieldConfig
 from swiftwrf.models.geometry import GeometryModel, Plane
+from swiftwrf.runtime.validation import PositiveInt, checked
 
 N_BOOTSTRAP = 500  # samples of positions that determine standard errors
 FEW_CELLS = MatchedFieldConfig(spacing=0.25, max_cells=20_000, n_best=100, n_background=30)
@@ -38,17 +39,23 @@ class StationSuggestion:
     position: Tensor
 
     @property
+    def normal(self) -> Tensor:
+        """Unit vectors that the arrays face, (n, 3)."""
+        return torch.stack([pose.rotation[:, 2] for pose in self.pose])
+
+    @property
     def before_m(self) -> float:
         """Expected median position error of the existing arrays alone [m]."""
         return float(self.error_m[0] + self.gain_m[0])
 
 
+@checked
 def suggest_station(
     locator: MatchedField,
-    count: int = 1,
+    count: PositiveInt = 1,
     candidates: Sequence[ArrayPose] | None = None,
     *,
-    n_positions: int = 100,
+    n_positions: PositiveInt = 80,
     config: MatchedFieldConfig = FEW_CELLS,
     seed: int = 0,
 ) -> StationSuggestion:
@@ -83,8 +90,8 @@ def suggest_station(
     like = _most_weighted(locator)
     own = {name: (name, room) for name, room in locator.rooms.items()}
     room = locator.rooms[like]
-    if not 1 <= count <= MAX_STATIONS:
-        raise InputError(f"between 1 and {MAX_STATIONS} poses of an array can be suggested, not {count}")
+    if count > MAX_STATIONS:
+        raise InputError(f"at most {MAX_STATIONS} poses of an array can be suggested, not {count}")
     poses = wall_poses(locator, count) if candidates is None else list(candidates)
     if len(poses) < count:
         raise InputError(f"{count} poses cannot be chosen among {len(poses)} candidates; give more")

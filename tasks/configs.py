@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 from annotated_types import Ge, Gt, Le, Lt
 
-from augment.choices import AUTO, MAX_SUGGESTIONS, fraction_key
+from augment.choices import AUTO, MAX_STATIONS, MAX_SUGGESTIONS, fraction_key
 from swiftwrf.choices import CARRIERS_HZ, FIELD_MODELS, RSSI_PREDICTORS, CalibrationPart, Moving, NotDetected
 from swiftwrf.contrib.raytraced.names import RAYTRACE, ROOMS, SCENE_FILE, check_scene
 from swiftwrf.errors import InputError
@@ -203,7 +203,8 @@ class LocateConfig(Options):
     cells: Annotated[int, Ge(10), Le(1_000_000)] = 4000
     """number of candidate positions of the posterior"""
     suggest: Annotated[int, Ge(0), Le(MAX_SUGGESTIONS)] = 0
-    """number of positions to measure next that are suggested: where position errors are large and radio maps uncertain"""
+    """number of positions to measure next that are suggested: where position errors are large and radio maps uncertain; of
+    several antenna arrays, number of poses of a next array (at most 24)"""
     scheduler: str | None = None
     """address of a Dask scheduler whose workers compute the steps (extra: cluster)"""
     seed: Seed = 0
@@ -218,8 +219,19 @@ class LocateConfig(Options):
         self.table.check_used(self.data)
         if self.stations and self.data is not None:
             raise InputError("--stations is for the built-in office; with --data the data determine the stations")
-        if self.stations and (self.rx != ("all",) or self.suggest):
-            raise InputError("--rx and --suggest are for RSSI; leave them out with --stations")
+        if self.stations and self.rx != ("all",):
+            raise InputError("--rx is for RSSI; leave it out with --stations")
+        if self.stations:
+            self.check_stations()
+
+    def check_stations(self) -> None:
+        """Refuse options that do not apply to several arrays.
+
+        Raises:
+            InputError: More poses of a next array than are compared.
+        """
+        if self.suggest > MAX_STATIONS:
+            raise InputError(f"--suggest takes at most {MAX_STATIONS} poses of a next array, got {self.suggest}")
 
 
 @options

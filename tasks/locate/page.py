@@ -16,6 +16,7 @@ from swiftwrf.contrib.comparison.localizers import LOCALIZERS
 from swiftwrf.metrics import LEVEL
 from swiftwrf.plotting import corners_of
 from tasks import labels
+from tasks.locate.placement import poses_section
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table, number, provenance, sections_of
 from tasks.page.shared import (
@@ -67,7 +68,10 @@ def page(runs: list[Records]) -> Page:
         limits(runs[0], *(LIMITS if runs[0].metrics["received_by"] == "receiver" else LIMITS_OF_STATIONS)),
     ]
     if any(run.arrays(SUGGESTED) for run in runs):
-        sections.insert(-1, sections_of("Where to measure next", runs, _suggestion))
+        title = (
+            "Where to measure next" if runs[0].metrics["received_by"] == "receiver" else "Where the next array belongs"
+        )
+        sections.insert(-1, sections_of(title, runs, _suggestion))
     names = ", ".join(dict.fromkeys(run.place for run in runs))
     if len(runs) == 1:
         first = _summary(runs[0], answers[runs[0]])
@@ -120,6 +124,8 @@ def _directions(run: Records) -> Section | None:
 
 
 def _suggestion(run: Records) -> Section | None:
+    if run.metrics["received_by"] == "station":
+        return poses_section(run.arrays(SUGGESTED), SUGGESTED, run.file_name)
     return suggestion_section(
         "",
         run.arrays(SUGGESTED),
