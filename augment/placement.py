@@ -100,7 +100,8 @@ def suggest_station(
     def errors(pose: ArrayPose | None) -> Tensor:
         added = {} if pose is None else {"": (like, _placed(room, pose))}
         posterior = locator.elsewhere(own | added, config).located_samples(position, seed)
-        return (posterior.median - position).norm(dim=1)
+        error: Tensor = (posterior.median - position).norm(dim=1)
+        return error
 
     before, after = errors(None), torch.stack([errors(pose) for pose in poses])
     drawn = torch.randint(n_positions, (N_BOOTSTRAP, n_positions), generator=torch.Generator().manual_seed(seed))

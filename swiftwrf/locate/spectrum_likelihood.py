@@ -207,7 +207,8 @@ class PhaseLikelihood:
         power = spread + mean.abs().square().mean(dim=(1, 2))
         k = mean.shape[2]
         root = torch.linalg.cholesky(self._diffuse * self._isotropic + self._floor * torch.eye(k))
-        return mean + change + power.sqrt()[:, None, None] * (complex_normal(*mean.shape) @ root.T)
+        channel: Tensor = mean + change + power.sqrt()[:, None, None] * (complex_normal(*mean.shape) @ root.T)
+        return channel
 
     def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
         """Return log-likelihoods (m,) of m observations at m candidates, up to a constant of each observation."""
