@@ -6,7 +6,7 @@ from pathlib import Path
 
 from augment.placement import suggest_station
 from augment.suggest import suggest_positions
-from swiftwrf import Rssi, Stations, rssi_room, simulated_stations
+from swiftwrf import InputError, Rssi, Stations, rssi_room, simulated_stations
 from swiftwrf.contrib.comparison.locating import LocateComparison, PositionComparison, compare
 from swiftwrf.contrib.comparison.stations import StationsComparison, compare_stations
 from swiftwrf.data.coordinates import degree_columns
@@ -78,7 +78,11 @@ def _place(result: StationsComparison, config: LocateConfig, directory: Run) -> 
     """Write the poses of a next array that lower the position error most, and print the best."""
     if not config.suggest or result.locator is None:
         return
-    found = suggest_station(result.locator, config.suggest, seed=config.seed)
+    try:
+        found = suggest_station(result.locator, config.suggest, seed=config.seed)
+    except InputError as error:
+        console.print(f"no pose of a next array: {error}")
+        return
     write_poses(directory.path(SUGGESTED), result.train.position, found)
     best, normal = found.pose[0], found.normal[0].tolist()
     console.print(
