@@ -5,8 +5,9 @@ import pandas as pd
 import pytest
 import quick
 import torch
+from small import known_planes
 
-from augment.placement import suggest_station, wall_poses
+from augment.placement import StationSuggestion, suggest_station, wall_poses
 from swiftwrf import AngularGrid, ArrayPose, InputError, MatchedField, Spectra, Stations, simulated_stations
 from swiftwrf.array.beamforming import unit_phasor
 from swiftwrf.array.planar import PlanarArray
@@ -14,6 +15,7 @@ from swiftwrf.data.simulated import OFFICE, simulated_channel
 from swiftwrf.data.spectra import array_spectra
 from swiftwrf.locate.matched_field import MatchedFieldConfig
 from swiftwrf.models.geometry import GeometryModel, Plane
+from tasks.locate.placement import poses_section, write_poses
 
 GRID = AngularGrid.hemisphere(15, 60)
 WALLS = [
@@ -112,9 +114,27 @@ def test_the_suggested_pose_is_no_worse_than_the_median_one(office, locator):
     assert errors[candidates.index(found.pose[0])] <= np.median(errors)
 
 
+def test_files_and_section_of_poses(tmp_path):
+    poses = ArrayPose.facing((4.0, 0.1, 1.9), (0, 1, 0)), ArrayPose.facing((0.1, 3.0, 1.9), (1, 0, 0))
+    error, gain, std = torch.tensor([0.2, 0.3]), torch.tensor([0.15, 0.05]), torch.tensor([0.02, 0.03])
+    found = StationSuggestion(poses, error, gain, std, torch.tensor([[7.9, 3.0, 1.9]]))
+    write_poses(tmp_path / "suggested", torch.rand(9, 3), found)
+    table = pd.read_csv(tmp_path / "suggested.csv")
+    assert table[["x_m", "y_m", "z_m"]].to_numpy() == pytest.approx(np.array([[4.0, 0.1, 1.9], [0.1, 3.0, 1.9]]))
+    assert table[["facing_x", "facing_y", "facing_z"]].to_numpy() == pytest.approx(np.eye(3)[[1, 0]], abs=1e-6)
+    assert table.filter(like="orientation").to_numpy() == pytest.approx(np.array([pose.orientation for pose in poses]))
+    with np.load(tmp_path / "suggested.npz") as arrays:
+        section = poses_section(arrays, "suggested", "run")
+    assert "by 0.150 m (standard error 0.020 m) from 0.350 m" in section.paragraphs[0]
+    assert [row[0] for row in section.tables[0].rows] == ["1", "2"]
+    assert poses_section({}, "suggested", "run") is None
+
+
 @pytest.mark.long
-def test_poses_of_a_run(tmp_path):
+def test_poses_of_a_run(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(quick, "known_planes", lambda: known_planes(*WALLS))
     assert quick.run("locate", "--stations", 2, "--suggest", 2, "--out", tmp_path / "run") == 0
+    assert "a next array at (" in capsys.readouterr().err
     table = pd.read_csv(tmp_path / "run" / "suggested.csv")
     assert len(table) == 2
     assert table["expected_error_m"].is_monotonic_increasing
