@@ -67,11 +67,8 @@ def page(runs: list[Records]) -> Page:
         sections_of("How sure is it?", runs, lambda run: Section("", plots=[_calibration(run)])),
         limits(runs[0], *(LIMITS if runs[0].metrics["received_by"] == "receiver" else LIMITS_OF_STATIONS)),
     ]
-    if any(run.arrays(SUGGESTED) for run in runs):
-        title = (
-            "Where to measure next" if runs[0].metrics["received_by"] == "receiver" else "Where the next array belongs"
-        )
-        sections.insert(-1, sections_of(title, runs, _suggestion))
+    if runs[0].metrics["received_by"] == "receiver" and any(run.arrays(SUGGESTED) for run in runs):
+        sections.insert(-1, sections_of("Where to measure next", runs, _suggestion))
     names = ", ".join(dict.fromkeys(run.place for run in runs))
     if len(runs) == 1:
         first = _summary(runs[0], answers[runs[0]])
@@ -108,7 +105,7 @@ def _errors(run: Records, found: Answer) -> Section:
 
 
 def _directions(run: Records) -> Section | None:
-    """Return the angular errors at each station, None for data without arrays."""
+    """Return the angular errors at each station and poses of a next one, None for data without arrays."""
     if run.metrics["received_by"] != "station":
         return None
     table = run.table("directions")
@@ -120,12 +117,11 @@ def _directions(run: Records) -> Section | None:
     text = (
         "Median angular errors of the direction of the transmitter. A position found by all stations determines each."
     )
-    return Section("", paragraphs=[text], tables=[Table(heads, rows)])
+    poses = poses_section(run.arrays(SUGGESTED), SUGGESTED, run.file_name)
+    return Section("", paragraphs=[text], tables=[Table(heads, rows)], parts=[poses] if poses else [])
 
 
 def _suggestion(run: Records) -> Section | None:
-    if run.metrics["received_by"] == "station":
-        return poses_section(run.arrays(SUGGESTED), SUGGESTED, run.file_name)
     return suggestion_section(
         "",
         run.arrays(SUGGESTED),

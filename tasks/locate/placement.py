@@ -84,4 +84,4 @@ def poses_section(arrays: Mapping[str, NDArray[Any]], table: str, name: str) -> 
     heads += ["expected error [m]", "gain [m]", "standard error [m]"]
     caption = "Suggested poses of a further array in plan, numbered by rank. Arrows show where they face."
     plot = Plot(f"suggested-{name}", [figure], caption, _table(arrays))
-    return Section("", [text], plots=[plot], tables=[Table(heads, rows)])
+    return Section("Where the next array belongs", [text], plots=[plot], tables=[Table(heads, rows)])
