@@ -1,5 +1,7 @@
 """Where the next array belongs: poses on the walls, expected errors, and the truth in the simulated office."""
 
+from functools import partial
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -130,9 +132,10 @@ def test_files_and_section_of_poses(tmp_path):
     assert poses_section({}, "suggested", "run") is None
 
 
-@pytest.mark.long
 def test_poses_of_a_run(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(quick, "known_planes", lambda: known_planes(*WALLS))
+    short = partial(suggest_station, n_positions=8, config=TINY)
+    monkeypatch.setattr("tasks.locate.experiment.suggest_station", short)
     assert quick.run("locate", "--stations", 2, "--suggest", 2, "--out", tmp_path / "run") == 0
     assert "a next array at (" in capsys.readouterr().err
     table = pd.read_csv(tmp_path / "run" / "suggested.csv")
