@@ -2,6 +2,7 @@
 
 AUTO = "auto"  # the field model that cross-validation chooses
 MAX_SUGGESTIONS = 500  # positions to measure next
+MAX_STATIONS = 24  # poses of a next array
 
 
 def fraction_key(fraction: float) -> str:

@@ -11,6 +11,8 @@ from swiftwrf.runtime.registry import Registry
 
 Moving = Literal["transmitter", "receiver"]
 NotDetected = Literal["auto", "weak", "unknown"]  # meaning of an empty cell of RSSI
+CalibrationPart = Literal["phases", "orientation", "position"]
+PHASES_AND_ORIENTATION: tuple[CalibrationPart, ...] = ("phases", "orientation")
 CARRIERS_HZ = (1e6, 1e13)
 
 FIELD_MODELS: Registry[Any] = Registry(

@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 import tyro
 from annotated_types import Ge, Gt, Le, Lt
 
-from augment.choices import AUTO, MAX_SUGGESTIONS, fraction_key
-from swiftwrf.choices import CARRIERS_HZ, FIELD_MODELS, RSSI_PREDICTORS, Moving, NotDetected
+from augment.choices import AUTO, MAX_STATIONS, MAX_SUGGESTIONS, fraction_key
+from swiftwrf.choices import CARRIERS_HZ, FIELD_MODELS, RSSI_PREDICTORS, CalibrationPart, Moving, NotDetected
 from swiftwrf.contrib.raytraced.names import RAYTRACE, ROOMS, SCENE_FILE, check_scene
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.validation import Fraction, NonNegativeInt, PositiveFloat, PositiveInt, Preset
@@ -184,7 +184,8 @@ class LocateConfig(ReadingConfig):
     cells: Annotated[int, Ge(10), Le(1_000_000)] = 4000
     """number of candidate positions of the posterior"""
     suggest: Annotated[int, Ge(0), Le(MAX_SUGGESTIONS)] = 0
-    """number of positions to measure next that are suggested: where position errors are large and radio maps uncertain"""
+    """number of positions to measure next that are suggested: where position errors are large and radio maps uncertain; of
+    several antenna arrays, number of poses of a next array (at most 24)"""
     scheduler: str | None = None
     """address of a Dask scheduler whose workers compute the steps (extra: cluster)"""
     seed: Seed = 0
@@ -197,8 +198,19 @@ class LocateConfig(ReadingConfig):
         self.check_read()
         if self.stations and self.data is not None:
             raise InputError("--stations is for the built-in office; with --data the data determine the stations")
-        if self.stations and (self.receivers != ("all",) or self.suggest):
-            raise InputError("--receivers and --suggest are for RSSI; leave them out with --stations")
+        if self.stations and self.receivers != ("all",):
+            raise InputError("--receivers is for RSSI; leave it out with --stations")
+        if self.stations:
+            self.check_stations()
+
+    def check_stations(self) -> None:
+        """Refuse options that do not apply to several arrays.
+
+        Raises:
+            InputError: More poses of a next array than are compared.
+        """
+        if self.suggest > MAX_STATIONS:
+            raise InputError(f"--suggest takes at most {MAX_STATIONS} poses of a next array, got {self.suggest}")
 
 
 @options
@@ -274,9 +286,9 @@ class ConvertConfig(FindingConfig):
     out: Annotated[str, tyro.conf.Positional]
     """directory to write, or file: .csv, .mat, and of RSSI maps .tif (GeoTIFF), .geojson, .png (with a world file); must
     not exist"""
-    calibrate: bool = False
-    """whether to estimate the elements' phases and the array's orientation from the training positions of array snapshots,
-    and to correct them"""
+    calibrate: tuple[CalibrationPart, ...] | None = None
+    """estimate these from the training positions of array snapshots, and correct them: phases of the elements, orientation
+    and position of the array (without a word: phases orientation)"""
     split: str | None = None
     """with --calibrate: split whose training part is used (default: random); it is written beside the spectra"""
     seed: Seed = 0
@@ -298,11 +310,11 @@ class ConvertConfig(FindingConfig):
 
     def check(self) -> None:
         super().check()
-        if (self.split is not None or self.seed) and not self.calibrate:
+        if (self.split is not None or self.seed) and self.calibrate is None:
             raise InputError("--split and --seed are of the calibration; give --calibrate, too")
         if self.deepmimo and self.suffix:
             raise InputError(f"--deepmimo writes a folder; give a directory instead of {self.out}")
-        if self.calibrate and (self.suffix or self.deepmimo):
+        if self.calibrate is not None and (self.suffix or self.deepmimo):
             raise InputError("--calibrate writes a directory in the toolkit's own layout; give another OUT")
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from swiftwrf import FieldModel, InputError, RssiModel, load
+from swiftwrf.choices import PHASES_AND_ORIENTATION
 from swiftwrf.contrib.diagnostics.calibration import Calibration, calibrate
 from swiftwrf.contrib.formats.deepmimo import write_deepmimo
 from swiftwrf.contrib.map_files import write_geojson, write_geotiff, write_world_file
@@ -85,7 +86,7 @@ def _write_directory(config: ConvertConfig) -> None:
     with new_directory(Path(config.out), "a directory") as folder:
         data = how.read(*FORMATS)
         found = None
-        if config.calibrate:
+        if config.calibrate is not None:
             data, found = _calibrated(data, config)
         for note in data.notes:
             console.print(f"{data.name}: {note}")
@@ -113,12 +114,18 @@ def _calibrated(data: Spectra | Snapshots | Rssi, config: ConvertConfig) -> tupl
         raise InputError("--calibrate takes array snapshots; spectra and RSSI do not hold the elements' phases")
     name = config.split or "random"
     train, test = data.split(name, config.seed)
-    found = calibrate(train)
-    phase, turn = float(found.phase_std.rad2deg().max()), float(found.turn.rad2deg().norm())
+    parts = config.calibrate or PHASES_AND_ORIENTATION
+    found = calibrate(train, parts)
+    values = {
+        "phases": f"phases to {float(found.phase_std.rad2deg().max()):.1f} deg",
+        "orientation": f"rotated by {float(found.turn.rad2deg().norm()):.1f} deg (+- "
+        f"{float(found.turn_std.rad2deg().max()):.1f})",
+        "position": f"moved by {float(found.shift.norm()):.2f} m (+- {float(found.shift_std.max()):.2f})",
+    }
     console.print(
-        f"calibrated on {found.clear} training positions: phases to {phase:.1f} deg, rotated by {turn:.1f} deg (+- "
-        f"{float(found.turn_std.rad2deg().max()):.1f}); at held-out positions, {found.after:.0%} of the received power "
-        f"arrives along the line of sight, {found.before:.0%} without calibration"
+        f"calibrated on {found.clear} training positions: {', '.join(values[part] for part in parts)}; at held-out "
+        f"positions, {found.after:.0%} of the received power arrives along the line of sight, {found.before:.0%} without "
+        "calibration"
     )
     rows = torch.searchsorted(data.index, train.index), torch.searchsorted(data.index, test.index)
     return replace(found.apply(data), named_splits={**data.named_splits, name: rows}), found

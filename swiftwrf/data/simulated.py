@@ -230,7 +230,7 @@ def simulated_stations(
     array = PlanarArray.square(4, OFFICE.frequency_hz)
     spectra = {}
     for name, pose in list(STATIONS.items())[:stations]:
-        channel, line_of_sight = _channel(OFFICE, position, pose, array)
+        channel, line_of_sight = simulated_channel(OFFICE, position, pose, array)
         turn = phase_noise * torch.randn(channel.shape, dtype=torch.float64, generator=generator)
         channel = channel * unit_phasor(turn)
         if snr_db is not None:
@@ -248,7 +248,9 @@ def simulated_stations(
     return Stations(spectra, name="simulated-office")
 
 
-def _channel(room: ShoeboxRoom, position: Tensor, pose: ArrayPose, array: PlanarArray) -> tuple[Tensor, Tensor]:
+def simulated_channel(
+    room: ShoeboxRoom, position: Tensor, pose: ArrayPose, array: PlanarArray
+) -> tuple[Tensor, Tensor]:
     """Return channels (n, S, K) of a fixed array, and where the direct path is unobstructed, bool (n,)."""
     fixed = torch.tensor(pose.position, dtype=torch.float64)
     parts = [room.paths(some, fixed) for some in position.split(BATCH_POSITIONS)]

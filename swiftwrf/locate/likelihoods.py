@@ -6,7 +6,7 @@ Both kinds are fitted without each fold and to all data, screen the cells of a r
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated, ClassVar, Self
 
@@ -100,6 +100,14 @@ class Likelihoods(ABC):
     def screens(self, region: Region, count: int, most: int) -> tuple[Cells, list[Screen]]:
         """Return about `count` cells of a region, or `most` of them, and likelihoods at all of them that choose some."""
 
+    @abstractmethod
+    def elsewhere(self, room: GeometryModel) -> Self:
+        """Return the likelihoods of an equal array in another pose, by its room, where nothing was measured."""
+
+    @abstractmethod
+    def sample(self, position: Tensor, generator: torch.Generator) -> SpectrumFeatures:
+        """Return features at positions (n, 3) of channels whose path gains vary as at held-out positions."""
+
     def check(self) -> None:
         """Refuse likelihoods from a file that do not fit their room.
 
@@ -184,6 +192,14 @@ class SpectrumLikelihoods(Likelihoods):
             constant, varying = (Student.fit(part[known], floor) for part in residual)
             likelihoods.append(cls(refined, CARRIER, phases.log_variance, gains, (constant, varying)))
         return features, likelihoods
+
+    def elsewhere(self, room: GeometryModel) -> SpectrumLikelihoods:
+        gains = replace(self.gains, process=_far_away(self.gains.process))
+        return replace(self, room=room, gains=gains, coarray=(self.coarray[0], self.coarray[0]))
+
+    def sample(self, position: Tensor, generator: torch.Generator) -> SpectrumFeatures:
+        channel = self._phases.sample(PathWaves.at(self.room, position), generator)
+        return SpectrumFeatures.of([self.room.array.spectrum(channel, self.room.grid)], self.room.array, self.room.grid)
 
     def features(self, data: Numbers | Spectra, seed: int) -> SpectrumFeatures:
         values, grid = data.spectrum if isinstance(data, Spectra) else data, self.room.grid
@@ -300,6 +316,13 @@ class ChannelLikelihoods(Likelihoods):
             for own, nearby, rows in zip(rooms, processes, kept, strict=True)
         ]
 
+    def elsewhere(self, room: GeometryModel) -> ChannelLikelihoods:
+        return replace(self, room=room, process=_far_away(self.process))
+
+    def sample(self, position: Tensor, generator: torch.Generator) -> SpectrumFeatures:
+        channel = self._paths.sample(PathWaves.at(self.room, position, self.frequency), generator)
+        return SpectrumFeatures.of_channels(channel, self.room.array)
+
     def features(self, data: Numbers | Spectra, seed: int) -> SpectrumFeatures:
         channel = data.channel if isinstance(data, Spectra) else data
         if channel is None or not torch.as_tensor(channel).is_complex():
@@ -343,3 +366,8 @@ def _held_out_and_kept(fold: Tensor) -> tuple[list[Tensor], list[Tensor]]:
     """Return the rows of each fold, and those of all but each fold with, last, all rows."""
     outs, kept = zip(*each_fold(fold), strict=True)
     return [*outs], [*kept, torch.arange(len(fold))]
+
+
+def _far_away(process: GaussianProcess, distance_m: float = 1e6) -> GaussianProcess:
+    """Return the process with its known values so far away that predictions are those of the prior."""
+    return replace(process, known=process.known + distance_m)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Self
 
@@ -286,13 +287,43 @@ class MatchedField(Locator):
                 features.append(likelihoods.features(aligned, self.config.seed))
             else:
                 features.append(None)
-        observed = Observed(row, features)
+        return self._located(Observed(row, features))
+
+    def _located(self, observed: Observed) -> Posterior:
         parts = self._searched(observed, self.likelihoods)
         posterior = Posterior.cat(
             [self._posterior(cells.position, values, cells.log_volume) for cells, values in parts]
         )
         # within half a wavelength the field changes too little for a second mode
         return replace(posterior, mode_width_m=max(each.room.array.wavelength for each in self.likelihoods) / 2)
+
+    def elsewhere(self, rooms: Mapping[str, tuple[str, GeometryModel]], config: MatchedFieldConfig) -> Self:
+        """Return the locator of equal arrays in other poses, without what was measured at positions.
+
+        Args:
+            rooms: Name of the station of this locator that each array is equal to, and its room, by name.
+            config: Options of the search.
+        """
+        like = [self.stations.index(name) for name, _ in rooms.values()]
+        weights = self.weight.split([len(each.start) for each in self.likelihoods])
+        found = copy(self)
+        found.config, found.stations, found.weight = (
+            config,
+            tuple(rooms),
+            torch.cat([weights[number] for number in like]),
+        )
+        found.likelihoods = tuple(
+            self.likelihoods[number].elsewhere(room) for number, (_, room) in zip(like, rooms.values(), strict=True)
+        )
+        found._prepare()
+        return found
+
+    @torch.no_grad()
+    def located_samples(self, position: Tensor, seed: int = 0) -> Posterior:
+        """Return posteriors of spectra that are simulated at positions (n, 3) by the rooms and their errors."""
+        generator = torch.Generator().manual_seed(seed)
+        features = [each.sample(position, generator) for each in self.likelihoods]
+        return self._located(Observed(torch.arange(len(position))[:, None].expand(-1, len(features)), features))
 
     def _by_station(self, spectrum: Numbers | Spectra | Stations) -> Mapping[str, tuple[Tensor, Numbers | Spectra]]:
         """Return the rows that stations of this locator received, and their spectra, by station.

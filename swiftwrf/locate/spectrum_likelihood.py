@@ -11,7 +11,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Annotated, Self
 
 import numpy as np
@@ -23,7 +23,7 @@ from torch import Tensor
 
 from swiftwrf.data.splits import each_fold
 from swiftwrf.locate.features import Features, PathWaves, SpectrumFeatures
-from swiftwrf.models.geometry.channels import coherence, ends, sources
+from swiftwrf.models.geometry.channels import coherence, ends, sources, superposed
 from swiftwrf.models.geometry.model import GeometryModel
 from swiftwrf.runtime.threads import parallel_map
 from swiftwrf.runtime.validation import PositiveFloat
@@ -202,6 +202,18 @@ class PhaseLikelihood:
         bounds = [BOUNDS] * len(start)
         optimum = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 20})
         return cls(room, torch.from_numpy(optimum.x).float())
+
+    def sample(self, waves: PathWaves, generator: torch.Generator) -> Tensor:
+        """Return channels (m, F, K) of the distribution at m positions. Scattering is independent at each frequency."""
+        complex_normal = partial(torch.randn, dtype=torch.complex64, generator=generator)
+        gain = self._variance.sqrt() * complex_normal(*waves.gain.shape)
+        mean, change = waves.channel, superposed(gain, waves.wave)
+        spread = torch.einsum("s,msfk->mfk", self._variance, waves.wave.abs().square()).mean(dim=(1, 2))
+        power = spread + mean.abs().square().mean(dim=(1, 2))
+        k = mean.shape[2]
+        root = torch.linalg.cholesky(self._diffuse * self._isotropic + self._floor * torch.eye(k))
+        channel: Tensor = mean + change + power.sqrt()[:, None, None] * (complex_normal(*mean.shape) @ root.T)
+        return channel
 
     def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
         """Return log-likelihoods (m,) of m observations at m candidates, up to a constant of each observation."""

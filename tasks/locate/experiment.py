@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from augment.placement import suggest_station
 from augment.suggest import suggest_positions
-from swiftwrf import Rssi, Stations, rssi_room, simulated_stations
+from swiftwrf import InputError, Rssi, Stations, rssi_room, simulated_stations
 from swiftwrf.contrib.comparison.locating import LocateComparison, PositionComparison, compare
-from swiftwrf.contrib.comparison.stations import compare_stations
+from swiftwrf.contrib.comparison.stations import StationsComparison, compare_stations
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.formats import RSSI_FORMATS
 from swiftwrf.data.formats.stations import read_stations, station_names
@@ -15,6 +16,7 @@ from tasks.configs import LocateConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
 from tasks.locate.page import SUGGESTED, page
+from tasks.locate.placement import write_poses
 from tasks.page.page import finish
 from tasks.page.shared import write_suggestion
 from tasks.records import Row
@@ -31,6 +33,8 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
     """
     device = choose_device("cpu")
     data, reference = measurements(config)
+    if isinstance(data, Stations):
+        config.check_stations()
     for note in data.notes:
         console.print(f"{data.name}: {note}")
     label = f"{'stations' if isinstance(data, Stations) else 'rx' + '_'.join(config.receivers)}-s{config.seed}"
@@ -46,6 +50,8 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
                 result = compare(data, n_cells=config.cells, reference=reference, **common)
         if isinstance(result, LocateComparison):
             _conclude(result, config, directory)
+        elif isinstance(result, StationsComparison):
+            _place(result, config, directory)
         finish(directory, result.recorded(), page)
 
 
@@ -66,6 +72,24 @@ def _conclude(result: LocateComparison, config: LocateConfig, directory: Run) ->
         degrees = degree_columns(train.origin, found.position.numpy())
         measured = train.transmitter_position
         write_suggestion(directory.path(SUGGESTED), measured, found.position, found.variance, degrees)
+
+
+def _place(result: StationsComparison, config: LocateConfig, directory: Run) -> None:
+    """Write the poses of a next array that lower the position error most, and print the best."""
+    if not config.suggest or result.locator is None:
+        return
+    try:
+        found = suggest_station(result.locator, config.suggest, seed=config.seed)
+    except InputError as error:
+        console.print(f"no pose of a next array: {error}")
+        return
+    write_poses(directory.path(SUGGESTED), result.train.position, found)
+    best, normal = found.pose[0], found.normal[0].tolist()
+    console.print(
+        f"a next array at ({', '.join(f'{x:.2f}' for x in best.position)}) m, facing "
+        f"({', '.join(f'{x:.2f}' for x in normal)}), would lower the expected median error by "
+        f"{float(found.gain_m[0]):.3f} m (+- {float(found.gain_std_m[0]):.3f}) from {found.before_m:.3f} m"
+    )
 
 
 def measurements(config: LocateConfig) -> tuple[Rssi | Stations, str | None]:

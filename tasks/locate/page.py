@@ -16,6 +16,7 @@ from swiftwrf.contrib.comparison.localizers import LOCALIZERS
 from swiftwrf.metrics import LEVEL
 from swiftwrf.plotting import corners_of
 from tasks import labels
+from tasks.locate.placement import poses_section
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table, number, provenance, sections_of
 from tasks.page.shared import (
@@ -65,7 +66,7 @@ def page(runs: list[Records]) -> Page:
         sections_of("How sure is it?", runs, lambda run: Section("", plots=[_calibration(run)])),
         limits(runs[0], *(LIMITS if runs[0].metrics["received_by"] == "receiver" else LIMITS_OF_STATIONS)),
     ]
-    if any(run.arrays(SUGGESTED) for run in runs):
+    if runs[0].metrics["received_by"] == "receiver" and any(run.arrays(SUGGESTED) for run in runs):
         sections.insert(-1, sections_of("Where to measure next", runs, _suggestion))
     names = ", ".join(dict.fromkeys(run.place for run in runs))
     if len(runs) == 1:
@@ -106,7 +107,7 @@ def _errors(run: Records, found: Answer) -> Section:
 
 
 def _directions(run: Records) -> Section:
-    """Return the angular errors at each station."""
+    """Return the angular errors at each station, and poses of a next one."""
     table = run.table("directions")
     rows = [
         [str(name), str(count), *(f"{value:.2f}" for value in values)]
@@ -116,7 +117,10 @@ def _directions(run: Records) -> Section:
     text = (
         "Median angular errors of the direction of the transmitter. A position found by all stations determines each."
     )
-    return Section("Directions at each station", paragraphs=[text], tables=[Table(heads, rows)])
+    poses = poses_section(run.arrays(SUGGESTED), SUGGESTED, run.file_name)
+    return Section(
+        "Directions at each station", paragraphs=[text], tables=[Table(heads, rows)], parts=[poses] if poses else []
+    )
 
 
 def _suggestion(run: Records) -> Section | None:

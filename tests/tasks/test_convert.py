@@ -9,7 +9,7 @@ import pytest
 import quick
 import torch
 from samples import snapshots, walk, write_deepmimo, write_dichasus, write_snapshots
-from test_calibration import spoilt
+from test_calibration import spoilt, spoilt_in
 
 from swiftwrf import AngularGrid, load_rssi, load_spectra
 from swiftwrf.array.planar import PlanarArray
@@ -73,6 +73,26 @@ def test_calibration_sees_the_training_part_alone(tmp_path, capsys):
     assert float(angle_errors(mended.label, usual.label)["great_circle"].rad2deg().max()) < 2
     assert {name: (len(a), len(b)) for name, (a, b) in mended.named_splits.items()} == {"block": (120, 30)}
     assert torch.equal(mended.split("block")[1].index, data.split("block", 1)[1].index)
+
+
+@pytest.mark.parametrize(
+    ("parts", "says"),
+    [
+        (["phases"], "training positions: phases to"),
+        (["orientation", "position"], r"rotated by 12\.\d deg .*, moved by 0\.3\d m"),
+    ],
+)
+def test_calibration_of_some_parts(tmp_path, capsys, parts, says):
+    data, _, turn, shift = spoilt_in(parts, snapshots(n=150))
+    folder = write_snapshots(tmp_path / "source", data=data)
+    assert run(folder, tmp_path / "own", *GRID, "--calibrate", *parts) == 0
+    record = json.loads((tmp_path / "own" / "conversion.json").read_text())
+    assert record["options"]["calibrate"] == parts
+    assert record["calibration"]["shift_m"] == pytest.approx(shift.tolist(), abs=0.02)
+    assert record["calibration"]["turn_deg"] == pytest.approx(turn.rad2deg().tolist(), abs=1)
+    assert re.search(says, " ".join(capsys.readouterr().err.split()))
+    pose = load_spectra(tmp_path / "own").fixed_position
+    assert pose.allclose(snapshots().fixed_position, atol=0.02)
 
 
 def test_every_format_is_described():

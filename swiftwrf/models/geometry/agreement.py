@@ -48,8 +48,8 @@ def agreed(
         True
     """
     reference = list[Plane]()
+    within = Within(max_tilt, max_wavelengths * max(room.array.wavelength for room in rooms.values()))
     for plane in sorted((p for room in rooms.values() for p in room.planes), key=lambda p: (-p.probability, p.std_mm)):
-        within = Within(max_tilt, max_wavelengths * max(room.array.wavelength for room in rooms.values()))
         if not any(within.same(plane, other) for other in reference):
             reference.append(plane)
     return {name: _placed(room, spectra[name], reference, within, significance) for name, room in rooms.items()}

@@ -7,14 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from samples import snapshots
+from samples import POSITION, snapshots
 from scipy.spatial.transform import Rotation
 
 from swiftwrf import InputError, calibrate
-from swiftwrf.array.angles import wrap
+from swiftwrf.array.angles import AngularGrid, wrap
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.contrib.diagnostics.inspection import inspect
 from swiftwrf.data import Snapshots
+from swiftwrf.data.simulated import OFFICE, STATIONS, simulated_channel, simulated_stations
 
 
 def spoilt(data, degrees=20.0, seed=0):
@@ -162,3 +163,123 @@ def test_plain_values_are_strict_json():
     assert shares == [calibration.before, calibration.after]
     assert len(found["phase_deg"]) == 16
     assert 0 < found["turn_std_deg"][0] < 1
+
+
+SHIFT = torch.tensor([0.2, -0.25, 0.15], dtype=torch.float64)  # from the declared to the true position [m]
+PARTS = {
+    part: part.split(" and ")
+    for part in (
+        "phases",
+        "orientation",
+        "position",
+        "phases and position",
+        "orientation and position",
+        "phases and orientation and position",
+    )
+}
+
+
+def spoilt_in(parts, data, seed=0):
+    """The snapshots with some parts of the calibration wrong; the correct phases, turn and shift."""
+    wrong, phase, turn = spoilt(data, degrees=12, seed=seed)
+    data = replace(data, channel=wrong.channel) if "phases" in parts else data
+    data = replace(data, rotation=wrong.rotation) if "orientation" in parts else data
+    data = replace(data, fixed_position=data.fixed_position - SHIFT) if "position" in parts else data
+    values = {"phases": phase, "orientation": turn, "position": SHIFT}
+    return data, *(value if part in parts else torch.zeros_like(value) for part, value in values.items())
+
+
+@pytest.mark.parametrize("parts", PARTS.values(), ids=PARTS)
+def test_parts_are_recovered_exactly_without_noise(parts):
+    data, phase, turn, shift = spoilt_in(parts, snapshots(n=60, count=1, noise=0.0))
+    found = calibrate(data, parts)
+    by_turn, by_phase = errors(found, phase, turn)
+    assert (by_turn, by_phase) == pytest.approx((0, 0), abs=1e-3)
+    assert found.shift.allclose(shift, atol=1e-5)
+    corrected = found.apply(data)
+    assert corrected.fixed_position.allclose(snapshots().fixed_position, atol=1e-5)
+    assert corrected.rotation.allclose(snapshots().rotation, atol=1e-5)
+    for part, name in (("phases", "phase"), ("orientation", "turn"), ("position", "shift")):
+        assert part in parts or not getattr(found, name).any()
+        assert part in parts or not getattr(found, f"{name}_std").any()
+
+
+def office(station, n=200, seed=0):
+    """Snapshots of an array in the simulated office, with 25 paths of each transmission and noise 20 dB below them."""
+    position = simulated_stations(n=n, stations=1, seed=seed, grid=AngularGrid.hemisphere(4, 8)).position
+    array = PlanarArray.square(4, OFFICE.frequency_hz)
+    channel, line_of_sight = simulated_channel(OFFICE, position, STATIONS[station], array)
+    channel = channel / channel.abs().square().mean().sqrt()
+    noise = torch.randn(channel.shape, dtype=channel.dtype, generator=torch.Generator().manual_seed(seed))
+    return Snapshots(
+        channel + 0.1 * noise, position, array=array, pose=STATIONS[station], line_of_sight=line_of_sight, name=station
+    )
+
+
+@pytest.mark.parametrize("parts", [["phases"], ["orientation"], ["position"]], ids=lambda parts: parts[0])
+def test_errors_in_a_room_with_reflections_are_within_three_standard_errors(parts):
+    """Of all values at four stations, but for a phase whose bias from reflections is half a standard error more."""
+    score = []
+    for station in STATIONS:
+        data, phase, turn, shift = spoilt_in(parts, office(station))
+        found = calibrate(data, parts)
+        left = Rotation.from_rotvec(found.turn.numpy()).inv() * Rotation.from_rotvec(turn.numpy())
+        error = {
+            "phases": (wrap(found.phase - phase + phase[0]), found.phase_std),
+            "orientation": (torch.from_numpy(left.as_rotvec()), found.turn_std),
+            "position": (found.shift - shift, found.shift_std),
+        }
+        away, std = error[parts[0]]
+        score.append((away / std)[std > 0].abs())
+    assert float((torch.cat(score) <= 3).double().mean()) > 0.98
+    assert float(torch.cat(score).max()) < 4
+
+
+def linear(n=120):
+    """Snapshots of four elements on a line."""
+    data = snapshots(n=n, count=1)
+    return replace(data, channel=data.channel[..., :4], array=data.array.subset(torch.arange(4)))
+
+
+def test_phases_of_a_linear_array_and_of_a_narrow_cone():
+    for data in (linear(), narrow(snapshots(n=900, noise=0.5))):
+        data, phase, turn, _ = spoilt_in(["phases"], data)
+        found = calibrate(data, ["phases"])
+        assert errors(found, phase, turn)[1] < 5
+        assert found.after > 0.8
+
+
+def far(n=200):
+    """Snapshots from 60 to 80 m away."""
+    data = snapshots(n=n, count=1)
+    away = data.direction * torch.linspace(60, 80, n, dtype=torch.float64)[:, None]
+    return replace(data, position=data.fixed_position + away @ data.rotation.T)
+
+
+@pytest.mark.parametrize(
+    ("make", "parts", "says"),
+    [
+        (far, ["orientation", "position"], "does not determine .*the position of the array along"),
+        (
+            lambda: replace(snapshots(), fixed_position=POSITION + 3 * SHIFT),
+            ["position"],
+            "beyond 0.5 m that is an error",
+        ),
+        (linear, ["orientation"], "estimate the phases alone"),
+        (snapshots, [], "one part or more of phases, orientation, position"),
+        (snapshots, ["gains"], "'phases' or 'orientation' or 'position'"),
+    ],
+)
+def test_refuses_parts_that_cannot_be_told(make, parts, says):
+    with pytest.raises(InputError, match=says):
+        calibrate(make(), parts)
+
+
+def test_the_default_keeps_its_values():
+    """Values of the estimate that had no choice of parts."""
+    data, *_ = spoilt(snapshots(n=120, noise=0.3, echo=0.1))
+    found = calibrate(data)
+    assert found.turn.tolist() == pytest.approx([-0.1838764164, 0.1121828373, -0.2751287853], abs=1e-9)
+    assert found.turn_std.tolist() == pytest.approx([0.0053121296, 0.0062071523, 0.0032439975], abs=1e-9)
+    assert float(found.phase.sum()) == pytest.approx(5.799042877, abs=1e-8)
+    assert not found.shift.any()
