@@ -1,4 +1,4 @@
-"""Where the next array belongs: the pose that lowers the expected position error most, by the rooms that were found."""
+"""Placement of a next array: the pose that lowers the expected position error most, by the rooms that were found."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the next array belongs: poses on the walls, expected errors, and the truth in the simulated office."""
+"""Placement of a next array: poses on the walls, expected errors, and the truth in the simulated office."""
 
 from functools import partial
 

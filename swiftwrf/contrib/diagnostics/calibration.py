@@ -113,8 +113,8 @@ def calibrate(train: Snapshots, estimate: Sequence[CalibrationPart] = PHASES_AND
             position is estimated within 0.5 m of the declared one, an orientation within 45 degrees.
 
     Raises:
-        InputError: No part, fewer than 20 positions with line of sight, fewer than 10 where the direct path dominates,
-            phases that do not depend on the position, an array too far from its declared pose, or a part that the data do
+        InputError: No part, fewer than 20 positions with line of sight, or fewer than 10 where the direct path dominates.
+            Phases that do not depend on the position, and an array too far from its declared pose. A part that the data do
             not determine, such as the orientation of a linear array.
 
     Example:

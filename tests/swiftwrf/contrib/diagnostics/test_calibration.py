@@ -218,7 +218,7 @@ def office(station, n=200, seed=0):
 
 @pytest.mark.parametrize("parts", [["phases"], ["orientation"], ["position"]], ids=lambda parts: parts[0])
 def test_errors_in_a_room_with_reflections_are_within_three_standard_errors(parts):
-    """Of all values at four stations, but for a phase whose bias from reflections is half a standard error more."""
+    """All values at four stations are, but for a phase whose bias from reflections is half a standard error more."""
     score = []
     for station in STATIONS:
         data, phase, turn, shift = spoilt_in(parts, office(station))
