@@ -22,6 +22,17 @@ from swiftwrf.models.link import Link
 Normal = tuple[float, float, float]
 GRID = AngularGrid.hemisphere(10, 40)
 ARRAY = PlanarArray.square(4, 915e6)
+OFFICE_WALLS = [
+    Plane(normal, offset, -0.6)
+    for normal, offset in (
+        ((-1.0, 0.0, 0.0), 0.0),
+        ((1.0, 0.0, 0.0), 8.0),
+        ((0.0, -1.0, 0.0), 0.0),
+        ((0.0, 1.0, 0.0), 6.0),
+        ((0.0, 0.0, -1.0), 0.0),
+        ((0.0, 0.0, 1.0), 3.0),
+    )
+]
 
 
 def mirror_room(

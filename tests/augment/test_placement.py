@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 import quick
 import torch
+from rooms import OFFICE_WALLS
 from small import known_planes
 
 from augment.placement import StationSuggestion, suggest_station, wall_poses
@@ -16,26 +17,15 @@ from swiftwrf.array.planar import PlanarArray
 from swiftwrf.data.simulated import OFFICE, simulated_channel
 from swiftwrf.data.spectra import array_spectra
 from swiftwrf.locate.matched_field import MatchedFieldConfig
-from swiftwrf.models.geometry import GeometryModel, Plane
+from swiftwrf.models.geometry import GeometryModel
 from tasks.locate.placement import poses_section, write_poses
 
 GRID = AngularGrid.hemisphere(15, 60)
-WALLS = [
-    Plane(normal, offset, -0.6)
-    for normal, offset in (
-        ((-1.0, 0.0, 0.0), 0.0),
-        ((1.0, 0.0, 0.0), 8.0),
-        ((0.0, -1.0, 0.0), 0.0),
-        ((0.0, 1.0, 0.0), 6.0),
-        ((0.0, 0.0, -1.0), 0.0),
-        ((0.0, 0.0, 1.0), 3.0),
-    )
-]
 TINY = MatchedFieldConfig(spacing=0.5, max_cells=2000, n_best=30, n_background=10, n_rounds=1)
 
 
 def fitted(train: Stations) -> MatchedField:
-    rooms = {name: GeometryModel.of_planes(train.of(name)[1], WALLS) for name in train.names}
+    rooms = {name: GeometryModel.of_planes(train.of(name)[1], OFFICE_WALLS) for name in train.names}
     small = MatchedField(spacing=0.5, max_cells=4000, n_best=60, n_background=20, n_rounds=2, n_calibration=40)
     return small.fit(train, room=rooms)
 
@@ -133,7 +123,7 @@ def test_files_and_section_of_poses(tmp_path):
 
 
 def test_poses_of_a_run(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(quick, "known_planes", lambda: known_planes(*WALLS))
+    monkeypatch.setattr(quick, "known_planes", lambda: known_planes(*OFFICE_WALLS))
     short = partial(suggest_station, n_positions=8, config=TINY)
     monkeypatch.setattr("tasks.locate.experiment.suggest_station", short)
     assert quick.run("locate", "--stations", 2, "--suggest", 2, "--out", tmp_path / "run") == 0

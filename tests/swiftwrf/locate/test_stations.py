@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from rooms import OFFICE_WALLS
 
 import swiftwrf
 from swiftwrf import InputError, MatchedField, Stations, simulated_stations
@@ -12,17 +13,6 @@ from swiftwrf.models.geometry import GeometryModel, Plane
 from swiftwrf.models.geometry.agreement import agreed
 
 GRID = swiftwrf.AngularGrid.hemisphere(15, 60)
-WALLS = [
-    Plane(normal, offset, -0.6)
-    for normal, offset in (
-        ((-1.0, 0.0, 0.0), 0.0),
-        ((1.0, 0.0, 0.0), 8.0),
-        ((0.0, -1.0, 0.0), 0.0),
-        ((0.0, 1.0, 0.0), 6.0),
-        ((0.0, 0.0, -1.0), 0.0),
-        ((0.0, 0.0, 1.0), 3.0),
-    )
-]
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +24,7 @@ def office() -> tuple[Stations, Stations]:
 @pytest.fixture(scope="module")
 def rooms(office) -> dict[str, GeometryModel]:
     train, _ = office
-    return {name: GeometryModel.of_planes(train.of(name)[1], WALLS) for name in train.names}
+    return {name: GeometryModel.of_planes(train.of(name)[1], OFFICE_WALLS) for name in train.names}
 
 
 def small() -> MatchedField:
@@ -200,7 +190,7 @@ class TestAgreement:
         spectra = {name: train.of(name)[1] for name in train.names}
 
         def room(name: str, offset: float, probability: float) -> GeometryModel:
-            planes = [Plane((1.0, 0.0, 0.0), offset, -0.6, probability=probability), *WALLS[2:]]
+            planes = [Plane((1.0, 0.0, 0.0), offset, -0.6, probability=probability), *OFFICE_WALLS[2:]]
             return GeometryModel.of_planes(spectra[name], planes)
 
         rooms = {"west": room("west", 8.062, 0.6), "east": room("east", 8.0, 0.99)}
@@ -212,7 +202,7 @@ class TestAgreement:
         train, _ = office
         spectra = {name: train.of(name)[1] for name in train.names}
         rooms = {
-            "west": GeometryModel.of_planes(spectra["west"], WALLS),
+            "west": GeometryModel.of_planes(spectra["west"], OFFICE_WALLS),
             "east": GeometryModel.of_planes(
                 spectra["east"], [Plane((0.0, 0.0, -1.0), 0.06, -0.6), Plane((0.0, 0.0, 1.0), 3.0, -0.6)]
             ),
