@@ -158,9 +158,12 @@ def furnished_room(
         moving, mirrored = "transmitter", np.array([corner % 2, corner // 2, 0], dtype=bool)
         fixed = np.where(mirrored, size - fixed, fixed)
     ends = torch.from_numpy(fixed), position, moving
-    paths = trace(Scene(surfaces, 2.4e9), *ends, Tracing(order=2, seed=seed), progress=False).reached
+    paths = trace(Scene(surfaces, 2.4e9), *ends, Tracing(order=2, seed=seed), progress=False)
+    reached = (paths.count > 0).nonzero()[:, 0]
     grid = AngularGrid.hemisphere(30, 120)
-    return paths.spectra("furnished room", grid=grid, subcarriers=subcarriers, bandwidth_hz=bandwidth)
+    return paths.reached.spectra(
+        "furnished room", grid=grid, subcarriers=subcarriers, bandwidth_hz=bandwidth, index=reached
+    )
 
 
 def impaired(data: Spectra, snr_db: float, seed: int) -> Spectra:
