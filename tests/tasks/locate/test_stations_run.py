@@ -1,6 +1,7 @@
 """A comparison by several stations: its numbers are those of its estimates and the truth."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,18 +12,31 @@ from swiftwrf.contrib.comparison.steps import Memo
 from swiftwrf.locate import MatchedFieldConfig
 from swiftwrf.locate.triangulation import peak_directions
 from swiftwrf.models.geometry import GeometryModel, Plane
+from tasks.view.sources import open_source
 
 QUICK = MatchedFieldConfig(spacing=0.5, max_cells=3000, n_best=60, n_background=20, n_rounds=2)
 WALLS = [Plane((-1.0, 0.0, 0.0), 0.0, -0.6), Plane((0.0, 0.0, -1.0), 0.0, -0.6), Plane((0.0, 0.0, 1.0), 3.0, -0.6)]
 
 
 @pytest.fixture(scope="module")
-def result(tmp_path_factory) -> StationsComparison:
+def run_folder(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("run")
+
+
+@pytest.fixture(scope="module")
+def result(run_folder) -> StationsComparison:
     data = swiftwrf.simulated_stations(n=60, stations=2, grid=swiftwrf.AngularGrid.hemisphere(15, 60))
     part = data.derived(row=data.row.clone())
     part.row[::7, 1] = -1  # the second station did not receive each seventh transmission
     rooms = {name: GeometryModel.of_planes(part.of(name)[1], WALLS) for name in part.names}
-    return compare_stations(part, rooms=rooms, config=QUICK, keep=Memo(tmp_path_factory.mktemp("run")))
+    return compare_stations(part, rooms=rooms, config=QUICK, keep=Memo(run_folder))
+
+
+def test_view_shows_the_room_of_each_station(result, run_folder):
+    (run_folder / "config.json").write_text(json.dumps({"task": "locate", "config": {}}), encoding="utf-8")
+    view = open_source(run_folder)
+    assert [loaded.title for loaded in view.models] == ["at east", "at west"]
+    assert all(len(loaded.planes) == len(WALLS) for loaded in view.models)
 
 
 def test_errors_and_coverage(result):
