@@ -41,6 +41,8 @@ BASELINES = {
     "station": (("triangulation", "triangulation_matched", "knn"), "the best baseline"),
 }  # by what receives: localizers without a model of the scene, and what they are together
 SUGGESTED = "suggested"  # name of the files with suggested positions
+OF_STATIONS = ("stations", "alone_estimate", "alone_radius_80_m")
+STATIONS_TEXT = "; triangles: stations; dashed circles of their colours: 80 % credible regions by each station alone."
 TRUTH, ESTIMATE = "#cf4a4a", "#ffffff"
 COLUMNS = ["index", "place", "method", "position_error_m"]  # of the errors of methods
 COLOURS = labels.LOCALIZERS
@@ -181,7 +183,7 @@ def _posteriors(run: Records, several: bool) -> Section:
     caption = (
         f"Posteriors of {len(maps['index'])} test rows in plan, from the smallest error to the largest, each relative to "
         "its largest mass. Cross: true position; dot: estimate; circle: 80 % credible region; small dots: training "
-        "positions" + ("; triangles: stations." if "stations" in maps else ".")
+        "positions" + (STATIONS_TEXT if "stations" in maps else ".")
     )
     plot = Plot(f"posteriors-{run.file_name}", posteriors(maps), caption, data[np.isfinite(density)])
     return Section("", plots=[plot, *([_overview(run, f"overview-{run.file_name}")] if several else [])])
@@ -198,7 +200,11 @@ def posteriors(maps: Mapping[str, NDArray[Any]]) -> list[Figure]:
         drawn = ax.imshow(maps["density"][i], origin="lower", extent=extent, cmap="magma", vmin=0, vmax=1)
         ax.plot(*maps["training_position"].T[:2], ".", color="#888888", markersize=1, rasterized=True)
         if "stations" in maps:
-            ax.plot(*maps["stations"].T[:2], "^", color=labels.colour(COLOURS, OWN), markersize=7, clip_on=False)
+            for colour, *of_station in zip(labels.OTHER_COLOURS, *(maps[name] for name in OF_STATIONS), strict=False):
+                place, alone, radius = of_station
+                ax.plot(*place[:2], "^", color=colour, markersize=7, clip_on=False)
+                style: dict[str, Any] = {"fill": False, "color": colour, "linewidth": 0.8, "linestyle": "--"}
+                ax.add_patch(Circle(alone[i][:2], radius[i], **style))
         ax.add_patch(Circle(estimate[:2], maps["radius_80_m"][i], fill=False, color=ESTIMATE, linewidth=1))
         ax.plot(*estimate[:2], "o", color=ESTIMATE, markeredgecolor="#000001", markersize=5)
         ax.plot(*truth[:2], "x", color=TRUTH, markersize=8, markeredgewidth=2)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from swiftwrf.contrib.comparison.base import Recorded, Values
 from swiftwrf.contrib.comparison.errors import summary
-from swiftwrf.contrib.comparison.localizers import Located
+from swiftwrf.contrib.comparison.localizers import LEVELS, Located
 from swiftwrf.contrib.comparison.locating import PositionComparison
 from swiftwrf.contrib.comparison.station_localizers import STATION_LOCALIZERS, StationsPosterior
 from swiftwrf.contrib.comparison.steps import LOCATOR, Memo, Steps
@@ -27,7 +27,7 @@ from swiftwrf.locate import MatchedField, MatchedFieldConfig
 from swiftwrf.locate.matched_field import MIN_SPECTRA
 from swiftwrf.locate.posterior import Posterior
 from swiftwrf.locate.triangulation import bearings, peak_directions, station_positions, triangulated
-from swiftwrf.metrics import angle_errors
+from swiftwrf.metrics import LEVEL, angle_errors
 from swiftwrf.models.geometry import GeometryModel
 from swiftwrf.models.geometry.agreement import agreed
 from swiftwrf.runtime.checkpoint import load
@@ -169,7 +169,15 @@ class StationsComparison(PositionComparison):
         return replace(found, tables={**found.tables, "directions": self.directions})
 
     def _maps(self) -> dict[str, Any]:
-        return super()._maps() | {"stations": station_positions(self.train).numpy()}
+        maps = super()._maps()
+        row = {number: n for n, number in enumerate(self.test.index.tolist())}
+        shown = [row[number] for number in maps["index"].tolist()]
+        alone = [self.values[ALONE + name] for name in self.test.names]
+        return maps | {
+            "stations": station_positions(self.train).numpy(),
+            "alone_estimate": np.array([np.array(each["estimate"])[shown] for each in alone]),
+            "alone_radius_80_m": np.array([np.array(each["radius"])[shown, LEVELS.index(LEVEL)] for each in alone]),
+        }
 
     def _positions(self) -> tuple[Tensor, Tensor]:
         return self.train.position, self.test.position

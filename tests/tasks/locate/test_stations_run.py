@@ -88,3 +88,12 @@ def test_answer_and_report(result, tmp_path):
     for value in result.directions["posterior_deg"]:
         assert f"{value:.2f}" in page
     assert json.dumps(answer.values())  # as --json prints it
+
+
+def test_maps_have_the_regions_by_each_station_alone(result):
+    maps = result.recorded().arrays["maps"]
+    rows = [result.test.index.tolist().index(number) for number in maps["index"]]
+    for number, name in enumerate(result.test.names):
+        alone = result.values[ALONE + name]
+        assert np.array_equal(maps["alone_estimate"][number], np.array(alone["estimate"])[rows])
+        assert np.array_equal(maps["alone_radius_80_m"][number], np.array(alone["radius"])[rows, 1])
