@@ -5,9 +5,7 @@ import os
 import socket
 import subprocess
 import sys
-import threading
 import time
-from _thread import interrupt_main
 from pathlib import Path
 
 import dask
@@ -18,6 +16,7 @@ from sums import STEPS, Sum, add, kill, kill_once, results, sleep
 from test_rssi_model import with_field
 
 from swiftwrf import FitError, InputError, fit_rssi
+from swiftwrf.contrib.comparison import steps
 from swiftwrf.contrib.comparison.steps import _compute
 from swiftwrf.runtime.threads import set_threads
 from tasks import workers
@@ -116,20 +115,20 @@ def test_a_step_that_ends_every_worker_ends_in_a_sentence(local, tmp_path, monke
         results(tmp_path / "run", [Sum(1, function=kill)], cluster=cluster)
 
 
-def test_the_next_run_does_not_wait_for_the_steps_of_a_stopped_one(local, tmp_path):
+def test_the_next_run_does_not_wait_for_the_steps_of_a_stopped_one(local, tmp_path, monkeypatch):
     def processes():
         with distributed.Client(local.scheduler_address) as client:
             client.wait_for_workers(1)
             return set(client.run(os.getpid).values())
 
-    def stop():
+    def stop(*_):
         with distributed.Client(local.scheduler_address) as client:
             while not any(client.processing().values()):
                 time.sleep(0.1)
-        interrupt_main()
+        raise KeyboardInterrupt
 
     before = processes()
-    threading.Thread(target=stop, daemon=True).start()  # once the step is computed
+    monkeypatch.setattr(steps, "wait", stop)  # once the step is computed
     with pytest.raises(KeyboardInterrupt), connected(local.scheduler_address, CPU) as cluster:
         results(tmp_path / "run", [Sum(1, function=sleep)], cluster=cluster)
     assert before - processes()  # a new worker is in the place of the one that slept

@@ -136,4 +136,4 @@ def test_aoa_names_the_stations_of_a_folder_of_several(csi, tmp_path, capsys):
     assert quick.run("aoa", "--mix", 0.5, "--data", folder, "--out", tmp_path / "run") == 2
     said = quick.said(capsys)
     assert "several stations (west, east)" in said
-    assert f"swiftwrf locate --data {folder}" in said
+    assert "swiftwrf locate" in said
