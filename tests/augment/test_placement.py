@@ -14,6 +14,7 @@ from augment.placement import StationSuggestion, suggest_station, wall_poses
 from swiftwrf import AngularGrid, ArrayPose, InputError, MatchedField, Spectra, Stations, simulated_stations
 from swiftwrf.array.beamforming import unit_phasor
 from swiftwrf.array.planar import PlanarArray
+from swiftwrf.contrib.comparison.stations import compare_stations
 from swiftwrf.data.simulated import OFFICE, simulated_channel
 from swiftwrf.data.spectra import array_spectra
 from swiftwrf.locate.matched_field import MatchedFieldConfig
@@ -124,8 +125,14 @@ def test_files_and_section_of_poses(tmp_path):
 
 def test_poses_of_a_run(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(quick, "known_planes", lambda: known_planes(*OFFICE_WALLS))
+    few = partial(simulated_stations, n=40, grid=GRID)
     short = partial(suggest_station, n_positions=8, config=TINY)
-    monkeypatch.setattr("tasks.locate.experiment.suggest_station", short)
+    for name, function in {
+        "simulated_stations": few,
+        "compare_stations": partial(compare_stations, config=TINY),
+        "suggest_station": short,
+    }.items():
+        monkeypatch.setattr(f"tasks.locate.experiment.{name}", function)
     assert quick.run("locate", "--stations", 2, "--suggest", 2, "--out", tmp_path / "run") == 0
     assert "a next array at (" in capsys.readouterr().err
     table = pd.read_csv(tmp_path / "run" / "suggested.csv")
