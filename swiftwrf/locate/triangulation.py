@@ -42,13 +42,16 @@ def triangulated(origin: Tensor, direction: Tensor, start: Tensor, start_weight:
     return found
 
 
-def bearings(data: Stations, direction: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+def bearings(data: Stations, direction: dict[str, Tensor], towards: Tensor) -> tuple[Tensor, Tensor]:
     """Return the lines of bearing of the moving end in world coordinates.
+
+    A planar array does not distinguish directions that mirror in its plane, so known positions decide the side.
 
     Args:
         data: Transmissions, whose stations have a fixed end and an orientation.
         direction: Azimuth and elevation [rad] of the transmitter in the coordinates of each station's array, (m, 2) for the
             m transmissions that it received.
+        towards: Mean of known positions of the moving end, (3,) [m].
 
     Returns:
         Positions of the stations, (A, 3) [m], and unit vectors along the lines, (n, A, 3), nan where nothing was received.
@@ -56,14 +59,16 @@ def bearings(data: Stations, direction: dict[str, Tensor]) -> tuple[Tensor, Tens
     Raises:
         InputError: A station without position or orientation.
     """
-    line = torch.full((len(data), len(data.names), 3), torch.nan, dtype=torch.float64)
-    for number, (name, spectra) in enumerate(data.spectra.items()):
+    origin, line = station_positions(data), torch.full((len(data), len(data.names), 3), torch.nan, dtype=torch.float64)
+    for number, ((name, spectra), fixed) in enumerate(zip(data.spectra.items(), origin, strict=True)):
         if spectra.rotation is None:
             raise InputError(f"station {name} of {data.name} has no orientation, which bearings need")
-        unit = to_direction(*direction[name].double().unbind(-1)) @ spectra.rotation.T
-        # from the fixed end to the moving one
-        line[data.received[:, number], number] = unit if data.moving == "transmitter" else -unit
-    return station_positions(data), line
+        sign = 1.0 if data.moving == "transmitter" else -1.0  # from the fixed end to the moving one
+        unit = to_direction(*direction[name].double().unbind(-1)) * sign
+        side = (towards.double() - fixed) @ spectra.rotation[:, 2]
+        unit[:, 2] = torch.where(side < 0, -1.0, 1.0) * unit[:, 2].abs()
+        line[data.received[:, number], number] = unit @ spectra.rotation.T
+    return origin, line
 
 
 def station_positions(data: Stations) -> Tensor:

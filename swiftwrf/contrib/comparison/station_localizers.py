@@ -90,7 +90,7 @@ class PeakTriangulation(StationLocalizer):
         return self
 
     def locate(self, data: Stations) -> Located:
-        return Located(triangulated(*bearings(data, peak_directions(data)), start=self._mean))
+        return Located(triangulated(*bearings(data, peak_directions(data), self._mean), start=self._mean))
 
 
 @STATION_LOCALIZERS.register("knn")

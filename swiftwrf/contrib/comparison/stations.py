@@ -119,7 +119,8 @@ class StationsComparison(PositionComparison):
             name: torch.as_tensor(values, dtype=torch.float64)[self.test.of(name)[0]]
             for name, values in directions.items()
         }
-        position = triangulated(*bearings(self.test, known), start=self.train.position.mean(dim=0))
+        mean = self.train.position.mean(dim=0)
+        position = triangulated(*bearings(self.test, known, mean), start=mean)
         return self._values(Located(position), 0.0, time.perf_counter() - began)
 
     def _values(self, located: Located, fit_s: float, predict_s: float) -> Values:

@@ -157,13 +157,28 @@ class TestTriangulation:
     def test_lines_meet_at_the_position(self):
         data = simulated_stations(n=12, stations=4, grid=GRID)
         label = {name: data.of(name)[1].label for name in data.names}
-        found = triangulated(*bearings(data, label), start=torch.zeros(3))
+        found = triangulated(*bearings(data, label, data.position.mean(dim=0)), start=torch.zeros(3))
         assert found.allclose(data.position, atol=1e-4)
+
+    @pytest.mark.parametrize("moving", ["transmitter", "receiver"])
+    def test_level_arrays_above_the_positions(self, moving):
+        """Their directions are folded to the upper half-space, and the positions are below."""
+        position = simulated_stations(n=9, stations=1, grid=GRID).position
+        array, spectra = swiftwrf.simulated_room(n=10, grid=GRID).array, {}
+        for name, corner in (("a", (0.2, 0.3, 2.8)), ("b", (7.8, 0.4, 2.8)), ("c", (0.3, 5.7, 2.8))):
+            ends = {"fixed_position": corner, "rotation": torch.eye(3)}
+            spectra[name] = swiftwrf.Spectra(
+                torch.rand(9, 15, 60), position, array=array, moving=moving, grid=GRID, **ends
+            )
+        data = Stations(spectra)
+        label = {name: spectra[name].label for name in spectra}
+        found = triangulated(*bearings(data, label, position.mean(dim=0)), start=torch.zeros(3))
+        assert found.allclose(position, atol=1e-4)
 
     def test_least_squares(self):
         """The result is numpy's solution of the stacked equations of all lines."""
         data = simulated_stations(n=5, stations=3, grid=GRID)
-        origin, line = bearings(data, peak_directions(data))
+        origin, line = bearings(data, peak_directions(data), data.position.mean(dim=0))
         start = torch.tensor([4.0, 3.0, 1.0])
         found = triangulated(origin, line, start)
         for row in range(len(data)):
