@@ -89,7 +89,7 @@ floor_alone = during_a_test(known_planes, FLOOR)  # the only plane that any sear
 @pytest.fixture(scope="module")
 def without_furniture() -> Iterator[None]:
     """No search for furniture, which takes most of the time of a fit to channels, and has tests of its own."""
-    with mock.patch.object(GeometryModel, "_furnish"):
+    with mock.patch.object(GeometryModel, "furnish"):
         yield
 
 

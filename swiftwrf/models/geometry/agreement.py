@@ -105,4 +105,6 @@ def _placed(
                 found.estimate = moved(found.estimate, [number])
     if unknown:
         found.estimate = widened_room(found.estimate, unknown, spectra, config)
+    if found.estimate is not room.estimate:  # furniture reflects in the planes, too
+        found.furnish(found.link.aligned(spectra))
     return found

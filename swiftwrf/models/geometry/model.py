@@ -105,9 +105,9 @@ class GeometryModel(Linked, FieldModel):
         else:
             self.estimate = refine_room(known.estimate, train, self.config)
         self.fingerprint = owner
-        self._furnish(train)
+        self.furnish(train)
 
-    def _furnish(self, train: Spectra) -> None:
+    def furnish(self, train: Spectra) -> None:
         """Estimate what stands in the room, if there are channels."""
         self.furniture = None
         if train.channel is not None and self.planes:

@@ -213,6 +213,22 @@ class TestAgreement:
         assert found["west"].planes[0].offset_m == pytest.approx(8.0, abs=0.02)
         assert found["east"].planes[0].offset_m == pytest.approx(8.0, abs=0.02)
 
+    def test_furniture_is_found_again_where_planes_moved(self, office, monkeypatch):
+        train, _ = office
+        spectra = {name: train.of(name)[1] for name in train.names}
+        off = Plane((1.0, 0.0, 0.0), 8.062, -0.6, probability=0.6)
+        rooms = {
+            name: GeometryModel.of_planes(spectra[name], [plane, *OFFICE_WALLS[2:]])
+            for name, plane in (("west", off), ("east", OFFICE_WALLS[1]))
+        }
+        furnished = []
+        monkeypatch.setattr(
+            GeometryModel, "furnish", lambda room, train: furnished.append((room, train.fixed_position))
+        )
+        found = agreed(rooms, spectra)
+        assert [room for room, _ in furnished] == [found["west"]]
+        assert furnished[0][1].equal(spectra["west"].fixed_position)
+
     def test_a_station_keeps_a_plane_that_its_spectra_determine(self, office):
         train, _ = office
         spectra = {name: train.of(name)[1] for name in train.names}

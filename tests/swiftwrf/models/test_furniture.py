@@ -60,7 +60,7 @@ def measured(
 
 def fitted(walls: GeometryModel, train: Spectra) -> GeometryModel:
     """The room of known walls with the furniture that its channels show."""
-    walls._furnish(train)
+    walls.furnish(train)
     return walls
 
 
@@ -194,7 +194,7 @@ def test_furniture_is_drawn_by_height_and_hatched_where_it_is_unknown(tmp_path):
 def test_an_empty_room_has_no_furniture_and_spectra_alone_have_none():
     data, walls = measured(0.0, n=40)
     assert fitted(walls, data).furniture is None
-    walls._furnish(replace(data, channel=None))
+    walls.furnish(replace(data, channel=None))
     assert walls.furniture is None
     with pytest.raises(InputError, match="contains spectra alone"):
         walls.channels(replace(data, channel=None))
