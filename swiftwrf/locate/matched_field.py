@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import torch
 from annotated_types import Ge, Le
@@ -203,7 +203,8 @@ class MatchedField(Locator):
         self._prepare()
         start = [weight for each in self.likelihoods for weight in each.start]
         self.weight, self.inflation = torch.tensor(start, dtype=torch.float64), 1.0
-        self._calibrate(self._held_out(position, Observed(_rows(data, len(position)), features), fold, fitted))
+        observed = Observed(_rows(data, self.stations, len(position)), features)
+        self._calibrate(self._held_out(position, observed, fold, fitted))
         return self
 
     def _prepare(self) -> None:
@@ -278,16 +279,14 @@ class MatchedField(Locator):
         if not len(spectrum):
             raise InputError("there is no row to locate")
         data, features = self._by_station(spectrum), list[SpectrumFeatures | None]()
-        row = torch.full((len(spectrum), len(self.stations)), -1)
-        for number, (station, likelihoods) in enumerate(zip(self.stations, self.likelihoods, strict=True)):
+        for station, likelihoods in zip(self.stations, self.likelihoods, strict=True):
             if station in data:
-                rows, spectra = data[station]
-                row[rows, number] = torch.arange(len(rows))
+                _, spectra = data[station]
                 aligned = likelihoods.room.link.aligned(spectra) if isinstance(spectra, Spectra) else spectra
                 features.append(likelihoods.features(aligned, self.config.seed))
             else:
                 features.append(None)
-        return self._located(Observed(row, features))
+        return self._located(Observed(_rows(data, self.stations, len(spectrum)), features))
 
     def _located(self, observed: Observed) -> Posterior:
         parts = self._searched(observed, self.likelihoods)
@@ -335,7 +334,8 @@ class MatchedField(Locator):
             if unknown := spectrum.spectra.keys() - set(self.stations):
                 known = ", ".join(filter(None, self.stations)) or "plain spectra"
                 raise InputError(f"this locator was fitted to {known}, not to {', '.join(sorted(unknown))}")
-            return {station: spectrum.of(station) for station in spectrum.spectra if len(spectrum.of(station)[0])}
+            parts = {station: spectrum.of(station) for station in spectrum.spectra}
+            return {station: (rows, spectra) for station, (rows, spectra) in parts.items() if len(rows)}
         if len(self.stations) > 1:
             raise InputError(f"this locator takes Stations with {', '.join(self.stations)}, or some of them")
         return {self.stations[0]: (torch.arange(len(spectrum)), spectrum)}
@@ -393,9 +393,11 @@ def _by_station(data: Spectra | Stations) -> dict[str, tuple[Tensor, Spectra]]:
     return {ONE: (torch.arange(len(data)), data)}
 
 
-def _rows(data: Mapping[str, tuple[Tensor, Spectra]], n: int) -> Tensor:
+def _rows(data: Mapping[str, tuple[Tensor, Any]], stations: Sequence[str], n: int) -> Tensor:
     """Return the row of each of n transmissions at each station, (n, A), -1 where a station did not receive it."""
-    row = torch.full((n, len(data)), -1)
-    for number, (rows, _) in enumerate(data.values()):
-        row[rows, number] = torch.arange(len(rows))
+    row = torch.full((n, len(stations)), -1)
+    for number, station in enumerate(stations):
+        if station in data:
+            received = data[station][0]
+            row[received, number] = torch.arange(len(received))
     return row

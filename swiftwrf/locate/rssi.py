@@ -94,6 +94,8 @@ class RssiLocator(Locator):
     """radio maps of the receivers, set by `fit`"""
     likelihoods: Annotated[RssiLikelihoods, "r=model.r"]
     """likelihoods that are pooled, set by `fit`"""
+    weight: Annotated[Tensor, "float64 3", Ge(0), Le(1e3)]
+    """their weights: of values, detections and fingerprints"""
     held_out_m: dict[str, float]
     """mean errors [m] of the posterior and of the mean training position at held-out rows, set by `fit`, not saved"""
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from swiftwrf.contrib.comparison.base import Comparison, Recorded, Values
 from swiftwrf.contrib.comparison.errors import summary
-from swiftwrf.contrib.comparison.localizers import LEVELS, LOCALIZERS, PosteriorLocalizer
+from swiftwrf.contrib.comparison.localizers import LEVELS, LOCALIZERS, Located, PosteriorLocalizer
 from swiftwrf.contrib.comparison.steps import LOCATOR, Memo, Steps
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin, degree_columns
@@ -35,6 +35,7 @@ from swiftwrf.runtime.checkpoint import load
 from swiftwrf.runtime.validation import checked
 
 MIN_ROWS = 20  # training rows that a receiver detected: five folds, of which four hold at least 10 rows
+OPTIONAL = ("radius", "ambiguous", "floor_probability", "direction")  # of `Located`, which some localizers give
 N_MAPS = 6  # test rows whose posteriors are drawn
 
 
@@ -73,6 +74,19 @@ class PositionComparison(Comparison):
     @abstractmethod
     def _positions(self) -> tuple[Tensor, Tensor]:
         """Return the training and the test positions, (n, 3) [m]."""
+
+    def _values(self, located: Located, fit_s: float, predict_s: float) -> Values:
+        """Return the values of a localizer from its positions of the test rows, and the seconds that it took."""
+        _, truth = self._positions()
+        values: Values = {
+            "seconds": {"fit": fit_s, "predict": predict_s},
+            "index": self.test.index,
+            "truth": truth,
+            "estimate": located.position,
+            "median": summary((located.position - truth).norm(dim=1))["median"],
+        }
+        optional = {name: getattr(located, name) for name in OPTIONAL}
+        return values | {name: value for name, value in optional.items() if value is not None}
 
     def _extent(self) -> Tensor | None:
         """Return positions whose extent maps of the posterior have, (n, 3) [m]. None if all have the same candidates."""
@@ -225,16 +239,7 @@ class LocateComparison(PositionComparison):
         localizer.fit(train)
         fitted = time.perf_counter()
         located = localizer.locate(test.rssi_dbm)
-        error = (located.position - test.transmitter_position).norm(dim=1)
-        values: Values = {
-            "seconds": {"fit": fitted - began, "predict": time.perf_counter() - fitted},
-            "index": test.index,
-            "truth": test.transmitter_position,
-            "estimate": located.position,
-            "median": summary(error)["median"],
-        }
-        optional = {name: getattr(located, name) for name in ("radius", "ambiguous", "floor_probability")}
-        values |= {name: value for name, value in optional.items() if value is not None}
+        values = self._values(located, fitted - began, time.perf_counter() - fitted)
         if isinstance(localizer, PosteriorLocalizer):
             weight = localizer.locator.weight.tolist()
             values["weights"] = dict(zip(("values", "detections", "fingerprints"), weight, strict=True))

@@ -16,7 +16,6 @@ from pandas import DataFrame
 from torch import Tensor
 
 from swiftwrf.contrib.comparison.base import Recorded, Values
-from swiftwrf.contrib.comparison.errors import summary
 from swiftwrf.contrib.comparison.localizers import LEVELS, Located
 from swiftwrf.contrib.comparison.locating import PositionComparison
 from swiftwrf.contrib.comparison.station_localizers import STATION_LOCALIZERS, StationsPosterior
@@ -122,18 +121,6 @@ class StationsComparison(PositionComparison):
         mean = self.train.position.mean(dim=0)
         position = triangulated(*bearings(self.test, known, mean), start=mean)
         return self._values(Located(position), 0.0, time.perf_counter() - began)
-
-    def _values(self, located: Located, fit_s: float, predict_s: float) -> Values:
-        error = (located.position - self.test.position).norm(dim=1)
-        values: Values = {
-            "seconds": {"fit": fit_s, "predict": predict_s},
-            "index": self.test.index,
-            "truth": self.test.position,
-            "estimate": located.position,
-            "median": summary(error)["median"],
-        }
-        optional = {name: getattr(located, name) for name in ("radius", "ambiguous", "direction")}
-        return values | {name: value for name, value in optional.items() if value is not None}
 
     @property
     def directions(self) -> DataFrame:

@@ -328,6 +328,12 @@ def test_a_locator_whose_numbers_overflow_is_refused(closed_form, name, value, s
         MatchedField.from_state(damaged, header).locate(test.spectrum[:2])
 
 
+def test_a_file_with_another_number_of_weights_is_refused():
+    tensors, header = RssiLocator(n_cells=50).fit(rssi_room(n=40)).state()
+    with pytest.raises(InputError, match="weight has shape"):
+        RssiLocator.from_state(tensors | {"weight": torch.ones(4, dtype=torch.float64)}, header)
+
+
 def test_values_have_the_density_of_a_common_offset_and_missing_ones_count_as_missing():
     observed = torch.tensor([[-61.0, math.nan, -84.0], [-50.0, -71.0, -80.0]], dtype=torch.float64)
     maps = torch.tensor([[-60.0, -70.0, -80.0], [-55.0, -66.0, -75.0]]), torch.tensor([[2.0, 3, 4], [1, 2, 5]])
