@@ -15,7 +15,7 @@ from torch import Tensor
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin
 from swiftwrf.data.dataset import Arrays, Numbers, PositionedData, position_coordinates, to_positions
 from swiftwrf.data.powers import check_powers
-from swiftwrf.data.splits import MIN_TRAINING, Validation, random_split
+from swiftwrf.data.splits import MIN_TRAINING, Validation, matching_validation, random_split
 from swiftwrf.data.survey import TableOptions, read_survey
 from swiftwrf.errors import InputError, listed
 from swiftwrf.plotting import MARK, Axes, plan
@@ -235,8 +235,9 @@ class Rssi(PositionedData):
     def validation_for(self, split: str, test: Rssi) -> Validation:
         """Return the kind of folds of this training part that resembles the test part of a split.
 
-        Folds are single rows for random splits and regions for all others. They are whole sessions if the test rows are of
-        other sessions than the training rows.
+        Folds are single rows for random splits, and regions for splits by block or place. For a split that comes with the
+        data, distances of its test rows to the training positions decide, and measurements of test rows have no part. Folds
+        are whole sessions if the test rows are of other sessions than the training rows.
 
         Example:
             >>> import swiftwrf
@@ -247,7 +248,11 @@ class Rssi(PositionedData):
         sessions, others = ({*data.session.tolist()} if data.session is not None else {0} for data in (self, test))
         if len(sessions) > 1 and sessions.isdisjoint(others):
             return "session"
-        return "random" if split == "random" else "block"
+        if split in ("block", PLACE):
+            return "block"
+        return (
+            "random" if split == "random" else matching_validation(self.transmitter_position, test.transmitter_position)
+        )
 
     @checked
     def receivers(self, asked: Sequence[str]) -> Rssi:
