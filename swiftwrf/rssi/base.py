@@ -16,7 +16,7 @@ from swiftwrf.choices import NotDetected
 from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Offsets, Rssi
-from swiftwrf.data.splits import MIN_TRAINING
+from swiftwrf.data.splits import MIN_TRAINING, Validation
 from swiftwrf.errors import InputError, listed
 from swiftwrf.models.base import FieldConfig, Updatable
 from swiftwrf.models.prediction import Prediction
@@ -60,9 +60,16 @@ class RssiConfig(FieldConfig):
 
     - "weak": the power was below the limit of detection.
     - "unknown": the cell is ignored.
-    - "auto": "weak" at each receiver whose empty cells are where its path loss expects no value, otherwise "unknown".
+    - "auto": "weak" at each receiver whose empty cells are where its path loss expects no value, otherwise "unknown". It is
+      "unknown" at all receivers if values and detections in held-out folds are then more likely.
 
     Only the path loss counts the empty cells of a receiver with fewer than 10 values"""
+    calibration: Validation | None = None
+    """folds whose errors scale the standard deviations. Defaults to those of `validation`. "block" suits predictions for
+    other days or devices, whose errors no fold of single rows contains"""
+    noises: tuple[PositiveFloat, ...] = (0.02, 0.05, 0.1, 0.3, 1.0, 2.0, 3.0)
+    """compared variances of one measurement about the field, relative to that of the field. Fading of a packet is about as
+    large as shadowing. Means of many packets have less noise"""
 
 
 class RssiPredictor(Updatable, Configured, Displayed, ABC):
