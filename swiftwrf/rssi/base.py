@@ -16,7 +16,7 @@ from swiftwrf.choices import NotDetected
 from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Offsets, Rssi
-from swiftwrf.data.splits import MIN_TRAINING, Validation
+from swiftwrf.data.splits import MIN_PLACES, MIN_TRAINING, Validation
 from swiftwrf.errors import InputError, listed
 from swiftwrf.models.base import FieldConfig, Updatable
 from swiftwrf.models.prediction import Prediction
@@ -141,7 +141,7 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
         """Fit the predictor to measured RSSI and return it. A fit that fails leaves the predictor as it was.
 
         Args:
-            train: Training rows, at least 10 measurements in all. Missing values (nan) are ignored.
+            train: Training rows, at least 4 measurements in all. Missing values (nan) are ignored.
             pool: The same rows at every receiver of the data, from which properties common to all receivers are learnt.
                 Defaults to `train`. Receivers with fewer than 10 rows take no part in the choice of the kernel.
             device: Device to compute on. The fitted predictor is on the CPU.
@@ -156,10 +156,10 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
         pool = pool or train
         names = {*train.receiver_names, *(pool.receiver_names[c] for c in often_detected(pool).tolist())}
         pool = pool.columns([c for c, name in enumerate(pool.receiver_names) if name in names])
-        if (detected := int(train.detected.sum())) < MIN_TRAINING:
+        if (detected := int(train.detected.sum())) < (least := MIN_PLACES - 1):
             raise InputError(
                 f"receivers {listed(train.receiver_names)} have {detected} training measurements in all; measure at least "
-                f"{MIN_TRAINING}"
+                f"{least}"
             )
         more = set(train.receiver_names) <= set(pool.receiver_names)
         if not more or not torch.equal(pool.transmitter_position, train.transmitter_position):
