@@ -95,15 +95,12 @@ class RssiModel(RssiPredictor, Saved):
         progress: bool = False,
         **_: Any,
     ) -> None:
-        def fitted_with(curve: Detection | None) -> Fit:
-            training = prepare(pool, columns_of(train.receiver_names, pool), self.config, shift, curve)
-            return fit_receivers(training, self.config, device, parallel or _in_threads, progress)
-
-        fit = fitted_with(curve)
-        if self.config.not_detected == "auto" and curve is not None and not bool(fit.training.limit.isnan().all()):
-            without = fitted_with(replace(curve, is_limit=torch.zeros_like(curve.is_limit)))
-            # as probable as with values of a mean error that is 1 % lower
-            fit = without if without.score > fit.score + 0.01 * float(train.detected.sum()) else fit
+        candidates = prepare(pool, columns_of(train.receiver_names, pool), self.config, shift, curve)
+        parallel = parallel or _in_threads
+        fit, *others = (fit_receivers(training, self.config, device, parallel, progress) for training in candidates)
+        for without_limits in others:  # as probable as values of a mean error that is 1 % lower
+            is_better = without_limits.score > fit.score + 0.01 * float(train.detected.sum())
+            fit = without_limits if is_better else fit
         training, rows = fit.training, fit.training.bin_of_row
         self.detection, self.detection_field = training.path_loss.detection, fit.detection_field
         predicted, std, means = fit.predicted[:, rows], fit.std[-1, rows], training.path_loss.shared(fit.distance)
