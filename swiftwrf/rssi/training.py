@@ -226,7 +226,7 @@ def choose_residual_kernels(
         for kernel in rough_candidates(position, noises)
     ]
     covariance = [kernel(position, position) + (kernel.noise * noise_scale).diag() for kernel in kernels]
-    precision = torch.linalg.inv(torch.stack(covariance))
+    precision = torch.cholesky_inverse(torch.linalg.cholesky(torch.stack(covariance)))
     dual, errors = torch.einsum("knm,mrl->knrl", precision, residual.nan_to_num()), []
     for r, missing in enumerate(residual[..., 0].isnan().T):
         # missing rows are held out with every fold, so that the zeros in their place have no effect

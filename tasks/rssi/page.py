@@ -30,6 +30,7 @@ from tasks.page.shared import (
     recommendation,
 )
 from tasks.records import Records, notes
+from tasks.rssi.differences import where_methods_differ
 from tasks.rssi.maps import MIN_RATIO, WIDTH_PER_STD, Maps, coverage_sentence
 from tasks.terminal import Answer, Method, NextStep
 
@@ -98,7 +99,7 @@ def _errors(run: Records, found: Answer) -> Section:
         "interval over test places. Detection: mean of the fractions of detected and of empty test cells that are predicted "
         "as such; 0.5 is chance."
     )
-    return errors_section(
+    section = errors_section(
         found,
         run.table("errors")[COLUMNS],
         COLOURS,
@@ -108,6 +109,8 @@ def _errors(run: Records, found: Answer) -> Section:
         paragraphs=[f"Left out: {reason}." for reason in run.metrics["left_out"].values()],
         panels=_by_rows(run),
     )
+    section.tables.append(where_methods_differ(run, found))
+    return section
 
 
 def answer(run: Records) -> Answer:
