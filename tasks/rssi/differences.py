@@ -11,10 +11,11 @@ def where_methods_differ(run: Records, found: Answer) -> Table:
     """Return the errors of all methods at weak and strong values, far from training rows, with few rows, and in a region."""
     errors = run.table("errors")
     errors = errors.assign(error=errors["predicted_dbm"] - errors["measured_dbm"])
-    weak, strong = errors["measured_dbm"].quantile([0.25, 0.75])
-    apart = float(errors["from_training_m"].quantile(0.75))
+    pairs = errors[errors["method"] == found.chosen]  # which are those of all methods
+    weak, strong = pairs["measured_dbm"].quantile([0.25, 0.75])
+    apart = float(pairs["from_training_m"].quantile(0.75))
     by_method = {
-        f"{end} quarter, {sign} {value:.0f} dBm: bias [dB]": errors[part].groupby("method")["error"].mean()
+        f"{end} quarter, {sign} {value:.4g} dBm: bias [dB]": errors[part].groupby("method")["error"].mean()
         for end, sign, value, part in (
             ("weakest", "up to", weak, errors["measured_dbm"] <= weak),
             ("strongest", "from", strong, errors["measured_dbm"] >= strong),
