@@ -99,7 +99,8 @@ def execute(program: str, config_type: type[Config], task: Callable[[Config], No
     """
     general, own, saved = split(arguments)
     finds = issubclass(config_type, FindingConfig) or not issubclass(config_type, ReadingConfig)
-    for name in [] if finds else _reading_options(own):
+    declared = {option.name for option in fields(config_type)}  # aoa has a --station of its own
+    for name in [] if finds else [name for name in _reading_options(own) if name not in declared]:
         raise InputError(f"--{name} is no option of this command; {HOW_TO_READ.format(name)}")
     config = parse(config_type, own, program, saved, general.config)
     config.check()

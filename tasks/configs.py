@@ -37,6 +37,8 @@ class AoaConfig(ReadingConfig):
     --preset paper"""
     data: str | None = None
     """folder or file of spectra, ray paths or array snapshots, or name of a public data set, see docs/formats.md"""
+    station: str | None = None
+    """name of the array to take from data of several (default: each of them, one run after the other, and one report)"""
     split: str = "random"
     """a split that comes with the data, or a seeded one: random or block"""
     models: Annotated[
@@ -94,6 +96,8 @@ class AoaConfig(ReadingConfig):
             if RAYTRACE not in self.models:
                 raise InputError(f"--scene is for the model {RAYTRACE}; add it to --models, or leave --scene out")
             check_scene(self.scene, "--scene ")
+        if self.station is not None and self.data is None:
+            raise InputError("--station is for --data with several arrays; the built-in room has one")
         if self.moving is not None and self.data is not None:
             raise InputError("--moving is for the built-in room; with --data the data determine which end moves")
         given_mix = " ".join(map(fraction_key, self.measured))
