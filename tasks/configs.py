@@ -398,7 +398,8 @@ class ResumeConfig(Options):
 class ScenesConfig(Options):
     """Trace ray paths in a room or a scene file by Sionna RT (extra: raytrace).
 
-    The directory holds paths.npz, which --data of the tasks reads, and scene.svg, a plan of the room and the positions.
+    The directory holds paths.npz, which --data of the tasks reads, and scene.svg, a plan of the room and the positions. With
+    several fixed ends each has a folder of its own, which locate --data reads as the arrays.
 
     Example: swiftwrf scenes --room office --moving receiver --positions 1000 --out office
     """
@@ -424,8 +425,8 @@ class ScenesConfig(Options):
     """fraction of the reflected amplitude that surfaces scatter, 0 to 1"""
     diffraction: bool = False
     """whether to trace paths diffracted at one edge"""
-    fixed: tuple[float, float, float] | None = None
-    """position of the fixed end [m] (default: that of the room)"""
+    fixed: tuple[float, ...] = ()
+    """position of the fixed end, or of several, each of which has a folder: x y z x y z ... [m] (default: that of the room)"""
     region: tuple[float, float, float, float, float, float] | None = None
     """region of the moving end: opposite corners x y z x y z [m] (default: that of the room)"""
     seed: Seed = 0
@@ -438,9 +439,11 @@ class ScenesConfig(Options):
                 "--order 0 leaves the direct path alone; scattering and diffraction need at least --order 1"
             )
         check_scene(self.room)
+        if len(self.fixed) % 3:
+            raise InputError(f"--fixed takes x y z of each fixed end, got {len(self.fixed)} numbers")
         if not self.room.endswith(SCENE_FILE):
             return
-        if self.fixed is None or self.region is None:
+        if not self.fixed or self.region is None:
             raise InputError(
                 f"{self.room} does not contain the positions of the ends; give --fixed X Y Z and --region X Y Z X Y Z"
             )
