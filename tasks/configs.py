@@ -426,7 +426,7 @@ class ScenesConfig(Options):
     diffraction: bool = False
     """whether to trace paths diffracted at one edge"""
     fixed: tuple[float, ...] = ()
-    """position of the fixed end, or of several, each of which has a folder: x y z x y z ... [m] (default: that of the room)"""
+    """position of the fixed end, or of several, with a folder each: x y z x y z ... [m] (default: that of the room)"""
     region: tuple[float, float, float, float, float, float] | None = None
     """region of the moving end: opposite corners x y z x y z [m] (default: that of the room)"""
     seed: Seed = 0

@@ -69,7 +69,7 @@ class AngularGrid:
     @classmethod
     @checked
     def ring(cls, n_azimuth: Size) -> AngularGrid:
-        """Return one row of azimuths in the plane of the array, the grid of an array that tells no elevations apart.
+        """Return one row of azimuths in the plane of the array, the grid of an array that does not resolve elevations.
 
         Raises:
             InputError: A size that is no whole number from 2 on, or too many pixels.
