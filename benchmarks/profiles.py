@@ -5,7 +5,7 @@ python benchmarks/profiles.py locate --data DIR
 
 `channels` is `swiftwrf aoa --mix 0.5` on 160 channels of 16 elements and 16 subcarriers in the simulated office, which it
 writes first. `locate` is `swiftwrf locate` on a survey. A row of the table is a function whose own calls and those below it
-take a twentieth of the time or more. Profiling makes Python slower, so the seconds of the command are those of a run without.
+take a twentieth of the time or more. Seconds of the command are those of a run without profiler.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import torch
 import tyro
-import yaml
 from record import RESULTS, options, write_result
 
 from swiftwrf.array.planar import PlanarArray
@@ -87,7 +86,7 @@ def functions(stats: pstats.Stats) -> list[dict[str, Any]]:
 
 
 def write_channels(folder: Path) -> None:
-    """Write channels of one array in the simulated office as snapshots.npz with array.yml."""
+    """Write channels of one array in the simulated office as snapshots.npz."""
     folder.mkdir()
     generator = torch.Generator().manual_seed(0)
     low, high = torch.tensor(OFFICE_REGION, dtype=torch.float64)
@@ -98,16 +97,17 @@ def write_channels(folder: Path) -> None:
     channel, frequency = paths.subcarriers(array, N_SUBCARRIERS, BANDWIDTH_HZ)
     std = channel.abs().square().mean().sqrt() * 10 ** (-SNR_DB / 20)
     channel = channel + std * torch.randn(channel.shape, dtype=channel.dtype, generator=generator)
-    np.savez(folder / "snapshots.npz", csi=channel.numpy(), position=position.numpy(), frequency_hz=frequency.numpy())
-    described = {
-        "frequency_hz": OFFICE.frequency_hz,
-        "rows": 4,
-        "columns": 4,
-        "spacing_m": array.wavelength / 2,
-        "array_position": list(pose.position),
-        "array_orientation": list(pose.orientation),
-    }
-    (folder / "array.yml").write_text(yaml.safe_dump(described))
+    np.savez(
+        folder / "snapshots.npz",
+        csi=channel.numpy(),
+        position=position.numpy(),
+        frequency_hz=frequency.numpy(),
+        array_position=np.array(pose.position),
+        array_orientation=np.array(pose.orientation),
+        rows=4,
+        columns=4,
+        spacing_m=array.wavelength / 2,
+    )
 
 
 if __name__ == "__main__":
