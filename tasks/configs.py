@@ -121,7 +121,7 @@ class RssiTaskConfig(ReadingConfig):
     Example: swiftwrf rssi --rx 6 --data DIR
     """
 
-    receivers: tuple[str, ...]
+    receivers: tuple[str, ...] = ("all",)
     """receivers: names, numbers counted from 1, or all"""
     data: str | None = None
     """survey table (CSV, Parquet, JSON, GPX, KML), folder with tx_pos.csv, gateway_rssi.csv and gateway_position.yml (NeRF2

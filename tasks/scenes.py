@@ -15,6 +15,7 @@ from swiftwrf.data.files import sha256
 from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.writing import write_paths
 from swiftwrf.runtime.durable import write_json
+from tasks.command import run_module
 from tasks.configs import ScenesConfig
 from tasks.directory import new_directory
 from tasks.environment import invocation
@@ -123,3 +124,7 @@ def draw_positions(room: FurnishedRoom | None, region: Tensor, count: int, seed:
         if len(found) >= count:
             return found[:count]
     raise InputError(f"only {len(found)} of {count} positions are free of walls and furniture; choose another --region")
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_module("tasks.scenes"))
