@@ -1,4 +1,4 @@
-"""Where the time of a command goes: processor seconds of functions, in one process and thread.
+"""Processor seconds of a command and of its functions, in one process and thread.
 
 python benchmarks/profiles.py channels
 python benchmarks/profiles.py locate --data DIR
