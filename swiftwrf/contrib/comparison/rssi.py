@@ -19,11 +19,13 @@ from torch import Tensor
 from swiftwrf.choices import RSSI_PREDICTORS, NotDetected
 from swiftwrf.contrib.comparison.base import Comparison, Recorded, Values
 from swiftwrf.contrib.comparison.errors import summaries, summary
+from swiftwrf.contrib.comparison.leave_one_out import LEAVE_ONE_OUT, distances_to_others, is_small, predict_each_place
+from swiftwrf.contrib.comparison.parts import fewer_rows, pool_of, region_of
 from swiftwrf.contrib.comparison.steps import MODEL, Memo, Steps, refusing_executor
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.rssi import PLACE
-from swiftwrf.data.splits import MIN_TRAINING, Validation, places
+from swiftwrf.data.splits import Validation, places
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import LEVEL
 from swiftwrf.models.prediction import Prediction
@@ -101,6 +103,7 @@ class RssiComparison(Comparison):
         left_out: Reason for each predictor that the data do not suffice for.
         predictors: Fitted predictors by name. Of those whose values `keep` had, the model alone.
         by_rows: Mean absolute errors [dB] of the model and of "knn" by the number of training rows, a column for each.
+        region: Mean absolute errors [dB] of both in a fifth of the area, fitted to the training rows elsewhere.
 
     Example:
         >>> import swiftwrf
@@ -117,6 +120,7 @@ class RssiComparison(Comparison):
     left_out: Mapping[str, str] = field(default_factory=dict)
     predictors: Mapping[str, RssiPredictor] = field(default_factory=dict)
     by_rows: DataFrame = field(default_factory=DataFrame)
+    region: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def model(self) -> str:
@@ -170,7 +174,10 @@ class RssiComparison(Comparison):
         """Columns of the detected test pairs that are those of every method."""
         test, (row, column) = self.test, self._pairs
         from_receiver = distance(test.transmitter_position, test.receiver_position)[row, column]
-        from_training = nearest(test.transmitter_position, self.train.transmitter_position, 1)[0][row, 0]
+        if self.options["split"] == LEAVE_ONE_OUT:
+            from_training = distances_to_others(test.transmitter_position)[row]
+        else:
+            from_training = nearest(test.transmitter_position, self.train.transmitter_position, 1)[0][row, 0]
         return {
             "receiver": self._receiver,
             "index": test.index[row],
@@ -198,6 +205,7 @@ class RssiComparison(Comparison):
             "interval": {"nominal": LEVEL, "coverage": self.coverage},
             "coverage": coverage,
             "by_rows": {str(n): {str(name): mean for name, mean in row.items()} for n, row in self.by_rows.iterrows()},
+            "region": dict(self.region),
             "chosen": {
                 "n_primitives": max(value["n_primitives"] for value in self.values.values()),
                 "floor_attenuation_db": None if attenuation is None else attenuation.db,
@@ -287,14 +295,16 @@ def compare(
     Args:
         data: RSSI. Offsets between its groups, if it has any, are estimated from training rows and removed from them.
         receivers: Names of receivers, numbers counted from 1, or "all".
-        split: Split that comes with the data, or a seeded one: random, block, or place.
+        split: Split that comes with the data, or a seeded one: random, block, or place. Without enough rows for a random
+            split, 13, all other places predict each one.
         seed: Seed of everything random.
         also: Predictors that are compared only when named, e.g. "nerf2".
         preset: "quick", or "paper" for published settings.
         reference: Group whose offset is 0. Defaults to the most frequent one.
         not_detected: Meaning of an empty cell; see `RssiConfig`.
         validation: Folds that choose all settings: "random", "block" or "session". Defaults to those like the test rows.
-        fewer: Fractions of the training rows that the model and "knn" are fitted to, too, e.g. (0.25, 0.5).
+        fewer: Fractions of the training rows that the model and "knn" are fitted to, too, e.g. (0.25, 0.5). After a random
+            split both then predict a region of the training rows by all others.
         device: Device to compute on.
         keep: Results by the names of predictors, in a folder, and the model. A call with equal data, options, code and
             versions continues after them, others are refused.
@@ -302,7 +312,8 @@ def compare(
         progress: Show a progress bar on a terminal.
 
     Raises:
-        InputError: Unknown receivers, split or predictors, no test row that a receiver detects, too few rows, or `keep` of
+        InputError: Unknown receivers, split or predictors, no test row that a receiver detects, too few rows, fewer than 5
+            places, or `keep` of
             another call.
 
     Example:
@@ -313,40 +324,51 @@ def compare(
     """
     given = locals().copy()
     chosen = data.as_measured().receivers(receivers)
-    train, test = chosen.split(split, seed)
+    small = is_small(chosen, split)
+    train, test = (chosen, chosen) if small else chosen.split(split, seed)
     if not bool(test.detected.any()):
         raise InputError(f"split {split!r} of {data.name} has no test rows that detect these receivers")
-    pool = pool_of(data, train, test, split, seed)
+    pool = data if small else pool_of(data, train, test, split, seed)
     if pool.groups is not None:
         offsets = estimate_offsets(pool, reference)
         train, pool = offsets.removed(train), offsets.removed(pool)
     offset = 0.0 if train.offsets is None else train.offsets.of(test)[:, None]
     kind = train.validation_for(split, test) if validation == "auto" else validation
     options: Values = {"validation": kind, "seed": seed, "new_places": split == PLACE, "not_detected": not_detected}
+    if kind == "random" != split:  # test rows of a split that comes with the data may be of another day or device
+        options["calibration"] = "block"
     names, left_out = compared(chosen, also)
     if keep is not None:
         keep.of(given | {"predictors": [RSSI_PREDICTORS[name] for name in names]})
-    begun = RssiComparison(train, test, {}, {"split": split, "preset": preset, "seed": seed}, left_out)
+    shown = {"split": LEAVE_ONE_OUT if small else split, "preset": preset, "seed": seed}
+    begun = RssiComparison(train, test, {}, shown, left_out)
     model_name, predictors = begun.model, dict[str, RssiPredictor]()
     parallel = None if executor is None else executor.map
 
     def compute(_: None, folder: Path, name: str, rows: Tensor | None = None) -> Values:
-        predictor = make_predictor(name, preset, **options)
+        def fit(rows: Rssi, pool: Rssi) -> RssiPredictor:
+            predictor = make_predictor(name, preset, **options)
+            return predictor.fit(rows, pool=pool, device=device, parallel=parallel, progress=progress)
+
         part, every = (train, pool) if rows is None else (train.subset(rows), pool.subset(rows))
         began = time.perf_counter()
-        predictor.fit(part, pool=every, device=device, parallel=parallel, progress=progress)
+        predictor = fit(part, every)
         fitted = time.perf_counter()
-        prediction = predictor.predict_detected(test)
+        if small:
+            prediction, probability = predict_each_place(fit, train, pool)
+        else:
+            prediction, probability = predictor.predict_detected(test), None
         seconds = {"fit": fitted - began, "predict": time.perf_counter() - fitted}
-        detection = (
-            None  # fractions of detected and of empty test cells that are predicted as such, if there are both kinds
-        )
+        # fractions of detected and of empty test cells that are predicted as such, if there are both kinds
+        detection = None
         if rows is None:
             predictors[name], detected = predictor, test.detected
             if name == model_name and isinstance(predictor, Saved):
                 predictor.save(folder / MODEL)
             if predictor.detection is not None and not bool(detected.all()) and not test.receiver_moves:
-                above = predictor.predict_detection(test.transmitter_position, offset) > 0.5
+                if probability is None:
+                    probability = predictor.predict_detection(test.transmitter_position, offset)
+                above = probability > 0.5
                 detection = float(above[detected].double().mean()), float((~above)[~detected].double().mean())
         std = None if prediction.std is None else prediction.std[test.detected]
         error = (prediction.mean + offset - test.rssi_dbm)[test.detected].abs()
@@ -361,14 +383,19 @@ def compare(
             "n_primitives": getattr(predictor, "n_primitives", 0),
         }
 
-    order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))
-    parts = [order[: round(fraction * len(train))].sort().values for fraction in fewer]
-    parts = [rows for rows in parts if int(train.detected[rows].sum(dim=0).min()) >= MIN_TRAINING]
     studied = [name for name in (model_name, "knn") if name in names]
+    region = region_of(train, seed) if split == "random" else None
 
     def study(_: None, folder: Path) -> Values:
+        parts = fewer_rows(train, fewer, seed)
         less = {str(len(rows)): {name: compute(_, folder, name, rows)["mean"] for name in studied} for rows in parts}
-        return less | {str(len(train)): {name: values[name]["mean"] for name in studied}}
+        less |= {str(len(train)): {name: values[name]["mean"] for name in studied}}
+        return {"rows": less, "region": {} if region is None else {name: error_in(name, *region) for name in studied}}
+
+    def error_in(name: str, out: Tensor, others: Tensor) -> float:
+        predictor, asked = make_predictor(name, preset, **options | {"validation": "block"}), train.subset(out)
+        predictor.fit(train.subset(others), pool=pool.subset(others), device=device, parallel=parallel)
+        return float((predictor.predict_detected(asked).mean - asked.rssi_dbm)[asked.detected].abs().mean())
 
     memo = keep or Memo()
     with refusing_executor(executor):
@@ -377,24 +404,11 @@ def compare(
         if fewer:
             steps.start("fewer rows", "fewer rows", study)
         values = {name: steps[name] for name in started}
-        by_rows = DataFrame.from_dict(steps["fewer rows"] if fewer else {}, orient="index")
+        studies = steps["fewer rows"] if fewer else {"rows": {}, "region": {}}
+        by_rows = DataFrame.from_dict(studies["rows"], orient="index")
         if model_name in names and model_name not in predictors:
             model = load(memo.folder / MODEL)
             assert isinstance(model, RssiModel | PairModel)
             predictors[model_name] = model
     by_rows = by_rows.set_index(by_rows.index.astype(int)).rename_axis("n_train")
-    return replace(begun, values=values, predictors=predictors, by_rows=by_rows)
-
-
-def pool_of(whole: Rssi, train: Rssi, test: Rssi, split: str, seed: int) -> Rssi:
-    """Return the training rows at every receiver, without those that a split by place holds out.
-
-    `train` and `test` are the parts of the split at the compared receivers.
-    """
-    if split != PLACE or PLACE in whole.named_splits:
-        return whole.split(split, seed)[0]
-    is_held_out = test.detected.any(dim=0)
-    held_out = {name for name, out in zip(test.receiver_names, is_held_out.tolist(), strict=True) if out}
-    kept = torch.tensor([name not in held_out for name in whole.receiver_names])
-    rows = torch.isin(whole.index, train.index)
-    return replace(whole, rssi_dbm=whole.rssi_dbm.where(kept, torch.nan)).subset(rows)
+    return replace(begun, values=values, predictors=predictors, by_rows=by_rows, region=studies["region"])
