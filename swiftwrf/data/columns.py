@@ -68,6 +68,7 @@ GROUPS_OF_ROWS = re.compile(  # columns that distinguish rows, but not the recei
     r"|app\w*|sample\w*|index|idx|row|count\w*|seq\w*|packet\w*|frame\w*|node_?addr\w*|dev_?(?:eui|addr))"
     r"(?:_?(?:id|name|no|number))?"
 )
+MARKS = {"tx": "transmitter", "transmitter": "transmitter", "rx": "receiver", "receiver": "receiver"}  # words in names
 GEODETIC = {"x": "longitude", "y": "latitude"}  # that take the place of x and y
 
 
@@ -241,6 +242,31 @@ def check_receiver_known(
                 f"{source}: is {name!r} the receiver of each row? Then give --columns receiver={name}, or --columns "
                 f"rssi={rssi} if all rows are of one receiver"
             )
+
+
+def columns_of_end(source: object, table: pd.DataFrame, given: Sequence[str]) -> dict[str, str]:
+    """Return the columns of the second end by x, y and z; none in a table with positions of one end.
+
+    They are the given ones. Otherwise they are those marked tx or transmitter beside others, or those marked rx or receiver
+    beside unmarked ones.
+    """
+    if given:
+        missing = [name for name in given if name not in table.columns]
+        if missing or len(given) not in (2, 3) or len(set(given)) < len(given):
+            raise InputError(
+                f"{source}: transmitter takes the columns of x, y and, if it is known, z, or one column of names, got "
+                f"{' '.join(given)}; there are {listed(table.columns)}"
+            )
+        return dict(zip("xyz", given, strict=False))
+
+    def end_of(name: str) -> str:
+        return next((MARKS[word] for word in plain_name(name).split("_") if word in MARKS), "")
+
+    marked = {axis: {end_of(name): name for name in reversed(candidates(table, axis))} for axis in "xyz"}
+    for mark, others in (("transmitter", {"receiver", ""}), ("receiver", {""})):
+        if all(mark in marked[axis] and others & marked[axis].keys() for axis in "xy"):
+            return {axis: names[mark] for axis, names in marked.items() if mark in names}
+    return {}
 
 
 def is_rssi(column: pd.Series) -> bool:

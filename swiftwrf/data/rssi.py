@@ -46,6 +46,8 @@ class Rssi(PositionedData):
         receiver_moves: Whether the receivers are positions of one receiver that moves, too.
         plan_scale: Pixels in a metre if positions were pixels of a floor plan, whose upper left corner is x = y = 0.
         session: Session of measurements that each row is of, e.g. a walk or a day: n names, or their numbers, int64 (n,).
+        margin_db: How far an empty cell may be above the weakest value of its row [dB], if rows list the strongest or the
+            associated receivers only; infinite for single packets; see `swiftwrf.data.scans.list_margin`.
         time: Time of each measurement [s], (n,), nan where unknown.
         name: Name of the data set.
         details: index, named_splits, source and notes of `PositionedData`.
@@ -71,6 +73,7 @@ class Rssi(PositionedData):
     floors: Floors | None
     receiver_moves: bool
     plan_scale: float | None
+    margin_db: float | None
     session: Tensor | None
     time: Tensor | None
 
@@ -91,6 +94,7 @@ class Rssi(PositionedData):
         floors: Floors | None = None,
         receiver_moves: bool = False,
         plan_scale: float | None = None,
+        margin_db: float | None = None,
         session: Tensor | Sequence[str | int] | None = None,
         time: Numbers | None = None,
         name: str = "rssi",
@@ -126,6 +130,7 @@ class Rssi(PositionedData):
             floors=floors,
             receiver_moves=receiver_moves,
             plan_scale=plan_scale,
+            margin_db=margin_db,
             session=None if session is None else session.long(),
             time=None if time is None else to_tensor("time", time, torch.float64, (None,), missing=True),
         )

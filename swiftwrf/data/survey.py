@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from numpy.typing import NDArray
 
 from swiftwrf.data.cells import (
     CLOCK_ONLY,
@@ -28,7 +27,15 @@ from swiftwrf.data.cells import (
     text_of,
     unit_of,
 )
-from swiftwrf.data.columns import GEODETIC, candidates, check_receiver_known, column_of, find_roles, receiver_columns
+from swiftwrf.data.columns import (
+    GEODETIC,
+    candidates,
+    check_receiver_known,
+    column_of,
+    columns_of_end,
+    find_roles,
+    receiver_columns,
+)
 from swiftwrf.data.coordinates import (
     MIN_STOREY_M,
     STOREY_M,
@@ -44,11 +51,10 @@ from swiftwrf.data.coordinates import (
 )
 from swiftwrf.data.powers import check_powers, end_of_scale, find_fillers, without_fillers
 from swiftwrf.data.receivers import plain_receiver, pool_names, read_receivers
+from swiftwrf.data.scans import list_margin, repeated_scans, split_packets, windows
 from swiftwrf.errors import InputError, listed
 from swiftwrf.positions import cells, check_positions
 from swiftwrf.runtime.validation import PositiveFloat, configuration
-
-MARKS = {"tx": "transmitter", "transmitter": "transmitter", "rx": "receiver", "receiver": "receiver"}  # words in names
 
 
 @configuration
@@ -140,7 +146,7 @@ class _Survey:
         if len(options.transmitter) == 1:
             asked["receiver"] = options.transmitter[0]
         elif options.transmitter or not {"x", "y"} & asked.keys():
-            self.end = _columns_of_end(source, table, options.transmitter)
+            self.end = columns_of_end(source, table, options.transmitter)
         self.roles = find_roles(source, table, asked, self.end.values())
         if (floor := self.text("floor")) is not None and not floor.any():
             self.notes.append(f"column {self.roles.pop('floor')} is empty, so there are no floors")
@@ -195,7 +201,7 @@ class _Survey:
         if omitted.all():
             raise InputError(f"{self.source} has no row with a position; {notes[0]}")
         row = np.flatnonzero(~omitted)
-        repeated = _repeated_scans(self.coordinate[row], self.rssi[row])
+        repeated = repeated_scans(self.coordinate[row], self.rssi[row])
         if repeated.any():
             fate = "stay because of the given splits" if keeps_rows else "are left out"
             notes.append(
@@ -226,11 +232,11 @@ class _Survey:
                     f"{self.source} has no column of times, which a window of {window:g} s needs; leave it out"
                 )
             kind, n = self.kind.to_numpy()[self.table_row], len(self.rssi)
-            first, self.rssi, self.coordinate, self.time = _windows(kind, self.time, self.rssi, self.coordinate, window)
+            first, self.rssi, self.coordinate, self.time = windows(kind, self.time, self.rssi, self.coordinate, window)
             self.notes.append(f"{n} rows are joined to {len(first)} by their mean in windows of {window:g} s")
             self.index, self.table_row = self.index[first], self.table_row[first]
         elif self.time is not None:
-            self.notes += _split_packets(self.rssi, self.time)
+            self.notes += split_packets(self.rssi, self.time)
 
     def arguments(self, receivers: Path | None) -> dict[str, Any]:
         """Return the arguments of `Rssi`, with the positions of receivers in a table or those of a second end."""
@@ -261,6 +267,7 @@ class _Survey:
             "floors": floors,
             "receiver_moves": moves,
             "plan_scale": self.frame.scale if self.frame.y_down else None,
+            "margin_db": self._list_margin(moves),
             "session": None if self.session is None else self.session.to_numpy()[self.table_row].tolist(),
             "time": self.time,
             "index": self.index,
@@ -289,6 +296,18 @@ class _Survey:
                 self.source, table, self.names[0], [name for name in others if name not in self.names], where
             )
         return left_out, notes
+
+    def _list_margin(self, moves: bool) -> float | None:
+        """Return how far an empty cell may be above the weakest value of its row [dB], and note what empty cells are."""
+        margin_db = None if moves else list_margin(self.rssi, self.coordinate)
+        kinds = {
+            0.0: "rows list the strongest receivers only: an empty cell was weaker than the listed ones",
+            np.inf: "rows hold packets of one receiver each: an empty cell is ignored",
+        }
+        associated = f"each row has one receiver, the associated one: others were at most {margin_db} dB stronger"
+        if margin_db is not None:
+            self.notes.append(f"{kinds.get(margin_db, associated)}, which is no sign of a signal below the limit")
+        return margin_db
 
     def text(self, role: str) -> pd.Series | None:
         """Return the cells of the column of a role, None without one."""
@@ -479,79 +498,3 @@ class _Survey:
             )
         pool = dict(zip(pairs["radio"], pairs["pool"], strict=True))
         return [pool[name] or name for name in self.names]
-
-
-def _repeated_scans(
-    coordinate: Floats, rssi: Floats, min_receivers: int = 3, min_rows: int = 5, min_fraction: float = 0.05
-) -> NDArray[np.bool_]:
-    """Return which rows repeat the RSSI of the row before at another place.
-
-    A scan of fewer than `min_receivers` repeats by chance. None is repeated, if fewer than `min_rows` or a fraction of the
-    rows are. The bounds are not studied.
-    """
-    before = np.isnan(rssi[:-1]) & np.isnan(rssi[1:]) | (rssi[:-1] == rssi[1:])
-    top = np.nanmax(rssi) if end_of_scale(rssi) else np.inf  # which repeats by chance
-    several = (rssi[1:] < top).sum(axis=1) >= min_receivers
-    repeated = np.append(False, before.all(axis=1) & several & (coordinate[1:, :2] != coordinate[:-1, :2]).any(axis=1))
-    enough = repeated.sum() >= max(min_rows, min_fraction * len(rssi))
-    return repeated if enough else np.zeros_like(repeated)
-
-
-def _split_packets(rssi: Floats, time: Floats, min_rows: int = 5, min_fraction: float = 0.9) -> list[str]:
-    """Return a note on rows of one receiver each that follow each other within a second, or none."""
-    alone = float(((~np.isnan(rssi)).sum(axis=1) == 1).mean())
-    step = float(np.median(np.diff(np.sort(time)))) if len(time) >= min_rows else np.inf  # nan without some times
-    if rssi.shape[1] < 2 or alone < min_fraction or not step < 1:
-        return []
-    return [
-        f"rows hold the packet of one receiver each, {step:.2g} s after the row before; --window 1 joins the packets of a "
-        "second"
-    ]
-
-
-def _windows(
-    kind: NDArray[Any], time: Floats, rssi: Floats, position: Floats, window: float, n_phases: int = 20
-) -> tuple[NDArray[np.int64], Floats, Floats, Floats]:
-    """Return the first row, and mean RSSI [dBm], position and time of the rows in each window. Kinds are kept apart.
-
-    Windows begin where the cycles of the receivers do: where they contain the fewest packets of one receiver twice. Of
-    `n_phases` beginnings, the best counts (not studied).
-    """
-    alone = -1.0 - np.arange(len(time))  # rows without a time
-    row, receiver = np.nonzero(~np.isnan(rssi))
-    most = -1
-    for phase in np.linspace(0, 1, n_phases, endpoint=False):
-        number_of_window = np.where(np.isnan(time), alone, np.floor((time - np.nanmin(time)) / window + phase))
-        keys = pd.DataFrame({"kind": kind, "window": number_of_window})
-        tried = keys.groupby(["kind", "window"], sort=False).ngroup().to_numpy()
-        if (n := len(np.unique(tried[row] * rssi.shape[1] + receiver))) > most:
-            most, number = n, tried
-    _, first = np.unique(number, return_index=True)
-    n_rssi, n_position = rssi.shape[1], position.shape[1]
-    means = pd.DataFrame(np.column_stack([rssi, position, time])).groupby(number).mean().to_numpy()
-    return first, means[:, :n_rssi], means[:, n_rssi : n_rssi + n_position], means[:, -1]
-
-
-def _columns_of_end(source: object, table: pd.DataFrame, given: Sequence[str]) -> dict[str, str]:
-    """Return the columns of the second end by x, y and z; none in a table with positions of one end.
-
-    They are the given ones. Otherwise they are those marked tx or transmitter beside others, or those marked rx or receiver
-    beside unmarked ones.
-    """
-    if given:
-        missing = [name for name in given if name not in table.columns]
-        if missing or len(given) not in (2, 3) or len(set(given)) < len(given):
-            raise InputError(
-                f"{source}: transmitter takes the columns of x, y and, if it is known, z, or one column of names, got "
-                f"{' '.join(given)}; there are {listed(table.columns)}"
-            )
-        return dict(zip("xyz", given, strict=False))
-
-    def end_of(name: str) -> str:
-        return next((MARKS[word] for word in plain_name(name).split("_") if word in MARKS), "")
-
-    marked = {axis: {end_of(name): name for name in reversed(candidates(table, axis))} for axis in "xyz"}
-    for mark, others in (("transmitter", {"receiver", ""}), ("receiver", {""})):
-        if all(mark in marked[axis] and others & marked[axis].keys() for axis in "xy"):
-            return {axis: names[mark] for axis, names in marked.items() if mark in names}
-    return {}

@@ -87,6 +87,7 @@ def write_rssi(data: Rssi, folder: Path) -> None:
         "offsets": data.offsets and asdict(data.offsets),
         "labels": list(data.labels),
         "plan_scale": data.plan_scale,
+        "margin_db": None if data.margin_db is None else str(data.margin_db),
     }
     if survey := {name: value for name, value in survey.items() if value}:
         write_text(folder / SURVEY, yaml.safe_dump(survey, sort_keys=False, allow_unicode=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
@@ -60,7 +61,8 @@ class RssiConfig(FieldConfig):
 
     - "weak": the power was below the limit of detection.
     - "unknown": the cell is ignored.
-    - "auto": "weak" at each receiver whose empty cells are where its path loss expects no value, otherwise "unknown".
+    - "auto": if rows list the strongest or the associated receivers only (`Rssi.margin_db`), the power was below the listed
+      ones. Otherwise "weak" at each receiver whose empty cells are where its path loss expects no value, else "unknown".
 
     Only the path loss counts the empty cells of a receiver with fewer than 10 values"""
 
@@ -171,8 +173,13 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
             self.attenuation = replace(of_pool, receiver_floor=tuple(of_pool.receiver_floor[c] for c in columns))
             shift = shift + of_pool.of(pool.transmitter_position)
             train, pool = self.attenuation.removed(train), of_pool.removed(pool)
-        curve = Detection.estimate(pool.transmitter_position, pool.rssi_dbm + shift)
+        empty_cells, curve = getattr(self.config, "not_detected", "auto"), None
+        if empty_cells == "weak" or (empty_cells == "auto" and pool.margin_db is None):
+            curve = Detection.estimate(pool.transmitter_position, pool.rssi_dbm + shift)
         self.detection = curve and curve.columns(columns_of(self.receiver_names, pool))
+        if empty_cells == "auto" and pool.margin_db is not None and math.isfinite(pool.margin_db):
+            curve, of_lists = Detection.of_lists(pool.rssi_dbm + shift, pool.margin_db)
+            shift = shift + of_lists
         others = {"device": to_device(device), "parallel": parallel, "progress": progress}
         self._fit(train, pool=pool, shift=shift, curve=curve, **others)
         return self

@@ -94,7 +94,8 @@ class RssiModel(RssiPredictor, Saved):
         progress: bool = False,
         **_: Any,
     ) -> None:
-        training = prepare(pool, columns_of(train.receiver_names, pool), self.config, shift, curve)
+        config = self.config if curve is not None else replace(self.config, not_detected="unknown")
+        training = prepare(pool, columns_of(train.receiver_names, pool), config, shift, curve)
         task = partial(fit_receiver, data=training, config=self.config, device=device)
         with progress_bar(progress) as bar:
             fits = (parallel or _in_threads)(task, range(len(training.receiver_names)))
@@ -106,6 +107,8 @@ class RssiModel(RssiPredictor, Saved):
         level = held_out.where(~held_out.isnan(), loss.each(distance)) + shift
         std = held_out_std(training, training.kernel, (training.field_db, training.noise_db), covariance)
         self.detection, self.detection_field, power = loss.detection, None, level
+        if pool.margin_db is not None and config.not_detected == "auto":
+            self.detection = None  # limits of rows, not of a receiver
         if self.detection is not None:
             bins = training.position, measured, training.fold, level
             self.detection_field = DetectionField.fit(training.kernel, *bins, self.detection.limit)
