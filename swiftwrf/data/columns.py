@@ -11,6 +11,7 @@ import pandas as pd
 
 from swiftwrf.data.cells import parsed, plain_name, text_of
 from swiftwrf.data.powers import KNOWN_FILLERS, MIN_RSSI_DBM
+from swiftwrf.data.radios import unknown_ids
 from swiftwrf.errors import InputError, listed
 
 PLACE = (
@@ -28,7 +29,7 @@ ROLES = {  # patterns of names in lower case with underscores and without units,
     "latitude": [f"{GPS}(?:lat|latitude){GPS_END}"],
     "floor": ["floor(?:_?(?:id|name|number|no|level))?|storey|etage|stockwerk"],
     "time": [
-        "time_?stamp|date_?time|unix(?:_?time)?|epoch(?:_?time)?|(?:gps|utc|local|phone|system|event|measured|received)_?time",
+        "time_?stamp|date_?time|unix(?:_?time)?|epoch(?:_?time)?|(?:gps|utc|local|phone|device|system|event|scan|measured|received)_?time",
         "time|when|t|ts|elapsed(?:_?time)?|uptime",
         "date",
         "(?:first|last)_?seen|(?:received|measured|recorded|created|logged|reported)_?at",
@@ -63,12 +64,14 @@ NO_POWER = re.compile(  # quantities beside received power that may be negative,
 )
 GROUPS_OF_ROWS = re.compile(  # columns that distinguish rows, but not the receivers
     r"(?:.*_)?(device|phone|user|model|brand|person|operator|mode|weather|channel|ch|freq\w*|band|sf|data_?rate|modulation|bw"
-    r"|bandwidth|codr|building\w*|room|zone|area|space\w*|site|place|location|point|snapshot|direction|orientation|date|day"
+    r"|bandwidth|codr|(?P<place>building\w*|room|zone|area|space\w*|site|place|location|point)|snapshot|direction|orientation|date|day"
     r"|time\w*|type|security|auth_?mode|capabilities|vendor|manufacturer|provider|experiment\w*|trial|comment|notes?|version|os"
     r"|app\w*|sample\w*|index|idx|row|count\w*|seq\w*|packet\w*|frame\w*|node_?addr\w*|dev_?(?:eui|addr))"
     r"(?:_?(?:id|name|no|number))?"
 )
 MARKS = {"tx": "transmitter", "transmitter": "transmitter", "rx": "receiver", "receiver": "receiver"}  # words in names
+TRANSMITTED = re.compile(r"(?:.*_)?(?:tx_?(?:power|pwr|pow)\w*|transmit\w*_power|power_?tx|eirp|erp)")
+SNR = re.compile(r"(?:.*_)?[le]?snr(?:_(?:mean|avg|median))?")
 GEODETIC = {"x": "longitude", "y": "latitude"}  # that take the place of x and y
 
 
@@ -112,7 +115,7 @@ def find_roles(
                 f"{source} has {len(matches)} columns that may be {role} ({listed(matches)}); choose one with columns "
                 f"{role}=NAME"
             )
-        roles[role] = matches[0]
+        roles[role] = matches[0] if role != "receiver" else _with_known_ids(table, matches)
     for role, other in GEODETIC.items():
         if other in roles and role in roles:
             del roles[other]
@@ -131,6 +134,12 @@ def find_roles(
             )
         del roles["receiver"]  # which distinguishes rows of a wide table
     return roles
+
+
+def _with_known_ids(table: pd.DataFrame, names: Sequence[str], max_unknown: float = 0.1) -> str:
+    """Return the first column of ids with few unknown ones, e.g. the PCI if neighbours lack the cell id (not studied)."""
+    unknown = {name: ((text_of(table[name]) == "") | unknown_ids(table[name])).mean() for name in names}
+    return next((name for name in names if unknown[name] <= max_unknown), min(names, key=lambda name: unknown[name]))
 
 
 def receiver_columns(
@@ -235,8 +244,11 @@ def check_receiver_known(
         apart = ~pd.DataFrame({"row": together, "cell": cell}).duplicated(keep=False)
         is_packet = several.mean() > min_together and apart[several].mean() > min_different
         alternates = is_text.all() and not several.any() and (cell != cell.shift()).mean() > min_changes
-        if (group := GROUPS_OF_ROWS.fullmatch(plain_name(name))) and not (timed and is_packet and group[1] == "device"):
-            continue
+        if group := GROUPS_OF_ROWS.fullmatch(plain_name(name)):
+            # a transmitter is in one room at a time, but one receiver may hear several devices at one place
+            may_be_receiver = bool(group["place"]) or (timed and group[1] == "device")
+            if not (is_packet and may_be_receiver):
+                continue
         if is_name and (is_packet or alternates):
             raise InputError(
                 f"{source}: is {name!r} the receiver of each row? Then give --columns receiver={name}, or --columns "

@@ -1,4 +1,4 @@
-"""Scans: rows of RSSI that repeat, that belong together, and that list a part of the receivers only."""
+"""Scans: times of rows, rows of RSSI that repeat, that belong together, and that list a part of the receivers only."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from swiftwrf.data.cells import Floats
+from swiftwrf.data.cells import CLOCK_ONLY, Floats, parsed, plain_name, seconds, text_of
+from swiftwrf.data.columns import candidates
 from swiftwrf.data.powers import end_of_scale
 
 
@@ -135,3 +136,35 @@ def _detected_together(detected: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
     pairs = csr_array(detected.T.astype(np.float32) @ detected.astype(np.float32))
     number, label = connected_components(pairs, directed=False)
     return [np.flatnonzero(label == group) for group in range(number)]
+
+
+def times_of(
+    table: pd.DataFrame,
+    name: str,
+    position: Floats,
+    max_speed_m_s: float = 2e-3,
+    max_step_m: float = 1.0,
+    min_rows: int = 6,
+) -> tuple[Floats, list[str]]:
+    """Return the times of the rows [s] in a column, and notes; dates may be in another column.
+
+    Whole numbers at which the positions move slower than anybody walks, but not in milliseconds, are milliseconds. They
+    are those of a log of movement, with at least 6 rows and a median step below 1 m (not studied).
+    """
+    column = table[name]
+    days = [other for other in candidates(table, "time") if plain_name(other) == "date" and other != name]
+    is_joined = bool(days) and column.dtype.kind not in "biufM" and text_of(column).str.fullmatch(CLOCK_ONLY).all()
+    time, notes = seconds(column, table[days[0]] if is_joined else None)
+    if is_joined:
+        notes.append(f"columns {days[0]} and {column.name} together are the time")
+    if not notes and np.isfinite(time).all() and len(time) >= min_rows and (parsed(column)[0] % 1 == 0).all():
+        order = np.argsort(time, kind="stable")
+        step, length = np.diff(time[order]), np.linalg.norm(np.diff(position[order, :3], axis=0), axis=1)
+        speed = length[step > 0].sum() / max(step.sum(), 1e-9)
+        if 1e-5 < speed < max_speed_m_s and np.median(length) < max_step_m:
+            time = time / 1e3
+            notes.append(
+                f"column {column.name} counts milliseconds, which are converted to seconds: as seconds, the positions "
+                f"move {1e3 * speed:.1g} mm/s"
+            )
+    return time, notes
