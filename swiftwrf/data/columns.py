@@ -245,7 +245,7 @@ def check_receiver_known(
         is_packet = several.mean() > min_together and apart[several].mean() > min_different
         alternates = is_text.all() and not several.any() and (cell != cell.shift()).mean() > min_changes
         if group := GROUPS_OF_ROWS.fullmatch(plain_name(name)):
-            # a transmitter is in one room at a time, but one receiver may hear several devices at one place
+            # a transmitter is in one room at a time, but a receiver may detect several devices at one place
             may_be_receiver = bool(group["place"]) or (timed and group[1] == "device")
             if not (is_packet and may_be_receiver):
                 continue
