@@ -49,7 +49,14 @@ SPLITS = {
     "wifi-rooms/office": ("random", "block"),
     "wifi-rooms/lecture-theatre": ("random", "block"),
     "wifi-rooms/corridor": ("random", "block"),
+    "dae-2025": ("user",),
+    "ts-dsi1": ("published",),
+    "ts-ujib1": ("published",),
+    "ts-tut2": ("published",),
+    "ts-tut5": ("random",),
 }
+# number of the most often detected receivers that are compared, of buildings with hundreds
+N_RECEIVERS = {"dae-2025": 16, "ts-dsi1": 16, "ts-ujib1": 16, "ts-tut2": 16, "ts-tut5": 20}
 TRANSMITTER = {"dcm-rssi": ("receiver",)}  # column with the second end of the link, where both ends move
 COVERAGE = {
     **{f"simulated-floor-{seed}": ("random",) for seed in range(10)},
@@ -93,7 +100,8 @@ def main(config: Config) -> None:
         key = f"{name} {split}"
         if config.resume and key in found:
             continue
-        found[key] = measure(load_rssi(config.data / name, transmitter=TRANSMITTER.get(name, ())), split, config.also)
+        data = load_rssi(config.data / name, transmitter=TRANSMITTER.get(name, ()))
+        found[key] = measure(most_detected(data, N_RECEIVERS.get(name)), split, config.also)
         found = {key: found[key] for key in (f"{name} {split}" for name, split in splits()) if key in found}
         for method, row in found[key]["methods"].items():
             error = row["abs_error_db"]
@@ -106,6 +114,14 @@ def splits(names: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]:
     for name in names or SPLITS:
         for split in SPLITS[name]:
             yield name, split
+
+
+def most_detected(data: Rssi, n_receivers: int | None) -> Rssi:
+    """Return the data of the receivers that were detected most often, in their order; all of them without a number."""
+    if n_receivers is None:
+        return data
+    count = data.detected.sum(dim=0)
+    return data.columns(count.argsort(descending=True, stable=True)[:n_receivers].sort().values.tolist())
 
 
 def measure(data: Rssi, split: str, also: tuple[str, ...] = ()) -> Row:
@@ -168,9 +184,7 @@ def measure_coverage(data: Rssi, split: str, receivers: int | None = None) -> Ro
     A row has the threshold, the number of test scans, the mean `predicted` probability, the counted share `above`, the share
     with a probability of at least 0.9, `certain`, and the counted share of those, `certain_above`.
     """
-    data = data.receivers(["all"])
-    often = data.detected.sum(dim=0).argsort(descending=True, stable=True)[:receivers].sort().values
-    train, test = data.columns(often.tolist()).split(split)
+    train, test = most_detected(data.receivers(["all"]), receivers).split(split)
     validation = train.validation_for(split, test)
     model, limits = RssiModel(validation=validation).fit(train), thresholds(train)
     floor = torch.zeros(len(test)).long() if test.floors is None else test.floors.number(test.transmitter_position)

@@ -15,7 +15,7 @@ from torch import Tensor
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin
 from swiftwrf.data.dataset import Arrays, Numbers, PositionedData, position_coordinates, to_positions
 from swiftwrf.data.powers import check_powers
-from swiftwrf.data.splits import MIN_TRAINING, Validation, random_split
+from swiftwrf.data.splits import MIN_PLACES, MIN_SPLIT_ROWS, MIN_TRAINING, Validation, matching_validation, random_split
 from swiftwrf.data.survey import TableOptions, read_survey
 from swiftwrf.errors import InputError, listed
 from swiftwrf.plotting import MARK, Axes, plan
@@ -240,8 +240,9 @@ class Rssi(PositionedData):
     def validation_for(self, split: str, test: Rssi) -> Validation:
         """Return the kind of folds of this training part that resembles the test part of a split.
 
-        Folds are single rows for random splits and regions for all others. They are whole sessions if the test rows are of
-        other sessions than the training rows.
+        Folds are single rows for random splits, and regions for splits by block or place. For a split that comes with the
+        data, distances of its test rows to the training positions decide, and measurements of test rows have no part. Folds
+        are whole sessions if the test rows are of other sessions than the training rows.
 
         Example:
             >>> import swiftwrf
@@ -252,28 +253,35 @@ class Rssi(PositionedData):
         sessions, others = ({*data.session.tolist()} if data.session is not None else {0} for data in (self, test))
         if len(sessions) > 1 and sessions.isdisjoint(others):
             return "session"
-        return "random" if split == "random" else "block"
+        if split in ("block", PLACE):
+            return "block"
+        return (
+            "random" if split == "random" else matching_validation(self.transmitter_position, test.transmitter_position)
+        )
 
     @checked
     def receivers(self, asked: Sequence[str]) -> Rssi:
         """Return the data of some receivers.
 
+        Fewer than 10 rows are too few of a receiver, and fewer than 5 in a survey of fewer than 13 rows.
+
         Args:
             asked: Names, numbers counted from 1 in file order, or "all", which omits receivers that detected the transmitter
-                in fewer than 10 rows and adds a note. Positions of one receiver that moves are all kept.
+                in too few rows and adds a note. Positions of one receiver that moves are all kept.
 
         Raises:
-            InputError: An unknown receiver, one asked for twice, or one that detected the transmitter in fewer than 10 rows.
+            InputError: An unknown receiver, one asked for twice, or one that detected the transmitter in too few rows.
         """
+        least = MIN_PLACES if len(self) < MIN_SPLIT_ROWS else MIN_TRAINING
         if list(asked) == ["all"] and self.receiver_moves:
             return self
         if list(asked) == ["all"]:
-            enough = self.detected.sum(dim=0) >= MIN_TRAINING
+            enough = self.detected.sum(dim=0) >= least
             if not bool(enough.any()):
-                raise InputError(f"no receiver of {self.name} detected the transmitter in {MIN_TRAINING} rows")
+                raise InputError(f"no receiver of {self.name} detected the transmitter in {least} rows")
             kept = self.columns(enough.nonzero()[:, 0].tolist())
             rare = [name for name in self.receiver_names if name not in kept.receiver_names]
-            note = f"receivers that detected fewer than {MIN_TRAINING} rows are left out: {listed(rare)}"
+            note = f"receivers that detected fewer than {least} rows are left out: {listed(rare)}"
             return replace(kept, notes=(*kept.notes, note)) if rare else kept
         columns = [receiver_row(self.receiver_names, name, self.name) for name in asked]
         if not columns:
@@ -282,10 +290,10 @@ class Rssi(PositionedData):
             raise InputError(f"ask for each receiver once, got {' '.join(asked)}")
         for column in columns:
             count = int(self.detected[:, column].sum())
-            if count < MIN_TRAINING:
+            if count < least:
                 raise InputError(
                     f"receiver {self.receiver_names[column]!r} of {self.name} detected the transmitter in {count} rows; "
-                    f"at least {MIN_TRAINING} are needed"
+                    f"at least {least} are needed"
                 )
         return self.columns(columns)
 

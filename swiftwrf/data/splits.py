@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Literal
 
@@ -13,9 +13,12 @@ from torch import Tensor
 
 from swiftwrf.data.files import read_text
 from swiftwrf.errors import InputError
+from swiftwrf.positions import nearest
 from swiftwrf.runtime.validation import PositiveInt, checked
 
 MIN_TRAINING = 10  # measurements
+MIN_SPLIT_ROWS = 13  # below, the places of a survey are held out one at a time
+MIN_PLACES = 5  # of such a survey
 MAX_REPEATED = 0.1  # fraction of test rows at training positions, beyond which a split tests look-up
 FOLDS = 5
 
@@ -234,6 +237,32 @@ def folds(
     place = places(position, number)
     order = torch.randperm(len(place.unique()), generator=torch.Generator().manual_seed(seed))
     return (order % number)[place]
+
+
+def matching_validation(train: Tensor, test: Tensor, n_quantiles: int = 200) -> Validation:
+    """Return the kind of folds whose held-out distances resemble those of the test positions.
+
+    A distance is that to the nearest training position (C. Mila et al., Methods in Ecology and Evolution 13, 2022). Two sets
+    of distances are compared at their quantiles.
+
+    Example:
+        >>> line = torch.linspace(0, 99, 100)[:, None] * torch.tensor([1.0, 0.0, 0.0])
+        >>> matching_validation(line, line + 0.5), matching_validation(line, line + 50)
+        ('random', 'block')
+    """
+    level = (torch.arange(n_quantiles, dtype=torch.float64) + 0.5) / n_quantiles
+
+    def quantiles(pairs: Iterable[tuple[Tensor, Tensor]]) -> Tensor:
+        distance = torch.cat([nearest(other, known, 1)[0][:, 0] for known, other in pairs])
+        return distance.double().quantile(level)
+
+    def misfit(validation: Validation) -> float:
+        held_out = quantiles((train[kept], train[out]) for out, kept in each_fold(folds(train, validation, 0)))
+        return float((held_out - of_test).abs().mean())
+
+    of_test = quantiles([(train, test)])
+    kinds: tuple[Validation, Validation] = ("random", "block")
+    return min(kinds, key=misfit)
 
 
 def each_fold(fold: Tensor, rows: Tensor | None = None) -> Iterator[tuple[Tensor, Tensor]]:

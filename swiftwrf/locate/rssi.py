@@ -160,8 +160,9 @@ class RssiLocator(Locator):
         )
 
     def _radio_maps(self, train: Rssi) -> RssiModel:
-        # which receivers detect the transmitter is a likelihood of its own
-        return RssiModel(validation=self.config.validation, seed=self.config.seed, not_detected="unknown").fit(train)
+        # which receivers detect the transmitter is a likelihood of its own, and a scan is no mean of packets
+        validation, seed, noises = self.config.validation, self.config.seed, (0.3, 1.0, 2.0, 3.0)
+        return RssiModel(validation=validation, seed=seed, not_detected="unknown", noises=noises).fit(train)
 
     def _part(self, train: Rssi, out: Tensor, kept: Tensor, fingerprints: Fingerprints) -> _Part:
         generator = torch.Generator().manual_seed(self.config.seed)

@@ -17,7 +17,7 @@ from swiftwrf.choices import NotDetected
 from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Offsets, Rssi
-from swiftwrf.data.splits import MIN_TRAINING
+from swiftwrf.data.splits import MIN_PLACES, MIN_TRAINING, Validation
 from swiftwrf.errors import InputError, listed
 from swiftwrf.models.base import FieldConfig, Updatable
 from swiftwrf.models.prediction import Prediction
@@ -62,9 +62,16 @@ class RssiConfig(FieldConfig):
     - "weak": the power was below the limit of detection.
     - "unknown": the cell is ignored.
     - "auto": if rows list the strongest or the associated receivers only (`Rssi.margin_db`), the power was below the listed
-      ones. Otherwise "weak" at each receiver whose empty cells are where its path loss expects no value, else "unknown".
+      ones. Otherwise "weak" at each receiver whose empty cells are where its path loss expects no value, else "unknown". It
+      is "unknown" at all receivers if values and detections in held-out folds are then more likely.
 
     Only the path loss counts the empty cells of a receiver with fewer than 10 values"""
+    calibration: Validation | None = None
+    """folds whose errors scale the standard deviations. Defaults to those of `validation`. "block" suits predictions for
+    other days or devices, whose errors no fold of single rows contains"""
+    noises: tuple[PositiveFloat, ...] = (0.02, 0.05, 0.1, 0.3, 1.0, 2.0, 3.0)
+    """compared variances of one measurement about the field, relative to that of the field. Fading of a packet is about as
+    large as shadowing. Means of many packets have less noise"""
 
 
 class RssiPredictor(Updatable, Configured, Displayed, ABC):
@@ -136,7 +143,7 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
         """Fit the predictor to measured RSSI and return it. A fit that fails leaves the predictor as it was.
 
         Args:
-            train: Training rows, at least 10 measurements in all. Missing values (nan) are ignored.
+            train: Training rows, at least 4 measurements in all. Missing values (nan) are ignored.
             pool: The same rows at every receiver of the data, from which properties common to all receivers are learnt.
                 Defaults to `train`. Receivers with fewer than 10 rows take no part in the choice of the kernel.
             device: Device to compute on. The fitted predictor is on the CPU.
@@ -151,10 +158,10 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
         pool = pool or train
         names = {*train.receiver_names, *(pool.receiver_names[c] for c in often_detected(pool).tolist())}
         pool = pool.columns([c for c, name in enumerate(pool.receiver_names) if name in names])
-        if (detected := int(train.detected.sum())) < MIN_TRAINING:
+        if (detected := int(train.detected.sum())) < (least := MIN_PLACES - 1):
             raise InputError(
                 f"receivers {listed(train.receiver_names)} have {detected} training measurements in all; measure at least "
-                f"{MIN_TRAINING}"
+                f"{least}"
             )
         more = set(train.receiver_names) <= set(pool.receiver_names)
         if not more or not torch.equal(pool.transmitter_position, train.transmitter_position):

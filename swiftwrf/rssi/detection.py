@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from sklearn.linear_model import LogisticRegression
 from torch import Tensor
+from torch.nn.functional import logsigmoid
 
 from swiftwrf.errors import listed
 from swiftwrf.gp import GaussianProcess, Kernel, leave_folds_out, subsample
@@ -225,26 +226,24 @@ class DetectionField:
     @classmethod
     def fit(
         cls, kernel: Kernel, position: Tensor, detected: Tensor, fold: Tensor, level: Tensor, limit: Tensor
-    ) -> Self | None:
+    ) -> tuple[Self, Tensor]:
         """Fit to bins, detected or not, bool (n, R), with held-out predictions `level` of their power, (n, R) [dBm].
 
-        The result is None if every cell is detected.
+        Return the field, and the log-likelihood of each bin by the detections nearby in other folds, (n, R).
         """
-        if bool(detected.all()):
-            return None
         value, mean = detected.double(), detected.double().mean(dim=0)
         process = GaussianProcess(kernel, position, value - mean)
         nearby = torch.empty_like(value)
         for out, kept, weight, _ in leave_folds_out(kernel, position, fold):
             of_kept = value[kept].mean(dim=0)
             nearby[out] = of_kept + weight @ (value[kept] - of_kept)
-        known = level.isfinite()
-        features = torch.stack([(level - limit) / 10, nearby], dim=-1)[known]
-        detected, order = detected[known].sort(stable=True)  # the first and the last cell, one of each kind, are kept
-        features, detected = subsample(features[order], detected, rows=80_000)
-        regression = LogisticRegression(C=100.0).fit(features.numpy(), detected.numpy())
+        feature = torch.stack([(level - limit) / 10, nearby], dim=-1)
+        kinds, order = detected.flatten().sort(stable=True)  # the first and the last cell, one of each kind, are kept
+        some, kinds = subsample(feature.flatten(0, 1)[order], kinds, rows=80_000)
+        regression = LogisticRegression(C=100.0).fit(some.numpy(), kinds.numpy())
         weight = torch.tensor([*regression.intercept_, *regression.coef_[0]], dtype=torch.float64)
-        return cls(process, mean, limit, weight)
+        odds = weight[0] + feature @ weight[1:]
+        return cls(process, mean, limit, weight), logsigmoid(odds.where(detected, -odds))
 
     def probability(self, level: Tensor, position: Tensor) -> Tensor:
         """Return the probability of a detection, float64 (m, R), by the power (m, R) [dBm] at positions (m, 3) [m]."""

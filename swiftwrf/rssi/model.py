@@ -8,10 +8,11 @@ directivity_r a few harmonics of the direction from the receiver.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -30,7 +31,7 @@ from swiftwrf.rssi.detection import Detection, DetectionField
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.path_loss import PathLoss, log_distance
 from swiftwrf.rssi.regression import RssiPosterior, fit_receiver, held_out_std, predictive_std
-from swiftwrf.rssi.training import prepare, rounding_std
+from swiftwrf.rssi.training import RssiTraining, prepare, rounding_std
 from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import parallel_map, single_thread
@@ -95,42 +96,39 @@ class RssiModel(RssiPredictor, Saved):
         **_: Any,
     ) -> None:
         config = self.config if curve is not None else replace(self.config, not_detected="unknown")
-        training = prepare(pool, columns_of(train.receiver_names, pool), config, shift, curve)
-        task = partial(fit_receiver, data=training, config=self.config, device=device)
-        with progress_bar(progress) as bar:
-            fits = (parallel or _in_threads)(task, range(len(training.receiver_names)))
-            results = list(bar.track(fits, total=len(training.receiver_names), description="receivers"))
-        fitted = {name: torch.stack([result[name] for result in results]) for name in results[0]}
-        held_out, covariance = fitted.pop("held_out").T, fitted.pop("covariance")
-        loss, shift, measured, rows = training.path_loss, training.shift, ~training.rssi.isnan(), training.bin_of_row
-        distance = log_distance(training.position, training.receiver)
-        level = held_out.where(~held_out.isnan(), loss.each(distance)) + shift
-        std = held_out_std(training, training.kernel, (training.field_db, training.noise_db), covariance)
-        self.detection, self.detection_field, power = loss.detection, None, level
-        if pool.margin_db is not None and config.not_detected == "auto":
-            self.detection = None  # limits of rows, not of a receiver
-        if self.detection is not None:
-            bins = training.position, measured, training.fold, level
-            self.detection_field = DetectionField.fit(training.kernel, *bins, self.detection.limit)
-            power, std = self.detection.given_detection(level, std)
-        predicted, means = (power - shift)[rows], loss.shared(distance)
+        of_lists = pool.margin_db is not None and config.not_detected == "auto"  # limits of rows, not of a receiver
+
+        def fitted_with(curve: Detection | None) -> Fit:
+            training = prepare(pool, columns_of(train.receiver_names, pool), config, shift, curve)
+            return fit_receivers(training, config, device, parallel or _in_threads, progress)
+
+        fit = fitted_with(curve)
+        is_choice = config.not_detected == "auto" and not of_lists
+        if is_choice and curve is not None and not bool(fit.training.limit.isnan().all()):
+            without = fitted_with(replace(curve, is_limit=torch.zeros_like(curve.is_limit)))
+            # as probable as with values of a mean error that is 1 % lower
+            fit = without if without.score > fit.score + 0.01 * float(train.detected.sum()) else fit
+        self.detection_field, training, rows = None, fit.training, fit.training.bin_of_row
+        if not of_lists:
+            self.detection, self.detection_field = training.path_loss.detection, fit.detection_field
+        predicted, std, means = fit.predicted[:, rows], fit.std[-1, rows], training.path_loss.shared(fit.distance)
         for out, kept in each_fold(training.fold):
             mean = training.rssi[kept].nanmean(dim=0)
             means[out] = mean.where(~mean.isnan(), means[out])
-        errors = {self.name: predicted, "mean": means[rows]}
+        errors = {self.name: predicted[0], "mean": means[rows]}
         self.held_out_db = {name: float((each - train.rssi_dbm).abs().nanmean()) for name, each in errors.items()}
-        scale = self._calibrate(train, predicted, std[rows], training.field_db, training.noise_db)
-        self.covariance, self.centre = scale.square()[:, None, None] * covariance, training.centre
+        scale = self._calibrate(train, predicted[-1], std, training.field_db, fit.noise_db)
+        self.covariance, self.centre = scale.square()[:, None, None] * fit.covariance, training.centre
         self.posterior = RssiPosterior(
             kernel=training.kernel,
             heads=training.heads,
             huber=self.config.huber,
             receiver=training.receiver,
             position=training.position,
-            measured=measured.T.double(),
+            measured=(~training.rssi.isnan()).T.double(),
             field_db=training.field_db,
             noise_db=training.noise_db,
-            **fitted,
+            **fit.posterior,
         )
 
     def _calibrate(
@@ -285,6 +283,84 @@ def fit_rssi(train: Rssi, config: RssiConfig | None = None, **options: Any) -> R
         RssiModel(fitted, 12 receivers)
     """
     return RssiModel(config).fit(train, **options)
+
+
+class Fit(NamedTuple):
+    """Fits of R receivers with one meaning of their empty cells, and their predictions of n bins by other folds.
+
+    Args:
+        training: Training rows by location bin.
+        posterior: Arguments of `RssiPosterior` that depend on the receiver.
+        covariance: Covariance of level and slope, (R, 2, 2).
+        distance: log10 of the distances to the receivers, (n, R).
+        predicted: RSSI of detected packets by each of the `folds`, (f, n, R) [dBm].
+        std: Standard deviation of a detected measurement about it before calibration, (f, n, R) [dB].
+        noise_db: Standard deviation of a measurement about the field, of which the last `std` is, (R,) [dB].
+        detection_field: Probability of a detection; None if every cell has a value, or if empty cells are ignored.
+        score: Held-out log-likelihood of values and detections, less a constant.
+    """
+
+    training: RssiTraining
+    posterior: dict[str, Tensor]
+    covariance: Tensor
+    distance: Tensor
+    predicted: Tensor
+    std: Tensor
+    noise_db: Tensor
+    detection_field: DetectionField | None
+    score: float
+
+
+def fit_receivers(
+    training: RssiTraining,
+    config: RssiConfig,
+    device: torch.device,
+    parallel: Map,
+    progress: bool = False,
+    *,
+    session_noise: float = 0.3,
+) -> Fit:
+    """Fit all receivers and predict each bin by the other folds.
+
+    The likelihood of the values is that of errors with a Laplace distribution, whose scale is the mean absolute error.
+
+    Args:
+        training: Training rows by location bin.
+        config: Options.
+        device: Device to compute on.
+        parallel: Function that maps a fit over receivers.
+        progress: Show a progress bar on a terminal.
+        session_noise: Least variance of a measurement of another session, relative to that of the field, for `calibration`:
+            that of single packets. Not studied.
+    """
+    task = partial(fit_receiver, data=training, config=config, device=device)
+    with progress_bar(progress) as bar:
+        fits = parallel(task, range(len(training.receiver_names)))
+        results = list(bar.track(fits, total=len(training.receiver_names), description="receivers"))
+    fitted = {name: torch.stack([result[name] for result in results]) for name in results[0]}
+    held_out, covariance = fitted.pop("held_out").permute(1, 2, 0), fitted.pop("covariance")
+    loss, measured = training.path_loss, ~training.rssi.isnan()
+    distance = log_distance(training.position, training.receiver)
+    level = held_out.where(~held_out.isnan(), loss.each(distance)) + training.shift
+    noise_db = [training.noise_db for _ in training.folds]
+    if config.calibration is not None:  # rows of another day differ at one place, too
+        noise_db[-1] = training.noise_db.maximum(math.sqrt(session_noise) * training.field_db)
+    stds = [
+        held_out_std(training, fold, training.kernel, (training.field_db, noise), covariance)
+        for fold, noise in zip(training.folds, noise_db, strict=True)
+    ]
+    std = torch.stack(stds)
+    detection_field, power, score = None, level, 0.0
+    if loss.detection is not None:
+        power, std = loss.detection.given_detection(level, std)
+        if not bool(measured.all()):
+            bins = training.position, measured, training.fold, level[0]
+            detection_field, likelihood = DetectionField.fit(training.kernel, *bins, loss.detection.limit)
+            score = float(likelihood.sum())
+    predicted = power - training.shift
+    error = (predicted[0] - training.rssi)[measured].abs()
+    score -= len(error) * math.log(max(float(error.mean()), 1e-3))
+    return Fit(training, fitted, covariance, distance, predicted, std, noise_db[-1], detection_field, score)
 
 
 def _in_threads(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:

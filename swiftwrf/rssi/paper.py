@@ -78,10 +78,10 @@ class RssiPaperModel(RssiModel):
         check_folds(bins.fold == HELD_OUT_FOLD, bins.rssi)
         pool_residual = of_pool.rssi - of_pool.rssi.nanmean(dim=0)
         residual = pool_residual[:, often_detected(pool)]
-        kernel = choose_residual_kernel(bins.position, residual, bins.fold, train.floors is not None)[0]
+        kernel = choose_residual_kernel(bins, residual, config.noises, train.floors is not None)[0]
         variance = (bins.rssi - bins.rssi.nanmean(dim=0)).square().nanmean(dim=0)
         variance = variance.nan_to_num(float(pool_residual.square().nanmean())).clamp_min(1e-6)
-        prior_db = prior_std(variance, kernel)
+        prior_db = prior_std(variance, kernel, bins.noise_scale)
         covariance = kernel(bins.position, bins.position)
         covariance.diagonal().add_(1e-3)  # bins may nearly coincide
         root = torch.linalg.cholesky(covariance)  # the latent field in the bins is this times standard normal numbers
@@ -96,7 +96,7 @@ class RssiPaperModel(RssiModel):
         self.covariance, self.centre, self.detection_field = torch.zeros(n_receivers, 2, 2).double(), bins.centre, None
         out = ~bins.rssi.isnan() & (bins.fold == HELD_OUT_FOLD)[:, None]
         predicted = held_out.T.double().where(out, torch.nan)[bins.bin_of_row]
-        std = held_out_std(bins, kernel, prior_db, self.covariance)[bins.bin_of_row]
+        std = held_out_std(bins, bins.fold, kernel, prior_db, self.covariance)[bins.bin_of_row]
         self._calibrate(train, predicted, std, *prior_db)
         dual = torch.linalg.solve_triangular(root.T, white.T.double() * prior_db[0], upper=True).T
         level = LEVEL_DBM + mean_magnitude(rendered, torch.zeros(1, n_receivers))[0].double()

@@ -17,6 +17,7 @@ them together, so their order has no effect. Tangents and weights of the rows of
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Annotated, Any, NamedTuple
@@ -51,7 +52,7 @@ def fit_receiver(number: int, data: RssiTraining, config: RssiConfig, device: to
         - dual (n,), tangent (n,), variance (n,), prior (2,) and root (2, 2); see `RssiPosterior`. If RSSI would rise with
           the distance, slope and its standard deviation are 0.
         - covariance (2, 2) of level and slope, given the rows.
-        - held_out (n,), predictions of the bins of the fit by all other folds [dBm], nan in other bins.
+        - held_out (f, n), predictions of all bins by the others in each of the `folds` [dBm], nan without a bin in the fit.
 
     Raises:
         FitError: A system that cannot be solved, for positions or values beyond any measurement.
@@ -61,19 +62,19 @@ def fit_receiver(number: int, data: RssiTraining, config: RssiConfig, device: to
     receiver, field_db = data.receiver[number, None], float(data.field_db[number])
     distance = log_distance(data.position, receiver)[:, 0]
     used = (~rssi.isnan() | ~limit.isnan()).nonzero()[:, 0]
-    error, dual, tangent, variance = (torch.zeros_like(rssi) for _ in range(4))
-    covariance = root @ root.T
+    dual, tangent, variance = (torch.zeros_like(rssi) for _ in range(3))
+    covariance, held_out = root @ root.T, rssi.new_full((len(data.folds), len(rssi)), torch.nan)
     if len(used):
         at, weak = data.position[used].to(device), limit[used].isnan().logical_not()
         feature = regressors(data.position[used], receiver, root[None])[0]
         noise_db = (data.noise_db[number] / data.count[used, number].clamp_min(1).sqrt()).to(device)
         detection = loss.detection
         censored = None if detection is None or not weak.any() else (detection.width, float(detection.missed[number]))
-        latent_covariance = field_db**2 * data.kernel(at, at)
+        across = field_db**2 * data.kernel(data.position.to(device), at)
 
         def solved() -> tuple[Tensor, ...]:
             value = (rssi.where(limit.isnan(), limit) - prior[0] - prior[1] * distance)[used].to(device)
-            system = value, weak.to(device), feature.to(device), latent_covariance, noise_db
+            system = value, weak.to(device), feature.to(device), across[used], noise_db
             return solve(*system, data.heads, config.huber, censored)
 
         try:
@@ -86,18 +87,46 @@ def fit_receiver(number: int, data: RssiTraining, config: RssiConfig, device: to
                 prior = torch.stack([prior[0] - prior[1] * root[0, 1] / root[1, 1], torch.zeros(()).double()])
                 root[:, 1], feature[:, 1] = 0.0, 0.0
                 *solution, factor = solved()
-            precision, fold = torch.cholesky_inverse(factor), data.fold[used]
-            for part, _ in each_fold(fold):
-                error[used[part]] = held_out_errors(precision, solution[0][:, None], part.to(device))[:, 0].cpu()
+            precision, feature = torch.cholesky_inverse(factor), regressors(data.position, receiver, root[None])[0]
+            system = used, across, feature.to(device), precision
+            others = [held_out_means(fold, *system, solution, data.heads).cpu() for fold in data.folds]
+            held_out = prior[0] + prior[1] * distance + torch.stack(others)
         except torch.linalg.LinAlgError as reason:  # type: ignore[attr-defined]
             raise FitError(
                 f"the RSSI fit of receiver {data.receiver_names[number]!r} broke ({reason}); are its values sane?"
             ) from None
-        dual[used], tangent[used], variance[used], target = (x.cpu() for x in solution)
-        error[used] -= target  # prediction less prior
-    held_out = (prior[0] + prior[1] * distance - error).where(variance > 0, torch.nan)
+        dual[used], tangent[used], variance[used], _ = (x.cpu() for x in solution)
     rows = {"dual": dual, "tangent": field_db * tangent, "variance": variance, "held_out": held_out}
     return rows | {"prior": prior, "root": root, "covariance": covariance}
+
+
+def held_out_means(
+    fold: Tensor,
+    used: Tensor,
+    across: Tensor,
+    feature: Tensor,
+    precision: Tensor,
+    solution: Sequence[Tensor],
+    heads: Heads,
+) -> Tensor:
+    """Return how the bins of all other folds predict RSSI less the prior path loss, (n,) [dB].
+
+    Args:
+        fold: Fold of each bin, (n,).
+        used: Numbers of the u bins of the fit.
+        across: Covariance of the latent field between all bins and those of the fit, (n, u) [dB^2].
+        feature: Regressors of all bins, (n, k).
+        precision: Inverse covariance of the bins of the fit, (u, u).
+        solution: Dual coefficients and slopes of the tangent, each (u,), of `solve`.
+        heads: Head of the receiver.
+    """
+    (dual, slope, *_), predicted = solution, torch.empty_like(across[:, 0])
+    for out, _ in each_fold(fold):
+        part = torch.isin(used, out).nonzero()[:, 0].to(dual.device)
+        others = dual - precision[:, part] @ held_out_errors(precision, dual[:, None], part)[:, 0]
+        latent = across[out] @ (slope * others)
+        predicted[out] = feature[out] @ (feature[used].T @ others) + heads(latent[:, None])[0][:, 0]
+    return predicted
 
 
 def regressors(position: Tensor, receiver: Tensor, root: Tensor, directivity_std_db: float = 2.0) -> Tensor:
@@ -438,10 +467,12 @@ def predictive_std(
     return std
 
 
-def held_out_std(bins: Bins, kernel: Kernel, prior_db: tuple[Tensor, Tensor], covariance: Tensor) -> Tensor:
-    """Return the standard deviations (n, R) [dB] that models without a bin's fold predict; see `predictive_std`."""
+def held_out_std(
+    bins: Bins, fold: Tensor, kernel: Kernel, prior_db: tuple[Tensor, Tensor], covariance: Tensor
+) -> Tensor:
+    """Return the standard deviations (n, R) [dB] that models without a bin's fold (n,) predict; see `predictive_std`."""
     std = torch.empty_like(bins.rssi)
-    for out, kept in each_fold(bins.fold):
+    for out, kept in each_fold(fold):
         process = trend_process(kernel, bins.position[kept], bins.receiver)
         std[out] = predictive_std(process, bins.receiver, bins.position[out], prior_db, covariance)
     return std

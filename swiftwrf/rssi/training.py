@@ -31,7 +31,8 @@ class Bins:
         centre: Mean of the bins' positions, float64 (3,) [m].
         position: Mean position in each bin less the centre, float64 (n, 3) [m].
         bin_of_row: Bin of each training row, int64 (rows,).
-        fold: Cross-validation fold of each bin, int64 (n,).
+        folds: Cross-validation fold of each bin, int64 (n,): that of all choices, and that whose errors scale the standard
+            deviations, if it is another.
         rssi: Mean in each bin, float64 (n, R) [dBm], nan where not detected.
         count: Measurements in each mean, float64 (n, R).
     """
@@ -41,7 +42,7 @@ class Bins:
     centre: Tensor
     position: Tensor
     bin_of_row: Tensor
-    fold: Tensor
+    folds: tuple[Tensor, ...]
     rssi: Tensor
     count: Tensor
 
@@ -56,17 +57,27 @@ class Bins:
         if session is not None:  # that most rows of each bin are of
             number = session.unique(return_inverse=True)[1]
             session = _bin_sums(torch.nn.functional.one_hot(number), bin_of_row).argmax(dim=1)
-        centre = position.mean(dim=0)
+        centre, kinds = position.mean(dim=0), (config.validation, config.calibration or config.validation)
         return cls(
             receiver_names=tuple(map(str, rows.receiver_names)),
             receiver=rows.receiver_position.double() - centre,
             centre=centre,
             position=position - centre,
             bin_of_row=bin_of_row,
-            fold=folds(position, config.validation, config.seed, session=session),
+            folds=tuple(folds(position, kind, config.seed, session=session) for kind in dict.fromkeys(kinds)),
             rssi=rssi,
             count=count,
         )
+
+    @property
+    def fold(self) -> Tensor:
+        """Fold of each bin that determines all choices, int64 (n,)."""
+        return self.folds[0]
+
+    @property
+    def noise_scale(self) -> Tensor:
+        """Variance of the noise of each bin's means relative to that of one row, float64 (n,)."""
+        return 1 / self.bin_of_row.bincount().double()
 
     def means(self, values: Tensor) -> Tensor:
         """Return the means of values (rows, c) in each bin, float64 (n, c)."""
@@ -75,8 +86,8 @@ class Bins:
     def columns(self, number: Tensor) -> Self:
         """Return the bins of the receivers `number`."""
         names = tuple(self.receiver_names[n] for n in number.tolist())
-        of_receivers = {"receiver": self.receiver[number], "rssi": self.rssi[:, number], "count": self.count[:, number]}
-        return replace(self, receiver_names=names, **of_receivers)
+        rssi, count = self.rssi[:, number], self.count[:, number]
+        return replace(self, receiver_names=names, receiver=self.receiver[number], rssi=rssi, count=count)
 
 
 def _bin_sums(values: Tensor, bin_of_row: Tensor) -> Tensor:
@@ -121,11 +132,12 @@ def prepare(pool: Rssi, fitted: Tensor, config: RssiConfig, shift: Tensor, curve
     shift = bins.means(shift)
     losses = fit_path_losses(position, of_pool.receiver, of_pool.rssi, config.not_detected, shift, curve)
     residual = of_pool.rssi - losses.each(log_distance(position, of_pool.receiver))
-    kernel, has_field = choose_residual_kernel(
-        position, residual[:, often_detected(pool)], bins.fold, pool.floors is not None
-    )
+    residual, has_floors = residual[:, often_detected(pool)], pool.floors is not None
+    kernel, has_field = choose_residual_kernel(bins, residual, config.noises, has_floors)
     loss, shift = losses.columns(fitted), shift[:, fitted]
-    field_db, noise_db = prior_std(loss.variance, kernel if has_field and config.n_primitives else None)
+    field_db, noise_db = prior_std(
+        loss.variance, kernel if has_field and config.n_primitives else None, bins.noise_scale
+    )
     return RssiTraining(
         **vars(bins),
         kernel=kernel,
@@ -164,38 +176,38 @@ def check_folds(fold: Tensor, rssi: Tensor) -> None:
         )
 
 
-def prior_std(variance: Tensor, kernel: Kernel | None) -> tuple[Tensor, Tensor]:
-    """Return prior standard deviations (R,) [dB] of latent field and noise, whose variances sum to those given, (R,) [dB^2].
+def prior_std(variance: Tensor, kernel: Kernel | None, noise_scale: Tensor) -> tuple[Tensor, Tensor]:
+    """Return prior standard deviations (R,) [dB] of latent field and of the noise of one row.
 
-    The noise of the kernel is relative to the field. Without a field the kernel is None.
+    Args:
+        variance: Variance of the means in n bins about the path loss, (R,) [dB^2].
+        kernel: Kernel, whose noise is relative to the field; None without a field.
+        noise_scale: Variance of the noise of a mean relative to that of one row, (n,).
     """
-    noise = 1.0 if kernel is None else kernel.noise / (1 + kernel.noise)
-    return ((1 - noise) * variance).sqrt(), (noise * variance).sqrt()
+    of_mean = noise_scale.mean()
+    if kernel is None:
+        return torch.zeros_like(variance), (variance / of_mean).sqrt()
+    field = variance / (1 + kernel.noise * of_mean)
+    return field.sqrt(), (kernel.noise * field).sqrt()
 
 
 def choose_residual_kernel(
-    position: Tensor,
-    residual: Tensor,
-    fold: Tensor,
-    has_floors: bool = False,
-    *,
-    noises: tuple[float, ...] = (0.3, 1.0, 2.0, 3.0),
+    bins: Bins, residual: Tensor, noises: tuple[float, ...], has_floors: bool = False
 ) -> tuple[Kernel, bool]:
     """Choose the kernel with the lowest mean absolute error on held-out residuals of the path-loss model.
 
     Args:
-        position: Positions (n, 3) [m].
-        residual: Residuals (n, R) [dB], nan where not detected.
-        fold: Fold of each row, (n,).
+        bins: Location bins.
+        residual: Residuals (n, P) [dB], nan where not detected.
+        noises: Compared variances of one row, relative to that of the field.
         has_floors: Whether differences in height may count more than others.
-        noises: Compared variances of a packet, relative to that of the field: fading is about as large as shadowing. Not
-            studied.
 
     Returns:
         The kernel, and whether its error is lower than that of no field at all.
     """
     detected = (~residual.isnan()).any(dim=1)
-    position, residual, fold = subsample(position[detected], residual[detected], fold[detected], rows=300)
+    rows = bins.position, residual, bins.fold, bins.noise_scale
+    position, residual, fold, noise_scale = subsample(*(each[detected] for each in rows), rows=300)
     residual = residual[:, (~residual.isnan()).any(dim=0)]
     (columns,) = subsample(torch.arange(residual.shape[1]), rows=12)  # more rows or receivers do not change the choice
     residual = residual[:, columns]
@@ -205,7 +217,8 @@ def choose_residual_kernel(
         for vertical in (1.0, 5.0)[: 1 + has_floors]
         for kernel in rough_candidates(position, noises)
     ]
-    precision = torch.linalg.inv(torch.stack([kernel.covariance(position) for kernel in kernels]))
+    covariance = [kernel(position, position) + (kernel.noise * noise_scale).diag() for kernel in kernels]
+    precision = torch.linalg.inv(torch.stack(covariance))
     dual, errors = precision @ residual.nan_to_num(), []
     for r, missing in enumerate(residual.isnan().T):
         # missing rows are held out with every fold, so that the zeros in their place have no effect

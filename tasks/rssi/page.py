@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.contrib.comparison.errors import paired_difference
+from swiftwrf.contrib.comparison.leave_one_out import LEAVE_ONE_OUT
 from swiftwrf.contrib.comparison.rssi import CERTAINTY, COVERED_DBM
 from swiftwrf.data.splits import places
 from swiftwrf.metrics import LEVEL
@@ -143,12 +144,18 @@ def conclusion(run: Records) -> list[str]:
     who = f"one of {len(names)} receivers" if len(names) > 1 else names[0]
     covered = [f"{maps.coverage['covered'] or 0:.0%} of {maps.place}" for maps in floors]
     error = run.metrics["overall"][own]["abs_error_db"]
+    errors = by_method(run.table("errors")[COLUMNS])
+    tested = f"Tested on {error['n']} measurements, fitted to {run.metrics['n_train']} rows ({run.scene})."
+    if run.metrics["split"] == LEAVE_ONE_OUT:
+        count = errors.index.get_level_values("place").nunique()
+        tested = (
+            f"All others predict each of {count} positions, {error['n']} measurements in all ({run.scene}). Errors and "
+            "intervals of so few positions vary by chance."
+        )
     sure = (
         f"90 % of the errors are below {error['p90']:.1f} dB, and {interval['coverage']:.0%} of the measurements lie in "
-        f"their {interval['nominal']:.0%} intervals. Tested on {error['n']} measurements, fitted to "
-        f"{run.metrics['n_train']} rows ({run.scene})."
+        f"their {interval['nominal']:.0%} intervals. {tested}"
     )
-    errors = by_method(run.table("errors")[COLUMNS])
     compared = comparison_sentence(errors, own, best, name=own, unit="dB", rows="pairs")
     return [
         *recommendation(run, own, "dB")[1],

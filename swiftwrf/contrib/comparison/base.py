@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pandas import DataFrame, concat
 
 from swiftwrf.contrib.comparison.errors import method_summary, summaries
+from swiftwrf.contrib.comparison.leave_one_out import LEAVE_ONE_OUT
 from swiftwrf.data import Rssi
 from swiftwrf.data.dataset import PositionedData
 from swiftwrf.data.splits import MAX_REPEATED, places, repeated_fraction
@@ -156,6 +157,12 @@ def split_notes(train: Rssi, test: Rssi, split: str) -> list[str]:
         >>> split_notes(*swiftwrf.rssi_room(n=60).split(), "random")
         []
     """
+    if split == LEAVE_ONE_OUT:
+        count = int(places(test.transmitter_position).max()) + 1
+        return [
+            f"{len(test)} rows are too few for a test part: rows of each of {count} positions are predicted by those of all "
+            f"others, and errors and intervals of so few vary by chance"
+        ]
     notes = []
     if train.validation_for(split, test) == "session":
         notes.append(

@@ -13,7 +13,6 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.stats import wasserstein_distance
 from torch import Tensor
 
 from swiftwrf.contrib.comparison.base import Comparison, Recorded, Values
@@ -23,13 +22,12 @@ from swiftwrf.contrib.comparison.steps import LOCATOR, Memo, Steps
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin, degree_columns
 from swiftwrf.data.rssi import PLACE
-from swiftwrf.data.splits import Validation, each_fold, folds, places
+from swiftwrf.data.splits import places
 from swiftwrf.errors import InputError
 from swiftwrf.locate.locator import Locator
 from swiftwrf.locate.posterior import Posterior
 from swiftwrf.locate.rssi import RssiLocator
 from swiftwrf.metrics import LEVEL
-from swiftwrf.positions import nearest
 from swiftwrf.rssi import estimate_offsets
 from swiftwrf.runtime.checkpoint import load
 from swiftwrf.runtime.validation import checked
@@ -231,8 +229,6 @@ class LocateComparison(PositionComparison):
         """
         train, test, split = self.train, self.test, self.options["split"]
         validation = train.validation_for(split, test)
-        if validation == "block" and split != "block":
-            validation = matching_validation(train.transmitter_position, test.transmitter_position)
         n_cells, seed = self.options["n_cells"], self.options["seed"]
         localizer = LOCALIZERS[name](validation=validation, n_cells=n_cells, seed=seed)
         began = time.perf_counter()
@@ -318,26 +314,3 @@ def compare(
     locator = load(memo.folder / LOCATOR)
     assert isinstance(locator, RssiLocator)
     return replace(begun, values=values, locator=locator)
-
-
-def matching_validation(train: Tensor, test: Tensor) -> Validation:
-    """Return the kind of folds whose held-out distances resemble those of the test positions.
-
-    A distance is that to the nearest training position (C. Mila et al., Methods in Ecology and Evolution 13, 2022).
-
-    Example:
-        >>> line = torch.linspace(0, 99, 100)[:, None] * torch.tensor([1.0, 0.0, 0.0])
-        >>> matching_validation(line, line + 0.5), matching_validation(line, line + 50)
-        ('random', 'block')
-    """
-
-    def distances(known: Tensor, other: Tensor) -> Tensor:
-        return nearest(other, known, 1)[0][:, 0]
-
-    def misfit(validation: Validation) -> float:
-        fold = folds(train, validation, 0)
-        held_out = [distances(train[kept], train[out]) for out, kept in each_fold(fold)]
-        return float(wasserstein_distance(torch.cat(held_out), distances(train, test)))
-
-    kinds: tuple[Validation, Validation] = ("random", "block")
-    return min(kinds, key=misfit)

@@ -19,6 +19,7 @@ from torch import Tensor
 from swiftwrf.choices import RSSI_PREDICTORS, NotDetected
 from swiftwrf.contrib.comparison.base import Comparison, Recorded, Values
 from swiftwrf.contrib.comparison.errors import summaries, summary
+from swiftwrf.contrib.comparison.leave_one_out import LEAVE_ONE_OUT, distances_to_others, is_small, predict_each_place
 from swiftwrf.contrib.comparison.steps import MODEL, Memo, Steps, refusing_executor
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
@@ -170,7 +171,10 @@ class RssiComparison(Comparison):
         """Columns of the detected test pairs that are those of every method."""
         test, (row, column) = self.test, self._pairs
         from_receiver = distance(test.transmitter_position, test.receiver_position)[row, column]
-        from_training = nearest(test.transmitter_position, self.train.transmitter_position, 1)[0][row, 0]
+        if self.options["split"] == LEAVE_ONE_OUT:
+            from_training = distances_to_others(test.transmitter_position)[row]
+        else:
+            from_training = nearest(test.transmitter_position, self.train.transmitter_position, 1)[0][row, 0]
         return {
             "receiver": self._receiver,
             "index": test.index[row],
@@ -287,7 +291,8 @@ def compare(
     Args:
         data: RSSI. Offsets between its groups, if it has any, are estimated from training rows and removed from them.
         receivers: Names of receivers, numbers counted from 1, or "all".
-        split: Split that comes with the data, or a seeded one: random, block, or place.
+        split: Split that comes with the data, or a seeded one: random, block, or place. Without enough rows for a random
+            split, 13, all other places predict each one.
         seed: Seed of everything random.
         also: Predictors that are compared only when named, e.g. "nerf2".
         preset: "quick", or "paper" for published settings.
@@ -302,7 +307,8 @@ def compare(
         progress: Show a progress bar on a terminal.
 
     Raises:
-        InputError: Unknown receivers, split or predictors, no test row that a receiver detects, too few rows, or `keep` of
+        InputError: Unknown receivers, split or predictors, no test row that a receiver detects, too few rows, fewer than 5
+            places, or `keep` of
             another call.
 
     Example:
@@ -313,40 +319,51 @@ def compare(
     """
     given = locals().copy()
     chosen = data.as_measured().receivers(receivers)
-    train, test = chosen.split(split, seed)
+    small = is_small(chosen, split)
+    train, test = (chosen, chosen) if small else chosen.split(split, seed)
     if not bool(test.detected.any()):
         raise InputError(f"split {split!r} of {data.name} has no test rows that detect these receivers")
-    pool = pool_of(data, train, test, split, seed)
+    pool = data if small else pool_of(data, train, test, split, seed)
     if pool.groups is not None:
         offsets = estimate_offsets(pool, reference)
         train, pool = offsets.removed(train), offsets.removed(pool)
     offset = 0.0 if train.offsets is None else train.offsets.of(test)[:, None]
     kind = train.validation_for(split, test) if validation == "auto" else validation
     options: Values = {"validation": kind, "seed": seed, "new_places": split == PLACE, "not_detected": not_detected}
+    if kind == "random" != split:  # test rows of a split that comes with the data may be of another day or device
+        options["calibration"] = "block"
     names, left_out = compared(chosen, also)
     if keep is not None:
         keep.of(given | {"predictors": [RSSI_PREDICTORS[name] for name in names]})
-    begun = RssiComparison(train, test, {}, {"split": split, "preset": preset, "seed": seed}, left_out)
+    shown = {"split": LEAVE_ONE_OUT if small else split, "preset": preset, "seed": seed}
+    begun = RssiComparison(train, test, {}, shown, left_out)
     model_name, predictors = begun.model, dict[str, RssiPredictor]()
     parallel = None if executor is None else executor.map
 
     def compute(_: None, folder: Path, name: str, rows: Tensor | None = None) -> Values:
-        predictor = make_predictor(name, preset, **options)
+        def fit(rows: Rssi, pool: Rssi) -> RssiPredictor:
+            predictor = make_predictor(name, preset, **options)
+            return predictor.fit(rows, pool=pool, device=device, parallel=parallel, progress=progress)
+
         part, every = (train, pool) if rows is None else (train.subset(rows), pool.subset(rows))
         began = time.perf_counter()
-        predictor.fit(part, pool=every, device=device, parallel=parallel, progress=progress)
+        predictor = fit(part, every)
         fitted = time.perf_counter()
-        prediction = predictor.predict_detected(test)
+        if small:
+            prediction, probability = predict_each_place(fit, train, pool)
+        else:
+            prediction, probability = predictor.predict_detected(test), None
         seconds = {"fit": fitted - began, "predict": time.perf_counter() - fitted}
-        detection = (
-            None  # fractions of detected and of empty test cells that are predicted as such, if there are both kinds
-        )
+        # fractions of detected and of empty test cells that are predicted as such, if there are both kinds
+        detection = None
         if rows is None:
             predictors[name], detected = predictor, test.detected
             if name == model_name and isinstance(predictor, Saved):
                 predictor.save(folder / MODEL)
             if predictor.detection is not None and not bool(detected.all()) and not test.receiver_moves:
-                above = predictor.predict_detection(test.transmitter_position, offset) > 0.5
+                if probability is None:
+                    probability = predictor.predict_detection(test.transmitter_position, offset)
+                above = probability > 0.5
                 detection = float(above[detected].double().mean()), float((~above)[~detected].double().mean())
         std = None if prediction.std is None else prediction.std[test.detected]
         error = (prediction.mean + offset - test.rssi_dbm)[test.detected].abs()

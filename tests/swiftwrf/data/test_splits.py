@@ -5,10 +5,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.distance import cdist
+from scipy.stats import wasserstein_distance
 
 from swiftwrf import InputError, Rssi, RssiModel, load_rssi, rssi_room
 from swiftwrf.contrib.comparison.base import split_notes
-from swiftwrf.data.splits import block_split, folds, places, random_split, repeated_fraction, slabs, split_names
+from swiftwrf.data.splits import (
+    block_split,
+    each_fold,
+    folds,
+    matching_validation,
+    places,
+    random_split,
+    repeated_fraction,
+    slabs,
+    split_names,
+)
 from swiftwrf.data.writing import write_rssi
 
 REPEATED = {  # number of places, extent and error of positioning [m]
@@ -133,11 +145,34 @@ def test_split_of_other_sessions_holds_out_sessions():
     assert "cross-validation holds out sessions" in split_notes(train, test, "day")[0]
 
 
-def coverage_of(validation, parts):
+def test_split_of_a_file_has_folds_like_its_test_rows():
+    data = rssi_room(n=120)
+    among, apart = data.split("random", seed=3), data.split("block", seed=3)
+    data = replace(data, named_splits={"again": tuple(p.index for p in among), "wing": tuple(p.index for p in apart)})
+    for name, expected in (("again", "random"), ("wing", "block")):
+        train, test = data.split(name)
+        assert train.validation_for(name, test) == expected
+
+
+@pytest.mark.parametrize("gap", [-10.0, -9.0, -8.0, -6.0, 0.0])
+def test_matching_folds_are_nearest_in_wasserstein_distance(gap):
+    draw = np.random.default_rng(1)
+    train, test = draw.uniform(0, 10, (200, 3)), draw.uniform([10 + gap, 0, 0], [20 + gap, 10, 10], (60, 3))
+
+    def misfit(validation):
+        fold = folds(torch.from_numpy(train), validation, 0)
+        held_out = [cdist(train[out], train[kept]).min(axis=1) for out, kept in each_fold(fold)]
+        return wasserstein_distance(np.concatenate(held_out), cdist(test, train).min(axis=1))
+
+    expected = min(("random", "block"), key=misfit)
+    assert matching_validation(torch.from_numpy(train), torch.from_numpy(test)) == expected
+
+
+def coverage_of(validation, parts, **options):
     """Return the fraction of test values inside intervals of 80 % of models that this validation calibrates."""
     inside = []
     for train, test in parts:
-        low, high = RssiModel(validation=validation).fit(train).predict_detected(test).interval(0.8)
+        low, high = RssiModel(validation=validation, **options).fit(train).predict_detected(test).interval(0.8)
         inside.append(((low <= test.rssi_dbm) & (test.rssi_dbm <= high))[test.detected])
     return float(torch.cat(inside).double().mean())
 
@@ -147,6 +182,18 @@ def test_intervals_contain_the_difference_between_sessions():
     parts = [(data.subset(data.session != number), data.subset(data.session == number)) for number in range(5)]
     assert coverage_of("random", parts) < 0.76
     assert 0.77 < coverage_of("session", parts) < 0.83
+
+
+def test_intervals_for_single_scans_after_a_survey_of_averages():
+    """Folds of averages hold 80 % of averages; the calibration for other days leaves room for scans of 1.5 dB."""
+    data, generator = rssi_room(n=150, seed=2).columns(range(0, 12, 3)), torch.Generator().manual_seed(0)
+    at = data.transmitter_position
+    truth = -60 + 5 * torch.sin(at[:, :1] / 2 + torch.arange(4)) * torch.cos(at[:, 1:2] / 3)
+    std = torch.where(torch.arange(150) < 100, 0.3, 1.5)[:, None]
+    data = replace(data, rssi_dbm=truth + std * torch.randn(150, 4, generator=generator))
+    parts = [(data.subset(torch.arange(100)), data.subset(torch.arange(100, 150)))]
+    assert coverage_of("random", parts) < 0.6
+    assert 0.74 < coverage_of("random", parts, calibration="block") < 0.9
 
 
 @pytest.mark.data

@@ -36,7 +36,7 @@ def test_the_map_of_a_receiver_that_is_not_listed_is_nearer_to_the_truth(number,
         if meaning == "auto":  # being listed is no detection
             assert bool((model.predict_detection(data.transmitter_position) == 1).all())
     assert error["auto"] < 0.75 * error["unknown"]
-    assert error["auto"] < 1.1 * error["weak"]
+    assert number == 1 or error["auto"] < 0.9 * error["weak"]
 
 
 def packets(order: str) -> tuple[np.ndarray, np.ndarray]:

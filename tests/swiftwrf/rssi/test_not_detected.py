@@ -9,7 +9,7 @@ import torch
 from small import only
 from test_floors import FLOOR_DB, RECEIVERS, building, rssi
 
-from swiftwrf import Rssi, RssiModel, rssi_room
+from swiftwrf import Rssi, RssiModel, load_rssi, rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.data.rssi import Offsets
 from swiftwrf.gp import Kernel
@@ -115,7 +115,7 @@ def test_one_cell_of_its_kind_among_many_is_enough(is_detected):
     detected = torch.full((300, 100), not is_detected)
     detected[3, 2] = is_detected
     kernel, level = Kernel(1.0, matern12_weight=1.0, noise=1.0), torch.full((300, 100), -60.0).double()
-    found = DetectionField.fit(kernel, position, detected, torch.arange(300) % 5, level, torch.full((100,), -90.0))
+    found, _ = DetectionField.fit(kernel, position, detected, torch.arange(300) % 5, level, torch.full((100,), -90.0))
     probability = found.probability(level, position)
     assert bool(((probability > 0.5) == detected).double().mean() > 0.999)
 
@@ -147,6 +147,23 @@ def test_a_receiver_seen_at_one_distance_has_the_slope_of_all():
     found, truth = model.predict(line), -42 - 38 * log_distance(line, RECEIVER)[:, 0]
     assert float((found.mean[:, 0] - truth).abs().max()) < 6
     assert float(found.std[0, 0]) > float(found.std[2, 0]) + 0.5  # the trend is uncertain far from the rows
+
+
+@pytest.mark.data
+def test_empty_cells_that_make_held_out_values_unlikely_are_no_limits(measured_data):
+    """A receiver of this building misses strong packets on whole days; limits cost 1.1 dB of the median."""
+    train, test = load_rssi(measured_data / "ts-ujib1").columns(range(0, 16, 4)).split("published")
+    models = {kind: RssiModel(not_detected=kind).fit(train) for kind in ("weak", "unknown", "auto")}
+    error = {
+        kind: float((model.predict_detected(test).mean - test.rssi_dbm)[test.detected].abs().median())
+        for kind, model in models.items()
+    }
+    assert error["auto"] < error["unknown"] + 0.1 < error["weak"] - 0.5
+    assert models["weak"].detection.is_limit.all()
+    assert "here empty cells say nothing" in models["auto"].detection.note(train.receiver_names)
+    # the probability of a detection is that of the rows nearby
+    probability = models["auto"].predict_detection(test.transmitter_position)
+    assert float(probability[test.detected].mean()) > float(probability[~test.detected].mean()) + 0.1
 
 
 @only(RSSI_PREDICTORS, "swiftwrf", "mean")

@@ -77,7 +77,7 @@ def training_of(data, n_primitives=50):
         centre=centre,
         position=data.transmitter_position - centre,
         bin_of_row=torch.arange(n),
-        fold=torch.arange(n) % 5,
+        folds=(torch.arange(n) % 5,),
         rssi=data.rssi_dbm,
         count=torch.ones(n, r, dtype=torch.float64),
         kernel=KERNEL,
@@ -147,9 +147,10 @@ def test_solution_is_the_maximum_of_the_posterior():
 
 def test_held_out_is_a_fit_without_the_fold():
     """The formula for held-out rows against fits that never see them; without outliers, so that no weight depends on them,
-    and without a head, which the formula takes along its tangent."""
+    and without a head, which the formula takes along its tangent. Every sixth row is empty."""
     training, gentle = training_of(with_field(n=60).columns([1]), n_primitives=0), RssiConfig(huber=1e6)
-    whole = fit_receiver(FIRST, training, gentle, CPU)["held_out"]
+    training = replace(training, rssi=training.rssi.where(torch.arange(60)[:, None] % 6 > 0, torch.nan))
+    (whole,) = fit_receiver(FIRST, training, gentle, CPU)["held_out"]
     for number in range(5):
         out = training.fold == number
         rest = replace(training, rssi=torch.where(out[:, None], torch.nan, training.rssi))
@@ -186,6 +187,23 @@ def test_errors_at_held_out_rows_are_those_of_the_model_and_of_the_receivers_mea
     assert found["swiftwrf"] > found["mean"]
     found = RssiModel().fit(with_field()).held_out_db
     assert found["swiftwrf"] < 0.7 * found["mean"]
+
+
+@pytest.mark.parametrize("max_locations", [1500, 100])
+def test_a_survey_of_averages_has_less_noise_than_packets(max_locations):
+    """With packets alone in mind the map is smoother than the field: errors of 0.8 dB for 0.4."""
+    generator = torch.Generator().manual_seed(0)
+    position = torch.rand(200, 3, generator=generator).double() * torch.tensor([30.0, 20, 0])
+    truth = -60 + 6 * torch.sin(position[:, :1] / 3 + torch.arange(3))
+    rssi = truth + 0.3 * torch.randn(200, 3, generator=generator)
+    data = Rssi(rssi, position, receiver_names=list("abc"))
+    train, test = data.subset(torch.arange(120)), position[120:]
+    model, packets = (
+        RssiModel(max_locations=max_locations, **each).fit(train) for each in ({}, {"noises": (0.3, 1.0)})
+    )
+    error, other = (float((each.predict(test).mean - truth[120:]).abs().mean()) for each in (model, packets))
+    assert model.kernel.noise < 0.3
+    assert error < 0.7 * other
 
 
 def test_primitives_are_for_a_field():
