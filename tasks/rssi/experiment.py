@@ -59,6 +59,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
                 validation=config.validation,
                 reference=how.reference if how else None,
                 fewer=FEWER,
+                above=config.above,
                 device=device,
                 keep=directory,
                 executor=workers,

@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.contrib.comparison.errors import paired_difference
 from swiftwrf.contrib.comparison.leave_one_out import LEAVE_ONE_OUT
-from swiftwrf.contrib.comparison.rssi import CERTAINTY, COVERED_DBM
 from swiftwrf.data.splits import places
 from swiftwrf.metrics import LEVEL
 from tasks.labels import PREDICTORS, colour, meanings
@@ -30,7 +29,8 @@ from tasks.page.shared import (
     recommendation,
 )
 from tasks.records import Records, notes
-from tasks.rssi.maps import MIN_RATIO, WIDTH_PER_STD, Maps, coverage_sentence
+from tasks.rssi import coverage
+from tasks.rssi.maps import MIN_RATIO, WIDTH_PER_STD, Maps
 from tasks.terminal import Answer, Method, NextStep
 
 COLUMNS = ["index", "place", "receiver", "method", "abs_error_db"]  # of the errors of methods
@@ -53,13 +53,13 @@ def page(runs: list[Records]) -> Page:
     """Return the page of these runs."""
     answers = {run: answer(run) for run in runs}
     sections = [
+        sections_of("Coverage", runs, coverage.section),
         sections_of("Errors", runs, lambda run: _errors(run, answers[run]), meanings(RSSI_PREDICTORS)),
-        sections_of("Where the errors are", runs, lambda run: Section("", plots=[_where(run)])),
         limits(runs[0], *LIMITS),
     ]
     details = [provenance(runs)]
-    if len(runs) > 1 or any(len(Maps(run).names) > 1 for run in runs):
-        sections.insert(0, sections_of("Maps", runs, partial(_maps, kind="predicted")))
+    if len(runs) > 1 or any(len(Maps(run).names) > 1 or Maps(run).suffix for run in runs):
+        sections.insert(1, sections_of("Maps", runs, partial(_maps, kind="predicted")))
         by_receiver = sections_of("Errors by receiver", runs, lambda run: Section("", plots=_differences(run)))
         details[:0] = [by_receiver, sections_of("Widths of the intervals", runs, partial(_maps, kind="width"))]
     names = ", ".join(dict.fromkeys(run.place for run in runs))
@@ -75,21 +75,31 @@ def _summary(run: Records, found: Answer) -> Summary:
     floors, interval = Maps.of_floors(run), run.metrics["interval"]
     error = {name: entry["abs_error_db"] for name, entry in run.metrics["overall"].items()}
     best = best_baseline(run)
+    threshold = floors[0].coverage["threshold_dbm"]
     numbers = [
         *(
-            Number(f"{maps.coverage['covered'] or 0:.0%}", f"of {maps.place} above {COVERED_DBM:g} dBm")
+            Number(f"{maps.coverage['covered'] or 0:.0%}", f"of {maps.place} above {threshold:g} dBm")
             for maps in floors
         ),
         Number(f"{error[found.chosen]['median']:.2f} dB", f"median absolute error of {found.chosen}"),
         Number(f"{error[best]['median']:.2f} dB", f"that of {best}, the best other method"),
         Number(f"{interval['coverage']:.0%}", f"of the test measurements in their {interval['nominal']:.0%} interval"),
     ]
-    plots = [maps.summary() for maps in floors]
+    plots = [Maps.coverage_plot(floors), *(maps.summary() for maps in floors if len(floors) == 1)]
     return Summary(numbers, plots, found.conclusion, found.next_steps, notes=notes(run))
 
 
 def _maps(run: Records, kind: str) -> Section:
-    return Section("", plots=[maps.by_receiver(kind) for maps in Maps.of_floors(run)])
+    """Return the maps of the strongest receivers of each floor, the others folded."""
+    floors = Maps.of_floors(run)
+    parts = []
+    for maps in floors:
+        first = [maps.summary()] if len(floors) > 1 and kind == "predicted" else []
+        part = Section(maps.name if maps.suffix else "", plots=[*first, *filter(None, [maps.by_receiver(kind)])])
+        if kind == "predicted" and (more := maps.by_receiver(kind, first=False)) is not None:
+            part.parts.append(Section("More receivers", plots=[more], folded=True))
+        parts.append(part)
+    return Section("", parts=parts) if len(floors) > 1 else parts[0]
 
 
 def _errors(run: Records, found: Answer) -> Section:
@@ -98,7 +108,7 @@ def _errors(run: Records, found: Answer) -> Section:
         "interval over test places. Detection: mean of the fractions of detected and of empty test cells that are predicted "
         "as such; 0.5 is chance."
     )
-    return errors_section(
+    section = errors_section(
         found,
         run.table("errors")[COLUMNS],
         COLOURS,
@@ -108,6 +118,8 @@ def _errors(run: Records, found: Answer) -> Section:
         paragraphs=[f"Left out: {reason}." for reason in run.metrics["left_out"].values()],
         panels=_by_rows(run),
     )
+    section.parts.append(Section("Where the errors are", plots=[_where(run)]))
+    return section
 
 
 def answer(run: Records) -> Answer:
@@ -142,6 +154,7 @@ def conclusion(run: Records) -> list[str]:
     best, interval = best_baseline(run), run.metrics["interval"]
     own, floors, names = model_of(run), Maps.of_floors(run), list(run.metrics["receivers"])
     who = f"one of {len(names)} receivers" if len(names) > 1 else names[0]
+    first = floors[0].coverage
     covered = [f"{maps.coverage['covered'] or 0:.0%} of {maps.place}" for maps in floors]
     error = run.metrics["overall"][own]["abs_error_db"]
     errors = by_method(run.table("errors")[COLUMNS])
@@ -159,9 +172,10 @@ def conclusion(run: Records) -> list[str]:
     compared = comparison_sentence(errors, own, best, name=own, unit="dB", rows="pairs")
     return [
         *recommendation(run, own, "dB")[1],
-        f"{', '.join(covered)} {'has' if len(covered) == 1 else 'have'} {who} above {COVERED_DBM:g} dBm with "
-        f"{CERTAINTY:.0%} certainty; predictions are within {error['median']:.1f} dB (median error).",
-        *(coverage_sentence(maps.coverage, maps.place) for maps in floors),
+        f"{', '.join(covered)} {'has' if len(covered) == 1 else 'have'} {who} above {first['threshold_dbm']:g} dBm with "
+        f"{first['certainty']:.0%} certainty; predictions are within {error['median']:.1f} dB (median error).",
+        *(coverage.coverage_sentence(maps.coverage, maps.place) for maps in floors),
+        *filter(None, [coverage.spots_sentence(floors), coverage.held_out_sentence(run), coverage.why(run)]),
         sure,
         compared,
     ]

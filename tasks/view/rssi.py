@@ -20,7 +20,8 @@ from swiftwrf.rssi.coverage import Coverage, reach
 from swiftwrf.rssi.maps import RssiMap
 from tasks.page.maps import Corners, FloorPlan
 from tasks.records import as_table, read_npz, rounded
-from tasks.rssi.maps import MAX_WIDTH_DB, coverage_sentence
+from tasks.rssi.coverage import coverage_sentence
+from tasks.rssi.maps import MAX_WIDTH_DB
 from tasks.view.locating import RssiLocating
 
 RECEIVER_COLOURS, N_RECEIVER_COLOURS = "tab20", 20
