@@ -136,6 +136,28 @@ def find_roles(
     return roles
 
 
+def column_of_quantity(source: object, table: pd.DataFrame, quantity: str) -> str:
+    """Return the only column of numbers whose name contains a quantity, or else begins with its first word.
+
+    Raises:
+        InputError: None or several of them.
+
+    Example:
+        >>> column_of_quantity("a.csv", pd.DataFrame({"x": [1.0], "latency_ms": [3.0]}), "latency")
+        'latency_ms'
+    """
+    plain = plain_name(quantity)
+    found = [
+        n for n in table.columns if plain in plain_name(n) and not is_coordinate(n) and not parsed(table[n])[1].all()
+    ]
+    if len(found) != 1:
+        raise InputError(
+            f"{source} has {len(found)} columns that are named {quantity}; choose one with columns rssi=NAME; there are "
+            f"{listed(table.columns)}"
+        )
+    return str(found[0])
+
+
 def _with_known_ids(table: pd.DataFrame, names: Sequence[str], max_unknown: float = 0.1) -> str:
     """Return the first column of ids with few unknown ones, e.g. the PCI if neighbours lack the cell id (not studied)."""
     unknown = {name: ((text_of(table[name]) == "") | unknown_ids(table[name])).mean() for name in names}

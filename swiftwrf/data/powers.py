@@ -91,8 +91,10 @@ def _fills_the_lower_edge(
     return bool((weakest[np.isfinite(weakest)] == value[0]).mean() > fraction)  # near receivers detect every row
 
 
-def without_fillers(rssi: Floats, fillers: list[float]) -> tuple[Floats, list[str]]:
+def without_fillers(rssi: Floats, fillers: list[float], quantity: str | None = None) -> tuple[Floats, list[str]]:
     """Return RSSI (n, R) with nan in place of fillers and of -inf, and a note on each of them.
+
+    Another quantity than RSSI has no usual filler.
 
     Example:
         >>> without_fillers(np.array([[-60.0, 127.0]]), [127.0])
@@ -105,7 +107,7 @@ def without_fillers(rssi: Floats, fillers: list[float]) -> tuple[Floats, list[st
         if n := int(cells.sum()):
             notes.append(f"{filler:g} counts as not detected: {n} of {rssi.size} cells ({n / rssi.size:.0%})")
         filled |= cells
-    if NOT_DETECTED_DBM not in fillers and (n := int((rssi == NOT_DETECTED_DBM).sum())):
+    if quantity is None and NOT_DETECTED_DBM not in fillers and (n := int((rssi == NOT_DETECTED_DBM).sum())):
         notes.append(f"{NOT_DETECTED_DBM:g} dBm counts as measured: {n} cells")
     return np.where(filled, np.nan, rssi), notes
 

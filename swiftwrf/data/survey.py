@@ -29,6 +29,7 @@ from swiftwrf.data.columns import (
     TRANSMITTED,
     check_receiver_known,
     column_of,
+    column_of_quantity,
     columns_of_end,
     find_roles,
     receiver_columns,
@@ -81,9 +82,19 @@ class TableOptions:
     y_down: bool = False
     up: Up = "z"
     window: PositiveFloat | None = None
+    quantity: str | None = None
+    unit: str | None = None
 
     def check(self) -> None:
-        """Keep lists as tuples, which compare as a whole."""
+        """Keep lists as tuples, which compare as a whole.
+
+        Raises:
+            InputError: A quantity without a unit or the reverse, or pools of another quantity than power.
+        """
+        if (self.quantity is None) != (self.unit is None):
+            raise InputError("quantity and unit belong together, e.g. throughput and Mbps; give both")
+        if self.quantity is not None and self.pool_by is not None:
+            raise InputError(f"pool_by pools received powers, but the quantity is {self.quantity}; leave it out")
         object.__setattr__(self, "filler", None if self.filler is None else tuple(map(float, self.filler)))
         object.__setattr__(self, "transmitter", tuple(self.transmitter))
 
@@ -150,6 +161,8 @@ class _Survey:
             if n := int(table.duplicated().sum()):
                 self.notes.append(f"rows equal an earlier one in all columns and count once more: {n} of {len(table)}")
         asked = dict(options.columns or {})
+        if options.quantity is not None and "rssi" not in asked:
+            asked["rssi"] = column_of_quantity(source, table, options.quantity)
         table, self.n_listed, notes = from_ranked_lists(table, asked)
         self.notes += notes
         self.table, self.names, self.end, self.corrected = table, list[str](), dict[str, str](), ""
@@ -199,6 +212,11 @@ class _Survey:
     def clean_powers(self) -> None:
         """Take fillers as not detected, refuse what is no received power, and pool radios."""
         by = self.options.pool_by
+        if self.options.quantity is not None:
+            values = np.where(np.isfinite(self.rssi), self.rssi, np.nan)
+            self.rssi, notes = without_fillers(values, list(self.options.filler or ()), self.options.quantity)
+            self.notes += notes
+            return
         fillers = find_fillers(self.rssi) if self.options.filler is None else list(self.options.filler)
         self.rssi, notes = without_fillers(self.rssi, fillers)
         check_powers(self.source, self.rssi, self.names, self.table_row // self.n_listed)
@@ -303,7 +321,12 @@ class _Survey:
         if moves and not self.end:
             column = options.transmitter[0]
             self.notes.append(f"both ends move; {len(self.names)} positions of column {column} count as receivers")
-        if receivers is not None and receiver_position is None:
+        if options.quantity is not None:
+            what = f"values are {options.quantity} [{options.unit}]"
+            self.notes.append(f"{what}: maps have no path loss and no limit of detection")
+            if moves:
+                raise InputError(f"{self.source} has positions of both ends, which only a model of RSSI takes; {what}")
+        elif receivers is not None and receiver_position is None:
             known, notes = read_receivers(receivers, self.names, self.origin, self.frame)
             receiver_position = known.numpy()
             self.notes += notes
@@ -323,6 +346,7 @@ class _Survey:
             "session": None if self.session is None else self.session.to_numpy()[self.table_row].tolist(),
             "time": self.time,
             "index": self.index,
+            **({"quantity": options.quantity, "unit": options.unit} if options.quantity else {}),
             "notes": tuple(self.notes),
         }
 
@@ -351,6 +375,8 @@ class _Survey:
 
     def _list_margin(self, moves: bool) -> float | None:
         """Return how far an empty cell may be above the weakest value of its row [dB], and note what empty cells are."""
+        if self.options.quantity is not None:
+            return None
         margin_db = None if moves else list_margin(self.rssi, self.coordinate)
         if 1 < self.n_listed < len(self.names):
             margin_db = 0.0

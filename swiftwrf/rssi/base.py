@@ -102,7 +102,10 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
     """positions evaluated at a time, few enough to stay in the processor's cache"""
 
     fitted_attribute = "receiver_names"
-    saved: ClassVar[str] = "receiver_position receiver_names origin offsets attenuation detection row_digests"
+    saved: ClassVar[str] = (
+        "receiver_position receiver_names origin offsets attenuation detection row_digests quantity unit value_centre "
+        "value_scale"
+    )
     """what the file of a predictor contains that is `Saved`, too"""
     receiver_names: Annotated[tuple[str, ...], "r"]
     """names of the receivers, set by `fit`"""
@@ -114,6 +117,14 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
     """curve of detection of the training rows; None if every cell has a value; set by `fit`"""
     offsets: Offsets | None
     """offsets that were removed from the training rows, set by `fit`; predictions are of their reference"""
+    quantity: str = "RSSI"
+    """what is predicted, set by `fit`: RSSI, or another quantity of the data"""
+    unit: str = "dBm"
+    """its unit, set by `fit`"""
+    value_centre: float = 0.0
+    """mean of the training values of another quantity than RSSI, which is subtracted before the fit"""
+    value_scale: float = 1.0
+    """their number in a dB of the fit: other quantities are scaled to the standard deviation of RSSI"""
     attenuation: Annotated[FloorAttenuation, "r"] | None = None
     """attenuation of the floors between transmitter and receiver, set by `fit` if the data have floors"""
 
@@ -139,6 +150,7 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
         device: torch.device | str = "cpu",
         parallel: Map | None = None,
         progress: bool = False,
+        usual_std_db: float = 8.0,
     ) -> Self:
         """Fit the predictor to measured RSSI and return it. A fit that fails leaves the predictor as it was.
 
@@ -150,6 +162,8 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
             parallel: Function that maps a picklable fit over receivers as `map` does, e.g. on other machines. Defaults to
                 threads of this process.
             progress: Show a progress bar on a terminal.
+            usual_std_db: Standard deviation that values of another quantity are scaled to, since priors are those of RSSI.
+                Not studied.
 
         Raises:
             InputError: Too few measurements, values that are not finite, a missing requirement, or a pool of other rows.
@@ -170,17 +184,26 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
             raise InputError(lacking)
         self.receiver_names, self.receiver_position = tuple(map(str, train.receiver_names)), train.receiver_position
         self.origin, self.offsets, self.attenuation = train.origin, train.offsets, None
+        self.quantity, self.unit, self.value_centre, self.value_scale = train.quantity, train.unit, 0.0, 1.0
+        if not train.is_power:
+            values = pool.rssi_dbm[pool.detected]
+            self.value_centre = float(values.mean())
+            self.value_scale = (float(values.std(correction=0)) or 1.0) / usual_std_db
+            train, pool = self._scaled(train), self._scaled(pool)
         self.row_digests = train.row_digests() if self.updates else self.row_digests
         shift = torch.zeros_like(pool.rssi_dbm)
         if train.offsets is not None:
             shift = shift + train.offsets.of(pool)[:, None]
         if train.floors is not None:
-            of_pool = estimate_floor_attenuation(pool)
+            of_pool = FloorAttenuation(train.floors, (0,) * len(pool.receiver_names), 0.0)
+            of_pool = estimate_floor_attenuation(pool) if pool.is_power else of_pool
             columns = columns_of(self.receiver_names, pool).tolist()
             self.attenuation = replace(of_pool, receiver_floor=tuple(of_pool.receiver_floor[c] for c in columns))
             shift = shift + of_pool.of(pool.transmitter_position)
             train, pool = self.attenuation.removed(train), of_pool.removed(pool)
         empty_cells, curve = getattr(self.config, "not_detected", "auto"), None
+        if not pool.is_power:
+            empty_cells = "unknown"
         if empty_cells == "weak" or (empty_cells == "auto" and pool.margin_db is None):
             curve = Detection.estimate(pool.transmitter_position, pool.rssi_dbm + shift)
         self.detection = curve and curve.columns(columns_of(self.receiver_names, pool))
@@ -189,7 +212,13 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
             shift = shift + of_lists
         others = {"device": to_device(device), "parallel": parallel, "progress": progress}
         self._fit(train, pool=pool, shift=shift, curve=curve, **others)
+        if not train.is_power and (held_out := getattr(self, "held_out_db", None)):
+            self.held_out_db = {name: self.value_scale * error for name, error in held_out.items()}
         return self
+
+    def _scaled(self, data: Rssi) -> Rssi:
+        """Return data with the values of the fit."""
+        return data.derived(rssi_dbm=(data.rssi_dbm - self.value_centre) / self.value_scale)
 
     @checked
     def update(self, new: Rssi) -> Self:
@@ -216,6 +245,7 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
         if len(new):
             self.check_updates()
             predictor.row_digests = torch.cat([self.row_digests, new.row_digests()])
+            new = self._scaled(new)
             predictor._update(new if self.attenuation is None else self.attenuation.removed(new))
         return predictor
 
@@ -239,6 +269,11 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
                 positions in degrees for a predictor in metres or the reverse, on other floors, or far away.
         """
         self.check_fitted()
+        if (data.quantity, data.unit) != (self.quantity, self.unit):
+            raise InputError(
+                f"{data.name} has {data.quantity} [{data.unit}], but the predictor was fitted to {self.quantity} "
+                f"[{self.unit}]"
+            )
         names, fitted = data.receiver_names, self.receiver_names
         if sorted(names) != sorted(fitted):
             raise InputError(
@@ -319,7 +354,11 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
             mean, std = in_batches(self._predict, position, self.batch_size)
         if self.attenuation is not None:
             mean = mean + self.attenuation.of(position).to(mean)
-        return Prediction(mean, std, position, receiver_names=self.receiver_names)
+        if self.value_scale != 1:
+            mean, std = self.value_centre + self.value_scale * mean, std if std is None else self.value_scale * std
+        return Prediction(
+            mean, std, position, receiver_names=self.receiver_names, quantity=self.quantity, unit=self.unit
+        )
 
     @checked
     def predict_detected(self, data: Rssi) -> Prediction:

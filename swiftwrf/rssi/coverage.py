@@ -39,7 +39,8 @@ WIFI = re.compile(r"(?<![a-z])(wi-?fi|wlan|wap|ap|b?ssid|access ?point)(?![a-z])
 def default_threshold(data: Rssi) -> tuple[float, str]:
     """Return the threshold of the coverage of data [dBm], and the reason for it.
 
-    It is that of Wi-Fi if names of the data set, of receivers or of columns taken as receivers are those of Wi-Fi.
+    It is the median of the values of another quantity than RSSI. It is that of Wi-Fi if names of the data set, of receivers
+    or of columns taken as receivers are those of Wi-Fi.
 
     Example:
         >>> default_threshold(Rssi([[-60.0]], [[0, 0, 1]], receiver_names=["WAP012"]))
@@ -47,6 +48,8 @@ def default_threshold(data: Rssi) -> tuple[float, str]:
         >>> default_threshold(Rssi([[-60.0]], [[0, 0, 1]], receiver_names=["beacon"]))
         (-75.0, 'the default for receivers that no name shows to be Wi-Fi')
     """
+    if not data.is_power:
+        return float(f"{float(data.rssi_dbm.nanmedian()):.3g}"), "the median of the measured values"
     taken = [column for note in data.notes for column in re.findall(r"receiver = (\S+?)(?:,|$)", note)]
     for name in (*data.receiver_names, *taken, data.name):
         if WIFI.search(name):

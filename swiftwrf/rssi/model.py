@@ -202,8 +202,10 @@ class RssiModel(RssiPredictor, Saved):
             kept[without] = False
         at, rssi, attenuation = self.region()[kept], posterior.rssi[kept], self.attenuation
         rows = Rssi(
-            rssi if attenuation is None else rssi + attenuation.of(at),
+            self.value_centre + self.value_scale * (rssi if attenuation is None else rssi + attenuation.of(at)),
             at,
+            quantity=self.quantity,
+            unit=self.unit,
             receiver_position=self.receiver_position,
             receiver_names=self.receiver_names,
             origin=self.origin,

@@ -36,9 +36,9 @@ def why(run: Records) -> str:
     """Return the default threshold of the coverage, and why it is that one; empty if it was asked for."""
     if run.metrics["threshold"] is None:
         return ""
+    threshold, unit = run.metrics["coverage"][0]["threshold_dbm"], Maps(run).unit
     return (
-        f"The threshold of {run.metrics['coverage'][0]['threshold_dbm']:g} dBm is {run.metrics['threshold']}; `--above DBM` "
-        "sets another."
+        f"The threshold of {threshold:g} {unit} is {run.metrics['threshold']}; `--above {unit.upper()}` sets another."
     )
 
 
@@ -62,12 +62,18 @@ def spots_sentence(floors: Sequence[Maps]) -> str:
             if spot["area_m2"] < MIN_NAMED_M2:
                 continue
             place = f"{spot['area_m2']:,.0f} m², weakest at x = {spot['x_m']:.1f} m, y = {spot['y_m']:.1f} m{where}"
-            named.append((spot["not_covered_m2"], spot["area_m2"], f"{place} ({missing(spot)} at {spot['receiver']})"))
+            named.append(
+                (
+                    spot["not_covered_m2"],
+                    spot["area_m2"],
+                    f"{place} ({missing(spot, maps.error_unit)} at {spot['receiver']})",
+                )
+            )
     largest = [text for *_, text in sorted(named, key=lambda one: one[:2], reverse=True)[:MAX_NAMED]]
     return f"Largest weak spots: {'; '.join(largest)}." if largest else ""
 
 
-def missing(spot: Row) -> str:
+def missing(spot: Row, unit: str = "dB") -> str:
     """Return what a weak spot lacks, in words.
 
     Example:
@@ -75,21 +81,21 @@ def missing(spot: Row) -> str:
         ('4 dB missing', 'packets are lost')
     """
     db = spot["missing_db"]
-    return f"{db:.0f} dB missing" if db >= MIN_MISSING_DB else "packets are lost"
+    return f"{db:.0f} {unit} missing" if db >= MIN_MISSING_DB else "packets are lost"
 
 
 def section(run: Records) -> Section:
     """Return weak spots, and coverage by threshold and receiver."""
     floors = Maps.of_floors(run)
     tables = [_spots(floors)] if any(maps.spots for maps in floors) else []
-    every, several = run.table("coverage"), len(floors) > 1
+    every, several, unit = run.table("coverage"), len(floors) > 1, floors[0].unit
     of_one = ~every["receiver"].isin([ANY, TWO])
     found = Section("", [*filter(None, [why(run)])], tables)
     if of_one.all():
-        found.tables.append(_table(every, several))
+        found.tables.append(_table(every, several, unit))
     else:
-        found.tables.append(_table(every[~of_one], several))
-        found.parts.append(Section("Each receiver", tables=[_table(every[of_one], several)], folded=True))
+        found.tables.append(_table(every[~of_one], several, unit))
+        found.parts.append(Section("Each receiver", tables=[_table(every[of_one], several, unit)], folded=True))
     return found
 
 
@@ -99,18 +105,27 @@ def _spots(floors: Sequence[Maps]) -> Table:
         for rank, spot in enumerate(maps.spots[: 2 * MAX_SPOTS], start=1):
             floor = [str(maps.arrays["floor_names"][maps.floor])] if maps.suffix else []
             sizes = [f"{spot[name]:.1f}" for name in ("x_m", "y_m", "area_m2", "not_covered_m2")]
-            rows.append([str(rank), *floor, *sizes, f"{spot['probability']:.0%}", missing(spot), spot["receiver"]])
+            rows.append(
+                [
+                    str(rank),
+                    *floor,
+                    *sizes,
+                    f"{spot['probability']:.0%}",
+                    missing(spot, maps.error_unit),
+                    spot["receiver"],
+                ]
+            )
     heads = ["x [m]", "y [m]", "area [m²]", "not covered [m²]", "probability", "missing", "best receiver"]
-    found = floors[0].coverage
+    found, unit = floors[0].coverage, floors[0].unit
     caption = (
-        f"Weak spots: connected parts of the measured area that are not covered above {found['threshold_dbm']:g} dBm. "
-        f"The place is the weakest one. Missing there: dB by which the best receiver is too weak for "
+        f"Weak spots: connected parts of the measured area that are not covered above {found['threshold_dbm']:g} {unit}. "
+        f"The place is the weakest one. Missing there: {floors[0].error_unit} by which the best receiver is too weak for "
         f"{found['certainty']:.0%} of its detected packets. All are in `weak_spots.csv`."
     )
     return Table(["", *(["floor"] if floors[0].suffix else []), *heads], rows, caption)
 
 
-def _table(table: DataFrame, several: bool) -> Table:
+def _table(table: DataFrame, several: bool, unit: str) -> Table:
     columns = {
         "covered": "covered",
         "not_covered": "not covered",
@@ -135,5 +150,5 @@ def _table(table: DataFrame, several: bool) -> Table:
         "second-best receiver is above it, too, as roaming needs. Not measured: part of the area between the scans. Test "
         "scans took no part in the fit. `coverage.csv` contains the same."
     )
-    heads = ["receiver", *(["floor"] if several else []), "above [dBm]", *columns.values()]
+    heads = ["receiver", *(["floor"] if several else []), f"above [{unit}]", *columns.values()]
     return Table(heads, rows, caption)

@@ -8,6 +8,7 @@ from swiftwrf import InputError, Rssi, rssi_room
 from swiftwrf.contrib.comparison.rssi import compare, compared
 from swiftwrf.data.files import sha256
 from swiftwrf.data.formats import RSSI_FORMATS
+from swiftwrf.models.prediction import difference_unit
 from tasks.configs import RssiTaskConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
@@ -41,7 +42,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     source = data.source | ({"floor plan": sha256(Path(config.floor_plan))} if config.floor_plan else {})
 
     def described(value: Row) -> str:
-        return f"{value['median']:.2f} dB" if "median" in value else ""
+        return f"{value['median']:.2f} {difference_unit(whole.unit)}" if "median" in value else ""
 
     with (
         connected(config.scheduler, device) as cluster,

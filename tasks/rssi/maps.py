@@ -17,6 +17,7 @@ from pandas import DataFrame, concat
 
 from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
 from swiftwrf.metrics import HALF_WIDTH, LEVEL
+from swiftwrf.models.prediction import difference_unit
 from swiftwrf.plotting import corners_of, hatch
 from swiftwrf.rssi.coverage import CLASSES, classified
 from tasks.labels import COVERAGE
@@ -85,6 +86,25 @@ class Maps:
     def suffix(self) -> str:
         """End of the names of files of this floor, if there are several."""
         return "" if len(self.arrays["floor_names"]) == 1 else f"-{self.floor}"
+
+    @property
+    def quantity(self) -> str:
+        """What is predicted: RSSI, or another quantity."""
+        return str(self.run.metrics.get("quantity", "RSSI"))
+
+    @property
+    def unit(self) -> str:
+        """Unit of the values."""
+        return str(self.run.metrics.get("unit", "dBm"))
+
+    @property
+    def error_unit(self) -> str:
+        """Unit of differences of the values."""
+        return difference_unit(self.unit)
+
+    def amount(self, difference: float) -> str:
+        """Return a difference of values with its unit, in dB without decimals."""
+        return f"{difference:.0f} dB" if self.error_unit == "dB" else f"{difference:.2g} {self.error_unit}"
 
     @property
     def names(self) -> list[str]:
@@ -163,7 +183,7 @@ class Maps:
         who = f"one of {len(first.names)} receivers" if several else first.names[0]
         far = "" if found["reach_m"] is None else f", or farther than {found['reach_m']:.1f} m from any"
         caption = (
-            f"Coverage: a packet at {who} is above {found['threshold_dbm']:g} dBm with a probability of at least "
+            f"Coverage: a packet at {who} is above {found['threshold_dbm']:g} {first.unit} with a probability of at least "
             f"{found['certainty']:.0%} (covered), of at most {1 - found['certainty']:.0%} (not covered), or between them "
             f"(uncertain). Percentages are of the measured area. Grey: not between the scans (dots){far}. Numbers: weak "
             "spots of the table. Crosses: receivers."
@@ -186,9 +206,9 @@ class Maps:
         kinds = ("predicted", "width") if self.varies else ("predicted",)
         panels = [self._panel(self.best, kind, title, receiver, 4.6 if self.varies else 5.4) for kind in kinds]
         widths = f"width of the {LEVEL:.0%} interval of a measurement"
-        same = f"; the {widths} is about {self.widest[3]:.0f} dB in the whole measured area"
+        same = f"; the {widths} is about {self.amount(self.widest[3])} in the whole measured area"
         widths = f", and the {widths}" if self.varies else same
-        caption = f"Predicted RSSI{widths}. {self.hatched}" + (
+        caption = f"Predicted {self.quantity}{widths}. {self.hatched}" + (
             " The best server is the receiver with the highest prediction; crosses mark receivers."
             if several
             else " Dots: training measurements in the colours of the map, hollow where nothing was received; the cross "
@@ -214,7 +234,7 @@ class Maps:
         data = self._cells({name: a[name][shown] for name in fields}, names)
         values = [{name: a[name][i] for name in fields} for i in shown]
         panels = [self._panel(each, kind, self.names[i], i, 3.6) for each, i in zip(values, shown, strict=True)]
-        what = "Predicted RSSI" if kind == "predicted" else f"Width of the {LEVEL:.0%} interval"
+        what = f"Predicted {self.quantity}" if kind == "predicted" else f"Width of the {LEVEL:.0%} interval"
         which = f"the {len(shown)} strongest of {len(self.names)} receivers" if first else "the next ones"
         caption = f"{what} at {which}. {self.hatched} Hollow dots: nothing was received. A cross marks the receiver."
         name = ("map" if kind == "predicted" else "width") + ("" if first else "-more")
@@ -260,7 +280,7 @@ class Maps:
             ax.scatter(known[detected, 0], known[detected, 1], s=9, c=a["measured"][detected, receiver], **style)
         self._mark_receivers(ax, receiver)
         ax.set_title(figures.short(title), fontsize=9)
-        label = "interval width [dB]" if kind == "width" else "predicted RSSI [dBm]"
+        label = f"interval width [{self.error_unit}]" if kind == "width" else f"predicted {self.quantity} [{self.unit}]"
         figures.colour_bar(ax, drawn, label, "both")
         return figure
 
@@ -283,7 +303,7 @@ class Maps:
     @cached_property
     def _widths(self) -> tuple[float, float]:
         low, high = np.quantile(self.arrays["width"], (0.01, 0.99)).tolist()
-        return float(np.floor(low)), float(np.ceil(high))
+        return (float(np.floor(low)), float(np.ceil(high))) if high > 1 else (low, high)
 
     @cached_property
     def _limits(self) -> tuple[float, float]:

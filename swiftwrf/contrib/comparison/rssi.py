@@ -204,6 +204,8 @@ class RssiComparison(Comparison):
                 for receiver in self.test.receiver_names
             },
             "model": self.model,
+            "quantity": self.train.quantity,
+            "unit": self.train.unit,
             "seconds": self.values[self.model]["seconds"],
             "interval": {"nominal": LEVEL, "coverage": self.coverage},
             "coverage": coverage,
