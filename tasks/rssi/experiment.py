@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from swiftwrf import InputError, Rssi, rssi_room
-from swiftwrf.contrib.comparison.rssi import compare, compared
+from swiftwrf.contrib.comparison.predictors import compared
+from swiftwrf.contrib.comparison.rssi import compare
 from swiftwrf.data.files import sha256
 from swiftwrf.data.formats import RSSI_FORMATS
 from swiftwrf.models.prediction import difference_unit

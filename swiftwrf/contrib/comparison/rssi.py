@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +20,7 @@ from swiftwrf.contrib.comparison.base import Comparison, Recorded, Values
 from swiftwrf.contrib.comparison.coverage import maps_and_coverage
 from swiftwrf.contrib.comparison.errors import summaries, summary
 from swiftwrf.contrib.comparison.leave_one_out import LEAVE_ONE_OUT, distances_to_others, is_small, predict_each_place
+from swiftwrf.contrib.comparison.predictors import compared, make_predictor
 from swiftwrf.contrib.comparison.steps import MODEL, Memo, Steps, refusing_executor
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
@@ -33,58 +35,13 @@ from swiftwrf.rssi.coverage import default_threshold
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.offsets import estimate_offsets
 from swiftwrf.rssi.pairs import PairModel
-from swiftwrf.rssi.paper import RssiPaperModel
 from swiftwrf.runtime.checkpoint import Saved, load
 from swiftwrf.runtime.validation import Fraction, Preset, checked
 
 DISTANCES = ("from_receiver_m", "from_training_m")  # columns of the errors
 
 
-@checked
-def make_predictor(name: str, preset: Preset = "quick", **options: Any) -> RssiPredictor:
-    """Return a predictor by its name, with those of the options that it has.
-
-    Args:
-        name: Name in the registry, e.g. "knn".
-        preset: "quick", or "paper" for published settings; a predictor without published settings ignores it. With "paper"
-            the name "swiftwrf" gives `RssiPaperModel`.
-        options: Options such as seed and validation. A predictor ignores options that it does not have.
-
-    Raises:
-        InputError: An unknown name, or a value outside its range.
-
-    Example:
-        >>> make_predictor("swiftwrf", "paper", seed=3).name
-        'swiftwrf_paper'
-    """
-    is_published = name == RssiModel.name and preset == "paper"
-    predictor_type: type[RssiPredictor] = RssiPaperModel if is_published else RSSI_PREDICTORS[name]
-    return predictor_type(**predictor_type.supported({"preset": preset} | options))
-
-
-def compared(data: Rssi, also: Sequence[str] = ()) -> tuple[list[str], dict[str, str]]:
-    """Return the names of the predictors that are compared on these data, and the reason for each one that is left out.
-
-    Args:
-        data: RSSI.
-        also: Names of predictors that are compared only when named.
-
-    Raises:
-        InputError: An unknown name.
-
-    Example:
-        >>> import swiftwrf
-        >>> compared(swiftwrf.rssi_room(n=20))[0]
-        ['swiftwrf', 'mean', 'mri_pooled', 'mri_receiver', 'knn', 'mri_residual', 'gp']
-    """
-    for name in also:
-        RSSI_PREDICTORS.check(name)
-    asked = [name for name in RSSI_PREDICTORS if RSSI_PREDICTORS[name].compared(data) or name in also]
-    left_out = {name: reason for name in asked if (reason := RSSI_PREDICTORS[name].lacking(data))}
-    return [name for name in asked if name not in left_out], left_out
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RssiComparison(Comparison):
     """Result of `compare`.
 
@@ -252,7 +209,7 @@ def compare(
     receivers: Sequence[str] = ("all",),
     split: str = "random",
     seed: int = 0,
-    also: Sequence[str] = (),
+    also: Sequence[str | RssiPredictor] = (),
     preset: Preset = "quick",
     reference: str | None = None,
     not_detected: NotDetected = "auto",
@@ -272,7 +229,7 @@ def compare(
         split: Split that comes with the data, or a seeded one: random, block, or place. Without enough rows for a random
             split, 13, all other places predict each one.
         seed: Seed of everything random.
-        also: Predictors that are compared only when named, e.g. "nerf2".
+        also: Predictors that are compared only when named, e.g. "nerf2", and predictors of your own, which stay as they are.
         preset: "quick", or "paper" for published settings.
         reference: Group whose offset is 0. Defaults to the most frequent one.
         not_detected: Meaning of an empty cell; see `RssiConfig`.
@@ -312,7 +269,12 @@ def compare(
     if kind == "random" != split:  # test rows of a split that comes with the data may be of another day or device
         options["calibration"] = "block"
     names, left_out = compared(chosen, also)
+    own = {predictor.name: predictor for predictor in also if isinstance(predictor, RssiPredictor)}
     if keep is not None:
+        if own:
+            raise InputError(
+                "keep takes predictors by name; register those of your own as entry points, or leave it out"
+            )
         keep.of(given | {"predictors": [RSSI_PREDICTORS[name] for name in names]})
     shown = {"split": LEAVE_ONE_OUT if small else split, "preset": preset, "seed": seed}
     begun = RssiComparison(train, test, {}, shown, left_out, above=tuple(above))
@@ -321,7 +283,7 @@ def compare(
 
     def compute(_: None, folder: Path, name: str, rows: Tensor | None = None) -> Values:
         def fit(rows: Rssi, pool: Rssi) -> RssiPredictor:
-            predictor = make_predictor(name, preset, **options)
+            predictor = deepcopy(own[name]) if name in own else make_predictor(name, preset, **options)
             return predictor.fit(rows, pool=pool, device=device, parallel=parallel, progress=progress)
 
         part, every = (train, pool) if rows is None else (train.subset(rows), pool.subset(rows))

@@ -21,7 +21,8 @@ from test_rssi_model import path_loss_only
 
 from swiftwrf import rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
-from swiftwrf.contrib.comparison.rssi import make_predictor, pool_of
+from swiftwrf.contrib.comparison.predictors import make_predictor
+from swiftwrf.contrib.comparison.rssi import pool_of
 from swiftwrf.contrib.comparison.rssi_baselines import NEIGHBOUR_COUNTS
 from swiftwrf.data.splits import folds
 from swiftwrf.rssi import RssiPredictor, compare
