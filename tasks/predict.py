@@ -129,7 +129,8 @@ def shown(table: DataFrame) -> str:
     """
     if len(table) > MAX_SHOWN:
         return ""
-    return DataFrame(rounded(table.to_dict("records"))).to_string(index=False) + "\n"
+    text: str = DataFrame(rounded(table.to_dict("records"))).to_string(index=False)
+    return f"{text}\n"
 
 
 def saved_file(model: Path) -> Path:

@@ -45,7 +45,8 @@ def unknown_ids(receiver: pd.Series) -> NDArray[np.bool_]:
     unknown = text.map(plain_receiver).isin(NO_ADDRESS) | text.str.fullmatch(NO_CELL.pattern)
     if CELL_NUMBER.fullmatch(name) and not PHYSICAL_CELL.fullmatch(name):
         unknown |= text == "0"
-    return unknown.to_numpy(bool)
+    mask: NDArray[np.bool_] = unknown.to_numpy(bool)
+    return mask
 
 
 def separate_radios(table: pd.DataFrame, receiver: str, together: pd.Series, min_fraction: float = 0.3) -> str | None:
@@ -99,7 +100,8 @@ def strongest_of_each(
         return None
     usable = pd.Series(np.where(power < 0, power, -np.inf))  # fillers are at or above 0
     order = usable.groupby(group.ngroup().to_numpy()).rank(method="first", ascending=False)
-    return (order == 1).to_numpy()
+    is_strongest: NDArray[np.bool_] = (order == 1).to_numpy()
+    return is_strongest
 
 
 def pool_names(names: Sequence[str], by: str) -> list[str]:

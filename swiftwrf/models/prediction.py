@@ -141,9 +141,8 @@ class Prediction(Labelled, Displayed):
         return position_coordinates(self._located()) | values
 
     def variables(self) -> Arrays:
-        name, dimensions, unit = suffix(self.quantity), ("receiver",), self.unit
-        if self.grid:
-            name, dimensions, unit = "spectrum", DIRECTION, "1"
+        of_receivers = suffix(self.quantity), ("receiver",), self.unit
+        name, dimensions, unit = ("spectrum", DIRECTION, "1") if self.grid else of_receivers
         values: Arrays = {name: (("position", *dimensions), self.mean.detach().cpu().numpy(), {"units": unit})}
         if self.std is not None:
             std = self.std.detach().cpu().numpy()
