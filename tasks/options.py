@@ -183,6 +183,8 @@ class ReadingOptions(Options):
     """leave out these elements of the array, counted from 0"""
     round_trip: bool = False
     """phases of array snapshots are those of the way there and back, as of RFID and backscatter"""
+    sender: str | None = None
+    """hardware address of the sender whose packets are used, of captures with several (default: the most frequent one)"""
     columns: tuple[str, ...] = ()
     """names of columns of a survey table that are not recognised: x=NAME y=NAME receiver=NAME rssi=NAME
     floor=NAME ... (several with rssi='WAP*')"""
