@@ -17,8 +17,8 @@ from swiftwrf.positions import nearest
 from swiftwrf.runtime.validation import PositiveInt, checked
 
 MIN_TRAINING = 10  # measurements
-MIN_SPLIT_ROWS = 13  # below, the places of a survey are held out one at a time
-MIN_PLACES = 5  # of such a survey
+MIN_SPLIT_ROWS = 13  # of RSSI, below which places are held out one at a time
+MIN_PLACES = 5  # different positions that are held out one at a time
 MAX_REPEATED = 0.1  # fraction of test rows at training positions, beyond which a split tests look-up
 FOLDS = 5
 

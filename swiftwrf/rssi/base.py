@@ -10,14 +10,12 @@ from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Self
 
 import torch
-from annotated_types import Ge
 from torch import Tensor
 
-from swiftwrf.choices import NotDetected
 from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Offsets, Rssi
-from swiftwrf.data.splits import MIN_PLACES, MIN_TRAINING, Validation
+from swiftwrf.data.splits import MIN_PLACES, MIN_TRAINING
 from swiftwrf.errors import InputError, listed
 from swiftwrf.models.base import FieldConfig, Updatable
 from swiftwrf.models.prediction import Prediction
@@ -28,50 +26,12 @@ from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation
 from swiftwrf.runtime.threads import to_device
 from swiftwrf.runtime.validation import (
     Configured,
-    NonNegativeInt,
-    PositiveFloat,
     all_or_nothing,
     checked,
-    configuration,
 )
 
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 RECEIVER_POSITIONS = "positions of the receivers"
-
-
-@configuration
-class RssiConfig(FieldConfig):
-    """Options of `RssiModel`. The defaults have the lowest error on held-out training rows.
-
-    Example:
-        >>> RssiConfig(validation="block").n_primitives
-        50
-    """
-
-    n_primitives: NonNegativeInt = 50
-    """primitives a receiver; 0 for a path-loss model without a field, which a fit also takes if it predicts held-out rows as
-    well"""
-    huber: PositiveFloat = 1.345
-    """number of standard deviations of the noise beyond which an error counts linearly (Huber's constant: 95 % efficient
-    for Gaussian noise), since packets have outliers"""
-    max_locations: Annotated[int, Ge(10)] = 1500
-    """location bins that the rows are averaged in; the time of a fit grows with the cube of their number"""
-    not_detected: NotDetected = "auto"
-    """meaning of an empty cell.
-
-    - "weak": the power was below the limit of detection.
-    - "unknown": the cell is ignored.
-    - "auto": if rows list the strongest or the associated receivers only (`Rssi.margin_db`), the power was below the listed
-      ones. Otherwise "weak" at each receiver whose empty cells are where its path loss expects no value, else "unknown". It
-      is "unknown" at all receivers if values and detections in held-out folds are then more likely.
-
-    Only the path loss counts the empty cells of a receiver with fewer than 10 values"""
-    calibration: Validation | None = None
-    """folds whose errors scale the standard deviations. Defaults to those of `validation`. "block" suits predictions for
-    other days or devices, whose errors no fold of single rows contains"""
-    noises: tuple[PositiveFloat, ...] = (0.02, 0.05, 0.1, 0.3, 1.0, 2.0, 3.0)
-    """compared variances of one measurement about the field, relative to that of the field. Fading of a packet is about as
-    large as shadowing. Means of many packets have less noise"""
 
 
 class RssiPredictor(Updatable, Configured, Displayed, ABC):

@@ -26,7 +26,8 @@ from swiftwrf.models.base import CPU
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Axes
 from swiftwrf.positions import check_positions
-from swiftwrf.rssi.base import Map, RssiConfig, RssiPredictor, columns_of
+from swiftwrf.rssi.base import Map, RssiPredictor, columns_of
+from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.detection import Detection, DetectionField
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.path_loss import PathLoss, log_distance
@@ -97,17 +98,12 @@ class RssiModel(RssiPredictor, Saved):
     ) -> None:
         config = self.config if curve is not None else replace(self.config, not_detected="unknown")
         of_lists = pool.margin_db is not None and config.not_detected == "auto"  # limits of rows, not of a receiver
-
-        def fitted_with(curve: Detection | None) -> Fit:
-            training = prepare(pool, columns_of(train.receiver_names, pool), config, shift, curve)
-            return fit_receivers(training, config, device, parallel or _in_threads, progress)
-
-        fit = fitted_with(curve)
-        is_choice = config.not_detected == "auto" and not of_lists
-        if is_choice and curve is not None and not bool(fit.training.limit.isnan().all()):
-            without = fitted_with(replace(curve, is_limit=torch.zeros_like(curve.is_limit)))
-            # as probable as with values of a mean error that is 1 % lower
-            fit = without if without.score > fit.score + 0.01 * float(train.detected.sum()) else fit
+        candidates = prepare(pool, columns_of(train.receiver_names, pool), config, shift, curve)
+        parallel, candidates = parallel or _in_threads, candidates[: 1 if of_lists else None]
+        fit, *others = (fit_receivers(training, config, device, parallel, progress) for training in candidates)
+        for without_limits in others:  # as probable as values of a mean error that is 1 % lower
+            is_better = without_limits.score > fit.score + 0.01 * float(train.detected.sum())
+            fit = without_limits if is_better else fit
         self.detection_field, training, rows = None, fit.training, fit.training.bin_of_row
         if not of_lists:
             self.detection, self.detection_field = training.path_loss.detection, fit.detection_field

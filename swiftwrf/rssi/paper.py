@@ -19,11 +19,12 @@ from torch.nn import functional
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.errors import FitError, InputError
 from swiftwrf.models.base import CPU
-from swiftwrf.rssi.base import Map, RssiConfig, columns_of, often_detected
+from swiftwrf.rssi.base import Map, columns_of, often_detected
+from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import Head, Heads, mean_magnitude, render
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.regression import RssiPosterior, held_out_std
-from swiftwrf.rssi.training import Bins, check_folds, choose_residual_kernel, prior_std
+from swiftwrf.rssi.training import Bins, check_folds, choose_residual_kernels, prior_std
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, configuration
@@ -77,8 +78,8 @@ class RssiPaperModel(RssiModel):
         bins = of_pool.columns(columns_of(train.receiver_names, pool))
         check_folds(bins.fold == HELD_OUT_FOLD, bins.rssi)
         pool_residual = of_pool.rssi - of_pool.rssi.nanmean(dim=0)
-        residual = pool_residual[:, often_detected(pool)]
-        kernel = choose_residual_kernel(bins, residual, config.noises, train.floors is not None)[0]
+        residual = pool_residual[:, often_detected(pool), None]
+        kernel = choose_residual_kernels(bins, residual, config.noises, train.floors is not None)[0][0]
         variance = (bins.rssi - bins.rssi.nanmean(dim=0)).square().nanmean(dim=0)
         variance = variance.nan_to_num(float(pool_residual.square().nanmean())).clamp_min(1e-6)
         prior_db = prior_std(variance, kernel, bins.noise_scale)

@@ -14,7 +14,8 @@ from swiftwrf.data.splits import MIN_TRAINING, each_fold, folds
 from swiftwrf.errors import InputError
 from swiftwrf.gp import Kernel, candidates, held_out_errors, subsample
 from swiftwrf.positions import cells
-from swiftwrf.rssi.base import RssiConfig, often_detected
+from swiftwrf.rssi.base import often_detected
+from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.detection import Detection, empty_given
 from swiftwrf.rssi.head import Heads
 from swiftwrf.rssi.path_loss import PathLosses, fit_path_losses, log_distance
@@ -121,33 +122,42 @@ class RssiTraining(Bins):
 
 
 @single_thread()
-def prepare(pool: Rssi, fitted: Tensor, config: RssiConfig, shift: Tensor, curve: Detection | None) -> RssiTraining:
+def prepare(
+    pool: Rssi, fitted: Tensor, config: RssiConfig, shift: Tensor, curve: Detection | None
+) -> list[RssiTraining]:
     """Average the rows by location bin, fit the path-loss models and choose the kernel; see `RssiPredictor._fit`.
 
-    `fitted` are the columns of the receivers that are fitted.
+    `fitted` are the columns of the receivers that are fitted. A second result is without limits, if "auto" has some.
     """
     of_pool = Bins.of(pool, config)
     check_folds(of_pool.fold, of_pool.rssi)
-    bins, position = of_pool.columns(fitted), of_pool.position
-    shift = bins.means(shift)
-    losses = fit_path_losses(position, of_pool.receiver, of_pool.rssi, config.not_detected, shift, curve)
-    residual = of_pool.rssi - losses.each(log_distance(position, of_pool.receiver))
-    residual, has_floors = residual[:, often_detected(pool)], pool.floors is not None
-    kernel, has_field = choose_residual_kernel(bins, residual, config.noises, has_floors)
-    loss, shift = losses.columns(fitted), shift[:, fitted]
-    field_db, noise_db = prior_std(
-        loss.variance, kernel if has_field and config.n_primitives else None, bins.noise_scale
-    )
-    return RssiTraining(
-        **vars(bins),
-        kernel=kernel,
-        heads=Heads.alike(config.n_primitives, config.seed),
-        path_loss=loss,
-        shift=shift,
-        limit=_limits(bins.rssi, loss, log_distance(position, bins.receiver), shift),
-        field_db=field_db,
-        noise_db=noise_db,
-    )
+    bins, position, shift = of_pool.columns(fitted), of_pool.position, of_pool.means(shift)
+    rows = position, of_pool.receiver, of_pool.rssi, config.not_detected, shift
+    losses, shift = [fit_path_losses(*rows, curve)], shift[:, fitted]
+    distance = log_distance(position, of_pool.receiver)
+    limits = [_limits(bins.rssi, losses[0].columns(fitted), distance[:, fitted], shift)]
+    if config.not_detected == "auto" and curve is not None and not bool(limits[0].isnan().all()):
+        losses.append(fit_path_losses(*rows, replace(curve, is_limit=torch.zeros_like(curve.is_limit))))
+        limits.append(torch.full_like(limits[0], torch.nan))
+    residual = torch.stack([of_pool.rssi - each.each(distance) for each in losses], dim=-1)[:, often_detected(pool)]
+    kernels = choose_residual_kernels(bins, residual, config.noises, pool.floors is not None)
+    heads, results = Heads.alike(config.n_primitives, config.seed), []
+    for each, limit, (kernel, has_field) in zip(losses, limits, kernels, strict=True):
+        loss = each.columns(fitted)
+        used = kernel if has_field and config.n_primitives else None
+        field_db, noise_db = prior_std(loss.variance, used, bins.noise_scale)
+        training = RssiTraining(
+            **vars(bins),
+            kernel=kernel,
+            heads=heads,
+            path_loss=loss,
+            shift=shift,
+            limit=limit,
+            field_db=field_db,
+            noise_db=noise_db,
+        )
+        results.append(training)
+    return results
 
 
 def _limits(rssi: Tensor, loss: PathLosses, distance: Tensor, shift: Tensor, certain: float = 0.99) -> Tensor:
@@ -191,24 +201,23 @@ def prior_std(variance: Tensor, kernel: Kernel | None, noise_scale: Tensor) -> t
     return field.sqrt(), (kernel.noise * field).sqrt()
 
 
-def choose_residual_kernel(
+def choose_residual_kernels(
     bins: Bins, residual: Tensor, noises: tuple[float, ...], has_floors: bool = False
-) -> tuple[Kernel, bool]:
-    """Choose the kernel with the lowest mean absolute error on held-out residuals of the path-loss model.
+) -> list[tuple[Kernel, bool]]:
+    """Choose the kernel with the lowest mean absolute error on held-out residuals of each of several path-loss models.
 
     Args:
         bins: Location bins.
-        residual: Residuals (n, P) [dB], nan where not detected.
+        residual: Residuals of k path-loss models, (n, P, k) [dB], nan where not detected.
         noises: Compared variances of one row, relative to that of the field.
         has_floors: Whether differences in height may count more than others.
 
     Returns:
-        The kernel, and whether its error is lower than that of no field at all.
+        For each path-loss model the kernel, and whether its error is lower than that of no field at all.
     """
-    detected = (~residual.isnan()).any(dim=1)
-    rows = bins.position, residual, bins.fold, bins.noise_scale
-    position, residual, fold, noise_scale = subsample(*(each[detected] for each in rows), rows=300)
-    residual = residual[:, (~residual.isnan()).any(dim=0)]
+    detected = ~residual[..., 0].isnan()
+    rows = bins.position, residual[:, detected.any(dim=0)], bins.fold, bins.noise_scale
+    position, residual, fold, noise_scale = subsample(*(each[detected.any(dim=1)] for each in rows), rows=300)
     (columns,) = subsample(torch.arange(residual.shape[1]), rows=12)  # more rows or receivers do not change the choice
     residual = residual[:, columns]
     # floors alike, or nearly independent beyond their attenuation
@@ -218,15 +227,16 @@ def choose_residual_kernel(
         for kernel in rough_candidates(position, noises)
     ]
     covariance = [kernel(position, position) + (kernel.noise * noise_scale).diag() for kernel in kernels]
-    precision = torch.linalg.inv(torch.stack(covariance))
-    dual, errors = precision @ residual.nan_to_num(), []
-    for r, missing in enumerate(residual.isnan().T):
+    precision = torch.cholesky_inverse(torch.linalg.cholesky(torch.stack(covariance)))
+    dual, errors = torch.einsum("knm,mrl->knrl", precision, residual.nan_to_num()), []
+    for r, missing in enumerate(residual[..., 0].isnan().T):
         # missing rows are held out with every fold, so that the zeros in their place have no effect
         for out, _ in each_fold(fold, (~missing).nonzero()[:, 0]):
             every = torch.cat([out, missing.nonzero()[:, 0]])
-            errors.append(held_out_errors(precision, dual[:, :, r, None], every)[:, : len(out), 0])
+            errors.append(held_out_errors(precision, dual[:, :, r], every)[:, : len(out)])
     score, best = torch.cat(errors, dim=1).abs().mean(dim=1).min(dim=0)
-    return kernels[int(best)], bool(score < residual.abs().nanmean())
+    better = (score < residual.flatten(0, 1).abs().nanmean(dim=0)).tolist()
+    return [(kernels[number], has_field) for number, has_field in zip(best.tolist(), better, strict=True)]
 
 
 def rough_candidates(position: Tensor, noises: tuple[float, ...]) -> list[Kernel]:

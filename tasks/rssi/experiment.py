@@ -21,7 +21,7 @@ from tasks.source import offset_notes, reading
 from tasks.terminal import console, terminal
 from tasks.workers import connected, workers_of
 
-FEWER = (0.125, 0.25, 0.5)  # of the training rows, for the figure of the error against their number
+FEWER = (0.125, 0.25)  # of the training rows, for the figure of the error against their number
 
 
 def run(config: RssiTaskConfig, resume: Path | None = None) -> None:

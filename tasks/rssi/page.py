@@ -31,6 +31,7 @@ from tasks.page.shared import (
 )
 from tasks.records import Records, notes
 from tasks.rssi import coverage
+from tasks.rssi.differences import where_methods_differ
 from tasks.rssi.maps import MIN_RATIO, WIDTH_PER_STD, Maps
 from tasks.terminal import Answer, Method, NextStep
 
@@ -119,6 +120,7 @@ def _errors(run: Records, found: Answer) -> Section:
         paragraphs=[f"Left out: {reason}." for reason in run.metrics["left_out"].values()],
         panels=_by_rows(run),
     )
+    section.tables.append(where_methods_differ(run, found))
     section.parts.append(Section("Where the errors are", plots=[_where(run)]))
     return section
 

@@ -20,12 +20,13 @@ from swiftwrf.contrib.comparison.base import Comparison, Recorded, Values
 from swiftwrf.contrib.comparison.coverage import maps_and_coverage
 from swiftwrf.contrib.comparison.errors import summaries, summary
 from swiftwrf.contrib.comparison.leave_one_out import LEAVE_ONE_OUT, distances_to_others, is_small, predict_each_place
+from swiftwrf.contrib.comparison.parts import fewer_rows, pool_of, region_of
 from swiftwrf.contrib.comparison.predictors import compared, make_predictor
 from swiftwrf.contrib.comparison.steps import MODEL, Memo, Steps, refusing_executor
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.rssi import PLACE
-from swiftwrf.data.splits import MIN_TRAINING, Validation, places
+from swiftwrf.data.splits import Validation, places
 from swiftwrf.errors import InputError
 from swiftwrf.metrics import LEVEL
 from swiftwrf.models.prediction import Prediction
@@ -57,6 +58,7 @@ class RssiComparison(Comparison):
         predictors: Fitted predictors by name. Of those whose values `keep` had, the model alone.
         by_rows: Mean absolute errors [dB] of the model and of "knn" by the number of training rows, a column for each.
         above: Thresholds of the coverage [dBm]. Defaults to that of `default_threshold`.
+        region: Mean absolute errors [dB] of both in a fifth of the area, fitted to the training rows elsewhere.
 
     Example:
         >>> import swiftwrf
@@ -74,6 +76,7 @@ class RssiComparison(Comparison):
     predictors: Mapping[str, RssiPredictor] = field(default_factory=dict)
     by_rows: DataFrame = field(default_factory=DataFrame)
     above: tuple[float, ...] = ()
+    region: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def model(self) -> str:
@@ -168,6 +171,7 @@ class RssiComparison(Comparison):
             "coverage": coverage,
             "threshold": self.thresholds[1],
             "by_rows": {str(n): {str(name): mean for name, mean in row.items()} for n, row in self.by_rows.iterrows()},
+            "region": dict(self.region),
             "chosen": {
                 "n_primitives": max(value["n_primitives"] for value in self.values.values()),
                 "floor_attenuation_db": None if attenuation is None else attenuation.db,
@@ -234,7 +238,8 @@ def compare(
         reference: Group whose offset is 0. Defaults to the most frequent one.
         not_detected: Meaning of an empty cell; see `RssiConfig`.
         validation: Folds that choose all settings: "random", "block" or "session". Defaults to those like the test rows.
-        fewer: Fractions of the training rows that the model and "knn" are fitted to, too, e.g. (0.25, 0.5).
+        fewer: Fractions of the training rows that the model and "knn" are fitted to, too, e.g. (0.25, 0.5). After a random
+            split both then predict a region of the training rows by all others.
         above: Thresholds of the coverage [dBm], the first one that of maps. Defaults to -67 for Wi-Fi, else -75.
         device: Device to compute on.
         keep: Results by the names of predictors, in a folder, and the model. A call with equal data, options, code and
@@ -319,14 +324,19 @@ def compare(
             "n_primitives": getattr(predictor, "n_primitives", 0),
         }
 
-    order = torch.randperm(len(train), generator=torch.Generator().manual_seed(seed))
-    parts = [order[: round(fraction * len(train))].sort().values for fraction in fewer]
-    parts = [rows for rows in parts if int(train.detected[rows].sum(dim=0).min()) >= MIN_TRAINING]
     studied = [name for name in (model_name, "knn") if name in names]
+    region = region_of(train, seed) if split == "random" else None
 
     def study(_: None, folder: Path) -> Values:
+        parts = fewer_rows(train, fewer, seed)
         less = {str(len(rows)): {name: compute(_, folder, name, rows)["mean"] for name in studied} for rows in parts}
-        return less | {str(len(train)): {name: values[name]["mean"] for name in studied}}
+        less |= {str(len(train)): {name: values[name]["mean"] for name in studied}}
+        return {"rows": less, "region": {} if region is None else {name: error_in(name, *region) for name in studied}}
+
+    def error_in(name: str, out: Tensor, others: Tensor) -> float:
+        predictor, asked = make_predictor(name, preset, **options | {"validation": "block"}), train.subset(out)
+        predictor.fit(train.subset(others), pool=pool.subset(others), device=device, parallel=parallel)
+        return float((predictor.predict_detected(asked).mean - asked.rssi_dbm)[asked.detected].abs().mean())
 
     memo = keep or Memo()
     with refusing_executor(executor):
@@ -335,24 +345,11 @@ def compare(
         if fewer:
             steps.start("fewer rows", "fewer rows", study)
         values = {name: steps[name] for name in started}
-        by_rows = DataFrame.from_dict(steps["fewer rows"] if fewer else {}, orient="index")
+        studies = steps["fewer rows"] if fewer else {"rows": {}, "region": {}}
+        by_rows = DataFrame.from_dict(studies["rows"], orient="index")
         if model_name in names and model_name not in predictors:
             model = load(memo.folder / MODEL)
             assert isinstance(model, RssiModel | PairModel)
             predictors[model_name] = model
     by_rows = by_rows.set_index(by_rows.index.astype(int)).rename_axis("n_train")
-    return replace(begun, values=values, predictors=predictors, by_rows=by_rows)
-
-
-def pool_of(whole: Rssi, train: Rssi, test: Rssi, split: str, seed: int) -> Rssi:
-    """Return the training rows at every receiver, without those that a split by place holds out.
-
-    `train` and `test` are the parts of the split at the compared receivers.
-    """
-    if split != PLACE or PLACE in whole.named_splits:
-        return whole.split(split, seed)[0]
-    is_held_out = test.detected.any(dim=0)
-    held_out = {name for name, out in zip(test.receiver_names, is_held_out.tolist(), strict=True) if out}
-    kept = torch.tensor([name not in held_out for name in whole.receiver_names])
-    rows = torch.isin(whole.index, train.index)
-    return replace(whole, rssi_dbm=whole.rssi_dbm.where(kept, torch.nan)).subset(rows)
+    return replace(begun, values=values, predictors=predictors, by_rows=by_rows, region=studies["region"])

@@ -43,6 +43,26 @@ def test_errors_by_the_number_of_training_rows(tmp_path):
     assert asked == ["swiftwrf", "mean", "knn", "fewer rows"]  # as many steps as a run announces
 
 
+@only(RSSI_PREDICTORS, "swiftwrf", "mean", "knn")
+def test_error_in_a_region_is_that_of_a_fit_to_all_rows_elsewhere():
+    """The region is the second fifth of the training rows along the longer side of the floor."""
+    room = rssi_room(n=200, seed=1).columns([2, 5])
+    result = compare(room, fewer=(0.5,), seed=1)
+    train = room.split("random", 1)[0]
+    along = train.transmitter_position[:, :2].numpy()
+    along = (along - along.mean(axis=0)) @ np.linalg.eigh(np.cov(along.T))[1][:, -1]
+    for inside in (np.argsort(np.argsort(side)) * 5 // len(along) == 1 for side in (along, -along)):
+        model = RssiModel(validation="block", seed=1).fit(train.subset(torch.tensor(np.flatnonzero(~inside))))
+        part = train.subset(torch.tensor(np.flatnonzero(inside)))
+        error = (model.predict_detected(part).mean - part.rssi_dbm)[part.detected].abs().mean()
+        if float(error) == pytest.approx(result.region["swiftwrf"], rel=1e-3):
+            break
+    else:
+        pytest.fail(f"{result.region} is of no second fifth")
+    assert {*result.region} == {"swiftwrf", "knn"}
+    assert compare(room, split="block", fewer=(0.5,)).region == {}
+
+
 def path_loss_only(n=60, noise=0.0, level=-50.0, exponent=2.0, seed=0):
     """Three receivers that follow the path-loss model exactly, except for noise."""
     generator = torch.Generator().manual_seed(seed)

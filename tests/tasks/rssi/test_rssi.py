@@ -21,8 +21,8 @@ from test_rssi_model import path_loss_only
 
 from swiftwrf import rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
+from swiftwrf.contrib.comparison.parts import pool_of
 from swiftwrf.contrib.comparison.predictors import make_predictor
-from swiftwrf.contrib.comparison.rssi import pool_of
 from swiftwrf.contrib.comparison.rssi_baselines import NEIGHBOUR_COUNTS
 from swiftwrf.data.splits import folds
 from swiftwrf.rssi import RssiPredictor, compare
@@ -31,6 +31,7 @@ from tasks.records import Records
 from tasks.report import merge
 from tasks.rssi import experiment
 from tasks.rssi.coverage import coverage_sentence
+from tasks.rssi.differences import where_methods_differ
 from tasks.rssi.maps import Maps
 from tasks.rssi.page import answer, where_next
 
@@ -294,3 +295,20 @@ def test_receivers_that_a_split_by_place_holds_out_are_not_in_the_pool(seed):
     assert not pool.detected[:, [pool.receiver_names.index(name) for name in held_out]].any()
     assert torch.equal(pool.transmitter_position, train.transmitter_position)
     assert int(pool.detected.any(dim=0).sum()) == len(whole.receiver_names) - len(held_out)
+
+
+def test_the_table_of_differences_is_that_of_the_errors(rssi_run):
+    run = Records(rssi_run)
+    table, errors = where_methods_differ(run, answer(run)), pd.read_csv(rssi_run / "errors.csv")
+    own = errors[errors["method"] == "swiftwrf"]
+    measured, predicted = own["measured_dbm"].to_numpy(), own["predicted_dbm"].to_numpy()
+    apart = own["from_training_m"].to_numpy()
+    (cells,) = [row for row in table.rows if row[0] == "swiftwrf"]
+    weak, strong = np.quantile(measured, 0.25), np.quantile(measured, 0.75)
+    far = apart >= np.quantile(apart, 0.75)
+    expected = [(predicted - measured)[part].mean() for part in (measured <= weak, measured >= strong)]
+    expected.append(np.abs(predicted - measured)[far].mean())
+    assert [float(cell) for cell in cells[1:4]] == pytest.approx(expected, abs=0.06)
+    shown = [float(re.search(r"(-\d\S*) dBm", column)[1]) for column in table.columns[1:3]]
+    assert shown == pytest.approx([weak, strong], abs=0.06)
+    assert len(cells) == len(table.columns)
