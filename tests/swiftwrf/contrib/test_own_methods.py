@@ -25,7 +25,7 @@ class Constant(RssiPredictor):
 
 
 class Origin(Localizer):
-    """The origin, for any row."""
+    """Locate any row at the origin."""
 
     def fit(self, train):
         return self
