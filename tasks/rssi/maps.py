@@ -89,7 +89,7 @@ class Maps:
 
     @property
     def quantity(self) -> str:
-        """What is predicted: RSSI, or another quantity."""
+        """Predicted quantity: RSSI, or another one."""
         return str(self.run.metrics.get("quantity", "RSSI"))
 
     @property
