@@ -322,7 +322,7 @@ class _Survey:
             column = options.transmitter[0]
             self.notes.append(f"both ends move; {len(self.names)} positions of column {column} count as receivers")
         if options.quantity is not None:
-            what = f"values are {options.quantity} [{options.unit}]"
+            what = f"values are {options.quantity} in {options.unit}"
             self.notes.append(f"{what}: maps have no path loss and no limit of detection")
             if moves:
                 raise InputError(f"{self.source} has positions of both ends, which only a model of RSSI takes; {what}")

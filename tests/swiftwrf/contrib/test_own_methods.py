@@ -12,7 +12,7 @@ from swiftwrf.rssi.base import RssiPredictor
 DATA = swiftwrf.rssi_room(n=60).columns([0, 4, 8])
 
 
-class Constant(RssiPredictor):
+    """Constant power at any place."""
     """The same power everywhere."""
 
     name = "constant"
