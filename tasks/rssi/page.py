@@ -70,7 +70,7 @@ def page(runs: list[Records]) -> Page:
     else:
         named = {f"{run.number}: {run.place}": one for run, one in answers.items()}
         first = compared(named, runs, COLOURS, "absolute error")
-    return Page(f"RSSI: {names}", first, sections, details, answer=answers[runs[0]])
+    return Page(f"{Maps(runs[0]).quantity}: {names}", first, sections, details, answer=answers[runs[0]])
 
 
 def _summary(run: Records, found: Answer) -> Summary:

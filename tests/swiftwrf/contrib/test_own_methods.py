@@ -12,8 +12,8 @@ from swiftwrf.rssi.base import RssiPredictor
 DATA = swiftwrf.rssi_room(n=60).columns([0, 4, 8])
 
 
-    """Constant power at any place."""
-    """The same power everywhere."""
+class Constant(RssiPredictor):
+    """One power at any place."""
 
     name = "constant"
 
