@@ -14,9 +14,10 @@ from torch import Tensor
 
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin
 from swiftwrf.data.dataset import Arrays, Numbers, PositionedData, position_coordinates, to_positions
+from swiftwrf.data.options import TableOptions
 from swiftwrf.data.powers import check_powers
 from swiftwrf.data.splits import MIN_PLACES, MIN_SPLIT_ROWS, MIN_TRAINING, Validation, matching_validation, random_split
-from swiftwrf.data.survey import TableOptions, read_survey
+from swiftwrf.data.survey import read_survey
 from swiftwrf.errors import InputError, listed
 from swiftwrf.plotting import MARK, Axes, plan
 from swiftwrf.positions import to_tensor

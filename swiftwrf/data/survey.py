@@ -35,12 +35,11 @@ from swiftwrf.data.columns import (
     receiver_columns,
 )
 from swiftwrf.data.coordinates import (
-    Coordinates,
     PlanFrame,
-    Up,
     floors_of,
     without_fix,
 )
+from swiftwrf.data.options import TableOptions
 from swiftwrf.data.packets import rows_of_packets
 from swiftwrf.data.places import local_metres, read_coordinates, receivers_of_ends
 from swiftwrf.data.powers import (
@@ -60,43 +59,6 @@ from swiftwrf.data.ranked import from_ranked_lists
 from swiftwrf.data.receivers import read_receivers
 from swiftwrf.data.scans import list_margin, repeated_scans, split_packets, times_of, windows
 from swiftwrf.errors import InputError, listed
-from swiftwrf.runtime.validation import PositiveFloat, configuration
-
-
-@configuration
-class TableOptions:
-    """Options of reading tables, with the meaning that `load_rssi` describes.
-
-    Example:
-        >>> TableOptions(filler=[0, 100]).filler
-        (0.0, 100.0)
-    """
-
-    columns: Mapping[str, str] | None = None
-    filler: Sequence[float] | None = None
-    coordinates: Coordinates | None = None
-    offset_by: str | None = None
-    transmitter: Sequence[str] = ()
-    pool_by: str | None = None
-    scale: PositiveFloat | None = None
-    y_down: bool = False
-    up: Up = "z"
-    window: PositiveFloat | None = None
-    quantity: str | None = None
-    unit: str | None = None
-
-    def check(self) -> None:
-        """Keep lists as tuples, which compare as a whole.
-
-        Raises:
-            InputError: A quantity without a unit or the reverse, or pools of another quantity than power.
-        """
-        if (self.quantity is None) != (self.unit is None):
-            raise InputError("quantity and unit belong together, e.g. throughput and Mbps; give both")
-        if self.quantity is not None and self.pool_by is not None:
-            raise InputError(f"pool_by pools received powers, but the quantity is {self.quantity}; leave it out")
-        object.__setattr__(self, "filler", None if self.filler is None else tuple(map(float, self.filler)))
-        object.__setattr__(self, "transmitter", tuple(self.transmitter))
 
 
 def has_positions(table: pd.DataFrame, columns: Mapping[str, str]) -> bool:
