@@ -136,6 +136,8 @@ class RssiTaskConfig(ReadingConfig):
     each receiver by the data"""
     validation: Literal["auto", "random", "block", "session"] = "auto"
     """folds of the training rows that choose all settings; auto takes those that are like the test rows"""
+    above: tuple[float, ...] = ()
+    """thresholds of the coverage [dBm], the first one that of the maps (default: -67 for Wi-Fi, else -75)"""
     preset: Preset = "quick"
     """of SwiftWRF and NeRF2: quick, or paper for the published head and field"""
     floor_plan: str | None = None

@@ -48,7 +48,9 @@ def run(config: InspectConfig) -> None:
     out = Path(config.out) if config.out else Path("runs") / "inspect" / stamp()
     with new_directory(out, "an inspection") as folder:
         data = how.read(SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS)
-        kind = "RSSI" if isinstance(data, Rssi) else "array snapshots" if isinstance(data, Snapshots) else "spectra"
+        kind = (
+            data.quantity if isinstance(data, Rssi) else "array snapshots" if isinstance(data, Snapshots) else "spectra"
+        )
         findings = inspect(data, grid=how.options.grid, beamformer=how.options.beamformer or PHASE)
         for column in data.labels if isinstance(data, Rssi) else ():
             with suppress(InputError):  # the toolkit's own layout has the names of these columns alone
@@ -194,7 +196,7 @@ def _floor(data: Rssi) -> Plot:
     for name, at, is_located in places:
         if is_located:
             ax.annotate(figures.short(name), at[:2].tolist(), fontsize=7, xytext=(3, 3), textcoords="offset points")
-    caption = "Positions, coloured by the strongest RSSI; triangles: receivers, where they are known."
+    caption = f"Positions, coloured by the strongest {data.quantity}; triangles: receivers, where they are known."
     strongest = data.rssi_dbm.nan_to_num(-torch.inf).amax(dim=1)
     return Plot("plan", [figure], caption, _places(data.transmitter_position, strongest_dbm=strongest))
 

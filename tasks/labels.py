@@ -80,6 +80,8 @@ PREDICTORS = {
     "knn_pairs": "#a0623a",
     "nerf2": "#4f8f2f",
 }
+# Classes of coverage. Each pair differs by at least 30 in CIE Lab for every kind of colour vision.
+COVERAGE = {"not measured": "#aab0b9", "not covered": "#c8501e", "uncertain": "#f2cf4a", "covered": "#1f6fb4"}
 LOCALIZERS = {
     "posterior": "#3a7fd5",
     "knn": "#1b8fa6",

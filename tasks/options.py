@@ -207,6 +207,11 @@ class ReadingOptions(Options):
     """axis of a survey table that points up: y as in ARCore, ARKit and Unity"""
     window: PositiveFloat | None = None
     """join packets of several receivers in windows of this length [s] to one row each, by their means"""
+    quantity: str | None = None
+    """what the values of a survey table are, if not RSSI: throughput, latency, SNR, ... Maps then have no path loss and no
+    limit of detection. Needs --unit, and --columns rssi=NAME unless one column is named so"""
+    unit: str | None = None
+    """unit of --quantity"""
     offset_by: str | None = None
     """column of a survey table with groups of rows, e.g. devices, whose constant offsets are estimated; COLUMN=VALUE makes
     that group the reference of maps (default: the most frequent one)"""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from os.path import isfile  # unlike Path.is_file, it is False for names that are too long
 from pathlib import Path
 
@@ -17,6 +18,9 @@ from swiftwrf.data.receivers import read_places
 from swiftwrf.data.survey import has_positions
 from swiftwrf.errors import with_article
 from swiftwrf.locate import MatchedField, RssiLocator
+from swiftwrf.metrics import LEVEL
+from swiftwrf.models.prediction import suffix
+from swiftwrf.positions import inside
 from swiftwrf.rssi.base import RssiPredictor
 from tasks.aoa.records import FractionRecords
 from tasks.command import run_module
@@ -29,6 +33,7 @@ from tasks.source import Reading, aligned, is_table, observed_spectra, reading, 
 from tasks.terminal import console, terminal
 
 PLAN = ("scale", "y_down", "up")  # options of reading a table of positions
+MAX_SHOWN = 20  # rows of a table on the terminal
 MEDIANS = {"great_circle_deg": "degrees", "position_error_m": "m"}  # columns of errors and their units
 
 
@@ -56,9 +61,17 @@ def run(config: PredictConfig) -> None:
         if isinstance(model, RssiPredictor):
             origin, floors = model.origin, model.attenuation and model.attenuation.floors
         frame = PlanFrame(**{name: getattr(how.options, name) for name in PLAN})
-        prediction = predict(model, read_places(Path(how.source), origin, frame, floors), track=config.track)
+        position = read_places(Path(how.source), origin, frame, floors)
+        prediction = predict(model, position, track=config.track)
         assert isinstance(prediction, Prediction)
-        terminal.page({"table": str(out)}, f"{write_file(prediction, out)}: {out}")
+        if out.suffix.lower() == ".mat":
+            terminal.page({"table": str(out)}, f"{write_file(prediction, out)}: {out}")
+            return
+        table = prediction.to_frame()
+        if isinstance(model, RssiPredictor):
+            table = with_intervals(table, model, prediction)
+        write_table(out, rounded(table.to_dict("records")))
+        terminal.page({"table": str(out)}, f"{shown(table)}{len(table)} rows: {out}")
         return
     if isinstance(model, RssiLocator):
         data, is_known = read_rssi(with_groups(how, model.model.offsets))
@@ -84,7 +97,40 @@ def run(config: PredictConfig) -> None:
     errors = " and ".join(f"{values[f'median_{name}']:.3g} {MEDIANS[name]}" for name in MEDIANS if name in table)
     what = "positions" if "x_m" in table else "directions"
     said = f", median error {errors}, too low if these rows trained the model" if errors else ""
-    terminal.page(values, f"{values['n']} {what}{said}: {out}")
+    terminal.page(values, f"{shown(table)}{values['n']} {what}{said}: {out}")
+
+
+def with_intervals(table: DataFrame, model: RssiPredictor, prediction: Prediction) -> DataFrame:
+    """Return a table of predictions with their intervals, the probability of a detection, and places that are outside.
+
+    A place is outside if it is beyond the training positions in plan. Models without these positions have no such column.
+    """
+    position, unit = prediction.position, suffix(model.unit)
+    assert position is not None
+    if prediction.std is not None:
+        low, high = prediction.interval(LEVEL)
+        table = table.assign(**{f"low_{unit}": low.flatten().numpy(), f"high_{unit}": high.flatten().numpy()})
+    table = table.assign(detection=model.predict_detection(position).flatten().numpy().round(3))
+    with suppress(InputError):  # of a model without training positions
+        outside = ~inside(position.numpy(), model.region().numpy())
+        table = table.assign(outside=outside.repeat(len(model.receiver_names)))
+    if model.unit != "dBm":  # of any size
+        values = [name for name in table if str(name).endswith(f"_{unit}")]
+        table[values] = table[values].map(lambda value: float(f"{value:.5g}"))
+    return table
+
+
+def shown(table: DataFrame) -> str:
+    """Return a table of at most 20 rows as lines of text, otherwise an empty text.
+
+    Example:
+        >>> shown(DataFrame({"x_m": [1.23456]})).split()
+        ['x_m', '1.235']
+    """
+    if len(table) > MAX_SHOWN:
+        return ""
+    text: str = DataFrame(rounded(table.to_dict("records"))).to_string(index=False)
+    return f"{text}\n"
 
 
 def saved_file(model: Path) -> Path:

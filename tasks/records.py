@@ -32,6 +32,7 @@ NAMES = (  # columns of text, even if a cell reads NA, 1 or 12:34
     "estimator",
     "training",
     "receiver",
+    "floor",
     "synthesizer",
     "stage",
     "origin",

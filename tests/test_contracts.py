@@ -26,7 +26,7 @@ from augment.estimators.subspace import SnapshotEstimator
 from augment.testing import check_estimator
 from swiftwrf import AngularGrid, InputError, Spectra, make_model, rssi_room, simulated_room
 from swiftwrf.choices import RSSI_PREDICTORS
-from swiftwrf.contrib.comparison.rssi import make_predictor
+from swiftwrf.contrib.comparison.predictors import make_predictor
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.locate import MatchedField, RssiLocator
 from swiftwrf.models import FIELD_MODELS

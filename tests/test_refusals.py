@@ -41,7 +41,7 @@ from swiftwrf import (
 )
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.choices import RSSI_PREDICTORS
-from swiftwrf.contrib.comparison.rssi import compared, make_predictor
+from swiftwrf.contrib.comparison.predictors import compared, make_predictor
 from swiftwrf.contrib.online import Follower, prequential
 from swiftwrf.contrib.raytraced import Tracing
 from swiftwrf.contrib.subspace import esprit

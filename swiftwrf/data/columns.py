@@ -11,6 +11,7 @@ import pandas as pd
 
 from swiftwrf.data.cells import parsed, plain_name, text_of
 from swiftwrf.data.powers import KNOWN_FILLERS, MIN_RSSI_DBM
+from swiftwrf.data.radios import unknown_ids
 from swiftwrf.errors import InputError, listed
 
 PLACE = (
@@ -28,7 +29,7 @@ ROLES = {  # patterns of names in lower case with underscores and without units,
     "latitude": [f"{GPS}(?:lat|latitude){GPS_END}"],
     "floor": ["floor(?:_?(?:id|name|number|no|level))?|storey|etage|stockwerk"],
     "time": [
-        "time_?stamp|date_?time|unix(?:_?time)?|epoch(?:_?time)?|(?:gps|utc|local|phone|system|event|measured|received)_?time",
+        "time_?stamp|date_?time|unix(?:_?time)?|epoch(?:_?time)?|(?:gps|utc|local|phone|device|system|event|scan|measured|received)_?time",
         "time|when|t|ts|elapsed(?:_?time)?|uptime",
         "date",
         "(?:first|last)_?seen|(?:received|measured|recorded|created|logged|reported)_?at",
@@ -63,11 +64,14 @@ NO_POWER = re.compile(  # quantities beside received power that may be negative,
 )
 GROUPS_OF_ROWS = re.compile(  # columns that distinguish rows, but not the receivers
     r"(?:.*_)?(device|phone|user|model|brand|person|operator|mode|weather|channel|ch|freq\w*|band|sf|data_?rate|modulation|bw"
-    r"|bandwidth|codr|building\w*|room|zone|area|space\w*|site|place|location|point|snapshot|direction|orientation|date|day"
+    r"|bandwidth|codr|(?P<place>building\w*|room|zone|area|space\w*|site|place|location|point)|snapshot|direction|orientation|date|day"
     r"|time\w*|type|security|auth_?mode|capabilities|vendor|manufacturer|provider|experiment\w*|trial|comment|notes?|version|os"
     r"|app\w*|sample\w*|index|idx|row|count\w*|seq\w*|packet\w*|frame\w*|node_?addr\w*|dev_?(?:eui|addr))"
     r"(?:_?(?:id|name|no|number))?"
 )
+MARKS = {"tx": "transmitter", "transmitter": "transmitter", "rx": "receiver", "receiver": "receiver"}  # words in names
+TRANSMITTED = re.compile(r"(?:.*_)?(?:tx_?(?:power|pwr|pow)\w*|transmit\w*_power|power_?tx|eirp|erp)")
+SNR = re.compile(r"(?:.*_)?[le]?snr(?:_(?:mean|avg|median))?")
 GEODETIC = {"x": "longitude", "y": "latitude"}  # that take the place of x and y
 
 
@@ -111,7 +115,7 @@ def find_roles(
                 f"{source} has {len(matches)} columns that may be {role} ({listed(matches)}); choose one with columns "
                 f"{role}=NAME"
             )
-        roles[role] = matches[0]
+        roles[role] = matches[0] if role != "receiver" else _with_known_ids(table, matches)
     for role, other in GEODETIC.items():
         if other in roles and role in roles:
             del roles[other]
@@ -130,6 +134,34 @@ def find_roles(
             )
         del roles["receiver"]  # which distinguishes rows of a wide table
     return roles
+
+
+def column_of_quantity(source: object, table: pd.DataFrame, quantity: str) -> str:
+    """Return the only column of numbers whose name contains a quantity, or else begins with its first word.
+
+    Raises:
+        InputError: None or several of them.
+
+    Example:
+        >>> column_of_quantity("a.csv", pd.DataFrame({"x": [1.0], "latency_ms": [3.0]}), "latency")
+        'latency_ms'
+    """
+    plain = plain_name(quantity)
+    found = [
+        n for n in table.columns if plain in plain_name(n) and not is_coordinate(n) and not parsed(table[n])[1].all()
+    ]
+    if len(found) != 1:
+        raise InputError(
+            f"{source} has {len(found)} columns that are named {quantity}; choose one with columns rssi=NAME; there are "
+            f"{listed(table.columns)}"
+        )
+    return str(found[0])
+
+
+def _with_known_ids(table: pd.DataFrame, names: Sequence[str], max_unknown: float = 0.1) -> str:
+    """Return the first column of ids with few unknown ones, e.g. the PCI if neighbours lack the cell id (not studied)."""
+    unknown = {name: ((text_of(table[name]) == "") | unknown_ids(table[name])).mean() for name in names}
+    return next((name for name in names if unknown[name] <= max_unknown), min(names, key=lambda name: unknown[name]))
 
 
 def receiver_columns(
@@ -234,13 +266,41 @@ def check_receiver_known(
         apart = ~pd.DataFrame({"row": together, "cell": cell}).duplicated(keep=False)
         is_packet = several.mean() > min_together and apart[several].mean() > min_different
         alternates = is_text.all() and not several.any() and (cell != cell.shift()).mean() > min_changes
-        if (group := GROUPS_OF_ROWS.fullmatch(plain_name(name))) and not (timed and is_packet and group[1] == "device"):
-            continue
+        if group := GROUPS_OF_ROWS.fullmatch(plain_name(name)):
+            # a transmitter is in one room at a time, but a receiver may detect several devices at one place
+            may_be_receiver = bool(group["place"]) or (timed and group[1] == "device")
+            if not (is_packet and may_be_receiver):
+                continue
         if is_name and (is_packet or alternates):
             raise InputError(
                 f"{source}: is {name!r} the receiver of each row? Then give --columns receiver={name}, or --columns "
                 f"rssi={rssi} if all rows are of one receiver"
             )
+
+
+def columns_of_end(source: object, table: pd.DataFrame, given: Sequence[str]) -> dict[str, str]:
+    """Return the columns of the second end by x, y and z; none in a table with positions of one end.
+
+    They are the given ones. Otherwise they are those marked tx or transmitter beside others, or those marked rx or receiver
+    beside unmarked ones.
+    """
+    if given:
+        missing = [name for name in given if name not in table.columns]
+        if missing or len(given) not in (2, 3) or len(set(given)) < len(given):
+            raise InputError(
+                f"{source}: transmitter takes the columns of x, y and, if it is known, z, or one column of names, got "
+                f"{' '.join(given)}; there are {listed(table.columns)}"
+            )
+        return dict(zip("xyz", given, strict=False))
+
+    def end_of(name: str) -> str:
+        return next((MARKS[word] for word in plain_name(name).split("_") if word in MARKS), "")
+
+    marked = {axis: {end_of(name): name for name in reversed(candidates(table, axis))} for axis in "xyz"}
+    for mark, others in (("transmitter", {"receiver", ""}), ("receiver", {""})):
+        if all(mark in marked[axis] and others & marked[axis].keys() for axis in "xy"):
+            return {axis: names[mark] for axis, names in marked.items() if mark in names}
+    return {}
 
 
 def is_rssi(column: pd.Series) -> bool:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from swiftwrf.data.cells import Floats
 from swiftwrf.errors import InputError
@@ -90,8 +91,10 @@ def _fills_the_lower_edge(
     return bool((weakest[np.isfinite(weakest)] == value[0]).mean() > fraction)  # near receivers detect every row
 
 
-def without_fillers(rssi: Floats, fillers: list[float]) -> tuple[Floats, list[str]]:
+def without_fillers(rssi: Floats, fillers: list[float], quantity: str | None = None) -> tuple[Floats, list[str]]:
     """Return RSSI (n, R) with nan in place of fillers and of -inf, and a note on each of them.
+
+    Another quantity than RSSI has no usual filler.
 
     Example:
         >>> without_fillers(np.array([[-60.0, 127.0]]), [127.0])
@@ -104,7 +107,7 @@ def without_fillers(rssi: Floats, fillers: list[float]) -> tuple[Floats, list[st
         if n := int(cells.sum()):
             notes.append(f"{filler:g} counts as not detected: {n} of {rssi.size} cells ({n / rssi.size:.0%})")
         filled |= cells
-    if NOT_DETECTED_DBM not in fillers and (n := int((rssi == NOT_DETECTED_DBM).sum())):
+    if quantity is None and NOT_DETECTED_DBM not in fillers and (n := int((rssi == NOT_DETECTED_DBM).sum())):
         notes.append(f"{NOT_DETECTED_DBM:g} dBm counts as measured: {n} cells")
     return np.where(filled, np.nan, rssi), notes
 
@@ -123,6 +126,77 @@ def end_of_scale(rssi: Floats, min_fraction: float = 0.25) -> list[str]:
         return []
     cells = f"{count[0]} of {rssi.size} cells ({count[0] / rssi.size:.0%})"
     return [f"the scale ends at {-value[0]:g} dBm: {cells} have this largest value, so their power is at least that"]
+
+
+def signal_power(
+    rssi: Floats, snr: Floats, min_fraction: float = 0.05, min_packets: int = 20, max_ratio: float = 0.5
+) -> Floats | None:
+    """Return the power of the signals of LoRa packets [dBm], None if RSSI is that power already.
+
+    Below the noise, RSSI is the power of the noise. With the signal-to-noise ratio it determines that of the signal:
+    RSSI + SNR - 10 log10(1 + 10^(SNR / 10)), since RSSI is the sum of both. Other receivers detect nothing there.
+
+    Args:
+        rssi: RSSI (n, R) [dBm], nan where empty.
+        snr: Signal-to-noise ratios [dB], (n, R) or (n, 1).
+        min_fraction: Least fraction of packets below the noise. The bounds are not studied.
+        min_packets: Least number of packets below the noise.
+        max_ratio: Largest standard deviation of their RSSI, relative to that of RSSI less SNR.
+
+    Example:
+        >>> level = np.linspace(-125, -105, 81)[:, None]
+        >>> total = 10 * np.log10(10 ** (level / 10) + 10**-11.7)
+        >>> bool(np.allclose(signal_power(total, level + 117), level))
+        True
+    """
+    below = np.isfinite(rssi) & (snr < 0)
+    if below.sum() < max(min_packets, min_fraction * np.isfinite(rssi).sum()):
+        return None
+    noise = rssi - np.where(np.isfinite(rssi), snr, np.nan)
+    if rssi[below].std() > max_ratio * noise[below].std():  # RSSI follows the signal, not the noise
+        return None
+    power = rssi + snr - 10 * np.log10(1 + 10 ** (snr / 10))
+    return np.where(np.isnan(power), rssi, power)
+
+
+def of_one_power(
+    rssi: Floats, transmitted: Floats, position: Floats, min_slope: float = 0.5, min_rows: int = 10
+) -> tuple[Floats, float] | None:
+    """Return RSSI as if all packets had the most frequent transmit power, and that power; None if RSSI does not follow it.
+
+    It follows if differences of RSSI between rows and their nearest rows of another power have a slope of 1, within
+    `min_slope` (not studied), over the differences of the transmit power.
+
+    Args:
+        rssi: RSSI (n, R) [dBm], nan where empty.
+        transmitted: Transmit power (n, R) or (n, 1) [dBm], or its difference to another one.
+        position: Positions of the rows, (n, 2 or more).
+        min_slope: Largest difference of the slope to 1.
+        min_rows: Least number of rows of each transmit power.
+
+    Example:
+        >>> power, place = np.array([0.0, -12.0] * 10)[:, None], np.arange(20.0)[:, None] * [1, 0]
+        >>> np.unique(of_one_power(-60 + power, power, place)[0])
+        array([-72.])
+    """
+    transmitted = np.broadcast_to(transmitted, rssi.shape)
+    values, count = np.unique(transmitted[np.isfinite(rssi) & np.isfinite(transmitted)], return_counts=True)
+    if not 2 <= len(values) <= 30 or count.min() < min_rows:
+        return None
+    products, squares = 0.0, 0.0
+    for column, power in zip(rssi.T, transmitted.T, strict=True):
+        known = np.isfinite(column) & np.isfinite(power)
+        for value in values:
+            here, others = np.flatnonzero(known & (power == value)), np.flatnonzero(known & (power != value))
+            if len(here) and len(others):
+                near = here[cKDTree(position[here]).query(position[others])[1]]
+                step = power[others] - value
+                products += float(step @ (column[others] - column[near]))
+                squares += float(step @ step)
+    reference = float(values[count.argmax()])
+    if not squares or abs(products / squares - 1) > min_slope:
+        return None
+    return rssi - np.nan_to_num(transmitted - reference), reference
 
 
 def check_powers(source: object, rssi: Floats, receivers: Sequence[str], table_row: NDArray[np.int64]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import reprlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,22 +15,9 @@ from swiftwrf.data.cells import Floats, column_of_numbers, text_of
 from swiftwrf.data.columns import GEODETIC, column_of
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin, PlanFrame, frame_of
 from swiftwrf.data.files import numbers, read_table, read_yaml
+from swiftwrf.data.radios import plain_receiver
 from swiftwrf.errors import InputError, listed
 from swiftwrf.positions import check_positions
-
-ADDRESS = re.compile(r"((?:[0-9a-f]{2}[:-]?){4}[0-9a-f]{2})[:-]?[0-9a-f]{2}", re.IGNORECASE)
-
-
-def plain_receiver(name: str) -> str:
-    """Return the name of a receiver without what people write differently: case, separators, and zeros before a number.
-
-    Example:
-        >>> plain_receiver("CB-99-D5-23-7D-12"), plain_receiver("AP 01"), plain_receiver("007")
-        ('cb99d5237d12', 'ap 1', '7')
-    """
-    words = re.split(r"[\s:._-]+", name.strip().lower())
-    plain = "".join(words)
-    return plain if re.fullmatch("[0-9a-f]{12}", plain) else re.sub(r"(?<!\d)0+(?=\d)", "", " ".join(words))
 
 
 def spelled_as(names: Sequence[str], known: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -51,32 +37,6 @@ def spelled_as(names: Sequence[str], known: Sequence[str]) -> tuple[list[str], l
     ]
     other = [f"{name} is {as_known}" for name, as_known in zip(names, spelled, strict=True) if name != as_known]
     return spelled, [f"receivers are matched whose names are spelled differently: {listed(other)}"] * bool(other)
-
-
-def pool_names(names: Sequence[str], by: str) -> list[str]:
-    """Return the access point of each radio; a radio that does not match is one of its own.
-
-    `by` is "mac" for the first five bytes of an address, else a regular expression whose group is the access point.
-
-    Raises:
-        InputError: An expression that is broken, has no group, or matches no radio.
-
-    Example:
-        >>> pool_names(["a4:56:cc:00:10:b0", "a4:56:cc:00:10:b1", "lab"], "mac")
-        ['a4:56:cc:00:10', 'a4:56:cc:00:10', 'lab']
-        >>> pool_names(["hall-2G", "hall-5G"], "(.*)-.G")
-        ['hall', 'hall']
-    """
-    try:
-        pattern = ADDRESS if by == "mac" else re.compile(by)
-    except re.error as error:
-        raise InputError(f"pool_by {by!r} is no column and no regular expression ({error})") from None
-    if pattern.groups != 1:
-        raise InputError(f"pool_by takes mac, a column, or a regular expression with one group, got {by!r}")
-    matches = [pattern.fullmatch(name) for name in names]
-    if not any(matches):
-        raise InputError(f"pool_by {by!r} matches no receiver; there are {listed(names)}")
-    return [name if match is None else match.group(1) for name, match in zip(names, matches, strict=True)]
 
 
 def read_receivers(

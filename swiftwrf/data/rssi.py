@@ -14,14 +14,16 @@ from torch import Tensor
 
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin
 from swiftwrf.data.dataset import Arrays, Numbers, PositionedData, position_coordinates, to_positions
+from swiftwrf.data.options import TableOptions
 from swiftwrf.data.powers import check_powers
 from swiftwrf.data.splits import MIN_PLACES, MIN_SPLIT_ROWS, MIN_TRAINING, Validation, matching_validation, random_split
-from swiftwrf.data.survey import TableOptions, read_survey
+from swiftwrf.data.survey import read_survey
 from swiftwrf.errors import InputError, listed
 from swiftwrf.plotting import MARK, Axes, plan
 from swiftwrf.positions import to_tensor
 from swiftwrf.runtime.validation import NonNegativeInt, checked
 
+RSSI = "RSSI"
 META = "meta.csv"  # file of the NeRF2 layout with a row for each measurement
 SURVEY = "survey.yml"  # file of the toolkit's own layout with properties of all measurements
 PLACE = "place"  # split by receiver, a fifth of which is held out
@@ -46,6 +48,11 @@ class Rssi(PositionedData):
         receiver_moves: Whether the receivers are positions of one receiver that moves, too.
         plan_scale: Pixels in a metre if positions were pixels of a floor plan, whose upper left corner is x = y = 0.
         session: Session of measurements that each row is of, e.g. a walk or a day: n names, or their numbers, int64 (n,).
+        margin_db: How far an empty cell may be above the weakest value of its row [dB], if rows list the strongest or the
+            associated receivers only; infinite for single packets; see `swiftwrf.data.scans.list_margin`.
+        quantity: What `rssi_dbm` contains: RSSI, or another quantity, e.g. throughput, whose maps have neither path loss
+            nor a limit of detection.
+        unit: Its unit: dBm of RSSI.
         time: Time of each measurement [s], (n,), nan where unknown.
         name: Name of the data set.
         details: index, named_splits, source and notes of `PositionedData`.
@@ -71,6 +78,9 @@ class Rssi(PositionedData):
     floors: Floors | None
     receiver_moves: bool
     plan_scale: float | None
+    margin_db: float | None
+    quantity: str
+    unit: str
     session: Tensor | None
     time: Tensor | None
 
@@ -91,6 +101,9 @@ class Rssi(PositionedData):
         floors: Floors | None = None,
         receiver_moves: bool = False,
         plan_scale: float | None = None,
+        margin_db: float | None = None,
+        quantity: str = RSSI,
+        unit: str = "dBm",
         session: Tensor | Sequence[str | int] | None = None,
         time: Numbers | None = None,
         name: str = "rssi",
@@ -126,10 +139,16 @@ class Rssi(PositionedData):
             floors=floors,
             receiver_moves=receiver_moves,
             plan_scale=plan_scale,
+            margin_db=margin_db,
+            quantity=quantity,
+            unit=unit,
             session=None if session is None else session.long(),
             time=None if time is None else to_tensor("time", time, torch.float64, (None,), missing=True),
         )
-        check_powers(name, rssi.numpy(), names, self.index.numpy()[:, None])
+        if self.is_power:
+            check_powers(name, rssi.numpy(), names, self.index.numpy()[:, None])
+        elif self.located or not unit or bool(rssi.isinf().any()):
+            raise InputError(f"{name} has {quantity}, which needs a unit, finite values, and no positions of receivers")
 
     @classmethod
     @checked
@@ -163,6 +182,16 @@ class Rssi(PositionedData):
             ]
             arguments["receiver_position"] = places
         return cls(**arguments, name=name)
+
+    @property
+    def is_power(self) -> bool:
+        """True for RSSI, False for another quantity."""
+        return self.quantity == RSSI
+
+    def check_power(self, model: str) -> None:
+        """Raise InputError for another quantity than RSSI, which a model of received power cannot take."""
+        if not self.is_power:
+            raise InputError(f"{self.name} has {self.quantity}, but {model} needs RSSI; read RSSI, without quantity")
 
     @property
     def located(self) -> bool:
@@ -319,7 +348,7 @@ class Rssi(PositionedData):
         shown = self if receiver is None else self.columns([receiver_row(self.receiver_names, receiver, self.name)])
         strongest = shown.rssi_dbm.nan_to_num(-torch.inf).amax(dim=1)
         detected = strongest.isfinite()
-        ax = plan(self.transmitter_position[detected], strongest[detected], "RSSI [dBm]", ax)
+        ax = plan(self.transmitter_position[detected], strongest[detected], f"{self.quantity} [{self.unit}]", ax)
         x, y, _ = shown.receiver_position[shown.receiver_located].T.numpy()
         ax.plot(x, y, "^", color=MARK)
         ax.set_title(f"{self.name}, {'strongest receiver' if receiver is None else shown.receiver_names[0]}")

@@ -68,7 +68,11 @@ def write_rssi(data: Rssi, folder: Path) -> None:
     the origin of the coordinates, the floors, offsets that were removed, and further properties of all measurements.
 
     Measurements of exactly -100 dBm, which the layout uses for not detected, are written as -99.99.
+
+    Raises:
+        InputError: Another quantity than RSSI.
     """
+    data.check_power("the layout")
     rssi = data.rssi_dbm.where(data.rssi_dbm != NOT_DETECTED_DBM, NOT_DETECTED_DBM + 0.01)
     write_text(folder / "gateway_rssi.csv", _csv(list(data.receiver_names), rssi.nan_to_num(NOT_DETECTED_DBM)))
     write_text(folder / "tx_pos.csv", _csv(["x", "y", "z"], data.transmitter_position))
@@ -87,6 +91,7 @@ def write_rssi(data: Rssi, folder: Path) -> None:
         "offsets": data.offsets and asdict(data.offsets),
         "labels": list(data.labels),
         "plan_scale": data.plan_scale,
+        "margin_db": None if data.margin_db is None else str(data.margin_db),
     }
     if survey := {name: value for name, value in survey.items() if value}:
         write_text(folder / SURVEY, yaml.safe_dump(survey, sort_keys=False, allow_unicode=True))

@@ -121,6 +121,7 @@ class RssiLocator(Locator):
         Raises:
             InputError: Too few rows or positions, or a model of other receivers.
         """
+        train.check_power("a locator")
         config = self.config
         if model is not None:
             train = model.aligned(train)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Annotated
@@ -32,6 +33,8 @@ class Prediction(Labelled, Displayed):
         position: Positions of the predictions, (n, 3) [m]. `predict` of every model sets it.
         grid: Directions of predicted spectra.
         receiver_names: Names of the receivers of predicted RSSI.
+        quantity: RSSI, or what else is predicted at the receivers.
+        unit: Its unit.
 
     Example:
         >>> import torch
@@ -46,6 +49,8 @@ class Prediction(Labelled, Displayed):
     position: Tensor | None = None
     grid: AngularGrid | None = None
     receiver_names: tuple[str, ...] = ()
+    quantity: str = "RSSI"
+    unit: str = "dBm"
 
     def plot(self, number: int = 0, ax: Axes | None = None) -> Axes:
         """Draw a predicted spectrum seen along the normal of the array, or the RSSI at a receiver seen from above.
@@ -69,7 +74,7 @@ class Prediction(Labelled, Displayed):
             return polar_spectrum(self.mean[number], self.grid, ax)
         if self.position is None or self.mean.dim() != 2:
             raise InputError("this prediction contains neither directions nor positions; use that of a model's predict")
-        ax = plan(self.position, self.mean[:, number], "predicted RSSI [dBm]", ax)
+        ax = plan(self.position, self.mean[:, number], f"predicted {self.quantity} [{self.unit}]", ax)
         ax.set_title(self.receiver_names[number] if self.receiver_names else "")
         return ax
 
@@ -124,8 +129,9 @@ class Prediction(Labelled, Displayed):
             }
             return _positions(position).assign(**peak)
         table = _positions(position.repeat(len(self.receiver_names), axis=0))
-        values = {"receiver": np.tile(self.receiver_names, len(position)), "predicted_dbm": mean.flatten().numpy()}
-        std = {} if self.std is None else {"std_db": self.std.detach().cpu().flatten().numpy()}
+        receiver, differences = np.tile(self.receiver_names, len(position)), difference_unit(self.unit)
+        values = {"receiver": receiver, f"predicted_{suffix(self.unit)}": mean.flatten().numpy()}
+        std = {} if self.std is None else {f"std_{suffix(differences)}": self.std.detach().cpu().flatten().numpy()}
         return table.assign(**values, **std)
 
     def coordinates(self) -> Arrays:
@@ -135,11 +141,16 @@ class Prediction(Labelled, Displayed):
         return position_coordinates(self._located()) | values
 
     def variables(self) -> Arrays:
-        name, dimensions, unit = ("spectrum", DIRECTION, "1") if self.grid else ("rssi", ("receiver",), "dBm")
+        of_receivers = suffix(self.quantity), ("receiver",), self.unit
+        name, dimensions, unit = ("spectrum", DIRECTION, "1") if self.grid else of_receivers
         values: Arrays = {name: (("position", *dimensions), self.mean.detach().cpu().numpy(), {"units": unit})}
         if self.std is not None:
             std = self.std.detach().cpu().numpy()
-            values["std"] = (("position", *dimensions), std, {"units": "1" if self.grid else "dB"})
+            values["std"] = (
+                ("position", *dimensions),
+                std,
+                {"units": "1" if self.grid else difference_unit(self.unit)},
+            )
         return values
 
     def _located(self) -> NDArray[np.float64]:
@@ -150,6 +161,26 @@ class Prediction(Labelled, Displayed):
             )
         position: NDArray[np.float64] = self.position.detach().cpu().double().numpy()
         return position
+
+
+def difference_unit(unit: str) -> str:
+    """Return the unit of differences of values: dB of dBm.
+
+    Example:
+        >>> difference_unit("dBm"), difference_unit("Mbps")
+        ('dB', 'Mbps')
+    """
+    return "dB" if unit == "dBm" else unit
+
+
+def suffix(unit: str) -> str:
+    """Return a unit or quantity as the part of a column's name.
+
+    Example:
+        >>> suffix("dBm"), suffix("Mbit/s")
+        ('dbm', 'mbit_s')
+    """
+    return re.sub(r"[^a-z0-9]+", "_", unit.lower()).strip("_") or "value"
 
 
 def _positions(position: NDArray[np.float64]) -> pd.DataFrame:

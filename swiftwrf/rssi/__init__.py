@@ -2,7 +2,8 @@
 
 from typing import TYPE_CHECKING
 
-from swiftwrf.rssi.base import Map, RssiConfig, RssiPredictor
+from swiftwrf.rssi.base import Map, RssiPredictor
+from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.model import RssiModel, fit_rssi
 from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation, estimate_offsets
 from swiftwrf.rssi.pairs import PairModel

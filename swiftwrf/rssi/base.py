@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
@@ -9,14 +10,12 @@ from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Self
 
 import torch
-from annotated_types import Ge
 from torch import Tensor
 
-from swiftwrf.choices import NotDetected
 from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Offsets, Rssi
-from swiftwrf.data.splits import MIN_PLACES, MIN_TRAINING, Validation
+from swiftwrf.data.splits import MIN_PLACES, MIN_TRAINING
 from swiftwrf.errors import InputError, listed
 from swiftwrf.models.base import FieldConfig, Updatable
 from swiftwrf.models.prediction import Prediction
@@ -27,49 +26,12 @@ from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation
 from swiftwrf.runtime.threads import to_device
 from swiftwrf.runtime.validation import (
     Configured,
-    NonNegativeInt,
-    PositiveFloat,
     all_or_nothing,
     checked,
-    configuration,
 )
 
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 RECEIVER_POSITIONS = "positions of the receivers"
-
-
-@configuration
-class RssiConfig(FieldConfig):
-    """Options of `RssiModel`. The defaults have the lowest error on held-out training rows.
-
-    Example:
-        >>> RssiConfig(validation="block").n_primitives
-        50
-    """
-
-    n_primitives: NonNegativeInt = 50
-    """primitives a receiver; 0 for a path-loss model without a field, which a fit also takes if it predicts held-out rows as
-    well"""
-    huber: PositiveFloat = 1.345
-    """number of standard deviations of the noise beyond which an error counts linearly (Huber's constant: 95 % efficient
-    for Gaussian noise), since packets have outliers"""
-    max_locations: Annotated[int, Ge(10)] = 1500
-    """location bins that the rows are averaged in; the time of a fit grows with the cube of their number"""
-    not_detected: NotDetected = "auto"
-    """meaning of an empty cell.
-
-    - "weak": the power was below the limit of detection.
-    - "unknown": the cell is ignored.
-    - "auto": "weak" at each receiver whose empty cells are where its path loss expects no value, otherwise "unknown". It is
-      "unknown" at all receivers if values and detections in held-out folds are then more likely.
-
-    Only the path loss counts the empty cells of a receiver with fewer than 10 values"""
-    calibration: Validation | None = None
-    """folds whose errors scale the standard deviations. Defaults to those of `validation`. "block" suits predictions for
-    other days or devices, whose errors no fold of single rows contains"""
-    noises: tuple[PositiveFloat, ...] = (0.03, 0.1, 0.3, 1.0, 3.0)
-    """compared variances of one measurement about the field, relative to that of the field. Fading of a packet is about as
-    large as shadowing. Means of many packets have less noise"""
 
 
 class RssiPredictor(Updatable, Configured, Displayed, ABC):
@@ -100,7 +62,10 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
     """positions evaluated at a time, few enough to stay in the processor's cache"""
 
     fitted_attribute = "receiver_names"
-    saved: ClassVar[str] = "receiver_position receiver_names origin offsets attenuation detection row_digests"
+    saved: ClassVar[str] = (
+        "receiver_position receiver_names origin offsets attenuation detection row_digests quantity unit value_centre "
+        "value_scale"
+    )
     """what the file of a predictor contains that is `Saved`, too"""
     receiver_names: Annotated[tuple[str, ...], "r"]
     """names of the receivers, set by `fit`"""
@@ -112,6 +77,14 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
     """curve of detection of the training rows; None if every cell has a value; set by `fit`"""
     offsets: Offsets | None
     """offsets that were removed from the training rows, set by `fit`; predictions are of their reference"""
+    quantity: str = "RSSI"
+    """what is predicted, set by `fit`: RSSI, or another quantity of the data"""
+    unit: str = "dBm"
+    """its unit, set by `fit`"""
+    value_centre: float = 0.0
+    """mean of the training values of another quantity than RSSI, which is subtracted before the fit"""
+    value_scale: float = 1.0
+    """their number in a dB of the fit: other quantities are scaled to the standard deviation of RSSI"""
     attenuation: Annotated[FloorAttenuation, "r"] | None = None
     """attenuation of the floors between transmitter and receiver, set by `fit` if the data have floors"""
 
@@ -137,6 +110,7 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
         device: torch.device | str = "cpu",
         parallel: Map | None = None,
         progress: bool = False,
+        usual_std_db: float = 8.0,
     ) -> Self:
         """Fit the predictor to measured RSSI and return it. A fit that fails leaves the predictor as it was.
 
@@ -148,6 +122,8 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
             parallel: Function that maps a picklable fit over receivers as `map` does, e.g. on other machines. Defaults to
                 threads of this process.
             progress: Show a progress bar on a terminal.
+            usual_std_db: Standard deviation that values of another quantity are scaled to, since priors are those of RSSI.
+                Not studied.
 
         Raises:
             InputError: Too few measurements, values that are not finite, a missing requirement, or a pool of other rows.
@@ -168,21 +144,41 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
             raise InputError(lacking)
         self.receiver_names, self.receiver_position = tuple(map(str, train.receiver_names)), train.receiver_position
         self.origin, self.offsets, self.attenuation = train.origin, train.offsets, None
+        self.quantity, self.unit, self.value_centre, self.value_scale = train.quantity, train.unit, 0.0, 1.0
+        if not train.is_power:
+            values = pool.rssi_dbm[pool.detected]
+            self.value_centre = float(values.mean())
+            self.value_scale = (float(values.std(correction=0)) or 1.0) / usual_std_db
+            train, pool = self._scaled(train), self._scaled(pool)
         self.row_digests = train.row_digests() if self.updates else self.row_digests
         shift = torch.zeros_like(pool.rssi_dbm)
         if train.offsets is not None:
             shift = shift + train.offsets.of(pool)[:, None]
         if train.floors is not None:
-            of_pool = estimate_floor_attenuation(pool)
+            of_pool = FloorAttenuation(train.floors, (0,) * len(pool.receiver_names), 0.0)
+            of_pool = estimate_floor_attenuation(pool) if pool.is_power else of_pool
             columns = columns_of(self.receiver_names, pool).tolist()
             self.attenuation = replace(of_pool, receiver_floor=tuple(of_pool.receiver_floor[c] for c in columns))
             shift = shift + of_pool.of(pool.transmitter_position)
             train, pool = self.attenuation.removed(train), of_pool.removed(pool)
-        curve = Detection.estimate(pool.transmitter_position, pool.rssi_dbm + shift)
+        empty_cells, curve = getattr(self.config, "not_detected", "auto"), None
+        if not pool.is_power:
+            empty_cells = "unknown"
+        if empty_cells == "weak" or (empty_cells == "auto" and pool.margin_db is None):
+            curve = Detection.estimate(pool.transmitter_position, pool.rssi_dbm + shift)
         self.detection = curve and curve.columns(columns_of(self.receiver_names, pool))
+        if empty_cells == "auto" and pool.margin_db is not None and math.isfinite(pool.margin_db):
+            curve, of_lists = Detection.of_lists(pool.rssi_dbm + shift, pool.margin_db)
+            shift = shift + of_lists
         others = {"device": to_device(device), "parallel": parallel, "progress": progress}
         self._fit(train, pool=pool, shift=shift, curve=curve, **others)
+        if not train.is_power and (held_out := getattr(self, "held_out_db", None)):
+            self.held_out_db = {name: self.value_scale * error for name, error in held_out.items()}
         return self
+
+    def _scaled(self, data: Rssi) -> Rssi:
+        """Return data with the values of the fit."""
+        return data.derived(rssi_dbm=(data.rssi_dbm - self.value_centre) / self.value_scale)
 
     @checked
     def update(self, new: Rssi) -> Self:
@@ -209,6 +205,7 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
         if len(new):
             self.check_updates()
             predictor.row_digests = torch.cat([self.row_digests, new.row_digests()])
+            new = self._scaled(new)
             predictor._update(new if self.attenuation is None else self.attenuation.removed(new))
         return predictor
 
@@ -232,6 +229,11 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
                 positions in degrees for a predictor in metres or the reverse, on other floors, or far away.
         """
         self.check_fitted()
+        if (data.quantity, data.unit) != (self.quantity, self.unit):
+            raise InputError(
+                f"{data.name} has {data.quantity} [{data.unit}], but the predictor was fitted to {self.quantity} "
+                f"[{self.unit}]"
+            )
         names, fitted = data.receiver_names, self.receiver_names
         if sorted(names) != sorted(fitted):
             raise InputError(
@@ -312,7 +314,11 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
             mean, std = in_batches(self._predict, position, self.batch_size)
         if self.attenuation is not None:
             mean = mean + self.attenuation.of(position).to(mean)
-        return Prediction(mean, std, position, receiver_names=self.receiver_names)
+        if self.value_scale != 1:
+            mean, std = self.value_centre + self.value_scale * mean, std if std is None else self.value_scale * std
+        return Prediction(
+            mean, std, position, receiver_names=self.receiver_names, quantity=self.quantity, unit=self.unit
+        )
 
     @checked
     def predict_detected(self, data: Rssi) -> Prediction:

@@ -11,13 +11,17 @@ body beside the device (one-factor Gaussian copula).
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pandas import DataFrame
+from scipy.ndimage import label
 from scipy.spatial import cKDTree
+from scipy.special import ndtri
 from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
@@ -25,6 +29,32 @@ from swiftwrf.positions import inside
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.pairs import PairModel
+
+WIFI_DBM, OTHER_DBM = -67.0, -75.0  # usual thresholds: voice over Wi-Fi; BLE and others
+CERTAINTY = 0.9  # probability from which a cell is covered
+CLASSES = ("not measured", "not covered", "uncertain", "covered")  # of cells, in the order of their numbers
+WIFI = re.compile(r"(?<![a-z])(wi-?fi|wlan|wap|ap|b?ssid|access ?point)(?![a-z])", re.IGNORECASE)
+
+
+def default_threshold(data: Rssi) -> tuple[float, str]:
+    """Return the threshold of the coverage of data [dBm], and the reason for it.
+
+    It is the median of the values of another quantity than RSSI. It is that of Wi-Fi if names of the data set, of receivers
+    or of columns taken as receivers are those of Wi-Fi.
+
+    Example:
+        >>> default_threshold(Rssi([[-60.0]], [[0, 0, 1]], receiver_names=["WAP012"]))
+        (-67.0, 'the default for Wi-Fi, by the name WAP012')
+        >>> default_threshold(Rssi([[-60.0]], [[0, 0, 1]], receiver_names=["beacon"]))
+        (-75.0, 'the default for receivers that no name shows to be Wi-Fi')
+    """
+    if not data.is_power:
+        return float(f"{float(data.rssi_dbm.nanmedian()):.3g}"), "the median of the measured values"
+    taken = [column for note in data.notes for column in re.findall(r"receiver = (\S+?)(?:,|$)", note)]
+    for name in (*data.receiver_names, *taken, data.name):
+        if WIFI.search(name):
+            return WIFI_DBM, f"the default for Wi-Fi, by the name {name}"
+    return OTHER_DBM, "the default for receivers that no name shows to be Wi-Fi"
 
 
 def at_least(
@@ -79,6 +109,19 @@ def reach(model: RssiModel | PairModel, max_open_variance: float = 0.5, max_wide
     return math.inf if is_flat or open_variance >= 1 else -kernel.matern12_length / 2 * math.log(1 - open_variance)
 
 
+def classified(
+    probability: NDArray[Any], measured: NDArray[np.bool_], certainty: float = CERTAINTY
+) -> NDArray[np.int64]:
+    """Return the number of the class of each cell in `CLASSES`.
+
+    Example:
+        >>> found = classified(np.array([0.95, 0.5, 0.1, 0.95]), np.array([True, True, True, False]))
+        >>> [CLASSES[number] for number in found]
+        ['covered', 'uncertain', 'not covered', 'not measured']
+    """
+    return np.where(measured, 1 + (probability > 1 - certainty) + (probability >= certainty), 0)
+
+
 @dataclass(frozen=True, eq=False)
 class Coverage:
     """Probability that a scan has at least a number of receivers above a threshold, on the cells of one floor.
@@ -89,7 +132,8 @@ class Coverage:
         measured: Those of them that a scan determines, bool (rows, columns).
         values: Fractions of the measured cells that are `covered` (probability of at least `certainty`), `not_covered` (at
             most 1 - `certainty`) and `uncertain`, of the cells inside that are `not_measured`, and of the `n_scans` scans
-            that are above, `scans_above`; with `threshold_dbm` and `reach_m`. None is a fraction of nothing, and no limit.
+            that are above, `scans_above`; with `threshold_dbm`, `certainty`, `at_least` (number of receivers) and
+            `reach_m`. None is a fraction of nothing, and no limit.
     """
 
     probability: NDArray[np.float64]
@@ -121,11 +165,53 @@ class Coverage:
         enclosed = inside(cells, known) if len(known) else np.zeros(probability.shape, dtype=bool)
         measured = enclosed & (cKDTree(known).query(cells)[0] <= reach)
         above = ((scans.rssi_dbm > threshold_dbm).sum(dim=1) >= number).numpy()
-        covered, not_covered = (probability >= certainty)[measured], (probability <= 1 - certainty)[measured]
-        parts = {"covered": covered, "not_covered": not_covered, "uncertain": ~covered & ~not_covered}
+        of_cell = classified(probability, measured, certainty)[measured]
+        parts = {name.replace(" ", "_"): of_cell == CLASSES.index(name) for name in CLASSES[:0:-1]}
         # a row at a receiver that moves is no scan
         parts |= {"not_measured": ~measured[enclosed], "scans_above": above[: 0 if scans.receiver_moves else None]}
         fractions = {name: float(part.mean()) if len(part) else None for name, part in parts.items()}
-        limited = {"threshold_dbm": threshold_dbm, "certainty": certainty, "n_scans": len(above)}
+        limited = {"threshold_dbm": threshold_dbm, "certainty": certainty, "at_least": number, "n_scans": len(above)}
         reach_m = reach if math.isfinite(reach) else None
         return cls(probability, enclosed, measured, {**limited, "reach_m": reach_m, **fractions})
+
+    def weak_spots(self, chart: RssiMap) -> DataFrame:
+        """Return the connected measured areas that are not covered, a row each, those without any coverage first.
+
+        Args:
+            chart: Map of detected packets that the coverage is of.
+
+        Returns:
+            `area_m2`, the part `not_covered_m2` of it, and its weakest cell: place `x_m` and `y_m`, the `probability`, the
+            best `receiver`, and the `missing_db` by which that is too weak for its detected packets to be above with the
+            certainty. For at least k receivers it is the k-th best one. 0 dB are missing where packets are lost.
+
+        Example:
+            >>> import swiftwrf
+            >>> floor = swiftwrf.rssi_room(n=60)
+            >>> chart = RssiMap.predict(swiftwrf.RssiModel().fit(floor), cell=1.0, detected=True)
+            >>> Coverage.of(chart, floor, (-50.0, 0.9, 1)).weak_spots(chart).columns.tolist()[:4]
+            ['x_m', 'y_m', 'area_m2', 'not_covered_m2']
+        """
+        threshold_dbm, certainty, number = (self.values[name] for name in ("threshold_dbm", "certainty", "at_least"))
+        of_cell = classified(self.probability, self.measured, certainty)
+        shortfall = threshold_dbm + ndtri(certainty) * chart.std.astype(float) - chart.mean
+        order = np.argsort(shortfall, axis=0, kind="stable")[number - 1]
+        missing = np.take_along_axis(shortfall, order[None], 0)[0]
+        areas, n_areas = label((of_cell == 1) | (of_cell == 2), np.ones((3, 3)))
+        rows = []
+        for area in (areas == one for one in range(1, n_areas + 1)):
+            weakest = np.unravel_index(np.where(area, missing, -np.inf).argmax(), area.shape)
+            rows.append(
+                {
+                    "x_m": float(chart.x[weakest[1]]),
+                    "y_m": float(chart.y[weakest[0]]),
+                    "area_m2": float(area.sum() * chart.cell**2),
+                    "not_covered_m2": float((of_cell[area] == 1).sum() * chart.cell**2),
+                    "probability": float(self.probability[weakest]),
+                    "missing_db": max(float(missing[weakest]), 0.0),
+                    "receiver": chart.receiver_names[order[weakest]],
+                }
+            )
+        columns = ["x_m", "y_m", "area_m2", "not_covered_m2", "probability", "missing_db", "receiver"]
+        found = DataFrame(rows, columns=columns)
+        return found.sort_values(["not_covered_m2", "area_m2"], ascending=False, ignore_index=True)

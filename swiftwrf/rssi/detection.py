@@ -130,6 +130,34 @@ class Detection:
         lost_count = (strong & ~seen).sum(dim=0).double() + misses_worth * misses
         return cls(limit + offset, width, lost_count / (strong.sum(dim=0) + misses_worth), is_limit)
 
+    @classmethod
+    def of_lists(cls, rssi: Tensor, margin_db: float, *, width: float = 2.0) -> tuple[Self, Tensor]:
+        """Return the curve of rows that list the strongest or associated receivers, and the shift of each cell.
+
+        A cell is empty if its power is below the weakest value of its row and a margin. The limit of the curve is one number
+        for all rows: with the shift, the power of an empty cell counts from the limit of its row. A value has no shift, and
+        is far above the limit, since every power may be listed.
+
+        Args:
+            rssi: Measurements (n, R) [dBm], nan where not listed.
+            margin_db: Margin above the weakest value of a row.
+            width: Standard deviation of the limit over rows [dB]. Not studied.
+
+        Returns:
+            Curve, and shift (n, R) [dB].
+
+        Example:
+            >>> curve, shift = Detection.of_lists(torch.tensor([[-60.0, float("nan")]]), 8.0)
+            >>> curve.limit - shift  # limit of the power in each cell
+            tensor([[-1000.,   -52.]], dtype=torch.float64)
+        """
+        n_receivers, far_below, far_above = rssi.shape[1], -1000.0, 1000.0  # [dBm]
+        weakest = rssi.double().nan_to_num(torch.inf).amin(dim=1, keepdim=True) + margin_db
+        weakest = weakest.where(weakest.isfinite(), far_above)  # a row without a value has no limit
+        each = torch.ones(n_receivers, dtype=torch.float64)
+        curve = cls(far_below * each, width, MISSES[0] * each, torch.ones(n_receivers, dtype=torch.bool))
+        return curve, (far_below - weakest).expand(rssi.shape).where(rssi.isnan(), 0.0)
+
     def note(self, receiver_names: Sequence[str]) -> str:
         """Return a sentence on the meaning of empty cells of these R receivers."""
         weak = [name for name, limit in zip(receiver_names, self.is_limit.tolist(), strict=True) if limit]

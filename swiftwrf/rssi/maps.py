@@ -15,7 +15,7 @@ from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
 from swiftwrf.data.dataset import DEGREE_UNITS, Arrays, Labelled, Numbers
 from swiftwrf.data.rssi import Rssi, receiver_row
 from swiftwrf.errors import InputError, listed
-from swiftwrf.models.prediction import Prediction
+from swiftwrf.models.prediction import Prediction, difference_unit, suffix
 from swiftwrf.plotting import Axes, Displayed, corners_of, hatch, plan_map
 from swiftwrf.positions import to_tensor
 from swiftwrf.rssi.base import RssiPredictor
@@ -39,6 +39,8 @@ class RssiMap(Labelled, Displayed):
         detection: Probability of a detection (R, rows, columns).
         receiver_names: Names of the receivers.
         origin: Latitude and longitude of x = y = 0, if they are known.
+        quantity: RSSI, or what else is predicted.
+        unit: Its unit.
     """
 
     x: Values
@@ -50,6 +52,8 @@ class RssiMap(Labelled, Displayed):
     detection: NDArray[np.float32]
     receiver_names: tuple[str, ...]
     origin: GeodeticOrigin | None = None
+    quantity: str = "RSSI"
+    unit: str = "dBm"
 
     @classmethod
     def predict(
@@ -107,13 +111,15 @@ class RssiMap(Labelled, Displayed):
             receiver_position=receiver,
             receiver_names=model.receiver_names,
             origin=model.origin,
+            quantity=model.quantity,
+            unit=model.unit,
         )
         with torch.no_grad():
             rssi = model.predict_detected(cells) if detected else model.predict(grid)
         assert rssi.std is not None
         fields = (rssi.mean, rssi.std, model.predict_detection(grid))
         mean, std, detection = (values.T.reshape(-1, len(y), len(x)).float().numpy() for values in fields)
-        return cls(x, y, z, cell, mean, std, detection, model.receiver_names, model.origin)
+        return cls(x, y, z, cell, mean, std, detection, model.receiver_names, model.origin, model.quantity, model.unit)
 
     def receivers(self, asked: Sequence[str]) -> RssiMap:
         """Return the map of receivers by their names, or by numbers counted from 1.
@@ -147,9 +153,10 @@ class RssiMap(Labelled, Displayed):
             InputError: An unknown receiver.
         """
         shown = self if receiver is None else self.receivers([receiver])
-        ax = plan_map(self.corners, shown.mean.max(axis=0), "predicted RSSI [dBm]", ax)
+        ax = plan_map(self.corners, shown.mean.max(axis=0), f"predicted {self.quantity} [{self.unit}]", ax)
         hatch(ax, self.x, self.y, shown.detection.max(axis=0) < 0.5)
-        ax.set_title(f"predicted RSSI of {'the strongest receiver' if receiver is None else shown.receiver_names[0]}")
+        of = "the strongest receiver" if receiver is None else shown.receiver_names[0]
+        ax.set_title(f"predicted {self.quantity} of {of}")
         return ax
 
     def __repr__(self) -> str:
@@ -168,10 +175,16 @@ class RssiMap(Labelled, Displayed):
         n_receivers = len(self.receiver_names)
         return pd.DataFrame({name: np.tile(values, n_receivers) for name, values in cells.items()}).assign(
             receiver=np.repeat(self.receiver_names, len(x)),
-            predicted_dbm=self.mean.ravel(),
-            std_db=self.std.ravel(),
+            **{
+                f"predicted_{suffix(self.unit)}": self.mean.ravel(),
+                f"std_{suffix(self._differences)}": self.std.ravel(),
+            },
             detection=self.detection.ravel(),
         )
+
+    @property
+    def _differences(self) -> str:
+        return difference_unit(self.unit)
 
     def coordinates(self) -> Arrays:
         metres = {"units": "m"}
@@ -189,5 +202,6 @@ class RssiMap(Labelled, Displayed):
     def variables(self) -> Arrays:
         dimensions = ("receiver", "y", "x")
         detection = (dimensions, self.detection, {"long_name": "probability of a detection"})
-        values = {"rssi": (dimensions, self.mean, {"units": "dBm"}), "std": (dimensions, self.std, {"units": "dB"})}
+        values = {suffix(self.quantity): (dimensions, self.mean, {"units": self.unit})}
+        values |= {"std": (dimensions, self.std, {"units": self._differences})}
         return values | {"detection": detection}

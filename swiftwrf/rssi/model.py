@@ -26,7 +26,8 @@ from swiftwrf.models.base import CPU
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Axes
 from swiftwrf.positions import check_positions
-from swiftwrf.rssi.base import Map, RssiConfig, RssiPredictor, columns_of
+from swiftwrf.rssi.base import Map, RssiPredictor, columns_of
+from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.detection import Detection, DetectionField
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.path_loss import PathLoss, log_distance
@@ -95,14 +96,17 @@ class RssiModel(RssiPredictor, Saved):
         progress: bool = False,
         **_: Any,
     ) -> None:
-        candidates = prepare(pool, columns_of(train.receiver_names, pool), self.config, shift, curve)
-        parallel = parallel or _in_threads
-        fit, *others = (fit_receivers(training, self.config, device, parallel, progress) for training in candidates)
+        config = self.config if curve is not None else replace(self.config, not_detected="unknown")
+        of_lists = pool.margin_db is not None and config.not_detected == "auto"  # limits of rows, not of a receiver
+        candidates = prepare(pool, columns_of(train.receiver_names, pool), config, shift, curve)
+        parallel, candidates = parallel or _in_threads, candidates[: 1 if of_lists else None]
+        fit, *others = (fit_receivers(training, config, device, parallel, progress) for training in candidates)
         for without_limits in others:  # as probable as values of a mean error that is 1 % lower
             is_better = without_limits.score > fit.score + 0.01 * float(train.detected.sum())
             fit = without_limits if is_better else fit
-        training, rows = fit.training, fit.training.bin_of_row
-        self.detection, self.detection_field = training.path_loss.detection, fit.detection_field
+        self.detection_field, training, rows = None, fit.training, fit.training.bin_of_row
+        if not of_lists:
+            self.detection, self.detection_field = training.path_loss.detection, fit.detection_field
         predicted, std, means = fit.predicted[:, rows], fit.std[-1, rows], training.path_loss.shared(fit.distance)
         for out, kept in each_fold(training.fold):
             mean = training.rssi[kept].nanmean(dim=0)
@@ -194,8 +198,10 @@ class RssiModel(RssiPredictor, Saved):
             kept[without] = False
         at, rssi, attenuation = self.region()[kept], posterior.rssi[kept], self.attenuation
         rows = Rssi(
-            rssi if attenuation is None else rssi + attenuation.of(at),
+            self.value_centre + self.value_scale * (rssi if attenuation is None else rssi + attenuation.of(at)),
             at,
+            quantity=self.quantity,
+            unit=self.unit,
             receiver_position=self.receiver_position,
             receiver_names=self.receiver_names,
             origin=self.origin,

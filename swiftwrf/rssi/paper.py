@@ -19,7 +19,8 @@ from torch.nn import functional
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.errors import FitError, InputError
 from swiftwrf.models.base import CPU
-from swiftwrf.rssi.base import Map, RssiConfig, columns_of, often_detected
+from swiftwrf.rssi.base import Map, columns_of, often_detected
+from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import Head, Heads, mean_magnitude, render
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.regression import RssiPosterior, held_out_std

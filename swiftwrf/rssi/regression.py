@@ -31,7 +31,7 @@ from torch.nn import functional
 from swiftwrf.data.splits import each_fold
 from swiftwrf.errors import FitError, InputError
 from swiftwrf.gp import GaussianProcess, Kernel, held_out_errors, subsample
-from swiftwrf.rssi.base import RssiConfig
+from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.detection import empty_given
 from swiftwrf.rssi.head import Heads
 from swiftwrf.rssi.path_loss import PathLoss, harmonics, log_distance

@@ -14,7 +14,8 @@ from swiftwrf.data.splits import MIN_TRAINING, each_fold, folds
 from swiftwrf.errors import InputError
 from swiftwrf.gp import Kernel, candidates, held_out_errors, subsample
 from swiftwrf.positions import cells
-from swiftwrf.rssi.base import RssiConfig, often_detected
+from swiftwrf.rssi.base import often_detected
+from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.detection import Detection, empty_given
 from swiftwrf.rssi.head import Heads
 from swiftwrf.rssi.path_loss import PathLosses, fit_path_losses, log_distance

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import re
 import textwrap
@@ -18,6 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 from numpy.typing import ArrayLike, NDArray
 from pandas import DataFrame
+from PIL import Image
 
 from tasks.labels import colour
 
@@ -88,7 +90,16 @@ def as_svg(figure: Figure, title: str | None = None) -> str:
             metadata["Title"] = title
         # print_figure would draw it twice
         canvas.print_svg(stream, metadata=metadata)  # type: ignore[no-untyped-call]
-    return stream.getvalue()
+    svg = re.sub(r'(data:image/png;base64,\s*)([^"]+)', _with_palette, stream.getvalue())
+    return re.sub(r' d="[^"]+"', lambda path: re.sub(r"(\.\d)\d+", r"\1", path[0]), svg)  # tenths of a point
+
+
+def _with_palette(image: re.Match[str]) -> str:
+    """Return an image of an SVG in 256 colours, a third of the bytes."""
+    written = io.BytesIO()
+    with Image.open(io.BytesIO(base64.b64decode(image[2]))) as pixels:
+        pixels.convert("RGBA").quantize(256, Image.Quantize.FASTOCTREE).save(written, "PNG", optimize=True)
+    return f"{image[1]}{base64.b64encode(written.getvalue()).decode()}"
 
 
 def for_page(svg: str, name: str) -> str:

@@ -74,7 +74,7 @@ class Plot:
 class Section:
     """A heading and what follows it: paragraphs, tables, plots, meanings of names, and sections below it.
 
-    Text between backticks is shown as code.
+    Text between backticks is shown as code. A part that is `folded` opens by a click on its title.
     """
 
     title: str
@@ -83,6 +83,7 @@ class Section:
     plots: list[Plot] = field(default_factory=list)
     terms: dict[str, str] = field(default_factory=dict)
     parts: list[Section] = field(default_factory=list)
+    folded: bool = False
 
     @property
     def all_plots(self) -> list[Plot]:

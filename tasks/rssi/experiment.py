@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from swiftwrf import InputError, Rssi, rssi_room
-from swiftwrf.contrib.comparison.rssi import compare, compared
+from swiftwrf.contrib.comparison.predictors import compared
+from swiftwrf.contrib.comparison.rssi import compare
 from swiftwrf.data.files import sha256
 from swiftwrf.data.formats import RSSI_FORMATS
+from swiftwrf.models.prediction import difference_unit
 from tasks.configs import RssiTaskConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
@@ -41,7 +43,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     source = data.source | ({"floor plan": sha256(Path(config.floor_plan))} if config.floor_plan else {})
 
     def described(value: Row) -> str:
-        return f"{value['median']:.2f} dB" if "median" in value else ""
+        return f"{value['median']:.2f} {difference_unit(whole.unit)}" if "median" in value else ""
 
     with (
         connected(config.scheduler, device) as cluster,
@@ -59,6 +61,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
                 validation=config.validation,
                 reference=how.reference if how else None,
                 fewer=FEWER,
+                above=config.above,
                 device=device,
                 keep=directory,
                 executor=workers,

@@ -2,44 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from numpy.typing import NDArray
-from pandas import DataFrame
+from pandas import DataFrame, concat
 
 from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
 from swiftwrf.metrics import HALF_WIDTH, LEVEL
+from swiftwrf.models.prediction import difference_unit
 from swiftwrf.plotting import corners_of, hatch
+from swiftwrf.rssi.coverage import CLASSES, classified
+from tasks.labels import COVERAGE
 from tasks.page import figures, maps
 from tasks.page.page import Plot
 from tasks.records import Records, Row
 
-MAX_MAPS = 24  # receivers with a map in the report; all are in the tables
+MAX_MAPS = 36  # of receivers, in a report of several floors; all are in the tables, and on the page of swiftwrf view
+FIRST_MAPS = 6  # of the receivers of a floor that are not folded
+MAX_SPOTS = 5  # weak spots of a floor with a number on its map
 MAX_WIDTH_DB = 30.0  # end of the scale of interval widths of the page
 MAX_RATIO = 12.0  # of the sides of a map that is to scale; one of a corridor would be a line
 MIN_RATIO = 1.2  # of the widest interval inside to the median one, for which the widths are drawn
 RECEIVER = "#cf4a4a"
 WIDTH_PER_STD = 2 * HALF_WIDTH  # of the interval of a normal variable
-
-
-def coverage_sentence(found: Row, where: str = "the measured area") -> str:
-    """Return a coverage in words, by `Coverage.values` and the name of the measured area."""
-    if found["covered"] is None:
-        return f"No cell of the map is in {where}."
-    shares = {name: f"{share:.0%}" for name, share in found.items() if isinstance(share, float)}
-    sentence = (
-        f"{shares['covered']} of {where} is covered, {shares['not_covered']} is not, {shares['uncertain']} is uncertain"
-    )
-    if found["scans_above"] is not None:
-        sentence += f"; {shares['scans_above']} of the {found['n_scans']} scans pass"
-    if (part := shares["not_measured"]) != "0%":
-        far = f"over {found['reach_m']:.1f} m from any scan"
-        sentence += f". {part} of the area between the scans is not measured, {far}"
-    return f"{sentence}."
 
 
 @dataclass(frozen=True)
@@ -95,6 +88,25 @@ class Maps:
         return "" if len(self.arrays["floor_names"]) == 1 else f"-{self.floor}"
 
     @property
+    def quantity(self) -> str:
+        """Predicted quantity: RSSI, or another one."""
+        return str(self.run.metrics.get("quantity", "RSSI"))
+
+    @property
+    def unit(self) -> str:
+        """Unit of the values."""
+        return str(self.run.metrics.get("unit", "dBm"))
+
+    @property
+    def error_unit(self) -> str:
+        """Unit of differences of the values."""
+        return difference_unit(self.unit)
+
+    def amount(self, difference: float) -> str:
+        """Return a difference of values with its unit, in dB without decimals."""
+        return f"{difference:.0f} dB" if self.error_unit == "dB" else f"{difference:.2g} {self.error_unit}"
+
+    @property
     def names(self) -> list[str]:
         """Names of the receivers."""
         return [str(name) for name in self.arrays["receiver_names"]]
@@ -113,6 +125,79 @@ class Maps:
         far = "" if reach is None else f" or more than {reach:.1f} m from any scan"
         return f"Hatched like /: not measured, outside the scans{far}; like \\: a packet is more likely lost than received."
 
+    @property
+    def classes(self) -> NDArray[np.int64]:
+        """Number in `CLASSES` of each cell, at the first threshold."""
+        return classified(self.arrays["above"], self.arrays["known"], self.coverage["certainty"])
+
+    @property
+    def spots(self) -> list[Row]:
+        """Weak spots of this floor at the first threshold, the first ones those without any coverage."""
+        here = str(self.arrays["floor_names"][self.floor]) if self.suffix else None
+        return [
+            spot
+            for spot in self.run.table("weak_spots").to_dict("records")
+            if spot["threshold_dbm"] == self.coverage["threshold_dbm"] and here in (None, spot["floor"])
+        ]
+
+    def covered(self, width: float = 4.6) -> Figure:
+        """Draw the classes of coverage, the scans and the first weak spots by their numbers."""
+        a, classes = self.arrays, self.classes
+        figure, ax, (extent, aspect) = self._axes(width, legend=0.45)
+        colours = ListedColormap([COVERAGE[name] for name in CLASSES])
+        style: dict[str, Any] = {"cmap": colours, "vmin": -0.5, "vmax": len(CLASSES) - 0.5, "interpolation": "none"}
+        opacity = 1.0 if self.plan is None else 0.75
+        ax.imshow(classes, origin="lower", extent=extent, aspect=aspect, alpha=opacity, zorder=1, **style)
+        many = len(a["measured_position"]) >= figures.MAX_VECTOR_MARKS
+        ax.plot(*a["measured_position"][:, :2].T, ".", color="black", markersize=1.2, rasterized=many, zorder=2)
+        self._mark_receivers(ax, None)
+        style = {"fontsize": 8, "color": "#000001", "ha": "center", "va": "center", "zorder": 5}
+        for rank, spot in enumerate(self.spots[:MAX_SPOTS], start=1):
+            box: dict[str, Any] = {"boxstyle": "circle,pad=0.15", "facecolor": "white", "linewidth": 0.6}
+            ax.text(
+                spot["x_m"],
+                spot["y_m"],
+                str(rank),
+                fontsize=8,
+                color="#000001",
+                bbox=box,
+                ha="center",
+                va="center",
+                zorder=5,
+            )
+        shares = {name: self.coverage[name.replace(" ", "_")] for name in reversed(CLASSES)}
+        patches = [
+            Patch(color=COVERAGE[name], label=name if share is None or name == CLASSES[0] else f"{name} {share:.0%}")
+            for name, share in shares.items()
+        ]
+        figure.legend(handles=patches, loc="outside lower center", ncols=2, frameon=False)
+        if self.suffix:
+            ax.set_title(figures.short(self.name), fontsize=10)
+        return figure
+
+    @classmethod
+    def coverage_plot(cls, floors: Sequence[Maps]) -> Plot:
+        """Return the map of coverage of each floor of a run."""
+        first = floors[0]
+        found, several = first.coverage, len(first.names) > 1
+        who = f"one of {len(first.names)} receivers" if several else first.names[0]
+        far = "" if found["reach_m"] is None else f", or farther than {found['reach_m']:.1f} m from any"
+        caption = (
+            f"Coverage: a packet at {who} is above {found['threshold_dbm']:g} {first.unit} with a probability of at least "
+            f"{found['certainty']:.0%} (covered), of at most {1 - found['certainty']:.0%} (not covered), or between them "
+            f"(uncertain). Percentages are of the measured area. Grey: not between the scans (dots){far}. Numbers: weak "
+            "spots of the table. Crosses: receivers."
+        )
+        names = np.array(CLASSES)
+        data = [
+            maps._cells({"above": maps.arrays["above"][None]}, [maps.titled("coverage")]).assign(
+                coverage=names[maps.classes.ravel()]
+            )
+            for maps in floors
+        ]
+        width = 4.6 if len(floors) > 1 else 5.8
+        return Plot("coverage", [maps.covered(width) for maps in floors], caption, concat(data, ignore_index=True))
+
     def summary(self) -> Plot:
         """Return map and uncertainty of the only receiver, or of the best server."""
         several = len(self.names) > 1
@@ -121,9 +206,9 @@ class Maps:
         kinds = ("predicted", "width") if self.varies else ("predicted",)
         panels = [self._panel(self.best, kind, title, receiver, 4.6 if self.varies else 5.4) for kind in kinds]
         widths = f"width of the {LEVEL:.0%} interval of a measurement"
-        same = f"; the {widths} is about {self.widest[3]:.0f} dB in the whole measured area"
+        same = f"; the {widths} is about {self.amount(self.widest[3])} in the whole measured area"
         widths = f", and the {widths}" if self.varies else same
-        caption = f"Predicted RSSI{widths}. {self.hatched}" + (
+        caption = f"Predicted {self.quantity}{widths}. {self.hatched}" + (
             " The best server is the receiver with the highest prediction; crosses mark receivers."
             if several
             else " Dots: training measurements in the colours of the map, hollow where nothing was received; the cross "
@@ -133,59 +218,69 @@ class Maps:
         data = self._cells({kind: values[None] for kind, values in fields.items()}, [title])
         return Plot(f"summary{self.suffix}", panels, caption, data)
 
-    def by_receiver(self, kind: str) -> Plot:
-        """Return maps of the receivers that detected most rows: "predicted", or "width" for that of the intervals."""
-        detected = (~np.isnan(self.arrays["measured"])).sum(axis=0)
-        shown = sorted(np.argsort(-detected, kind="stable")[:MAX_MAPS].tolist())
+    def by_receiver(self, kind: str, first: bool = True) -> Plot | None:
+        """Return maps of the receivers that are strongest in the measured area: "predicted", or "width" of the intervals.
+
+        The `first` ones are those that are not folded. None if there are no others.
+        """
+        a = self.arrays
+        strength = a["predicted"][:, a["known"] if a["known"].any() else ...].reshape(len(self.names), -1).mean(axis=1)
+        strongest = np.argsort(-strength, kind="stable").tolist()
+        most = max(FIRST_MAPS, MAX_MAPS // len(a["floor_names"]))
+        shown = strongest[:FIRST_MAPS] if first else strongest[FIRST_MAPS:most]
+        if not shown:
+            return None
         names, fields = [self.names[i] for i in shown], ("predicted", "width", "detection")
-        data = self._cells({name: self.arrays[name][shown] for name in fields}, names)
-        values = [{name: self.arrays[name][i] for name in fields} for i in shown]
-        panels = [
-            self._panel(each, kind, self.titled(self.names[i]), i, 3.6) for each, i in zip(values, shown, strict=True)
-        ]
-        what = "Predicted RSSI" if kind == "predicted" else f"Width of the {LEVEL:.0%} interval"
-        caption = (
-            f"{what} at each receiver. {self.hatched} Hollow dots: nothing was received. A cross marks the receiver."
-        )
-        name = "map" if kind == "predicted" else "width"
+        data = self._cells({name: a[name][shown] for name in fields}, names)
+        values = [{name: a[name][i] for name in fields} for i in shown]
+        panels = [self._panel(each, kind, self.names[i], i, 3.6) for each, i in zip(values, shown, strict=True)]
+        what = f"Predicted {self.quantity}" if kind == "predicted" else f"Width of the {LEVEL:.0%} interval"
+        which = f"the {len(shown)} strongest of {len(self.names)} receivers" if first else "the next ones"
+        caption = f"{what} at {which}. {self.hatched} Hollow dots: nothing was received. A cross marks the receiver."
+        name = ("map" if kind == "predicted" else "width") + ("" if first else "-more")
         return Plot(f"{name}-{self.run.file_name}{self.suffix}", panels, caption, data)
+
+    def _axes(self, width: float, legend: float = 0.0) -> tuple[Figure, Axes, tuple[Any, Literal["equal", "auto"]]]:
+        """Return a figure and axes of the floor above its plan, with the edges of the map and its aspect."""
+        x0, x1, y0, y1 = extent = corners_of(self.arrays["x"], self.arrays["y"])
+        shape = (y1 - y0) / (x1 - x0)
+        aspect: Literal["equal", "auto"] = "equal" if 1 / MAX_RATIO <= shape <= MAX_RATIO else "auto"
+        figure, ax = figures.panel(width, 0.8 + legend + (width - 1.2) * float(np.clip(shape, 0.4, 1.6)))
+        if (plan := self.plan) is not None:
+            ax.imshow(plan.pixels, extent=plan.corners, aspect="equal", zorder=0)
+        ax.set(xlabel="x [m]", ylabel="y [m]")
+        ax.grid(visible=False)
+        return figure, ax, (extent, aspect)
+
+    def _mark_receivers(self, ax: Axes, receiver: int | None) -> None:
+        for number, at in enumerate(self.arrays["receiver"]):
+            if receiver in (None, number) and np.isfinite(at).all():
+                for size, colour in ((4.5, "#fffffd"), (2.0, RECEIVER)):
+                    ax.plot(*at[:2], "x", color=colour, markersize=8, markeredgewidth=size, zorder=4)
 
     def _panel(
         self, fields: dict[str, NDArray[Any]], kind: str, title: str, receiver: int | None, width: float = 4.6
     ) -> Figure:
         """Draw one map, with the measurements of a receiver, or with all receivers for None."""
         a, values = self.arrays, fields[kind]
-        x0, x1, y0, y1 = corners_of(a["x"], a["y"])
-        shape = (y1 - y0) / (x1 - x0)
-        aspect: Literal["equal", "auto"] = "equal" if 1 / MAX_RATIO <= shape <= MAX_RATIO else "auto"
-        figure, ax = figures.panel(width, 0.8 + (width - 1.2) * float(np.clip(shape, 0.4, 1.6)))
+        figure, ax, (extent, aspect) = self._axes(width)
         limits, colours = (self._widths, "magma") if kind == "width" else (self._limits, "viridis")
         if kind == "predicted" and receiver is None:
             limits = (float(values.min()), float(values.max()))
         style: dict[str, Any] = {"cmap": colours, "vmin": limits[0], "vmax": limits[1]}
-        if (plan := self.plan) is not None:
-            ax.imshow(plan.pixels, extent=plan.corners, aspect="equal", zorder=0)
-        opacity = 1.0 if plan is None else 0.75
-        drawn = ax.imshow(
-            values, origin="lower", extent=(x0, x1, y0, y1), alpha=opacity, zorder=1, aspect=aspect, **style
-        )
+        opacity = 1.0 if self.plan is None else 0.75
+        drawn = ax.imshow(values, origin="lower", extent=extent, alpha=opacity, zorder=1, aspect=aspect, **style)
         hatch(ax, a["x"], a["y"], ~a["known"])
         hatch(ax, a["x"], a["y"], fields["detection"] < 0.5, "\\\\\\\\")
-        ax.set(xlabel="x [m]", ylabel="y [m]")
-        ax.grid(visible=False)
         known = a["measured_position"]
         if receiver is not None and kind == "predicted":
             detected = ~np.isnan(a["measured"][:, receiver])
-            many = len(detected) >= figures.MAX_VECTOR_MARKS
-            ax.plot(*known[~detected, :2].T, "o", markersize=3, markerfacecolor="none", color="white", rasterized=many)
-            style |= {"zorder": 3, "edgecolors": "white", "linewidths": 0.4, "rasterized": many}
+            ax.plot(*known[~detected, :2].T, "o", markersize=3, markerfacecolor="none", color="white", rasterized=True)
+            style |= {"zorder": 3, "edgecolors": "white", "linewidths": 0.4, "rasterized": True}
             ax.scatter(known[detected, 0], known[detected, 1], s=9, c=a["measured"][detected, receiver], **style)
-        for number, at in enumerate(a["receiver"]):
-            if receiver in (None, number) and np.isfinite(at).all():
-                for size, colour in ((4.5, "#fffffd"), (2.0, RECEIVER)):
-                    ax.plot(*at[:2], "x", color=colour, markersize=8, markeredgewidth=size, zorder=4)
+        self._mark_receivers(ax, receiver)
         ax.set_title(figures.short(title), fontsize=9)
-        label = "interval width [dB]" if kind == "width" else "predicted RSSI [dBm]"
+        label = f"interval width [{self.error_unit}]" if kind == "width" else f"predicted {self.quantity} [{self.unit}]"
         figures.colour_bar(ax, drawn, label, "both")
         return figure
 
@@ -208,7 +303,7 @@ class Maps:
     @cached_property
     def _widths(self) -> tuple[float, float]:
         low, high = np.quantile(self.arrays["width"], (0.01, 0.99)).tolist()
-        return float(np.floor(low)), float(np.ceil(high))
+        return (float(np.floor(low)), float(np.ceil(high))) if high > 1 else (low, high)
 
     @cached_property
     def _limits(self) -> tuple[float, float]:

@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.contrib.comparison.errors import paired_difference
 from swiftwrf.contrib.comparison.leave_one_out import LEAVE_ONE_OUT
-from swiftwrf.contrib.comparison.rssi import CERTAINTY, COVERED_DBM
 from swiftwrf.data.splits import places
 from swiftwrf.metrics import LEVEL
+from swiftwrf.models.prediction import difference_unit
 from tasks.labels import PREDICTORS, colour, meanings
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of
@@ -30,8 +30,9 @@ from tasks.page.shared import (
     recommendation,
 )
 from tasks.records import Records, notes
+from tasks.rssi import coverage
 from tasks.rssi.differences import where_methods_differ
-from tasks.rssi.maps import MIN_RATIO, WIDTH_PER_STD, Maps, coverage_sentence
+from tasks.rssi.maps import MIN_RATIO, WIDTH_PER_STD, Maps
 from tasks.terminal import Answer, Method, NextStep
 
 COLUMNS = ["index", "place", "receiver", "method", "abs_error_db"]  # of the errors of methods
@@ -54,13 +55,13 @@ def page(runs: list[Records]) -> Page:
     """Return the page of these runs."""
     answers = {run: answer(run) for run in runs}
     sections = [
+        sections_of("Coverage", runs, coverage.section),
         sections_of("Errors", runs, lambda run: _errors(run, answers[run]), meanings(RSSI_PREDICTORS)),
-        sections_of("Where the errors are", runs, lambda run: Section("", plots=[_where(run)])),
-        limits(runs[0], *LIMITS),
+        limits(runs[0], *(LIMITS if Maps(runs[0]).quantity == "RSSI" else ())),
     ]
     details = [provenance(runs)]
-    if len(runs) > 1 or any(len(Maps(run).names) > 1 for run in runs):
-        sections.insert(0, sections_of("Maps", runs, partial(_maps, kind="predicted")))
+    if len(runs) > 1 or any(len(Maps(run).names) > 1 or Maps(run).suffix for run in runs):
+        sections.insert(1, sections_of("Maps", runs, partial(_maps, kind="predicted")))
         by_receiver = sections_of("Errors by receiver", runs, lambda run: Section("", plots=_differences(run)))
         details[:0] = [by_receiver, sections_of("Widths of the intervals", runs, partial(_maps, kind="width"))]
     names = ", ".join(dict.fromkeys(run.place for run in runs))
@@ -69,28 +70,38 @@ def page(runs: list[Records]) -> Page:
     else:
         named = {f"{run.number}: {run.place}": one for run, one in answers.items()}
         first = compared(named, runs, COLOURS, "absolute error")
-    return Page(f"RSSI: {names}", first, sections, details, answer=answers[runs[0]])
+    return Page(f"{Maps(runs[0]).quantity}: {names}", first, sections, details, answer=answers[runs[0]])
 
 
 def _summary(run: Records, found: Answer) -> Summary:
     floors, interval = Maps.of_floors(run), run.metrics["interval"]
     error = {name: entry["abs_error_db"] for name, entry in run.metrics["overall"].items()}
     best = best_baseline(run)
+    threshold, unit = floors[0].coverage["threshold_dbm"], floors[0].error_unit
     numbers = [
         *(
-            Number(f"{maps.coverage['covered'] or 0:.0%}", f"of {maps.place} above {COVERED_DBM:g} dBm")
+            Number(f"{maps.coverage['covered'] or 0:.0%}", f"of {maps.place} above {threshold:g} {maps.unit}")
             for maps in floors
         ),
-        Number(f"{error[found.chosen]['median']:.2f} dB", f"median absolute error of {found.chosen}"),
-        Number(f"{error[best]['median']:.2f} dB", f"that of {best}, the best other method"),
+        Number(f"{error[found.chosen]['median']:.2f} {unit}", f"median absolute error of {found.chosen}"),
+        Number(f"{error[best]['median']:.2f} {unit}", f"that of {best}, the best other method"),
         Number(f"{interval['coverage']:.0%}", f"of the test measurements in their {interval['nominal']:.0%} interval"),
     ]
-    plots = [maps.summary() for maps in floors]
+    plots = [Maps.coverage_plot(floors), *(maps.summary() for maps in floors if len(floors) == 1)]
     return Summary(numbers, plots, found.conclusion, found.next_steps, notes=notes(run))
 
 
 def _maps(run: Records, kind: str) -> Section:
-    return Section("", plots=[maps.by_receiver(kind) for maps in Maps.of_floors(run)])
+    """Return the maps of the strongest receivers of each floor, the others folded."""
+    floors = Maps.of_floors(run)
+    parts = []
+    for maps in floors:
+        first = [maps.summary()] if len(floors) > 1 and kind == "predicted" else []
+        part = Section(maps.name if maps.suffix else "", plots=[*first, *filter(None, [maps.by_receiver(kind)])])
+        if kind == "predicted" and (more := maps.by_receiver(kind, first=False)) is not None:
+            part.parts.append(Section("More receivers", plots=[more], folded=True))
+        parts.append(part)
+    return Section("", parts=parts) if len(floors) > 1 else parts[0]
 
 
 def _errors(run: Records, found: Answer) -> Section:
@@ -110,21 +121,23 @@ def _errors(run: Records, found: Answer) -> Section:
         panels=_by_rows(run),
     )
     section.tables.append(where_methods_differ(run, found))
+    section.parts.append(Section("Where the errors are", plots=[_where(run)]))
     return section
 
 
 def answer(run: Records) -> Answer:
     """Return the answer of a run."""
     own, errors, methods = model_of(run), by_method(run.table("errors")[COLUMNS]), []
-    chosen = recommendation(run, own, "dB")[0]
+    unit = Maps(run).error_unit
+    chosen = recommendation(run, own, unit)[0]
     scored = any(entry.get("detection") for entry in run.metrics["overall"].values())
     for name, entry in run.metrics["overall"].items():
         detection = entry.get("detection")
-        cells = {f"{own} minus it [dB]": difference(errors, own, name)}
+        cells = {f"{own} minus it [{unit}]": difference(errors, own, name)}
         cells |= {"detection": number(None if detection is None else sum(detection) / 2)} if scored else {}
         seconds = entry["seconds"]["fit"], entry["seconds"]["predict"]
         methods.append(Method(name, entry["abs_error_db"], name in REFERENCES and name != chosen, seconds, cells))
-    return Answer("dB", methods, chosen, conclusion(run), steps(run), (own, best_baseline(run)))
+    return Answer(unit, methods, chosen, conclusion(run), steps(run), (own, best_baseline(run)))
 
 
 def model_of(run: Records) -> str:
@@ -144,7 +157,9 @@ def conclusion(run: Records) -> list[str]:
     """Return coverage and error, how sure they are, and how the model compares with the best baseline."""
     best, interval = best_baseline(run), run.metrics["interval"]
     own, floors, names = model_of(run), Maps.of_floors(run), list(run.metrics["receivers"])
+    unit = floors[0].error_unit
     who = f"one of {len(names)} receivers" if len(names) > 1 else names[0]
+    first = floors[0].coverage
     covered = [f"{maps.coverage['covered'] or 0:.0%} of {maps.place}" for maps in floors]
     error = run.metrics["overall"][own]["abs_error_db"]
     errors = by_method(run.table("errors")[COLUMNS])
@@ -156,15 +171,17 @@ def conclusion(run: Records) -> list[str]:
             "intervals of so few positions vary by chance."
         )
     sure = (
-        f"90 % of the errors are below {error['p90']:.1f} dB, and {interval['coverage']:.0%} of the measurements lie in "
+        f"90 % of the errors are below {error['p90']:.1f} {unit}, and {interval['coverage']:.0%} of the measurements lie in "
         f"their {interval['nominal']:.0%} intervals. {tested}"
     )
-    compared = comparison_sentence(errors, own, best, name=own, unit="dB", rows="pairs")
+    compared = comparison_sentence(errors, own, best, name=own, unit=unit, rows="pairs")
     return [
-        *recommendation(run, own, "dB")[1],
-        f"{', '.join(covered)} {'has' if len(covered) == 1 else 'have'} {who} above {COVERED_DBM:g} dBm with "
-        f"{CERTAINTY:.0%} certainty; predictions are within {error['median']:.1f} dB (median error).",
-        *(coverage_sentence(maps.coverage, maps.place) for maps in floors),
+        *recommendation(run, own, unit)[1],
+        f"{', '.join(covered)} {'has' if len(covered) == 1 else 'have'} {who} above {first['threshold_dbm']:g} "
+        f"{floors[0].unit} with {first['certainty']:.0%} certainty; predictions are within {error['median']:.1f} {unit} "
+        "(median error).",
+        *(coverage.coverage_sentence(maps.coverage, maps.place) for maps in floors),
+        *filter(None, [coverage.spots_sentence(floors), coverage.held_out_sentence(run), coverage.why(run)]),
         sure,
         compared,
     ]
@@ -175,7 +192,8 @@ def steps(run: Records) -> list[NextStep]:
     interval = run.metrics["interval"]
     pairs = model_of(run) == "pairs"  # its maps depend on both ends, and the page shows one
     own = [NextStep(where_next(run))]
-    if unknown := int(np.isnan(run.arrays("maps")["receiver"]).any(axis=1).sum()):
+    unknown = int(np.isnan(run.arrays("maps")["receiver"]).any(axis=1).sum())
+    if unknown and Maps(run).quantity == "RSSI":
         text = f"Give the unknown positions of access points ({unknown}), in `receivers.csv` beside the table"
         own.insert(0, NextStep(text, "receiver,x,y,z"))
     n_places = run.table("errors")["place"].nunique()
@@ -199,20 +217,20 @@ def where_next(run: Records) -> str:
         for maps in varied:
             x, y, width, typical = maps.widest
             at = f"x = {x:.1f} m, y = {y:.1f} m{f' on {maps.name}' if maps.suffix else ''}"
-            widest.append(f"{at} ({width:.0f} dB instead of {typical:.0f} dB)")
+            widest.append(f"{at} ({maps.amount(width)} instead of {maps.amount(typical)})")
         best = " of the best server" if len(floors[0].names) > 1 else ""
         return f"Measure around {', '.join(widest)}: the {LEVEL:.0%} interval{best} is widest there."
     if (n := int(places(torch.from_numpy(run.arrays("maps")["measured_position"])).max()) + 1) < MIN_POSITIONS:
-        return f"Measure at more positions: {n} are too few to show how RSSI varies between them."
+        return f"Measure at more positions: {n} are too few to show how {floors[0].quantity} varies between them."
     typical, scatter = max(maps.widest[3] for maps in floors), scatter_of_repeats(run)
     reason = "and the model explains no more"
     if scatter is not None and typical < MAX_RATIO_TO_SCATTER * scatter:
         reason = "which is the scatter of repeated measurements at one place"
     elif scatter is not None:
-        reason += f", though repeated measurements at one place lie within {scatter:.0f} dB"
+        reason += f", though repeated measurements at one place lie within {floors[0].amount(scatter)}"
     return (
-        f"More positions between the scans would hardly narrow the {LEVEL:.0%} interval: it is about {typical:.0f} dB wide, "
-        f"and less than {MIN_RATIO:g} times as wide in any place, {reason}."
+        f"More positions between the scans would hardly narrow the {LEVEL:.0%} interval: it is about "
+        f"{floors[0].amount(typical)} wide, and less than {MIN_RATIO:g} times as wide in any place, {reason}."
     )
 
 
@@ -234,7 +252,7 @@ def _by_rows(run: Records) -> list[Figure]:
     names = list(next(iter(found.values())))
     figure, axes = figures.panel(5.6, 3.2)
     lines = {name: ([int(n) for n in found], [row[name] for row in found.values()]) for name in names}
-    figures.curves(axes, COLOURS, lines, "training rows", "mean absolute error [dB]")
+    figures.curves(axes, COLOURS, lines, "training rows", f"mean absolute error [{Maps(run).error_unit}]")
     axes.set_ylim(0, None)
     return [figure]
 
@@ -251,7 +269,7 @@ def _differences(run: Records) -> list[Plot]:
             found[name] = paired_difference(at_receiver, own, best)
     names = sorted(found, key=lambda name: found[name][0])
     shown, values = names[:MAX_RECEIVERS], {own: [found[name] for name in names]}
-    label = f"{own} minus {best}, mean absolute error [dB]"
+    label = f"{own} minus {best}, mean absolute error [{Maps(run).error_unit}]"
     figure = figures.dots(shown, {own: values[own][: len(shown)]}, COLOURS, label, zero=True)
     caption = (
         f"Difference of the mean absolute error of {own} from that of {best}, the best baseline, at each receiver on "
@@ -275,7 +293,8 @@ def _where(run: Records) -> Plot:
     ax.plot(own["measured_dbm"], own["predicted_dbm"], ".", markersize=2, color=own_colour, rasterized=many)
     ends = [own["measured_dbm"].min(), own["measured_dbm"].max()]
     ax.plot(ends, ends, color=figures.RULE, linewidth=1)
-    ax.set(xlabel="measured [dBm]", ylabel="predicted [dBm]")
+    unit = Maps(run).unit
+    ax.set(xlabel=f"measured [{unit}]", ylabel=f"predicted [{unit}]")
     panels = [first]
     for column, label in columns.items():
         panel, ax = figures.panel(4, 3.4)
@@ -283,11 +302,11 @@ def _where(run: Records) -> Plot:
         ax.plot(ordered[column], ordered["abs_error_db"], ".", markersize=2, color=figures.RULE, rasterized=many)
         median = ordered["abs_error_db"].rolling(max(len(ordered) // 5, 1), center=True).median()
         ax.plot(ordered[column], median, color=own_colour, linewidth=2)
-        ax.set(xlabel=label, ylabel="absolute error [dB]")
+        ax.set(xlabel=label, ylabel=f"absolute error [{difference_unit(unit)}]")
         panels.append(panel)
     caption = (
-        "Predicted against measured RSSI, and the absolute error (dots; line: running median) against the distance from the "
-        "receiver, if its position is known, and from the nearest training position. All receivers."
+        f"Predicted against measured {Maps(run).quantity}, and the absolute error (dots; line: running median) against "
+        "the distance from the receiver, if its position is known, and from the nearest training position. All receivers."
     )
     data = own[["receiver", "index", "measured_dbm", "predicted_dbm", "abs_error_db", *columns]]
     return Plot(f"where-{run.file_name}", panels, caption, data)

@@ -198,6 +198,8 @@ def _of_receivers(
         position,
         receiver_names=model.receiver_names,
         origin=model.origin,
+        quantity=model.quantity,
+        unit=model.unit,
     )
 
 

@@ -14,13 +14,15 @@ from numpy.typing import NDArray
 
 from swiftwrf import Prediction, Rssi, RssiModel
 from swiftwrf.data.coordinates import Floors
+from swiftwrf.errors import InputError
 from swiftwrf.locate.posterior import PlanMap
 from swiftwrf.metrics import LEVEL
 from swiftwrf.rssi.coverage import Coverage, reach
 from swiftwrf.rssi.maps import RssiMap
 from tasks.page.maps import Corners, FloorPlan
 from tasks.records import as_table, read_npz, rounded
-from tasks.rssi.maps import MAX_WIDTH_DB, coverage_sentence
+from tasks.rssi.coverage import coverage_sentence
+from tasks.rssi.maps import MAX_WIDTH_DB
 from tasks.view.locating import RssiLocating
 
 RECEIVER_COLOURS, N_RECEIVER_COLOURS = "tab20", 20
@@ -30,15 +32,19 @@ LOCATING: tuple[MapKind, ...] = ("posterior", "expected error")
 Values = NDArray[np.floating]
 
 
-def rows_of_run(file: Path, receivers: tuple[str, ...]) -> Rssi:
-    """Return the measured rows in the `maps.npz` of a run.
+def rows_of_run(file: Path, model: RssiModel) -> Rssi:
+    """Return the measured rows in the `maps.npz` of a run of a model.
 
     Raises:
-        InputError: The file is damaged, or contains other receivers.
+        InputError: The file is damaged, contains other receivers, or is of another quantity than RSSI.
     """
+    if model.quantity != "RSSI":
+        raise InputError(
+            f"{file.parent} is a run of {model.quantity}; the page shows RSSI, the report of the run its maps"
+        )
     stored = read_npz(file)
     measured, position, receiver = stored["measured"], stored["measured_position"], stored["receiver"]
-    return Rssi(measured, position, receiver_position=receiver, receiver_names=receivers)
+    return Rssi(measured, position, receiver_position=receiver, receiver_names=model.receiver_names)
 
 
 def rows_of_model(model: RssiModel) -> Rssi:

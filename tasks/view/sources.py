@@ -74,9 +74,7 @@ def open_source(source: Path) -> SpectraView | RssiView | FollowedView:
         case "rssi":
             model = _opened(source / MODEL, RssiModel)
             with refusing(f"the maps in {source} are not those of a run"):
-                return RssiView(
-                    source.name, model, rows_of_run(source / "maps.npz", model.receiver_names), folder=source
-                )
+                return RssiView(source.name, model, rows_of_run(source / "maps.npz", model), folder=source)
         case "locate":
             return _locate_run(source, content)
         case "update":

@@ -51,6 +51,7 @@ SPECTRA_OPTIONS = (
 RSSI_OPTIONS = ("receiver_position", "receiver_names", "origin", "session", "time", "name", "index")
 FRAME_OPTIONS = (
     "columns", "filler", "coordinates", "offset_by", "transmitter", "pool_by", "scale", "y_down", "up", "window",
+    "quantity", "unit",
     "receiver_position", "name",
 )  # fmt: skip
 Call = Callable[[Any], object]

@@ -40,6 +40,7 @@ from swiftwrf import (
     rssi,
 )
 from swiftwrf.contrib.comparison import rssi as comparison
+from swiftwrf.contrib.comparison.predictors import make_predictor
 from swiftwrf.contrib.online import Follower, Monitor, adapted, prequential, score
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin
 from swiftwrf.rssi import FloorAttenuation, estimate_floor_attenuation, estimate_offsets
@@ -111,7 +112,7 @@ def pairs():
 
 @cache
 def knn():
-    return comparison.make_predictor("knn").fit(training_rows())
+    return make_predictor("knn").fit(training_rows())
 
 
 @cache

@@ -176,6 +176,29 @@ def test_spectra_and_rssi_at_the_positions_of_a_table(small, tmp_path):
     table = pd.read_csv(tmp_path / "a.csv")
     np.testing.assert_allclose(table["predicted_dbm"], rssi.predict(position).mean.numpy().ravel(), atol=0.00501)
     assert all(len(text.rpartition(".")[2]) <= 2 for text in table["predicted_dbm"].astype(str))
+    low, high = rssi.predict(position).interval(0.8)
+    np.testing.assert_allclose(table["low_dbm"], low.numpy().ravel(), atol=0.00501)
+    np.testing.assert_allclose(table["high_dbm"], high.numpy().ravel(), atol=0.00501)
+
+
+def test_few_predictions_are_shown_and_places_beyond_the_scans_are_marked(tmp_path, capsys):
+    data = rssi_room(n=120)
+    rssi = data.rssi_dbm.where(data.rssi_dbm > -62, torch.nan)  # a receiver that is not sensitive
+    model = RssiModel().fit(replace(data, rssi_dbm=rssi).columns([0, 4]))
+    model.save(tmp_path / "rssi.safetensors")
+    at, amid = tmp_path / "at.csv", data.transmitter_position.mean(dim=0)
+    position = torch.stack([amid, amid + torch.tensor([500.0, 0, 0])])
+    pd.DataFrame(position.numpy(), columns=["x", "y", "z"]).to_csv(at, index=False)
+    assert run("predict", tmp_path / "rssi.safetensors", at, "--out", tmp_path / "a.csv") == 0
+    table = pd.read_csv(tmp_path / "a.csv")
+    assert table["outside"].tolist() == [False, False, True, True]
+    np.testing.assert_allclose(table["detection"], model.predict_detection(position).ravel(), atol=0.000501)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split() == list(table.columns)
+    assert [line.split()[4] for line in lines[1:5]] == [f"{value:.2f}" for value in table["predicted_dbm"]]
+    pd.DataFrame(np.zeros((11, 3)), columns=["x", "y", "z"]).to_csv(at, index=False)
+    assert run("predict", tmp_path / "rssi.safetensors", at, "--out", tmp_path / "b.csv") == 0
+    assert capsys.readouterr().out == f"22 rows: {tmp_path / 'b.csv'}\n"
 
 
 @pytest.mark.parametrize("suffix", [".xlsx", ".mat", "", ".parquet"])

@@ -86,7 +86,7 @@ def _reporter() -> Callable[[Recorded, Path | None], Any]:
     return reporter
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Comparison(Result):
     """Methods that were fitted to the training rows of a split, and their errors on its test rows; see its subclasses."""
 
@@ -115,6 +115,37 @@ class Comparison(Result):
     def errors(self) -> DataFrame:
         """Errors, a row for each method and test row, or pair of test row and receiver, with the number of its place."""
         return concat((DataFrame({"method": name, **self._columns(name)}) for name in self.values), ignore_index=True)
+
+    def __repr__(self) -> str:
+        medians = {name: float(median) for name, median in self.summary()["median"].items()} if self.values else {}
+        best = sorted(medians, key=medians.__getitem__)[:3]
+        errors = ", ".join(f"{name} {medians[name]:.3g}" for name in best) or "none"
+        return (
+            f"<{type(self).__name__} of {self.train.name}: {len(self.values)} methods, {len(self.train)} training and "
+            f"{len(self.test)} test rows;\n lowest median errors: {errors}>"
+        )
+
+    def to_latex(self) -> str:
+        r"""Return the summary as a table of LaTeX, for the package booktabs: median, 95 % interval, mean, 90th percentile.
+
+        Example:
+            >>> import swiftwrf
+            >>> print(swiftwrf.rssi.compare(swiftwrf.rssi_room(n=60), receivers=["6"]).to_latex().splitlines()[0])
+            \begin{tabular}{lrrrr}
+        """
+        lines = [r"\begin{tabular}{lrrrr}", r"\toprule", r"method & median & 95\,\% interval & mean & 90\,\% below \\"]
+        lines.append(r"\midrule")
+        for name, row in self.summary().sort_values("median").iterrows():
+            interval = f"{row['low']:.2f} to {row['high']:.2f}"
+            cells = (
+                str(name).replace("_", r"\_"),
+                f"{row['median']:.2f}",
+                interval,
+                f"{row['mean']:.2f}",
+                f"{row['p90']:.2f}",
+            )
+            lines.append(" & ".join(cells) + r" \\")
+        return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
 
     def summary(self) -> DataFrame:
         """Return a row for each method: errors, and their mean difference to those of `model`; see `method_summary`."""

@@ -6,7 +6,8 @@ import time
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from swiftwrf.contrib.comparison.base import Comparison, Recorded, Values
 from swiftwrf.contrib.comparison.errors import summary
-from swiftwrf.contrib.comparison.localizers import LEVELS, LOCALIZERS, Located, PosteriorLocalizer
+from swiftwrf.contrib.comparison.localizers import LEVELS, LOCALIZERS, Localizer, Located, PosteriorLocalizer
 from swiftwrf.contrib.comparison.steps import LOCATOR, Memo, Steps
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin, degree_columns
@@ -37,7 +38,7 @@ OPTIONAL = ("radius", "ambiguous", "floor_probability", "direction")  # of `Loca
 N_MAPS = 6  # test rows whose posteriors are drawn
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PositionComparison(Comparison):
     """Localizers that were fitted to the training rows of a split, and their position errors on its test rows.
 
@@ -163,7 +164,7 @@ def _radius(level: float) -> str:
     return f"credible_radius_{100 * level:.0f}_m"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class LocateComparison(PositionComparison):
     """Result of `compare`.
 
@@ -186,6 +187,7 @@ class LocateComparison(PositionComparison):
     test: Rssi
     locator: RssiLocator | None = None
     n_undetected: int = 0
+    own: Mapping[str, Localizer] = field(default_factory=dict)
 
     @classmethod
     def of(cls, data: Rssi, split: str, n_cells: int, seed: int, reference: str | None = None) -> LocateComparison:
@@ -230,7 +232,8 @@ class LocateComparison(PositionComparison):
         train, test, split = self.train, self.test, self.options["split"]
         validation = train.validation_for(split, test)
         n_cells, seed = self.options["n_cells"], self.options["seed"]
-        localizer = LOCALIZERS[name](validation=validation, n_cells=n_cells, seed=seed)
+        options: Values = {"validation": validation, "n_cells": n_cells, "seed": seed}
+        localizer = deepcopy(self.own[name]) if name in self.own else LOCALIZERS[name](**options)
         began = time.perf_counter()
         localizer.fit(train)
         fitted = time.perf_counter()
@@ -276,6 +279,7 @@ def compare(
     split: str = "random",
     seed: int = 0,
     n_cells: int = 4000,
+    also: Mapping[str, Localizer] | None = None,
     reference: str | None = None,
     keep: Memo | None = None,
     executor: Executor | None = None,
@@ -288,6 +292,7 @@ def compare(
         split: Split that comes with the data, or a seeded one: random or block.
         seed: Seed of everything random.
         n_cells: Number of candidate positions of the posterior.
+        also: Localizers of your own by their names, which stay as they are.
         reference: Group whose offset is 0. Defaults to the most frequent one.
         keep: Results by the names of steps, in a folder. A call with equal data, options, code and versions continues
             after them, others are refused.
@@ -305,11 +310,19 @@ def compare(
     """
     given = locals().copy()
     begun = LocateComparison.of(data.receivers(receivers), split, n_cells, seed, reference)
+    own = dict(also or {})
+    if known := sorted(own.keys() & set(LOCALIZERS)):
+        raise InputError(f"also has a localizer {known[0]!r}, which is the name of another one; give it its own")
     if keep is not None:
+        if own:
+            raise InputError(
+                "keep takes localizers by name; register those of your own as entry points, or leave it out"
+            )
         keep.of(given | {"localizers": [LOCALIZERS[name] for name in LOCALIZERS]})
+    begun = replace(begun, own=own)
     memo = keep or Memo()
     steps = Steps(begun, memo, executor)
-    started = [steps.start(name, name, LocateComparison.fit, name) for name in LOCALIZERS]
+    started = [steps.start(name, name, LocateComparison.fit, name) for name in (*LOCALIZERS, *own)]
     values = {name: steps[name] for name in started}
     locator = load(memo.folder / LOCATOR)
     assert isinstance(locator, RssiLocator)

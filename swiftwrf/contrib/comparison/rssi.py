@@ -5,22 +5,23 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from pandas import DataFrame
 from torch import Tensor
 
 from swiftwrf.choices import RSSI_PREDICTORS, NotDetected
 from swiftwrf.contrib.comparison.base import Comparison, Recorded, Values
+from swiftwrf.contrib.comparison.coverage import maps_and_coverage
 from swiftwrf.contrib.comparison.errors import summaries, summary
 from swiftwrf.contrib.comparison.leave_one_out import LEAVE_ONE_OUT, distances_to_others, is_small, predict_each_place
 from swiftwrf.contrib.comparison.parts import fewer_rows, pool_of, region_of
+from swiftwrf.contrib.comparison.predictors import compared, make_predictor
 from swiftwrf.contrib.comparison.steps import MODEL, Memo, Steps, refusing_executor
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
@@ -31,64 +32,17 @@ from swiftwrf.metrics import LEVEL
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import distance, nearest
 from swiftwrf.rssi.base import RssiPredictor
-from swiftwrf.rssi.coverage import Coverage, reach
-from swiftwrf.rssi.maps import RssiMap
+from swiftwrf.rssi.coverage import default_threshold
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.offsets import estimate_offsets
 from swiftwrf.rssi.pairs import PairModel
-from swiftwrf.rssi.paper import RssiPaperModel
 from swiftwrf.runtime.checkpoint import Saved, load
 from swiftwrf.runtime.validation import Fraction, Preset, checked
 
 DISTANCES = ("from_receiver_m", "from_training_m")  # columns of the errors
-COVERED_DBM, CERTAINTY = -75.0, 0.9  # coverage of the maps
 
 
-@checked
-def make_predictor(name: str, preset: Preset = "quick", **options: Any) -> RssiPredictor:
-    """Return a predictor by its name, with those of the options that it has.
-
-    Args:
-        name: Name in the registry, e.g. "knn".
-        preset: "quick", or "paper" for published settings; a predictor without published settings ignores it. With "paper"
-            the name "swiftwrf" gives `RssiPaperModel`.
-        options: Options such as seed and validation. A predictor ignores options that it does not have.
-
-    Raises:
-        InputError: An unknown name, or a value outside its range.
-
-    Example:
-        >>> make_predictor("swiftwrf", "paper", seed=3).name
-        'swiftwrf_paper'
-    """
-    is_published = name == RssiModel.name and preset == "paper"
-    predictor_type: type[RssiPredictor] = RssiPaperModel if is_published else RSSI_PREDICTORS[name]
-    return predictor_type(**predictor_type.supported({"preset": preset} | options))
-
-
-def compared(data: Rssi, also: Sequence[str] = ()) -> tuple[list[str], dict[str, str]]:
-    """Return the names of the predictors that are compared on these data, and the reason for each one that is left out.
-
-    Args:
-        data: RSSI.
-        also: Names of predictors that are compared only when named.
-
-    Raises:
-        InputError: An unknown name.
-
-    Example:
-        >>> import swiftwrf
-        >>> compared(swiftwrf.rssi_room(n=20))[0]
-        ['swiftwrf', 'mean', 'mri_pooled', 'mri_receiver', 'knn', 'mri_residual', 'gp']
-    """
-    for name in also:
-        RSSI_PREDICTORS.check(name)
-    asked = [name for name in RSSI_PREDICTORS if RSSI_PREDICTORS[name].compared(data) or name in also]
-    left_out = {name: reason for name in asked if (reason := RSSI_PREDICTORS[name].lacking(data))}
-    return [name for name in asked if name not in left_out], left_out
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RssiComparison(Comparison):
     """Result of `compare`.
 
@@ -103,6 +57,7 @@ class RssiComparison(Comparison):
         left_out: Reason for each predictor that the data do not suffice for.
         predictors: Fitted predictors by name. Of those whose values `keep` had, the model alone.
         by_rows: Mean absolute errors [dB] of the model and of "knn" by the number of training rows, a column for each.
+        above: Thresholds of the coverage [dBm]. Defaults to that of `default_threshold`.
         region: Mean absolute errors [dB] of both in a fifth of the area, fitted to the training rows elsewhere.
 
     Example:
@@ -120,11 +75,18 @@ class RssiComparison(Comparison):
     left_out: Mapping[str, str] = field(default_factory=dict)
     predictors: Mapping[str, RssiPredictor] = field(default_factory=dict)
     by_rows: DataFrame = field(default_factory=DataFrame)
+    above: tuple[float, ...] = ()
     region: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def model(self) -> str:
         return PairModel.name if self.train.receiver_moves else RssiModel.name
+
+    @property
+    def thresholds(self) -> tuple[tuple[float, ...], str | None]:
+        """Thresholds of the coverage [dBm], the first one that of maps, and the reason for a default."""
+        default, reason = default_threshold(self.train)
+        return (self.above, None) if self.above else ((default,), reason)
 
     @cached_property
     def predictions(self) -> DataFrame:
@@ -192,7 +154,8 @@ class RssiComparison(Comparison):
 
     def recorded(self) -> Recorded:
         recorded, attenuation = super().recorded(), self._fitted.attenuation
-        maps, coverage = _maps(self._fitted, self.train)
+        test = self.test if self.train.offsets is None else self.train.offsets.removed(self.test)
+        maps, coverage, tables = maps_and_coverage(self._fitted, self.train, test, self.thresholds[0])
         at_receiver, none = summaries(self.errors, ["receiver", "method"], [self.column]), {self.column: summary([])}
         metrics = {
             "left_out": self.left_out,
@@ -201,9 +164,12 @@ class RssiComparison(Comparison):
                 for receiver in self.test.receiver_names
             },
             "model": self.model,
+            "quantity": self.train.quantity,
+            "unit": self.train.unit,
             "seconds": self.values[self.model]["seconds"],
             "interval": {"nominal": LEVEL, "coverage": self.coverage},
             "coverage": coverage,
+            "threshold": self.thresholds[1],
             "by_rows": {str(n): {str(name): mean for name, mean in row.items()} for n, row in self.by_rows.iterrows()},
             "region": dict(self.region),
             "chosen": {
@@ -211,7 +177,7 @@ class RssiComparison(Comparison):
                 "floor_attenuation_db": None if attenuation is None else attenuation.db,
             },
         }
-        tables = {"errors": self.errors, "predictions": self.predictions}
+        tables |= {"errors": self.errors, "predictions": self.predictions}
         return replace(recorded, metrics=recorded.metrics | metrics, tables=tables, arrays={"maps": maps})
 
     @property
@@ -240,38 +206,6 @@ class RssiComparison(Comparison):
         return Prediction(mean, std)
 
 
-def _maps(model: RssiModel | PairModel, train: Rssi) -> tuple[dict[str, NDArray[Any]], list[Values]]:
-    """Return maps of each floor, (floors, R, H, W) or (floors, H, W), and the coverage of each floor.
-
-    Without floors there is one map, at the median height of the measurements.
-    """
-    floors, limits = train.floors, (COVERED_DBM, CERTAINTY, 1)
-    names, heights = (floors.names, floors.height_m) if floors else ([""], [None])
-    charts = [RssiMap.predict(model, height=height) for height in heights]
-    number = floors.number(train.transmitter_position) if floors else torch.zeros(len(train), dtype=torch.int64)
-    detected = [RssiMap.predict(model, height=height, detected=True) for height in heights]
-    coverage = [Coverage.of(each, train[number == n], limits, reach(model)) for n, each in enumerate(detected)]
-    lower, upper = zip(*(chart.prediction.interval(LEVEL) for chart in charts), strict=True)
-    maps: dict[str, NDArray[Any]] = {
-        "x": charts[0].x,
-        "y": charts[0].y,
-        "predicted": np.stack([chart.mean for chart in charts]),
-        "width": (torch.stack(upper) - torch.stack(lower)).numpy(),
-        "detection": np.stack([chart.detection for chart in charts]),
-        "above": np.stack([floor.probability for floor in coverage]),
-        "inside": np.stack([floor.inside for floor in coverage]),
-        "known": np.stack([floor.measured for floor in coverage]),
-        "measured_position": train.transmitter_position.numpy(),
-        "measured": train.rssi_dbm.numpy(),
-        "receiver": train.receiver_position.numpy(),
-        "receiver_names": np.array(train.receiver_names),
-        "floor_names": np.array(names),
-        "floor_of_row": number.numpy(),
-    }
-    maps = maps if train.origin is None else maps | {"origin": np.array(train.origin)}
-    return maps, [{"floor": name} | floor.values for name, floor in zip(names, coverage, strict=True)]
-
-
 @checked
 def compare(
     data: Rssi,
@@ -279,12 +213,13 @@ def compare(
     receivers: Sequence[str] = ("all",),
     split: str = "random",
     seed: int = 0,
-    also: Sequence[str] = (),
+    also: Sequence[str | RssiPredictor] = (),
     preset: Preset = "quick",
     reference: str | None = None,
     not_detected: NotDetected = "auto",
     validation: Validation | Literal["auto"] = "auto",
     fewer: Sequence[Fraction] = (),
+    above: Sequence[float] = (),
     device: torch.device | str = "cpu",
     keep: Memo | None = None,
     executor: Executor | None = None,
@@ -298,13 +233,14 @@ def compare(
         split: Split that comes with the data, or a seeded one: random, block, or place. Without enough rows for a random
             split, 13, all other places predict each one.
         seed: Seed of everything random.
-        also: Predictors that are compared only when named, e.g. "nerf2".
+        also: Predictors that are compared only when named, e.g. "nerf2", and predictors of your own, which stay as they are.
         preset: "quick", or "paper" for published settings.
         reference: Group whose offset is 0. Defaults to the most frequent one.
         not_detected: Meaning of an empty cell; see `RssiConfig`.
         validation: Folds that choose all settings: "random", "block" or "session". Defaults to those like the test rows.
         fewer: Fractions of the training rows that the model and "knn" are fitted to, too, e.g. (0.25, 0.5). After a random
             split both then predict a region of the training rows by all others.
+        above: Thresholds of the coverage [dBm], the first one that of maps. Defaults to -67 for Wi-Fi, else -75.
         device: Device to compute on.
         keep: Results by the names of predictors, in a folder, and the model. A call with equal data, options, code and
             versions continues after them, others are refused.
@@ -338,16 +274,21 @@ def compare(
     if kind == "random" != split:  # test rows of a split that comes with the data may be of another day or device
         options["calibration"] = "block"
     names, left_out = compared(chosen, also)
+    own = {predictor.name: predictor for predictor in also if isinstance(predictor, RssiPredictor)}
     if keep is not None:
+        if own:
+            raise InputError(
+                "keep takes predictors by name; register those of your own as entry points, or leave it out"
+            )
         keep.of(given | {"predictors": [RSSI_PREDICTORS[name] for name in names]})
     shown = {"split": LEAVE_ONE_OUT if small else split, "preset": preset, "seed": seed}
-    begun = RssiComparison(train, test, {}, shown, left_out)
+    begun = RssiComparison(train, test, {}, shown, left_out, above=tuple(above))
     model_name, predictors = begun.model, dict[str, RssiPredictor]()
     parallel = None if executor is None else executor.map
 
     def compute(_: None, folder: Path, name: str, rows: Tensor | None = None) -> Values:
         def fit(rows: Rssi, pool: Rssi) -> RssiPredictor:
-            predictor = make_predictor(name, preset, **options)
+            predictor = deepcopy(own[name]) if name in own else make_predictor(name, preset, **options)
             return predictor.fit(rows, pool=pool, device=device, parallel=parallel, progress=progress)
 
         part, every = (train, pool) if rows is None else (train.subset(rows), pool.subset(rows))

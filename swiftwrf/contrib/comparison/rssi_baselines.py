@@ -77,7 +77,7 @@ class ReceiverPathLoss(SharedPathLoss):
 
     def _fit(self, train: Rssi, *, pool: Rssi, shift: Tensor, curve: Detection | None, **_: Any) -> None:
         self._receiver, at = train.receiver_position, pool.transmitter_position
-        found = fit_path_losses(at, pool.receiver_position, pool.rssi_dbm, "auto", shift, curve)
+        found = fit_path_losses(at, pool.receiver_position, pool.rssi_dbm, "auto" if curve else "unknown", shift, curve)
         self._path_loss = found.columns(columns_of(train.receiver_names, pool)).each
 
 

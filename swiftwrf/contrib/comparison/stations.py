@@ -36,7 +36,7 @@ ALONE = "posterior by "  # and the name of the station, of the posterior given t
 MATCHED = "triangulation_matched"  # of the directions by these posteriors
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class StationsComparison(PositionComparison):
     """Result of `compare_stations`.
 

@@ -246,7 +246,8 @@ def _check_rssi(data: Rssi, findings: Findings) -> None:
     share = float(detected.double().mean())
     low, high = float(data.rssi_dbm[detected].min()), float(data.rssi_dbm[detected].max())
     findings.add(
-        f"{len(data)} rows of RSSI at {len(data.receiver_names)} receivers, {share:.0%} detected, {low:g} to {high:g} dBm.",
+        f"{len(data)} rows of {data.quantity} at {len(data.receiver_names)} receivers, {share:.0%} detected, {low:g} to "
+        f"{high:g} {data.unit}.",
         kind="rssi",
         receivers=len(data.receiver_names),
         detected_fraction=share,
@@ -256,8 +257,9 @@ def _check_rssi(data: Rssi, findings: Findings) -> None:
     few = [name for name, n in zip(data.receiver_names, count.tolist(), strict=True) if n < MIN_TRAINING]
     if few:
         findings.warn(f"Receivers that detected fewer than {MIN_TRAINING} rows, too few to fit a model: {listed(few)}.")
-    _columns(data, detected, findings)
-    _path_loss(data, findings)
+    if data.is_power:
+        _columns(data, detected, findings)
+        _path_loss(data, findings)
     _add_splits(data, findings)
 
 

@@ -13,10 +13,10 @@ from typing import Any, ClassVar, Generic, TypeVar
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray
+from swiftwrf.data.options import TableOptions
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.spectra import Spectra
-from swiftwrf.data.survey import TableOptions
 from swiftwrf.errors import InputError, listed
 from swiftwrf.runtime.registry import Registry
 from swiftwrf.runtime.validation import PositiveFloat, PositiveInt, configuration

@@ -44,7 +44,7 @@ from swiftwrf.data.archives import array_header, read_arrays, read_rows, refusin
 from swiftwrf.data.cells import column_of_numbers, seconds, text_of
 from swiftwrf.data.columns import column_of
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin, PlanFrame, without_fix
-from swiftwrf.data.files import digests, numbers, read_bytes, read_table, read_xyz, read_yaml, sha256
+from swiftwrf.data.files import digests, number, numbers, read_bytes, read_table, read_xyz, read_yaml, sha256
 from swiftwrf.data.formats.base import Format, ReadOptions
 from swiftwrf.data.formats.snapshots import array_of, described_arrays, pose_of
 from swiftwrf.data.powers import NOT_DETECTED_DBM, find_fillers, without_fillers
@@ -59,7 +59,8 @@ from swiftwrf.positions import check_positions
 TABLES = ("gateway_rssi.csv", "rssi.csv")
 POSITIONS = ("tx_pos.csv", "rx_pos.csv", "beacon_pos.csv")
 RECEIVERS = ("gateway_position.yml", "gateway_pos.csv")
-PROPERTIES = ("origin", "floors", "receiver_moves", "groups", "offsets", "labels", "plan_scale")  # in survey.yml
+# in survey.yml
+PROPERTIES = ("origin", "floors", "receiver_moves", "groups", "offsets", "labels", "plan_scale", "margin_db")
 FILES = ("gateway_rssi.csv", *POSITIONS, *RECEIVERS)  # any of which marks the layout
 
 
@@ -317,6 +318,10 @@ def _properties(file: Path) -> dict[str, Any]:
         values = numbers([content.get("plan_scale", "0"), offsets.get("explained", "0"), *db.values()], len(db) + 2)
         scale, explained, *decibels = values or ()
         properties["plan_scale"] = scale or None
+        margin_db = number(content.get("margin_db", "0"))
+        if not margin_db >= 0:
+            raise ValueError("margin_db must be a number from 0 on")
+        properties["margin_db"] = margin_db if "margin_db" in content else None
         if offsets:
             by_name = dict(zip(db, decibels, strict=True))
             properties["offsets"] = Offsets(str(offsets["column"]), str(offsets["reference"]), by_name, explained)

@@ -15,9 +15,10 @@ from swiftwrf.data.columns import is_coordinate, is_rssi
 from swiftwrf.data.files import SUFFIXES, TABLES, digests, has_header, read_table
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
 from swiftwrf.data.formats.nerf2 import FILES as NERF2_FILES
+from swiftwrf.data.options import TableOptions
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
-from swiftwrf.data.survey import TableOptions, has_positions, read_survey
+from swiftwrf.data.survey import has_positions, read_survey
 from swiftwrf.errors import InputError, listed
 
 RECEIVERS = "receivers.csv"  # beside the table: receiver,x,y,z

@@ -1,5 +1,6 @@
 """Written data are read back: samples of every format from the toolkit's own layout, and any measurements."""
 
+import math
 import zipfile
 from dataclasses import fields, replace
 from pathlib import Path
@@ -98,6 +99,7 @@ def rssi(draw):
         "groups": pd.Series(phone, name="Phone ID"),
         "labels": ("Phone ID", "channel: 1"),
         "plan_scale": 20.7,
+        "margin_db": math.inf,
     }
     known = {name: value for name, value in known.items() if draw(st.booleans())}
     if "groups" in known and draw(st.booleans()):
@@ -167,6 +169,7 @@ def test_a_walk_of_several_phones_keeps_them(tmp_path):
         "offsets: 3",
         "offsets: {column: a}",
         "labels: 3",
+        "margin_db: -1",
         "offsets: {column: a, reference: b, explained: nan, offset_db: {b: 0}}",
     ],
 )

@@ -16,7 +16,7 @@ from test_not_detected import RECEIVER, survey
 
 from swiftwrf import PairModel, Rssi, RssiModel, rssi_room
 from swiftwrf.gp import Kernel
-from swiftwrf.rssi.coverage import Coverage, at_least, reach
+from swiftwrf.rssi.coverage import Coverage, at_least, default_threshold, reach
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.path_loss import log_distance
 
@@ -78,6 +78,71 @@ def test_shares_are_of_the_cells_near_scans_inside_their_hull():
     assert both.values["scans_above"] == (rssi.min(axis=1) > -75).mean()
     assert (both.measured == both.inside).all()
     assert both.values["reach_m"] is None
+
+
+def flooded(cells):
+    """Sets of cells (row, column) that touch each other, corners included."""
+    left, areas = set(zip(*np.nonzero(cells), strict=True)), []
+    while left:
+        area, border = set(), [left.pop()]
+        while border:
+            row, column = border.pop()
+            area.add((row, column))
+            near = {(row + dy, column + dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)} & left
+            left -= near
+            border += near
+        areas.append(area)
+    return areas
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_weak_spots_are_the_connected_cells_without_coverage(number):
+    generator = np.random.default_rng(3)
+    x, y = np.arange(0.25, 15, 0.5), np.arange(0.25, 10, 0.5)
+    waves = np.stack([np.sin(x / 2 + shift) * np.cos(y[:, None] / 1.5 - shift) for shift in (0.0, 1.0, 2.5)])
+    mean = (-66 + 9 * waves).astype(np.float32)
+    std, detection = (generator.uniform(*ends, mean.shape).astype(np.float32) for ends in ((1, 3), (0.97, 1)))
+    chart = RssiMap(x, y, 1.0, 0.5, mean, std, detection, ("a", "b", "c"))
+    at = np.c_[generator.random((80, 2)) * (13, 8) + 1, np.ones(80)]
+    coverage = Coverage.of(chart, Rssi(np.full((80, 3), -70.0), at), (-70.0, 0.9, number), 2.0)
+    found = coverage.weak_spots(chart)
+    above, needed = coverage.probability, np.sort(-70.0 + 1.2815515655446004 * std - mean, axis=0)[number - 1]
+    expected = []
+    for area in flooded(coverage.measured & (above < 0.9)):
+        row, column = max(area, key=lambda cell: needed[cell])
+        spot = [
+            x[column],
+            y[row],
+            0.25 * len(area),
+            0.25 * sum(above[cell] <= 0.1 for cell in area),
+            above[row, column],
+        ]
+        order = np.argsort(-70.0 + 1.2815515655446004 * std[:, row, column] - mean[:, row, column])
+        expected.append((*spot, max(needed[row, column], 0.0), "abc"[order[number - 1]]))
+    expected.sort(key=lambda spot: (spot[3], spot[2]), reverse=True)
+    assert len(expected) >= 2
+    assert found["area_m2"].sum() > found["not_covered_m2"].sum() > 0
+    for spot, wanted in zip(found.itertuples(index=False), expected, strict=True):
+        assert spot[:6] == pytest.approx(wanted[:6], abs=1e-4)
+        assert spot[6] == wanted[6]
+
+
+@pytest.mark.parametrize(
+    ("names", "notes", "data", "threshold", "reason"),
+    [
+        (("WAP012", "WAP013"), (), "survey", -67.0, "WAP012"),
+        (("ap-3",), (), "survey", -67.0, "ap-3"),
+        (("aa:bb:cc:dd:ee:01",), ("taken as: x = x, y = y, receiver = bssid, RSSI = rssi",), "walk", -67.0, "bssid"),
+        (("aa:bb:cc:dd:ee:01",), ("taken as: x = x, y = y, receiver = mac, RSSI = rssi",), "walk", -75.0, "no name"),
+        (("a1",), (), "office-wifi", -67.0, "office-wifi"),
+        (("gateway1", "apple", "lab"), (), "map", -75.0, "no name"),
+    ],
+)
+def test_wifi_is_recognised_by_names(names, notes, data, threshold, reason):
+    rows = Rssi(np.full((1, len(names)), -60.0), [[0, 0, 1]], receiver_names=names, notes=notes, name=data)
+    found, why = default_threshold(rows)
+    assert found == threshold
+    assert reason in why
 
 
 def _hull(points):

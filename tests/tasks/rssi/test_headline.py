@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.distance import cdist
 from scipy.stats import norm
 
-from swiftwrf import load, rssi_room
+from swiftwrf import load, load_rssi, rssi_room
 from swiftwrf.rssi.coverage import reach
 from tasks.view.rssi import MapSelection
 from tasks.view.sources import open_source
@@ -101,6 +101,49 @@ def test_one_number_everywhere(building, floor):
     same = sentence.replace(place, "the measured area")
     assert shown == f"Coloured: one of 3 receivers above -75 dBm with 90% certainty. {same}"
     np.testing.assert_allclose(maps["above"][floor].ravel(), above, atol=1e-4)
+
+
+@pytest.mark.parametrize("floor", [0, 1])
+def test_test_scans_are_counted_beside_their_prediction(building, floor):
+    """In coverage.csv, for one of all receivers, for two, and for each, from the split and the model of the run."""
+    folder, terminal = building
+    model, table = load(folder / "model.safetensors"), pd.read_csv(folder / "coverage.csv")
+    _, test = load_rssi(folder.parent / "walk.csv").split()
+    test = test[model.attenuation.floors.number(test.transmitter_position) == floor]
+    found = model.predict_detected(test)
+    mean, std, rssi = found.mean.numpy(), found.std.numpy(), test.rssi_dbm.numpy()
+    of_floor = table[table["floor"].astype(str) == NAMES[floor]].set_index("receiver")
+    assert of_floor.index.tolist() == ["any receiver", "two receivers", "a", "b", "c"]
+    assert (of_floor["n_test"] == len(test)).all()
+    any_above = np.mean([probability(*row) for row in zip(mean, std, strict=True)])
+    expected = {"any receiver": (any_above, (rssi > -75).any(axis=1).mean())}
+    expected |= {
+        name: (norm.sf(-75, mean, std)[:, i].mean(), (rssi[:, i] > -75).mean()) for i, name in enumerate("abc")
+    }
+    for name, shares in expected.items():
+        assert of_floor.loc[name, ["test_predicted", "test_above"]].tolist() == pytest.approx(shares, abs=1e-3)
+    assert of_floor.loc["two receivers", "test_above"] == ((rssi > -75).sum(axis=1) >= 2).mean()
+    every = table[table["receiver"] == "any receiver"]
+    counted, predicted = (np.average(every[name], weights=every["n_test"]) for name in ("test_above", "test_predicted"))
+    assert f"Of {every['n_test'].sum()} test scans {counted:.0%} pass, {predicted:.0%} were predicted." in terminal
+
+
+def test_weak_spots_are_listed_from_the_largest(building):
+    folder, terminal = building
+    spots = pd.read_csv(folder / "weak_spots.csv", dtype={"floor": str})
+    with np.load(folder / "maps.npz") as stored:
+        maps = dict(stored)
+    weak = maps["known"] & (maps["above"] < 0.9)
+    cell = maps["x"][1] - maps["x"][0]
+    for floor, name in enumerate(NAMES):
+        assert spots[spots["floor"] == name]["area_m2"].sum() == pytest.approx(weak[floor].sum() * cell**2)
+    first = spots.sort_values(["not_covered_m2", "area_m2"], ascending=False).iloc[0]
+    place = f"{first['area_m2']:,.0f} m², weakest at x = {first['x_m']:.1f} m, y = {first['y_m']:.1f} m on floor 1 ("
+    sentence = f"Largest weak spots: {place}{first['missing_db']:.0f} dB missing at {first['receiver']})"
+    report = unescape(re.sub("<[^>]*>", "", (folder / "report.html").read_text()))
+    assert sentence in terminal
+    assert sentence in report
+    assert "-75 dBm is the default for receivers that no name shows to be Wi-Fi; --above DBM sets another" in report
 
 
 def test_widths_are_those_of_the_80_percent_interval(building):

@@ -22,7 +22,7 @@ from test_rssi_model import path_loss_only
 from swiftwrf import rssi_room
 from swiftwrf.choices import RSSI_PREDICTORS
 from swiftwrf.contrib.comparison.parts import pool_of
-from swiftwrf.contrib.comparison.rssi import make_predictor
+from swiftwrf.contrib.comparison.predictors import make_predictor
 from swiftwrf.contrib.comparison.rssi_baselines import NEIGHBOUR_COUNTS
 from swiftwrf.data.splits import folds
 from swiftwrf.rssi import RssiPredictor, compare
@@ -30,8 +30,9 @@ from swiftwrf.runtime import registry
 from tasks.records import Records
 from tasks.report import merge
 from tasks.rssi import experiment
+from tasks.rssi.coverage import coverage_sentence
 from tasks.rssi.differences import where_methods_differ
-from tasks.rssi.maps import Maps, coverage_sentence
+from tasks.rssi.maps import Maps
 from tasks.rssi.page import answer, where_next
 
 
@@ -118,7 +119,7 @@ def test_a_lone_receiver_has_one_map_and_no_average(tmp_path, capsys):
     out = tmp_path / "her 'own' run"
     assert quick.run("rssi", "--rx", "1", "--out", out) == 0
     drawn = {file.stem.partition("-")[0] for file in (out / "figures").glob("*.svg")}
-    assert drawn == {"summary", "errors", "where"}
+    assert drawn == {"coverage", "summary", "errors", "where"}
     assert list((out / "figures").glob("summary*.csv"))
     for text in (capsys.readouterr().out, unescape(re.sub("<[^>]*>", "", (out / "report.html").read_text()))):
         assert f"swiftwrf view {shlex.quote(str(out))}" in text

@@ -1,0 +1,121 @@
+"""Maps and coverage that a comparison records: each floor, at thresholds, of any, two and each receiver."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pandas import DataFrame, concat
+from torch import Tensor
+
+from swiftwrf.contrib.comparison.base import Values
+from swiftwrf.data import Rssi
+from swiftwrf.data.coordinates import degree_columns
+from swiftwrf.metrics import LEVEL
+from swiftwrf.rssi.coverage import CERTAINTY, Coverage, at_least, reach
+from swiftwrf.rssi.maps import RssiMap
+from swiftwrf.rssi.model import RssiModel
+from swiftwrf.rssi.pairs import PairModel
+
+ANY, TWO = "any receiver", "two receivers"  # of a scan, above the threshold; others are names of receivers
+MAX_SPOTS = 100  # rows of a floor and threshold in the table of weak spots
+
+
+def maps_and_coverage(
+    model: RssiModel | PairModel, train: Rssi, test: Rssi, thresholds_dbm: Sequence[float]
+) -> tuple[dict[str, NDArray[Any]], list[Values], dict[str, DataFrame]]:
+    """Return maps of each floor, their coverage, and tables of it.
+
+    Without floors there is one map, at the median height of the measurements.
+
+    Args:
+        model: Fitted model.
+        train: Training rows, the scans.
+        test: Test rows without offsets between groups, whose scans are counted.
+        thresholds_dbm: Thresholds of the coverage. Maps are those of the first one.
+
+    Returns:
+        Arrays (floors, R, H, W) or (floors, H, W) by name; `Coverage.values` of each floor, at the first threshold and any
+        receiver; tables `coverage`, with a row for each floor, threshold and receiver, and `weak_spots`.
+
+    Example:
+        >>> import swiftwrf
+        >>> train, test = swiftwrf.rssi_room(n=60).columns([0, 5]).split()
+        >>> _, _, tables = maps_and_coverage(swiftwrf.RssiModel().fit(train), train, test, [-70.0])
+        >>> tables["coverage"]["receiver"].tolist()
+        ['any receiver', 'two receivers', 'receiver01', 'receiver06']
+    """
+    floors = train.floors
+    names, heights = (floors.names, floors.height_m) if floors else ([""], [None])
+    of_row, of_test = (
+        floors.number(rows.transmitter_position) if floors else torch.zeros(len(rows), dtype=torch.int64)
+        for rows in (train, test)
+    )
+    charts = [RssiMap.predict(model, height=height) for height in heights]
+    found, tables, first = [], [], []
+    for number, (name, height) in enumerate(zip(names, heights, strict=True)):
+        scans, held_out = train[of_row == number], test[of_test == number]
+        detected = RssiMap.predict(model, height=height, detected=True)
+        for threshold in thresholds_dbm:
+            best, *_ = of_floor = _coverages(model, detected, scans, held_out, threshold)
+            first += [best[0]] if threshold == thresholds_dbm[0] else []
+            found += [{"floor": name} | row for _, row in of_floor]
+            spots = best[0].weak_spots(detected).head(MAX_SPOTS)
+            degrees = degree_columns(train.origin, spots[["x_m", "y_m"]].to_numpy())
+            tables.append(spots.assign(**degrees, floor=name, threshold_dbm=threshold))
+    lower, upper = zip(*(chart.prediction.interval(LEVEL) for chart in charts), strict=True)
+    maps: dict[str, NDArray[Any]] = {
+        "x": charts[0].x,
+        "y": charts[0].y,
+        "predicted": np.stack([chart.mean for chart in charts]),
+        "width": (torch.stack(upper) - torch.stack(lower)).numpy(),
+        "detection": np.stack([chart.detection for chart in charts]),
+        "above": np.stack([floor.probability for floor in first]),
+        "inside": np.stack([floor.inside for floor in first]),
+        "known": np.stack([floor.measured for floor in first]),
+        "measured_position": train.transmitter_position.numpy(),
+        "measured": train.rssi_dbm.numpy(),
+        "receiver": train.receiver_position.numpy(),
+        "receiver_names": np.array(train.receiver_names),
+        "floor_names": np.array(names),
+        "floor_of_row": of_row.numpy(),
+    }
+    maps = maps if train.origin is None else maps | {"origin": np.array(train.origin)}
+    of_floors = [{"floor": name} | floor.values for name, floor in zip(names, first, strict=True)]
+    return maps, of_floors, {"coverage": DataFrame(found), "weak_spots": concat(tables, ignore_index=True)}
+
+
+def _coverages(
+    model: RssiModel | PairModel, chart: RssiMap, scans: Rssi, held_out: Rssi, threshold_dbm: float
+) -> list[tuple[Coverage, Values]]:
+    """Return the coverage of any, of two and of each receiver on a floor, with the predicted and counted test scans."""
+    names, found, fields, distance = chart.receiver_names, [], None, reach(model)
+    if len(held_out) and not held_out.receiver_moves:
+        prediction, detection = model.predict_detected(held_out), _detection(model, held_out)
+        assert prediction.std is not None
+        fields = prediction.mean.T, prediction.std.T, detection.T
+    every = list(range(len(names)))
+    chosen = [(ANY, every, 1), (TWO, every, 2)] if len(names) > 1 else []
+    chosen += [(name, [column], 1) for column, name in enumerate(names)]
+    for receiver, columns, number in chosen:
+        part = chart if columns == every else chart.receivers([names[column] for column in columns])
+        coverage = Coverage.of(part, scans.columns(columns), (threshold_dbm, CERTAINTY, number), distance)
+        row: Values = {"receiver": receiver} | coverage.values
+        if fields is not None:
+            mean, std, detection = (field[columns] for field in fields)
+            above = (held_out.rssi_dbm[:, columns] > threshold_dbm).sum(dim=1) >= number
+            row |= {
+                "n_test": len(held_out),
+                "test_predicted": float(at_least(number, mean, std, detection, threshold_dbm).mean()),
+                "test_above": float(above.double().mean()),
+            }
+        found.append((coverage, row))
+    return found
+
+
+def _detection(model: RssiModel | PairModel, rows: Rssi) -> Tensor:
+    offset = 0.0 if model.offsets is None else model.offsets.of(rows)[:, None]
+    return model.predict_detection(rows.transmitter_position, offset)

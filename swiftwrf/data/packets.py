@@ -1,0 +1,82 @@
+"""Rows of RSSI formed of packets: one a time and place, with the packets of all receivers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from swiftwrf.data.cells import Floats, text_of
+from swiftwrf.data.radios import plain_receiver, separate_radios, strongest_of_each, unknown_ids
+from swiftwrf.errors import InputError, listed
+
+
+def rows_of_packets(
+    source: object,
+    table: pd.DataFrame,
+    column: str,
+    power: Floats,
+    keys: pd.DataFrame,
+    n_listed: int = 1,
+    max_values: int = 2**27,
+) -> tuple[list[str], Floats, NDArray[np.int64], list[str]]:
+    """Form the rows of a long table, one a time and place. Repeated packets have a row each.
+
+    Without a receiver, nothing was detected.
+
+    Args:
+        source: Name of the table, for messages.
+        table: Packets.
+        column: Column of the receivers' names.
+        power: Power of each packet (p,) [dBm], nan where empty.
+        keys: Place, time and other values of packets whose rows stay apart; column time is empty without times.
+        n_listed: Packets of one scan that follow each other.
+        max_values: Number of values of RSSI, a limit of memory.
+
+    Returns:
+        Names of the R receivers, RSSI (n, R) [dBm], the packet of each value (n, R), and notes. A packet without a value is
+        the first one of its row.
+
+    Raises:
+        InputError: A power without a receiver, or too many values.
+    """
+    receiver, notes, timed = text_of(table[column]), list[str](), bool((keys["time"] != "").any())
+    if (unknown := unknown_ids(table[column]) & ~np.isnan(power)).any():
+        ids = listed(receiver[unknown].unique())
+        notes.append(f"{ids} in column {column} is no name, so these packets are left out: {unknown.sum()}")
+    named = (receiver != "").to_numpy() & ~unknown_ids(table[column])
+    if n_listed == 1 and len(nameless := np.flatnonzero((receiver == "").to_numpy() & ~np.isnan(power))):
+        raise InputError(f"{source} row {nameless[0] + 1} has no receiver in column {column}")
+    if not named.any():
+        raise InputError(f"{source} has no receiver in column {column}; choose another one with columns receiver=NAME")
+    keys = keys.assign(list=np.arange(len(keys)) // n_listed if n_listed > 1 else 0)
+    together = keys.groupby(list(keys.columns), sort=False, dropna=False).ngroup()
+    if by := separate_radios(table, column, together):
+        receiver = receiver.where(receiver == "", receiver + " " + text_of(table[by]))
+        notes.append(f"names in column {column} are those of several radios, which column {by} separates")
+    plain = receiver.map(plain_receiver)
+    one = plain.map(dict(zip(plain[::-1], receiver[::-1], strict=True)))  # in the first spelling
+    if len(others := receiver[one != receiver].unique()):
+        notes.append(f"names count as those of one receiver that differ in case, separators or zeros: {listed(others)}")
+    packets = keys.assign(receiver=one.to_numpy())
+    strongest = strongest_of_each(packets, column, power, timed)
+    if strongest is not None:
+        n = int((~strongest & named).sum())
+        notes.append(
+            f"packets of one name, place and time are of several radios, of which the strongest counts: {n} are left out"
+        )
+        named &= strongest
+    kept = named if n_listed > 1 else named | (receiver == "").to_numpy()
+    repeats = packets[kept].groupby(list(packets.columns), sort=False, dropna=False).cumcount()
+    keys["repeat"] = repeats.reindex(keys.index, fill_value=0)
+    row = keys.groupby(list(keys.columns), sort=False, dropna=False).ngroup().to_numpy()
+    number, names = pd.factorize(one[named])
+    _, first = np.unique(row, return_index=True)
+    if len(first) * len(names) > max_values:
+        raise InputError(
+            f"{source} has {len(first)} rows and {len(names)} receivers; at most {max_values} values are read"
+        )
+    rssi, packet = np.full((len(first), len(names)), np.nan), np.tile(first[:, None], len(names))
+    at = row[named], number
+    rssi[at], packet[at] = power[named], np.flatnonzero(named)
+    return list(names), rssi, packet, notes

@@ -1,0 +1,154 @@
+"""Coverage of an RSSI run in words and tables: shares of the area, weak spots, receivers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pandas import DataFrame
+
+from swiftwrf.contrib.comparison.coverage import ANY, TWO
+from tasks.page.page import Section, Table
+from tasks.records import Records, Row
+from tasks.rssi.maps import MAX_SPOTS, Maps
+
+MAX_NAMED = 3  # weak spots in a sentence
+MIN_NAMED_M2 = 0.5  # which is 1 as a whole number
+MIN_MISSING_DB = 0.5  # below which lost packets are what is missing
+
+
+def coverage_sentence(found: Row, where: str = "the measured area") -> str:
+    """Return a coverage in words, by `Coverage.values` and the name of the measured area."""
+    if found["covered"] is None:
+        return f"No cell of the map is in {where}."
+    shares = {name: f"{share:.0%}" for name, share in found.items() if isinstance(share, float)}
+    sentence = (
+        f"{shares['covered']} of {where} is covered, {shares['not_covered']} is not, {shares['uncertain']} is uncertain"
+    )
+    if found["scans_above"] is not None:
+        sentence += f"; {shares['scans_above']} of the {found['n_scans']} scans pass"
+    if (part := shares["not_measured"]) != "0%":
+        far = f"over {found['reach_m']:.1f} m from any scan"
+        sentence += f". {part} of the area between the scans is not measured, {far}"
+    return f"{sentence}."
+
+
+def why(run: Records) -> str:
+    """Return the default threshold of the coverage, and why it is that one; empty if it was asked for."""
+    if run.metrics["threshold"] is None:
+        return ""
+    threshold, unit = run.metrics["coverage"][0]["threshold_dbm"], Maps(run).unit
+    return (
+        f"The threshold of {threshold:g} {unit} is {run.metrics['threshold']}; `--above {unit.upper()}` sets another."
+    )
+
+
+def held_out_sentence(run: Records) -> str:
+    """Return how many test scans pass at the first threshold, beside the prediction; empty without test scans."""
+    table = run.table("coverage")
+    first = table[table["threshold_dbm"] == run.metrics["coverage"][0]["threshold_dbm"]]
+    rows = first[first["receiver"] == (ANY if (first["receiver"] == ANY).any() else first["receiver"].iloc[0])]
+    if "n_test" not in rows or not (n := rows["n_test"].sum()):
+        return ""
+    above, predicted = ((rows["n_test"] * rows[name]).sum() / n for name in ("test_above", "test_predicted"))
+    return f"Of {n:.0f} test scans {above:.0%} pass, {predicted:.0%} were predicted."
+
+
+def spots_sentence(floors: Sequence[Maps]) -> str:
+    """Return the largest weak spots of all floors; empty if there are none."""
+    named = []
+    for maps in floors:
+        where = f" on {maps.name}" if maps.suffix else ""
+        for spot in maps.spots[:MAX_NAMED]:
+            if spot["area_m2"] < MIN_NAMED_M2:
+                continue
+            place = f"{spot['area_m2']:,.0f} m², weakest at x = {spot['x_m']:.1f} m, y = {spot['y_m']:.1f} m{where}"
+            named.append(
+                (
+                    spot["not_covered_m2"],
+                    spot["area_m2"],
+                    f"{place} ({missing(spot, maps.error_unit)} at {spot['receiver']})",
+                )
+            )
+    largest = [text for *_, text in sorted(named, key=lambda one: one[:2], reverse=True)[:MAX_NAMED]]
+    return f"Largest weak spots: {'; '.join(largest)}." if largest else ""
+
+
+def missing(spot: Row, unit: str = "dB") -> str:
+    """Return what a weak spot lacks, in words.
+
+    Example:
+        >>> missing({"missing_db": 4.2}), missing({"missing_db": 0.0})
+        ('4 dB missing', 'packets are lost')
+    """
+    db = spot["missing_db"]
+    return f"{db:.0f} {unit} missing" if db >= MIN_MISSING_DB else "packets are lost"
+
+
+def section(run: Records) -> Section:
+    """Return weak spots, and coverage by threshold and receiver."""
+    floors = Maps.of_floors(run)
+    tables = [_spots(floors)] if any(maps.spots for maps in floors) else []
+    every, several, unit = run.table("coverage"), len(floors) > 1, floors[0].unit
+    of_one = ~every["receiver"].isin([ANY, TWO])
+    found = Section("", [*filter(None, [why(run)])], tables)
+    if of_one.all():
+        found.tables.append(_table(every, several, unit))
+    else:
+        found.tables.append(_table(every[~of_one], several, unit))
+        found.parts.append(Section("Each receiver", tables=[_table(every[of_one], several, unit)], folded=True))
+    return found
+
+
+def _spots(floors: Sequence[Maps]) -> Table:
+    rows = []
+    for maps in floors:
+        for rank, spot in enumerate(maps.spots[: 2 * MAX_SPOTS], start=1):
+            floor = [str(maps.arrays["floor_names"][maps.floor])] if maps.suffix else []
+            sizes = [f"{spot[name]:.1f}" for name in ("x_m", "y_m", "area_m2", "not_covered_m2")]
+            rows.append(
+                [
+                    str(rank),
+                    *floor,
+                    *sizes,
+                    f"{spot['probability']:.0%}",
+                    missing(spot, maps.error_unit),
+                    spot["receiver"],
+                ]
+            )
+    heads = ["x [m]", "y [m]", "area [m²]", "not covered [m²]", "probability", "missing", "best receiver"]
+    found, unit = floors[0].coverage, floors[0].unit
+    caption = (
+        f"Weak spots: connected parts of the measured area that are not covered above {found['threshold_dbm']:g} {unit}. "
+        f"The place is the weakest one. Missing there: {floors[0].error_unit} by which the best receiver is too weak for "
+        f"{found['certainty']:.0%} of its detected packets. All are in `weak_spots.csv`."
+    )
+    return Table(["", *(["floor"] if floors[0].suffix else []), *heads], rows, caption)
+
+
+def _table(table: DataFrame, several: bool, unit: str) -> Table:
+    columns = {
+        "covered": "covered",
+        "not_covered": "not covered",
+        "uncertain": "uncertain",
+        "not_measured": "not measured",
+        "scans_above": "scans above",
+        "test_predicted": "test scans, predicted",
+        "test_above": "test scans, counted",
+    }
+    columns = {name: head for name, head in columns.items() if name in table}
+    rows = [
+        [
+            row["receiver"],
+            *([str(row["floor"])] if several else []),
+            f"{row['threshold_dbm']:g}",
+            *("-" if row[name] != row[name] or row[name] is None else f"{row[name]:.0%}" for name in columns),
+        ]
+        for row in table.to_dict("records")
+    ]
+    caption = (
+        f"Coverage by receiver. {ANY.capitalize()}: a scan has at least one above the threshold. {TWO.capitalize()}: the "
+        "second-best receiver is above it, too, as roaming needs. Not measured: part of the area between the scans. Test "
+        "scans took no part in the fit. `coverage.csv` contains the same."
+    )
+    heads = ["receiver", *(["floor"] if several else []), f"above [{unit}]", *columns.values()]
+    return Table(heads, rows, caption)
