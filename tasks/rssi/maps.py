@@ -23,7 +23,7 @@ from tasks.page import figures, maps
 from tasks.page.page import Plot
 from tasks.records import Records, Row
 
-MAX_MAPS = 36  # of receivers, in a report of several floors; all are in the tables, and on the page of swiftwrf view
+MAX_MAPS = 30  # of receivers, in a report of several floors; all are in the tables, and on the page of swiftwrf view
 FIRST_MAPS = 6  # of the receivers of a floor that are not folded
 MAX_SPOTS = 5  # weak spots of a floor with a number on its map
 MAX_WIDTH_DB = 30.0  # end of the scale of interval widths of the page

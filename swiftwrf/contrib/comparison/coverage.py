@@ -66,7 +66,7 @@ def maps_and_coverage(
             first += [best[0]] if threshold == thresholds_dbm[0] else []
             found += [{"floor": name} | row for _, row in of_floor]
             of_rooms += [] if rooms is None else _of_rooms(rooms, detected, best[0])
-            spots = best[0].weak_spots(detected).head(MAX_SPOTS)
+            spots = best[0].weak_spots(detected).head(MAX_SPOTS).round(3)
             degrees = degree_columns(train.origin, spots[["x_m", "y_m"]].to_numpy())
             tables.append(spots.assign(**degrees, floor=name, threshold_dbm=threshold))
     lower, upper = zip(*(chart.prediction.interval(LEVEL) for chart in charts), strict=True)
