@@ -139,7 +139,7 @@ def test_weak_spots_are_listed_from_the_largest(building):
     weak = maps["known"] & (maps["above"] < 0.9)
     cell = maps["x"][1] - maps["x"][0]
     for floor, name in enumerate(NAMES):
-        assert spots[spots["floor"] == name]["area_m2"].sum() == pytest.approx(weak[floor].sum() * cell**2)
+        assert spots[spots["floor"] == name]["area_m2"].sum() == pytest.approx(weak[floor].sum() * cell**2, abs=0.01)
     first = spots.sort_values(["not_covered_m2", "area_m2"], ascending=False).iloc[0]
     place = f"{first['area_m2']:,.0f} m², weakest at x = {first['x_m']:.1f} m, y = {first['y_m']:.1f} m on floor 1 ("
     sentence = f"Largest weak spots: {place}{first['missing_db']:.0f} dB missing at {first['receiver']})"
