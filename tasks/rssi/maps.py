@@ -127,7 +127,7 @@ class Maps:
         style |= {"alpha": 1.0 if self.plan is None else 0.75, "interpolation": "none", "zorder": 1}
         ax.imshow(classes, origin="lower", extent=extent, aspect=aspect, **style)
         many = len(a["measured_position"]) >= figures.MAX_VECTOR_MARKS
-        ax.plot(*a["measured_position"][:, :2].T, ".", color="black", markersize=1.2, rasterized=many, zorder=2)
+        ax.plot(*a["measured_position"][:, :2].T, ".", color="#000001", markersize=1.2, rasterized=many, zorder=2)
         self._mark_receivers(ax, None)
         style = {"fontsize": 8, "color": "#000001", "ha": "center", "va": "center", "zorder": 5}
         for rank, spot in enumerate(self.spots[:MAX_SPOTS], start=1):

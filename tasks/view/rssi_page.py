@@ -138,7 +138,7 @@ class RssiPage:
             return
         coloured, data, best = found
         self._limits.set_visibility(selection.kind == "coverage")
-        self._receiver.set_enabled(selection.kind not in ("best receiver", *LOCATING))
+        self._receiver.set_enabled(selection.kind not in ("best receiver", *LOCATING) and not _at_any(selection))
         self._height.set_enabled(selection.kind not in LOCATING)
         self._choice.set_visibility(selection.kind == "posterior")
         self._sentence.set_text(coloured.sentence)
@@ -179,7 +179,7 @@ class RssiPage:
         found = None
         if selection.kind == "posterior" and view.locating is not None:
             data["rows"], found = points(view.position), view.locating.located(selection.row)
-        every = selection.kind in ("best receiver", *LOCATING)
+        every = selection.kind in ("best receiver", *LOCATING) or _at_any(selection)
         for number, position in enumerate(rows.receiver_position.numpy()):
             if np.isfinite(position).all() and (every or number == selection.receiver):
                 colour = _colour(number) if selection.kind == "best receiver" else RECEIVER_MARK
@@ -207,6 +207,11 @@ class RssiPage:
     def _save_table(self) -> None:
         selection = self._selection
         ui.download.content(self._view.table(selection), f"{_file_name(selection)}.csv", "text/csv")
+
+
+def _at_any(selection: MapSelection) -> bool:
+    """Return True if the map is of all receivers together."""
+    return selection.kind == "coverage" and selection.at_least > 0
 
 
 def _colour(receiver: int) -> str:
