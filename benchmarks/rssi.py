@@ -2,6 +2,7 @@
 
 python benchmarks/rssi.py --data DATA
 python benchmarks/rssi.py coverage --data DATA
+python benchmarks/rssi.py receivers --data DATA --receivers 16
 
 `errors`: every predictor is fitted to the training rows of a split and predicts its test rows. `identity` is `swiftwrf` with
 heads whose primitives are in phase in all directions, so that they do not change the field.
@@ -10,6 +11,9 @@ heads whose primitives are in phase in all directions, so that they do not chang
 probability that any receiver is above a threshold is compared with the test scans that pass. The correlation of errors in a
 scan (default of `swiftwrf.rssi.coverage.at_least`) is the one with the lowest Brier score on a fifth of the training rows,
 which the fit for it leaves out.
+
+`receivers`: the table `coverage` of a run, at its default threshold and at the median of the strongest RSSI of the training
+scans: predicted and counted shares of the test scans, by floor and receiver.
 
 The result is written after each split, and `--resume` skips the splits that it contains.
 """
@@ -30,13 +34,14 @@ from record import kept, options, write_result
 from torch import Tensor
 
 from swiftwrf import Rssi, load_rssi, rssi_room
+from swiftwrf.contrib.comparison.coverage import maps_and_coverage
 from swiftwrf.contrib.comparison.errors import method_summary, summary
 from swiftwrf.contrib.comparison.rssi import compare
 from swiftwrf.contrib.comparison.steps import Memo
 from swiftwrf.metrics import LEVEL
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.rssi import RssiModel
-from swiftwrf.rssi.coverage import at_least, reach
+from swiftwrf.rssi.coverage import at_least, default_threshold, reach
 from swiftwrf.rssi.head import DB_PER_UNIT, Head, render
 
 RESULT = "rssi"
@@ -66,7 +71,7 @@ COVERAGE = {
     "dae-2025": ("random", "block"),
     **{f"ts-{name}": ("random", "block") for name in ("ujib1", "dsi1", "tut2", "tut5")},
 }
-COVERAGE_RESULT = "coverage_headline"
+COVERAGE_RESULT, RECEIVERS_RESULT = "coverage_headline", "coverage_receivers"
 COVERED_DBM, CERTAINTY = -75.0, 0.9
 QUANTILES = (0.1, 0.3, 0.5, 0.7)  # of the strongest RSSI of the training scans, further thresholds
 CORRELATIONS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5)
@@ -79,12 +84,12 @@ Row = dict[str, Any]
 class Config:
     data: Path
     """folder of the data sets"""
-    study: tyro.conf.Positional[Literal["errors", "coverage"]] = "errors"
-    """errors of all predictors, or scans where coverage is predicted"""
+    study: tyro.conf.Positional[Literal["errors", "coverage", "receivers"]] = "errors"
+    """errors of all predictors, scans where coverage is predicted, or that by floor and receiver"""
     sets: tuple[str, ...] = ()
     """data sets to measure. Defaults to all; the results of others are kept"""
     receivers: int | None = None
-    """most detected receivers of a set that the study of coverage fits. Defaults to all"""
+    """most detected receivers of a set that the studies of coverage fit. Defaults to all"""
     also: tuple[str, ...] = ()
     """predictors that are compared only when named, e.g. nerf2, whose fit is slow"""
     resume: bool = False
@@ -92,8 +97,8 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Measure each split and write `results/rssi.json` or `results/coverage_headline.json`."""
-    if config.study == "coverage":
+    """Measure each split and write `results/rssi.json` or the result of a study of coverage."""
+    if config.study != "errors":
         return measure_coverages(config)
     found: dict[str, Row] = dict(kept(RESULT, "sets"))
     for name, split in splits(config.sets):
@@ -163,7 +168,10 @@ def measure(data: Rssi, split: str, also: tuple[str, ...] = ()) -> Row:
 
 def measure_coverages(config: Config) -> None:
     """Measure the coverage of each scene and split, and write the result."""
-    found: dict[str, Row] = dict(kept(COVERAGE_RESULT, "scenes"))
+    measured, result = measure_coverage, COVERAGE_RESULT
+    if config.study == "receivers":
+        measured, result = measure_receivers, RECEIVERS_RESULT
+    found: dict[str, Row] = dict(kept(result, "scenes"))
     keys = [(name, split) for name in config.sets or COVERAGE for split in COVERAGE[name]]
     for name, split in keys:
         key = f"{name} {split}"
@@ -171,11 +179,11 @@ def measure_coverages(config: Config) -> None:
             continue
         seed = name.removeprefix("simulated-floor-")
         data = load_rssi(config.data / name) if seed == name else rssi_room(seed=int(seed))
-        found[key] = measure_coverage(data, split, config.receivers)
+        found[key] = measured(data, split, config.receivers)
         for row in found[key]["rows"]:
             print(key, row, flush=True)
         print(key, {name: value for name, value in found[key].items() if name != "rows"}, flush=True)
-        write_result(COVERAGE_RESULT, {"scenes": found}, rows=[found[key]])
+        write_result(result, {"scenes": found}, rows=[found[key]])
 
 
 def measure_coverage(data: Rssi, split: str, receivers: int | None = None) -> Row:
@@ -212,6 +220,17 @@ def measure_coverage(data: Rssi, split: str, receivers: int | None = None) -> Ro
         "brier_by_correlation": scores,
         "rows": rows,
     }
+
+
+def measure_receivers(data: Rssi, split: str, receivers: int | None = None) -> Row:
+    """Return the predicted and the counted shares of test scans above thresholds, by floor and receiver."""
+    data = most_detected(data.receivers(["all"]), receivers)
+    train, test = data.split(split)
+    model = RssiModel(validation=train.validation_for(split, test)).fit(train)
+    limits = default_threshold(data)[0], thresholds(train)[QUANTILES.index(0.5)]
+    table = maps_and_coverage(model, train, test, limits)[2]["coverage"].dropna(subset=["n_test"])
+    names = ["floor", "receiver", "threshold_dbm", "n_test", "test_predicted", "test_above"]
+    return {"n_train": len(train), "n_receivers": len(train.receiver_names), "rows": table[names].to_dict("records")}
 
 
 def thresholds(train: Rssi) -> list[float]:

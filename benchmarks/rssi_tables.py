@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+import operator
 from statistics import mean
 from typing import Any
 
 from record import load, markdown
 
+ANY, TWO = "any receiver", "two receivers"  # rows that are of no single receiver
 Row = dict[str, Any]
 COVERED_DBM = -75.0  # threshold of the reports
 RELEVANT_DB = 0.02  # difference of medians below which predictors are level
@@ -55,6 +58,36 @@ def coverage_headline() -> str:
         rows.append([name, *cells, "" if passed is None else f"{passed:.1%} of {n_sure}"])
     columns = ["data, split", "floors", "scans", "predicted", "counted", "largest difference of a floor [points]"]
     return markdown([*columns, "pass where P is 0.9 or more, all thresholds"], rows)
+
+
+def coverage_receivers() -> str:
+    """Return how often predicted shares of test scans are within 5 points of the counted ones, by floor and receiver.
+
+    A counted share of n scans has a standard error. Shares count as within 5 points up to two of it, too.
+    """
+    found: dict[str, list[Row]] = {}
+    for name, scene in load("coverage_receivers").get("scenes", {}).items():
+        floors = "simulated floors random" if name.startswith("simulated-floor") else name
+        found.setdefault(floors, []).extend(scene["rows"])
+    rows = []
+    for name, every in found.items():
+        cells = []
+        for own in (
+            [row for row in every if row["receiver"] == ANY],
+            [row for row in every if row["receiver"] not in (ANY, TWO)],
+        ):
+            off = [abs(row["test_predicted"] - row["test_above"]) for row in own]
+            by_chance = [
+                max(0.05, 2 * math.sqrt(row["test_predicted"] * (1 - row["test_predicted"]) / row["n_test"]))
+                for row in own
+            ]
+            within = sum(error <= 0.05 for error in off), sum(map(operator.le, off, by_chance))
+            bias = mean(row["test_predicted"] - row["test_above"] for row in own)
+            cells += [f"{within[0]} of {len(own)}", f"{within[1]} of {len(own)}", f"{100 * bias + 0.0:+.1f}"]
+        rows.append([name, *cells])
+    heads = ("within 5 points", "or two standard errors", "mean difference [points]")
+    columns = [f"{who}: {head}" for who in ("any receiver", "each receiver") for head in heads]
+    return markdown(["data, split", *columns], rows)
 
 
 def intervals() -> str:

@@ -15,6 +15,7 @@ from torch import Tensor
 from swiftwrf.data import Rssi, Spectra, Stations
 from swiftwrf.data.coordinates import Floors, degree_columns
 from swiftwrf.data.dataset import Numbers
+from swiftwrf.data.rooms import Rooms
 from swiftwrf.data.store import Store
 from swiftwrf.errors import InputError, with_article
 from swiftwrf.locate import MatchedField, Posterior, RssiLocator, smoothed
@@ -32,7 +33,12 @@ Columns = dict[str, Any]  # of tensors, and arrays of names
 
 
 def predict(
-    model: Any, new: Numbers | Rssi | Spectra | Stations | Store, *, track: float | None = None, truth: bool = True
+    model: Any,
+    new: Numbers | Rssi | Spectra | Stations | Store,
+    *,
+    track: float | None = None,
+    truth: bool = True,
+    rooms: Rooms | None = None,
 ) -> Prediction | DataFrame:
     """Apply a fitted model to new positions or measurements.
 
@@ -43,6 +49,7 @@ def predict(
         new: Positions or measurements.
         track: Speed [m/s] of a walk, along which positions are smoothed: the standard deviation of each component.
         truth: Compare with the positions of the measurements.
+        rooms: Rooms whose probability is given for each located row.
 
     Returns:
         Mean and standard deviation at positions. Otherwise a table with a row for each measurement: positions with standard
@@ -66,26 +73,30 @@ def predict(
         raise InputError(
             f"a walk smooths positions, and {with_article(getattr(model, 'kind', 'model'))} locates nothing"
         )
+    if rooms is not None and not isinstance(model, RssiLocator | MatchedField):
+        raise InputError(
+            f"rooms are of located rows, and {with_article(getattr(model, 'kind', 'model'))} locates nothing"
+        )
     if isinstance(model, FieldModel | RssiPredictor):
         prediction: Prediction = model.predict(new)
         return prediction
     if isinstance(model, RssiLocator):
         if not isinstance(new, Rssi):
             raise InputError(f"an RSSI locator takes Rssi, got {type(new).__name__}")
-        columns = _positions_of_rssi(model, new, track, truth)
+        columns = _positions_of_rssi(model, new, track, truth, rooms)
     elif not hasattr(model, "predict"):
         raise InputError(f"expected a fitted model or its file, got {type(model).__name__}")
     elif isinstance(new, Stations):
         if not isinstance(model, MatchedField):
             raise InputError(f"{with_article(model.kind)} takes the spectra of one station; give data.of(station)[1]")
-        columns = _positions_of_stations(model, new, track, truth)
+        columns = _positions_of_stations(model, new, track, truth, rooms)
     else:
         known = new if isinstance(new, Spectra) else None
         store = (
             new if isinstance(new, Store) else new.store if isinstance(new, Spectra) else Store(torch.as_tensor(new))
         )
         if isinstance(model, MatchedField):
-            columns = _positions_of_spectra(model, store, known, track)
+            columns = _positions_of_spectra(model, store, known, track, rooms)
         else:
             estimate = torch.cat([model.predict(part) for part in store.batches()])
             index = torch.arange(len(store)) if known is None else known.index
@@ -93,7 +104,9 @@ def predict(
     return DataFrame({name: np.asarray(column) for name, column in columns.items()})
 
 
-def _positions_of_rssi(locator: RssiLocator, data: Rssi, track: float | None, truth: bool) -> Columns:
+def _positions_of_rssi(
+    locator: RssiLocator, data: Rssi, track: float | None, truth: bool, rooms: Rooms | None
+) -> Columns:
     data = locator.model.aligned(data, located=truth)
     data = data.subset(data.detected.any(dim=1))
     if not len(data):
@@ -101,12 +114,15 @@ def _positions_of_rssi(locator: RssiLocator, data: Rssi, track: float | None, tr
     posteriors: Iterable[Posterior] = map(locator.locate, data.rssi_dbm.split(BATCH_ROWS))
     if track is not None:
         posteriors = _tracked(posteriors, _times(data), track)
-    columns = _located(posteriors, data.index, data.transmitter_position if truth else None, locator.region.floors)
+    position = data.transmitter_position if truth else None
+    columns = _located(posteriors, data.index, position, locator.region.floors, rooms)
     degrees = degree_columns(locator.model.origin, torch.stack([columns["x_m"], columns["y_m"]], dim=1).numpy())
     return columns | {name: torch.from_numpy(values.copy()) for name, values in degrees.items()}
 
 
-def _positions_of_spectra(locator: MatchedField, store: Store, known: Spectra | None, track: float | None) -> Columns:
+def _positions_of_spectra(
+    locator: MatchedField, store: Store, known: Spectra | None, track: float | None, rooms: Rooms | None
+) -> Columns:
     directions: list[Tensor] = []
     index = torch.arange(len(store)) if known is None else known.index
     rows = torch.arange(len(store)).split(BATCH_ROWS)
@@ -118,17 +134,20 @@ def _positions_of_spectra(locator: MatchedField, store: Store, known: Spectra | 
         directions.append(locator.direction(posterior))
         return posterior
 
-    columns = _located(map(with_direction, posteriors), index, None if known is None else known.position)
+    position = None if known is None else known.position
+    columns = _located(map(with_direction, posteriors), index, position, rooms=rooms)
     return columns | _directions(torch.cat(directions), known)
 
 
-def _positions_of_stations(locator: MatchedField, data: Stations, track: float | None, truth: bool) -> Columns:
+def _positions_of_stations(
+    locator: MatchedField, data: Stations, track: float | None, truth: bool, rooms: Rooms | None
+) -> Columns:
     data = data.subset(data.received.any(dim=1))
     rows = torch.arange(len(data)).split(BATCH_ROWS)
     posteriors: Iterable[Posterior] = (locator.locate(data.subset(part)) for part in rows)
     if track is not None:
         posteriors = _tracked(posteriors, data.index.double(), track)
-    columns = _located(posteriors, data.index, data.position if truth else None)
+    columns = _located(posteriors, data.index, data.position if truth else None, rooms=rooms)
     received = {f"received_{name}": column for name, column in zip(data.names, data.received.T, strict=True)}
     return columns | received
 
@@ -186,22 +205,34 @@ def _tracked(posteriors: Iterable[Posterior], time: Tensor, speed_m_s: float) ->
 
 
 def _located(
-    posteriors: Iterable[Posterior], index: Tensor, truth: Tensor | None, floors: Floors | None = None
+    posteriors: Iterable[Posterior],
+    index: Tensor,
+    truth: Tensor | None,
+    floors: Floors | None = None,
+    rooms: Rooms | None = None,
 ) -> Columns:
     """Return the columns of a table with the positions of observations, batch by batch."""
     parts = (
-        (each.median, each.std, each.credible_radius(), each.ambiguous, each.floor_probability.amax(dim=1))
+        (
+            each.median,
+            each.std,
+            each.credible_radius(),
+            each.ambiguous,
+            each.floor_probability.amax(dim=1),
+            torch.empty(len(each), 0) if rooms is None else rooms.probability(each.position, each.weight),
+        )
         for each in posteriors
     )
     if not len(index):
         raise InputError("there is no row to locate")
-    position, std, radius, ambiguous, probability = (torch.cat(values) for values in zip(*parts, strict=True))
+    position, std, radius, ambiguous, probability, of_rooms = (torch.cat(values) for values in zip(*parts, strict=True))
     columns: Columns = {"index": index}
     columns |= dict(zip(("x_m", "y_m", "z_m"), position.T, strict=True))
     columns |= dict(zip(("std_x_m", "std_y_m", "std_z_m"), std.T, strict=True))
     columns |= {"credible_radius_80_m": radius, "ambiguous": ambiguous}
     if floors is not None:
         columns |= {"floor": np.array(floors.named(position)), "floor_probability": probability}
+    columns |= {} if rooms is None else rooms.columns(of_rooms)
     if truth is not None:
         columns |= dict(zip(("truth_x_m", "truth_y_m", "truth_z_m"), truth.T, strict=True))
         columns["position_error_m"] = (position - truth).norm(dim=1)

@@ -138,6 +138,9 @@ class RssiTaskConfig(ReadingConfig):
     """folds of the training rows that choose all settings; auto takes those that are like the test rows"""
     above: tuple[float, ...] = ()
     """thresholds of the coverage [dBm], the first one that of the maps (default: -67 for Wi-Fi, else -75)"""
+    rooms: str | None = None
+    """rooms as polygons: GeoJSON, or a table of their corners with columns room, x, y and floor (default: rooms.csv or
+    rooms.geojson beside the data)"""
     preset: Preset = "quick"
     """of SwiftWRF and NeRF2: quick, or paper for the published head and field"""
     floor_plan: str | None = None
@@ -185,6 +188,9 @@ class LocateConfig(ReadingConfig):
     """receivers: names, numbers counted from 1, or all"""
     split: str = "random"
     """a split that comes with the data, or a seeded one: random or block"""
+    rooms: str | None = None
+    """rooms as polygons: GeoJSON, or a table of their corners with columns room, x, y and floor (default: rooms.csv or
+    rooms.geojson beside the data)"""
     stations: Annotated[int, Ge(0), Le(4)] = 0
     """number of antenna arrays in the built-in office, whose spectra locate the transmitter in place of RSSI"""
     cells: Annotated[int, Ge(10), Le(1_000_000)] = 4000
@@ -213,8 +219,10 @@ class LocateConfig(ReadingConfig):
         """Refuse options that do not apply to several arrays.
 
         Raises:
-            InputError: More poses of a next array than are compared.
+            InputError: Rooms, or more poses of a next array than are compared.
         """
+        if self.rooms is not None:
+            raise InputError("--rooms is for RSSI; positions by several arrays get rooms by swiftwrf predict --rooms")
         if self.suggest > MAX_STATIONS:
             raise InputError(f"--suggest takes at most {MAX_STATIONS} poses of a next array, got {self.suggest}")
 
@@ -241,6 +249,9 @@ class PredictConfig(ReadingConfig):
     latitude, longitude, altitude"""
     track: float | None = None
     """rows of SOURCE are a walk: smooths its positions by this typical speed [m/s]. Rows without times are 1 s apart"""
+    rooms: str | None = None
+    """rooms as polygons: GeoJSON, or a table of their corners with columns room, x, y and floor (default: rooms.csv or
+    rooms.geojson beside the data)"""
     ignore_receivers: bool = False
     """leave out receivers in SOURCE that the locator does not have (default: refuse them)"""
     out: str | None = None

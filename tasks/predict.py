@@ -29,7 +29,7 @@ from tasks.convert import write_file
 from tasks.directory import check_new_file, kept_model
 from tasks.environment import stamp
 from tasks.records import CONFIG, Records, Row, rounded, write_table
-from tasks.source import Reading, aligned, is_table, observed_spectra, reading, with_groups
+from tasks.source import Reading, aligned, is_table, observed_spectra, reading, rooms_beside, with_groups
 from tasks.terminal import console, terminal
 
 PLAN = ("scale", "y_down", "up")  # options of reading a table of positions
@@ -56,6 +56,8 @@ def run(config: PredictConfig) -> None:
             raise InputError(f"{how.file} states {name}, which does not apply to positions; leave it out")
     if how.note:
         console.print(how.note)
+    if config.rooms is not None and not isinstance(model, RssiLocator | MatchedField):
+        raise InputError(f"--rooms is for locators, and {file} holds {with_article(model.kind)}; leave it out")
     if isinstance(model, FieldModel | RssiPredictor):
         origin, floors = None, None
         if isinstance(model, RssiPredictor):
@@ -78,14 +80,17 @@ def run(config: PredictConfig) -> None:
         data = aligned(data, model.model, config.ignore_receivers)
         if silent := int((~data.detected.any(dim=1)).sum()):
             console.print(f"{data.name}: rows that no receiver detected are left out: {silent}")
-        table = predict(model, data, track=config.track, truth=is_known)
+        rooms = rooms_beside(how, config.rooms, model.model.origin, model.region.floors)
+        table = predict(model, data, track=config.track, truth=is_known, rooms=rooms)
     elif isinstance(model, MatchedField) and len(model.stations) > 1:
         data_of_all = read_stations(Path(how.source), how.options)
-        table = predict(model, data_of_all, track=config.track)
+        rooms = rooms_beside(how, config.rooms, None, None)
+        table = predict(model, data_of_all, track=config.track, rooms=rooms)
     elif isinstance(model, MatchedField | Estimator):
         kind = "locator" if isinstance(model, MatchedField) else "estimator"
         store, known = observed_spectra(how, model.grid, kind)
-        table = predict(model, store if known is None else known, track=config.track)
+        rooms = rooms_beside(how, config.rooms, None, None) if isinstance(model, MatchedField) else None
+        table = predict(model, store if known is None else known, track=config.track, rooms=rooms)
     else:
         raise InputError(
             f"{file} holds {with_article(model.kind)}, which no command applies; load it with swiftwrf.load in Python"

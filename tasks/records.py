@@ -33,6 +33,8 @@ NAMES = (  # columns of text, even if a cell reads NA, 1 or 12:34
     "training",
     "receiver",
     "floor",
+    "room",
+    "truth_room",
     "synthesizer",
     "stage",
     "origin",

@@ -18,10 +18,12 @@ from swiftwrf import AngularGrid, InputError, Rssi, RssiModel, Spectra
 from swiftwrf.array.planar import PlanarArray
 from swiftwrf.contrib.datasets import DATA_SETS, fetch
 from swiftwrf.data.archives import array_header, read_rows
+from swiftwrf.data.coordinates import Floors, GeodeticOrigin, PlanFrame
 from swiftwrf.data.files import TABLES, read_table, sha256
 from swiftwrf.data.formats import SNAPSHOT_FORMATS, SPECTRA_FORMATS, ReadOptions, read
 from swiftwrf.data.formats.base import Format
 from swiftwrf.data.receivers import spelled_as
+from swiftwrf.data.rooms import FILES, Rooms, read_rooms
 from swiftwrf.data.rssi import Offsets
 from swiftwrf.data.store import Store
 from swiftwrf.errors import listed
@@ -133,6 +135,24 @@ def located(source: str) -> str:
     found = DATA_SETS[source]
     console.print(f"{source}: licence {found.licence}; {found.citation}")
     return str(fetch(source))
+
+
+def rooms_beside(
+    how: Reading | None, given: str | None, origin: GeodeticOrigin | None, floors: Floors | None
+) -> Rooms | None:
+    """Return the rooms in a file that the user gives, or in one beside the measurements. None without a file.
+
+    Raises:
+        InputError: Rooms that cannot be read.
+    """
+    found = None if given is None else Path(given)
+    if found is None and how is not None:
+        folder = Path(how.source) if os.path.isdir(how.source) else Path(how.source).parent
+        found = next((folder / name for name in FILES if isfile(folder / name)), None)
+    if found is None:
+        return None
+    frame = PlanFrame() if how is None else PlanFrame(*(getattr(how.options, name) for name in PlanFrame._fields))
+    return read_rooms(found, origin, frame, floors)
 
 
 def offset_notes(data: Rssi) -> list[str]:

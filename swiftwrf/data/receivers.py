@@ -62,7 +62,7 @@ def read_receivers(
     if len(set(listed_names)) < len(listed_names):
         raise InputError(f"{file} must have each receiver once, got {listed(listed_names)}")
     listed_names, notes = spelled_as(listed_names, names)
-    position = _positions(file, table, origin, frame)
+    position = positions_of(file, table, origin, frame)
     given = np.flatnonzero(~np.isnan(position[:, :2]).all(axis=1))
     position, listed_names = position[given], [listed_names[row] for row in given]
     position_of = dict(zip(listed_names, check_positions(position, f"positions of {file}").tolist(), strict=True))
@@ -99,7 +99,7 @@ def read_places(file: Path, origin: GeodeticOrigin | None, frame: PlanFrame, flo
         InputError: A column that is missing, an unknown floor, or a position that is not usable.
     """
     table = read_table(file)
-    position = _positions(file, table, origin, frame)
+    position = positions_of(file, table, origin, frame)
     if floors is not None and column_of(table, "z", {}) is None:
         column = column_of(table, "floor", {})
         named = [] if column is None else text_of(table[column]).tolist()
@@ -110,7 +110,7 @@ def read_places(file: Path, origin: GeodeticOrigin | None, frame: PlanFrame, flo
     return check_positions(position, f"positions of {file}")
 
 
-def _positions(
+def positions_of(
     file: Path, table: pd.DataFrame, origin: GeodeticOrigin | None, frame: PlanFrame, max_from_origin_deg: float = 2.0
 ) -> Floats:
     """Return the positions (n, 3) [m] in a table, nan where a cell is empty; degrees lie near the origin."""

@@ -115,7 +115,7 @@ def classified(
     """Return the number of the class of each cell in `CLASSES`.
 
     Example:
-        >>> found = classified(np.array([0.95, 0.5, 0.1, 0.95]), np.array([True, True, True, False]))
+        >>> found = classified(np.array([0.95, 0.5, 0.05, 0.95]), np.array([True, True, True, False]))
         >>> [CLASSES[number] for number in found]
         ['covered', 'uncertain', 'not covered', 'not measured']
     """

@@ -20,7 +20,7 @@ from tasks.locate.placement import write_poses
 from tasks.page.page import finish
 from tasks.page.shared import write_suggestion
 from tasks.records import Row
-from tasks.source import reading
+from tasks.source import reading, rooms_beside
 from tasks.terminal import console, terminal
 from tasks.workers import connected, workers_of
 
@@ -33,8 +33,12 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
     """
     device = choose_device("cpu")
     data, reference = measurements(config)
+    rooms = None
     if isinstance(data, Stations):
         config.check_stations()
+    else:
+        how = None if config.data is None else reading(config, config.data)
+        rooms = rooms_beside(how, config.rooms, data.origin, data.floors)
     for note in data.notes:
         console.print(f"{data.name}: {note}")
     label = f"{'stations' if isinstance(data, Stations) else 'rx' + '_'.join(config.receivers)}-s{config.seed}"
@@ -47,7 +51,7 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
             if isinstance(data, Stations):
                 result: PositionComparison = compare_stations(data, **common)
             else:
-                result = compare(data, n_cells=config.cells, reference=reference, **common)
+                result = compare(data, n_cells=config.cells, reference=reference, rooms=rooms, **common)
         if isinstance(result, LocateComparison):
             _conclude(result, config, directory)
         elif isinstance(result, StationsComparison):

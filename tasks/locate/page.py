@@ -9,10 +9,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
-from pandas import DataFrame
+from pandas import DataFrame, crosstab
 from scipy.stats import binomtest
 
 from swiftwrf.contrib.comparison.localizers import LOCALIZERS
+from swiftwrf.data.rooms import OUTSIDE
 from swiftwrf.metrics import LEVEL
 from swiftwrf.plotting import corners_of
 from tasks import labels
@@ -68,6 +69,8 @@ def page(runs: list[Records]) -> Page:
         sections_of("How sure is it?", runs, lambda run: Section("", plots=[_calibration(run)])),
         limits(runs[0], *(LIMITS if runs[0].metrics["received_by"] == "receiver" else LIMITS_OF_STATIONS)),
     ]
+    if any(run.metrics.get("rooms") for run in runs):
+        sections.insert(1, sections_of("Which room?", runs, _rooms))
     if runs[0].metrics["received_by"] == "receiver" and any(run.arrays(SUGGESTED) for run in runs):
         sections.insert(-1, sections_of("Where to measure next", runs, _suggestion))
     names = ", ".join(dict.fromkeys(run.place for run in runs))
@@ -122,6 +125,34 @@ def _directions(run: Records) -> Section:
     poses = poses_section(run.arrays(SUGGESTED), SUGGESTED, run.file_name)
     return Section(
         "Directions at each station", paragraphs=[text], tables=[Table(heads, rows)], parts=[poses] if poses else []
+    )
+
+
+def _rooms(run: Records) -> Section | None:
+    """Return how often the most probable room is the true one, and which rooms are taken for which."""
+    if not run.metrics.get("rooms"):
+        return None
+    table = run.table("rooms")
+    counts = crosstab(table["truth_room"], table["room"])
+    names = [name for name in [*run.metrics["rooms"], OUTSIDE] if name in counts.index or name in counts.columns]
+    counts = counts.reindex(index=names, columns=names, fill_value=0)
+    rows = [
+        [name, *(str(count) if count else "" for count in row)]
+        for name, row in zip(names, counts.to_numpy(), strict=True)
+    ]
+    caption = (
+        "Test rows by their true room (row) and the most probable room (column). `rooms.csv` contains the probability of "
+        "each room."
+    )
+    return Section("", [_rooms_sentence(run)], [Table(["true room", *names], rows, caption)])
+
+
+def _rooms_sentence(run: Records) -> str:
+    table = run.table("rooms")
+    right, mean = (table["room"] == table["truth_room"]).mean(), table["room_probability"].mean()
+    return (
+        f"The most probable room is the true one in {right:.0%} of {len(table)} test rows; the mean of its probability is "
+        f"{mean:.0%}."
     )
 
 
@@ -244,6 +275,7 @@ def conclusion(run: Records) -> list[str]:
         f"{run.metrics['calibration'][str(LEVEL)]:.0%} of the true positions lie in the {LEVEL:.0%} region that comes with "
         f"each estimate. Tested on {n_test} rows, fitted to {run.metrics['n_train']} rows at {receivers}; "
         f"{run.scene}.",
+        *([_rooms_sentence(run)] if run.metrics.get("rooms") else []),
         comparison_sentence(
             by_method(run.table("errors")[COLUMNS]),
             OWN,

@@ -8,6 +8,7 @@ from typing import BinaryIO
 
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.colors import ListedColormap
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
@@ -15,12 +16,15 @@ from swiftwrf import InputError
 from swiftwrf.positions import MAX_COORDINATE_M
 from swiftwrf.runtime.checkpoint import refusing
 from swiftwrf.runtime.durable import write_npz
+from tasks.labels import COVERAGE
 from tasks.records import read_npz
 
 TRANSPARENT = 255  # palette index of pixels without a value
 MAX_PLAN_PIXELS = 2**24
 STORED = "floor-plan.npz"  # in the directory of a run
 Corners = tuple[float, float, float, float]  # x0, x1, y0, y1 [m]
+CLASS_COLOURS = "coverage"  # colour map of `swiftwrf.rssi.coverage.CLASSES` by their numbers
+colormaps.register(ListedColormap(list(COVERAGE.values()), CLASS_COLOURS), force=True)
 
 
 def colour_image(values: NDArray[np.floating], colours: str, low: float = 0.0, high: float = 1.0) -> Image.Image:

@@ -90,6 +90,8 @@ def section(run: Records) -> Section:
     tables = [_spots(floors)] if any(maps.spots for maps in floors) else []
     every, several, unit = run.table("coverage"), len(floors) > 1, floors[0].unit
     of_one = ~every["receiver"].isin([ANY, TWO])
+    if run.metrics["rooms"]:
+        tables.append(_rooms(run.table("rooms")))
     found = Section("", [*filter(None, [why(run)])], tables)
     if of_one.all():
         found.tables.append(_table(every, several, unit))
@@ -152,3 +154,19 @@ def _table(table: DataFrame, several: bool, unit: str) -> Table:
     )
     heads = ["receiver", *(["floor"] if several else []), f"above [{unit}]", *columns.values()]
     return Table(heads, rows, caption)
+
+
+def _rooms(table: DataFrame) -> Table:
+    names = ("area_m2", "covered", "not_covered", "uncertain", "not_measured")
+    rows = [
+        [
+            row["room"],
+            f"{row['threshold_dbm']:g}",
+            f"{row['area_m2']:.0f}",
+            *("-" if row[name] != row[name] or row[name] is None else f"{row[name]:.0%}" for name in names[1:]),
+            row["best_receiver"],
+        ]
+        for row in table.to_dict("records")
+    ]
+    heads = ["room", "above [dBm]", "area [m²]", "covered", "not covered", "uncertain", "not measured", "best receiver"]
+    return Table(heads, rows, "Coverage of each room by any receiver; percentages of its measured area. `rooms.csv`.")

@@ -17,7 +17,7 @@ from tasks.page.maps import FloorPlan, read_pixels
 from tasks.page.page import finish
 from tasks.records import Row
 from tasks.rssi.page import page
-from tasks.source import offset_notes, reading
+from tasks.source import offset_notes, reading, rooms_beside
 from tasks.terminal import console, terminal
 from tasks.workers import connected, workers_of
 
@@ -35,6 +35,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     whole: Rssi = rssi_room(seed=config.seed) if how is None else how.read(RSSI_FORMATS)
     data = whole.receivers(config.receivers)
     plan = _read_floor_plan(config, data)
+    rooms = rooms_beside(how, config.rooms, data.origin, data.floors)
     for note in data.notes:
         console.print(f"{data.name}: {note}")
     for reason in compared(data, config.also)[1].values():
@@ -62,6 +63,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
                 reference=how.reference if how else None,
                 fewer=FEWER,
                 above=config.above,
+                rooms=rooms,
                 device=device,
                 keep=directory,
                 executor=workers,

@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
@@ -25,7 +24,7 @@ from tasks.page import figures, maps
 from tasks.page.page import Plot
 from tasks.records import Records, Row
 
-MAX_MAPS = 36  # of receivers, in a report of several floors; all are in the tables, and on the page of swiftwrf view
+MAX_MAPS = 30  # of receivers, in a report of several floors; all are in the tables, and on the page of swiftwrf view
 FIRST_MAPS = 6  # of the receivers of a floor that are not folded
 MAX_SPOTS = 5  # weak spots of a floor with a number on its map
 MAX_WIDTH_DB = 30.0  # end of the scale of interval widths of the page
@@ -144,12 +143,11 @@ class Maps:
         """Draw the classes of coverage, the scans and the first weak spots by their numbers."""
         a, classes = self.arrays, self.classes
         figure, ax, (extent, aspect) = self._axes(width, legend=0.45)
-        colours = ListedColormap([COVERAGE[name] for name in CLASSES])
-        style: dict[str, Any] = {"cmap": colours, "vmin": -0.5, "vmax": len(CLASSES) - 0.5, "interpolation": "none"}
-        opacity = 1.0 if self.plan is None else 0.75
-        ax.imshow(classes, origin="lower", extent=extent, aspect=aspect, alpha=opacity, zorder=1, **style)
+        style: dict[str, Any] = {"cmap": maps.CLASS_COLOURS, "vmin": 0, "vmax": len(CLASSES) - 1}
+        style |= {"alpha": 1.0 if self.plan is None else 0.75, "interpolation": "none", "zorder": 1}
+        ax.imshow(classes, origin="lower", extent=extent, aspect=aspect, **style)
         many = len(a["measured_position"]) >= figures.MAX_VECTOR_MARKS
-        ax.plot(*a["measured_position"][:, :2].T, ".", color="black", markersize=1.2, rasterized=many, zorder=2)
+        ax.plot(*a["measured_position"][:, :2].T, ".", color="#000001", markersize=1.2, rasterized=many, zorder=2)
         self._mark_receivers(ax, None)
         style = {"fontsize": 8, "color": "#000001", "ha": "center", "va": "center", "zorder": 5}
         for rank, spot in enumerate(self.spots[:MAX_SPOTS], start=1):

@@ -17,17 +17,17 @@ from swiftwrf.data.coordinates import Floors
 from swiftwrf.errors import InputError
 from swiftwrf.locate.posterior import PlanMap
 from swiftwrf.metrics import LEVEL
-from swiftwrf.rssi.coverage import Coverage, reach
+from swiftwrf.rssi.coverage import CLASSES, OTHER_DBM, Coverage, classified, default_threshold, reach
 from swiftwrf.rssi.maps import RssiMap
-from tasks.page.maps import Corners, FloorPlan
-from tasks.records import as_table, read_npz, rounded
+from tasks.page.maps import CLASS_COLOURS, Corners, FloorPlan
+from tasks.records import METRICS, as_table, read_json, read_npz, rounded
 from tasks.rssi.coverage import coverage_sentence
 from tasks.rssi.maps import MAX_WIDTH_DB
 from tasks.view.locating import RssiLocating
 
 RECEIVER_COLOURS, N_RECEIVER_COLOURS = "tab20", 20
 MAX_MAPS = 8  # in memory, e.g. those of as many floors
-MapKind = Literal["RSSI", "interval", "coverage", "best receiver", "posterior", "expected error"]
+MapKind = Literal["coverage", "RSSI", "interval", "best receiver", "posterior", "expected error"]
 LOCATING: tuple[MapKind, ...] = ("posterior", "expected error")
 Values = NDArray[np.floating]
 
@@ -61,7 +61,7 @@ class MapSelection:
     kind: MapKind  # what the map shows
     receiver: int  # number of the receiver, counted from 0. Maps of all receivers ignore it
     height: float  # height of the transmitter [m]
-    threshold: float = -75.0  # threshold of the coverage [dBm]
+    threshold: float = OTHER_DBM  # threshold of the coverage [dBm]
     certainty: float = 0.9  # required probability that a measurement exceeds the threshold, in (0, 1)
     row: int = 0  # row whose posterior is shown, counted from 0
     at_least: int = 0  # number of receivers of the coverage; 0 for that of the selected receiver
@@ -110,6 +110,13 @@ class RssiView:
     def receivers(self) -> tuple[str, ...]:
         """Names of the receivers."""
         return self.model.receiver_names
+
+    @property
+    def threshold(self) -> float:
+        """Threshold of the coverage that is shown first [dBm]: that of the run, or else the default."""
+        if self.folder is not None and (found := read_json(self.folder / METRICS).get("coverage")):
+            return float(found[0]["threshold_dbm"])
+        return default_threshold(self.rows)[0]
 
     @property
     def position(self) -> Values:
@@ -193,8 +200,7 @@ class RssiView:
                     f"Coloured: {self._who(selection)} above {selection.threshold:g} dBm with {selection.certainty:.0%} "
                     f"certainty. {coverage_sentence(self.coverage(selection, counted=True).values)}"
                 )
-                covered = np.where(self.covered(selection), 0.7, np.nan)
-                return ColouredMap(text, covered, "GnBu", 0.0, 1.0, "")
+                return ColouredMap(text, self.classes(selection).astype(float), CLASS_COLOURS, 0, len(CLASSES) - 1, "")
             case "best receiver":
                 first, part = next(iter(self.best(selection.height).items()))
                 best = f"{self.receivers[first]} on {part:.0%} of the measured area"
@@ -226,9 +232,10 @@ class RssiView:
             chart, scans = chart.receivers([self.receivers[selection.receiver]]), scans.columns([selection.receiver])
         return Coverage.of(chart, scans, (selection.threshold, selection.certainty, max(number, 1)), reach(self.model))
 
-    def covered(self, selection: MapSelection) -> NDArray[np.bool_]:
-        """Return the cells of the map that is shown that are covered, measured or not, (rows, columns)."""
-        return self.coverage(selection).probability >= selection.certainty
+    def classes(self, selection: MapSelection) -> NDArray[np.int64]:
+        """Return the numbers in `CLASSES` of the cells of the map that is shown, (rows, columns)."""
+        found = self.coverage(selection)
+        return classified(found.probability, found.measured, selection.certainty)
 
     def best(self, height: float) -> dict[int, float]:
         """Return the fraction of the measured cells where each receiver has the highest prediction, the largest first.
@@ -281,6 +288,7 @@ class RssiView:
         low, high = (end[r].double().numpy().ravel() for end in chart.prediction.interval(LEVEL))
         table = chart.receivers([self.receivers[r]]).to_frame().drop(columns="std_db")
         table = table.assign(low_dbm=low, high_dbm=high)
-        table[f"above_{selection.threshold:g}_dbm_with_{selection.certainty:.0%}"] = self.covered(selection).ravel() * 1
+        name = f"above_{selection.threshold:g}_dbm_with_{selection.certainty:.0%}"
+        table[name] = np.array(CLASSES)[self.classes(selection).ravel()]
         table["best_receiver"] = np.array(self.receivers)[chart.mean.argmax(axis=0).ravel()]
         return as_table(rounded(table.to_dict("records")))

@@ -13,6 +13,8 @@ from nicegui import events, run, ui
 from PIL import Image
 
 from swiftwrf import InputError
+from swiftwrf.rssi.coverage import CLASSES
+from tasks.labels import COVERAGE
 from tasks.page.maps import FloorPlan, colour_image, read_pixels
 from tasks.view.charts import BAR, Data, around, colour_bar, crosses, dots, named, picture, pictures, points, stripes
 from tasks.view.page import (
@@ -43,7 +45,9 @@ class RssiPage:
         self._maps, self._points = NewestOnly(self._show_map), NewestOnly(self._show_point)
         with header(view.title, view.notes):
             kinds = {kind: KIND_LABELS.get(kind, kind) for kind in view.kinds}
-            self._kind = ui.toggle(kinds, value="RSSI", on_change=self._update).props("no-caps padding='2px 12px'")
+            self._kind = ui.toggle(kinds, value=view.kinds[0], on_change=self._update).props(
+                "no-caps padding='2px 12px'"
+            )
         layers = [pictures(name) for name in ("floor", "map", "silent", "outside")] + [dots("rows", ROW, 3)]
         layers += [dots("nothing", "transparent", 6, borderColor="white", borderWidth=1)]
         layers += [dots("measured", ROW, 8, borderColor="white", borderWidth=0.7), *located_layers()]
@@ -71,7 +75,7 @@ class RssiPage:
                 self._height = slider("height", low, high, round(middle, 2), "m", self._update, step=0.01)
             column.set_visibility(high > low)
         with ui.column().classes("w-full gap-0") as self._limits:
-            self._threshold = slider("above", -110, -30, -75, "dBm", self._update)
+            self._threshold = slider("above", -110, -30, self._view.threshold, "dBm", self._update)
             self._certainty = slider("certainty", 50, 99, 90, "%", self._update)
             numbers = {0: "at this receiver", 1: "at any receiver"}
             numbers |= {number: f"at {number} receivers or more" for number in range(2, len(names) + 1)}
@@ -134,11 +138,13 @@ class RssiPage:
             return
         coloured, data, best = found
         self._limits.set_visibility(selection.kind == "coverage")
-        self._receiver.set_enabled(selection.kind not in ("best receiver", *LOCATING))
+        self._receiver.set_enabled(selection.kind not in ("best receiver", *LOCATING) and not _at_any(selection))
         self._height.set_enabled(selection.kind not in LOCATING)
         self._choice.set_visibility(selection.kind == "posterior")
         self._sentence.set_text(coloured.sentence)
         entries = [(_colour(r), "■", f"{self._view.receivers[r]} {part:.0%}") for r, part in best.items()]
+        if selection.kind == "coverage":
+            entries = [(COVERAGE[name], "■", name) for name in reversed(CLASSES)]
         self._best.set_content(legend(entries[:N_RECEIVER_COLOURS]))
         limits = coloured.low, coloured.high
         bar = colour_bar(coloured.colours, limits, coloured.label, "measured", coloured.extend)
@@ -159,7 +165,7 @@ class RssiPage:
         data["map"] = picture(image, coloured.corners or corners, 0.7 if view.plan else 1.0)
         if view.plan:
             data["floor"] = picture(Image.fromarray(view.plan.pixels), view.plan.corners)
-        if selection.kind not in LOCATING:  # grey where no scan determines the map
+        if selection.kind not in ("coverage", *LOCATING):  # grey where no scan determines the map
             data["outside"] = picture(
                 colour_image(np.where(view.known(selection.height), np.nan, 0.5)[::-1], "gray"), corners, 0.55
             )
@@ -173,7 +179,7 @@ class RssiPage:
         found = None
         if selection.kind == "posterior" and view.locating is not None:
             data["rows"], found = points(view.position), view.locating.located(selection.row)
-        every = selection.kind in ("best receiver", *LOCATING)
+        every = selection.kind in ("best receiver", *LOCATING) or _at_any(selection)
         for number, position in enumerate(rows.receiver_position.numpy()):
             if np.isfinite(position).all() and (every or number == selection.receiver):
                 colour = _colour(number) if selection.kind == "best receiver" else RECEIVER_MARK
@@ -201,6 +207,11 @@ class RssiPage:
     def _save_table(self) -> None:
         selection = self._selection
         ui.download.content(self._view.table(selection), f"{_file_name(selection)}.csv", "text/csv")
+
+
+def _at_any(selection: MapSelection) -> bool:
+    """Return True if the map is of all receivers together."""
+    return selection.kind == "coverage" and selection.at_least > 0
 
 
 def _colour(receiver: int) -> str:

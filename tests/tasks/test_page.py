@@ -1,6 +1,8 @@
 """The page of a report: what it holds, where its figures and their numbers lie, light and dark."""
 
 import ast
+import base64
+import io
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,7 +10,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from matplotlib import colormaps
+from matplotlib.colors import to_rgb
 from pandas import DataFrame
+from PIL import Image
 
 from swiftwrf import AngularGrid, Rssi, Spectra, plotting
 from swiftwrf.contrib.diagnostics.inspection import Findings
@@ -21,7 +26,7 @@ from tasks.inspect import page as inspection
 from tasks.locate.page import posteriors
 from tasks.page import figures
 from tasks.page.maps import colour_image
-from tasks.page.page import Number, Page, Plot, Section, Summary, write_page
+from tasks.page.page import Number, Page, Plot, Section, Summary, rendered, write_page
 from tasks.page.shared import again
 from tasks.records import read_table
 from tasks.terminal import NextStep
@@ -206,3 +211,64 @@ def test_names_in_scripts_that_the_font_lacks_give_no_warning(recwarn):
     axes.set_title("\u90e8\u5c4b")
     assert figures.as_svg(figure).endswith("</svg>\n")
     assert not recwarn.list
+
+
+def test_pictures_of_figures_have_256_colours_and_paths_tenths_of_a_point():
+    """A report of three floors and 20 receivers is 4.5 MB, and not 8.3."""
+    values = np.add.outer(np.linspace(0, 1, 90), np.linspace(0, 1, 120))
+    figure, axes = figures.panel(4, 3)
+    axes.imshow(values, interpolation="none", cmap="viridis")
+    axes.plot([1 / 3, 100 / 3], [1 / 7, 50 / 7])
+    svg = figures.as_svg(figure)
+    (picture,) = re.findall(r'data:image/png;base64,([^"]+)"', svg)
+    with Image.open(io.BytesIO(base64.b64decode(picture))) as image:
+        assert image.mode == "P"
+        pixels = np.asarray(image.convert("RGB")).astype(float)
+    expected = 255 * colormaps["viridis"](values / values.max())[:, :, :3]
+    assert min(np.abs(pixels - each).mean() for each in (expected, expected[::-1])) < 8
+    numbers = [number for path in re.findall(r' d="([^"]+)"', svg) for number in re.findall(r"\.(\d+)", path)]
+    assert numbers
+    assert max(map(len, numbers)) == 1
+
+
+def test_the_first_figure_stands_before_notes_which_are_folded(tmp_path):
+    summary = Summary(
+        [Number("1 dB", "error")], [plot()], ["The answer.", "How sure."], [], notes=["A note.", "Another."]
+    )
+    html, _ = rendered(Page("Title", summary, []))
+    order = [
+        html.index(text)
+        for text in ("The answer.", "<figure", "<b>1 dB", "How sure.", "<details><summary>Notes", "A note.")
+    ]
+    assert order == sorted(order)
+    assert "Notes on the data (2)" in html
+
+
+# linear RGB as seen without one kind of cone (G. M. Machado et al., IEEE TVCG 15, 2009)
+VISION = {
+    "all cones": np.eye(3),
+    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+    "tritanopia": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+}
+
+
+def lab(linear):
+    """CIE Lab of linear sRGB, under D65."""
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    t = to_xyz @ linear / (0.9505, 1.0, 1.089)
+    x, y, z = np.where(t > 0.008856, np.cbrt(t), 7.787 * t + 16 / 116)
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
+@pytest.mark.parametrize("vision", VISION)
+def test_classes_of_coverage_differ_for_every_kind_of_colour_vision(vision):
+    """A difference of 2.3 is just noticeable; the page is light or dark."""
+    colours = {name: np.array(to_rgb(colour)) for name, colour in labels.COVERAGE.items()}
+    colours |= {"light page": np.ones(3), "dark page": np.array(to_rgb("#14181f"))}
+    seen = []
+    for rgb in colours.values():
+        linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+        seen.append(lab(np.clip(np.array(VISION[vision]) @ linear, 0, 1)))
+    differences = [np.linalg.norm(a - b) for number, a in enumerate(seen) for b in seen[:number]]
+    assert min(differences) > 25

@@ -14,8 +14,9 @@ from torch import Tensor
 from swiftwrf.contrib.comparison.base import Values
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
+from swiftwrf.data.rooms import Rooms
 from swiftwrf.metrics import LEVEL
-from swiftwrf.rssi.coverage import CERTAINTY, Coverage, at_least, reach
+from swiftwrf.rssi.coverage import CERTAINTY, CLASSES, Coverage, at_least, classified, reach
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.pairs import PairModel
@@ -25,7 +26,7 @@ MAX_SPOTS = 100  # rows of a floor and threshold in the table of weak spots
 
 
 def maps_and_coverage(
-    model: RssiModel | PairModel, train: Rssi, test: Rssi, thresholds_dbm: Sequence[float]
+    model: RssiModel | PairModel, train: Rssi, test: Rssi, thresholds_dbm: Sequence[float], rooms: Rooms | None = None
 ) -> tuple[dict[str, NDArray[Any]], list[Values], dict[str, DataFrame]]:
     """Return maps of each floor, their coverage, and tables of it.
 
@@ -36,6 +37,7 @@ def maps_and_coverage(
         train: Training rows, the scans.
         test: Test rows without offsets between groups, whose scans are counted.
         thresholds_dbm: Thresholds of the coverage. Maps are those of the first one.
+        rooms: Rooms whose coverage is given in a table `rooms`, at any receiver.
 
     Returns:
         Arrays (floors, R, H, W) or (floors, H, W) by name; `Coverage.values` of each floor, at the first threshold and any
@@ -55,7 +57,7 @@ def maps_and_coverage(
         for rows in (train, test)
     )
     charts = [RssiMap.predict(model, height=height) for height in heights]
-    found, tables, first = [], [], []
+    found, tables, first, of_rooms = [], [], [], []
     for number, (name, height) in enumerate(zip(names, heights, strict=True)):
         scans, held_out = train[of_row == number], test[of_test == number]
         detected = RssiMap.predict(model, height=height, detected=True)
@@ -63,7 +65,8 @@ def maps_and_coverage(
             best, *_ = of_floor = _coverages(model, detected, scans, held_out, threshold)
             first += [best[0]] if threshold == thresholds_dbm[0] else []
             found += [{"floor": name} | row for _, row in of_floor]
-            spots = best[0].weak_spots(detected).head(MAX_SPOTS)
+            of_rooms += [] if rooms is None else _of_rooms(rooms, detected, best[0])
+            spots = best[0].weak_spots(detected).head(MAX_SPOTS).round(3)
             degrees = degree_columns(train.origin, spots[["x_m", "y_m"]].to_numpy())
             tables.append(spots.assign(**degrees, floor=name, threshold_dbm=threshold))
     lower, upper = zip(*(chart.prediction.interval(LEVEL) for chart in charts), strict=True)
@@ -85,7 +88,29 @@ def maps_and_coverage(
     }
     maps = maps if train.origin is None else maps | {"origin": np.array(train.origin)}
     of_floors = [{"floor": name} | floor.values for name, floor in zip(names, first, strict=True)]
-    return maps, of_floors, {"coverage": DataFrame(found), "weak_spots": concat(tables, ignore_index=True)}
+    every = {"coverage": DataFrame(found), "weak_spots": concat(tables, ignore_index=True)}
+    return maps, of_floors, every if rooms is None else every | {"rooms": DataFrame(of_rooms)}
+
+
+def _of_rooms(rooms: Rooms, chart: RssiMap, coverage: Coverage) -> list[Values]:
+    """Return the coverage of each room that has cells on the floor of a map."""
+    cells = np.stack([*np.meshgrid(chart.x, chart.y), np.full((len(chart.y), len(chart.x)), chart.height)], axis=-1)
+    within = rooms.contain(torch.from_numpy(cells.reshape(-1, 3))).reshape(*cells.shape[:2], -1)
+    of_cell = classified(coverage.probability, coverage.measured, coverage.values["certainty"])
+    found = []
+    for room, name in enumerate(rooms.names):
+        of_room = of_cell[within[..., room]]
+        if len(of_room):
+            measured = of_room[of_room > 0]
+            shares = {
+                kind.replace(" ", "_"): float((measured == CLASSES.index(kind)).mean()) if len(measured) else None
+                for kind in reversed(CLASSES[1:])
+            }
+            row: Values = {"room": name, "threshold_dbm": coverage.values["threshold_dbm"]}
+            row |= {"area_m2": len(of_room) * chart.cell**2, "not_measured": float((of_room == 0).mean())} | shares
+            strongest = chart.mean[:, within[..., room]].mean(axis=1).argmax()
+            found.append(row | {"best_receiver": chart.receiver_names[strongest]})
+    return found
 
 
 def _coverages(

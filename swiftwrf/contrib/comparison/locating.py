@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pandas import DataFrame
 from torch import Tensor
 
 from swiftwrf.contrib.comparison.base import Comparison, Recorded, Values
@@ -22,12 +23,13 @@ from swiftwrf.contrib.comparison.localizers import LEVELS, LOCALIZERS, Localizer
 from swiftwrf.contrib.comparison.steps import LOCATOR, Memo, Steps
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin, degree_columns
+from swiftwrf.data.rooms import Rooms
 from swiftwrf.data.rssi import PLACE
 from swiftwrf.data.splits import places
 from swiftwrf.errors import InputError
 from swiftwrf.locate.locator import Locator
 from swiftwrf.locate.posterior import Posterior
-from swiftwrf.locate.rssi import RssiLocator
+from swiftwrf.locate.rssi import BATCH_ROWS, RssiLocator
 from swiftwrf.metrics import LEVEL
 from swiftwrf.rssi import estimate_offsets
 from swiftwrf.runtime.checkpoint import load
@@ -175,6 +177,7 @@ class LocateComparison(PositionComparison):
         options: The split, the number of candidate positions of the posterior `n_cells`, and the seed.
         n_undetected: Number of test rows that no receiver detected, which are left out.
         locator: Locator of all training rows.
+        rooms: Rooms whose probability is recorded for each test row.
 
     Example:
         >>> import swiftwrf
@@ -188,6 +191,7 @@ class LocateComparison(PositionComparison):
     locator: RssiLocator | None = None
     n_undetected: int = 0
     own: Mapping[str, Localizer] = field(default_factory=dict)
+    rooms: Rooms | None = None
 
     @classmethod
     def of(cls, data: Rssi, split: str, n_cells: int, seed: int, reference: str | None = None) -> LocateComparison:
@@ -268,7 +272,18 @@ class LocateComparison(PositionComparison):
 
     def recorded(self) -> Recorded:
         found = super().recorded()
-        return replace(found, metrics=found.metrics | {"n_undetected": self.n_undetected})
+        metrics = {"n_undetected": self.n_undetected, "rooms": [] if self.rooms is None else list(self.rooms.names)}
+        tables = dict(found.tables) if self.rooms is None else {**found.tables, "rooms": self._rooms(self.rooms)}
+        return replace(found, metrics=found.metrics | metrics, tables=tables)
+
+    def _rooms(self, rooms: Rooms) -> DataFrame:
+        """Return the true room and the probability of each room, a row for each test row."""
+        posteriors = map(
+            self._posterior, np.split(np.arange(len(self.test)), range(BATCH_ROWS, len(self.test), BATCH_ROWS))
+        )
+        probability = torch.cat([rooms.probability(each.position, each.weight) for each in posteriors])
+        truth = rooms.named(self.test.transmitter_position)
+        return DataFrame({"index": self.test.index.numpy(), "truth_room": truth, **rooms.columns(probability)})
 
 
 @checked
@@ -281,6 +296,7 @@ def compare(
     n_cells: int = 4000,
     also: Mapping[str, Localizer] | None = None,
     reference: str | None = None,
+    rooms: Rooms | None = None,
     keep: Memo | None = None,
     executor: Executor | None = None,
 ) -> LocateComparison:
@@ -294,6 +310,7 @@ def compare(
         n_cells: Number of candidate positions of the posterior.
         also: Localizers of your own by their names, which stay as they are.
         reference: Group whose offset is 0. Defaults to the most frequent one.
+        rooms: Rooms whose probability is recorded for each test row; see `swiftwrf.data.rooms.read_rooms`.
         keep: Results by the names of steps, in a folder. A call with equal data, options, code and versions continues
             after them, others are refused.
         executor: Processes that compute steps side by side, e.g. a `ProcessPoolExecutor`.
@@ -308,7 +325,7 @@ def compare(
         >>> bool(result.summary().loc["posterior", "median"] < result.summary().loc["mean", "median"])
         True
     """
-    given = locals().copy()
+    given = {name: value for name, value in locals().items() if name != "rooms"}  # which change no step
     begun = LocateComparison.of(data.receivers(receivers), split, n_cells, seed, reference)
     own = dict(also or {})
     if known := sorted(own.keys() & set(LOCALIZERS)):
@@ -326,4 +343,4 @@ def compare(
     values = {name: steps[name] for name in started}
     locator = load(memo.folder / LOCATOR)
     assert isinstance(locator, RssiLocator)
-    return replace(begun, values=values, locator=locator)
+    return replace(begun, values=values, locator=locator, rooms=rooms)

@@ -25,6 +25,7 @@ from swiftwrf.contrib.comparison.predictors import compared, make_predictor
 from swiftwrf.contrib.comparison.steps import MODEL, Memo, Steps, refusing_executor
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
+from swiftwrf.data.rooms import Rooms
 from swiftwrf.data.rssi import PLACE
 from swiftwrf.data.splits import Validation, places
 from swiftwrf.errors import InputError
@@ -59,6 +60,7 @@ class RssiComparison(Comparison):
         by_rows: Mean absolute errors [dB] of the model and of "knn" by the number of training rows, a column for each.
         above: Thresholds of the coverage [dBm]. Defaults to that of `default_threshold`.
         region: Mean absolute errors [dB] of both in a fifth of the area, fitted to the training rows elsewhere.
+        rooms: Rooms whose coverage is recorded.
 
     Example:
         >>> import swiftwrf
@@ -77,6 +79,7 @@ class RssiComparison(Comparison):
     by_rows: DataFrame = field(default_factory=DataFrame)
     above: tuple[float, ...] = ()
     region: Mapping[str, float] = field(default_factory=dict)
+    rooms: Rooms | None = None
 
     @property
     def model(self) -> str:
@@ -155,7 +158,7 @@ class RssiComparison(Comparison):
     def recorded(self) -> Recorded:
         recorded, attenuation = super().recorded(), self._fitted.attenuation
         test = self.test if self.train.offsets is None else self.train.offsets.removed(self.test)
-        maps, coverage, tables = maps_and_coverage(self._fitted, self.train, test, self.thresholds[0])
+        maps, coverage, tables = maps_and_coverage(self._fitted, self.train, test, self.thresholds[0], self.rooms)
         at_receiver, none = summaries(self.errors, ["receiver", "method"], [self.column]), {self.column: summary([])}
         metrics = {
             "left_out": self.left_out,
@@ -170,6 +173,7 @@ class RssiComparison(Comparison):
             "interval": {"nominal": LEVEL, "coverage": self.coverage},
             "coverage": coverage,
             "threshold": self.thresholds[1],
+            "rooms": [] if self.rooms is None else list(self.rooms.names),
             "by_rows": {str(n): {str(name): mean for name, mean in row.items()} for n, row in self.by_rows.iterrows()},
             "region": dict(self.region),
             "chosen": {
@@ -220,6 +224,7 @@ def compare(
     validation: Validation | Literal["auto"] = "auto",
     fewer: Sequence[Fraction] = (),
     above: Sequence[float] = (),
+    rooms: Rooms | None = None,
     device: torch.device | str = "cpu",
     keep: Memo | None = None,
     executor: Executor | None = None,
@@ -241,6 +246,7 @@ def compare(
         fewer: Fractions of the training rows that the model and "knn" are fitted to, too, e.g. (0.25, 0.5). After a random
             split both then predict a region of the training rows by all others.
         above: Thresholds of the coverage [dBm], the first one that of maps. Defaults to -67 for Wi-Fi, else -75.
+        rooms: Rooms whose coverage is recorded; see `swiftwrf.data.rooms.read_rooms`.
         device: Device to compute on.
         keep: Results by the names of predictors, in a folder, and the model. A call with equal data, options, code and
             versions continues after them, others are refused.
@@ -258,7 +264,7 @@ def compare(
         >>> bool(result.summary().loc["swiftwrf", "median"] < result.summary().loc["mean", "median"])
         True
     """
-    given = locals().copy()
+    given = {name: value for name, value in locals().items() if name not in ("above", "rooms")}  # which change no step
     chosen = data.as_measured().receivers(receivers)
     small = is_small(chosen, split)
     train, test = (chosen, chosen) if small else chosen.split(split, seed)
@@ -282,7 +288,7 @@ def compare(
             )
         keep.of(given | {"predictors": [RSSI_PREDICTORS[name] for name in names]})
     shown = {"split": LEAVE_ONE_OUT if small else split, "preset": preset, "seed": seed}
-    begun = RssiComparison(train, test, {}, shown, left_out, above=tuple(above))
+    begun = RssiComparison(train, test, {}, shown, left_out, above=tuple(above), rooms=rooms)
     model_name, predictors = begun.model, dict[str, RssiPredictor]()
     parallel = None if executor is None else executor.map
 

@@ -95,12 +95,12 @@ def flooded(cells):
     return areas
 
 
-@pytest.mark.parametrize("number", [1, 2])
-def test_weak_spots_are_the_connected_cells_without_coverage(number):
+@pytest.mark.parametrize(("number", "level"), [(1, -72), (2, -66)])
+def test_weak_spots_are_the_connected_cells_without_coverage(number, level):
     generator = np.random.default_rng(3)
     x, y = np.arange(0.25, 15, 0.5), np.arange(0.25, 10, 0.5)
     waves = np.stack([np.sin(x / 2 + shift) * np.cos(y[:, None] / 1.5 - shift) for shift in (0.0, 1.0, 2.5)])
-    mean = (-66 + 9 * waves).astype(np.float32)
+    mean = (level + 9 * waves).astype(np.float32)
     std, detection = (generator.uniform(*ends, mean.shape).astype(np.float32) for ends in ((1, 3), (0.97, 1)))
     chart = RssiMap(x, y, 1.0, 0.5, mean, std, detection, ("a", "b", "c"))
     at = np.c_[generator.random((80, 2)) * (13, 8) + 1, np.ones(80)]

@@ -231,3 +231,30 @@ def test_positions_and_directions_of_spectra(matched, tmp_path, capsys):
     unknown = pd.read_csv(tmp_path / "unknown.csv")
     assert list(unknown)[-2:] == ["azimuth_deg", "elevation_deg"]
     assert len(unknown) == 5
+
+
+def test_rooms_of_rows_are_counted_and_predicted(tmp_path, capsys):
+    """The confusion table of the report, of the files of the run; new rows get the rooms beside them."""
+    out, data = tmp_path / "run", rssi_room(n=60)
+    corners = [(0, 0, "west"), (10, 0, "west"), (10, 16, "west"), (0, 16, "west")]
+    corners += [(10, 0, "east"), (20, 0, "east"), (20, 16, "east"), (10, 16, "east")]
+    pd.DataFrame(corners, columns=["x", "y", "room"]).to_csv(tmp_path / "rooms.csv", index=False)
+    source = write_rssi(tmp_path / "walk.csv", data)
+    assert run("--data", source, "--out", out) == 0
+    table, errors = pd.read_csv(out / "rooms.csv"), pd.read_csv(out / "errors.csv")
+    own = errors[errors["method"] == "posterior"]
+    assert table["index"].tolist() == own["index"].tolist()
+    truth = np.where(own["truth_x_m"] < 10, "west", "east")
+    assert table["truth_room"].tolist() == truth.tolist()
+    assert np.allclose(table["probability_west"] + table["probability_east"] + table["probability_outside"], 1)
+    assert (table["room"] == np.where(table["probability_west"] > table["probability_east"], "west", "east")).all()
+    cells = [(truth == one) & (table["room"] == other) for one in ("west", "east") for other in ("west", "east")]
+    counts = [str(int(cell.sum())) if cell.sum() else "" for cell in cells]
+    report = (out / "report.html").read_text()
+    rows = [f"<td>{name}</td><td>{a}</td><td>{b}</td>" for name, a, b in (("west", *counts[:2]), ("east", *counts[2:]))]
+    assert all(row in report for row in rows)
+    assert f"true one in {(table['room'] == truth).mean():.0%} of {len(table)} test rows" in capsys.readouterr().out
+    assert quick.command("predict", out, source, "--out", tmp_path / "located.csv") == 0
+    located = pd.read_csv(tmp_path / "located.csv").set_index("index").loc[table["index"]]
+    assert located["room"].tolist() == table["room"].tolist()
+    np.testing.assert_allclose(located["room_probability"], table["room_probability"], atol=1e-6)

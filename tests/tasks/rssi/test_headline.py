@@ -36,6 +36,9 @@ def building(tmp_path_factory):
     table = pd.DataFrame(torch.cat([position, rssi], dim=1).numpy(), columns=["x", "y", "z", "a", "b", "c"])
     table.insert(3, "floor", np.where(upper, NAMES[1], NAMES[0]))
     table.to_csv(folder / "walk.csv", index=False)
+    corners = [(*at, floor) for floor in NAMES for at in ((3, 2), (12, 2), (12, 9), (3, 9))]
+    rooms = pd.DataFrame(corners, columns=["x", "y", "floor"]).assign(room=["hall"] * 4 + ["office"] * 4)
+    rooms.to_csv(folder / "rooms.csv", index=False)
     with quick.recorded(folder), quick.sketched(), pytest.MonkeyPatch.context() as patch:
         patch.setattr("swiftwrf.rssi.maps.CELLS", 16)
         assert quick.command("rssi", "--rx", "all", "--data", folder / "walk.csv", "--out", folder / "run") == 0
@@ -136,7 +139,7 @@ def test_weak_spots_are_listed_from_the_largest(building):
     weak = maps["known"] & (maps["above"] < 0.9)
     cell = maps["x"][1] - maps["x"][0]
     for floor, name in enumerate(NAMES):
-        assert spots[spots["floor"] == name]["area_m2"].sum() == pytest.approx(weak[floor].sum() * cell**2)
+        assert spots[spots["floor"] == name]["area_m2"].sum() == pytest.approx(weak[floor].sum() * cell**2, abs=0.01)
     first = spots.sort_values(["not_covered_m2", "area_m2"], ascending=False).iloc[0]
     place = f"{first['area_m2']:,.0f} m², weakest at x = {first['x_m']:.1f} m, y = {first['y_m']:.1f} m on floor 1 ("
     sentence = f"Largest weak spots: {place}{first['missing_db']:.0f} dB missing at {first['receiver']})"
@@ -144,6 +147,29 @@ def test_weak_spots_are_listed_from_the_largest(building):
     assert sentence in terminal
     assert sentence in report
     assert "-75 dBm is the default for receivers that no name shows to be Wi-Fi; --above DBM sets another" in report
+
+
+def test_rooms_have_the_coverage_of_their_cells(building):
+    folder, _ = building
+    table = pd.read_csv(folder / "rooms.csv").set_index("room")
+    with np.load(folder / "maps.npz") as stored:
+        maps = dict(stored)
+    x, y = np.meshgrid(maps["x"], maps["y"])
+    within, cell = (x > 3) & (x < 12) & (y > 2) & (y < 9), maps["x"][1] - maps["x"][0]
+    assert table.index.tolist() == ["hall", "office"]
+    for floor, room in enumerate(("hall", "office")):
+        above, known = maps["above"][floor][within], maps["known"][floor][within]
+        expected = {
+            "area_m2": within.sum() * cell**2,
+            "covered": (above[known] >= 0.9).mean(),
+            "not_covered": (above[known] <= 0.1).mean(),
+            "not_measured": 1 - known.mean(),
+        }
+        assert table.loc[room, list(expected)].to_dict() == pytest.approx(expected)
+        strongest = maps["predicted"][floor][:, within].mean(axis=1).argmax()
+        assert table.loc[room, "best_receiver"] == "abc"[strongest]
+    report = unescape(re.sub("<[^>]*>", "", (folder / "report.html").read_text()))
+    assert re.search(rf"hall\s*-75\s*{table.loc['hall', 'area_m2']:.0f}\s*{table.loc['hall', 'covered']:.0%}", report)
 
 
 def test_widths_are_those_of_the_80_percent_interval(building):

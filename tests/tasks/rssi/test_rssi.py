@@ -33,7 +33,7 @@ from tasks.rssi import experiment
 from tasks.rssi.coverage import coverage_sentence
 from tasks.rssi.differences import where_methods_differ
 from tasks.rssi.maps import Maps
-from tasks.rssi.page import answer, where_next
+from tasks.rssi.page import _maps, answer, where_next
 
 
 @pytest.mark.parametrize("name", [n for n in RSSI_PREDICTORS if n.startswith(("mri", "gp"))])
@@ -312,3 +312,52 @@ def test_the_table_of_differences_is_that_of_the_errors(rssi_run):
     shown = [float(re.search(r"(-\d\S*) dBm", column)[1]) for column in table.columns[1:3]]
     assert shown == pytest.approx([weak, strong], abs=0.06)
     assert len(cells) == len(table.columns)
+
+
+def floors_of_a_building(tmp_path, n_receivers=20):
+    """A run of three floors whose receivers are the stronger, the higher their number."""
+    generator = np.random.default_rng(0)
+    position = np.concatenate([np.c_[generator.random((30, 2)) * (4, 3), np.full(30, 4.0 * n)] for n in range(3)])
+    shape = (3, n_receivers, 4, 5)
+    level = -90.0 + np.arange(n_receivers)[:, None, None] + generator.random(shape)
+    every = np.ones((3, 4, 5), bool)
+    fields = {
+        "predicted": level,
+        "width": level + 100,
+        "detection": 0 * level + 1,
+        "above": generator.random((3, 4, 5)),
+    }
+    fields |= {"inside": every, "known": every, "measured_position": position, "floor_of_row": np.repeat([0, 1, 2], 30)}
+    names = np.array([f"r{number}" for number in range(n_receivers)])
+    fields |= {"measured": generator.random((90, n_receivers)) - 80, "receiver_names": names}
+    run = made_run(
+        tmp_path, **fields, receiver=np.full((n_receivers, 3), np.nan), floor_names=np.array(["0", "1", "2"])
+    )
+    shares = {"threshold_dbm": -75.0, "certainty": 0.9, "covered": 0.25, "not_covered": 0.25, "uncertain": 0.5}
+    for each in run.metrics["coverage"]:
+        each |= shares | {"not_measured": 0.0}
+    spots = [{"floor": str(n), "x_m": 1.0 + n, "y_m": 1.0, "threshold_dbm": -75.0} for n in (2, 0)]
+    run.tables["weak_spots"] = pd.DataFrame([*spots, spots[0] | {"threshold_dbm": -60.0}])
+    return run
+
+
+def test_floors_have_maps_of_one_size_the_strongest_receivers_first(tmp_path):
+    run = floors_of_a_building(tmp_path)
+    floors = Maps.of_floors(run)
+    section = _maps(run, "predicted")
+    assert [part.title for part in section.parts] == ["floor 0", "floor 1", "floor 2"]
+    for part in section.parts:
+        titles = [panel.axes[0].get_title() for panel in part.plots[1].panels]
+        assert titles == [f"r{number}" for number in (19, 18, 17, 16, 15, 14)]
+        (more,) = part.parts
+        assert more.folded
+        assert [panel.axes[0].get_title() for panel in more.plots[0].panels] == ["r13", "r12", "r11", "r10"]
+    drawn = [panel for part in section.parts for panel in part.plots[1].panels]
+    assert len({tuple(panel.get_size_inches()) for panel in drawn}) == 1
+    coverage = Maps.coverage_plot(floors)
+    assert [panel.axes[0].get_title() for panel in coverage.panels] == ["floor 0", "floor 1", "floor 2"]
+    assert len({tuple(panel.get_size_inches()) for panel in coverage.panels}) == 1
+    marks = [[text.get_text() for text in panel.axes[0].texts] for panel in coverage.panels]
+    assert marks == [["1"], [], ["1"]]
+    classes = np.array(["not covered", "uncertain", "covered"])[np.digitize(run.maps["above"], [0.1, 0.9])]
+    assert coverage.data["coverage"].tolist() == classes.ravel().tolist()

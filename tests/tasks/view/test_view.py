@@ -241,12 +241,17 @@ def test_what_the_page_says_of_a_receiver(small_floor, receiver, threshold, cert
     first, part = next(iter(view.best(1.2).items()))
     best = view.coloured(MapSelection("best receiver", 0, 1.2)).sentence
     assert f"{view.receivers[first]} on {part:.0%} of the measured area" in best
-    np.testing.assert_array_equal(np.isfinite(coloured.values), above(shown) >= certainty)
+    cells = np.stack(np.meshgrid(shown.x, shown.y), axis=-1).reshape(-1, 2)
+    hull = np.array([linprog(np.zeros(len(at)), A_eq=corners, b_eq=[*cell, 1]).success for cell in cells])
+    known = (hull & (cdist(cells, at).min(axis=1) <= reach(view.model))).reshape(above(shown).shape)
+    uncertain = (above(shown) < certainty) & (above(shown) > 1 - certainty)
+    classes = np.where(~known, 0, np.where(above(shown) >= certainty, 3, np.where(uncertain, 2, 1)))
+    np.testing.assert_array_equal(coloured.values, classes)
+    assert set(np.unique(classes)) >= {0, 3}
     table, mean = pd.read_csv(io.StringIO(view.table(selection))), view.map(1.2).mean
     np.testing.assert_allclose(table["predicted_dbm"], mean[receiver].ravel(), atol=0.006)
-    np.testing.assert_array_equal(
-        table[f"above_{threshold:g}_dbm_with_{certainty:.0%}"], above(shown).ravel() >= certainty
-    )
+    words = np.array(["not measured", "not covered", "uncertain", "covered"])[classes.ravel()]
+    assert table[f"above_{threshold:g}_dbm_with_{certainty:.0%}"].tolist() == words.tolist()
     assert list(table["best_receiver"]) == [view.receivers[number] for number in mean.argmax(axis=0).ravel()]
     i, j = np.argwhere(above(shown) >= certainty)[0]
     place = float(shown.x[j]), float(shown.y[i])
@@ -258,8 +263,8 @@ def test_what_the_page_says_of_a_receiver(small_floor, receiver, threshold, cert
     low, high = (float(end[0, receiver]) for end in predicted.interval(0.8))
     assert f"{name}: {predicted.mean[0, receiver]:.1f} dBm, 80% of measurements in [{low:.1f}, {high:.1f}] dBm" in text
     assert f"best receiver: {view.receivers[predicted.mean[0].argmax()]}" in text
-    fraction = [view.covered(replace(selection, at_least=number)).mean() for number in (1, 2, 3)]
-    assert (coloured.values > 0).mean() <= fraction[0] > fraction[1] >= fraction[2]
+    chance = [view.coverage(replace(selection, at_least=number)).probability.mean() for number in (0, 1, 2, 3)]
+    assert chance[0] < chance[1] > chance[2] > chance[3]
 
 
 def test_view_of_a_run_of_rssi_and_of_its_model(rssi_run):

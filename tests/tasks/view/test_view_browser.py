@@ -231,9 +231,10 @@ def test_page_of_a_locator(browser, chromium, serve, locate_run):
         pointer(browser).move_to_element_with_offset(plan, x, y).perform()
         return said(browser, "here")
 
+    until(lambda: "% of the measured area" in said(browser, "sentence"))  # coverage is shown first
     first = until(lambda: "dBm" in point(30, 20) and said(browser, "here"))
     until(lambda: point(-120, 80) != first)
-    sentences = {"coverage": "% of the measured area", "best receiver": "highest prediction", "uncertainty": "interval"}
+    sentences = {"RSSI": "Predicted RSSI", "best receiver": "highest prediction", "uncertainty": "interval"}
     for kind, sentence in sentences.items():
         press(browser, kind)
         until(lambda sentence=sentence: sentence in said(browser, "sentence"))
