@@ -18,6 +18,7 @@ from tasks.environment import choose_device
 from tasks.locate.page import SUGGESTED, page
 from tasks.locate.placement import write_poses
 from tasks.page.page import finish
+from tasks.page.receivers import with_receivers
 from tasks.page.shared import write_suggestion
 from tasks.records import Row
 from tasks.source import reading
@@ -52,7 +53,8 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
             _conclude(result, config, directory)
         elif isinstance(result, StationsComparison):
             _place(result, config, directory)
-        finish(directory, result.recorded(), page)
+        train, recorded = result.train, result.recorded()
+        finish(directory, with_receivers(recorded, train) if isinstance(train, Rssi) else recorded, page)
 
 
 def _described(values: Row) -> str:

@@ -19,6 +19,7 @@ from tasks import labels
 from tasks.locate.placement import poses_section
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table, number, provenance, sections_of
+from tasks.page.receivers import RECEIVERS, receivers_section
 from tasks.page.shared import (
     again,
     by_method,
@@ -70,6 +71,8 @@ def page(runs: list[Records]) -> Page:
     ]
     if runs[0].metrics["received_by"] == "receiver" and any(run.arrays(SUGGESTED) for run in runs):
         sections.insert(-1, sections_of("Where to measure next", runs, _suggestion))
+    if any(run.arrays(RECEIVERS) for run in runs):
+        sections[0].parts.append(sections_of("Where the receivers are", runs, receivers_section))
     names = ", ".join(dict.fromkeys(run.place for run in runs))
     if len(runs) == 1:
         first = _summary(runs[0], answers[runs[0]])

@@ -13,6 +13,7 @@ from tasks.directory import Run
 from tasks.environment import choose_device
 from tasks.page.maps import FloorPlan, read_pixels
 from tasks.page.page import finish
+from tasks.page.receivers import with_receivers
 from tasks.records import Row
 from tasks.rssi.page import page
 from tasks.source import offset_notes, reading
@@ -70,7 +71,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
             console.print(f"{data.name}: {detection.note(data.receiver_names)}")
         if plan is not None:
             plan.save(directory.folder)
-        finish(directory, result.recorded(), page, offset_notes(data))
+        finish(directory, with_receivers(result.recorded(), result.train), page, offset_notes(data))
 
 
 def _read_floor_plan(config: RssiTaskConfig, data: Rssi) -> FloorPlan | None:

@@ -16,6 +16,7 @@ from swiftwrf.metrics import LEVEL
 from tasks.labels import PREDICTORS, colour, meanings
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of
+from tasks.page.receivers import RECEIVERS, receivers_section, receivers_sentence
 from tasks.page.shared import (
     again,
     by_method,
@@ -56,6 +57,8 @@ def page(runs: list[Records]) -> Page:
         sections_of("Where the errors are", runs, lambda run: Section("", plots=[_where(run)])),
         limits(runs[0], *LIMITS),
     ]
+    if any(run.arrays(RECEIVERS) for run in runs):
+        sections.insert(-1, sections_of("Where the receivers are", runs, receivers_section))
     details = [provenance(runs)]
     if len(runs) > 1 or any(len(Maps(run).names) > 1 for run in runs):
         sections.insert(0, sections_of("Maps", runs, partial(_maps, kind="predicted")))
@@ -155,6 +158,7 @@ def conclusion(run: Records) -> list[str]:
         f"{', '.join(covered)} {'has' if len(covered) == 1 else 'have'} {who} above {COVERED_DBM:g} dBm with "
         f"{CERTAINTY:.0%} certainty; predictions are within {error['median']:.1f} dB (median error).",
         *(coverage_sentence(maps.coverage, maps.place) for maps in floors),
+        *receivers_sentence(run),
         sure,
         compared,
     ]
@@ -167,7 +171,8 @@ def steps(run: Records) -> list[NextStep]:
     own = [NextStep(where_next(run))]
     if unknown := int(np.isnan(run.arrays("maps")["receiver"]).any(axis=1).sum()):
         text = f"Give the unknown positions of access points ({unknown}), in `receivers.csv` beside the table"
-        own.insert(0, NextStep(text, "receiver,x,y,z"))
+        estimated = f"{text}: begin with the estimates in {run.path}/{RECEIVERS}.csv, and correct those that you know"
+        own.insert(0, NextStep(estimated) if run.arrays(RECEIVERS) else NextStep(text, "receiver,x,y,z"))
     n_places = run.table("errors")["place"].nunique()
     if warning := coverage_warning("intervals", interval["coverage"], interval["nominal"], n_places):
         own.append(NextStep(warning))
