@@ -228,7 +228,7 @@ def _usable(data: Rssi) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class _Shared:
+class SharedPathLoss:
     """What all receivers share: path loss with the covariance root @ root^T of level and slope, field and noise."""
 
     level: float
@@ -239,7 +239,7 @@ class _Shared:
     noise_db: float
 
     @classmethod
-    def fit(cls, data: Rssi, receiver: Tensor) -> _Shared:
+    def fit(cls, data: Rssi, receiver: Tensor) -> SharedPathLoss:
         """Fit the shared path loss and the kernel with receivers at given positions (R, 3) [m]."""
         bins = Bins.of(data, RssiConfig(max_locations=300))
         at = receiver - bins.centre
@@ -249,6 +249,12 @@ class _Shared:
         field_db, noise_db = (float(std.median()) for std in prior_std(losses.variance, kernel))
         level, slope = float(losses.shared.level[0]), float(losses.shared.slope[0])
         return cls(level, slope, losses.root[0], kernel, field_db, noise_db)
+
+    def predict(self, log_distance: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation [dB] of a measurement of a further receiver at log10 distances (n,) [m]."""
+        feature = torch.stack([torch.ones_like(log_distance), log_distance], dim=1) @ self.root
+        variance = feature.square().sum(dim=1) + self.field_db**2 + self.noise_db**2
+        return self.level + self.slope * log_distance, variance.sqrt()
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,7 +276,7 @@ class _Evidence:
         fields = ([bins.position + bins.centre, bins.rssi[:, 0], bins.count[:, 0]] for bins in parts)
         return cls(*(torch.cat(values) for values in zip(*fields, strict=True)))
 
-    def log_likelihood(self, candidate: Tensor, model: _Shared, directivity_std_db: float = 1.0) -> Tensor:
+    def log_likelihood(self, candidate: Tensor, model: SharedPathLoss, directivity_std_db: float = 1.0) -> Tensor:
         """Return log p(y | q) up to a constant at candidates q (m, 3) [m], (m,).
 
         With a factor L of the covariance of e, X = L^-1 [F, y] and A = I + F^T L^-T L^-1 F it is
@@ -334,26 +340,26 @@ class _Search:
         shape = position.shape[:2]
         return Cells(position, self.cells.log_volume.expand(shape), self.cells.edge, self.cells.level.expand(shape))
 
-    def shared(self, usable: Tensor, rounds: int = 3) -> _Shared:
+    def shared(self, usable: Tensor, rounds: int = 3) -> SharedPathLoss:
         """Return what all receivers share. Unknown positions are the strongest rows first, then the most likely cells."""
         often = self.data.detected.sum(dim=0).where(usable, -1).argsort(descending=True, stable=True)
         columns = often[: min(N_SHARED, int(usable.sum()))].sort().values.tolist()
         data = self.data.columns(columns)
         known, evidence = data.receiver_located[:, None], [_Evidence.of(self.data, column) for column in columns]
         receiver, cells = data.receiver_position.where(known, strongest_rows(data)), self.on_floor(columns)
-        model = _Shared.fit(data, receiver)
+        model = SharedPathLoss.fit(data, receiver)
         for _ in range(rounds - 1 if not bool(known.all()) else 0):
             best = [value.argmax() for value in self.values(evidence, cells.position, model)]
             estimate = torch.stack([at[i] for at, i in zip(cells.position, best, strict=True)])
-            model = _Shared.fit(data, data.receiver_position.where(known, estimate))
+            model = SharedPathLoss.fit(data, data.receiver_position.where(known, estimate))
         return model
 
-    def values(self, evidence: Sequence[_Evidence], position: Tensor, model: _Shared) -> Tensor:
+    def values(self, evidence: Sequence[_Evidence], position: Tensor, model: SharedPathLoss) -> Tensor:
         """Return the log-likelihoods (R, m) at candidates (R, m, 3) [m] of each receiver."""
         work = zip(evidence, position, strict=True)
         return torch.stack(parallel_map(lambda one: one[0].log_likelihood(one[1], model), work))
 
-    def candidates(self, columns: Sequence[int], model: _Shared, weight: float) -> tuple[Cells, Tensor]:
+    def candidates(self, columns: Sequence[int], model: SharedPathLoss, weight: float) -> tuple[Cells, Tensor]:
         """Return the refined cells (R, m) of the receivers of these columns, and their log-likelihoods (R, m)."""
         evidence, cells = [_Evidence.of(self.data, column) for column in columns], self.on_floor(columns)
         value = self.values(evidence, cells.position, model)[None]
@@ -363,7 +369,7 @@ class _Search:
             cells, value = refined(cells, mass, value, lambda position: evaluate(position)[None], N_SPLIT)
         return cells, value[0]
 
-    def weight(self, columns: Sequence[int], model: _Shared) -> float:
+    def weight(self, columns: Sequence[int], model: SharedPathLoss) -> float:
         """Return the weight of the likelihood with the greatest posterior density at receivers of known position."""
         cells, value = self.candidates(columns, model, DEFAULT_WEIGHT)
         truth = self.data.receiver_position[list(columns)][:, None]
