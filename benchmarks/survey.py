@@ -29,7 +29,7 @@ from torch.nn import functional
 
 from swiftwrf import Rssi, RssiModel, load_rssi, rssi_room
 from swiftwrf.contrib.survey import receivers as receivers_module
-from swiftwrf.contrib.survey.plan import interval, plan_coverage
+from swiftwrf.contrib.survey.plan import SPREAD_DB, interval, plan_coverage
 from swiftwrf.contrib.survey.receivers import SharedPathLoss, locate_receivers
 from swiftwrf.data import simulated
 from swiftwrf.locate.posterior import pooled_weights
@@ -154,10 +154,12 @@ def measure_floor(seed: int, n_rows: int = 300, n_receivers: int = 4) -> Row:
     rows, cells = (
         low + (high - low) * torch.rand(n, 3, dtype=torch.float64, generator=generator) for n in (n_rows, 500)
     )
-    receiver = low + (high - low) * torch.rand(n_receivers, 3, dtype=torch.float64, generator=generator)
+    receiver = low + (high - low) * torch.rand(50, 3, dtype=torch.float64, generator=generator)
     receiver[:, 2] = 2.3
+    receiver = outside_of(boxes, receiver)[:n_receivers]
     x, y = np.meshgrid(np.linspace(2, 18, 5), np.linspace(2, 14, 4))
     places = torch.tensor(np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 2.3)]))
+    places = outside_of(boxes, places)
     with patch.object(simulated, "FLOOR", replace(simulated.FLOOR, boxes=boxes)):
         surveyed, existing, further = (
             torch.stack([simulated._power(at, one) for one in of], dim=1)
@@ -198,6 +200,13 @@ def measure_floor(seed: int, n_rows: int = 300, n_receivers: int = 4) -> Row:
     return row
 
 
+def outside_of(boxes: tuple[Any, ...], position: Tensor) -> Tensor:
+    """Return the positions (n, 3) [m] that are in no box: nobody hangs an access point into a cabinet."""
+    corners = torch.tensor(boxes, dtype=torch.float64)
+    within = ((position[:, None] >= corners[:, 0]) & (position[:, None] <= corners[:, 1])).all(dim=2).any(dim=1)
+    return position[~within]
+
+
 def hole_centre(cells: Tensor, probability: Tensor, places: Tensor) -> int:
     """Return the candidate nearest to the centre of the largest connected region with a probability below 0.5."""
     x, column = cells[:, 0].unique(return_inverse=True)
@@ -219,7 +228,7 @@ def predict_left_out(data: Rssi) -> Row:
     threshold = float(data.rssi_dbm[data.detected].quantile(0.5)) if int(data.detected.sum()) < 10**7 else -70.0
     for out in range(len(data.receiver_names)):
         others = [column for column in range(len(data.receiver_names)) if column != out]
-        shared = SharedPathLoss.fit(data.columns(others), data.receiver_position[others])
+        shared = SharedPathLoss.fit(data.columns(others), data.receiver_position[others], SPREAD_DB)
         seen = data.detected[:, out]
         distance = log_distance(data.transmitter_position[seen], data.receiver_position[out][None])[:, 0]
         mean, std = shared.predict(distance)

@@ -140,6 +140,8 @@ class RssiTaskConfig(ReadingConfig):
     """an image to draw behind the maps, PNG or JPEG"""
     floor_extent: tuple[float, float, float, float] | None = None
     """x0 x1 y0 y1 of that image [m] (default: as pixels of the image are the positions in the table)"""
+    suggest: Annotated[int, Ge(0), Le(MAX_SUGGESTIONS)] = 0
+    """number of positions to suggest for the next measurements, those that make the coverage more certain"""
     scheduler: str | None = None
     """address of a Dask scheduler whose workers fit groups of receivers (extra: cluster)"""
     seed: Seed = 0

@@ -15,12 +15,12 @@ from swiftwrf.data.formats.stations import read_stations, station_names
 from tasks.configs import LocateConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
-from tasks.locate.page import SUGGESTED, page
+from tasks.locate.page import page
 from tasks.locate.placement import write_poses
 from tasks.page.page import finish
 from tasks.page.receivers import with_receivers
 from tasks.page.shared import write_suggestion
-from tasks.records import Row
+from tasks.records import SUGGESTED, Row
 from tasks.source import reading
 from tasks.terminal import console, terminal
 from tasks.workers import connected, workers_of

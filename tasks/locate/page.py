@@ -33,7 +33,7 @@ from tasks.page.shared import (
     recommendation,
     suggestion_section,
 )
-from tasks.records import Records, notes
+from tasks.records import SUGGESTED, Records, notes
 from tasks.terminal import Answer, Method, NextStep
 
 OWN = "posterior"  # the localizer that all others are compared with
@@ -41,7 +41,6 @@ BASELINES = {
     "receiver": (("knn", "knn_difference"), "the best nearest-neighbour fingerprinting"),
     "station": (("triangulation", "triangulation_matched", "knn"), "the best baseline"),
 }  # by what receives: localizers without a model of the scene, and what they are together
-SUGGESTED = "suggested"  # name of the files with suggested positions
 OF_STATIONS = ("stations", "alone_estimate", "alone_radius_80_m")
 STATIONS_TEXT = "; triangles: stations; dashed circles of their colours: 80 % credible regions by each station alone."
 TRUTH, ESTIMATE = "#cf4a4a", "#ffffff"

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from swiftwrf import InputError, Rssi, rssi_room
-from swiftwrf.contrib.comparison.rssi import compare, compared
+from augment.suggest import suggest_scans
+from swiftwrf import InputError, Rssi, RssiModel, rssi_room
+from swiftwrf.contrib.comparison.rssi import COVERED_DBM, RssiComparison, compare, compared
+from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.files import sha256
 from swiftwrf.data.formats import RSSI_FORMATS
 from tasks.configs import RssiTaskConfig
@@ -14,7 +16,8 @@ from tasks.environment import choose_device
 from tasks.page.maps import FloorPlan, read_pixels
 from tasks.page.page import finish
 from tasks.page.receivers import with_receivers
-from tasks.records import Row
+from tasks.page.shared import NOT_WORTH, is_worth, suggestions, write_suggestion
+from tasks.records import SUGGESTED, Row
 from tasks.rssi.page import page
 from tasks.source import offset_notes, reading
 from tasks.terminal import console, terminal
@@ -71,7 +74,22 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
             console.print(f"{data.name}: {detection.note(data.receiver_names)}")
         if plan is not None:
             plan.save(directory.folder)
+        _suggest(result, config, directory)
         finish(directory, with_receivers(result.recorded(), result.train), page, offset_notes(data))
+
+
+def _suggest(result: RssiComparison, config: RssiTaskConfig, directory: Run) -> None:
+    """Write the positions to measure next, and print the first ones, or that none is worth it."""
+    model, train = result.predictors[result.model], result.train
+    if not config.suggest or not isinstance(model, RssiModel):
+        return
+    found = suggest_scans(model, train, config.suggest, COVERED_DBM)
+    if not is_worth(found.variance.numpy()):
+        console.print(NOT_WORTH)
+        return
+    degrees = degree_columns(train.origin, found.position.numpy())
+    write_suggestion(directory.path(SUGGESTED), train.transmitter_position, found.position, found.variance, degrees)
+    console.print(suggestions(found.position.numpy(), found.variance.numpy()))
 
 
 def _read_floor_plan(config: RssiTaskConfig, data: Rssi) -> FloorPlan | None:

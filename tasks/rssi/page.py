@@ -28,8 +28,9 @@ from tasks.page.shared import (
     limits,
     next_steps,
     recommendation,
+    suggestion_section,
 )
-from tasks.records import Records, notes
+from tasks.records import SUGGESTED, Records, notes
 from tasks.rssi.maps import MIN_RATIO, WIDTH_PER_STD, Maps, coverage_sentence
 from tasks.terminal import Answer, Method, NextStep
 
@@ -59,6 +60,8 @@ def page(runs: list[Records]) -> Page:
     ]
     if any(run.arrays(RECEIVERS) for run in runs):
         sections.insert(-1, sections_of("Where the receivers are", runs, receivers_section))
+    if any(run.arrays(SUGGESTED) for run in runs):
+        sections[-2].parts.append(sections_of("Where to measure next", runs, _suggestion))
     details = [provenance(runs)]
     if len(runs) > 1 or any(len(Maps(run).names) > 1 for run in runs):
         sections.insert(0, sections_of("Maps", runs, partial(_maps, kind="predicted")))
@@ -88,6 +91,20 @@ def _summary(run: Records, found: Answer) -> Summary:
     ]
     plots = [maps.summary() for maps in floors]
     return Summary(numbers, plots, found.conclusion, found.next_steps, notes=notes(run))
+
+
+def _suggestion(run: Records) -> Section | None:
+    return suggestion_section(
+        "",
+        run.arrays(SUGGESTED),
+        SUGGESTED,
+        run.file_name,
+        what="the variance of the radio maps",
+        whole="the field's variance",
+        how="The mean over the walked area is weighted by p (1 - p), where p is the probability that a scan has a receiver "
+        "above the threshold of the coverage.",
+        label="weighted variance left [%]",
+    )
 
 
 def _maps(run: Records, kind: str) -> Section:

@@ -33,7 +33,7 @@ from swiftwrf.plotting import MARK, Axes, Displayed, plan
 from swiftwrf.positions import inside
 from swiftwrf.rssi.base import RssiConfig
 from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation
-from swiftwrf.rssi.path_loss import fit_path_losses, log_distance
+from swiftwrf.rssi.path_loss import PathLoss, fit_path_losses, log_distance
 from swiftwrf.rssi.regression import regressors
 from swiftwrf.rssi.training import Bins, choose_residual_kernel, prior_std
 from swiftwrf.runtime.threads import parallel_map
@@ -229,26 +229,48 @@ def _usable(data: Rssi) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class SharedPathLoss:
-    """What all receivers share: path loss with the covariance root @ root^T of level and slope, field and noise."""
+    """Path loss that is learnt from all receivers together.
 
+    Args:
+        each: Model of each receiver, (R,).
+        level: Level of all receivers [dBm].
+        slope: Slope of all receivers [dB a decade].
+        root: A factor of the covariance of a receiver's level and slope about these, root @ root^T, (2, 2).
+        kernel: Kernel of the residuals.
+        field_db: Standard deviation of their field [dB].
+        noise_db: Standard deviation of the noise [dB].
+        common_db: Standard deviation of the part of the field that all receivers have at a position, e.g. behind a wall
+            [dB].
+    """
+
+    each: PathLoss
     level: float
     slope: float
     root: Tensor
     kernel: Kernel
     field_db: float
     noise_db: float
+    common_db: float
 
     @classmethod
-    def fit(cls, data: Rssi, receiver: Tensor) -> SharedPathLoss:
-        """Fit the shared path loss and the kernel with receivers at given positions (R, 3) [m]."""
+    def fit(cls, data: Rssi, receiver: Tensor, spread_db: float = 6.0) -> SharedPathLoss:
+        """Fit the shared path loss and the kernel with receivers at given positions (R, 3) [m].
+
+        `spread_db` is the prior standard deviation of `fit_path_losses`.
+        """
         bins = Bins.of(data, RssiConfig(max_locations=300))
         at = receiver - bins.centre
-        losses = fit_path_losses(bins.position, at, bins.rssi, "unknown")
+        losses = fit_path_losses(bins.position, at, bins.rssi, "unknown", spread_db=spread_db)
         residual = bins.rssi - losses.each(log_distance(bins.position, at))
         kernel, _ = choose_residual_kernel(bins.position, residual, bins.fold)
         field_db, noise_db = (float(std.median()) for std in prior_std(losses.variance, kernel))
         level, slope = float(losses.shared.level[0]), float(losses.shared.slope[0])
-        return cls(level, slope, losses.root[0], kernel, field_db, noise_db)
+        seen = residual.isfinite().double()
+        value, both = residual.nan_to_num(), seen.T @ seen
+        products, pairs = value.T @ value, ~torch.eye(len(receiver), dtype=torch.bool)
+        common = float(products[pairs].sum() / both[pairs].sum().clamp_min(1)) if len(receiver) > 1 else 0.0
+        common_db = math.sqrt(min(max(common, 0.0), 0.9 * field_db**2))
+        return cls(losses.each, level, slope, losses.root[0], kernel, field_db, noise_db, common_db)
 
     def predict(self, log_distance: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and standard deviation [dB] of a measurement of a further receiver at log10 distances (n,) [m]."""

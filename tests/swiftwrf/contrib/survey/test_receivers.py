@@ -8,7 +8,7 @@ from swiftwrf import InputError, Rssi, load_rssi, rssi_room
 from swiftwrf.contrib.survey import receivers as module
 from swiftwrf.contrib.survey.receivers import SharedPathLoss, _Evidence, locate_receivers
 from swiftwrf.gp import Kernel
-from swiftwrf.rssi.path_loss import harmonics
+from swiftwrf.rssi.path_loss import PathLoss, harmonics
 
 
 def hidden(data, known=()):
@@ -51,7 +51,9 @@ def test_the_likelihood_is_that_of_a_normal_vector():
     at, rssi = 9 * torch.rand(14, 3, dtype=torch.float64), -50 - 10 * torch.rand(14, dtype=torch.float64)
     count = torch.tensor([1.0, 2.0] * 7, dtype=torch.float64)
     root = torch.tensor([[5.0, -3.0], [0.0, 4.0]], dtype=torch.float64)
-    model = SharedPathLoss(-40.0, -22.0, root, Kernel(3.0, matern12_weight=1.0, noise=1.0), 3.0, 2.0)
+    model = SharedPathLoss(
+        PathLoss(*root), -40.0, -22.0, root, Kernel(3.0, matern12_weight=1.0, noise=1.0), 3.0, 2.0, 0.0
+    )
     candidate = 9 * torch.rand(5, 3, dtype=torch.float64)
     found = _Evidence(at, rssi, count).log_likelihood(candidate, model)
     wanted = []
