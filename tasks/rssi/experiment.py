@@ -6,7 +6,7 @@ from pathlib import Path
 
 from augment.suggest import suggest_scans
 from swiftwrf import InputError, Rssi, RssiModel, rssi_room
-from swiftwrf.contrib.comparison.rssi import COVERED_DBM, RssiComparison, compare, compared
+from swiftwrf.contrib.comparison.rssi import RssiComparison, compare, compared
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.files import sha256
 from swiftwrf.data.formats import RSSI_FORMATS
@@ -74,16 +74,17 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
             console.print(f"{data.name}: {detection.note(data.receiver_names)}")
         if plan is not None:
             plan.save(directory.folder)
-        _suggest(result, config, directory)
-        finish(directory, with_receivers(result.recorded(), result.train), page, offset_notes(data))
+        recorded = with_receivers(result.recorded(), result.train)
+        _suggest(result, config, directory, float(recorded.metrics["coverage"][0]["threshold_dbm"]))
+        finish(directory, recorded, page, offset_notes(data))
 
 
-def _suggest(result: RssiComparison, config: RssiTaskConfig, directory: Run) -> None:
+def _suggest(result: RssiComparison, config: RssiTaskConfig, directory: Run, above_dbm: float) -> None:
     """Write the positions to measure next, and print the first ones, or that none is worth it."""
     model, train = result.predictors[result.model], result.train
     if not config.suggest or not isinstance(model, RssiModel):
         return
-    found = suggest_scans(model, train, config.suggest, COVERED_DBM)
+    found = suggest_scans(model, train, config.suggest, above_dbm)
     if not is_worth(found.variance.numpy()):
         console.print(NOT_WORTH)
         return
