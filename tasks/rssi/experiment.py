@@ -90,7 +90,7 @@ def _suggest(result: RssiComparison, config: RssiTaskConfig, directory: Run, abo
         return
     degrees = degree_columns(train.origin, found.position.numpy())
     write_suggestion(directory.path(SUGGESTED), train.transmitter_position, found.position, found.variance, degrees)
-    console.print(suggestions(found.position.numpy(), found.variance.numpy()))
+    console.print(suggestions(found.position.numpy(), found.variance.numpy()), markup=False)
 
 
 def _read_floor_plan(config: RssiTaskConfig, data: Rssi) -> FloorPlan | None:

@@ -12,7 +12,6 @@ from augment.suggest import suggest_scans
 from swiftwrf import Rssi, RssiModel, load_rssi
 from swiftwrf.rssi.coverage import Coverage
 from swiftwrf.rssi.maps import RssiMap
-from tasks.rssi import experiment
 
 RECEIVERS = np.array([(5.0, 10.0, 2.5), (10.0, 4.0, 2.5), (9.0, 16.0, 2.5)])
 
@@ -102,13 +101,17 @@ def test_the_first_suggestion_is_the_best_of_all_cells():
     assert abs(float(found.variance[1] / found.variance[0]) - ratio) < 1e-4
 
 
-def test_suggestions_are_printed_and_in_the_report(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(experiment, "rssi_room", lambda seed: rough_hall())
-    assert quick.run("rssi", "--rx", "all", "--suggest", 12, "--out", tmp_path / "run") == 0
+def test_suggestions_are_printed_and_in_the_report(tmp_path, capsys):
+    hall = rough_hall()
+    table = pd.DataFrame(hall.transmitter_position.numpy(), columns=["x", "y", "z"]).assign(ap1=hall.rssi_dbm.numpy())
+    table.to_csv(tmp_path / "walk.csv", index=False)
+    options = ("--rx", "all", "--data", tmp_path / "walk.csv", "--suggest", 12)
+    assert quick.command("rssi", *options, "--out", tmp_path / "run") == 0
     printed = capsys.readouterr().err
     suggested = pd.read_csv(tmp_path / "run" / "suggested.csv")
     rows = re.findall(r"^ +(\d+) +([\d.]+) +([\d.]+) +([\d.]+) +([\d.]+)%$", printed, flags=re.MULTILINE)
     assert [float(row[1]) for row in rows] == [round(x, 2) for x in suggested["x_m"][:10]]
+    assert "rank   x [m]   y [m]   z [m]  variance left" in printed
     assert "Where to measure next" in (tmp_path / "run" / "report.html").read_text()
 
 
