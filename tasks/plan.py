@@ -23,9 +23,8 @@ from tasks.directory import new_directory
 from tasks.environment import command, stamp
 from tasks.page import figures
 from tasks.page.page import REPORT, Number, Page, Plot, Section, Summary, Table, write_page
-from tasks.page.receivers import RECEIVERS
 from tasks.page.shared import MEASURED, SUGGESTED
-from tasks.records import Records, Row, rounded, write_table
+from tasks.records import RECEIVERS, Records, Row, rounded, write_table
 from tasks.terminal import NextStep, terminal
 
 CANDIDATES = "candidates"  # name of the table

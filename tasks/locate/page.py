@@ -19,7 +19,7 @@ from tasks import labels
 from tasks.locate.placement import poses_section
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table, number, provenance, sections_of
-from tasks.page.receivers import RECEIVERS, receivers_section
+from tasks.page.receivers import receivers_section
 from tasks.page.shared import (
     again,
     by_method,
@@ -33,7 +33,7 @@ from tasks.page.shared import (
     recommendation,
     suggestion_section,
 )
-from tasks.records import SUGGESTED, Records, notes
+from tasks.records import RECEIVERS, SUGGESTED, Records, notes
 from tasks.terminal import Answer, Method, NextStep
 
 OWN = "posterior"  # the localizer that all others are compared with

@@ -14,9 +14,8 @@ from swiftwrf.contrib.survey.receivers import locate_receivers
 from tasks.page import figures
 from tasks.page.page import Plot, Section, Table
 from tasks.page.shared import MEASURED, SUGGESTED
-from tasks.records import Records
+from tasks.records import RECEIVERS, Records
 
-RECEIVERS = "receivers"  # name of the files of a run with estimated positions of receivers
 MAX_NAMED = 30  # receivers with their name in the figure; more would hide each other
 BAND = 0.35  # width of the part of the figure beside the rows, relative to their extent
 
@@ -52,11 +51,10 @@ def receivers_sentence(run: Records) -> list[str]:
         return []
     radius = float(np.median([one["radius_80_m"] for one in found]))
     outside = sum(one["outside"] > 0.5 for one in found)
-    what = (
-        f"The unknown {'positions' if len(found) > 1 else 'position'} of {len(found)} receiver{'s'[: len(found) > 1]}"
-    )
+    what = f"Positions of {len(found)} receivers" if len(found) > 1 else "The position of one receiver"
+    were = "were" if len(found) > 1 else "was"
     where = f"; {outside} {'is' if outside == 1 else 'are'} outside of what was walked" if outside else ""
-    return [f"{what} were estimated, within {radius:.1f} m with 80 % probability (median){where}."]
+    return [f"{what} {were} unknown and estimated, within {radius:.1f} m with 80 % probability (median){where}."]
 
 
 def receivers_section(run: Records) -> Section | None:
@@ -90,7 +88,7 @@ def receivers_section(run: Records) -> Section | None:
     heads = ["receiver", *(f"{axis} [m]" for axis in "xyz"), "80 % radius [m]", "outside of what was walked"]
     heads += ["x of the strongest row [m]", "y of it [m]"]
     text = (
-        f"The survey does not state the positions of {len(names)} receivers. Each is estimated from its own RSSI, and lies "
+        f"The survey does not state the positions of receivers ({len(names)}). Each is estimated from its own RSSI and lies "
         f"in its circle with 80 % probability. `{RECEIVERS}.csv` beside the survey gives the positions back: correct those "
         "that you know first. Heights are hardly determined."
     )

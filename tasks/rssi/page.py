@@ -16,7 +16,7 @@ from swiftwrf.metrics import LEVEL
 from tasks.labels import PREDICTORS, colour, meanings
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of
-from tasks.page.receivers import RECEIVERS, receivers_section, receivers_sentence
+from tasks.page.receivers import receivers_section, receivers_sentence
 from tasks.page.shared import (
     again,
     by_method,
@@ -30,7 +30,7 @@ from tasks.page.shared import (
     recommendation,
     suggestion_section,
 )
-from tasks.records import SUGGESTED, Records, notes
+from tasks.records import RECEIVERS, SUGGESTED, Records, notes
 from tasks.rssi.maps import MIN_RATIO, WIDTH_PER_STD, Maps, coverage_sentence
 from tasks.terminal import Answer, Method, NextStep
 
