@@ -1,13 +1,14 @@
-"""Where the next access point belongs, by a run of `rssi`: a table, a report and the candidates as a table."""
+"""Plans of access points by a run of `rssi`: an answer, a report and the candidates as a table."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 from pandas import DataFrame
 from torch import Tensor
 
@@ -87,7 +88,7 @@ def survey_of(records: Records) -> tuple[RssiModel, Rssi]:
         receiver_position=receiver,
         receiver_names=model.receiver_names,
         origin=model.origin,
-        floors=model.attenuation and model.attenuation.floors,
+        floors=None if model.attenuation is None else model.attenuation.floors,
         name=str(records.metrics["data"]),
     )
     return model, survey
@@ -228,14 +229,18 @@ def _maps(found: CoveragePlan) -> list[Plot]:
     return plots
 
 
-def _panel(survey: Rssi, at: Any, probability: Any, title: str, chosen: Tensor) -> Any:
+def _panel(
+    survey: Rssi, at: NDArray[np.float64], probability: NDArray[np.float64], title: str, chosen: Tensor
+) -> Figure:
+    """Draw the probability (n,) in cells (n, 3) [m], receivers, and the chosen places (k, 3) [m]."""
     sides = np.ptp(at[:, :2], axis=0)
     figure, plan = figures.panel(4.6, 0.8 + 3.4 * float(np.clip(sides[1] / max(sides[0], 1e-9), 0.4, 1.6)))
-    drawn = plan.scatter(*at[:, :2].T, c=probability, s=9, marker="s", cmap="viridis", vmin=0, vmax=1, rasterized=True)
+    x, y = at[:, :2].T
+    drawn = plan.scatter(x, y, c=probability, s=9, marker="s", cmap="viridis", vmin=0, vmax=1, rasterized=True)
     plan.plot(*survey.receiver_position[survey.receiver_located][:, :2].numpy().T, "^", color=MEASURED, markersize=6)
-    for rank, (x, y, _) in enumerate(chosen.tolist(), start=1):
-        plan.plot(x, y, "X", color=SUGGESTED, markersize=9)
-        plan.annotate(str(rank), (x, y), xytext=(5, 5), textcoords="offset points", fontsize=8)
+    for rank, place in enumerate(chosen[:, :2].tolist(), start=1):
+        plan.plot(*place, "X", color=SUGGESTED, markersize=9)
+        plan.annotate(str(rank), place, xytext=(5, 5), textcoords="offset points", fontsize=8)
     plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     plan.set_title(title, fontsize=9)
     figures.colour_bar(plan, drawn, "probability")

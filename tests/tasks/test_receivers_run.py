@@ -66,7 +66,7 @@ def test_known_receivers_are_not_estimated(tmp_path):
 
 
 def rough_hall(n=120):
-    """Return a walk of a hall whose RSSI varies over metres, so that a scan tells about its surroundings."""
+    """Return a walk of a hall whose RSSI varies over metres, so that a scan determines its surroundings."""
     draw = np.random.default_rng(1)
     at = np.column_stack([draw.uniform(0, 40, n), draw.uniform(0, 20, n), np.full(n, 1.2)])
     at = at[~((at[:, 0] > 18) & (at[:, 0] < 30) & (at[:, 1] > 5) & (at[:, 1] < 15))]  # nobody walked there
@@ -76,7 +76,7 @@ def rough_hall(n=120):
 
 
 def test_the_first_suggestion_is_the_best_of_all_cells():
-    """By a posterior variance in plain NumPy, after a scan in each cell of the walked area."""
+    """The posterior variance after a scan in each cell of the walked area is computed in plain NumPy."""
     survey = rough_hall()
     model = RssiModel().fit(survey)
     found = suggest_scans(model, survey, 3, above_dbm=-70.0)

@@ -1,1 +1,1 @@
-"""What a site survey asks beside its maps: where receivers are, and where a further one belongs."""
+"""Answers of a site survey beside its maps: positions of receivers, and places of further access points."""

@@ -1,4 +1,4 @@
-"""Where the next access point belongs: the coverage that a further receiver adds, by what the survey determined.
+"""Plans of access points: the coverage that a further one adds, by the path loss and shadowing that a survey determined.
 
 Coverage is the expected share of scans in the measured area with a receiver above a threshold. Maps are uncertain, so it is
 computed for samples of them:
@@ -169,7 +169,9 @@ def plan_coverage(
     places = area.grid() if candidates is None else check_positions(candidates, "candidates")
     if count > len(places):
         raise InputError(f"{count} access points cannot be chosen among {len(places)} candidates; give more")
-    first, chosen, after, gain = missing.mean(dim=0), [], [], torch.zeros(len(places), N_SAMPLES, dtype=torch.float64)
+    first, gain = missing.mean(dim=0), torch.zeros(len(places), N_SAMPLES, dtype=torch.float64)
+    chosen: list[int] = []
+    after: list[Tensor] = []
     for number in range(max(count, 1) if len(places) else 0):
         fields = area.new_fields()
         absent = [area.further(place, *fields) for place in places]
@@ -260,18 +262,20 @@ class _Area:
                 chosen = Coverage.of(chart, scans, (threshold_dbm, 0.9, 1), reach(model)).measured
                 x, y = np.meshgrid(chart.x, chart.y)
                 cells = np.stack([x, y, np.full_like(x, chart.height)], axis=-1)[chosen]
-                maps = (values[:, chosen] for values in (chart.mean, chart.std, chart.detection))
-                parts.append([torch.from_numpy(values.astype(float)) for values in (cells, *maps)])
-        position, *maps = (torch.cat(values, dim=int(i > 0)) for i, values in enumerate(zip(*parts, strict=True)))
+                maps = np.stack([chart.mean, chart.std, chart.detection])[:, :, chosen]
+                parts.append((torch.from_numpy(cells), torch.from_numpy(maps).double()))
+        position = torch.cat([cells for cells, _ in parts])
         if not len(position):
             raise InputError(f"no cell of {survey.name} is measured; survey an area, and not a line")
-        return cls(model, survey, shared, receiver, position, *maps, threshold_dbm, generator)
+        mean, std, detection = torch.cat([maps for _, maps in parts], dim=2)
+        return cls(model, survey, shared, receiver, position, mean, std, detection, threshold_dbm, generator)
 
     @cached_property
     def _factor(self) -> Tensor:
         """Cholesky factor of the correlation of fields between cells, (n, n)."""
         correlation = self.shared.kernel(self.position, self.position)
-        return torch.linalg.cholesky(correlation + 1e-6 * torch.eye(len(self.position), dtype=torch.float64))
+        factor: Tensor = torch.linalg.cholesky(correlation + 1e-6 * torch.eye(len(self.position), dtype=torch.float64))
+        return factor
 
     def _fields(self, *shape: int) -> Tensor:
         """Return samples of unit variance in the cells, (*shape, n)."""
@@ -296,8 +300,8 @@ class _Area:
     def _common(self) -> tuple[Tensor, float]:
         """The part of the field that all receivers have in each cell, (n,) [dB], and its standard deviation [dB].
 
-        The residuals of the R maps are this part c of variance v and others of variance w, so c is v / (v + w / R) times
-        their mean, with the variance v w / (R v + w).
+        A residual of the R maps is this part of variance v plus another one of variance w. Given their mean m, this part has
+        the mean m v / (v + w / R) and the variance v w / (R v + w).
         """
         located = self.receiver.isfinite().all(dim=1)
         distance = log_distance(self.position, self.receiver[located])
@@ -335,7 +339,8 @@ class _Area:
             mean = mean + attenuation.between(self.position, place.expand_as(self.position))
         missed = 0.0 if self.model.detection is None else float(self.model.detection.missed.median())
         z = (mean - self.threshold_dbm) / self.shared.noise_db
-        return 1 - (1 - missed) * torch.special.ndtr(z)
+        none: Tensor = 1 - (1 - missed) * torch.special.ndtr(z)
+        return none
 
     def share(self, missing: Tensor) -> Tensor:
         """Return the coverage by the probability (S, n) that no receiver is above, (S,)."""

@@ -301,8 +301,9 @@ class _Evidence:
     def log_likelihood(self, candidate: Tensor, model: SharedPathLoss, directivity_std_db: float = 1.0) -> Tensor:
         """Return log p(y | q) up to a constant at candidates q (m, 3) [m], (m,).
 
-        With a factor L of the covariance of e, X = L^-1 [F, y] and A = I + F^T L^-T L^-1 F it is
-        -(y^T L^-T L^-1 y - u^T A^-1 u + log |A|) / 2, where u = F^T L^-T L^-1 y.
+        E is the covariance of e. With A = I + F^T E^-1 F and u = F^T E^-1 y it is
+
+            -(y^T E^-1 y - u^T A^-1 u + log |A|) / 2.
 
         Args:
             candidate: Candidate positions.

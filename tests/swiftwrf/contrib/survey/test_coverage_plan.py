@@ -1,4 +1,4 @@
-"""Where the next access point belongs."""
+"""Plans of access points in a hall of known coverage."""
 
 import numpy as np
 import pytest
