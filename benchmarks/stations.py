@@ -5,7 +5,8 @@ python benchmarks/stations.py --draws 3
 Scenes are the simulated office with 100 measured transmissions and little or much phase noise. --rooms adds furnished rooms
 with three arrays under the ceiling, one a draw, that Sionna RT traces, with spectra alone or, with --subcarriers, channels:
 
-python benchmarks/stations.py --scenes --rooms 10 --subcarriers 8 --bandwidth 20e6 --snr-db 20 --name stations_rooms
+python benchmarks/stations.py --scenes --rooms 10 --subcarriers 8 --bandwidth 20e6 --snr-db 20 --n-measured 240 --n-test 60 \
+    --name stations_rooms
 
 The results of a scene have a row for each draw, and their medians. Test transmissions take no part in any fit.
 """
@@ -26,7 +27,7 @@ from swiftwrf import Stations, simulated_stations
 from swiftwrf.contrib.comparison.stations import ALONE, compare_stations
 from swiftwrf.metrics import LEVEL
 
-N_MEASURED, N_ARRAYS = 100, 3
+N_ARRAYS = 3
 OFFICES: dict[str, dict[str, Any]] = {"office": {"phase_noise": 0.1}, "noisy": {"phase_noise": 0.4, "snr_db": 15.0}}
 SPLIT = "measured"
 
@@ -37,6 +38,8 @@ class Config:
     """simulated offices: 0.1 rad of phase noise, or 0.4 rad and a signal-to-noise ratio of 15 dB"""
     draws: int = 3
     """draws of positions and noise"""
+    n_measured: int = 100
+    """number of measured transmissions"""
     n_test: int = 233
     """number of test transmissions: those that are left with 30 % measured"""
     rooms: int = 0
@@ -68,14 +71,12 @@ def main(config: Config) -> None:
 
 def scenes(config: Config) -> Iterator[tuple[str, Iterator[Stations]]]:
     """Yield the name of each scene and its transmissions, one data set for each draw."""
-    count = N_MEASURED + config.n_test
+    known, count = config.n_measured, config.n_measured + config.n_test
     for name in config.scenes:
-        yield (
-            name,
-            (with_split(simulated_stations(count, N_ARRAYS, seed=d, **OFFICES[name])) for d in range(config.draws)),
-        )
+        draws = (simulated_stations(count, N_ARRAYS, seed=draw, **OFFICES[name]) for draw in range(config.draws))
+        yield name, (with_split(data, known) for data in draws)
     if config.rooms:
-        yield "furnished rooms", (with_split(furnished_rooms(config, seed)) for seed in range(config.rooms))
+        yield "furnished rooms", (with_split(furnished_rooms(config, seed), known) for seed in range(config.rooms))
 
 
 def furnished_rooms(config: Config, seed: int) -> Stations:
@@ -84,12 +85,12 @@ def furnished_rooms(config: Config, seed: int) -> Stations:
     if config.snr_db is not None:
         parts = [impaired(part, config.snr_db, N_ARRAYS * seed + n) for n, part in enumerate(parts)]
     data = Stations({f"corner {n}": part for n, part in enumerate(parts, start=1)}, name="furnished room")
-    return data[: N_MEASURED + config.n_test]
+    return data[: config.n_measured + config.n_test]
 
 
-def with_split(data: Stations) -> Stations:
+def with_split(data: Stations, n_measured: int) -> Stations:
     """Return the data with the split whose first transmissions are measured."""
-    return data.derived(named_splits={SPLIT: (torch.arange(N_MEASURED), torch.arange(N_MEASURED, len(data)))})
+    return data.derived(named_splits={SPLIT: (torch.arange(n_measured), torch.arange(n_measured, len(data)))})
 
 
 def measure(data: Stations, draw: int) -> dict[str, Any]:

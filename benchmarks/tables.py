@@ -181,7 +181,7 @@ def commands() -> str:
     found: dict[tuple[str, str], list[str]] = {}
     for command, (config, _) in COMMANDS.items():
         for name, meaning in _options(getattr(configs, config)).items():
-            if name not in reading:
+            if reading.get(name) != meaning:
                 found.setdefault((name, meaning), []).append(f"`{command}`")
     found |= {(name, meaning): ["all"] for name, meaning in meanings(General).items()}
     rows = [[f"`{name}`", ", ".join(names), meaning] for (name, meaning), names in sorted(found.items())]

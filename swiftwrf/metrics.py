@@ -24,33 +24,47 @@ HALF_WIDTH = NormalDist().inv_cdf((1 + LEVEL) / 2)  # of the interval of a norma
 
 @lru_cache(maxsize=16)
 @torch.inference_mode(False)  # what is kept must also serve calls that await gradients
-def _window_mean(size: int, device: torch.device, dtype: torch.dtype) -> Tensor:
+def _window_mean(size: int, width: int, device: torch.device, dtype: torch.dtype) -> Tensor:
     """Banded matrix (size - 6, size) that averages 7 neighbours: two products replace a convolution, 15 times faster."""
-    rows = size - WINDOW + 1
+    rows = size - width + 1
     offset = torch.arange(size, device=device) - torch.arange(rows, device=device)[:, None]
-    return ((offset >= 0) & (offset < WINDOW)).to(dtype) / WINDOW
+    return ((offset >= 0) & (offset < width)).to(dtype) / width
+
+
+def too_small(shape: tuple[int, int]) -> bool:
+    """Return True if `ssim` is not defined for images of this height and width.
+
+    Example:
+        >>> too_small((1, 72)), too_small((2, 72)), too_small((7, 6))
+        (False, True, True)
+    """
+    return 1 < shape[0] < WINDOW or shape[1] < WINDOW
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:
     """Return the structural similarity of each pair of images (..., H, W) in [0, 1], differentiable, (...).
 
-    Equal to `skimage.metrics.structural_similarity(a, b, data_range=1)`.
+    Equal to `skimage.metrics.structural_similarity(a, b, data_range=1)`. Images of one row have a window of 1 x 7.
 
     Raises:
-        InputError: Images smaller than the 7 x 7 window.
+        InputError: Images smaller than the window.
 
     Example:
         >>> image = torch.rand(2, 30, 120)
         >>> ssim(image, image)
         tensor([1., 1.])
     """
-    if min(a.shape[-2:]) < WINDOW:
-        raise InputError(f"SSIM needs images of at least {WINDOW} x {WINDOW} pixels, got {tuple(a.shape[-2:])}")
-    down = _window_mean(a.shape[-2], a.device, a.dtype)
-    across = _window_mean(a.shape[-1], a.device, a.dtype).T
+    height, width = a.shape[-2:]
+    if too_small((height, width)):
+        raise InputError(
+            f"SSIM needs images of at least {WINDOW} x {WINDOW} pixels or of a row of {WINDOW}, got {height} x {width}"
+        )
+    window = min(height, WINDOW)
+    down = _window_mean(height, window, a.device, a.dtype)
+    across = _window_mean(width, WINDOW, a.device, a.dtype).T
 
     mean_a, mean_b, aa, bb, ab = (down @ x @ across for x in (a, b, a * a, b * b, a * b))
-    sample = WINDOW**2 / (WINDOW**2 - 1)
+    sample = window * WINDOW / (window * WINDOW - 1)
     variance_a, variance_b = sample * (aa - mean_a * mean_a), sample * (bb - mean_b * mean_b)
     covariance = sample * (ab - mean_a * mean_b)
     c1, c2 = 0.01**2, 0.03**2

@@ -82,6 +82,8 @@ def polar_spectrum(
         ax = pyplot.figure().add_subplot(projection="polar")
     azimuth = np.degrees(grid.azimuth_start + grid.azimuth_step * (np.arange(grid.n_azimuth + 1) - 0.5))
     elevation = np.degrees(grid.elevation_start + grid.elevation_step * (np.arange(grid.n_elevation + 1) - 0.5))
+    if grid.n_elevation == 1:
+        elevation = np.array([0.0, 30.0])  # a ring is wide enough to be seen
     zenith = (90 - elevation).clip(0, 90)
     low, high = limits
     mesh = ax.pcolormesh(

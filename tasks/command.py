@@ -11,8 +11,10 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from difflib import get_close_matches
 from functools import partial
 from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -55,7 +57,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0
     """
     name, *options = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
-    if name in ("-h", "--help"):
+    if name in ("-V", "--version"):
+        print(f"swiftwrf {version('swiftwrf-tasks')}")
+        return 0
+    if name == "help" and options:
+        name, options = options[0], ["--help"]
+    if name in ("-h", "--help", "help"):
         from tasks import configs
         from tasks.command_line import without_reader
         from tasks.options import General, meanings
@@ -73,9 +80,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return without_reader()
         return 0
     if name not in COMMANDS:
-        print(f"error: unknown command {name!a}; choose from {', '.join(COMMANDS)}", file=sys.stderr)
+        meant = [f"did you mean {close}?" for close in get_close_matches(name, COMMANDS, 1)]
+        remedy = meant[0] if meant else f"choose from {', '.join(COMMANDS)}"
+        print(f"error: unknown command {name!a}; {remedy}", file=sys.stderr)
         return 2
     return run_command(name, options, f"swiftwrf {name}")
+
+
+def run_module(module: str) -> int:
+    """Run the command of a module, `python -m tasks.inspect DIR`, and return its exit code."""
+    return run_command(module.removeprefix("tasks."), sys.argv[1:], f"python -m {module}")
 
 
 def run_command(name: str, options: Sequence[str], program: str) -> int:

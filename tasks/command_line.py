@@ -98,8 +98,10 @@ def execute(program: str, config_type: type[Config], task: Callable[[Config], No
         InputError: Wrong options, or the error of the task.
     """
     general, own, saved = split(arguments)
+    own = _with_data(config_type, own)
     finds = issubclass(config_type, FindingConfig) or not issubclass(config_type, ReadingConfig)
-    for name in [] if finds else _reading_options(own):
+    declared = {option.name for option in fields(config_type)}  # aoa has a --station of its own
+    for name in [] if finds else [name for name in _reading_options(own) if name not in declared]:
         raise InputError(f"--{name} is no option of this command; {HOW_TO_READ.format(name)}")
     config = parse(config_type, own, program, saved, general.config)
     config.check()
@@ -113,6 +115,13 @@ def execute(program: str, config_type: type[Config], task: Callable[[Config], No
         if not names or READING in str(error):
             raise
         raise InputError(f"{error}; {HOW_TO_READ.format(names[0])}") from error
+
+
+def _with_data(config_type: type[Options], words: list[str]) -> list[str]:
+    """Return the words of a command line with --data before a source that comes first, as in `swiftwrf rssi walk.csv`."""
+    names = {option.name for option in fields(config_type)}
+    takes_data = "data" in names and not names & {"source", "model"}  # which come first as they are
+    return ["--data", *words] if takes_data and words and not words[0].startswith("-") else words
 
 
 def _reading_options(words: Sequence[str]) -> list[str]:

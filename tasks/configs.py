@@ -39,6 +39,8 @@ class AoaConfig(ReadingConfig):
     --preset paper"""
     data: str | None = None
     """folder or file of spectra, ray paths or array snapshots, or name of a public data set, see docs/formats.md"""
+    station: str | None = None
+    """name of the array to take from data of several (default: each of them, one run after the other, and one report)"""
     split: str = "random"
     """a split that comes with the data, or a seeded one: random or block"""
     models: Annotated[
@@ -96,6 +98,8 @@ class AoaConfig(ReadingConfig):
             if RAYTRACE not in self.models:
                 raise InputError(f"--scene is for the model {RAYTRACE}; add it to --models, or leave --scene out")
             check_scene(self.scene, "--scene ")
+        if self.station is not None and self.data is None:
+            raise InputError("--station is for --data with several arrays; the built-in room has one")
         if self.moving is not None and self.data is not None:
             raise InputError("--moving is for the built-in room; with --data the data determine which end moves")
         given_mix = " ".join(map(fraction_key, self.measured))
@@ -119,7 +123,7 @@ class RssiTaskConfig(ReadingConfig):
     Example: swiftwrf rssi --rx 6 --data DIR
     """
 
-    receivers: tuple[str, ...]
+    receivers: tuple[str, ...] = ("all",)
     """receivers: names, numbers counted from 1, or all"""
     data: str | None = None
     """survey table (CSV, Parquet, JSON, GPX, KML), folder with tx_pos.csv, gateway_rssi.csv and gateway_position.yml (NeRF2
@@ -457,7 +461,8 @@ class ResumeConfig(Options):
 class ScenesConfig(Options):
     """Trace ray paths in a room or a scene file by Sionna RT (extra: raytrace).
 
-    The directory holds paths.npz, which --data of the tasks reads, and scene.svg, a plan of the room and the positions.
+    The directory holds paths.npz, which --data of the tasks reads, and scene.svg, a plan of the room and the positions. With
+    several fixed ends each has a folder of its own, which locate --data reads as the arrays.
 
     Example: swiftwrf scenes --room office --moving receiver --positions 1000 --out office
     """
@@ -483,8 +488,8 @@ class ScenesConfig(Options):
     """fraction of the reflected amplitude that surfaces scatter, 0 to 1"""
     diffraction: bool = False
     """whether to trace paths diffracted at one edge"""
-    fixed: tuple[float, float, float] | None = None
-    """position of the fixed end [m] (default: that of the room)"""
+    fixed: tuple[float, ...] = ()
+    """position of the fixed end, or of several, with a folder each: x y z x y z ... [m] (default: that of the room)"""
     region: tuple[float, float, float, float, float, float] | None = None
     """region of the moving end: opposite corners x y z x y z [m] (default: that of the room)"""
     seed: Seed = 0
@@ -497,9 +502,11 @@ class ScenesConfig(Options):
                 "--order 0 leaves the direct path alone; scattering and diffraction need at least --order 1"
             )
         check_scene(self.room)
+        if len(self.fixed) % 3:
+            raise InputError(f"--fixed takes x y z of each fixed end, got {len(self.fixed)} numbers")
         if not self.room.endswith(SCENE_FILE):
             return
-        if self.fixed is None or self.region is None:
+        if not self.fixed or self.region is None:
             raise InputError(
                 f"{self.room} does not contain the positions of the ends; give --fixed X Y Z and --region X Y Z X Y Z"
             )

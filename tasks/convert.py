@@ -25,6 +25,7 @@ from swiftwrf.rssi.base import RssiPredictor
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.durable import replacing, write_json
+from tasks.command import run_module
 from tasks.configs import FILES, MAP_FILES, ConvertConfig
 from tasks.directory import check_new_file, kept_model, new_directory
 from tasks.environment import command, invocation
@@ -194,3 +195,7 @@ def _write_map(data: RssiMap, file: Path) -> str:
         colour_image(strongest[::-1], "viridis", low, max(high, low + 1)).save(temporary, "PNG")
     write_world_file(file.with_suffix(WORLD_FILE), data)
     return f"{described}, strongest RSSI from {low:.0f} dBm (dark) to {high:.0f} dBm (bright)"
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_module("tasks.convert"))

@@ -22,6 +22,7 @@ from swiftwrf.errors import InputError
 from swiftwrf.positions import nearest
 from swiftwrf.rssi import fit_path_loss, log_distance
 from swiftwrf.runtime.durable import write_json, write_text
+from tasks.command import run_module
 from tasks.configs import InspectConfig
 from tasks.directory import new_directory
 from tasks.environment import command, stamp
@@ -217,3 +218,7 @@ def _against_distance(data: Rssi) -> Plot:
     )
     caption = "RSSI against the distance from the receiver. The line is a path-loss model of all receivers."
     return Plot("path-loss", [figure], caption, table)
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_module("tasks.inspect"))

@@ -168,7 +168,7 @@ class ReadingOptions(Options):
         None
     )
     grid: tuple[int, int] | None = None
-    """elevations and azimuths of computed spectra (default: 90 360)"""
+    """elevations and azimuths of computed spectra, 1 elevation for a ring in the plane of the array (default: 90 360)"""
     every: PositiveInt | None = None
     """reads one measurement of that many"""
     station: PositiveInt | None = None
@@ -183,6 +183,8 @@ class ReadingOptions(Options):
     """leave out these elements of the array, counted from 0"""
     round_trip: bool = False
     """phases of array snapshots are those of the way there and back, as of RFID and backscatter"""
+    sender: str | None = None
+    """hardware address of the sender whose packets are used, of captures with several (default: the most frequent one)"""
     columns: tuple[str, ...] = ()
     """names of columns of a survey table that are not recognised: x=NAME y=NAME receiver=NAME rssi=NAME
     floor=NAME ... (several with rssi='WAP*')"""
@@ -240,8 +242,10 @@ class ReadingOptions(Options):
                 raise InputError(
                     f"--array takes a spacing [m] and a carrier [Hz] above 0, got {spacing:g} and {frequency:g}"
                 )
-        if self.grid is not None and min(self.grid) < 2:
-            raise InputError(f"--grid takes numbers of elevations and azimuths, each at least 2, got {self.grid}")
+        if self.grid is not None and (self.grid[0] < 1 or self.grid[1] < 2):
+            raise InputError(
+                f"--grid takes numbers of elevations, 1 for a ring, and of azimuths, at least 2, got {self.grid}"
+            )
         pairs("columns", self.columns, "x")
         if len(self.transmitter) > 3:
             raise InputError(f"--transmitter takes 1 to 3 columns, got {' '.join(self.transmitter)}")

@@ -19,6 +19,7 @@ from swiftwrf.errors import with_article
 from swiftwrf.locate import MatchedField, RssiLocator
 from swiftwrf.rssi.base import RssiPredictor
 from tasks.aoa.records import FractionRecords
+from tasks.command import run_module
 from tasks.configs import PredictConfig
 from tasks.convert import write_file
 from tasks.directory import check_new_file, kept_model
@@ -122,3 +123,7 @@ def read_rssi(how: Reading) -> tuple[Rssi, bool]:
             data = Rssi.from_frame(somewhere, **{name: getattr(options, name) for name in names}, name=file.stem)
             return data, False
     return how.read(RSSI_FORMATS), True
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_module("tasks.predict"))

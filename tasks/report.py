@@ -11,6 +11,7 @@ from swiftwrf.contrib.comparison.base import Recorded
 from swiftwrf.runtime.checkpoint import refusing
 from swiftwrf.runtime.durable import write_text
 from tasks.aoa import page as aoa
+from tasks.command import run_module
 from tasks.configs import ReportConfig
 from tasks.directory import check_new_file, new_directory
 from tasks.environment import choose_device, environment, stamp
@@ -70,3 +71,7 @@ def merge(folders: list[Path], out: Path) -> None:
     names = ", ".join(os.fspath(run.folder) for run in runs)
     with new_directory(out, "a report") as unfinished, refusing(f"{names} does not hold what a report shows"):
         write_page(unfinished, PAGES[tasks[0]](runs))
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_module("tasks.report"))

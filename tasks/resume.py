@@ -7,7 +7,7 @@ from pathlib import Path
 from swiftwrf.errors import InputError
 from swiftwrf.runtime.digest import digest
 from tasks import configs
-from tasks.command import COMMANDS, run_task
+from tasks.command import COMMANDS, run_module, run_task
 from tasks.command_line import parse
 from tasks.configs import ResumeConfig
 from tasks.records import CONFIG, ENVIRONMENT, read_json
@@ -33,3 +33,7 @@ def run(config: ResumeConfig) -> None:
     resumed = parse(getattr(configs, COMMANDS[task].options), arguments, "swiftwrf resume", saved, folder)
     resumed.check()
     run_task(task, resumed, folder)
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_module("tasks.resume"))

@@ -12,8 +12,10 @@ from torch import Tensor
 from swiftwrf import InputError
 from swiftwrf.contrib.raytraced import ROOMS, FurnishedRoom, Tracing, open_scene, trace
 from swiftwrf.data.files import sha256
+from swiftwrf.data.paths import PropagationPaths
 from swiftwrf.data.writing import write_paths
 from swiftwrf.runtime.durable import write_json
+from tasks.command import run_module
 from tasks.configs import ScenesConfig
 from tasks.directory import new_directory
 from tasks.environment import invocation
@@ -38,18 +40,14 @@ def run(config: ScenesConfig) -> None:
         scene = open_scene(config.room, config.frequency, config.scattering)
         began = time.perf_counter()
         tracing = Tracing(config.order, config.scattering > 0, config.diffraction, config.seed)
-        paths = trace(scene, fixed, position, config.moving, tracing)
+        traced = {}
+        for number, at in enumerate(fixed, start=1):
+            name = f"array{number}" if len(fixed) > 1 else ""
+            traced[name] = traced_from(trace(scene, at, position, config.moving, tracing), name)
+            (folder / name).mkdir(exist_ok=True)
+            write_paths(traced[name], folder / name)
         seconds = time.perf_counter() - began
-        without = int((paths.count == 0).sum())
-        if without == len(position):
-            raise InputError(
-                f"no path reaches any of the {len(position)} positions; is the fixed end inside the scene?"
-            )
-        if without:
-            console.print(f"positions that no path reaches are left out: {without}")
-            paths = paths.reached
-        write_paths(paths, folder)
-        each = float(paths.count.double().mean())
+        count = torch.cat([paths.count for paths in traced.values()])
         record = {
             "command": invocation("scenes"),
             "options": by_name(config),
@@ -57,24 +55,39 @@ def run(config: ScenesConfig) -> None:
             "fixed": fixed.tolist(),
             "region": region.tolist(),
             "surfaces": {s.name: s.material.name for s in scene.surfaces},
-            "positions": len(paths.count),
-            "line_of_sight": int(paths.line_of_sight.sum()),
-            "paths_per_position": each,
+            "positions": len(count),
+            "line_of_sight": sum(int(paths.line_of_sight.sum()) for paths in traced.values()),
+            "paths_per_position": float(count.double().mean()),
             "seconds": seconds,
             "sionna_rt": version("sionna-rt"),
         }
         write_json(folder / "scene.json", record)
         figure, axes = figures.panel(8, 5)
-        ends = (paths.transmitter, paths.receiver)
-        moving, still = ends if config.moving == "transmitter" else ends[::-1]
-        scene.plot(still[0], moving, axes)
+        scene.plot(fixed, position, axes)
         (folder / PLAN).write_text(figures.as_svg(figure, f"Plan of {Path(config.room).stem}"), encoding="utf-8")
-    text = f"{len(paths.count)} positions with {each:.0f} paths each, traced in {seconds:.0f} s: {config.out}"
+    each = record["paths_per_position"]
+    ends = f" at {len(fixed)} arrays" if len(fixed) > 1 else ""
+    text = f"{len(count)} positions{ends} with {each:.0f} paths each, traced in {seconds:.0f} s: {config.out}"
     terminal.page(record, text, Path(config.out) / PLAN)
 
 
+def traced_from(paths: PropagationPaths, name: str) -> PropagationPaths:
+    """Return the paths of the positions that some path reaches, from the fixed end of a name.
+
+    Raises:
+        InputError: None is reached.
+    """
+    without, of = int((paths.count == 0).sum()), name and f" of {name}"
+    if without == len(paths.count):
+        raise InputError(f"no path{of} reaches any of the {without} positions; is the fixed end inside the scene?")
+    if not without:
+        return paths
+    console.print(f"positions that no path{of} reaches are left out: {without}")
+    return paths.reached
+
+
 def where(config: ScenesConfig) -> tuple[FurnishedRoom | None, Tensor, Tensor]:
-    """Return the room, the position of the fixed end (3,) and the region of the moving one (2, 3) [m].
+    """Return the room, the positions of the fixed ends (n, 3) and the region of the moving one (2, 3) [m].
 
     Raises:
         InputError: Either is outside the room, or the fixed end is in its furniture.
@@ -82,12 +95,12 @@ def where(config: ScenesConfig) -> tuple[FurnishedRoom | None, Tensor, Tensor]:
     room = ROOMS.get(config.room)
     corners = (config.region[:3], config.region[3:]) if config.region else room.region if room else ()
     region = torch.tensor(corners, dtype=torch.float64).sort(dim=0).values
-    fixed = torch.tensor(config.fixed or (room.fixed if room else ()), dtype=torch.float64)
+    fixed = torch.tensor(config.fixed or (room.fixed if room else ()), dtype=torch.float64).reshape(-1, 3)
     if room is None:
         return None, fixed, region
     size = " x ".join(f"{side:g}" for side in room.size)
-    if not bool(room.free(fixed[None])):
-        raise InputError(f"--fixed {_listed(fixed)} is outside the room of {size} m, at a wall, or in furniture")
+    for at in fixed[~room.free(fixed)]:
+        raise InputError(f"--fixed {_listed(at)} is outside the room of {size} m, at a wall, or in furniture")
     if not bool(((region >= 0) & (region <= torch.tensor(room.size))).all()):
         raise InputError(f"--region {_listed(region.flatten())} is not inside the room of {size} m")
     return room, fixed, region
@@ -111,3 +124,7 @@ def draw_positions(room: FurnishedRoom | None, region: Tensor, count: int, seed:
         if len(found) >= count:
             return found[:count]
     raise InputError(f"only {len(found)} of {count} positions are free of walls and furniture; choose another --region")
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_module("tasks.scenes"))

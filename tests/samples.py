@@ -282,7 +282,9 @@ def plane_waves(n: int, packets: int, subcarriers: int) -> tuple[np.ndarray, np.
 NEXMON_FLOATS = {3: (9, 5), 0xDEAD: (9, 5), 106: (12, 6)}
 
 
-def nexmon_payload(csi: np.ndarray, core: int, number: int = 1, chip: int = 106, stream: int = 0) -> bytes:
+def nexmon_payload(
+    csi: np.ndarray, core: int, number: int = 1, chip: int = 106, stream: int = 0, sender: bytes = b"\1\2\3\4\5\6"
+) -> bytes:
     """A packet of nexmon_csi: the channel (subcarriers,) of one core for one stream of a frame."""
     mantissa, exponent = NEXMON_FLOATS.get(chip, (12, 6))
     parts = (csi.real, csi.imag)
@@ -290,7 +292,7 @@ def nexmon_payload(csi: np.ndarray, core: int, number: int = 1, chip: int = 106,
     size = [np.minimum(np.round(np.abs(part) / 2.0**scale).astype(int), 2 ** (mantissa - 1) - 1) for part in parts]
     real, imag = (((part < 0) << (mantissa - 1)) | value for part, value in zip(parts, size, strict=True))
     words = real << (mantissa + exponent) | imag << exponent | (scale & (2**exponent - 1))
-    header = struct.pack("<HbB6sHHHH", 0x1111, -40, 8, b"\1\2\3\4\5\6", number, core | stream << 3, 0xE02A, chip)
+    header = struct.pack("<HbB6sHHHH", 0x1111, -40, 8, sender, number, core | stream << 3, 0xE02A, chip)
     return header + words.astype("<u4").tobytes()
 
 

@@ -1,5 +1,6 @@
 """README, docs and notebooks: their numbers are those of the committed results, they run, and print what they show."""
 
+import ast
 import json
 import re
 import shlex
@@ -182,3 +183,20 @@ def test_notebooks_run(file, tmp_path, monkeypatch):
             if cell["cell_type"] == "code":
                 exec("".join(cell["source"]), names)
     pyplot.close("all")
+
+
+def test_refusals_of_the_document_are_those_of_the_code():
+    """Each quoted sentence stands in a literal of the code, whose parts are joined as Python joins them."""
+    literals = []
+    for folder in ("swiftwrf", "tasks"):
+        for file in (ROOT / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(file.read_text())):
+                if isinstance(node, ast.JoinedStr):
+                    parts = (part.value if isinstance(part, ast.Constant) else "\0" for part in node.values)
+                    literals.append("".join(map(str, parts)))
+                elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                    literals.append(node.value)
+    table = (ROOT / "docs" / "troubleshooting.md").read_text().split("\n\n")[2]
+    sentences = re.findall(r"^\| `([^`]+)`", table, flags=re.MULTILINE)
+    assert len(sentences) == 10
+    assert [one for one in sentences if not any(one in literal for literal in literals)] == []

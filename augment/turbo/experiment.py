@@ -21,7 +21,7 @@ from augment.turbo.condition import NETWORKS, MeasuredSubset, Row, Training
 from swiftwrf.data import Spectra
 from swiftwrf.errors import InputError
 from swiftwrf.locate.matched_field import MIN_SPECTRA
-from swiftwrf.metrics import WINDOW
+from swiftwrf.metrics import WINDOW, too_small
 from swiftwrf.models import FIELD_MODELS, FieldModel
 from swiftwrf.models.base import model_type
 from swiftwrf.runtime.validation import Preset
@@ -56,10 +56,10 @@ class Experiment:
         data = self.test
         if len(data) == 0:
             raise InputError(f"this split of {data.name} has no test spectra")
-        if min(data.grid.shape) < WINDOW:
+        if too_small(data.grid.shape):
             raise InputError(
                 f"spectra of {data.name} have {data.grid.shape[0]} x {data.grid.shape[1]} pixels; SSIM, the measure "
-                f"of their quality, needs at least {WINDOW} x {WINDOW}"
+                f"of their quality, needs at least {WINDOW} x {WINDOW} or a row of {WINDOW}"
             )
         for part in (self.train, data):
             Mixed.measured(part)  # refuses spectra without directions

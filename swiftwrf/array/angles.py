@@ -67,9 +67,26 @@ class AngularGrid:
         return cls(step, step, n_elevation, 0.0, n_azimuth)
 
     @classmethod
+    @checked
+    def ring(cls, n_azimuth: Size) -> AngularGrid:
+        """Return one row of azimuths in the plane of the array, the grid of an array that does not resolve elevations.
+
+        Raises:
+            InputError: A size that is no whole number from 2 on, or too many pixels.
+
+        Example:
+            >>> AngularGrid.ring(72).direction[0, 18].round(decimals=3).tolist()
+            [0.0, 1.0, 0.0]
+        """
+        return cls(0.0, math.tau / n_azimuth, 1, 0.0, n_azimuth)
+
+    @classmethod
     def of(cls, grid: AngularGrid | tuple[int, int]) -> AngularGrid:
-        """Return a grid as it is, or `hemisphere` of a pair of rows and columns."""
-        return grid if isinstance(grid, AngularGrid) else cls.hemisphere(*grid)
+        """Return a grid as it is, or `hemisphere` of a pair of rows and columns, with one row `ring`."""
+        if isinstance(grid, AngularGrid):
+            return grid
+        n_elevation, n_azimuth = grid
+        return cls.ring(n_azimuth) if n_elevation == 1 else cls.hemisphere(n_elevation, n_azimuth)
 
     def coarsen(self, factor: int) -> AngularGrid:
         """Return the grid of the centres of factor x factor pixels. Both sizes must be multiples of the factor."""

@@ -34,6 +34,7 @@ def load_spectra(
     drop_null: bool = False,
     drop_elements: tuple[int, ...] = (),
     round_trip: bool = False,
+    sender: str | None = None,
 ) -> Spectra:
     """Read spectra in any format of docs/formats.md: images or arrays of spectra, ray paths, array snapshots.
 
@@ -51,6 +52,7 @@ def load_spectra(
         drop_null: Leaves out null subcarriers of array snapshots, which are the same at every position and element.
         drop_elements: Elements of array snapshots to leave out, counted from 0.
         round_trip: Phases of array snapshots are those of the way there and back, as of RFID and backscatter.
+        sender: Hardware address of the sender whose packets are used, of captures with several.
 
     Raises:
         InputError: A part that is missing or invalid, parts that do not match, or an argument that does not apply.

@@ -15,7 +15,7 @@ from numpy.lib.format import read_array_header_1_0, read_array_header_2_0, read_
 from numpy.typing import NDArray
 
 from swiftwrf.data.matlab import Stored, matlab_arrays
-from swiftwrf.errors import InputError, optional_module
+from swiftwrf.errors import InputError, listed, optional_module
 
 MAX_UNPACKED_BYTES, MAX_STORED_BYTES = 2**30, 2**33  # of arrays that are compressed, and not
 MAX_ROWS_BYTES = 2**36  # of an array that is read some rows at a time
@@ -142,7 +142,8 @@ def refusing_broken(file: object, kind: str) -> Iterator[None]:
 def _choose(file: Path, stored: set[str], needed: Sequence[str], optional: Sequence[str]) -> list[str]:
     missing = [name for name in needed if name not in stored]
     if missing:
-        raise InputError(f"{file} lacks {', '.join(missing)}; it must hold {', '.join(needed)}")
+        held = listed(sorted(stored)) or "nothing"
+        raise InputError(f"{file} lacks {', '.join(missing)}; it must hold {', '.join(needed)}, and holds {held}")
     return [*needed, *(name for name in optional if name in stored)]
 
 

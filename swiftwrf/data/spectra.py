@@ -103,7 +103,7 @@ class Spectra(PositionedData):
         position = to_positions("position", position)
         if store is None:
             store = Store(to_magnitudes("spectra", spectra, (None, None, None)))
-        grid = grid or AngularGrid.hemisphere(*store.shape[1:])
+        grid = grid or AngularGrid.of((store.shape[1], store.shape[2]))
         if grid.shape != store.shape[1:]:
             raise InputError(f"spectra of shape {store.shape} do not fit a grid of {grid.shape} directions")
         if pose is not None:

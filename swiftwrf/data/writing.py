@@ -35,7 +35,7 @@ def write_spectra(data: Spectra, folder: Path) -> None:
     """
     if data.fixed_position is None or data.rotation is None:
         raise InputError(f"{data.name} has no fixed end and orientation, which the layout needs; it cannot be written")
-    if data.grid != AngularGrid.hemisphere(*data.grid.shape):
+    if data.grid != AngularGrid.of(data.grid.shape):
         raise InputError(f"{data.name} has another grid than elevations up to 90 degrees and azimuths from 0 on")
     gateway: dict[str, Any] = {
         "position": data.fixed_position.tolist(),

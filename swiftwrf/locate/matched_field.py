@@ -27,6 +27,7 @@ from swiftwrf.locate.region import Cells, Region, best_cells, outside_mass, refi
 from swiftwrf.locate.spectrum_likelihood import Screen
 from swiftwrf.models.base import FieldModel
 from swiftwrf.models.geometry import GeometryModel
+from swiftwrf.models.geometry.agreement import agreed
 from swiftwrf.runtime.validation import NonNegativeInt, PositiveInt, all_or_nothing, checked, configuration
 
 MIN_SPECTRA = 15  # of a station: three in each of five folds
@@ -165,7 +166,7 @@ class MatchedField(Locator):
         Args:
             train: Measured spectra, at least 15 of each station, with array, rotation and fixed end.
             room: Fitted model of the scene with a room, of several stations by their names. Defaults to a search for the
-                room of each station.
+                room of each station, and rooms that agree about their planes.
             region: Prior over positions. Defaults to the neighbourhood of the training positions, with the mass outside from
                 held-out ones.
             progress: Show a progress bar on a terminal.
@@ -189,10 +190,16 @@ class MatchedField(Locator):
         for own in known.values():
             if own is not None and own.room is None:
                 raise InputError(f"{with_article(own.kind)} has no room to locate by; fit geometry or hybrid")
+        rooms = {
+            station: GeometryModel(seed=seed).fit(spectra, like=known[station], progress=progress)
+            for station, (_, spectra) in data.items()
+        }
+        if room is None and len(rooms) > 1:
+            rooms = agreed(rooms, {station: spectra for station, (_, spectra) in data.items()})
         fold = folds(position, "random", seed)
         fitted, features = list[dict[int, SpectrumLikelihoods | ChannelLikelihoods]](), list[SpectrumFeatures]()
         for station, (rows, spectra) in data.items():
-            own = GeometryModel(seed=seed).fit(spectra, like=known[station], progress=progress)
+            own = rooms[station]
             kind = SpectrumLikelihoods if spectra.channel is None else ChannelLikelihoods
             seen, parts = kind.fit(own.link.aligned(spectra), own, fold[rows], seed)
             features.append(seen)

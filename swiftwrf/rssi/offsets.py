@@ -56,13 +56,15 @@ class FloorAttenuation:
         return data.derived(rssi_dbm=data.rssi_dbm - self.of(data.transmitter_position))
 
 
-def estimate_floor_attenuation(data: Rssi) -> FloorAttenuation:
+def estimate_floor_attenuation(data: Rssi, max_rows: int = 3000) -> FloorAttenuation:
     """Estimate the attenuation of a floor jointly with the path-loss models of the receivers; see `fit_path_losses`.
 
     A receiver of unknown position counts as on the floor of its strongest mean RSSI, amid its three strongest rows.
 
     Args:
         data: Training rows with floors, at all receivers that determine the attenuation.
+        max_rows: Number of rows that determine it, drawn at random. In the building of ts-uji1, 1,500, 3,000 and 6,000 rows
+            give 4.4, 3.7 and 4.3 dB, and all 19,861 take 20 times as long as 1,500.
 
     Raises:
         InputError: Rows without floors.
@@ -86,7 +88,8 @@ def estimate_floor_attenuation(data: Rssi) -> FloorAttenuation:
     nearby = data.transmitter_position[rssi.nan_to_num(-torch.inf).topk(min(3, len(data)), dim=0).indices].mean(dim=0)
     receiver = data.receiver_position.where(data.receiver_located[:, None], nearby)
     crossed = (floor[:, None] - receiver_floor).abs().double()
-    losses = fit_path_losses(data.transmitter_position, receiver, rssi, crossed=crossed)
+    rows = torch.randperm(len(data), generator=torch.Generator().manual_seed(0))[:max_rows].sort().values
+    losses = fit_path_losses(data.transmitter_position[rows], receiver, rssi[rows], crossed=crossed[rows])
     measured = data.detected.sum(dim=0).double()
     db = float(losses.floor_db @ measured / measured.sum())
     return FloorAttenuation(data.floors, tuple(receiver_floor.tolist()), db)

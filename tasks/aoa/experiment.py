@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -14,17 +16,19 @@ from swiftwrf import InputError, Spectra, make_model, simulated_room
 from swiftwrf.contrib.raytraced import sionna
 from swiftwrf.contrib.raytraced.names import RAYTRACE
 from swiftwrf.data.files import sha256
-from swiftwrf.data.formats.stations import station_names
-from swiftwrf.errors import listed
+from swiftwrf.data.formats.stations import read_stations, station_names
 from swiftwrf.metrics import angle_errors
 from swiftwrf.models import FieldModel
+from swiftwrf.runtime.durable import strict
 from tasks.aoa.page import page
+from tasks.aoa.stations import sentence, triangulation
 from tasks.configs import AoaConfig
-from tasks.directory import Run
-from tasks.environment import choose_device
-from tasks.page.page import finish
+from tasks.directory import Run, new_directory
+from tasks.environment import choose_device, stamp
+from tasks.options import by_name
+from tasks.page.page import REPORT, finish, write_page
 from tasks.page.shared import write_suggestion
-from tasks.records import Row
+from tasks.records import CONFIG, Records, Row, read_json
 from tasks.source import reading
 from tasks.terminal import console, terminal
 from tasks.workers import connected, workers_of
@@ -37,6 +41,9 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
         InputError: Data or options that do not exist or do not fit together.
         FitError: A fit diverged, or the connection to the cluster was lost.
     """
+    if config.station is None and len(names := stations_of(config)) > 1:
+        run_each(config, names)
+        return
     device = choose_device(config.device)
     models, source = list[str | FieldModel](config.models), {}
     if RAYTRACE in models:
@@ -86,20 +93,54 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
         finish(run, results[0].recorded(*results[1:]), page)
 
 
-def measurements(config: AoaConfig) -> Spectra:
-    """Return the spectra of a run.
+def run_each(config: AoaConfig, names: Sequence[str]) -> None:
+    """Run the experiment at each station of the data, and write one report over all.
+
+    The runs are folders of `config.out` with the names of the stations. Those that are finished are kept.
 
     Raises:
-        InputError: The data cannot be read, or are those of several stations.
+        InputError: A run of other options, an interrupted run, or a report.
+    """
+    folder = Path(config.out) if config.out else Path("runs") / "aoa" / f"{stamp()}-stations"
+    runs = {name: replace(config, station=name, out=str(folder / name)) for name in names}
+    for name, one in runs.items():
+        if not (folder / name).exists():
+            console.print(f"station {name}")
+            run(one)
+        elif read_json(folder / name / CONFIG)["config"] != strict(by_name(one)):
+            raise InputError(f"{folder / name} is a run of other options; choose another --out")
+    of_stations = [Records(folder / name, number=number) for number, name in enumerate(names, start=1)]
+    with new_directory(folder / "report", "a report") as unfinished:
+        write_page(unfinished, page(of_stations))
+    how = reading(config, str(config.data))
+    train, test = read_stations(Path(how.source), how.options).split(config.split, config.seed)
+    found = triangulation(train, test, dict(zip(names, of_stations, strict=True)))
+    text = f"{sentence(found, len(names))} swiftwrf locate --data {config.data} locates by all spectra together."
+    terminal.page({"triangulation": found}, text, folder / "report" / REPORT)
+
+
+def stations_of(config: AoaConfig) -> list[str]:
+    """Return the names of the stations in the data, none in data of one."""
+    if config.data is None:
+        return []
+    how = reading(config, config.data)
+    return [] if how.options.station is not None else station_names(Path(how.source), how.options)
+
+
+def measurements(config: AoaConfig) -> Spectra:
+    """Return the spectra of a run; stations have the same split.
+
+    Raises:
+        InputError: The data cannot be read, or lack the station or the split.
     """
     if config.data is None:
         return simulated_room(seed=config.seed, moving=config.moving or "transmitter")
     how = reading(config, config.data)
-    folder = Path(how.source)
-    if how.options.station is None and len(names := station_names(folder, how.options)) > 1:
-        one = f"--data {folder / names[0]}" if (folder / names[0]).is_dir() else "station: 1 in a file for --read"
-        raise InputError(
-            f"{folder} has several stations ({listed(names)}); swiftwrf locate --data {folder} estimates positions, and "
-            f"directions at each, by all of them. For one station give {one}"
-        )
-    return how.spectra()
+    if config.station is None:
+        return how.spectra()
+    stations = read_stations(Path(how.source), how.options)
+    spectra = stations.of(config.station)[1]
+    train, test = (
+        torch.isin(spectra.index, part.index).nonzero()[:, 0] for part in stations.split(config.split, config.seed)
+    )
+    return spectra.derived(name=f"{config.station} of {stations.name}", named_splits={config.split: (train, test)})

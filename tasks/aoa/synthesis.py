@@ -113,7 +113,7 @@ def spectra(images: Images, title: str, truth: Direction | None = None, most: fl
         colours, low, high = SCALES[kind]
         if kind not in ("measured", "predicted"):
             low, high = most * low, most * high
-        grid, values = AngularGrid.hemisphere(*image.shape), torch.from_numpy(image)
+        grid, values = AngularGrid.of(image.shape), torch.from_numpy(image)
         polar_spectrum(values, grid, ax, colours, (low, high), label=None)
         ax.set(yticks=(), xticks=np.deg2rad((0, 90, 180, 270)))
         ax.tick_params(labelsize=LABEL, pad=-2)

@@ -1,7 +1,5 @@
 """Run `python -m tasks.rssi --rx 6`."""
 
-import sys
+from tasks.command import run_module
 
-from tasks.command import run_command
-
-sys.exit(run_command("rssi", sys.argv[1:], "python -m tasks.rssi"))
+raise SystemExit(run_module("tasks.rssi"))

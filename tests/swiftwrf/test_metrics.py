@@ -46,6 +46,23 @@ def test_summary_is_ordered(values):
     assert s["n"] == len(values)
 
 
+def test_ssim_of_a_single_row_by_windows_of_seven(generator):
+    a, b = torch.rand((2, 5, 1, 20), generator=generator, dtype=torch.float64)
+    expected = []
+    for one, other in zip(a[:, 0].numpy(), b[:, 0].numpy(), strict=True):
+        values = []
+        for start in range(14):
+            x, y = one[start : start + 7], other[start : start + 7]
+            covariance = np.cov(x, y)
+            values.append(
+                (2 * x.mean() * y.mean() + 1e-4)
+                * (2 * covariance[0, 1] + 9e-4)
+                / ((x.mean() ** 2 + y.mean() ** 2 + 1e-4) * (covariance[0, 0] + covariance[1, 1] + 9e-4))
+            )
+        expected.append(np.mean(values))
+    assert ssim(a, b).numpy() == pytest.approx(np.array(expected), abs=1e-12)
+
+
 def test_a_first_ssim_under_inference_mode_leaves_later_gradients_alone(generator):
     """Cached tensors must work in inference mode and outside."""
     a = torch.rand(23, 41, generator=generator, requires_grad=True)  # sizes that no other test asks for

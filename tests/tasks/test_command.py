@@ -8,6 +8,7 @@ import runpy
 import subprocess
 import sys
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -62,8 +63,10 @@ def test_a_closed_output_ends_a_command_without_a_message(arguments):
     assert (process.stderr.read(), process.wait()) == (b"", BROKEN_PIPE)
 
 
-@pytest.mark.parametrize("name", ["aoa", "rssi"])
-def test_the_two_tasks_of_the_paper_are_packages_that_python_runs(name, monkeypatch, capsys):
+@pytest.mark.parametrize("name", COMMANDS)
+def test_python_runs_the_module_of_each_command(name, monkeypatch, capsys):
+    if not (ROOT / "tasks" / name).is_dir():
+        monkeypatch.delitem(sys.modules, f"tasks.{name}", raising=False)  # which python -m has not imported either
     monkeypatch.setattr(sys, "argv", ["main", "--help"])
     with pytest.raises(SystemExit, match="0"):
         runpy.run_module(f"tasks.{name}", run_name="__main__")
@@ -102,7 +105,32 @@ def test_commands_shorten_the_wait_of_threads_and_libraries_do_not(given, spins)
 
 def test_an_unknown_command_is_refused_with_those_that_exist(capsys):
     assert main(["rsi"]) == 2
-    assert "unknown command 'rsi'; choose from aoa, rssi" in said(capsys)
+    assert "unknown command 'rsi'; did you mean rssi?" in said(capsys)
+    assert main(["x"]) == 2
+    assert "unknown command 'x'; choose from aoa, rssi" in said(capsys)
+
+
+def test_version_and_help_as_words(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"swiftwrf {version('swiftwrf-tasks')}\n"
+    assert main(["help"]) == 0
+    assert capsys.readouterr().out.startswith("usage: swiftwrf COMMAND")
+    with pytest.raises(SystemExit, match="0"):
+        main(["help", "rssi"])
+    assert capsys.readouterr().out.startswith("usage: swiftwrf rssi ")
+
+
+@pytest.mark.parametrize("task", ["aoa", "rssi", "locate"])
+def test_a_source_that_comes_first_is_the_data(monkeypatch, task):
+    seen = []
+    monkeypatch.setattr(f"tasks.{task}.experiment.run", seen.append)
+    mix = ("--mix", "0.3") if task == "aoa" else ()
+    assert main([task, "walk.csv", *mix]) == 0
+    assert main([task, *mix, "--data", "walk.csv"]) == 0
+    assert seen[0] == seen[1]
+    assert seen[0].data == "walk.csv"
+    if task == "rssi":
+        assert seen[0].receivers == ("all",)
 
 
 # command lines that cannot be: each ends in one sentence and exit code 2, and leaves nothing

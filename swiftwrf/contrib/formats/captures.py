@@ -16,7 +16,8 @@ Raspberry Pi) are refused. PicoScenes is not read: write its channels as array s
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -65,6 +66,8 @@ class Tool(NamedTuple):
     """packets of that many antennas in a capture, and the number of others; refuses damaged captures by ValueError"""
     decode: Callable[[bytes, int], Channel]
     """channel (subcarriers, K) of a packet"""
+    sender: Callable[[bytes], str] = lambda packet: ""
+    """hardware address of the sender of a packet, empty where captures have none"""
 
 
 def _split_csitool(content: bytes, elements: int) -> tuple[list[bytes], int]:
@@ -159,14 +162,20 @@ TOOLS = {
     ".dat": Tool(
         "the Linux 802.11n CSI Tool", lambda start: start[2:3] in (b"\xbb", b"\xc1"), _split_csitool, _decode_csitool
     ),
-    ".pcap": Tool("nexmon_csi", lambda start: start[:4] in PCAP_ORDERS, _split_nexmon, _decode_nexmon),
+    ".pcap": Tool(
+        "nexmon_csi",
+        lambda start: start[:4] in PCAP_ORDERS,
+        _split_nexmon,
+        _decode_nexmon,
+        lambda packet: packet[4:10].hex(":"),
+    ),
 }
 
 
 class Captures(Format[Snapshots]):
     """Packets of a capture and their subcarriers are the snapshots of its position."""
 
-    takes = frozenset({"beamformer", "grid", "every", "drop_elements", "round_trip"})
+    takes = frozenset({"beamformer", "grid", "every", "drop_elements", "round_trip", "sender"})
 
     def recognises(self, path: Path) -> bool:
         return holds_captures(path)
@@ -187,7 +196,10 @@ class Captures(Format[Snapshots]):
         description = described_arrays(described, content)
         elements = len(array_of(described, description).element)
         files = _files(table, frame)
-        channels, left_out = zip(*(_read_capture(file, elements) for file in files), strict=True)
+        packets = {file: _packets(file, elements) for file in files}
+        sender, others = _sender(path, packets, options.sender)
+        channels = [_channels(file, own, sender, elements) for file, (own, _) in packets.items()]
+        left_out = sum(count for _, count in packets.values())
         counts = list(map(len, channels))
         subcarriers = {channel.shape[1] for channel in channels}
         if len(subcarriers) > 1:
@@ -197,9 +209,9 @@ class Captures(Format[Snapshots]):
         position = np.stack([_column(table, frame, axis) for axis in "xyz"], axis=1)
         time = {"time": _column(table, frame, "time")} if column_of(frame, "time", {}) else {}
         arrays = description | time | {"csi": csi.reshape(len(files), -1, elements), "position": position}
-        notes = [f"packets used of each capture: {ranges(sorted(set(counts)))}", OFFSETS]
-        if any(left_out):
-            notes.append(f"packets without a channel of all {elements} elements are left out: {sum(left_out)}")
+        notes = [f"packets used of each capture: {ranges(sorted(set(counts)))}", OFFSETS, *others]
+        if left_out:
+            notes.append(f"packets without a channel of all {elements} elements are left out: {left_out}")
         if unlisted := [file.name for file in _captures(path) if file not in files]:
             notes.append(f"captures without a row in {POSITIONS} are left out: {listed(unlisted)}")
         return snapshots_of(path, arrays, options, [table, described, *files], None, tuple(notes))
@@ -244,8 +256,8 @@ def _column(table: Path, frame: pd.DataFrame, role: str) -> NDArray[np.float64]:
     return column_of_numbers(table, frame, name)
 
 
-def _read_capture(file: Path, elements: int) -> tuple[Channel, int]:
-    """Return channels (packets, subcarriers, K) of evenly spaced packets, and the number of packets without K elements."""
+def _packets(file: Path, elements: int) -> tuple[list[bytes], int]:
+    """Return the packets of a capture, and the number of those without K elements."""
     tool = TOOLS[file.suffix]
     if file.stat().st_size > MAX_UNPACKED_BYTES:
         raise InputError(f"{file} has more than {MAX_UNPACKED_BYTES} bytes; split it")
@@ -255,5 +267,30 @@ def _read_capture(file: Path, elements: int) -> tuple[Channel, int]:
             raise InputError(
                 f"no packet has a channel of the {elements} elements in {DESCRIPTION}; {left_out} have others"
             )
-        size = min(len(packets), MAX_PACKETS)
-        return np.stack([tool.decode(packets[i * len(packets) // size], elements) for i in range(size)]), left_out
+        return packets, left_out
+
+
+def _sender(path: Path, packets: Mapping[Path, tuple[list[bytes], int]], wanted: str | None) -> tuple[str, list[str]]:
+    """Return the sender that is wanted, or that of most packets, and a note on others.
+
+    Raises:
+        InputError: No packet of it in some capture, or another sender has half as many packets, and none is wanted.
+    """
+    of_file = {file: Counter(map(TOOLS[file.suffix].sender, own)) for file, (own, _) in packets.items()}
+    counts = sum(of_file.values(), Counter[str]()).most_common()
+    named = ", ".join(f"{sender} {count}" for sender, count in counts[:5])
+    if wanted is None and len(counts) > 1 and counts[1][1] > counts[0][1] / 2:
+        raise InputError(f"captures of {path} are of several senders, with these packets: {named}; choose one: sender")
+    sender = counts[0][0] if wanted is None else wanted.lower()
+    if absent := [file.name for file, own in of_file.items() if sender not in own]:
+        raise InputError(f"{absent[0]} of {path} has no packet of sender {sender}; there are {named}")
+    return sender, [f"packets of sender {sender} are used; packets by sender: {named}"] if len(counts) > 1 else []
+
+
+def _channels(file: Path, packets: list[bytes], sender: str, elements: int) -> Channel:
+    """Return channels (packets, subcarriers, K) of evenly spaced packets of a sender."""
+    tool = TOOLS[file.suffix]
+    own = [packet for packet in packets if tool.sender(packet) == sender]
+    size = min(len(own), MAX_PACKETS)
+    with refusing_broken(file, f"a complete capture of {tool.name}"):
+        return np.stack([tool.decode(own[i * len(own) // size], elements) for i in range(size)])

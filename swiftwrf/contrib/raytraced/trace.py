@@ -101,7 +101,7 @@ class Scene:
         self.surfaces = surfaces or held
 
     def plot(self, fixed: Tensor | None = None, position: Tensor | None = None, ax: Axes | None = None) -> Axes:
-        """Draw the surfaces seen from above by material, the fixed end (3,) and positions (n, 3) of the moving one."""
+        """Draw the surfaces seen from above by material, fixed ends (..., 3) and positions (n, 3) of the moving one."""
         ax = plan_axes(ax)
         every = np.concatenate([surface.vertex[:, :2] for surface in self.surfaces])
         materials = list(dict.fromkeys(surface.material.name for surface in self.surfaces))
@@ -122,7 +122,14 @@ class Scene:
         if position is not None:
             ax.plot(*position[:, :2].T.numpy(), ".", color=MOVING, markersize=2.5, label="moving end")
         if fixed is not None:
-            ax.plot(*fixed[:2].numpy(), "*", color=MARK, markersize=12, label="fixed end", linestyle="")
+            ax.plot(
+                *fixed[..., :2].reshape(-1, 2).T.numpy(),
+                "*",
+                color=MARK,
+                markersize=12,
+                label="fixed end",
+                linestyle="",
+            )
         ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1))
         return ax
 

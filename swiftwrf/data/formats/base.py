@@ -51,6 +51,7 @@ class ReadOptions(TableOptions):
     drop_null: bool = False
     drop_elements: tuple[int, ...] = ()
     round_trip: bool = False
+    sender: str | None = None
 
     @property
     def given(self) -> dict[str, Any]:

@@ -124,7 +124,7 @@ def _read_spectra(folder: Path, n: int) -> tuple[Store, dict[str, Any], dict[str
 def _read_values(file: Path, n: int, digest: str) -> Store:
     """Return the spectra of an array: magnitudes in [0, 1], or bytes as in images."""
     shape, kind = array_header(file, "spectrum")
-    if len(shape) != 3 or shape[0] != n or min(shape) < 2 or kind.kind not in "fu":
+    if len(shape) != 3 or shape[0] != n or min(n, shape[2]) < 2 or kind.kind not in "fu":
         raise InputError(
             f"{file}: expected spectra of shape ({n}, elevations, azimuths) for {n} positions, got {kind} of shape {shape}"
         )

@@ -16,6 +16,7 @@ from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.data.archives import ARCHIVES, Arrays, array_names, read_arrays, refusing_broken
 from swiftwrf.data.files import check_carrier, digests, read_yaml
 from swiftwrf.data.formats.base import Format, ReadOptions, station
+from swiftwrf.data.formats.channel_parts import PAIRS, channel_parts, joined, paired
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.data.splits import read_splits
 from swiftwrf.errors import InputError, listed, ranges
@@ -39,7 +40,8 @@ class SnapshotArrays(Format[Snapshots]):
         return _file(path) is not None
 
     def stations(self, path: Path) -> list[str]:
-        described = _described_stations(_file(path) or path)
+        file = _file(path) or path
+        described = _described_stations(file) or _stations_of_arrays(file, {})
         return [] if described is None else [name for name, _ in described[1]]
 
     def read(self, path: Path, options: ReadOptions) -> Snapshots:
@@ -47,12 +49,19 @@ class SnapshotArrays(Format[Snapshots]):
         name = {array: stated.get(array, array) for array in (*REQUIRED_ARRAYS, *OPTIONAL)}
         if file.is_dir() or stated.keys() - name.keys():
             raise InputError(f"arrays takes {', '.join(name)} of a file that is named, got {listed(stated)} of {file}")
-        described = _described_stations(file)
+        described = _described_stations(file) or _stations_of_arrays(file, stated)
         if described is None and options.station is not None:
             raise InputError(f"{file} holds one array; leave station out")
-        required = REQUIRED_ARRAYS if described is None else ("csi", "position")
-        needed = [name[array] for array in dict.fromkeys((*required, *stated))]
-        stored = read_arrays(file, needed, [name[array] for array in OPTIONAL if array not in stated])
+        required = ("csi", "position") if described is not None and described[0] != file else REQUIRED_ARRAYS
+        names = array_names(file)
+        halves = None if name["csi"] in names else channel_parts(names)
+        needed = [name[array] for array in dict.fromkeys((*required, *stated)) if array != "csi" or halves is None]
+        stored = read_arrays(
+            file, [*needed, *(halves or ())], [name[array] for array in OPTIONAL if array not in stated]
+        )
+        if halves is not None:
+            first, second = ((half, stored[half]) for half in halves)
+            stored[name["csi"]] = joined(file, first, second)
         arrays = {array: stored[name_in_file] for array, name_in_file in name.items() if name_in_file in stored}
         label = file.stem if file.stem != "snapshots" else None
         if described is None:
@@ -62,7 +71,7 @@ class SnapshotArrays(Format[Snapshots]):
         own, received = _of_station(file, arrays | parts[number][1], number, len(parts))
         rows = received[:: options.every or 1]
         own = {array: values[rows] if array in PER_ROW else values for array, values in own.items()}
-        return snapshots_of(file, own, options, [file, beside], label, index=rows.tolist())
+        return snapshots_of(file, own, options, [*dict.fromkeys((file, beside))], label, index=rows.tolist())
 
 
 def snapshots_of(
@@ -91,11 +100,24 @@ def snapshots_of(
     arrays |= {name: arrays[name].reshape(()) for name in SCALARS if name in arrays and arrays[name].size == 1}
     arrays, reversed_axes = _turned_round(arrays)
     arrays, polarisations = _polarisations(source, arrays)
-    given, frequency = arrays["frequency_hz"], None
+    given, frequency, doubts = arrays["frequency_hz"], None, tuple[str, ...]()
+    if given.ndim == 1 and len(given) == len(arrays["position"]) and arrays["csi"].shape[1:2] != given.shape:
+        doubts, given = _carrier_notes(given), np.asarray(given.mean())  # each row has its carrier
+        arrays |= {"frequency_hz": given}
     if given.ndim == 1 and arrays["csi"].ndim == 3:
         arrays |= {"frequency_hz": given.mean()}
     position, array = check_positions(arrays["position"], f"{source}: position"), array_of(source, arrays)
     n, folder, pose = len(position), files[0].parent, pose_of(source, arrays)
+    apart = array.spacing_wavelengths
+    if apart > 2 and "element_position" in arrays and 0.2 <= apart * array.wavelength <= 1.0:
+        doubts = (
+            *doubts,
+            f"elements are {apart * array.wavelength:.3g} m, {apart:.3g} wavelengths apart; if element_position is in "
+            f"wavelengths, multiply it by {array.wavelength:.4g} m",
+        )
+    pairs = paired(arrays["csi"], len(array.element))
+    if pairs is not None:
+        arrays |= {"csi": pairs}
     step = 1 if index is not None or options.every is None else options.every
     raw = _channel(source, arrays["csi"], n, len(array.element))
     channel, kept, elements, missing = measured(source, raw, options.drop_null, options.drop_elements)
@@ -120,7 +142,7 @@ def snapshots_of(
         line_of_sight=arrays.get("line_of_sight"),
         time=arrays.get("time"),
         frequency_hz=frequency,
-        notes=(*notes, *reversed_axes, *polarisations, *missing),
+        notes=(*notes, *reversed_axes, *polarisations, *[PAIRS] * (pairs is not None), *doubts, *missing),
     )
     return data if step == 1 else data.subset(torch.arange(0, n, step))
 
@@ -142,6 +164,20 @@ def _described_stations(file: Path) -> tuple[Path, list[tuple[str, Arrays]]] | N
     return beside, [(str(each["name"]), described_arrays(beside, common | each)) for each in each_station]
 
 
+def _stations_of_arrays(file: Path, stated: Mapping[str, str]) -> tuple[Path, list[tuple[str, Arrays]]] | None:
+    """Return the file itself, and name and description of each of several arrays whose poses are rows of arrays in it."""
+    position, at, *turned = (stated.get(array, array) for array in ("position", "array_position", *POSE))
+    if not {position, at} <= array_names(file):
+        return None
+    stored = read_arrays(file, [position, at], turned)
+    count = len(stored[at])
+    if stored[at].ndim != 2 or stored[at].shape[1] != 3 or count in (1, len(stored[position])):
+        return None  # one array, or one that moves
+    poses = {array: stored[name] for array in ("array_position", *POSE) if (name := stated.get(array, array)) in stored}
+    several = {array: values for array, values in poses.items() if values.ndim == 2 and len(values) == count}
+    return file, [(f"array{n + 1}", {array: values[n] for array, values in several.items()}) for n in range(count)]
+
+
 def _of_station(file: Path, arrays: Arrays, number: int, count: int) -> tuple[Arrays, NDArray[np.int64]]:
     """Return the arrays of one station, and the numbers of the rows that it received.
 
@@ -151,13 +187,13 @@ def _of_station(file: Path, arrays: Arrays, number: int, count: int) -> tuple[Ar
     csi = arrays["csi"]
     if csi.ndim not in (3, 4) or csi.shape[1] != count:
         raise InputError(
-            f"{file}: csi must have shape (n, {count}, [subcarriers or packets,] elements) for the {count} arrays of "
-            f"stations.yml, got {csi.shape}"
+            f"{file}: csi must have shape (n, {count}, [subcarriers or packets,] elements) for its {count} arrays, got "
+            f"{csi.shape}"
         )
     own = csi[:, number]
     received = (np.nan_to_num(own) != 0).reshape(len(own), -1).any(axis=1)
     if not received.any():
-        raise InputError(f"{file}: array {number + 1} of stations.yml received nothing; leave it out")
+        raise InputError(f"{file}: array {number + 1} received nothing; leave it out")
     return arrays | {"csi": own}, received.nonzero()[0]
 
 
@@ -166,7 +202,20 @@ def _file(path: Path) -> Path | None:
         return next(
             (path / f"snapshots{suffix}" for suffix in ARCHIVES if (path / f"snapshots{suffix}").is_file()), None
         )
-    return path if path.suffix in ARCHIVES and "csi" in array_names(path) else None
+    names = array_names(path) if path.suffix in ARCHIVES else set()
+    return path if "csi" in names or channel_parts(names) else None
+
+
+def _carrier_notes(carrier: NDArray[Any]) -> tuple[str, ...]:
+    """Return a note on rows with different carriers [Hz], none if they have one."""
+    low, high, mean = carrier.min() / 1e9, carrier.max() / 1e9, carrier.mean() / 1e9
+    if low == high:
+        return ()
+    off = max(high - mean, mean - low) / mean
+    return (
+        f"each row has its carrier, {low:.4g} to {high:.4g} GHz; the array counts at their mean, {mean:.4g} GHz, by which "
+        f"phases are up to {off:.1%} off",
+    )
 
 
 def _turned_round(arrays: Arrays) -> tuple[Arrays, tuple[str, ...]]:
@@ -213,8 +262,10 @@ def _polarisations(source: Path, arrays: Arrays) -> tuple[Arrays, tuple[str, ...
 def _channel(file: Path, csi: NDArray[np.generic], n: int, elements: int) -> Tensor:
     """Return channels, complex128 (n, S, K)."""
     if csi.dtype.kind != "c":
-        hint = "; join real and imaginary parts as csi[..., 0] + 1j * csi[..., 1]" if csi.shape[-1:] == (2,) else ""
-        raise InputError(f"{file}: csi must hold complex numbers, got {csi.dtype}{hint}")
+        raise InputError(
+            f"{file}: csi must hold complex numbers, or pairs of real ones on a last axis of {2 * elements}, got "
+            f"{csi.dtype} of shape {csi.shape}"
+        )
     if csi.ndim == 3 and csi.shape[0] == n and csi.shape[2] != elements and csi.shape[1] == elements:
         raise InputError(
             f"{file}: csi has shape {csi.shape} with its {elements} elements in the middle; they must be the last axis, so "

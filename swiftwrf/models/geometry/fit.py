@@ -229,6 +229,8 @@ def observe(train: Spectra, config: GeometryConfig | None = None) -> tuple[Phase
             frequency = train.frequency_hz[_nearest(train.frequency_hz, train.array)]
             link = replace(link, array=PlanarArray(train.array.element, LIGHT_SPEED / float(frequency)))
         return PhaseObservations.of_phases(train.position, link, phases, retrieved=False), rows
+    if train.grid.n_elevation == 1:
+        raise InputError(f"phases of the elements do not follow from a single row of azimuths, as in {train.name}")
     channel, error = retrieve_phases(correlations(train), train.array, config.seed)
     solved = (error < 0.1).nonzero()[:, 0]  # relative error of the autocorrelation
     if len(solved) < max(MIN_TRAINING, len(train) / 2):

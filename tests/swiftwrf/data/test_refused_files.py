@@ -182,7 +182,6 @@ def elements(change):
 
 SNAPSHOT_ARRAYS = [
     ("must hold complex numbers", csi(np.abs)),
-    ("join real and imaginary parts", csi(lambda c: np.stack([c.real, c.imag], -1))),
     (r"give csi.transpose\(0, 2, 1\)", csi(lambda c: c.transpose(0, 2, 1))),
     ("4 elements", csi(lambda c: c[..., :3])),
     ("for 12 positions", csi(lambda c: c[:5])),

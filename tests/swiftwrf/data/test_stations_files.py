@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import quick
 import torch
 import yaml
 
@@ -129,11 +128,3 @@ def _csi(folder: Path, shape: tuple[int, ...], factor: float = 1.0) -> None:
 def test_stations_need_measurements_of_each():
     with pytest.raises(InputError, match="one station or more"):
         Stations({})
-
-
-def test_aoa_names_the_stations_of_a_folder_of_several(csi, tmp_path, capsys):
-    folder, _, _ = csi
-    assert quick.run("aoa", "--mix", 0.5, "--data", folder, "--out", tmp_path / "run") == 2
-    said = quick.said(capsys)
-    assert "several stations (west, east)" in said
-    assert "swiftwrf locate" in said

@@ -229,6 +229,23 @@ class TestAgreement:
         assert [room for room, _ in furnished] == [found["west"]]
         assert furnished[0][1].equal(spectra["west"].fixed_position)
 
+    def test_rooms_that_a_locator_searches_agree(self, office, rooms, monkeypatch):
+        train, _ = office
+        off = [OFFICE_WALLS[0], Plane((1.0, 0.0, 0.0), 8.062, -0.6, probability=0.6), *OFFICE_WALLS[2:]]
+        searched = {
+            "west": GeometryModel.of_planes(train.of("west")[1], off),
+            "east": rooms["east"],
+        }
+
+        def fit(_: GeometryModel, spectra, like=None, **__) -> GeometryModel:
+            return like or next(
+                room for room in searched.values() if room.fixed_position.equal(spectra.fixed_position.double())
+            )
+
+        monkeypatch.setattr(GeometryModel, "fit", fit)
+        assert small().fit(train).rooms["west"].planes[1].offset_m == pytest.approx(8.0, abs=0.02)
+        assert small().fit(train, room=searched).rooms["west"].planes[1].offset_m == pytest.approx(8.062, abs=0.01)
+
     def test_a_station_keeps_a_plane_that_its_spectra_determine(self, office):
         train, _ = office
         spectra = {name: train.of(name)[1] for name in train.names}

@@ -126,3 +126,10 @@ def test_the_attenuation_is_a_part_of_the_model_and_of_its_file(kind):
     check_predictor(model, data)
     assert model.attenuation.db == pytest.approx(FLOOR_DB, abs=1.5)
     assert kind().fit(replace(data, floors=None)).attenuation is None
+
+
+def test_some_rows_determine_the_attenuation():
+    data = rssi(building(floor_db=15.0))
+    some, every = (estimate_floor_attenuation(data, max_rows=most) for most in (len(data) // 2, len(data)))
+    assert some.db != every.db
+    assert some.db == pytest.approx(every.db, abs=1.0)

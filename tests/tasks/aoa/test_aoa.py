@@ -25,7 +25,7 @@ from augment.estimators.kernel_regression import KernelRegression
 from augment.turbo import experiment as context
 from augment.turbo.condition import Condition, conditions_of, headline
 from augment.turbo.experiment import Experiment
-from swiftwrf import AngularGrid, FitError, MatchedField, load, make_model, simulated_room
+from swiftwrf import AngularGrid, FitError, InputError, MatchedField, load, load_spectra, make_model, simulated_room
 from swiftwrf.contrib.comparison.steps import Memo
 from swiftwrf.data.store import Store
 from swiftwrf.data.writing import write_spectra
@@ -528,3 +528,15 @@ def test_whole_run_on_a_gpu(small, small_published, tmp_path):
     assert {f"network, measured + synthetic + extra ({name})" for name in trained} <= set(metrics["methods"])
     assert set(trained) <= set(metrics["synthesis"])
     assert load(tmp_path / "run" / "swiftwrf-mix0.5.safetensors").device.type == "cpu"
+
+
+def test_a_ring_of_azimuths_is_a_grid(tmp_path):
+    data = simulated_room(n=40, grid=AngularGrid.ring(48))
+    assert data.grid.direction[0, :, 2].abs().max() == 0.0
+    folder = tmp_path / "ring"
+    folder.mkdir()
+    write_spectra(data, folder)
+    assert load_spectra(folder).spectrum.equal(data.spectrum)
+    assert quick.run("aoa", "--mix", 0.5, "--data", folder, "--models", "gp", "--out", tmp_path / "run") == 0
+    with pytest.raises(InputError, match="phases of the elements do not follow from a single row of azimuths"):
+        make_model("geometry").fit(data)

@@ -126,6 +126,38 @@ def test_nexmon_directions_in_all_kinds_of_pcap(tmp_path, form):
     assert (turn / (2 * torch.pi * spacing)).tolist() == pytest.approx(cosine.tolist(), abs=0.01)
 
 
+def test_packets_of_one_sender_are_used(tmp_path):
+    written = write_captures(tmp_path, n=2, packets=3, suffix=".pcap", tones=64)
+    usual, neighbour = load_snapshots(tmp_path), bytes(range(10, 16))
+
+    def capture(row: int, foreign: int) -> bytes:
+        packets = [
+            nexmon_payload(csi, core, number)
+            for number, cores in enumerate(written[row])
+            for core, csi in enumerate(cores.T)
+        ]
+        others = [
+            nexmon_payload(1j * csi, core, 9 + number, sender=neighbour)
+            for number in range(foreign)
+            for core, csi in enumerate(written[row, 0].T)
+        ]
+        return pcap(others + packets)
+
+    for foreign in (1, 3):
+        for row in range(2):
+            (tmp_path / f"walk{row}.pcap").write_bytes(capture(row, foreign))
+        if foreign == 1:
+            found = load_snapshots(tmp_path)
+            assert found.channel.equal(usual.channel)
+            assert "packets by sender: 01:02:03:04:05:06 6, 0a:0b:0c:0d:0e:0f 2" in " ".join(found.notes)
+    with pytest.raises(InputError, match=r"several senders, with these packets: 0.* 6, 0.* 6; choose one: sender"):
+        load_snapshots(tmp_path)
+    assert load_snapshots(tmp_path, sender="01:02:03:04:05:06").channel.equal(usual.channel)
+    assert not load_snapshots(tmp_path, sender="0A:0B:0C:0D:0E:0F").channel.equal(usual.channel)
+    with pytest.raises(InputError, match=r"walk0\.pcap of .* has no packet of sender ff"):
+        load_snapshots(tmp_path, sender="ff")
+
+
 def test_nexmon_packets_of_one_frame_make_a_channel(tmp_path):
     written = write_captures(tmp_path, n=2, packets=2, suffix=".pcap", tones=64)
     usual = load_snapshots(tmp_path)

@@ -17,7 +17,7 @@ import pytest
 import torch
 from quick import run, said
 
-from swiftwrf import AngularGrid, GeometryModel, InputError, load_spectra, simulated_room
+from swiftwrf import AngularGrid, GeometryModel, InputError, load_spectra, load_stations, simulated_room
 from swiftwrf.array.planar import LIGHT_SPEED
 from swiftwrf.contrib.raytraced import ROOMS, FurnishedRoom, Material, Scene, Surface, Tracing, sionna, trace
 from swiftwrf.contrib.raytraced.model import RaytraceModel, surfaces
@@ -216,6 +216,17 @@ def test_a_scene_is_read_back_as_spectra(ray_tracer, tmp_path, moving):
     assert "<svg" in (tmp_path / "scene" / "scene.svg").read_text()
 
 
+def test_several_fixed_ends_are_stations(ray_tracer, tmp_path):
+    ends = ((0.3, 0.3, 2.2), (3.9, 0.3, 2.2))
+    options = ("--room", "bedroom", "--moving", "transmitter", "--positions", 5, "--fixed", *ends[0], *ends[1])
+    assert run("scenes", *options, "--out", tmp_path / "scene") == 0
+    found = load_stations(tmp_path / "scene", grid=AngularGrid.hemisphere(15, 60))
+    assert found.names == ["array1", "array2"]
+    assert len(found) == 5
+    for name, end in zip(found.names, ends, strict=True):
+        assert found.of(name)[1].fixed_position.tolist() == list(end)
+
+
 def test_a_scene_file_is_traced_as_the_room_that_it_describes(ray_tracer, tmp_path):
     file = write_scene(tmp_path, "concrete")
     read = trace(Scene(file, FREQUENCY), FIXED, places(4), "receiver", Tracing())
@@ -298,6 +309,7 @@ def test_a_plan_of_a_room_has_its_walls_furniture_and_ends():
         ((*OPTIONS, "--order", 9), "--order must be a whole number at least 0 and at most 8"),
         ((*OPTIONS, "--order", 0, "--diffraction"), "need at least --order 1"),
         ((*OPTIONS, "--scattering", 1.1), "--scattering must be a number at least 0 and at most 1"),
+        ((*OPTIONS, "--fixed", 5, 1), "--fixed takes x y z of each fixed end, got 2 numbers"),
         ((*OPTIONS, "--fixed", 5, 1, 1), "--fixed 5 1 1 is outside the room of 4.2 x 3.6 x 2.5 m"),
         ((*OPTIONS, "--fixed", 2, 1, 0.4), "in furniture"),
         ((*OPTIONS, "--region", 1, 1, 1, 2, 2, 9), "is not inside the room"),
