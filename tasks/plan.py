@@ -19,6 +19,7 @@ from swiftwrf.data.coordinates import PlanFrame
 from swiftwrf.data.receivers import read_places
 from swiftwrf.metrics import LEVEL
 from swiftwrf.runtime.durable import write_json
+from tasks.command import run_module
 from tasks.configs import PlanConfig
 from tasks.directory import new_directory
 from tasks.environment import command, stamp
@@ -245,3 +246,7 @@ def _panel(
     plan.set_title(title, fontsize=9)
     figures.colour_bar(plan, drawn, "probability")
     return figure
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_module("tasks.plan"))

@@ -29,7 +29,7 @@ from swiftwrf.gp import Kernel
 from swiftwrf.locate.posterior import Posterior, normalised, pooled_weights
 from swiftwrf.locate.region import Cells, refined
 from swiftwrf.metrics import LEVEL
-from swiftwrf.plotting import MARK, Axes, Displayed, plan
+from swiftwrf.plotting import Displayed
 from swiftwrf.positions import inside
 from swiftwrf.rssi.base import RssiConfig
 from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation
@@ -64,7 +64,7 @@ class ReceiverPositions(Displayed):
         outside: Probability that the receiver is outside of what was walked, (R,).
         strongest: Positions of the strongest rows, a baseline, (R, 3) [m].
         centroid: Mean positions of the rows weighted by their power, a baseline, (R, 3) [m].
-        posterior: Posteriors in plan, a row for each receiver.
+        posterior: Posteriors in plan, a row for each receiver; `posterior.plot(0)` draws the first one.
         weight: Weight of the likelihood in the posterior.
         origin: Latitude and longitude of x = y = 0, if they are known.
         plan_scale: Pixels in a metre, if the positions were pixels of a floor plan.
@@ -115,23 +115,6 @@ class ReceiverPositions(Displayed):
             strongest_y_m=self.strongest[:, 1].numpy().round(2),
         )
 
-    def plot(self, receiver: int = 0, ax: Axes | None = None) -> Axes:
-        """Draw the posterior of a receiver, its estimate and the 80 % circle, seen from above.
-
-        Args:
-            receiver: Number of the receiver, counted from 0.
-            ax: Axes to draw into. Defaults to those of a new figure.
-        """
-        order = self.posterior.log_weight[receiver].argsort()  # the largest mass on top
-        ax = plan(self.posterior.position[receiver, order], self.posterior.weight[receiver, order], "mass", ax)
-        angle = torch.linspace(0, math.tau, 100)
-        (x, y, _), radius = self.position[receiver].tolist(), float(self.radius_m[receiver])
-        ax.plot(x, y, "x", color=MARK, label="estimate")
-        ax.plot(x + radius * angle.cos().numpy(), y + radius * angle.sin().numpy(), color=MARK, label="80 % region")
-        ax.set_title(self.names[receiver])
-        ax.legend()
-        return ax
-
     def __repr__(self) -> str:
         return (
             f"<ReceiverPositions of {listed(self.names)}:\n median 80 % radius {float(self.radius_m.median()):.2f} m>"
@@ -174,9 +157,7 @@ def locate_receivers(
         True
     """
     if data.receiver_moves:
-        raise InputError(
-            f"the receivers of {data.name} move, so they have no position to estimate; give data of fixed ones"
-        )
+        raise InputError(f"the receivers of {data.name} move and have no position to estimate; give fixed ones")
     usable = _usable(data)
     asked = (usable & ~data.receiver_located).nonzero()[:, 0].tolist()
     if not asked:
@@ -193,8 +174,8 @@ def locate_receivers(
         weight = search.weight(known, model) if len(known) >= MIN_KNOWN else DEFAULT_WEIGHT
     cells, value = search.candidates(asked, model, weight)
     posterior, position, radius = search.estimates(cells, value, weight)
-    flat = posterior.position
-    walked = torch.stack([torch.from_numpy(inside(at.numpy(), data.transmitter_position.numpy())) for at in flat])
+    known_rows = data.transmitter_position.numpy()
+    walked = torch.stack([torch.from_numpy(inside(at.numpy(), known_rows)) for at in posterior.position])
     chosen = data.columns(asked)
     return ReceiverPositions(
         names=chosen.receiver_names,
