@@ -16,14 +16,18 @@ from tasks.page.page import Plot, Section, Table
 from tasks.page.shared import MEASURED, SUGGESTED
 from tasks.records import RECEIVERS, Records
 
+MAX_ESTIMATED = 60  # most often detected receivers whose positions a run estimates, which takes half a second each
 MAX_NAMED = 30  # receivers with their name in the figure; more would hide each other
 BAND = 0.35  # width of the part of the figure beside the rows, relative to their extent
 
 
 def with_receivers(recorded: Recorded, data: Rssi) -> Recorded:
     """Return a recorded result with the positions of the receivers of unknown position, estimated from its rows."""
+    often = data.detected.sum(dim=0).where(~data.receiver_located, 0).argsort(descending=True, stable=True)
+    kept = data.receiver_located.clone()
+    kept[often[:MAX_ESTIMATED]] = True
     try:
-        found = locate_receivers(data)
+        found = locate_receivers(data.columns(kept.nonzero()[:, 0].tolist()))
     except InputError:  # nothing to estimate, or not enough rows
         return recorded
     table = found.to_frame()
@@ -90,7 +94,8 @@ def receivers_section(run: Records) -> Section | None:
     text = (
         f"The survey does not state the positions of receivers ({len(names)}). Each is estimated from its own RSSI and lies "
         f"in its circle with 80 % probability. `{RECEIVERS}.csv` beside the survey gives the positions back: correct those "
-        "that you know first. Heights are hardly determined."
+        f"that you know first. Heights are hardly determined. At most {MAX_ESTIMATED} receivers are estimated, those that were "
+        "detected most often."
     )
     caption = (
         "Estimated positions of the receivers in plan. A circle contains the receiver with 80 % probability; it is dashed "
