@@ -94,7 +94,7 @@ def receivers_section(run: Records) -> Section | None:
     text = (
         f"The survey does not state the positions of receivers ({len(names)}). Each is estimated from its own RSSI and lies "
         f"in its circle with 80 % probability. `{RECEIVERS}.csv` beside the survey gives the positions back: correct those "
-        f"that you know first. Heights are hardly determined. At most {MAX_ESTIMATED} receivers are estimated, those that were "
+        f"that you know first. Heights are hardly determined. At most {MAX_ESTIMATED} receivers are estimated, those "
         "detected most often."
     )
     caption = (
