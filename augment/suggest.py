@@ -15,9 +15,13 @@ from swiftwrf.data.splits import folds
 from swiftwrf.gp import choose_kernel, most_informative, subsample
 from swiftwrf.locate import RssiLocator
 from swiftwrf.positions import nearest
+from swiftwrf.rssi import RssiModel
+from swiftwrf.rssi.coverage import Coverage, reach
+from swiftwrf.rssi.maps import RssiMap
 
 N_CANDIDATE_POSITIONS = 1500  # positions that are compared
 MAX_MEASURED_POSITIONS = 2000  # measured positions that the variance is conditioned on
+MIN_UNCERTAIN = 0.02  # mean of 4 p (1 - p) below which the coverage is known
 BATCH_ROWS = 128  # rows whose posteriors are in memory together
 
 
@@ -108,6 +112,55 @@ def suggest_positions(locator: RssiLocator, train: Rssi, count: int, seed: int =
     weight = error[number].square().mean(dim=1).clamp_min(1e-12)
     (known,) = subsample(train.transmitter_position, rows=MAX_MEASURED_POSITIONS)
     chosen, variance = most_informative(locator.model.kernel, known, candidate, count, weight)
+    return Suggestion(candidate[chosen], variance)
+
+
+def suggest_scans(model: RssiModel, survey: Rssi, count: int, above_dbm: float) -> Suggestion:
+    """Return positions to measure next, where the maps are uncertain and so is whether a scan passes the threshold.
+
+    The positions are inside of what was walked. Each one lowers the sum of p (1 - p) times the posterior variance of the
+    field most, where p is the probability that a scan has a receiver above the threshold. The variance of the result is
+    weighted in the same way. No position is returned if the maps have no field or the coverage is known.
+
+    Args:
+        model: Model fitted to the survey.
+        survey: Measured rows.
+        count: Number of positions, 1 to 500; fewer are returned if the walked area has fewer cells.
+        above_dbm: Threshold of the coverage [dBm].
+
+    Raises:
+        InputError: A number outside 1 to 500.
+
+    Example:
+        >>> import swiftwrf
+        >>> survey = swiftwrf.rssi_room(n=60)
+        >>> suggest_scans(swiftwrf.RssiModel().fit(survey), survey, 3, above_dbm=-60).position.shape
+        torch.Size([3, 3])
+    """
+    _check_count(count)
+    none = Suggestion(torch.zeros(0, 3, dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
+    if not bool(model.field_db.any()):
+        return none
+    floors, at = survey.floors, survey.transmitter_position
+    heights = [None] if floors is None else list(floors.height_m)
+    extent = (at.amax(dim=0) - at.amin(dim=0))[:2]
+    edge = float(extent.prod() * len(heights) / N_CANDIDATE_POSITIONS) ** 0.5 or None
+    positions, weights = [], []
+    for number, height in enumerate(heights):
+        scans = survey if floors is None else survey.subset(floors.number(at) == number)
+        if len(scans):
+            chart = RssiMap.predict(model, edge, height, scans.transmitter_position, detected=True)
+            found = Coverage.of(chart, scans, (above_dbm, 0.9, 1), reach(model))
+            y, x = found.inside.nonzero()
+            cells = torch.tensor([(chart.x[i], chart.y[j], chart.height) for i, j in zip(x, y, strict=True)])
+            positions.append(cells.reshape(-1, 3).double())
+            p = torch.from_numpy(found.probability[found.inside])
+            weights.append(p * (1 - p))
+    candidate, weight = torch.cat(positions), torch.cat(weights)
+    if not len(candidate) or 4 * float(weight.mean()) < MIN_UNCERTAIN:
+        return none
+    (known,) = subsample(at, rows=MAX_MEASURED_POSITIONS)
+    chosen, variance = most_informative(model.kernel, known, candidate, min(count, len(candidate)), weight)
     return Suggestion(candidate[chosen], variance)
 
 

@@ -121,6 +121,57 @@ def not_detected() -> str:
     return markdown(columns, rows)
 
 
+def survey_receivers() -> str:
+    """Return errors of estimated positions of receivers in plan beside baselines, and how many regions hold."""
+    found, rows = load("survey_receivers").get("sets", {}), []
+    for name, one in found.items():
+        errors = {kind: one[f"{kind}_m"] for kind in ("strongest", "centroid", "estimate")}
+        cells = [f"{error['median']:.2f} / {error['p90']:.2f}" for error in errors.values()]
+        ratio = f"{errors['estimate']['median'] / errors['strongest']['median']:.2f}"
+        rows.append([name, str(one["n"]), *cells, ratio, f"{one['hold']} of {one['n']}", f"{one['radius_m']:.1f}"])
+    n, hold = (sum(one[key] for one in found.values()) for key in ("n", "hold"))
+    rows.append(["all", str(n), "", "", "", "", f"{hold} of {n}", ""])
+    columns = [
+        "data",
+        "receivers",
+        "strongest row [m]",
+        "weighted centroid [m]",
+        "estimate [m]",
+        "over the strongest row",
+    ]
+    return markdown([*columns, "80 % regions hold", "median radius [m]"], rows)
+
+
+def survey_plan() -> str:
+    """Return the regret of places for a further access point on simulated floors."""
+    floors = load("survey_plan").get("floors", [])
+    rows = []
+    for kind, what in (
+        ("chosen", "`swiftwrf plan`"),
+        ("hole", "centre of the largest hole"),
+        ("random", "random place (mean of all)"),
+    ):
+        regret = [100 * (floor["best"] - floor[kind]) for floor in floors]
+        rows.append([what, f"{mean(regret):.1f}", f"{min(regret):.1f} to {max(regret):.1f}"])
+    return markdown(["place", "regret of coverage, mean [points]", "of single floors"], rows)
+
+
+def survey_left_out() -> str:
+    """Return errors of RSSI that is predicted at a receiver from the path loss of all others."""
+    rows = [
+        [
+            name,
+            str(one["receivers"]),
+            f"{one['median_db']:.1f}",
+            f"{one['intervals_hold']:.0%}",
+            f"{100 * one['share_error']:.0f}",
+        ]
+        for name, one in load("survey_plan").get("left_out", {}).items()
+    ]
+    columns = ["data", "receivers", "median absolute error [dB]", "80 % intervals hold"]
+    return markdown([*columns, "share of rows above the median RSSI: median error of a receiver [points]"], rows)
+
+
 def _outcome(difference_db: float) -> str:
     if abs(difference_db) <= RELEVANT_DB:
         return "level"

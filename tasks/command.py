@@ -31,6 +31,7 @@ COMMANDS = {
     "rssi": Command("RssiTaskConfig", "tasks.rssi.experiment"),
     "locate": Command("LocateConfig", "tasks.locate.experiment"),
     "predict": Command("PredictConfig", "tasks.predict"),
+    "plan": Command("PlanConfig", "tasks.plan"),
     "report": Command("ReportConfig", "tasks.report"),
     "inspect": Command("InspectConfig", "tasks.inspect"),
     "convert": Command("ConvertConfig", "tasks.convert"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path, PurePath
 from typing import Annotated, Literal
 
@@ -19,6 +20,7 @@ from tasks.records import CONFIG, PARTIAL, Row, read_json
 
 MAP_FILES = (".tif", ".geojson", ".png")  # suffixes of files that hold a map only
 FILES = (".csv", ".mat", *MAP_FILES)  # other names are directories
+MAX_POWER_CHANGE_DB = 60.0  # of an access point
 TABLE_SUFFIX = ".csv"  # suffix of a followed table; other followed files are JSON lines
 
 
@@ -147,6 +149,8 @@ class RssiTaskConfig(ReadingConfig):
     """an image to draw behind the maps, PNG or JPEG"""
     floor_extent: tuple[float, float, float, float] | None = None
     """x0 x1 y0 y1 of that image [m] (default: as pixels of the image are the positions in the table)"""
+    suggest: Annotated[int, Ge(0), Le(MAX_SUGGESTIONS)] = 0
+    """number of positions to suggest for the next measurements, those that make the coverage more certain"""
     scheduler: str | None = None
     """address of a Dask scheduler whose workers fit groups of receivers (extra: cluster)"""
     seed: Seed = 0
@@ -256,6 +260,65 @@ class PredictConfig(ReadingConfig):
     """leave out receivers in SOURCE that the locator does not have (default: refuse them)"""
     out: str | None = None
     """table to write; of a field or RSSI model also .mat; must not exist (default: a new predicted-TIME.csv)"""
+
+
+@options
+class PlanConfig(Options):
+    """Plan access points: the coverage that further ones add, and that changes of existing ones cost.
+
+    The maps, the path loss and the floors are those of a run of swiftwrf rssi. To move an access point, switch it off and
+    add one.
+
+    Example: swiftwrf plan runs/rssi/first --aps 2
+
+    Example: swiftwrf plan runs/rssi/first --aps 0 --off AP3 --power AP1=+3
+    """
+
+    run: Annotated[str, tyro.conf.Positional]
+    """directory of a run of swiftwrf rssi"""
+    aps: Annotated[int, Ge(0), Le(20)] = 1
+    """number of further access points, chosen one after the other"""
+    at: str | None = None
+    """table of the places that are compared: x, y, z [m], or latitude, longitude, altitude (default: a grid inside of what
+    was walked)"""
+    above: float | None = None
+    """threshold of the coverage [dBm] (default: that of the run)"""
+    off: tuple[str, ...] = ()
+    """access points that are switched off, by name or number counted from 1"""
+    power: tuple[str, ...] = ()
+    """changes of the transmit power [dB]: NAME=+3 NAME=-6 ..."""
+    seed: Seed = 0
+    """seed of the samples of the maps"""
+    out: str | None = None
+    """directory of the plan; must not exist (default: a new one under runs/plan)"""
+
+    def check(self) -> None:
+        super().check()
+        _ = self.power_db
+        if not (self.aps or self.off or self.power):
+            raise InputError("--aps 0 changes nothing; give --off or --power, too")
+
+    @property
+    def power_db(self) -> dict[str, float]:
+        """Changes of the transmit power by name [dB].
+
+        Raises:
+            InputError: A change that is not NAME=NUMBER, or a name twice.
+        """
+        found: dict[str, float] = {}
+        for text in self.power:
+            name, _, db = text.rpartition("=")
+            try:
+                value = float(db)
+            except ValueError:
+                value = math.nan
+            if not name or name in found or not abs(value) <= MAX_POWER_CHANGE_DB:
+                raise InputError(
+                    f"--power takes NAME=DB once for each access point, within {MAX_POWER_CHANGE_DB:g} dB, e.g. AP1=+3, got "
+                    f"{' '.join(self.power)}"
+                )
+            found[name] = value
+        return found
 
 
 @options

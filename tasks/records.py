@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 CONFIG, ENVIRONMENT, METRICS = "config.json", "environment.json", "metrics.json"  # files of a run
+RECEIVERS = "receivers"  # name of the files of a run with estimated positions of receivers
+SUGGESTED = "suggested"  # name of the files of a run with positions to measure next
 PARTIAL = ".partial"  # suffix of a run that is not finished
 NAMES = (  # columns of text, even if a cell reads NA, 1 or 12:34
     "method",

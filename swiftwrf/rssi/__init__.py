@@ -13,9 +13,10 @@ from swiftwrf.runtime.lazy import import_lazily
 
 if TYPE_CHECKING:
     from swiftwrf.contrib.comparison.rssi import RssiComparison, compare
+    from swiftwrf.contrib.survey.receivers import ReceiverPositions, locate_receivers
 
 import_lazily(__name__)
 
-__all__ = ["FloorAttenuation", "Map", "PairModel", "PathLoss", "RssiComparison", "RssiConfig"]
+__all__ = ["FloorAttenuation", "Map", "PairModel", "PathLoss", "ReceiverPositions", "RssiComparison", "RssiConfig"]
 __all__ += ["RssiModel", "RssiPaperModel", "RssiPredictor", "compare", "estimate_floor_attenuation"]
-__all__ += ["estimate_offsets", "fit_path_loss", "fit_rssi", "log_distance"]
+__all__ += ["estimate_offsets", "fit_path_loss", "fit_rssi", "locate_receivers", "log_distance"]

@@ -15,11 +15,12 @@ from swiftwrf.data.formats.stations import read_stations, station_names
 from tasks.configs import LocateConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
-from tasks.locate.page import SUGGESTED, page
+from tasks.locate.page import page
 from tasks.locate.placement import write_poses
 from tasks.page.page import finish
+from tasks.page.receivers import with_receivers
 from tasks.page.shared import write_suggestion
-from tasks.records import Row
+from tasks.records import SUGGESTED, Row
 from tasks.source import reading, rooms_beside
 from tasks.terminal import console, terminal
 from tasks.workers import connected, workers_of
@@ -56,7 +57,8 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
             _conclude(result, config, directory)
         elif isinstance(result, StationsComparison):
             _place(result, config, directory)
-        finish(directory, result.recorded(), page)
+        train, recorded = result.train, result.recorded()
+        finish(directory, with_receivers(recorded, train) if isinstance(train, Rssi) else recorded, page)
 
 
 def _described(values: Row) -> str:

@@ -20,6 +20,7 @@ from tasks import labels
 from tasks.locate.placement import poses_section
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table, number, provenance, sections_of
+from tasks.page.receivers import receivers_section
 from tasks.page.shared import (
     again,
     by_method,
@@ -33,7 +34,7 @@ from tasks.page.shared import (
     recommendation,
     suggestion_section,
 )
-from tasks.records import Records, notes
+from tasks.records import RECEIVERS, SUGGESTED, Records, notes
 from tasks.terminal import Answer, Method, NextStep
 
 OWN = "posterior"  # the localizer that all others are compared with
@@ -41,7 +42,6 @@ BASELINES = {
     "receiver": (("knn", "knn_difference"), "the best nearest-neighbour fingerprinting"),
     "station": (("triangulation", "triangulation_matched", "knn"), "the best baseline"),
 }  # by what receives: localizers without a model of the scene, and what they are together
-SUGGESTED = "suggested"  # name of the files with suggested positions
 OF_STATIONS = ("stations", "alone_estimate", "alone_radius_80_m")
 STATIONS_TEXT = "; triangles: stations; dashed circles of their colours: 80 % credible regions by each station alone."
 TRUTH, ESTIMATE = "#cf4a4a", "#ffffff"
@@ -73,6 +73,8 @@ def page(runs: list[Records]) -> Page:
         sections.insert(1, sections_of("Which room?", runs, _rooms))
     if runs[0].metrics["received_by"] == "receiver" and any(run.arrays(SUGGESTED) for run in runs):
         sections.insert(-1, sections_of("Where to measure next", runs, _suggestion))
+    if any(run.arrays(RECEIVERS) for run in runs):
+        sections[0].parts.append(sections_of("Where the receivers are", runs, receivers_section))
     names = ", ".join(dict.fromkeys(run.place for run in runs))
     if len(runs) == 1:
         first = _summary(runs[0], answers[runs[0]])

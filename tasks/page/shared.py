@@ -25,6 +25,7 @@ from tasks.terminal import Answer, NextStep
 
 MEASURED, SUGGESTED = "#3a7fd5", "#cf4a4a"
 MIN_REDUCTION = 0.1  # of the variance, below which more positions are not worth it
+NOT_WORTH = "no further position is worth measuring for the coverage: its uncertainty would hardly fall"
 MAX_NUMBERED = 30  # suggestions with their rank beside them; more would hide each other
 MAX_COVERAGE_ERROR = 0.05  # difference from the nominal coverage below which intervals count as calibrated
 MIN_RELEVANT = 0.02  # difference of mean errors, relative to them, below which methods are equal in practice
@@ -232,6 +233,27 @@ def suggestion_section(
     return Section(title, [text], plots=[Plot(f"suggested-{name}", [first, second], caption, data)])
 
 
+def is_worth(left: NDArray[Any]) -> bool:
+    """Return whether the relative variance after 0 to k suggested positions, (1 + k,), falls by a tenth or more."""
+    return bool(len(left) > 1 and left[-1] <= (1 - MIN_REDUCTION) * left[0])
+
+
+def suggestions(position: NDArray[Any], left: NDArray[Any], most: int = 10) -> str:
+    """Return the first suggested positions (k, 3) [m] as lines of text, with the relative variance after each.
+
+    Example:
+        >>> import numpy as np
+        >>> print(suggestions(np.array([[1.0, 2.0, 1.5]]), np.array([0.2, 0.15])))
+        where to measure next
+        rank   x [m]   y [m]   z [m]  variance left
+           1    1.00    2.00    1.50          75.0%
+    """
+    rows = zip(range(1, most + 1), position, left[1:] / left[0], strict=False)
+    lines = [f"{rank:4d}{''.join(f'{x:8.2f}' for x in at)}{share:15.1%}" for rank, at, share in rows]
+    more = [f"and {len(position) - most} more"] if len(position) > most else []
+    return "\n".join(["where to measure next", "rank   x [m]   y [m]   z [m]  variance left", *lines, *more])
+
+
 def worth(left: NDArray[Any]) -> str:
     """Return whether suggested positions are worth measuring, by the relative variance after 0 to k of them, (1 + k,).
 
@@ -240,7 +262,7 @@ def worth(left: NDArray[Any]) -> str:
         >>> worth(np.array([0.11, 0.105]))
         'This is not worth it: the variance hardly falls.'
     """
-    if left[-1] > (1 - MIN_REDUCTION) * left[0]:
+    if not is_worth(left):
         return "This is not worth it: the variance hardly falls."
     return "This is worth it where the variance falls most: begin with the first positions."
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from swiftwrf import InputError, Rssi, rssi_room
+from augment.suggest import suggest_scans
+from swiftwrf import InputError, Rssi, RssiModel, rssi_room
 from swiftwrf.contrib.comparison.predictors import compared
-from swiftwrf.contrib.comparison.rssi import compare
+from swiftwrf.contrib.comparison.rssi import RssiComparison, compare
+from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.files import sha256
 from swiftwrf.data.formats import RSSI_FORMATS
 from swiftwrf.models.prediction import difference_unit
@@ -15,7 +17,9 @@ from tasks.directory import Run
 from tasks.environment import choose_device
 from tasks.page.maps import FloorPlan, read_pixels
 from tasks.page.page import finish
-from tasks.records import Row
+from tasks.page.receivers import with_receivers
+from tasks.page.shared import NOT_WORTH, is_worth, suggestions, write_suggestion
+from tasks.records import SUGGESTED, Row
 from tasks.rssi.page import page
 from tasks.source import offset_notes, reading, rooms_beside
 from tasks.terminal import console, terminal
@@ -75,7 +79,23 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
             console.print(f"{data.name}: {detection.note(data.receiver_names)}")
         if plan is not None:
             plan.save(directory.folder)
-        finish(directory, result.recorded(), page, offset_notes(data))
+        recorded = with_receivers(result.recorded(), result.train)
+        _suggest(result, config, directory, float(recorded.metrics["coverage"][0]["threshold_dbm"]))
+        finish(directory, recorded, page, offset_notes(data))
+
+
+def _suggest(result: RssiComparison, config: RssiTaskConfig, directory: Run, above_dbm: float) -> None:
+    """Write the positions to measure next, and print the first ones, or that none is worth it."""
+    model, train = result.predictors[result.model], result.train
+    if not config.suggest or not isinstance(model, RssiModel):
+        return
+    found = suggest_scans(model, train, config.suggest, above_dbm)
+    if not is_worth(found.variance.numpy()):
+        console.print(NOT_WORTH)
+        return
+    degrees = degree_columns(train.origin, found.position.numpy())
+    write_suggestion(directory.path(SUGGESTED), train.transmitter_position, found.position, found.variance, degrees)
+    console.print(suggestions(found.position.numpy(), found.variance.numpy()), markup=False)
 
 
 def _read_floor_plan(config: RssiTaskConfig, data: Rssi) -> FloorPlan | None:

@@ -17,6 +17,7 @@ from swiftwrf.models.prediction import difference_unit
 from tasks.labels import PREDICTORS, colour, meanings
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of
+from tasks.page.receivers import receivers_section, receivers_sentence
 from tasks.page.shared import (
     again,
     by_method,
@@ -28,8 +29,9 @@ from tasks.page.shared import (
     limits,
     next_steps,
     recommendation,
+    suggestion_section,
 )
-from tasks.records import Records, notes
+from tasks.records import RECEIVERS, SUGGESTED, Records, notes
 from tasks.rssi import coverage
 from tasks.rssi.differences import where_methods_differ
 from tasks.rssi.maps import MIN_RATIO, WIDTH_PER_STD, Maps
@@ -59,6 +61,10 @@ def page(runs: list[Records]) -> Page:
         sections_of("Errors", runs, lambda run: _errors(run, answers[run]), meanings(RSSI_PREDICTORS)),
         limits(runs[0], *(LIMITS if Maps(runs[0]).quantity == "RSSI" else ())),
     ]
+    if any(run.arrays(RECEIVERS) for run in runs):
+        sections.insert(-1, sections_of("Where the receivers are", runs, receivers_section))
+    if any(run.arrays(SUGGESTED) for run in runs):
+        sections[-2].parts.append(sections_of("Where to measure next", runs, _suggestion))
     details = [provenance(runs)]
     if len(runs) > 1 or any(len(Maps(run).names) > 1 or Maps(run).suffix for run in runs):
         sections.insert(1, sections_of("Maps", runs, partial(_maps, kind="predicted")))
@@ -89,6 +95,20 @@ def _summary(run: Records, found: Answer) -> Summary:
     ]
     plots = [Maps.coverage_plot(floors), *(maps.summary() for maps in floors if len(floors) == 1)]
     return Summary(numbers, plots, found.conclusion, found.next_steps, notes=notes(run))
+
+
+def _suggestion(run: Records) -> Section | None:
+    return suggestion_section(
+        "",
+        run.arrays(SUGGESTED),
+        SUGGESTED,
+        run.file_name,
+        what="the variance of the radio maps",
+        whole="the field's variance",
+        how="The mean over the walked area is weighted by p (1 - p), where p is the probability that a scan has a receiver "
+        "above the threshold of the coverage.",
+        label="weighted variance left [%]",
+    )
 
 
 def _maps(run: Records, kind: str) -> Section:
@@ -182,6 +202,7 @@ def conclusion(run: Records) -> list[str]:
         "(median error).",
         *(coverage.coverage_sentence(maps.coverage, maps.place) for maps in floors),
         *filter(None, [coverage.spots_sentence(floors), coverage.held_out_sentence(run), coverage.why(run)]),
+        *receivers_sentence(run),
         sure,
         compared,
     ]
@@ -195,7 +216,8 @@ def steps(run: Records) -> list[NextStep]:
     unknown = int(np.isnan(run.arrays("maps")["receiver"]).any(axis=1).sum())
     if unknown and Maps(run).quantity == "RSSI":
         text = f"Give the unknown positions of access points ({unknown}), in `receivers.csv` beside the table"
-        own.insert(0, NextStep(text, "receiver,x,y,z"))
+        estimated = f"{text}: begin with the estimates in {run.path}/{RECEIVERS}.csv, and correct those that you know"
+        own.insert(0, NextStep(estimated) if run.arrays(RECEIVERS) else NextStep(text, "receiver,x,y,z"))
     n_places = run.table("errors")["place"].nunique()
     if warning := coverage_warning("intervals", interval["coverage"], interval["nominal"], n_places):
         own.append(NextStep(warning))

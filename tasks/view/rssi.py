@@ -20,7 +20,7 @@ from swiftwrf.metrics import LEVEL
 from swiftwrf.rssi.coverage import CLASSES, OTHER_DBM, Coverage, classified, default_threshold, reach
 from swiftwrf.rssi.maps import RssiMap
 from tasks.page.maps import CLASS_COLOURS, Corners, FloorPlan
-from tasks.records import METRICS, as_table, read_json, read_npz, rounded
+from tasks.records import METRICS, RECEIVERS, as_table, read_json, read_npz, rounded
 from tasks.rssi.coverage import coverage_sentence
 from tasks.rssi.maps import MAX_WIDTH_DB
 from tasks.view.locating import RssiLocating
@@ -92,10 +92,21 @@ class RssiView:
     notes: list[str] = field(default_factory=list)  # remarks on the data, a sentence each
     folder: Path | None = None  # directory of the run, where a floor plan is saved. None for a saved model
     plan: FloorPlan | None = field(default=None, init=False)  # image of the floor. None if there is none
+    estimated: dict[str, tuple[list[float], float]] = field(default_factory=dict, init=False)
+    """Estimated position [m] and radius of its 80 % region [m] of receivers of unknown position, by name."""
 
     def __post_init__(self) -> None:
         if self.folder is not None:
             self.plan = FloorPlan.load(self.folder)
+            if (file := self.folder / f"{RECEIVERS}.npz").is_file():
+                found = read_npz(file)
+                names, position, radius = (
+                    found["names"].tolist(),
+                    found["position"].tolist(),
+                    found["radius_m"].tolist(),
+                )
+                places = zip(position, radius, strict=True)
+                self.estimated = dict(zip(names, places, strict=True))
         self.map = lru_cache(maxsize=MAX_MAPS)(
             lambda height, counted=False, detected=False: RssiMap.predict(
                 self.model, height=height, region=None if counted else self.region, detected=detected

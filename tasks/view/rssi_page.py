@@ -16,7 +16,22 @@ from swiftwrf import InputError
 from swiftwrf.rssi.coverage import CLASSES
 from tasks.labels import COVERAGE
 from tasks.page.maps import FloorPlan, colour_image, read_pixels
-from tasks.view.charts import BAR, Data, around, colour_bar, crosses, dots, named, picture, pictures, points, stripes
+from tasks.view.charts import (
+    BAR,
+    Data,
+    around,
+    circle,
+    colour_bar,
+    crosses,
+    dots,
+    lines,
+    named,
+    paths,
+    picture,
+    pictures,
+    points,
+    stripes,
+)
 from tasks.view.page import (
     MAX_UPLOAD_BYTES,
     NewestOnly,
@@ -51,7 +66,7 @@ class RssiPage:
         layers = [pictures(name) for name in ("floor", "map", "silent", "outside")] + [dots("rows", ROW, 3)]
         layers += [dots("nothing", "transparent", 6, borderColor="white", borderWidth=1)]
         layers += [dots("measured", ROW, 8, borderColor="white", borderWidth=0.7), *located_layers()]
-        layers += [crosses("receivers", RECEIVER_MARK)]
+        layers += [lines("around", RECEIVER_MARK, 1, "dashed"), crosses("receivers", RECEIVER_MARK)]
         with ui.row().classes("w-full items-start gap-8 lg:flex-nowrap"):
             with ui.column().classes("gap-1").style("flex: 0 1 880px; max-width: 100%; min-width: 0"):
                 self._plan = PlanChart("map", around(view.region), layers, MAX_MAP_PX, self._on_pointer, has_bar=True)
@@ -160,7 +175,7 @@ class RssiPage:
         """Return the data of all layers of the plan."""
         view, rows, corners = self._view, self._view.rows, self._view.map(selection.height).corners
         image = colour_image(coloured.values[::-1], coloured.colours, coloured.low, coloured.high)
-        hidden = ("floor", "silent", "outside", "rows", "nothing", "measured", "receivers")
+        hidden = ("floor", "silent", "outside", "rows", "nothing", "measured", "around", "receivers")
         data: dict[str, Data] = {name: [] for name in hidden}
         data["map"] = picture(image, coloured.corners or corners, 0.7 if view.plan else 1.0)
         if view.plan:
@@ -180,10 +195,14 @@ class RssiPage:
         if selection.kind == "posterior" and view.locating is not None:
             data["rows"], found = points(view.position), view.locating.located(selection.row)
         every = selection.kind in ("best receiver", *LOCATING) or _at_any(selection)
-        for number, position in enumerate(rows.receiver_position.numpy()):
-            if np.isfinite(position).all() and (every or number == selection.receiver):
+        for number, (name, place) in enumerate(zip(view.receivers, rows.receiver_position.numpy(), strict=True)):
+            if not (every or number == selection.receiver):
+                continue
+            position, radius = (place, 0.0) if np.isfinite(place).all() else view.estimated.get(name, (place, 0.0))
+            if np.isfinite(position).all():
                 colour = _colour(number) if selection.kind == "best receiver" else RECEIVER_MARK
-                data["receivers"].append(named(position, view.receivers[number], color=colour))
+                data["receivers"].append(named(position, name, color=colour))
+                data["around"] += paths([circle(position, radius)]) if radius else []
         return data | located_data(found)
 
     def _on_pointer(self, kind: str, buttons: int, x: float, y: float) -> None:
