@@ -283,13 +283,15 @@ class _Whitened:
     this order.
 
     Args:
-        fields: Waves of one standard deviation, expected and observed channels, whitened, (m, 1 + S + 2, F, K).
-        gram: Their inner products a b^*, (m, 1 + S + 2, 1 + S + 2).
+        fields: Waves, expected and observed channels, whitened, (m, 1 + S + 2, F, K).
+        size: Factors of these that give waves of one standard deviation and channels of unit power, (m, 1 + S + 2).
+        gram: Inner products a b^* of the products of both, (m, 1 + S + 2, 1 + S + 2).
         factor: Cholesky factors of I + s s^H, (m, 1 + S, 1 + S), with the waves s.
         log_volume: Logarithm of the factors that whiten the observed channels, summed.
     """
 
     fields: Tensor
+    size: Tensor
     gram: Tensor
     factor: Tensor
     log_volume: Tensor
@@ -309,18 +311,18 @@ class _Whitened:
         whitening = ((1 + rest.mean()) / rest).sqrt()
         amount = ((power[:, -2] + power[:, :-2] @ variance) * (1 + rest.mean())).rsqrt()[:, None]
         size = torch.cat([amount * variance.sqrt(), amount, torch.ones_like(amount)], dim=1)
-        fields = fields * (size[:, :, None, None] * whitening)
+        fields = fields * whitening
         rows = fields.flatten(2)
-        gram = rows @ rows.mH
+        gram = (rows @ rows.mH) * (size[:, :, None] * size[:, None])
         factor = torch.linalg.cholesky(gram[:, :-2, :-2] + torch.eye(len(variance)))
-        return cls(fields, gram, factor, whitening.log().expand(fields.shape[2:]).sum())
+        return cls(fields, size, gram, factor, whitening.log().expand(fields.shape[2:]).sum())
 
     def phases(self, *, steps: int = 3) -> Tensor:
         """Return the phasors (m, F, 1) by which the observed snapshots agree with the expected field.
 
         Phases and the field that is expected given the channels follow from each other in three steps (not studied).
         """
-        match = (self.fields[:, :-1] * self.fields[:, -1:].conj()).sum(-1)  # of each snapshot
+        match = self.size[:, :-1, None] * (self.fields[:, :-1] * self.fields[:, -1:].conj()).sum(-1)  # of each snapshot
         along, mean = match[:, :-1], match[:, -1:].mT
         phase = mean.sgn()
         for _ in range(steps - 1):
@@ -360,7 +362,8 @@ class ChannelLikelihood:
 
     def log_density(self, coherence: Tensor, channel: Tensor) -> Tensor:
         """Return the log-likelihoods of coherences of any shape with channels (n, F, K)."""
-        return -math.prod(channel.shape[1:]) * ((1 - coherence).clamp_min(0) + self.floor).log()
+        missing = (1 - coherence).clamp_min_(0).add_(self.floor)  # in place: a search has millions of cells
+        return missing.log_().mul_(-math.prod(channel.shape[1:]))
 
     def screen(self, predicted: Sequence[Tensor]) -> Screen:
         """Return the function from n observations to log-likelihoods (n, m), by channels at m cells.
