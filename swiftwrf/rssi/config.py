@@ -42,6 +42,6 @@ class RssiConfig(FieldConfig):
     calibration: Validation | None = None
     """folds whose errors scale the standard deviations. Defaults to those of `validation`. "block" suits predictions for
     other days or devices, whose errors no fold of single rows contains"""
-    noises: tuple[PositiveFloat, ...] = (0.03, 0.1, 0.3, 1.0, 3.0)
+    noises: tuple[PositiveFloat, ...] = (0.03, 0.1, 0.3, 1.0, 2.0, 3.0)
     """compared variances of one measurement about the field, relative to that of the field. Fading of a packet is about as
     large as shadowing. Means of many packets have less noise"""
