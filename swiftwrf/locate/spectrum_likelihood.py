@@ -255,21 +255,20 @@ class PathLikelihood(PhaseLikelihood):
     def __call__(self, waves: PathWaves, observed: SpectrumFeatures) -> Tensor:
         assert observed.channel is not None
         count = observed.channel.shape[1]  # snapshots at one frequency have the same waves
-        x, mean = observed.channel @ self._basis, waves.channel.expand(-1, count, -1) @ self._basis
-        wave = waves.wave.expand(-1, -1, count, -1) @ self._basis
-        power = torch.view_as_real(wave).square().sum((2, 3, 4)) / wave[0, 0].numel()  # which no rotation changes
-        paths = wave, power
-        one = _Whitened.of(mean, paths, self._variance, self._diffuse * self._over_element, self._floor)
-        x = x * one.phases(x)
+        mean, wave = waves.channel.expand(-1, count, -1), waves.wave.expand(-1, -1, count, -1)
         # scattering has the covariance of frequencies times that of elements, and the eigenvectors of both whiten it
+        fields = torch.cat([wave, mean[:, None], observed.channel[:, None]], dim=1) @ self._basis
+        power = torch.view_as_real(fields).square().sum((2, 3, 4)) / fields[0, 0].numel()  # which no rotation changes
+        with torch.no_grad():
+            one = _Whitened.of(fields, power, self._variance, self._diffuse * self._over_element, self._floor)
+            fields[:, -1] *= one.phases()
         frequency = waves.frequency.expand(count)
         apart = self._detour_rad * (frequency[:, None] - frequency).float()
         over_frequency, turn = torch.linalg.eigh((-apart.square() / 2).exp())
-        turn = turn.T.to(x.dtype)
-        x, mean, paths = turn @ x, turn @ mean, (turn @ wave, power)
+        fields = turn.T.to(fields.dtype) @ fields
         scattered = self._diffuse * over_frequency[:, None] * self._over_element
         densities = [
-            _Whitened.of(mean, paths, scale * self._variance, scale * scattered, self._floor).log_density(x)
+            _Whitened.of(fields, power, scale * self._variance, scale * scattered, self._floor).log_density()
             for scale in SCALES
         ]
         density: Tensor = torch.stack(densities).logsumexp(dim=0)
@@ -280,74 +279,63 @@ class PathLikelihood(PhaseLikelihood):
 class _Whitened:
     """Complex normal distribution of channels (F, K) at m candidates, scaled so that noise and scattering are white.
 
+    Only inner products of the waves, of the expected and of the observed channels count. These are the rows of `fields`, in
+    this order.
+
     Args:
-        whitening: Factors of the observed channels (F or 1, K).
-        mean: Expected channels (m, F, K).
-        wave: Waves of the paths (m, 1 + S, F K).
-        std: Standard deviations of their gains (m, 1 + S).
-        factor: Cholesky factors of I + s s^H, (m, 1 + S, 1 + S), with the waves s of one standard deviation.
+        fields: Waves, expected and observed channels, whitened, (m, 1 + S + 2, F, K).
+        size: Factors of these that give waves of one standard deviation and channels of unit power, (m, 1 + S + 2).
+        gram: Inner products a b^* of the products of both, (m, 1 + S + 2, 1 + S + 2).
+        factor: Cholesky factors of I + s s^H, (m, 1 + S, 1 + S), with the waves s.
+        log_volume: Logarithm of the factors that whiten the observed channels, summed.
     """
 
-    whitening: Tensor
-    mean: Tensor
-    wave: Tensor
-    std: Tensor
+    fields: Tensor
+    size: Tensor
+    gram: Tensor
     factor: Tensor
+    log_volume: Tensor
 
     @classmethod
-    def of(cls, mean: Tensor, paths: tuple[Tensor, Tensor], variance: Tensor, scattered: Tensor, floor: Tensor) -> Self:
+    def of(cls, fields: Tensor, power: Tensor, variance: Tensor, scattered: Tensor, floor: Tensor) -> Self:
         """Return the distribution of channels of unit expected power.
 
         Args:
-            mean: Expected channels (m, F, K).
-            paths: Waves of the paths (m, 1 + S, F, K) and their powers (m, 1 + S).
-            variance: Variances of their gains (1 + S,).
+            fields: Waves of the paths, expected and observed channels (m, 1 + S + 2, F, K).
+            power: Their powers (m, 1 + S + 2).
+            variance: Variances of the gains of the paths (1 + S,).
             scattered: Variances of scattering (F or 1, K), relative to the power of the paths.
             floor: Variance of the noise, relative to the same.
         """
-        wave, power = paths
         rest = scattered.clamp_min(0) + floor
         whitening = ((1 + rest.mean()) / rest).sqrt()
-        total = torch.view_as_real(mean).square().sum((1, 2, 3)) / mean[0].numel() + power @ variance
-        amount = (total * (1 + rest.mean())).rsqrt()[:, None]
-        wave, std = (wave * whitening).flatten(2), amount * variance.sqrt()
-        gram = (wave @ wave.mH) * (std[:, :, None] * std[:, None]) + torch.eye(wave.shape[1])
-        return cls(whitening, mean * amount[..., None] * whitening, wave, std, torch.linalg.cholesky(gram))
+        amount = ((power[:, -2] + power[:, :-2] @ variance) * (1 + rest.mean())).rsqrt()[:, None]
+        size = torch.cat([amount * variance.sqrt(), amount, torch.ones_like(amount)], dim=1)
+        fields = fields * whitening
+        rows = fields.flatten(2)
+        gram = (rows @ rows.mH) * (size[:, :, None] * size[:, None])
+        factor = torch.linalg.cholesky(gram[:, :-2, :-2] + torch.eye(len(variance)))
+        return cls(fields, size, gram, factor, whitening.log().expand(fields.shape[2:]).sum())
 
-    def _along(self, values: Tensor) -> Tensor:
-        """Return L^-1 s v^*, (m, 1 + S, 1), of values v (m, F, K), with the Cholesky factor L and the waves s."""
-        match = self.std[..., None] * (self.wave @ values.flatten(1).conj()[..., None])
-        along: Tensor = torch.linalg.solve_triangular(self.factor, match, upper=False)
-        return along
-
-    def phases(self, x: Tensor, *, steps: int = 3) -> Tensor:
-        """Return the phasors (m, F, 1) by which the snapshots of channels x (m, F, K) agree with the expected field.
+    def phases(self, *, steps: int = 3) -> Tensor:
+        """Return the phasors (m, F, 1) by which the observed snapshots agree with the expected field.
 
         Phases and the field that is expected given the channels follow from each other in three steps (not studied).
         """
-        x = x * self.whitening
-        expected, along_mean, total = self.mean, self._along(self.mean), torch.ones_like(x[..., :1])
-        for number in range(steps):
-            phase = (x.conj() * expected).sum(-1, keepdim=True).sgn().detach()
-            x, total = x * phase, total * phase
-            if number < steps - 1:
-                change = torch.linalg.solve_triangular(self.factor.mH, self._along(x) - along_mean, upper=True)
-                change = (change * self.std[..., None]).mH @ self.wave
-                expected = self.mean + change[:, 0].view_as(self.mean)
-        return total
+        match = self.size[:, :-1, None] * (self.fields[:, :-1] * self.fields[:, -1:].conj()).sum(-1)  # of each snapshot
+        along, mean = match[:, :-1], match[:, -1:].mT
+        phase = mean.sgn()
+        for _ in range(steps - 1):
+            change = torch.cholesky_solve(along @ phase.conj() - self.gram[:, :-2, -2:-1], self.factor)
+            phase = (mean + along.mT @ change.conj()).sgn()
+        return phase
 
-    def log_density(self, x: Tensor) -> Tensor:
-        """Return the log-densities of channels x (m, F, K) with an unknown common phase, up to a constant, (m,)."""
-        m, x = self.mean, x * self.whitening
-        along_m, along_x = self._along(m), self._along(x)
-
-        def product(a: Tensor, b: Tensor, along_a: Tensor, along_b: Tensor) -> Tensor:
-            value: Tensor = (a.conj() * b).sum((1, 2)) - (along_a * along_b.conj()).sum((1, 2))
-            return value
-
-        match = 2 * product(m, x, along_m, along_x).abs()
-        misfit = product(x, x, along_x, along_x).real + product(m, m, along_m, along_m).real
-        volume = self.factor.diagonal(dim1=1, dim2=2).real.log().sum(1) - self.whitening.log().expand(x.shape[1:]).sum()
+    def log_density(self) -> Tensor:
+        """Return the log-densities of the observed channels with an unknown common phase, up to a constant, (m,)."""
+        along = torch.linalg.solve_triangular(self.factor, self.gram[:, :-2, -2:], upper=False)
+        product = self.gram[:, -2:, -2:] - along.mH @ along  # of expected and observed channels over the covariance
+        match, misfit = 2 * product[:, 0, 1].abs(), product.diagonal(dim1=1, dim2=2).real.sum(1)
+        volume = self.factor.diagonal(dim1=1, dim2=2).real.log().sum(1) - self.log_volume
         density: Tensor = match + torch.special.i0e(match).log() - misfit - 2 * volume
         return density
 
@@ -374,7 +362,8 @@ class ChannelLikelihood:
 
     def log_density(self, coherence: Tensor, channel: Tensor) -> Tensor:
         """Return the log-likelihoods of coherences of any shape with channels (n, F, K)."""
-        return -math.prod(channel.shape[1:]) * ((1 - coherence).clamp_min(0) + self.floor).log()
+        missing = (1 - coherence).clamp_min_(0).add_(self.floor)  # in place: a search has millions of cells
+        return missing.log_().mul_(-math.prod(channel.shape[1:]))
 
     def screen(self, predicted: Sequence[Tensor]) -> Screen:
         """Return the function from n observations to log-likelihoods (n, m), by channels at m cells.

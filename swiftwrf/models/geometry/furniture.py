@@ -219,13 +219,14 @@ class Furniture:
         length = self.voxel_m * ray.square().sum(0).sqrt()
         samples = max(2, math.ceil(float(length.max()) / self.voxel_m))
         at = (torch.arange(samples) + 0.5) / samples
-        x = _straight(start[..., 0].expand_as(ray), ray, at)
+        x = torch.addcmul(start, at, ray.nan_to_num(0, 0, 0)[..., None])  # paths that do not exist have any points
         cell = torch.zeros(*length.shape, len(hits), dtype=torch.int64)
         for number, (point, along, plane) in enumerate(hits):
             hit, begin, plane = of_best(point), of_best(along).nan_to_num(0, 0, 0), of_best(plane[None])
             n = normal[:, plane]
-            ray = ray - 2 * (ray * n).sum(0) * n
-            x = torch.where(at > begin[..., None], _straight(hit - begin * ray, ray, at), x)
+            turn = -2 * (ray * n).sum(0) * n
+            ray = ray + turn
+            x.addcmul_((at - begin[..., None]).clamp_min_(0), turn.nan_to_num(0, 0, 0)[..., None])
             cell[..., number] = self._cell(plane, planes.normal[0], hit)
         largest = torch.tensor(self.absorption.shape)[:, None, None, None] + 1
         i, j, k = x.floor_().clamp_(torch.zeros(()), largest)
@@ -271,11 +272,6 @@ class _Crossings:
 def _padded(absorption: Tensor) -> Tensor:
     """Return the absorption with a layer of empty voxels around it, flat."""
     return torch.nn.functional.pad(absorption, (1,) * 6).flatten()
-
-
-def _straight(start: Tensor, ray: Tensor, at: Tensor) -> Tensor:
-    """Return the points start + t ray, (3, n, S, M), at fractions t (M,); paths that do not exist have any."""
-    return torch.addcmul(start.nan_to_num(0, 0, 0)[..., None], at, ray.nan_to_num(0, 0, 0)[..., None])
 
 
 def _gains(

@@ -213,11 +213,12 @@ class LinkAt:
 
     def waves(self, source: Tensor, frequency: Tensor) -> Tensor:
         """Return the waves of `wave` at frequencies (F,) relative to the carrier, complex64 (S, n, F, K)."""
-        waves = []
-        for ratio in frequency.tolist():
-            at = replace(self, element=self.element * ratio, wavenumber=self.wavenumber * ratio)
-            waves += [at.wave(source).expand(-1, len(self), -1)]
-        return torch.stack(waves, dim=2)
+        phase, length = self.phases((source - self.receiver).float().movedim(-1, 0))
+        # positions first in memory: products at each position follow
+        phase = phase.permute(2, 1, 0).contiguous()[:, :, None] * frequency.float()[:, None]
+        amplitude = length.reciprocal().T[:, :, None, None]
+        wave = torch.complex(phase.cos().mul_(amplitude), phase.sin_().mul_(amplitude))
+        return wave.expand(len(self), -1, -1, -1).transpose(0, 1)
 
     def wave(self, source: Tensor) -> Tensor:
         """Return the wave exp(-j k d) / d of sources (..., n or 1, 3) [m] at each element, complex64 (..., n, K)."""

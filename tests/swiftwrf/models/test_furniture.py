@@ -254,6 +254,20 @@ def test_channels_beside_positions_follow_from_the_paths_there(moving):
     assert coherence(unmoved, exact).median() < 0.8  # the field changes over these distances
 
 
+@pytest.mark.parametrize("moving", ["transmitter", "receiver"])
+def test_waves_at_frequencies_are_spherical_waves_of_the_images(moving):
+    data, walls = measured(0.0, moving, n=5)
+    ratio = data.frequency_hz * data.array.wavelength / LIGHT_SPEED
+    scene = walls.link_at(data.position)
+    ray = (sources(walls.reflectors, scene) - scene.receiver).movedim(1, 0)  # (n, 1 + S, 3)
+    length = ray.norm(dim=-1, keepdim=True)
+    phase = (ray / length) @ scene.element.double().T - scene.wavenumber * length
+    expected = torch.polar((1 / length)[..., None, :].expand(-1, -1, 4, 16), ratio[:, None] * phase[..., None, :])
+    found = waves(walls.reflectors, scene, ratio)
+    assert (found - expected).abs().max() < 1e-4 * expected.abs().max()  # phases of 500 rad are rounded in float32
+    assert (found[:, :, :1] - expected[:, :, 1:2]).abs().max() > 1e-2 * expected.abs().max()
+
+
 def test_the_likelihood_of_channels_is_a_normal_distribution_that_no_delay_or_phase_changes():
     data, walls = measured(0.0, n=6)
     frequency = data.frequency_hz * data.array.wavelength / LIGHT_SPEED
