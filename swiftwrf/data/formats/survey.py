@@ -1,6 +1,6 @@
 """Reader of survey tables: positions and RSSI, one column a receiver (wide) or one row a packet (long).
 
-Tables are CSV or Parquet, or the records in JSON, GPX and KML documents.
+Tables are CSV, maybe compressed, or Parquet, the records in JSON, GPX and KML documents, or logs in databases.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ from pathlib import Path
 import pandas as pd
 import torch
 
+from swiftwrf.data.archives import PACKED
 from swiftwrf.data.columns import is_coordinate, is_rssi
-from swiftwrf.data.files import SUFFIXES, TABLES, digests, has_header, read_table
+from swiftwrf.data.files import BINARIES, SUFFIXES, TABLES, digests, has_header, read_table
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
 from swiftwrf.data.formats.nerf2 import FILES as NERF2_FILES
 from swiftwrf.data.options import TableOptions
@@ -42,7 +43,7 @@ class SurveyTable(Format[Rssi]):
         arguments = read_survey(file, table, options, stated, keeps_rows=bool(splits))
         data = Rssi(
             **arguments,
-            name=file.stem,
+            name=file.stem.removesuffix(".csv"),
             named_splits=kept_splits(splits, torch.from_numpy(arguments["index"]), len(table)),
             source=digests([file, *others, *([stated] if stated else [])], file.parent),
         )
@@ -61,7 +62,9 @@ def _tables(path: Path) -> list[Path]:
         return [path] if path.suffix.lower() in TABLES else []
     if any((path / name).is_file() for name in NERF2_FILES):
         return []
-    return sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.name != RECEIVERS)
+    files = sorted(file for file in path.iterdir() if file.is_file() and file.name != RECEIVERS)
+    plain = [file for file in files if file.suffix.lower() in SUFFIXES]
+    return plain or [file for file in files if file.suffix.lower() in (*PACKED, *BINARIES)]
 
 
 def _table(path: Path) -> tuple[Path, list[Path], pd.DataFrame]:
