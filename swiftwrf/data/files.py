@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from swiftwrf.choices import CARRIERS_HZ
 from swiftwrf.data.archives import MAX_UNPACKED_BYTES, PACKED, refusing_broken, unpacked
-from swiftwrf.data.cells import DECIMAL_COMMA, NO_VALUE, column_of_numbers
+from swiftwrf.data.cells import NO_VALUE, column_of_numbers, with_decimal_points
 from swiftwrf.errors import InputError, optional_module
 from swiftwrf.runtime.plain import TextLoader
 from swiftwrf.runtime.registry import Registry
@@ -157,8 +157,8 @@ def read_table(file: Path, header: bool = True) -> pd.DataFrame:
     Args:
         file: A log as in `swiftwrf.contrib.formats.databases`, a document as in `swiftwrf.contrib.formats.documents`,
             Parquet, or one row a line with commas, semicolons or tabs between values; the most frequent one in the header
-            counts. Numbers may have a decimal comma if it is not the comma. Lines before the header are skipped. Texts may
-            be compressed as .gz or .zip.
+            counts. Numbers may have a decimal comma, in quotes if the separator is a comma. Lines before the header are
+            skipped. Texts may be compressed as .gz or .zip.
         header: The first line contains the names of the columns. Otherwise, they are named 1, 2, ...
 
     Returns:
@@ -225,9 +225,9 @@ def table_of(source: object, text: str, header: bool = True) -> pd.DataFrame:
         )
     if not header:
         lines = [[str(column) for column in range(1, len(lines[0]) + 1)], *lines]
+    if separator != "," or '"' in text:
+        lines = [lines[0], *with_decimal_points(lines[1:], quoted=separator == ",")]
     names, rows, notes = _regular(source, lines)
-    if separator != ",":
-        rows = [[DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in line] for line in rows]
     table = pd.DataFrame(rows, columns=names, dtype=object)
     table.attrs["notes"] = notes
     return table

@@ -208,6 +208,14 @@ FORMS = {
     "row of units": Form(shaped(lambda line: [line[0], "m,m,dBm,dBm,dBm,dBm", *line[1:]]), ("header",)),
     "lines above": Form(shaped(lambda line: ["Survey export", "Project: office, 2nd floor", "", *line]), ("header",)),
     "semicolons and decimal commas": Form(lambda t: t.to_csv(index=False, sep=";", decimal=",")),
+    "decimal commas in quotes": Form(lambda t: t.to_csv(index=False, decimal=","), None),
+    "points between thousands": Form(
+        lambda t: (
+            (t + [2000, 3000, 0, 0, 0, 0])
+            .map(lambda v: f"{v:,.2f}".translate(str.maketrans(",.", ".,")))
+            .to_csv(index=False, sep=";")
+        )
+    ),
     "names of axes": Form(lambda t: t.rename(columns={"x": "Pos X (m)", "y": "pos_y"})),
 }
 
@@ -231,6 +239,15 @@ def test_a_written_table_has_its_name_and_says_how_it_was_taken(table, tmp_path)
     assert noted(data, f"-100 counts as not detected: {SILENT.sum()} of {4 * N} cells ({SILENT.mean():.0%})")
     again = read(text(table.iloc[[*range(N), 3, 3]]), tmp_path)
     assert noted(again, f"rows equal an earlier one in all columns and count once more: 2 of {N + 2}")
+
+
+def test_commas_between_thousands_are_no_decimal_commas(table, tmp_path):
+    """A quoted 1,250 may be 1.25 or 1250: such a table is refused, unless other cells decide."""
+    table[["x", "y"]] = (100 * table[["x", "y"]]).round() + 1000
+    grouped = table.assign(x=table.x.map("{:,.0f}".format), y=table.y.map("{:,.0f}".format))
+    for doubtful in (grouped.astype(dict.fromkeys(NAMES, int)), grouped):
+        with pytest.raises(InputError, match="is not a number"):
+            read(text(doubtful), tmp_path)
 
 
 def test_parquet(table, tmp_path):
