@@ -211,7 +211,7 @@ FORMS = {
     "decimal commas in quotes": Form(lambda t: t.to_csv(index=False, decimal=","), None),
     "points between thousands": Form(
         lambda t: (
-            (t + [2000, 3000, 0, 0, 0, 0])
+            t.assign(x=t.x + 2000, y=t.y + 3000)
             .map(lambda v: f"{v:,.2f}".translate(str.maketrans(",.", ".,")))
             .to_csv(index=False, sep=";")
         )
@@ -264,6 +264,21 @@ def test_parquet(table, tmp_path):
 
 
 # receivers
+
+
+@pytest.mark.parametrize("long", [False, True])
+def test_relayed_packets_are_no_rssi_of_this_place(table, long):
+    """A relay sends from another place, so its packets are left out, and what is left is the table without them."""
+    mesh = table[["x", "y", "a"]].rename(columns={"a": "rx_rssi"}).assign(rx_snr=4.5)
+    mesh = mesh.assign(gateway_id="!7c5a01f2") if long else mesh
+    relayed = np.arange(N) % 3 == 1
+    hops = {"hops_away": np.where(relayed, 2, 0)}, {"hop_start": 3, "hop_limit": np.where(relayed, 1, 3)}
+    for columns in hops:
+        data = Rssi.from_frame(mesh.assign(**columns).assign(rx_rssi=np.where(relayed, -30.0, mesh.rx_rssi)))
+        np.testing.assert_array_equal(data.rssi_dbm[:, 0], table.a[~relayed])
+        np.testing.assert_array_equal(data.index, np.flatnonzero(~relayed))
+        assert noted(data, f"packets that a relay sent are left out: {relayed.sum()} of {N}")
+        assert not data.labels
 
 
 @pytest.mark.parametrize("name", ["RSRP", "rssi", "RSS [dBm]", "Signal Strength", "level"])
