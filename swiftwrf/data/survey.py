@@ -59,6 +59,7 @@ from swiftwrf.data.radios import (
 from swiftwrf.data.ranked import from_ranked_lists
 from swiftwrf.data.receivers import read_receivers
 from swiftwrf.data.scans import list_margin, repeated_scans, split_packets, times_of, windows
+from swiftwrf.data.zones import zone_column
 from swiftwrf.errors import InputError, listed
 
 
@@ -138,6 +139,7 @@ class _Survey:
         if (floor := self.text("floor")) is not None and not floor.any():
             self.notes.append(f"column {self.roles.pop('floor')} is empty, so there are no floors")
         used = {options.offset_by, options.pool_by, *self.end.values()}
+        used |= {zone_column(table, self.roles["x"])} if "x" in self.roles else set()
         self.left_out, notes = ([], []) if "receiver" in self.roles else self._find_receivers(asked, used)
         taken = [f"{role} = {name}" for role, name in self.roles.items()]
         taken += [f"transmitter {axis} = {name}" for axis, name in self.end.items()]

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from pyproj import Proj
 from samples import walk
 
 from swiftwrf import InputError, Rssi, load_rssi
@@ -261,6 +262,36 @@ def test_parquet(table, tmp_path):
     long.assign(receiver=["a"] * 4 + [None] + ["a"] * 7).to_parquet(tmp_path / "walk.parquet")
     with pytest.raises(InputError, match="row 5 has no receiver"):
         load_rssi(tmp_path)
+
+
+def in_zones(table, letter="U", border=12.0):
+    """Return the walk with x and y as UTM coordinates of the zones on either side of 12 degrees east."""
+    origin = GeodeticOrigin(48.0, border)
+    degrees = origin.to_degrees(np.column_stack([table.x - 10, table.y]))
+    zones = np.where(degrees[:, 1] < border, 32, 33)
+    both = {zone: Proj(proj="utm", zone=zone, ellps="WGS84")(degrees[:, 1], degrees[:, 0]) for zone in (32, 33)}
+    x, y = (np.where(zones == 32, both[32][axis], both[33][axis]) for axis in (0, 1))
+    return table.assign(x=x, y=y, zone=[f"{zone}{letter}" for zone in zones]), np.column_stack(both[32])
+
+
+def test_zones_of_utm_are_joined(table):
+    written, expected = in_zones(table)
+    data = Rssi.from_frame(pd.concat([written, written[written.zone == "32U"]]).drop_duplicates())
+    in_main = written.zone.mode()[0] == "32U"
+    xy = data.transmitter_position[:, :2].numpy()
+    step = np.linalg.norm(np.diff(xy, axis=0), axis=1)
+    np.testing.assert_allclose(step, np.linalg.norm(np.diff(expected, axis=0), axis=1), rtol=1e-4)
+    assert not in_main or np.allclose(xy, expected, atol=1e-3)
+    assert noted(data, "positions in UTM zones 32U, 33U are those of zone")
+    assert not data.labels
+
+
+def test_zones_of_unknown_hemisphere_are_refused(table):
+    for letter in ("", "S"):
+        with pytest.raises(InputError, match="hemisphere of 32"):
+            Rssi.from_frame(in_zones(table, letter)[0])
+    areas = table.assign(zone=np.where(table.x < 10, "1", "2"))
+    is_read_as(Rssi.from_frame(areas), table)
 
 
 # receivers
