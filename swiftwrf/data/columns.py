@@ -16,7 +16,7 @@ from swiftwrf.errors import InputError, listed
 
 PLACE = (
     "pos|position|coord|coordinate|loc|location|tx|rx|transmitter|receiver|map|plan|floorplan|image|point|pixels?|px|local|robot|ue|"
-    "true|truth|gt"
+    "true|truth|gt|field|pose"
 )
 MEAN = "(?:(?:mean|avg|average|median|max|raw|filtered|wifi|wlan|ble|bt|lora|lte|nr|ss|serving|measured)_?)*"
 GPS, GPS_END = "(?:(?:gps|gnss|current|location|device|phone|best|tri)_?)?", "(?:_?(?:1?e7|dd|wgs_?84|nmea))?"

@@ -94,6 +94,7 @@ def _clock_s(column: pd.Series) -> Floats:
     if np.isnan(values).all():
         text = column if column.dtype.kind == "M" else text_of(column)
         when = pd.to_datetime(text, errors="coerce", utc=True, format="mixed")
-        return (when - pd.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy(np.float64)
-    size = np.nanmedian(values)
-    return values / next((factor for _, factor, low, high in EPOCH_UNITS if low <= size < high), 1.0)
+        values = (when - pd.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy(np.float64)
+    size = np.nanmedian(values) if np.isfinite(values).any() else 0.0
+    unit = next((factor for _, factor, low, high in EPOCH_UNITS if low <= size < high), 1.0)
+    return np.asarray(values / unit, dtype=np.float64)

@@ -101,7 +101,8 @@ def without_relayed(
     start, *left = (parsed(table[name])[0] for name in columns)
     n_relays = start - left[0] if left else start
     relayed = (n_relays > 0)[packet] & ~np.isnan(rssi)
-    of_row = relayed.any(axis=1)
+    of_row = np.asarray(relayed.any(axis=1))
     notes = [f"packets that a relay sent are left out: {of_row.sum()} of {len(rssi)}"] if of_row.any() else []
     rssi = np.where(relayed, np.nan, rssi)
-    return rssi, of_row & np.isnan(rssi).all(axis=1), notes
+    alone: NDArray[np.bool_] = of_row & np.isnan(rssi).all(axis=1)
+    return rssi, alone, notes

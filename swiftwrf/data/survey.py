@@ -58,7 +58,7 @@ from swiftwrf.data.radios import (
 )
 from swiftwrf.data.ranked import from_ranked_lists
 from swiftwrf.data.receivers import read_receivers
-from swiftwrf.data.scans import list_margin, repeated_scans, split_packets, times_of, windows
+from swiftwrf.data.scans import held_fixes, list_margin, repeated_scans, split_packets, times_of, windows
 from swiftwrf.data.zones import zone_column
 from swiftwrf.errors import InputError, listed
 
@@ -240,6 +240,11 @@ class _Survey:
                 f"{fate}: {int(repeated.sum())} of {len(row)}"
             )
             row = row if keeps_rows else row[~repeated]
+        if not keeps_rows and (held := held_fixes(self.coordinate[row])).any():
+            notes.append(
+                f"rows that repeat a held fix, before a jump to the next one, are left out: {held.sum()} of {len(row)}"
+            )
+            row = row[~held]
         self.notes += notes
         self.index, self.table_row = row, self.table_row.max(axis=1)[row]
         self.rssi, self.coordinate = self.rssi[row], self.coordinate[row]
@@ -285,9 +290,12 @@ class _Survey:
             )
             self.names = [f"place{number}" for number in range(1, len(receiver_position) + 1)]
             self.notes += notes
-        labels = [*self.unused, *self.left_out, *([self.roles["session"]] if "session" in self.roles else [])]
-        labels = [name for name in labels if name != self.corrected]
-        labels, moves = labels_of(self.table, labels, self.roles.get("receiver")), bool(self.end or options.transmitter)
+        candidate = [*self.unused, *self.left_out, *([self.roles["session"]] if "session" in self.roles else [])]
+        candidate = [name for name in candidate if name != self.corrected]
+        labels, moves = (
+            labels_of(self.table, candidate, self.roles.get("receiver")),
+            bool(self.end or options.transmitter),
+        )
         if labels and not options.offset_by:
             self.notes.append(
                 f"rows differ in {listed(labels)}; swiftwrf inspect tests whether its values have constant offsets"

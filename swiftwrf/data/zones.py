@@ -66,6 +66,6 @@ def in_one_zone(source: object, zone: pd.Series, xy: Floats) -> tuple[Floats, li
         rows = (zone == name).to_numpy()
         joined[rows] = xy[rows]
         if name != main:
-            degrees = projection(name)(*xy[rows].T, inverse=True)
+            degrees = projection(name)(xy[rows, 0], xy[rows, 1], inverse=True)
             joined[rows] = np.stack(projection(main)(*degrees), axis=1)
     return joined, [f"positions in UTM zones {listed(names)} are those of zone {main}"]

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from swiftwrf import InputError, load_rssi
+from swiftwrf import InputError, Rssi, load_rssi
 
 START = pd.Timestamp("2026-06-10 08:00:00")
 
@@ -59,3 +59,34 @@ def test_logs_of_different_times_are_refused(tmp_path):
     write(tmp_path, 0.1)
     with pytest.raises(InputError, match="correct the times of one log"):
         load_rssi(tmp_path)
+
+
+def walk_of(x, **columns):
+    x = np.asarray(x, dtype=float)
+    rssi = -40.0 - np.arange(len(x)) % 7
+    return pd.DataFrame({"x": x, "y": x / 2, "a": rssi, "b": rssi - 20 + np.arange(len(x)) % 3, **columns})
+
+
+def test_rows_of_a_held_fix_are_left_out():
+    moving = np.arange(60.0)
+    held = np.where((moving > 20) & (moving < 35), 20.0, moving)
+    data = Rssi.from_frame(walk_of(held))
+    np.testing.assert_array_equal(data.index, [*range(21), *range(35, 60)])
+    assert any("held fix, before a jump to the next one, are left out: 14 of 60" in note for note in data.notes)
+    stands = np.concatenate([moving[:21], np.full(14, 20.0), moving[21:]])  # and then goes on from there
+    points = np.repeat(np.arange(12.0), 6)
+    for x in (stands, points):
+        assert len(Rssi.from_frame(walk_of(x))) == len(x)
+
+
+def test_times_that_run_back():
+    elapsed = 2.0 * np.arange(60)
+    clock = pd.Timestamp("2026-10-25 02:59:00") + pd.to_timedelta(elapsed - 3600 * (elapsed >= 60), unit="s")
+    data = Rssi.from_frame(walk_of(np.arange(60), time=clock.astype(str)))
+    np.testing.assert_allclose(data.time, elapsed)
+    assert any("run back by 3598 s before row 31, as at the end of summer time" in note for note in data.notes)
+    reset = Rssi.from_frame(
+        walk_of(np.arange(60), time=(clock + pd.to_timedelta(500.0 * (elapsed >= 60), unit="s")).astype(str))
+    )
+    np.testing.assert_allclose(reset.time, elapsed - 3100 * (elapsed >= 60))
+    assert any(note.endswith("run back by 3098 s before row 31") for note in reset.notes)

@@ -217,6 +217,13 @@ FORMS = {
             .to_csv(index=False, sep=";")
         )
     ),
+    "poses of ROS": Form(
+        lambda t: (
+            t.rename(columns={axis: f"field.pose.pose.position.{axis}" for axis in "xy"})
+            .assign(**{"field.pose.pose.orientation.x": -0.4, "field.pose.pose.orientation.y": 0.9})
+            .assign(**{"%time": 1_780_000_000_000_000_000 + 500_000_000 * np.arange(N)})
+        )
+    ),
     "names of axes": Form(lambda t: t.rename(columns={"x": "Pos X (m)", "y": "pos_y"})),
 }
 
