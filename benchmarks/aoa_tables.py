@@ -115,7 +115,7 @@ def locating_spectra() -> str:
 def stations() -> str:
     """Return position errors by several stations, by the best single one, and of the baselines, medians over the draws."""
     rows = []
-    for name in ("stations", "stations_rooms"):
+    for name in ("stations", "stations_rooms", "stations_rooms_spectra"):
         for scene, entry in load(name).get("scenes", {}).items():
             found, n = entry["median"], len(entry["draws"])
             methods = {"best": found["best_station_m"], **found["position_m"]}

@@ -76,7 +76,11 @@ def scenes(config: Config) -> Iterator[tuple[str, Iterator[Stations]]]:
         draws = (simulated_stations(count, N_ARRAYS, seed=draw, **OFFICES[name]) for draw in range(config.draws))
         yield name, (with_split(data, known) for data in draws)
     if config.rooms:
-        yield "furnished rooms", (with_split(furnished_rooms(config, seed), known) for seed in range(config.rooms))
+        alone = "" if config.subcarriers else ", spectra alone"
+        yield (
+            f"furnished rooms{alone}",
+            (with_split(furnished_rooms(config, seed), known) for seed in range(config.rooms)),
+        )
 
 
 def furnished_rooms(config: Config, seed: int) -> Stations:

@@ -66,13 +66,13 @@ def read_json(file: Path) -> Row:
     return content
 
 
-def write_table(file: Path, rows: Iterable[Row]) -> None:
+def write_table(file: Path, rows: Iterable[Row] | pd.DataFrame) -> None:
     """Write a comma-separated table with the keys of the rows as columns."""
     write_text(file, as_table(rows))
 
 
-def as_table(rows: Iterable[Row]) -> str:
-    r"""Return the text of a comma-separated table with the keys of the rows as columns.
+def as_table(rows: Iterable[Row] | pd.DataFrame) -> str:
+    r"""Return the text of a comma-separated table with the keys of the rows as columns; numbers of a frame stay as they are.
 
     Example:
         >>> as_table([{"receiver": "=1+1", "@home": -60.5}])
@@ -80,6 +80,11 @@ def as_table(rows: Iterable[Row]) -> str:
     """
     import pandas as pd
 
+    if isinstance(rows, pd.DataFrame):
+        is_number = pd.api.types.is_numeric_dtype
+        texts = {name: [*map(_escaped, rows[name])] for name in rows if not is_number(rows[name])}
+        text: str = rows.assign(**texts).rename(columns=_escaped).to_csv(index=False, lineterminator="\r\n")
+        return text
     rows = list(rows)
     columns = dict.fromkeys(key for row in rows for key in row)
     cells = {_escaped(name): pd.Series([_escaped(row.get(name)) for row in rows], dtype=object) for name in columns}
@@ -168,7 +173,7 @@ def read_npz(file: Path) -> dict[str, NDArray[Any]]:
 def write_result(result: Recorded, folder: Path) -> Row:
     """Write the tables and arrays of a result into a folder, and return the content of metrics.json."""
     for name, table in result.tables.items():
-        write_table(folder / f"{name}.csv", table.to_dict("records"))
+        write_table(folder / f"{name}.csv", table)
     for name, arrays in result.arrays.items():
         write_npz(folder / f"{name}.npz", arrays)
     return dict(result.metrics)

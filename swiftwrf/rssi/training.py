@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -140,7 +141,9 @@ def prepare(
         losses.append(fit_path_losses(*rows, replace(curve, is_limit=torch.zeros_like(curve.is_limit))))
         limits.append(torch.full_like(limits[0], torch.nan))
     residual = torch.stack([of_pool.rssi - each.each(distance) for each in losses], dim=-1)[:, often_detected(pool)]
-    kernels = choose_residual_kernels(bins, residual, config.noises, pool.floors is not None)
+    # values above a limit vary less than all, so that too little noise would seem best
+    least = [config.least_noise_with_limits if bool(limit.isfinite().any()) else 0.0 for limit in limits]
+    kernels = choose_residual_kernels(bins, residual, config.noises, pool.floors is not None, least)
     heads, results = Heads.alike(config.n_primitives, config.seed), []
     for each, limit, (kernel, has_field) in zip(losses, limits, kernels, strict=True):
         loss = each.columns(fitted)
@@ -202,7 +205,11 @@ def prior_std(variance: Tensor, kernel: Kernel | None, noise_scale: Tensor) -> t
 
 
 def choose_residual_kernels(
-    bins: Bins, residual: Tensor, noises: tuple[float, ...], has_floors: bool = False
+    bins: Bins,
+    residual: Tensor,
+    noises: tuple[float, ...],
+    has_floors: bool = False,
+    least_noise: Sequence[float] = (0.0,),
 ) -> list[tuple[Kernel, bool]]:
     """Choose the kernel with the lowest mean absolute error on held-out residuals of each of several path-loss models.
 
@@ -211,6 +218,7 @@ def choose_residual_kernels(
         residual: Residuals of k path-loss models, (n, P, k) [dB], nan where not detected.
         noises: Compared variances of one row, relative to that of the field.
         has_floors: Whether differences in height may count more than others.
+        least_noise: Smallest variance of each path-loss model, (k,).
 
     Returns:
         For each path-loss model the kernel, and whether its error is lower than that of no field at all.
@@ -234,7 +242,9 @@ def choose_residual_kernels(
         for out, _ in each_fold(fold, (~missing).nonzero()[:, 0]):
             every = torch.cat([out, missing.nonzero()[:, 0]])
             errors.append(held_out_errors(precision, dual[:, :, r], every)[:, : len(out)])
-    score, best = torch.cat(errors, dim=1).abs().mean(dim=1).min(dim=0)
+    noise = torch.tensor([kernel.noise for kernel in kernels])[:, None]
+    score = torch.cat(errors, dim=1).abs().mean(dim=1)
+    score, best = score.masked_fill(noise < torch.tensor(least_noise), torch.inf).min(dim=0)
     better = (score < residual.flatten(0, 1).abs().nanmean(dim=0)).tolist()
     return [(kernels[number], has_field) for number, has_field in zip(best.tolist(), better, strict=True)]
 

@@ -180,7 +180,7 @@ def write_page(folder: Path, page: Page) -> Page:
     for file, text in svg.items():
         write_text(figures / f"{file}.svg", text)
     for plot in page.plots:
-        write_table(figures / f"{plot.name}.csv", plot.data.to_dict("records"))
+        write_table(figures / f"{plot.name}.csv", plot.data)
     write_text(folder / REPORT, html)
     return page
 

@@ -40,6 +40,7 @@ REQUIRED_OPTIONS = {
     "convert": ["data", "taken"],
     "inspect": ["data"],
     "view": ["data"],
+    "plan": ["data"],
     "scenes": ["--room", "office", "--moving", "receiver", "--positions", "5"],
     "predict": ["data", "data"],
     "locate": ["--cells", "100"],

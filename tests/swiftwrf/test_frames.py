@@ -23,6 +23,7 @@ import augment
 import swiftwrf
 from augment.estimators import Estimator, make_estimator
 from augment.estimators.subspace import Music
+from augment.suggest import suggest_scans
 from augment.testing import check_estimator
 from swiftwrf import (
     FieldModel,
@@ -42,6 +43,7 @@ from swiftwrf import (
 from swiftwrf.contrib.comparison import rssi as comparison
 from swiftwrf.contrib.comparison.predictors import make_predictor
 from swiftwrf.contrib.online import Follower, Monitor, adapted, prequential, score
+from swiftwrf.contrib.survey.plan import CoveragePlan, plan_coverage
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin
 from swiftwrf.rssi import FloorAttenuation, estimate_floor_attenuation, estimate_offsets
 from swiftwrf.rssi.base import RssiPredictor
@@ -171,6 +173,18 @@ def covered(data):
     return torch.tensor([values["not_measured"], values["scans_above"]])
 
 
+def positions_of_hidden(data):
+    """Return estimated positions of receivers that the data do not state, less the mean of the rows, and their radii."""
+    hidden = data.derived(receiver_position=torch.full_like(data.receiver_position, torch.nan))
+    found = rssi.locate_receivers(hidden)
+    at = found.position - data.transmitter_position.mean(dim=0)
+    return torch.cat([at[:, :2], found.radius_m[:, None]], dim=1)
+
+
+def middle(data):
+    return data.transmitter_position.mean(dim=0, keepdim=True)
+
+
 # a fit estimates neither offsets nor, without their names, floors: there these are other data
 FIT = ("nothing", "origin", "heights of floors", "order")
 OF_RSSI = {
@@ -200,6 +214,17 @@ OF_RSSI = {
         training_rows,
         lambda data: torch.tensor([estimate_floor_attenuation(data).db]),
         FIT,
+    ),
+    rssi.locate_receivers: (training_rows, positions_of_hidden, ("nothing", "origin", "heights of floors")),
+    plan_coverage: (
+        new_rows,
+        lambda data: plan_coverage(model(), data, above_dbm=-70.0, candidates=middle(data)).after.mean(dim=1),
+        ("nothing", "order"),
+    ),
+    suggest_scans: (
+        new_rows,
+        lambda data: suggest_scans(model(), data, 2, -70.0).variance,
+        ("nothing", "origin", "order"),
     ),
     swiftwrf.inspect: (
         survey,
@@ -353,6 +378,7 @@ OF_CHANNELS = {
 }
 # they hold or return rows as these are given, positions, or whether data have what a model needs
 OF_NO_FRAME = {
+    CoveragePlan,
     swiftwrf.Stations,
     augment.choose.Fold,
     rssi.RssiComparison,
@@ -408,6 +434,13 @@ def public_functions():
     methods = [getattr(kind, name) for kind in classes for name in dir(kind) if not name.startswith("_")]
     functions = [value for value in (*values, *methods) if inspect.isroutine(value) or inspect.isclass(value)]
     return {plain(function) for function in functions if takes_data(function)}
+
+
+def test_a_plan_about_another_origin_is_refused():
+    other = CHANGES["origin"](new_rows())
+    with pytest.raises(InputError, match=r"give survey.about\(model.origin\)"):
+        plan_coverage(model(), other)
+    plan_coverage(model(), other.about(model().origin), candidates=middle(new_rows()))
 
 
 def test_every_public_function_that_takes_data_is_tested():

@@ -154,6 +154,8 @@ def plan_coverage(
     """
     if survey.receiver_moves:
         raise InputError(f"the receivers of {survey.name} move; a plan is for access points at fixed places")
+    if survey.origin != model.origin:
+        raise InputError(f"{survey.name} has another origin than the model; give survey.about(model.origin)")
     names, changes = list(survey.receiver_names), {**(power_db or {})}
     switched = {receiver_row(names, name, survey.name) for name in off}
     change = torch.zeros(len(names), dtype=torch.float64)

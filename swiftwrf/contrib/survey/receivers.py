@@ -337,8 +337,11 @@ class _Search:
         """Return the cells of each receiver of these columns, at heights above the transmitters on its floor."""
         heights = self.data.transmitter_position[:, 2].median().expand(len(columns))
         if self.attenuation is not None:
-            of_floor = torch.tensor(self.attenuation.floors.height_m, dtype=torch.float64)
-            heights = of_floor[torch.tensor(self.attenuation.receiver_floor)[list(columns)]]
+            at, floors = self.data.transmitter_position, self.attenuation.floors
+            floor = floors.number(at)
+            rows = [at[floor == number, 2] for number in range(len(floors.names))]
+            of_floor = [float(z.median()) if len(z) else low for z, low in zip(rows, floors.height_m, strict=True)]
+            heights = torch.tensor([of_floor[self.attenuation.receiver_floor[column]] for column in columns]).double()
         position = self.cells.position.repeat(len(columns), 1, 1)
         position[..., 2] += heights[:, None]
         shape = position.shape[:2]

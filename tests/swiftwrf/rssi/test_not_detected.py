@@ -23,17 +23,24 @@ LIMIT = -88.0
 RECEIVER = torch.tensor([[3.0, 3, 2], [27, 4, 2], [15, 18, 2], [5, 15, 2]], dtype=torch.float64)
 
 
-def survey(n=150, limit=LIMIT, missed=0.0, seed=0):
+def survey(n=150, limit=LIMIT, missed=0.0, seed=0, packet_db=2.0):
     """Path loss, a smooth field and noise at four receivers, and what is below the limit missing; with the true power."""
     generator = torch.Generator().manual_seed(seed)
     position = torch.tensor([0.0, 0, 1]) + torch.rand(n, 3, generator=generator).double() * torch.tensor([30.0, 20, 0])
     truth = -42.0 - 38.0 * log_distance(position, RECEIVER) + 3 * torch.sin(position[:, :1] / 4 + torch.arange(4))
-    rssi = truth + 2.0 * torch.randn(n, 4, generator=generator)
+    rssi = truth + packet_db * torch.randn(n, 4, generator=generator)
     lost = (rssi < limit) | (torch.rand(n, 4, generator=generator) < missed)
     data = Rssi(
         rssi.where(~lost, torch.nan), position, receiver_position=RECEIVER, receiver_names=list("abcd"), name="s"
     )
     return data, truth
+
+
+def test_maps_below_the_limit_have_the_noise_of_packets():
+    """Values above the limit vary less than all, so with a tenth of the noise weak cells are predicted too strong."""
+    data, _ = survey(packet_db=0.3)
+    assert RssiModel(not_detected="weak").fit(data).kernel.noise >= 0.3
+    assert RssiModel(not_detected="unknown").fit(data).kernel.noise < 0.3
 
 
 @pytest.fixture(scope="module")
