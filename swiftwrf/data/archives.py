@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import math
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
@@ -22,6 +23,7 @@ MAX_ROWS_BYTES = 2**36  # of an array that is read some rows at a time
 NUMPY, HDF5, MATLAB = (".npz",), (".h5", ".hdf5"), (".mat",)
 ARCHIVES = (*NUMPY, *HDF5, *MATLAB)  # suffixes of files that hold arrays by name
 MATLAB_HDF5 = (b"MATLAB 7.3", b"\x89HDF")  # first bytes of .mat files that are HDF5, of MATLAB and of Octave
+PACKED = (".gz", ".zip")  # suffixes of files that hold one compressed text
 NUMBERS = "biufc"  # kinds of NumPy types
 Arrays = dict[str, NDArray[Any]]
 
@@ -126,6 +128,32 @@ def _stream(file: Path, name: str) -> Iterator[tuple[Any, int]]:
         _check_total(member.file_size, file, MAX_ROWS_BYTES)
         with archive.open(member) as stream:
             yield stream, member.file_size
+
+
+def unpacked(file: Path, most: int) -> bytes:
+    """Return the text in a gzip file, or the only one in a zip archive.
+
+    Raises:
+        InputError: A broken file, none or several texts in an archive, or a text of more than `most` bytes.
+    """
+    kind = "a gzip file" if file.suffix.lower() == ".gz" else "a zip archive"
+    with refusing_broken(file, kind), file.open("rb") as stream:
+        if file.suffix.lower() == ".gz":
+            content = gzip.GzipFile(fileobj=stream).read(most + 1)
+        else:
+            with zipfile.ZipFile(stream) as archive, archive.open(_only_text(archive.namelist())) as member:
+                content = member.read(most + 1)
+        if len(content) > most:
+            raise InputError(f"it unpacks to more than {most} bytes; split the table")
+        return content
+
+
+def _only_text(names: Sequence[str]) -> str:
+    texts = [n for n in names if n.lower().endswith((".csv", ".tsv", ".txt")) and not n.startswith("__MACOSX")]
+    tables = [name for name in texts if not name.lower().endswith(".txt")] or texts  # beside a readme
+    if len(tables) != 1:
+        raise InputError(f"it holds {len(tables)} tables ({listed(names)}); unpack it and name the one to read")
+    return tables[0]
 
 
 @contextmanager

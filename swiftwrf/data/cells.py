@@ -48,6 +48,8 @@ DIGITS_OF_DATE = re.compile(
 DAY_FIRST = re.compile(r"\s*(?:\d{1,2}\.\d{1,2}\.|(?:1[3-9]|2\d|3[01])/\d{1,2}/)\d{2,4}\b.*")
 DAY_S = 86400.0  # length of a day
 DECIMAL_COMMA = re.compile(r"^(\s*[+-]?\d+),(\d+\s*)$")
+THOUSANDS = re.compile(r"\s*[+-]?[1-9]\d{0,2},\d{3}\s*")  # or a number with a decimal comma
+DOTTED = re.compile(r"\s*[+-]?\d{1,3}(?:\.\d{3})+(?:,\d+)?\s*")  # 1.000,05
 CLOCK_ONLY = re.compile(r"\s*\d{1,2}:\d\d(?::\d\d(?:[.,]\d+)?)?\s*(?:[ap]\.?m\.?)?\s*", re.IGNORECASE)
 
 
@@ -117,6 +119,35 @@ def _number_in(cell: str) -> float | None:
     sign = -1.0 if number and number[2][-1] in "SW" else 1.0  # of 47.4 N, 8.5 W
     value = sign * float(pd.to_numeric(number[1].replace(" ", "") if number else plain, errors="coerce"))
     return None if np.isnan(value) else value
+
+
+def with_decimal_points(lines: list[list[str]], quoted: bool = False) -> list[list[str]]:
+    """Return lines of cells whose decimal commas are points, without the points between thousands (1.000,05).
+
+    Args:
+        lines: Cells.
+        quoted: The separator of cells is a comma, so that cells with a comma were in quotes. Commas are then decimal only if
+            no number has a point, and not all of them may separate thousands.
+
+    Example:
+        >>> with_decimal_points([["0,5", "1.000,05", "2.000"]]), with_decimal_points([["1,000", "-60"]], quoted=True)
+        ([['0.5', '1000.05', '2000']], [['1,000', '-60']])
+    """
+    with_comma = [cell for line in lines for cell in line if "," in cell]
+    dotted = any(DOTTED.fullmatch(cell) for cell in with_comma)
+    if quoted:
+        commas = [cell for cell in with_comma if DECIMAL_COMMA.match(cell)]
+        if all(THOUSANDS.fullmatch(cell) for cell in commas) and not dotted:
+            return lines
+        if not dotted and any("." in cell and NUMBER.fullmatch(cell.strip()) for line in lines for cell in line):
+            return lines
+
+    def pointed(cell: str) -> str:
+        if dotted and DOTTED.fullmatch(cell):
+            cell = cell.replace(".", "")
+        return DECIMAL_COMMA.sub(r"\1.\2", cell)
+
+    return [[pointed(cell) for cell in line] for line in lines]
 
 
 def column_of_numbers(source: object, table: pd.DataFrame, name: str) -> Floats:

@@ -16,7 +16,7 @@ from swiftwrf.errors import InputError, listed
 
 PLACE = (
     "pos|position|coord|coordinate|loc|location|tx|rx|transmitter|receiver|map|plan|floorplan|image|point|pixels?|px|local|robot|ue|"
-    "true|truth|gt"
+    "true|truth|gt|field|pose"
 )
 MEAN = "(?:(?:mean|avg|average|median|max|raw|filtered|wifi|wlan|ble|bt|lora|lte|nr|ss|serving|measured)_?)*"
 GPS, GPS_END = "(?:(?:gps|gnss|current|location|device|phone|best|tri)_?)?", "(?:_?(?:1?e7|dd|wgs_?84|nmea))?"
@@ -46,7 +46,7 @@ ROLES = {  # patterns of names in lower case with underscores and without units,
     ],
     "rssi": [
         f"{MEAN}rsrp",
-        f"{MEAN}rssi?(?:_?(?:value|mean|avg|average|median|raw))*",
+        f"(?:rx_)?{MEAN}rssi?(?:_?(?:value|mean|avg|average|median|raw))*",
         f"{MEAN}(?:rscp|rxlev|rx_?lev(?:el)?|rx_?power|received_?power|dbm)",
         f"{MEAN}(?:received_)?signal(?:_?(?:strength|level|power|dbm))?",
         f"{MEAN}(?:power|strength|level)(?:_?dbm)?",
@@ -72,6 +72,7 @@ GROUPS_OF_ROWS = re.compile(  # columns that distinguish rows, but not the recei
 MARKS = {"tx": "transmitter", "transmitter": "transmitter", "rx": "receiver", "receiver": "receiver"}  # words in names
 TRANSMITTED = re.compile(r"(?:.*_)?(?:tx_?(?:power|pwr|pow)\w*|transmit\w*_power|power_?tx|eirp|erp)")
 SNR = re.compile(r"(?:.*_)?[le]?snr(?:_(?:mean|avg|median))?")
+HOPS = re.compile(r"(?:n_?)?hops(?:_?(?:away|taken|count))?|hop_?count")  # of packets in a mesh
 GEODETIC = {"x": "longitude", "y": "latitude"}  # that take the place of x and y
 
 
@@ -134,6 +135,26 @@ def find_roles(
             )
         del roles["receiver"]  # which distinguishes rows of a wide table
     return roles
+
+
+def relay_columns(table: pd.DataFrame) -> list[str]:
+    """Return the column with the number of relays of each packet, or those of hops left at the start and the end."""
+    plain = {plain_name(name): name for name in table.columns}
+    counted = [name for word, name in plain.items() if HOPS.fullmatch(word)]
+    return counted[:1] or (
+        [plain["hop_start"], plain["hop_limit"]] if {"hop_start", "hop_limit"} <= plain.keys() else []
+    )
+
+
+def labels_of(
+    table: pd.DataFrame, names: Sequence[str], receiver: str | None, max_values: int = 30, min_rows: int = 10
+) -> tuple[str, ...]:
+    """Return columns with few different values, each in several rows, that are no names of receivers. Not studied."""
+    if receiver is not None:
+        several = table.groupby(receiver)[list(names)].nunique().max() > 1
+        names = [name for name in names if several[name]]
+    counts = {name: text_of(table[name]).value_counts() for name in names}
+    return tuple(name for name, n in counts.items() if 2 <= len(n) <= max_values and int(n.min()) >= min_rows)
 
 
 def column_of_quantity(source: object, table: pd.DataFrame, quantity: str) -> str:

@@ -18,8 +18,8 @@ import yaml
 from numpy.typing import NDArray
 
 from swiftwrf.choices import CARRIERS_HZ
-from swiftwrf.data.archives import MAX_UNPACKED_BYTES, refusing_broken
-from swiftwrf.data.cells import DECIMAL_COMMA, NO_VALUE, column_of_numbers
+from swiftwrf.data.archives import MAX_UNPACKED_BYTES, PACKED, refusing_broken, unpacked
+from swiftwrf.data.cells import NO_VALUE, column_of_numbers, with_decimal_points
 from swiftwrf.errors import InputError, optional_module
 from swiftwrf.runtime.plain import TextLoader
 from swiftwrf.runtime.registry import Registry
@@ -32,7 +32,13 @@ DOCUMENTS: Registry[pd.DataFrame] = Registry(
         (".json", ".geojson", ".gpx", ".kml"), "swiftwrf.contrib.formats.documents:table_in_document"
     ),
 )
-TABLES = (*SUFFIXES, *DOCUMENTS)  # of tables that are named
+# functions that return the table in a file of another program, from its path
+BINARIES: Registry[pd.DataFrame] = Registry(
+    "binary file",
+    declared=dict.fromkeys((".sqlite", ".sqlite3", ".db", ".kismet"), "swiftwrf.contrib.formats.databases:table_in_log")
+    | dict.fromkeys((".xlsx", ".xls", ".ods"), "swiftwrf.contrib.formats.databases:refuse_workbook"),
+)
+TABLES = (*SUFFIXES, *DOCUMENTS, *PACKED, *BINARIES)  # of tables that are named
 SEPARATORS = ",;\t"
 MAX_TEXT_BYTES = 2**28  # a million rows of positions take a tenth of it
 
@@ -76,17 +82,18 @@ def read_bytes(file: Path) -> bytes:
 
 
 def read_text(file: Path) -> str:
-    """Return a text in UTF-8, with or without a byte-order mark.
+    """Return a text in UTF-8, with or without a byte-order mark, which may be compressed as .gz or .zip.
 
     Raises:
-        InputError: The file is missing, larger than 256 MiB, or in another encoding.
+        InputError: The file is missing, larger than 256 MiB, broken, or in another encoding.
     """
     with refusing_unreadable(file):
         size = file.stat().st_size
     if size > MAX_TEXT_BYTES:
         raise InputError(f"{file} has {size} bytes; a table or list has at most {MAX_TEXT_BYTES}")
+    content = unpacked(file, MAX_TEXT_BYTES) if file.suffix.lower() in PACKED else read_bytes(file)
     try:
-        text = read_bytes(file).decode("utf-8-sig")
+        text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{file} is no text in UTF-8 (byte {error.start + 1}); save it in that encoding") from None
     if "\0" in text:
@@ -145,12 +152,13 @@ def _lines_before_header(text: str, max_lines: int = 20, max_missing_cells: int 
 
 
 def read_table(file: Path, header: bool = True) -> pd.DataFrame:
-    """Return the table in a CSV, Parquet, JSON, GPX or KML file. Cells are text, except those of Parquet.
+    """Return the table in a CSV, Parquet, JSON, GPX or KML file. Cells are text, except those of Parquet and databases.
 
     Args:
-        file: A document as in `swiftwrf.contrib.formats.documents`, Parquet, or one row a line with commas, semicolons or
-            tabs between values; the most frequent one in the header counts. Numbers may have a decimal comma if it is not
-            the comma. Lines before the header are skipped.
+        file: A log as in `swiftwrf.contrib.formats.databases`, a document as in `swiftwrf.contrib.formats.documents`,
+            Parquet, or one row a line with commas, semicolons or tabs between values; the most frequent one in the header
+            counts. Numbers may have a decimal comma, in quotes if the separator is a comma. Lines before the header are
+            skipped. Texts may be compressed as .gz or .zip.
         header: The first line contains the names of the columns. Otherwise, they are named 1, 2, ...
 
     Returns:
@@ -159,10 +167,11 @@ def read_table(file: Path, header: bool = True) -> pd.DataFrame:
     Raises:
         InputError: No such file, one that is broken, a column without name or a name twice, rows of unequal length, no rows.
     """
-    if file.suffix.lower() in DOCUMENTS:
-        table: pd.DataFrame = DOCUMENTS[file.suffix.lower()](file, read_text(file), file.suffix.lower())
+    kind = _kind(file)
+    if kind in (*DOCUMENTS, *BINARIES):
+        table: pd.DataFrame = BINARIES[kind](file) if kind in BINARIES else DOCUMENTS[kind](file, read_text(file), kind)
         return table
-    if file.suffix.lower() != ".parquet":
+    if kind != ".parquet":
         text = read_text(file)
         skipped = _lines_before_header(text) if header else 0
         *before, rest = text.split("\n", skipped)
@@ -182,10 +191,16 @@ def read_table(file: Path, header: bool = True) -> pd.DataFrame:
 
 def has_header(file: Path) -> bool:
     """Return False if the first line of a table holds values: numbers alone, with signs, fractions or twice the same."""
-    if file.suffix.lower() in (".parquet", *DOCUMENTS):
+    if _kind(file) in (".parquet", *DOCUMENTS, *BINARIES):
         return True
     line = read_text(file).split("\n", 1)[0]
     return not _holds_values(next(csv.reader([line], delimiter=_separator(line)), []))
+
+
+def _kind(file: Path) -> str:
+    """Return the suffix of a file, of a compressed one that of its content."""
+    kind = Path(file.stem if file.suffix.lower() == ".gz" else file).suffix.lower()
+    return ".csv" if kind in (".parquet", *BINARIES) and kind != file.suffix.lower() else kind
 
 
 def _separator(header: str) -> str:
@@ -210,9 +225,9 @@ def table_of(source: object, text: str, header: bool = True) -> pd.DataFrame:
         )
     if not header:
         lines = [[str(column) for column in range(1, len(lines[0]) + 1)], *lines]
+    if separator != "," or '"' in text:
+        lines = [lines[0], *with_decimal_points(lines[1:], quoted=separator == ",")]
     names, rows, notes = _regular(source, lines)
-    if separator != ",":
-        rows = [[DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in line] for line in rows]
     table = pd.DataFrame(rows, columns=names, dtype=object)
     table.attrs["notes"] = notes
     return table

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from swiftwrf.data.cells import Floats, text_of
+from swiftwrf.data.cells import Floats, parsed, text_of
 from swiftwrf.data.radios import plain_receiver, separate_radios, strongest_of_each, unknown_ids
 from swiftwrf.errors import InputError, listed
 
@@ -80,3 +82,27 @@ def rows_of_packets(
     at = row[named], number
     rssi[at], packet[at] = power[named], np.flatnonzero(named)
     return list(names), rssi, packet, notes
+
+
+def without_relayed(
+    table: pd.DataFrame, columns: Sequence[str], rssi: Floats, packet: NDArray[np.int64]
+) -> tuple[Floats, NDArray[np.bool_], list[str]]:
+    """Return RSSI without packets that a relay sent from another place, the rows of such packets alone, and a note.
+
+    Args:
+        table: Packets.
+        columns: Number of relays of each packet, or numbers of hops left at the start and the end. None of them is relayed
+            without columns.
+        rssi: RSSI (n, R) [dBm].
+        packet: The packet of each value (n, R or 1).
+    """
+    if not columns:
+        return rssi, np.zeros(len(rssi), dtype=bool), []
+    start, *left = (parsed(table[name])[0] for name in columns)
+    n_relays = start - left[0] if left else start
+    relayed = (n_relays > 0)[packet] & ~np.isnan(rssi)
+    of_row = np.asarray(relayed.any(axis=1))
+    notes = [f"packets that a relay sent are left out: {of_row.sum()} of {len(rssi)}"] if of_row.any() else []
+    rssi = np.where(relayed, np.nan, rssi)
+    alone: NDArray[np.bool_] = of_row & np.isnan(rssi).all(axis=1)
+    return rssi, alone, notes

@@ -20,6 +20,7 @@ from swiftwrf.data.coordinates import (
     floor_numbers,
     frame_of,
 )
+from swiftwrf.data.zones import in_one_zone, zone_column
 from swiftwrf.errors import InputError
 from swiftwrf.positions import cells, check_positions
 
@@ -37,6 +38,9 @@ def read_coordinates(
     if "x" not in roles and frame != PlanFrame():
         raise InputError(f"{source} has longitudes and latitudes, which --scale, --y-down and --up do not apply to")
     frame, notes = frame_of(source, table, both, frame) if "x" in roles else (frame, [])
+    if "x" in roles and (zone := zone_column(table, both[0])) is not None:
+        joined, of_zones = in_one_zone(source, table[zone], np.stack([x, y], axis=1))
+        (x, y), notes = joined.T, notes + of_zones
     if "floor" in roles:
         floor, text = parsed(table[roles["floor"]])
         floor_names = text_of(table[roles["floor"]])

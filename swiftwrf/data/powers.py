@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from swiftwrf.data.cells import Floats
+from swiftwrf.data.cells import Floats, column_of_numbers, parsed
 from swiftwrf.errors import InputError
 
 NOT_DETECTED_DBM = -100.0  # the usual filler
@@ -217,3 +218,21 @@ def check_powers(source: object, rssi: Floats, receivers: Sequence[str], table_r
         f"{source} row {rows[row, column] + 1}, receiver {receivers[column]}: {value:g} dBm is no received power; expected "
         f"{MIN_RSSI_DBM:g} to {MAX_RSSI_DBM:g}; if it stands for not detected, give nan or --filler {value:g}"
     )
+
+
+def powers_in(
+    source: object, table: pd.DataFrame, names: Sequence[str], min_repeats: int = 5
+) -> tuple[Floats, list[str]]:
+    """Return the RSSI in columns (n, len(names)), nan where it was not detected, for which a repeated word may stand.
+
+    Raises:
+        InputError: Text in place of numbers.
+    """
+    values, text = (np.stack(part, axis=1) for part in zip(*(parsed(table[name]) for name in names), strict=True))
+    words = pd.Series(table[list(names)].to_numpy(dtype=object)[text], dtype=object).astype(str).str.strip()
+    if len(words) >= min_repeats and words.nunique() == 1:
+        cells = f"{len(words)} of {text.size} cells ({text.mean():.0%})"
+        return values, [f"{words[0]!r} counts as not detected: {cells}"]
+    for name in np.array(names)[text.any(axis=0)]:
+        column_of_numbers(source, table, name)
+    return values, []

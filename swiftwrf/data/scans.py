@@ -15,6 +15,8 @@ from swiftwrf.data.cells import CLOCK_ONLY, Floats, parsed, plain_name, seconds,
 from swiftwrf.data.columns import candidates
 from swiftwrf.data.powers import end_of_scale
 
+HOUR_S = 3600.0
+
 
 def repeated_scans(
     coordinate: Floats, rssi: Floats, min_receivers: int = 3, min_rows: int = 5, min_fraction: float = 0.05
@@ -30,6 +32,32 @@ def repeated_scans(
     repeated = np.append(False, before.all(axis=1) & several & (coordinate[1:, :2] != coordinate[:-1, :2]).any(axis=1))
     enough = repeated.sum() >= max(min_rows, min_fraction * len(rssi))
     return repeated if enough else np.zeros_like(repeated)
+
+
+def held_fixes(coordinate: Floats, min_rows: int = 5, min_jump: float = 5.0) -> NDArray[np.bool_]:
+    """Return which rows of a walk repeat the position before because the receiver of satellites had no new one.
+
+    Most positions of a walk differ from the one before. Who stands still goes on from there, but after a held fix the
+    position jumps.
+
+    Args:
+        coordinate: Coordinates of successive rows (n, 3) in any unit.
+        min_rows: Number of rows at a held position, at least. The bounds are not studied.
+        min_jump: Distance of the next position in median steps, at least.
+
+    Example:
+        >>> x = [0, 1, 2, 3, 3, 3, 3, 3, 3, 9, 10, 11]
+        >>> held_fixes(np.array([[value, 0.0, 0.0] for value in x])).nonzero()[0]
+        array([4, 5, 6, 7, 8])
+    """
+    step = np.linalg.norm(np.diff(coordinate, axis=0), axis=1)
+    if not (step > 0).sum() > len(step) / 2:
+        return np.zeros(len(coordinate), dtype=bool)
+    run = np.append(0, (step > 0).cumsum())
+    jump = np.append(step[step > 0], 0.0)  # after each run; the last one has none
+    held = (np.bincount(run) >= min_rows) & (jump >= min_jump * np.median(step[step > 0]))
+    repeats: NDArray[np.bool_] = np.append(False, step == 0) & held[run]
+    return repeats
 
 
 def split_packets(rssi: Floats, time: Floats, min_rows: int = 5, min_fraction: float = 0.9) -> list[str]:
@@ -145,11 +173,13 @@ def times_of(
     max_speed_m_s: float = 2e-3,
     max_step_m: float = 1.0,
     min_rows: int = 6,
+    max_change_s: float = 60.0,
 ) -> tuple[Floats, list[str]]:
     """Return the times of the rows [s] in a column, and notes; dates may be in another column.
 
     Whole numbers at which the positions move slower than anybody walks, but not in milliseconds, are milliseconds. They
-    are those of a log of movement, with at least 6 rows and a median step below 1 m (not studied).
+    are those of a log of movement, with at least 6 rows and a median step below 1 m. Dates that run back once, by an hour up
+    to a minute, are those of the end of summer time. The bounds are not studied.
     """
     column = table[name]
     days = [other for other in candidates(table, "time") if plain_name(other) == "date" and other != name]
@@ -167,4 +197,12 @@ def times_of(
                 f"column {column.name} counts milliseconds, which are converted to seconds: as seconds, the positions "
                 f"move {1e3 * speed:.1g} mm/s"
             )
+    back = np.flatnonzero(np.diff(time) < 0)
+    if len(back) == 1 and len(time) >= min_rows:
+        after, seconds_back = int(back[0]) + 1, float(time[back[0]] - time[back[0] + 1])
+        row = f"times of column {column.name} run back by {seconds_back:.4g} s before row {after + 1}"
+        is_clock_change = abs(seconds_back - HOUR_S) <= max_change_s and column.dtype.kind not in "biuf"
+        if is_clock_change:
+            time = time + HOUR_S * (np.arange(len(time)) >= after)
+        notes.append(f"{row}{', as at the end of summer time: an hour is added from there' if is_clock_change else ''}")
     return time, notes

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import fnmatch
 import re
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Set
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -17,8 +17,6 @@ import numpy as np
 import pandas as pd
 
 from swiftwrf.data.cells import (
-    Floats,
-    column_of_numbers,
     parsed,
     plain_name,
     text_of,
@@ -32,7 +30,9 @@ from swiftwrf.data.columns import (
     column_of_quantity,
     columns_of_end,
     find_roles,
+    labels_of,
     receiver_columns,
+    relay_columns,
 )
 from swiftwrf.data.coordinates import (
     PlanFrame,
@@ -40,13 +40,14 @@ from swiftwrf.data.coordinates import (
     without_fix,
 )
 from swiftwrf.data.options import TableOptions
-from swiftwrf.data.packets import rows_of_packets
+from swiftwrf.data.packets import rows_of_packets, without_relayed
 from swiftwrf.data.places import local_metres, read_coordinates, receivers_of_ends
 from swiftwrf.data.powers import (
     check_powers,
     end_of_scale,
     find_fillers,
     of_one_power,
+    powers_in,
     signal_power,
     without_fillers,
 )
@@ -57,7 +58,8 @@ from swiftwrf.data.radios import (
 )
 from swiftwrf.data.ranked import from_ranked_lists
 from swiftwrf.data.receivers import read_receivers
-from swiftwrf.data.scans import list_margin, repeated_scans, split_packets, times_of, windows
+from swiftwrf.data.scans import held_fixes, list_margin, repeated_scans, split_packets, times_of, windows
+from swiftwrf.data.zones import zone_column
 from swiftwrf.errors import InputError, listed
 
 
@@ -102,6 +104,7 @@ class _Survey:
         end: Columns of the second end by x, y and z.
         names: Names of the R receivers.
         left_out: Columns of other quantities than the received power.
+        relays: Columns that count the relays of a packet, none without these.
         corrected: Column of the transmit power that is subtracted, empty without one.
         unused: Columns without use.
         rssi: RSSI (n, R) [dBm], nan where nothing was detected.
@@ -136,6 +139,7 @@ class _Survey:
         if (floor := self.text("floor")) is not None and not floor.any():
             self.notes.append(f"column {self.roles.pop('floor')} is empty, so there are no floors")
         used = {options.offset_by, options.pool_by, *self.end.values()}
+        used |= {zone_column(table, self.roles["x"])} if "x" in self.roles else set()
         self.left_out, notes = ([], []) if "receiver" in self.roles else self._find_receivers(asked, used)
         taken = [f"{role} = {name}" for role, name in self.roles.items()]
         taken += [f"transmitter {axis} = {name}" for axis, name in self.end.items()]
@@ -143,7 +147,8 @@ class _Survey:
             several = f"RSSI of {len(self.names)} receivers = {listed(self.names)}"
             taken.append(several if len(self.names) > 1 else f"RSSI = {self.names[0]}")
         self.notes += [f"taken as: {', '.join(taken)}", *notes]
-        used |= {*self.roles.values(), *self.names, *self.left_out}
+        self.relays = [name for name in relay_columns(table) if name not in (*used, *self.roles.values())]
+        used |= {*self.roles.values(), *self.names, *self.left_out, *self.relays}
         self.unused = [name for name in table.columns if name not in used]
         if self.unused:
             self.notes.append(f"columns that are not used: {listed(self.unused)}")
@@ -164,16 +169,19 @@ class _Survey:
         if "receiver" in self.roles:
             keys, time = pd.DataFrame(self.coordinate), self.text("time")
             keys = keys.assign(kind=self.kind.to_numpy(), time="" if time is None else time.to_numpy())
-            power, names = self._powers([self.roles["rssi"]])[:, 0], self.roles["receiver"]
-            packets = rows_of_packets(self.source, self.table, names, power, keys, self.n_listed)
+            power, words = powers_in(self.source, self.table, [self.roles["rssi"]])
+            packets = rows_of_packets(self.source, self.table, self.roles["receiver"], power[:, 0], keys, self.n_listed)
             self.names, self.rssi, self.table_row, notes = packets
-            self.coordinate, self.notes = self.coordinate[self.table_row.min(axis=1)], self.notes + notes
+            self.coordinate, self.notes = self.coordinate[self.table_row.min(axis=1)], self.notes + words + notes
         else:
-            self.rssi, self.table_row = self._powers(self.names), np.arange(len(self.table))[:, None]
+            self.rssi, words = powers_in(self.source, self.table, self.names)
+            self.table_row, self.notes = np.arange(len(self.table))[:, None], self.notes + words
 
     def clean_powers(self) -> None:
         """Take fillers as not detected, refuse what is no received power, and pool radios."""
         by = self.options.pool_by
+        self.rssi, self.relayed, notes = without_relayed(self.table, self.relays, self.rssi, self.table_row)
+        self.notes += notes
         if self.options.quantity is not None:
             values = np.where(np.isfinite(self.rssi), self.rssi, np.nan)
             self.rssi, notes = without_fillers(values, list(self.options.filler or ()), self.options.quantity)
@@ -221,7 +229,9 @@ class _Survey:
         omitted, notes = without_fix(self.coordinate[:, :3])
         if omitted.all():
             raise InputError(f"{self.source} has no row with a position; {notes[0]}")
-        row = np.flatnonzero(~omitted)
+        row = np.flatnonzero(~(omitted | self.relayed))
+        if not len(row):
+            raise InputError(f"{self.source} has only packets that a relay sent in rows with a position")
         repeated = repeated_scans(self.coordinate[row], self.rssi[row])
         if repeated.any():
             fate = "stay because of the given splits" if keeps_rows else "are left out"
@@ -230,6 +240,11 @@ class _Survey:
                 f"{fate}: {int(repeated.sum())} of {len(row)}"
             )
             row = row if keeps_rows else row[~repeated]
+        if not keeps_rows and (held := held_fixes(self.coordinate[row])).any():
+            notes.append(
+                f"rows that repeat a held fix, before a jump to the next one, are left out: {held.sum()} of {len(row)}"
+            )
+            row = row[~held]
         self.notes += notes
         self.index, self.table_row = row, self.table_row.max(axis=1)[row]
         self.rssi, self.coordinate = self.rssi[row], self.coordinate[row]
@@ -275,7 +290,12 @@ class _Survey:
             )
             self.names = [f"place{number}" for number in range(1, len(receiver_position) + 1)]
             self.notes += notes
-        labels, moves = self._labels(), bool(self.end or options.transmitter)
+        candidate = [*self.unused, *self.left_out, *([self.roles["session"]] if "session" in self.roles else [])]
+        candidate = [name for name in candidate if name != self.corrected]
+        labels, moves = (
+            labels_of(self.table, candidate, self.roles.get("receiver")),
+            bool(self.end or options.transmitter),
+        )
         if labels and not options.offset_by:
             self.notes.append(
                 f"rows differ in {listed(labels)}; swiftwrf inspect tests whether its values have constant offsets"
@@ -354,27 +374,3 @@ class _Survey:
     def text(self, role: str) -> pd.Series | None:
         """Return the cells of the column of a role, None without one."""
         return text_of(self.table[self.roles[role]]) if role in self.roles else None
-
-    def _labels(self, max_values: int = 30, min_rows: int = 10) -> tuple[str, ...]:
-        """Return columns with few different values, each in several rows, that are no names of receivers. Not studied."""
-        candidate = [name for name in (*self.unused, *self.left_out, self.roles.get("session")) if name]
-        candidate = [name for name in candidate if name != self.corrected]
-        if "receiver" in self.roles:
-            several = self.table.groupby(self.roles["receiver"])[candidate].nunique().max() > 1
-            candidate = [name for name in candidate if several[name]]
-        counts = {name: text_of(self.table[name]).value_counts() for name in candidate}
-        return tuple(name for name, n in counts.items() if 2 <= len(n) <= max_values and int(n.min()) >= min_rows)
-
-    def _powers(self, names: Sequence[str], min_repeats: int = 5) -> Floats:
-        """Return the RSSI in columns (n, len(names)), nan where it was not detected, for which a repeated word may stand."""
-        values, text = (
-            np.stack(part, axis=1) for part in zip(*(parsed(self.table[name]) for name in names), strict=True)
-        )
-        words = pd.Series(self.table[list(names)].to_numpy(dtype=object)[text], dtype=object).astype(str).str.strip()
-        if len(words) >= min_repeats and words.nunique() == 1:
-            cells = f"{len(words)} of {text.size} cells ({text.mean():.0%})"
-            self.notes.append(f"{words[0]!r} counts as not detected: {cells}")
-            return values
-        for name in np.array(names)[text.any(axis=0)]:
-            column_of_numbers(self.source, self.table, name)
-        return values

@@ -1,6 +1,6 @@
 """Reader of survey tables: positions and RSSI, one column a receiver (wide) or one row a packet (long).
 
-Tables are CSV or Parquet, or the records in JSON, GPX and KML documents.
+Tables are CSV, maybe compressed, or Parquet, the records in JSON, GPX and KML documents, or logs in databases.
 """
 
 from __future__ import annotations
@@ -11,10 +11,12 @@ from pathlib import Path
 import pandas as pd
 import torch
 
+from swiftwrf.data.archives import PACKED
 from swiftwrf.data.columns import is_coordinate, is_rssi
-from swiftwrf.data.files import SUFFIXES, TABLES, digests, has_header, read_table
+from swiftwrf.data.files import BINARIES, SUFFIXES, TABLES, digests, has_header, read_table
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
 from swiftwrf.data.formats.nerf2 import FILES as NERF2_FILES
+from swiftwrf.data.logs import is_log_of_scans, is_track, joined_by_time
 from swiftwrf.data.options import TableOptions
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import kept_splits, read_splits
@@ -22,6 +24,7 @@ from swiftwrf.data.survey import has_positions, read_survey
 from swiftwrf.errors import InputError, listed
 
 RECEIVERS = "receivers.csv"  # beside the table: receiver,x,y,z
+TRACKS = (".gpx", ".kml")  # beside a log of scans without positions
 COORDINATES = re.compile(r"(?:crd|coord(?:inate)?s?|pos(?:ition)?s?|loc(?:ation)?s?|places?)(?![a-z])")
 HALF = re.compile(rf"[ _-]*(?:rssi?(?![a-z])|{COORDINATES.pattern})[ _-]*")
 
@@ -42,7 +45,7 @@ class SurveyTable(Format[Rssi]):
         arguments = read_survey(file, table, options, stated, keeps_rows=bool(splits))
         data = Rssi(
             **arguments,
-            name=file.stem,
+            name=file.stem.removesuffix(".csv"),
             named_splits=kept_splits(splits, torch.from_numpy(arguments["index"]), len(table)),
             source=digests([file, *others, *([stated] if stated else [])], file.parent),
         )
@@ -61,7 +64,9 @@ def _tables(path: Path) -> list[Path]:
         return [path] if path.suffix.lower() in TABLES else []
     if any((path / name).is_file() for name in NERF2_FILES):
         return []
-    return sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.name != RECEIVERS)
+    files = sorted(file for file in path.iterdir() if file.is_file() and file.name != RECEIVERS)
+    plain = [file for file in files if file.suffix.lower() in SUFFIXES]
+    return plain or [file for file in files if file.suffix.lower() in (*PACKED, *BINARIES)]
 
 
 def _table(path: Path) -> tuple[Path, list[Path], pd.DataFrame]:
@@ -72,8 +77,18 @@ def _table(path: Path) -> tuple[Path, list[Path], pd.DataFrame]:
         related = [file for file in _tables(path.parent) if HALF.sub("", file.stem.lower()) == name_of_both]
         files = related if len(related) == 2 else files
     if len(files) == 1:
-        return files[0], [], read_table(files[0])
+        table = read_table(files[0])
+        tracks = sorted(file for file in path.iterdir() if file.suffix.lower() in TRACKS) if path.is_dir() else []
+        if len(tracks) != 1 or not is_log_of_scans(table):
+            return files[0], [], table
+        files = [files[0], *tracks]
     tables = {file: read_table(file, header=has_header(file)) for file in files} if len(files) == 2 else {}
+    for scans, track in (files, files[::-1]) if tables else ():
+        if is_log_of_scans(tables[scans]) and is_track(tables[track]):
+            table, notes = joined_by_time(path, tables[track], tables[scans])
+            joined = f"scans of {scans.name} have the positions of {track.name}, interpolated at their times"
+            table.attrs["notes"] = [joined, *notes]
+            return scans, [track], table
     halves = {_holds_places(file, table): file for file, table in tables.items()}
     if halves.keys() != {False, True} or len({len(table) for table in tables.values()}) > 1:
         raise InputError(

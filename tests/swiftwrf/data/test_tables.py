@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from pyproj import Proj
 from samples import walk
 
 from swiftwrf import InputError, Rssi, load_rssi
@@ -208,6 +209,21 @@ FORMS = {
     "row of units": Form(shaped(lambda line: [line[0], "m,m,dBm,dBm,dBm,dBm", *line[1:]]), ("header",)),
     "lines above": Form(shaped(lambda line: ["Survey export", "Project: office, 2nd floor", "", *line]), ("header",)),
     "semicolons and decimal commas": Form(lambda t: t.to_csv(index=False, sep=";", decimal=",")),
+    "decimal commas in quotes": Form(lambda t: t.to_csv(index=False, decimal=","), None),
+    "points between thousands": Form(
+        lambda t: (
+            t.assign(x=t.x + 2000, y=t.y + 3000)
+            .map(lambda v: f"{v:,.2f}".translate(str.maketrans(",.", ".,")))
+            .to_csv(index=False, sep=";")
+        )
+    ),
+    "poses of ROS": Form(
+        lambda t: (
+            t.rename(columns={axis: f"field.pose.pose.position.{axis}" for axis in "xy"})
+            .assign(**{"field.pose.pose.orientation.x": -0.4, "field.pose.pose.orientation.y": 0.9})
+            .assign(**{"%time": 1_780_000_000_000_000_000 + 500_000_000 * np.arange(N)})
+        )
+    ),
     "names of axes": Form(lambda t: t.rename(columns={"x": "Pos X (m)", "y": "pos_y"})),
 }
 
@@ -233,6 +249,15 @@ def test_a_written_table_has_its_name_and_says_how_it_was_taken(table, tmp_path)
     assert noted(again, f"rows equal an earlier one in all columns and count once more: 2 of {N + 2}")
 
 
+def test_commas_between_thousands_are_no_decimal_commas(table, tmp_path):
+    """A quoted 1,250 may be 1.25 or 1250: such a table is refused, unless other cells decide."""
+    table[["x", "y"]] = (100 * table[["x", "y"]]).round() + 1000
+    grouped = table.assign(x=table.x.map("{:,.0f}".format), y=table.y.map("{:,.0f}".format))
+    for doubtful in (grouped.astype(dict.fromkeys(NAMES, int)), grouped):
+        with pytest.raises(InputError, match="is not a number"):
+            read(text(doubtful), tmp_path)
+
+
 def test_parquet(table, tmp_path):
     silenced(table).to_parquet(tmp_path / "walk.parquet")
     for place in (tmp_path, tmp_path / "walk.parquet"):
@@ -246,7 +271,52 @@ def test_parquet(table, tmp_path):
         load_rssi(tmp_path)
 
 
+def in_zones(table, letter="U", border=12.0):
+    """Return the walk with x and y as UTM coordinates of the zones on either side of 12 degrees east."""
+    origin = GeodeticOrigin(48.0, border)
+    degrees = origin.to_degrees(np.column_stack([table.x - 10, table.y]))
+    zones = np.where(degrees[:, 1] < border, 32, 33)
+    both = {zone: Proj(proj="utm", zone=zone, ellps="WGS84")(degrees[:, 1], degrees[:, 0]) for zone in (32, 33)}
+    x, y = (np.where(zones == 32, both[32][axis], both[33][axis]) for axis in (0, 1))
+    return table.assign(x=x, y=y, zone=[f"{zone}{letter}" for zone in zones]), np.column_stack(both[32])
+
+
+def test_zones_of_utm_are_joined(table):
+    written, expected = in_zones(table)
+    data = Rssi.from_frame(pd.concat([written, written[written.zone == "32U"]]).drop_duplicates())
+    in_main = written.zone.mode()[0] == "32U"
+    xy = data.transmitter_position[:, :2].numpy()
+    step = np.linalg.norm(np.diff(xy, axis=0), axis=1)
+    np.testing.assert_allclose(step, np.linalg.norm(np.diff(expected, axis=0), axis=1), rtol=1e-4)
+    assert not in_main or np.allclose(xy, expected, atol=1e-3)
+    assert noted(data, "positions in UTM zones 32U, 33U are those of zone")
+    assert not data.labels
+
+
+def test_zones_of_unknown_hemisphere_are_refused(table):
+    for letter in ("", "S"):
+        with pytest.raises(InputError, match="hemisphere of 32"):
+            Rssi.from_frame(in_zones(table, letter)[0])
+    areas = table.assign(zone=np.where(table.x < 10, "1", "2"))
+    is_read_as(Rssi.from_frame(areas), table)
+
+
 # receivers
+
+
+@pytest.mark.parametrize("long", [False, True])
+def test_relayed_packets_are_no_rssi_of_this_place(table, long):
+    """A relay sends from another place, so its packets are left out, and what is left is the table without them."""
+    mesh = table[["x", "y", "a"]].rename(columns={"a": "rx_rssi"}).assign(rx_snr=4.5)
+    mesh = mesh.assign(gateway_id="!7c5a01f2") if long else mesh
+    relayed = np.arange(N) % 3 == 1
+    hops = {"hops_away": np.where(relayed, 2, 0)}, {"hop_start": 3, "hop_limit": np.where(relayed, 1, 3)}
+    for columns in hops:
+        data = Rssi.from_frame(mesh.assign(**columns).assign(rx_rssi=np.where(relayed, -30.0, mesh.rx_rssi)))
+        np.testing.assert_array_equal(data.rssi_dbm[:, 0], table.a[~relayed])
+        np.testing.assert_array_equal(data.index, np.flatnonzero(~relayed))
+        assert noted(data, f"packets that a relay sent are left out: {relayed.sum()} of {N}")
+        assert not data.labels
 
 
 @pytest.mark.parametrize("name", ["RSRP", "rssi", "RSS [dBm]", "Signal Strength", "level"])
