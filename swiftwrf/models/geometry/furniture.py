@@ -217,7 +217,7 @@ class Furniture:
 
         ray = source[-1][:, None, :, 0].float() - start[..., 0]
         length = self.voxel_m * ray.square().sum(0).sqrt()
-        samples = max(2, math.ceil(float(length.max()) / self.voxel_m))
+        samples = self._samples(source[-1][..., 0])
         at = (torch.arange(samples) + 0.5) / samples
         x = torch.addcmul(start, at, ray.nan_to_num(0, 0, 0)[..., None])  # paths that do not exist have any points
         cell = torch.zeros(*length.shape, len(hits), dtype=torch.int64)
@@ -232,6 +232,15 @@ class Furniture:
         i, j, k = x.floor_().clamp_(torch.zeros(()), largest)
         voxel = i.mul_(largest[1] + 1).add_(j).mul_(largest[2] + 1).add_(k).int()  # exact in float32 below 2^24
         return _Crossings(torch.tensor(rows_of), voxel, length / samples, cell, of_best(exists))
+
+    def _samples(self, image: Tensor) -> int:
+        """Return the number of samples of paths to images (3, S) [voxels], one a voxel of the longest from inside the grid.
+
+        It must not depend on the paths that are followed together, which would change each other.
+        """
+        size = torch.tensor(self.absorption.shape, dtype=torch.float64) + 2
+        corner = torch.cartesian_prod(*(torch.tensor([0.0, edge], dtype=torch.float64) for edge in size.tolist()))
+        return max(2, math.ceil(float(torch.cdist(corner, image.T.double()).max())))
 
     def _cell(self, plane: Tensor, normal: Tensor, hit: Tensor) -> Tensor:
         """Return the number of the cell, counted over all planes, of points (3, n, S) [voxels] on planes (n, S)."""

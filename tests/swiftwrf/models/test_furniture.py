@@ -361,3 +361,13 @@ def test_walls_follow_from_a_subcarrier_beside_the_carrier():
     found = walls.refined_on(observe(data)[0])
     for plane, truth in zip(found.planes, WALLS, strict=True):
         assert plane.offset_m == pytest.approx(truth.offset_m, abs=1e-3)
+
+
+def test_channels_do_not_depend_on_the_positions_beside():
+    data, walls = measured(2.0, n=40)
+    room = GeometryModel.of_planes(data, WALLS)
+    room.furniture = furnished(walls, 2.0)
+    frequency = LIGHT_SPEED / data.array.wavelength
+    together = room.channel(data.position, torch.tensor([frequency]))
+    alone = torch.cat([room.channel(at[None], torch.tensor([frequency])) for at in data.position])
+    torch.testing.assert_close(alone, together, rtol=1e-5, atol=1e-6)
